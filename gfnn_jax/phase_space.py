@@ -1,0 +1,96 @@
+"""States z = (q, p), the symplectic form J, pairs of states, and how symplectic a Jacobian is.
+
+Positions come first, always: ``z[:d]`` is q and ``z[d:]`` is p. ``dim`` is the number d of
+degrees of freedom, never 2d.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Scalar = Float[Array, ""]
+State = Float[Array, "2d"]
+States = Float[Array, "batch 2d"]
+
+
+def split(z):
+    """z of shape (..., 2d) -> q, p of shape (..., d). NumPy or JAX arrays."""
+    dim = z.shape[-1] // 2
+    return z[..., :dim], z[..., dim:]
+
+
+def apply_j(g):
+    """J g for gradients g of shape (..., 2d), with J = [[0, I], [-I, 0]]: (g_q, g_p) -> (g_p, -g_q)."""
+    dim = g.shape[-1] // 2
+    return jnp.concatenate([g[..., dim:], -g[..., :dim]], axis=-1)
+
+
+def symplectic_form(dim: int, dtype: Any = float) -> Float[Array, "2d 2d"]:
+    """The matrix J of shape (2d, 2d)."""
+    zero, one = jnp.zeros((dim, dim), dtype), jnp.eye(dim, dtype=dtype)
+    return jnp.block([[zero, one], [-one, zero]])
+
+
+def symplecticity_defect(
+    jacobian: Float[Array, "*batch 2d 2d"], scale: Float[Array, "2d"] | None = None
+) -> Float[Array, "*batch"]:
+    """Largest entry of Mᵀ J M − J in magnitude, for Jacobians M of shape (..., 2d, 2d).
+
+    ``scale`` (2d,) makes the coordinates unit-sized first: z = scale * y. The form that M must
+    preserve is then J with the entry (q_i, p_i) multiplied by scale_q,i * scale_p,i; the defect is
+    divided by the largest such product, so that it is a pure number.
+    """
+    dim = jacobian.shape[-1] // 2
+    form = symplectic_form(dim, jacobian.dtype)
+    if scale is not None:
+        jacobian = jacobian * scale  # dZ/dy; the left factor of the form stays in z
+        weighted = form * jnp.outer(scale, scale)
+        unit = jnp.max(jnp.abs(weighted))
+    else:
+        weighted, unit = form, jnp.ones((), jacobian.dtype)
+    defect = jnp.swapaxes(jacobian, -1, -2) @ form @ jacobian - weighted
+    return jnp.max(jnp.abs(defect), axis=(-2, -1)) / unit
+
+
+def hamiltonian_vector_field(hamiltonian: Callable) -> Callable:
+    """``field(z, t=0.0)`` = J ∇H(z, t) of shape (2d,), the right-hand side of the paper's eq. (1)."""
+
+    def field(z, t=0.0):
+        return apply_j(jax.grad(hamiltonian)(z, t))
+
+    return field
+
+
+@partial(
+    jax.tree_util.register_dataclass, data_fields=("z0", "z1"), meta_fields=("dt",)
+)
+@dataclasses.dataclass(frozen=True)
+class Pairs:
+    """States and their images one time step later: what a map is learned from.
+
+    z0, z1: shape (N, 2d), q first; NumPy or JAX arrays. dt: the time between them (the paper's h),
+    in the user's unit of time; 1 for a map that has no time.
+    """
+
+    z0: Any
+    z1: Any
+    dt: float
+
+    def __len__(self) -> int:
+        return self.z0.shape[0]
+
+    @property
+    def dim(self) -> int:
+        """Degrees of freedom d."""
+        return self.z0.shape[-1] // 2
+
+    def take(self, rows) -> Pairs:
+        """The pairs of these rows (an index array or a slice)."""
+        return Pairs(self.z0[rows], self.z1[rows], self.dt)
