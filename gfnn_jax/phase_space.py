@@ -20,6 +20,14 @@ State = Float[Array, "2d"]
 States = Float[Array, "batch 2d"]
 
 
+def require_x64(what: str) -> None:
+    """Raises RuntimeError, naming ``what`` needs it, where JAX would silently compute in float32."""
+    if not jax.config.jax_enable_x64:
+        raise RuntimeError(
+            f"{what} needs float64: call jax.config.update('jax_enable_x64', True) first"
+        )
+
+
 def split(z):
     """z of shape (..., 2d) -> q, p of shape (..., d). NumPy or JAX arrays."""
     dim = z.shape[-1] // 2

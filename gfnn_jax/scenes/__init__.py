@@ -1,1 +1,60 @@
-"""The scenes."""
+"""The scenes: the systems that come with the package, each a `Scene`, found by name or by function."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Callable
+
+from gfnn_jax.scenes.henon_heiles import henon_heiles
+from gfnn_jax.scenes.pcr3bp import pcr3bp
+from gfnn_jax.scenes.scene import AroundOrbit, DrawnFrom, Scene
+from gfnn_jax.scenes.standard_map import standard_map
+from gfnn_jax.scenes.two_body import two_body
+
+SCENES: dict[str, Callable[[], Scene]] = {
+    "two-body": two_body,
+    "henon-heiles-regular": lambda: henon_heiles(energy=1 / 12),
+    "henon-heiles-chaotic": lambda: henon_heiles(energy=1 / 6),
+    "henon-heiles-printed": lambda: henon_heiles(energy=1 / 12, printed=True),
+    "pcr3bp": pcr3bp,
+    "standard-map-regular": lambda: standard_map(k=0.6),
+    "standard-map-chaotic": lambda: standard_map(k=1.2),
+}
+
+
+def names() -> tuple[str, ...]:
+    """The names that `make` knows."""
+    return tuple(SCENES)
+
+
+def make(name: str, dt: float | None = None) -> Scene:
+    """The scene of this name, with its own time step or with another.
+
+    Raises ValueError, in one line, on an unknown name (naming the nearest one and all there are),
+    on a ``dt`` that is not finite and > 0, and on any but its own for a scene that is a map.
+    """
+    if name not in SCENES:
+        close = difflib.get_close_matches(name, SCENES, n=1)
+        hint = f", did you mean '{close[0]}'?" if close else ";"
+        raise ValueError(f"unknown scene '{name}'{hint} scenes: {', '.join(SCENES)}")
+    scene = SCENES[name]()
+    if dt is None or dt == scene.dt:
+        return scene
+    if scene.step is not None:
+        raise ValueError(f"{name} is a map without time: it has dt = {scene.dt:g} only, not {dt:g}")
+    return dataclasses.replace(scene, dt=dt)
+
+
+__all__ = [
+    "SCENES",
+    "AroundOrbit",
+    "DrawnFrom",
+    "Scene",
+    "henon_heiles",
+    "make",
+    "names",
+    "pcr3bp",
+    "standard_map",
+    "two_body",
+]

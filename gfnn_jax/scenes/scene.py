@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
@@ -66,3 +67,7 @@ class Scene:
     features: Callable | None = None
     reversor: tuple[int, ...] | None = None
     regular: bool = True
+
+    def __post_init__(self):
+        if not (math.isfinite(self.dt) and self.dt > 0):
+            raise ValueError(f"dt must be finite and > 0, not {self.dt}")
