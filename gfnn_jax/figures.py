@@ -1,0 +1,435 @@
+"""Figures that a paper would print: arrays in, Axes out.
+
+Every function draws on ``ax`` where one is given, else on a new figure (`save(ax.figure, path)`).
+Figures are matplotlib `Figure` objects of their own: pyplot and its global state are never touched.
+One style for all, for the colour-blind and for grey print: each method has its own colour, marker
+and line style, by its place in the mapping; the reference is black and first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from gfnn_jax.metrics import error_statistics, kl_divergence
+
+# Okabe & Ito's palette without its yellow, which does not show on white, and with grey.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
+LINES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)))
+REFERENCE = "black"
+
+STYLE = {
+    "figure.constrained_layout.use": True,
+    "figure.dpi": 100,
+    "font.size": 9,
+    "axes.labelsize": 9,
+    "axes.titlesize": 9,
+    "legend.fontsize": 8,
+    "legend.framealpha": 0.85,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#DDDDDD",
+    "grid.linewidth": 0.5,
+    "axes.axisbelow": True,
+    "axes.formatter.use_mathtext": True,
+    "lines.linewidth": 1.3,
+    "lines.markersize": 4,
+    "pdf.fonttype": 42,
+    "axes.prop_cycle": cycler(color=COLOURS),
+}
+WIDTH, HEIGHT = 4.8, 3.2  # inches, of one panel; a column of a paper is about 3.3 wide
+
+
+def style():
+    """The package's look as a context, and as a decorator; leaves matplotlib as it was."""
+    return matplotlib.rc_context(STYLE)
+
+
+@style()
+def save(figure: Figure, path) -> None:
+    """Write a figure; the suffix says what, ``.png`` (200 dots per inch) or ``.pdf``."""
+    figure.savefig(Path(path), dpi=200, bbox_inches="tight")
+
+
+def _axes(ax, width=WIDTH, height=HEIGHT) -> Axes:
+    return Figure(figsize=(width, height)).add_subplot() if ax is None else ax
+
+
+def _look(place: int) -> dict:
+    return {
+        "color": COLOURS[place % len(COLOURS)],
+        "marker": MARKERS[place % len(MARKERS)],
+        "linestyle": LINES[place % len(LINES)],
+    }
+
+
+# Errors against step number
+
+
+@style()
+def error_growth(errors: Mapping, ylabel="position error", ax=None) -> Axes:
+    """Mean error over trajectories against step, log–log, with a band of one standard deviation.
+
+    errors: name -> (steps (L,), error (B, L)). Above the mean the band is mean + std. Below it is
+    mean / (1 + std/mean), the same factor down: mean − std to first order, and positive where
+    mean − std is not. A curve ends where a prediction is lost; the legend counts those. The dotted
+    line grows as the step, the paper's theorem for regular orbits.
+    """
+    ax = _axes(ax)
+    _error_curves(ax, errors, ylabel)
+    _guide(ax, 1.0, r"$\propto n$")
+    ax.legend()
+    return ax
+
+
+@style()
+def element_errors(errors: Mapping, axes=None) -> tuple[Axes, Axes]:
+    """Errors of semi-major axis and eccentricity against step (paper, Fig. 2, upper row).
+
+    errors: name -> (steps (L,), error of a (B, L), error of e (B, L)). Bands as in `error_growth`.
+    """
+    if axes is None:
+        axes = Figure(figsize=(2 * WIDTH, HEIGHT)).subplots(1, 2)
+    labels = ("error of semi-major axis $a$", "error of eccentricity $e$")
+    for i, (ax, label) in enumerate(zip(axes, labels, strict=True)):
+        _error_curves(ax, {name: (v[0], v[1 + i]) for name, v in errors.items()}, label)
+        ax.legend()
+    return tuple(axes)
+
+
+@style()
+def energy_error(errors: Mapping, ax=None) -> Axes:
+    """Root mean square over trajectories of the energy error against step, log–log.
+
+    errors: name -> (steps (L,), energy error (B, L)). The dotted line grows as √step: roundoff.
+    """
+    ax = _axes(ax)
+    for place, (name, (steps, error)) in enumerate(errors.items()):
+        size = np.sqrt(np.mean(np.atleast_2d(np.asarray(error)) ** 2, axis=0))
+        _log_curve(ax, place, name, np.asarray(steps), size)
+    _log_log(ax, r"energy error $|H-H_0|\,/\,|H_0|$ (RMS)")
+    _guide(ax, 0.5, r"$\propto \sqrt{n}$")
+    ax.legend()
+    return ax
+
+
+def _error_curves(ax, errors, ylabel):
+    for place, (name, (steps, error)) in enumerate(errors.items()):
+        error = np.atleast_2d(np.asarray(error))
+        statistics = error_statistics(error)
+        mean, steps = statistics.mean, np.asarray(steps)
+        if statistics.num_lost:
+            num = len(error) - statistics.num_excluded
+            name = f"{name} ({statistics.num_lost} of {num} lost)"
+        shown = _log_curve(ax, place, name, steps, mean)
+        if len(error) > 1:
+            factor = 1 + statistics.std[shown] / mean[shown]
+            low, high = mean[shown] / factor, mean[shown] * factor
+            colour = _look(place)["color"]
+            ax.fill_between(steps[shown], low, high, color=colour, alpha=0.18, linewidth=0)
+    _log_log(ax, ylabel)
+
+
+def _log_curve(ax, place, name, steps, values):
+    """Draw what a log–log plot can show, marked about eight times; returns which points it shows."""
+    shown = (steps > 0) & np.isfinite(values) & (values > 0)
+    x = np.log(steps[shown])
+    marks = []
+    if len(x):  # offset by method, so that markers of curves that coincide do not hide each other
+        ticks = np.linspace(x[0], x[-1], 9)[:-1] + (x[-1] - x[0]) / 8 * (0.3 + 0.37 * place % 0.7)
+        marks = np.unique(np.clip(np.searchsorted(x, ticks), 0, len(x) - 1)).tolist()
+    ax.plot(steps[shown], values[shown], label=name, markevery=marks, **_look(place))
+    return shown
+
+
+def _log_log(ax, ylabel):
+    ax.set(xscale="log", yscale="log", xlabel="step $n$", ylabel=ylabel)
+
+
+def _guide(ax, exponent, label):
+    """A dotted power law below the lowest curve, touching it: only its slope means something."""
+    curves = [(x, y) for x, y in (line.get_data() for line in ax.get_lines()) if len(x) > 1]
+    if not curves:
+        return
+    x, y = min(curves, key=lambda curve: curve[1][-1])
+    factor = np.min(y / x**exponent) / 2
+    ax.plot(x, factor * x**exponent, color=REFERENCE, linestyle=":", linewidth=1, label=label)
+
+
+# Orbits
+
+
+@style()
+def coordinates_against_time(
+    times, reference, predictions: Mapping, ylabel, window=None, xlabel="time $t$", ax=None
+) -> Axes:
+    """A coordinate against time: reference (L,) in black and predictions name -> (L,).
+
+    window: (first, last) time shown, for zooming in late (paper, Fig. 2, lower row).
+    """
+    ax = _axes(ax, WIDTH * 1.3)
+    times = np.asarray(times)
+    low, high = (times[0], times[-1]) if window is None else window
+    shown = (times >= low) & (times <= high)
+    every = max(1, int(shown.sum()) // 12)
+    ax.plot(times[shown], np.asarray(reference)[shown], color=REFERENCE, lw=2.2, label="reference")
+    for place, (name, values) in enumerate(predictions.items()):
+        start = place * every // max(1, len(predictions))
+        ax.plot(
+            times[shown],
+            np.asarray(values)[shown],
+            label=name,
+            markevery=(start, every),
+            **_look(place),
+        )
+    ax.set(xlabel=xlabel, ylabel=ylabel)
+    _legend_above(ax)
+    return ax
+
+
+@style()
+def phase_portrait(orbits: Mapping, labels=("$q$", "$p$"), modulo=False, ax=None) -> Axes:
+    """Orbits over each other: name -> (x (N,), y (N,)); the one named "reference" in black.
+
+    modulo: both coordinates reduced to [0, 2π), for the standard map.
+    """
+    ax = _axes(ax, HEIGHT * 1.35, HEIGHT * 1.2)
+    place = 0
+    for name, (x, y) in orbits.items():
+        if name == "reference":
+            _points(ax, x, y, modulo, color=REFERENCE, marker="o", label=name, zorder=1.5)
+        else:
+            look = _look(place)
+            _points(ax, x, y, modulo, color=look["color"], marker=look["marker"], label=name)
+            place += 1
+    _plane(ax, labels, modulo)
+    _legend_above(ax, markerscale=3)
+    return ax
+
+
+@style()
+def sections(points: Mapping, labels=("$q_2$", "$p_2$"), modulo=False, axes=None) -> list[Axes]:
+    """Poincaré sections (or chaotic phase portraits, ``modulo`` 2π) side by side, three in a row.
+
+    points: name -> (x (N,), y (N,)). All panels have the limits of the first, the reference;
+    what lies outside is counted in the title, not shown.
+    """
+    if axes is None:
+        columns = min(3, len(points))
+        rows = -(-len(points) // columns)
+        figure = Figure(figsize=(HEIGHT * 0.85 * columns, HEIGHT * 0.92 * rows))
+        axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+        for ax in axes[len(points) :]:
+            ax.remove()
+    axes = list(axes)[: len(points)]
+    limits = None
+    for ax, (name, (x, y)) in zip(axes, points.items(), strict=True):
+        x, y = _points(ax, x, y, modulo, color=REFERENCE, marker="o")
+        _plane(ax, labels, modulo)
+        ax.label_outer()
+        if limits is None:
+            limits = ax.get_xlim(), ax.get_ylim()
+        ax.set(xlim=limits[0], ylim=limits[1])
+        (x0, x1), (y0, y1) = limits
+        outside = int(np.sum(~((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))))
+        ax.set_title(f"{name} ({outside} of {x.size} outside)" if outside else name)
+    return axes
+
+
+def _points(ax, x, y, modulo, **look):
+    x, y = np.ravel(np.asarray(x)), np.ravel(np.asarray(y))
+    if modulo:
+        x, y = x % (2 * np.pi), y % (2 * np.pi)
+    size = float(np.clip(60 / np.sqrt(max(x.size, 1)), 0.5, 3))
+    # Rasterised, as a PDF of 100,000 vector points takes a minute to show.
+    ax.plot(x, y, ls="none", ms=size, mew=0, rasterized=True, **look)
+    return x, y
+
+
+def _plane(ax, labels, modulo):
+    ax.set(xlabel=labels[0], ylabel=labels[1])
+    if modulo:
+        ticks, names = [0, np.pi, 2 * np.pi], ["0", "π", "2π"]
+        ax.set(xlim=(0, 2 * np.pi), ylim=(0, 2 * np.pi))
+        ax.set_xticks(ticks, names)
+        ax.set_yticks(ticks, names)
+        ax.set_aspect("equal")
+
+
+@style()
+def marginals(reference, samples: Mapping, bins: int, range, label, ax=None) -> Axes:
+    """Histograms of a coordinate of chaotic orbits, with KL divergences from the reference.
+
+    reference: (M,) samples; samples: name -> (N,). The bins drawn are those of the divergence, see
+    `metrics.kl_divergence`; densities are of all samples, also those outside the range.
+    """
+    ax = _axes(ax)
+
+    def densities(values):
+        values = np.ravel(np.asarray(values, float))
+        counts, edges = np.histogram(values[np.isfinite(values)], bins, range)
+        return counts / (values.size * np.diff(edges)), edges
+
+    ax.stairs(
+        *densities(reference), fill=True, color=REFERENCE, alpha=0.18, label="reference", lw=0
+    )
+    for place, (name, values) in enumerate(samples.items()):
+        look = _look(place)
+        divergence = kl_divergence(values, reference, bins, range)
+        ax.stairs(
+            *densities(values),
+            color=look["color"],
+            linestyle=look["linestyle"],
+            linewidth=1.3,
+            label=f"{name}, KL {divergence:.2g}",
+        )
+    ax.set(xlabel=label, ylabel=f"density ({bins} bins)", xlim=range)
+    _legend_above(ax)
+    return ax
+
+
+# Cost and training
+
+
+@style()
+def speed_against_error(
+    microseconds, errors, labels: Sequence[str], chosen: int, tolerance=None, ax=None
+) -> Axes:
+    """Candidates: one-step error against time per predicted step, both logarithmic.
+
+    microseconds, errors: (K,). The points are numbered by rising cost and named on the right; the
+    chosen one is ringed, the staircase joins those that no other beats in both, and the dotted
+    line is the tolerance asked for.
+    """
+    ax = _axes(ax, WIDTH * 1.6, HEIGHT * 1.15)
+    cost, error = np.asarray(microseconds, float), np.asarray(errors, float)
+    order = np.argsort(cost, kind="stable")
+    best = np.minimum.accumulate(error[order])
+    front = np.flatnonzero(np.append(True, best[1:] < best[:-1]))
+    ax.step(
+        cost[order][front],
+        best[front],
+        where="post",
+        color=COLOURS[0],
+        lw=1,
+        label="best for its cost",
+    )
+    ax.plot(cost, error, ls="none", marker="o", color=COLOURS[0], ms=5, label="candidate")
+    ax.plot(
+        cost[chosen],
+        error[chosen],
+        ls="none",
+        marker="o",
+        ms=11,
+        mfc="none",
+        mec=COLOURS[1],
+        mew=1.8,
+        label="chosen",
+    )
+    if tolerance is not None:
+        ax.axhline(tolerance, color=REFERENCE, ls=":", lw=1, label="tolerance")
+    ax.set(
+        xscale="log",
+        yscale="log",
+        xlabel="time per step and trajectory (µs)",
+        ylabel="one-step error (RMS)",
+    )
+    ax.margins(0.12)
+    _number_points(ax, cost, error, order)
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
+    names = [
+        f"{number + 1}  {labels[i]}{'  (chosen)' if i == chosen else ''}"
+        for number, i in enumerate(order)
+    ]
+    ax.annotate(
+        "\n".join(names),
+        (1.03, 0.62),
+        xycoords="axes fraction",
+        va="top",
+        fontsize=7.5,
+        linespacing=1.35,
+        annotation_clip=False,
+    )
+    return ax
+
+
+def _number_points(ax, x, y, order):
+    """Write 1, 2, … beside the points, each on the side where it covers least."""
+    ax.autoscale_view()
+    points = ax.transData.transform(np.column_stack([x, y])) * 72 / ax.figure.dpi
+    taken = list(points)
+    sides = np.array([(0, 9), (9, 0), (0, -9), (-9, 0), (8, 8), (8, -8), (-8, -8), (-8, 8)])
+    for number, i in enumerate(order):
+        places = points[i] + sides
+        others = np.array(taken)
+        nearest = np.min(np.linalg.norm(places[:, None] - others, axis=-1), axis=1)
+        side = int(np.argmax(np.minimum(nearest, 9)))
+        taken.append(places[side])
+        ax.annotate(
+            str(number + 1),
+            (x[i], y[i]),
+            sides[side],
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            fontsize=8,
+        )
+
+
+@style()
+def work_precision(curves: Mapping, ylabel="position error", ax=None) -> Axes:
+    """Error against time per step: name -> (microseconds (K,), errors (K,)), compile time apart."""
+    ax = _axes(ax)
+    for place, (name, (cost, error)) in enumerate(curves.items()):
+        ax.plot(cost, error, label=name, **_look(place))
+    ax.set(xscale="log", yscale="log", xlabel="time per step and trajectory (µs)", ylabel=ylabel)
+    ax.legend()
+    return ax
+
+
+@style()
+def training_curve(train_rms, validation_rms, ax=None) -> Axes:
+    """Residual on training and held-out pairs after each epoch, (E,) each; the best one marked."""
+    ax = _axes(ax)
+    epochs = 1 + np.arange(len(train_rms))
+    best = int(np.nanargmin(validation_rms))
+    ax.plot(epochs, train_rms, color=COLOURS[0], label="training pairs")
+    ax.plot(epochs, validation_rms, color=COLOURS[1], ls="--", label="held-out pairs")
+    ax.plot(
+        epochs[best],
+        validation_rms[best],
+        ls="none",
+        marker="*",
+        ms=10,
+        color=COLOURS[1],
+        label=f"kept: epoch {best + 1}",
+    )
+    ax.set(yscale="log", xlabel="epoch", ylabel="residual (RMS)")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.legend()
+    return ax
+
+
+def _legend_above(ax, **options):
+    """Above the axes, where it covers no data: for plots whose curves fill the frame."""
+    ax.legend(
+        loc="lower left",
+        bbox_to_anchor=(0, 1.0),
+        ncols=3,
+        frameon=False,
+        borderaxespad=0.2,
+        handlelength=2.4,
+        columnspacing=1.2,
+        **options,
+    )
