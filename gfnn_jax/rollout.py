@@ -1,0 +1,46 @@
+"""Apply a step many times: scan over steps, vmap over initial states, save every K-th.
+
+Knows nothing of generating functions: any ``step(carry) -> carry`` will do, so every method that
+ends in a step function is rolled out, timed and judged by the same code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+
+def scan_steps(
+    step: Callable, carry: Any, num_saved: int, *, save_every: int = 1, observe: Callable
+) -> tuple[Any, Any]:
+    """One lane: ``num_saved`` blocks of ``save_every`` steps, ``observe(carry)`` after each block.
+
+    Returns the last carry and the stacked observations (num_saved, ...). Memory is that of what is
+    saved, whatever the number of steps.
+    """
+
+    def block(carry, _):
+        if save_every == 1:
+            carry = step(carry)
+        else:
+            carry, _ = jax.lax.scan(lambda c, _: (step(c), None), carry, None, length=save_every)
+        return carry, observe(carry)
+
+    return jax.lax.scan(block, carry, None, length=num_saved)
+
+
+def rollout(step: Callable, z0, num_steps: int, *, save_every: int = 1):
+    """Roll out a plain step function z -> z from a batch of initial states.
+
+    z0: (B, 2d). Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first.
+    """
+
+    def lane(z):
+        _, saved = scan_steps(
+            step, z, num_steps // save_every, save_every=save_every, observe=lambda z: z
+        )
+        return jax.numpy.concatenate([z[None], saved])
+
+    return jax.jit(jax.vmap(lane))(jax.numpy.asarray(z0))

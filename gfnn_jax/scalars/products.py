@@ -1,0 +1,255 @@
+"""S linear in its parameters: products of Chebyshev polynomials and Fourier harmonics.
+
+    S(C, w) = Σ C_ab u_a(x_A) v_b(x_B)
+
+x are the scaled variables of ``Inputs``, cut into two halves A and B; u and v are the products of
+one-dimensional functions over a half, up to a total degree, and C holds a coefficient for each
+allowed term (total degree of the product, parity) and zero elsewhere. Values, gradients and second
+derivatives come from recurrences and from matrix products with C, which a batch turns into two
+dense products of about (√terms)² each: many times faster than differentiating a thousand features.
+
+Because S is linear in C, the derivative rules below are complete: ``jax.grad``, ``jvp`` and
+``hessian`` of ``S`` use the recurrences, also with respect to C.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.scalars.inputs import Inputs
+
+
+def chebyshev(x, degree: int):
+    """T_0..T_degree at x, their first and second derivatives: each (degree + 1,).
+
+    T_{k+1} = 2x T_k − T_{k−1}, differentiated twice.
+    """
+    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
+    value, first, second = [one, x], [zero, one], [zero, zero]
+    for _ in range(degree - 1):
+        second.append(4 * first[-1] + 2 * x * second[-1] - second[-2])
+        first.append(2 * value[-1] + 2 * x * first[-1] - first[-2])
+        value.append(2 * x * value[-1] - value[-2])
+    return tuple(jnp.stack(f[: degree + 1]) for f in (value, first, second))
+
+
+def fourier(x, degree: int):
+    """1, cos x, sin x, cos 2x, sin 2x, ... up to harmonic ``degree``, and two derivatives."""
+    c, s = jnp.cos(x), jnp.sin(x)
+    cosines, sines = [jnp.ones_like(x)], [jnp.zeros_like(x)]
+    for _ in range(degree):
+        cosines.append(c * cosines[-1] - s * sines[-1])
+        sines.append(s * cosines[-2] + c * sines[-1])
+    value, first, second = [cosines[0]], [sines[0]], [sines[0]]
+    for k in range(1, degree + 1):
+        value += [cosines[k], sines[k]]
+        first += [-k * sines[k], k * cosines[k]]
+        second += [-k * k * cosines[k], -k * k * sines[k]]
+    return tuple(jnp.stack(f) for f in (value, first, second))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Half:
+    """The products of one-dimensional functions over one half of the variables."""
+
+    is_angle: tuple[bool, ...]
+    signs: tuple[int, ...]  # of each variable under the reversor
+    degree: int
+
+    @cached_property
+    def indices(self) -> np.ndarray:
+        """Which one-dimensional function of each variable each product takes: (terms, variables)."""
+        terms = [()]
+        for angle in self.is_angle:
+            count = 2 * self.degree + 1 if angle else self.degree + 1
+            order = [(k + 1) // 2 if angle else k for k in range(count)]
+            terms = [
+                (*t, k) for t in terms for k in range(count)
+                if order[k] + self._order(t) <= self.degree
+            ]  # fmt: skip
+        return np.array(terms, dtype=np.int32).reshape(len(terms), len(self.is_angle))
+
+    def _order(self, term) -> int:
+        return sum(
+            (k + 1) // 2 if a else k for k, a in zip(term, self.is_angle[: len(term)], strict=True)
+        )
+
+    @cached_property
+    def orders(self) -> np.ndarray:
+        """Total degree of each product (terms,)."""
+        return np.array([self._order(t) for t in self.indices.tolist()], dtype=int)
+
+    @cached_property
+    def parities(self) -> np.ndarray:
+        """Sign of each product under the reversor (terms,)."""
+        sign = np.ones(len(self.indices), dtype=int)
+        for j, (angle, flips) in enumerate(zip(self.is_angle, self.signs, strict=True)):
+            if flips < 0:
+                k = self.indices[:, j]
+                odd = (k > 0) & (k % 2 == 0) if angle else k % 2 == 1  # sines; odd degrees
+                sign = np.where(odd, -sign, sign)
+        return sign
+
+    def tables(self, x):
+        """Products u (terms,), gradient (variables, terms), Hessian (variables, variables, terms)."""
+        one_d = [
+            (fourier if angle else chebyshev)(x[j], self.degree)
+            for j, angle in enumerate(self.is_angle)
+        ]
+        picked = [
+            [f[self.indices[:, j]] for f in functions] for j, functions in enumerate(one_d)
+        ]
+        n, terms = len(picked), len(self.indices)
+        unit = jnp.ones(terms, x.dtype)
+
+        def product(orders):
+            factors = [picked[j][k] for j, k in enumerate(orders)]
+            out = factors[0] if factors else unit
+            for f in factors[1:]:
+                out = out * f
+            return out
+
+        def raised(*which):
+            orders = [0] * n
+            for j in which:
+                orders[j] += 1
+            return product(orders)
+
+        value = product([0] * n)
+        gradient = [raised(j) for j in range(n)]
+        upper = {(i, j): raised(i, j) for i in range(n) for j in range(i, n)}
+        hessian = [[upper[min(i, j), max(i, j)] for j in range(n)] for i in range(n)]
+        shape = (n, terms)
+        return (
+            value,
+            jnp.stack(gradient) if n else jnp.zeros(shape, x.dtype),
+            jnp.stack([jnp.stack(row) for row in hessian]) if n else jnp.zeros((n, *shape), x.dtype),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Products:
+    """Chebyshev × Fourier products of total degree at most ``degree`` in the variables of ``inputs``.
+
+    signs: of the variables under a reversor; then only even terms exist (midpoint chart).
+    """
+
+    inputs: Inputs
+    degree: int
+    signs: tuple[int, ...] | None = None
+
+    @property
+    def name(self) -> str:
+        return "fourier-chebyshev" if self.inputs.angles else "polynomial"
+
+    @property
+    def label(self) -> str:
+        """As candidates tables show it: what, and how large."""
+        return f"{self.name} {self.degree}"
+
+    @cached_property
+    def _cut(self) -> int:
+        return (self.inputs.num_variables + 1) // 2
+
+    @cached_property
+    def halves(self) -> tuple[_Half, _Half]:
+        n = self.inputs.num_variables
+        angle = tuple(j in self.inputs.angles for j in range(n))
+        signs = self.signs or (1,) * n
+        cut = self._cut
+        return (
+            _Half(angle[:cut], signs[:cut], self.degree),
+            _Half(angle[cut:], signs[cut:], self.degree),
+        )
+
+    @cached_property
+    def terms(self) -> np.ndarray:
+        """Rows (a, b) of the coefficients that exist, by rising total degree: (num_parameters, 2)."""
+        a, b = self.halves
+        order = a.orders[:, None] + b.orders[None, :]
+        exists = (order <= self.degree) & (order > 0)  # a constant generates nothing
+        if self.signs is not None:
+            exists &= a.parities[:, None] * b.parities[None, :] > 0
+        rows = np.argwhere(exists)
+        return rows[np.argsort(order[exists], kind="stable")]
+
+    @property
+    def num_parameters(self) -> int:
+        return len(self.terms)
+
+    def unflatten(self, coefficients):
+        """Coefficients (num_parameters,) -> the matrix C, the parameters of ``S``."""
+        a, b = self.halves
+        c = jnp.zeros((len(a.indices), len(b.indices)), coefficients.dtype)
+        return c.at[self.terms[:, 0], self.terms[:, 1]].set(coefficients)
+
+    def __call__(self, params, w):
+        """S(params, w): params the matrix C, w (2d,) -> scalar."""
+        return _chain(self, params, w)
+
+    def gradient_features(self, w):
+        """∇ of every term at w: (2d, num_parameters), the rows of the least-squares problem."""
+        x, pull_back = jax.vjp(self.inputs, w)
+        a, b = self.halves
+        u, du, _ = a.tables(x[: self._cut])
+        v, dv, _ = b.tables(x[self._cut :])
+        row, col = self.terms[:, 0], self.terms[:, 1]
+        by_variable = jnp.concatenate([du[:, row] * v[None, col], u[None, row] * dv[:, col]])
+        return jax.vmap(lambda column: pull_back(column)[0], in_axes=1, out_axes=1)(by_variable)
+
+
+def _chain(family: Products, matrix, w):
+    return _polynomial(family, matrix, family.inputs(w))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _polynomial(family, matrix, x):
+    a, b = family.halves
+    u = a.tables(x[: family._cut])[0]
+    v = b.tables(x[family._cut :])[0]
+    return u @ (matrix @ v)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _gradient(family, matrix, x):
+    a, b = family.halves
+    u, du, _ = a.tables(x[: family._cut])
+    v, dv, _ = b.tables(x[family._cut :])
+    return jnp.concatenate([du @ (matrix @ v), dv @ (u @ matrix)])
+
+
+def _hessian(family, matrix, x):
+    a, b = family.halves
+    u, du, ddu = a.tables(x[: family._cut])
+    v, dv, ddv = b.tables(x[family._cut :])
+    aa, ab, bb = ddu @ (matrix @ v), (du @ matrix) @ dv.T, ddv @ (u @ matrix)
+    return jnp.block([[aa, ab], [ab.T, bb]])
+
+
+def _is_zero(tangent) -> bool:
+    return isinstance(tangent, jax.custom_derivatives.SymbolicZero)
+
+
+def _linear_rule(value, derivative):
+    """d f(C, x) = f(dC, x) + f'(C, x) dx for f linear in C; what is symbolically zero costs nothing."""
+
+    def rule(family, primals, tangents):
+        (matrix, x), (matrix_dot, x_dot) = primals, tangents
+        out = value(family, matrix, x)
+        out_dot = jnp.zeros_like(out)
+        if not _is_zero(matrix_dot):
+            out_dot = out_dot + value(family, matrix_dot, x)
+        if not _is_zero(x_dot):
+            out_dot = out_dot + derivative(family, matrix, x) @ x_dot
+        return out, out_dot
+
+    return rule
+
+
+_polynomial.defjvp(_linear_rule(_polynomial, _gradient), symbolic_zeros=True)
+_gradient.defjvp(_linear_rule(_gradient, _hessian), symbolic_zeros=True)
