@@ -1,0 +1,796 @@
+"""A user's trajectories in: reading, checking, and outputs that never harm what was there before.
+
+Three kinds of file hold the same thing, sequences of states z = (q, p), q first, at a uniform
+time step:
+
+- ``.npz``: ``z0``, ``z1`` of shape (N, 2d), or ``trajectories`` of shape (M, L, 2d) with optional
+  ``lengths`` (M,), rows beyond a length ignored; and ``dt``.
+- ``.npy``: one array of shape (L, 2d) or (M, L, 2d).
+- ``.csv``: a header that names the columns ``t, q1..qd, p1..pd`` in any order, optionally
+  ``sequence``; units as in ``q1 [km]`` or ``q1 (km)``.
+
+All are read as blocks of consecutive rows, so that a whole file and a file larger than memory go
+through the same checks. Every refusal is an `InputError`: one line that says what was expected
+and what came. Nothing here needs JAX, so that a refusal comes at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import itertools
+import os
+import re
+import shutil
+import warnings
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+# Times in text files carry few digits: relative agreement asked of time steps.
+TIME_TOLERANCE = 1e-5
+# A larger number overflows when squared, which every norm does.
+LARGEST = float(np.sqrt(np.finfo(np.float64).max))
+# Rows read at a time when no chunk is asked for; 64k rows of four float64 are 2 MB.
+BLOCK_ROWS = 65_536
+
+
+class InputError(ValueError):
+    """Bad usage or bad input, in one line: what was expected and what came."""
+
+    def __init__(self, message: str):
+        super().__init__(" ".join(message.split()))
+
+
+class WorkError(RuntimeError):
+    """A failure during the work (a full disk), in one line; what was there before is as it was."""
+
+    def __init__(self, message: str):
+        super().__init__(" ".join(message.split()))
+
+
+class DataWarning(UserWarning):
+    """Data that can be used but look odd: constant, duplicated or unknown columns."""
+
+
+# ---------------------------------------------------------------------------------------------
+# What was read
+# ---------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class TrajectoryData:
+    """Sequences of states at a uniform time step, one after the other.
+
+    states:    (T, 2d) float64, q first: the sequences' states, concatenated.
+    lengths:   (M,) the number of states in each sequence. Pairs z0, z1 are sequences of two.
+    dt:        time between consecutive states, in the user's unit of time.
+    source:    the file it came from; digest: the SHA-256 of that file.
+    precision: the dtype that the file stores, "float32" say; ``states`` is float64 always.
+    units:     units by column name, as a CSV header gave them.
+    """
+
+    states: np.ndarray
+    lengths: np.ndarray
+    dt: float
+    source: str
+    digest: str
+    precision: str = "float64"
+    units: dict[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def dim(self) -> int:
+        """Degrees of freedom d."""
+        return self.states.shape[1] // 2
+
+    @property
+    def num_pairs(self) -> int:
+        return len(self.states) - len(self.lengths)
+
+    @property
+    def sequences(self) -> list[np.ndarray]:
+        """The M sequences, each of shape (L_i, 2d)."""
+        return np.split(self.states, np.cumsum(self.lengths)[:-1])
+
+    def pairs(self):
+        """All pairs of consecutive states, as `Pairs` of shape (num_pairs, 2d)."""
+        from gfnn_jax.phase_space import Pairs  # brings JAX
+
+        starts = np.ones(len(self.states), bool)
+        starts[np.cumsum(self.lengths) - 1] = False
+        rows = np.flatnonzero(starts)
+        return Pairs(self.states[rows], self.states[rows + 1], self.dt)
+
+    def last_states(self) -> np.ndarray:
+        """The last state of each sequence, (M, 2d)."""
+        return self.states[np.cumsum(self.lengths) - 1]
+
+
+def read_trajectories(path, *, dt: float | None = None) -> TrajectoryData:
+    """Read and check a trajectory file.
+
+    dt: the time step for a file that holds none; it must agree with one that a file holds.
+    Raises InputError where the file cannot be used; warns (DataWarning) about constant or
+    duplicated columns and about states that never move.
+    """
+    with _open(path, dt) as source:
+        blocks = list(source.blocks(2**62 if source.is_array else BLOCK_ROWS))
+        states = np.concatenate([np.empty((0, 2 * source.dim)), *(b.states for b in blocks)])
+        sequence = np.concatenate([np.empty(0), *(b.sequence for b in blocks)])
+    ends = np.flatnonzero(sequence[1:] != sequence[:-1]) + 1
+    lengths = np.diff(np.concatenate([[0], ends, [len(sequence)]])) if len(sequence) else ends
+    pairs = len(states) - len(lengths)
+    needed = 2 * source.dim + 1  # what determines an affine map
+    if pairs < needed:
+        raise InputError(
+            f"{path}: {pairs} pair{'s' * (pairs != 1)} of consecutive states found, at least "
+            f"{needed} are needed for d = {source.dim}"
+        )
+    _warn_of_odd_columns(path, states, sequence)
+    return TrajectoryData(
+        states, lengths, source.dt, str(path), _digest(path), source.precision, source.units
+    )
+
+
+def iterate_pairs(path, chunk: int, *, dt: float | None = None) -> Iterator[Any]:
+    """The pairs of a file larger than memory, as `Pairs` of at most ``chunk`` pairs each.
+
+    Memory stays within a few chunks, whatever the file's size, except for arrays stored in
+    Fortran order, which are read whole. The same checks as in `read_trajectories`, block by
+    block: a NaN far into the file is found only when it is reached.
+    """
+    from gfnn_jax.phase_space import Pairs
+
+    with _open(path, dt) as source:
+        last_state, last_sequence = np.empty((0, 2 * source.dim)), np.empty(0)
+        for block in source.blocks(chunk):
+            states = np.concatenate([last_state, block.states])
+            sequence = np.concatenate([last_sequence, block.sequence])
+            rows = np.flatnonzero(sequence[1:] == sequence[:-1])
+            if len(rows):
+                yield Pairs(states[rows], states[rows + 1], source.dt)
+            last_state, last_sequence = states[-1:], sequence[-1:]
+
+
+def read_initial_states(path, dim: int) -> np.ndarray:
+    """Initial states (B, 2d) float64 to predict from, for a map of ``dim`` degrees of freedom.
+
+    An ``.npy`` of shape (B, 2d), an ``.npz`` with ``z0``, or a ``.csv`` without a column ``t``
+    holds one state a row; of any other trajectory file each sequence gives its last state.
+    """
+    with _open(path, None, initial=True) as source:
+        if source.dim != dim:
+            raise InputError(
+                f"{path}: expected states of {2 * dim} columns (d = {dim}), found "
+                f"{2 * source.dim} columns (d = {source.dim})"
+            )
+        found: list[np.ndarray] = []
+        held: _Block | None = None  # the last row so far: the end of its sequence, or not
+        for block in source.blocks(BLOCK_ROWS):
+            ends = np.flatnonzero(block.sequence[1:] != block.sequence[:-1])
+            if held is not None and held.sequence[0] != block.sequence[0]:
+                found.append(held.checked(path).states)
+            found.append(block.rows(ends).checked(path).states)
+            held = block.rows(np.array([len(block.sequence) - 1]))
+        if held is None:
+            raise InputError(f"{path}: holds no states")
+        found.append(held.checked(path).states)
+    return np.concatenate(found)
+
+
+# ---------------------------------------------------------------------------------------------
+# Blocks of rows: what every kind of file is turned into
+# ---------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class _Block:
+    """Consecutive rows. ``sequence`` (n,) changes where one sequence ends and the next begins;
+    ``locate(row, column)`` says where in the file a number stands."""
+
+    states: np.ndarray
+    sequence: np.ndarray
+    locate: Callable[[int, int], str]
+
+    def rows(self, index: np.ndarray) -> _Block:
+        return _Block(
+            self.states[index], self.sequence[index], lambda r, c: self.locate(int(index[r]), c)
+        )
+
+    def checked(self, path) -> _Block:
+        """Itself, if every number is finite and can be squared; else InputError."""
+        for bad, what in (
+            (~np.isfinite(self.states), "not finite (NaN or infinity)"),
+            (np.abs(self.states) > LARGEST, f"too large to be squared (above {LARGEST:.1e})"),
+        ):
+            if bad.any():
+                row, column = (int(i) for i in np.argwhere(bad)[0])
+                raise InputError(
+                    f"{path}: {int(bad.sum())} value{'s' * (bad.sum() != 1)} {what}, first "
+                    f"{self.locate(row, column)} = {self.states[row, column]}"
+                )
+        return self
+
+
+@dataclasses.dataclass
+class _Source:
+    """An open file: what its header says, and its rows in blocks of at most so many."""
+
+    dim: int
+    dt: float  # NaN where initial states need none
+    precision: str
+    units: dict[str, str]
+    is_array: bool
+    blocks: Callable[[int], Iterator[_Block]]
+
+
+@contextlib.contextmanager
+def _open(path, dt: float | None, *, initial: bool = False) -> Iterator[_Source]:
+    """Open a trajectory file, its header checked. ``initial``: only its last states are wanted."""
+    path = Path(path)
+    kinds = {".npz": _open_npz, ".npy": _open_npy, ".csv": _open_csv}
+    if path.suffix.lower() not in kinds:
+        raise InputError(f"{path}: expected a .npz, .npy or .csv file")
+    if dt is not None:
+        dt = _check_dt(dt, "the given dt")
+    with contextlib.ExitStack() as stack:
+        try:
+            if not path.exists():
+                raise InputError(f"{path}: no such file")
+            if not path.is_file():
+                raise InputError(f"{path}: is not a file")
+            if path.stat().st_size == 0:
+                raise InputError(f"{path}: is empty")
+            source = kinds[path.suffix.lower()](path, stack, dt, initial)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+        unchecked = source.blocks
+        if not initial:  # of initial states only the rows that are used are checked
+            source.blocks = lambda rows: (block.checked(path) for block in unchecked(rows))
+        yield source
+
+
+def _check_dt(dt: Any, what: str) -> float:
+    array = np.asarray(dt)
+    if array.size != 1 or array.dtype.kind not in "fiu":
+        raise InputError(f"{what} must be one number, got {array.dtype} of shape {array.shape}")
+    value = float(array.reshape(())[()])
+    if not (np.isfinite(value) and value > 0):
+        raise InputError(f"{what} must be finite and above 0, got {value}")
+    return value
+
+
+def _agreed_dt(path, given: float | None, found: float | None) -> float:
+    if given is None and found is None:
+        raise InputError(f"{path}: holds no time step and none was given (dt)")
+    if given is None or found is None:
+        return given if found is None else found  # pyright: ignore[reportReturnType]
+    if abs(given - found) > TIME_TOLERANCE * found:
+        raise InputError(f"{path}: the given dt = {given} disagrees with the file's dt = {found}")
+    return given
+
+
+def _check_width(path, name: str, shape: tuple[int, ...]) -> int:
+    """d of an array of shape (..., 2d)."""
+    width = shape[-1]
+    if width == 0 or width % 2:
+        raise InputError(
+            f"{path}: {name} of shape {shape} must have an even last dimension 2d (q first, then "
+            f"p), found {width}"
+        )
+    return width // 2
+
+
+def _column(index: int, dim: int) -> str:
+    return f"q{index + 1}" if index < dim else f"p{index - dim + 1}"
+
+
+def _warn_of_odd_columns(path, states: np.ndarray, sequence: np.ndarray) -> None:
+    dim = states.shape[1] // 2
+    same = sequence[1:] == sequence[:-1]
+    if np.array_equal(states[1:][same], states[:-1][same]):
+        warnings.warn(
+            f"{path}: every state equals the one before it",
+            DataWarning,
+            stacklevel=3,
+        )
+        return
+    constant = [c for c in range(2 * dim) if np.all(states[:, c] == states[0, c])]
+    if constant:
+        names = ", ".join(_column(c, dim) for c in constant)
+        warnings.warn(
+            f"{path}: constant column(s) {names}; a conserved momentum may be, other columns "
+            "should not",
+            DataWarning,
+            stacklevel=3,
+        )
+    for a, b in itertools.combinations(range(2 * dim), 2):
+        if a not in constant and np.array_equal(states[:, a], states[:, b]):
+            warnings.warn(
+                f"{path}: columns {_column(a, dim)} and {_column(b, dim)} are equal in every row",
+                DataWarning,
+                stacklevel=3,
+            )
+
+
+def _digest(path) -> str:
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+# ---------------------------------------------------------------------------------------------
+# .npy and .npz
+# ---------------------------------------------------------------------------------------------
+
+
+class _StoredArray:
+    """An array in an ``.npy`` stream: its header now, its rows in order when asked for.
+
+    The header is checked against the stream's size first, so that a damaged one allocates nothing.
+    """
+
+    def __init__(self, path, name: str, stream, size: int):
+        self.path, self.name, self.stream = path, name, stream
+        with _damage(path, name):
+            version = np.lib.format.read_magic(stream)
+            read_header = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }[version]
+            self.shape, self.fortran_order, self.dtype = read_header(stream)
+        if self.dtype.kind not in "fiu":
+            hint = " (save padded sequences with 'lengths')" if self.dtype.hasobject else ""
+            raise InputError(
+                f"{path}: {name} must hold real numbers, found dtype {self.dtype}{hint}"
+            )
+        count = 1
+        for n in self.shape:
+            count *= n
+        if size - stream.tell() != count * self.dtype.itemsize:
+            raise InputError(
+                f"{path}: {name} is damaged: {count * self.dtype.itemsize} bytes expected for "
+                f"shape {self.shape}, {size - stream.tell()} found"
+            )
+
+    def whole(self) -> np.ndarray:
+        with _damage(self.path, self.name):
+            data = np.frombuffer(self.stream.read(), self.dtype)
+        return data.reshape(self.shape, order="F" if self.fortran_order else "C")
+
+    def read_rows(self, rows: int) -> Iterator[np.ndarray]:
+        """The array as (-1, 2d) float64, in blocks of at most so many rows."""
+        width = self.shape[-1]
+        if self.fortran_order:
+            everything = self.whole().reshape(-1, width)
+            for start in range(0, len(everything), rows):
+                yield everything[start : start + rows].astype(np.float64)
+            return
+        left = int(np.prod(self.shape[:-1], dtype=object))
+        while left:
+            count = min(rows, left)
+            with _damage(self.path, self.name):
+                data = self.stream.read(count * width * self.dtype.itemsize)
+                block = np.frombuffer(data, self.dtype).reshape(count, width)
+            left -= count
+            yield block.astype(np.float64, copy=False)
+        with _damage(self.path, self.name):
+            self.stream.read(1)  # the end of an archive's member, where its checksum is compared
+
+
+@contextlib.contextmanager
+def _damage(path, name: str) -> Iterator[None]:
+    """Whatever a damaged file makes zipfile, zlib or NumPy raise, in one line."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        detail = (str(error) or type(error).__name__)[:120]
+        raise InputError(f"{path}: {name} cannot be read: damaged? ({detail})") from error
+
+
+def _open_npy(path: Path, stack: contextlib.ExitStack, dt, initial: bool) -> _Source:
+    stream = stack.enter_context(open(path, "rb"))
+    array = _StoredArray(path, "the array", stream, path.stat().st_size)
+    dt = np.nan if initial else _agreed_dt(path, dt, None)
+    return _array_source(path, array, None, dt, each_row=initial and len(array.shape) == 2)
+
+
+def _open_npz(path: Path, stack: contextlib.ExitStack, dt, initial: bool) -> _Source:
+    with _damage(path, "the archive"):
+        archive = stack.enter_context(zipfile.ZipFile(path))
+    names = [name.removesuffix(".npy") for name in archive.namelist()]
+
+    def member(name: str) -> _StoredArray:
+        with _damage(path, name):
+            stream = stack.enter_context(archive.open(f"{name}.npy"))
+        return _StoredArray(path, name, stream, archive.getinfo(f"{name}.npy").file_size)
+
+    if initial and "z0" in names:
+        return _array_source(path, member("z0"), None, np.nan, each_row=True)
+    is_pairs = "z0" in names and "z1" in names
+    if is_pairs == ("trajectories" in names):
+        raise InputError(
+            f"{path}: expected either the arrays z0 and z1, or trajectories; found "
+            f"{', '.join(names[:8]) or 'none'}{', ...' * (len(names) > 8)}"
+        )
+    found = _check_dt(member("dt").whole(), f"{path}: dt") if "dt" in names else None
+    trajectories = None if is_pairs else member("trajectories")
+    if trajectories is not None and found is not None and "steps" in names:
+        found *= _stride(path, trajectories.shape, member("steps").whole())
+    dt = np.nan if initial else _agreed_dt(path, dt, found)
+    if trajectories is None:
+        return _pairs_source(path, member("z0"), member("z1"), dt)
+    lengths = member("lengths").whole() if "lengths" in names else None
+    return _array_source(path, trajectories, lengths, dt)
+
+
+def _stride(path, shape: tuple[int, ...], steps: np.ndarray) -> float:
+    """A prediction file keeps every K-th step, so that its rows are K dt apart: this K."""
+    if len(shape) != 3 or steps.shape != shape[1:2] or len(steps) < 2:
+        return 1.0
+    gaps = np.diff(steps)
+    if gaps[0] <= 0 or np.any(gaps != gaps[0]):
+        raise InputError(f"{path}: steps must rise by equal amounts")
+    return float(gaps[0])
+
+
+def _pairs_source(path, z0: _StoredArray, z1: _StoredArray, dt: float) -> _Source:
+    """z0, z1 as sequences of two states."""
+    if len(z0.shape) != 2 or z0.shape != z1.shape:
+        raise InputError(
+            f"{path}: z0 and z1 must both have shape (N, 2d), found {z0.shape} and {z1.shape}"
+        )
+    dim = _check_width(path, "z0", z0.shape)
+
+    def blocks(rows: int) -> Iterator[_Block]:
+        pair = 0
+        # Two rows a pair, and at most ``rows`` pairs a block.
+        for a, b in zip(z0.read_rows(rows), z1.read_rows(rows), strict=True):
+            states = np.stack([a, b], axis=1).reshape(-1, 2 * dim)
+            sequence = np.repeat(np.arange(pair, pair + len(a)), 2)
+            yield _Block(states, sequence, lambda r, c, n=pair: f"z{r % 2}[{n + r // 2}, {c}]")
+            pair += len(a)
+
+    precision = str(np.result_type(z0.dtype, z1.dtype))
+    return _Source(dim, dt, precision, {}, True, blocks)
+
+
+def _array_source(
+    path, array: _StoredArray, lengths: np.ndarray | None, dt: float, *, each_row: bool = False
+) -> _Source:
+    """(L, 2d) or (M, L, 2d); with ``each_row`` every row is a sequence of its own."""
+    shape = array.shape
+    if len(shape) not in (2, 3) or (each_row and len(shape) != 2):
+        wanted = "(B, 2d)" if each_row else "(L, 2d) or (M, L, 2d)"
+        raise InputError(f"{path}: {array.name} must have shape {wanted}, found {shape}")
+    dim = _check_width(path, array.name, shape)
+    count, length = (1, shape[0]) if len(shape) == 2 else shape[:2]
+    if lengths is not None:
+        lengths = _check_lengths(path, lengths, count, length)
+
+    def locate(row: int, column: int) -> str:
+        index = (row, column) if len(shape) == 2 else (*divmod(row, length), column)
+        return f"{array.name}[{', '.join(map(str, index))}]"
+
+    def blocks(rows: int) -> Iterator[_Block]:
+        start = 0
+        for states in array.read_rows(rows):
+            row = np.arange(start, start + len(states))
+            sequence = row if each_row else row // length
+            block = _Block(states, sequence, lambda r, c, n=start: locate(n + r, c))
+            if lengths is not None:
+                block = block.rows(np.flatnonzero(row % length < lengths[sequence]))
+            start += len(states)
+            if len(block.states):
+                yield block
+
+    return _Source(dim, dt, str(array.dtype), {}, True, blocks)
+
+
+def _check_lengths(path, lengths: np.ndarray, count: int, longest: int) -> np.ndarray:
+    if lengths.shape != (count,) or lengths.dtype.kind not in "iu":
+        raise InputError(
+            f"{path}: lengths must be integers of shape ({count},), found {lengths.dtype} of shape "
+            f"{lengths.shape}"
+        )
+    bad = np.flatnonzero((lengths < 1) | (lengths > longest))
+    if len(bad):
+        raise InputError(
+            f"{path}: {len(bad)} of the lengths outside 1..{longest}, first lengths[{bad[0]}] = "
+            f"{lengths[bad[0]]}"
+        )
+    return lengths.astype(np.int64)
+
+
+# ---------------------------------------------------------------------------------------------
+# .csv
+# ---------------------------------------------------------------------------------------------
+
+_HEADING = re.compile(r"^\s*([^\[(]*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))?\s*$")
+
+
+def _parse_header(line: str) -> tuple[list[str], dict[str, str]] | None:
+    """Column names, and units by name; None if this line does not name q and p columns."""
+    names, units = [], {}
+    for cell in line.strip().lstrip("#").split(","):
+        match = _HEADING.match(cell.strip().strip('"'))
+        name = match[1].lower() if match else cell.strip()
+        if match and (match[2] or match[3]):
+            units[name] = (match[2] or match[3]).strip()
+        names.append(name)
+    return (names, units) if any(re.fullmatch(r"[qp]\d+", n) for n in names) else None
+
+
+def _open_csv(path: Path, stack: contextlib.ExitStack, dt, initial: bool) -> _Source:
+    stream = stack.enter_context(open(path, encoding="utf-8-sig", newline=None))
+    header, line, line_number = None, "", 0
+    with _damage(path, "the header"):
+        for line in stream:
+            line_number += 1
+            header = _parse_header(line)
+            # Comments may come first, and np.savetxt writes the header itself as one.
+            if header is not None or not line.startswith("#"):
+                break
+    if header is None:
+        raise InputError(
+            f"{path}: expected a header t,q1,...,qd,p1,...,pd in line {line_number}, found "
+            f"{line.strip()[:60]!r}"
+        )
+    names, units = header
+    dim = sum(bool(re.fullmatch(r"q\d+", name)) for name in names)
+    wanted = [_column(c, dim) for c in range(2 * dim)]
+    others = [n for n in names if re.fullmatch(r"[qp]\d+", n) and n not in wanted]
+    missing = [n for n in wanted if n not in names]
+    repeated = [n for n in dict.fromkeys(names) if names.count(n) > 1]
+    for columns, what in ((missing, "missing"), (others, "without a partner"), (repeated, "twice")):
+        if columns:
+            raise InputError(
+                f"{path}: the header must name q1..qd and p1..pd once each: {', '.join(columns)} "
+                f"{what} in {','.join(names)}"
+            )
+    ignored = [n for n in names if n not in (*wanted, "t", "sequence")]
+    if ignored:
+        warnings.warn(f"{path}: columns ignored: {', '.join(ignored)}", DataWarning, stacklevel=4)
+    columns = [names.index(n) for n in wanted]
+    each_row = initial and "t" not in names and "sequence" not in names
+
+    first = next(_csv_tables(path, stream, names, line_number, BLOCK_ROWS), None)
+    if first is None:
+        raise InputError(f"{path}: holds a header and no rows")
+    found = None if initial or "t" not in names else _csv_dt(path, names, *first)
+    dt = np.nan if initial else _agreed_dt(path, dt, found)
+    usual = dt if found is None else found
+
+    def blocks(rows: int) -> Iterator[_Block]:
+        later = _csv_tables(path, stream, names, first[1][-1], rows)
+        seen: set[float] = set()
+        last = np.full(2, np.nan)  # sequence and time of the row before
+        for table, lines in itertools.chain(_cut(*first, rows), later):
+            if each_row:
+                sequence = lines
+            elif "sequence" in names:
+                sequence = table[:, names.index("sequence")]
+                changes = np.flatnonzero(np.append(last[0], sequence[:-1]) != sequence)
+                for row in changes:
+                    if sequence[row] in seen or not np.isfinite(sequence[row]):
+                        raise InputError(
+                            f"{path}: line {lines[row]}: the rows of sequence {sequence[row]:g} "
+                            "must stand together"
+                        )
+                    seen.add(float(sequence[row]))
+            else:
+                sequence = np.zeros(len(table))
+            if "t" in names and not initial:
+                time = table[:, names.index("t")]
+                _check_times(
+                    path, np.append(last[1], time), np.append(last[0], sequence), lines, usual
+                )
+                last = np.array([sequence[-1], time[-1]])
+            else:
+                last = np.array([sequence[-1], np.nan])
+            yield _Block(
+                table[:, columns],
+                sequence,
+                lambda r, c, lines=lines: f"line {lines[r]}, {wanted[c]}",
+            )
+
+    return _Source(dim, float(dt), "float64", units, False, blocks)
+
+
+def _cut(table: np.ndarray, lines: np.ndarray, rows: int):
+    for start in range(0, len(table), rows):
+        yield table[start : start + rows], lines[start : start + rows]
+
+
+def _csv_tables(path, stream, names: list[str], line_number: int, rows: int):
+    """Tables (n, columns) with the line number of every row, n at most ``rows``."""
+    while True:
+        with _damage(path, f"the text after line {line_number}"):
+            text = list(itertools.islice(stream, rows))
+        if not text:
+            return
+        lines = np.arange(line_number + 1, line_number + 1 + len(text))
+        line_number += len(text)
+        filled = np.array([bool(t.strip()) for t in text])
+        if not filled.any():
+            continue
+        try:
+            table = np.loadtxt(text, delimiter=",", comments=None, ndmin=2)
+            if table.shape[1] != len(names):
+                raise ValueError
+        except ValueError:
+            raise InputError(_csv_fault(path, names, text, int(lines[0]))) from None
+        yield table, lines[filled]
+
+
+def _csv_fault(path, names: list[str], text: list[str], line_number: int) -> str:
+    """The first thing wrong with these lines."""
+    for number, line in enumerate(text, line_number):
+        cells = line.strip().split(",")
+        if line.strip() and len(cells) != len(names):
+            return f"{path}: line {number}: {len(names)} columns expected, {len(cells)} found"
+        for name, cell in zip(names, cells, strict=False):
+            try:
+                float(cell)
+            except ValueError:
+                if line.strip():
+                    return f"{path}: line {number}, {name}: {cell.strip()[:40]!r} is not a number"
+    return f"{path}: the lines from {line_number} on cannot be read as numbers"
+
+
+def _csv_dt(path, names: list[str], table: np.ndarray, lines: np.ndarray) -> float | None:
+    """The time step of the first rows; None if no sequence among them has two states."""
+    time = table[:, names.index("t")]
+    sequence = table[:, names.index("sequence")] if "sequence" in names else np.zeros(len(table))
+    steps = np.diff(time)[sequence[1:] == sequence[:-1]]
+    if len(steps) == 0:
+        return None
+    # The median ignores a gap; then every step must agree with it, and the mean is more accurate.
+    usual = float(np.median(steps))
+    if not (np.isfinite(usual) and usual > 0):
+        raise InputError(f"{path}: the column t must rise, found a usual step of {usual}")
+    _check_times(path, np.append(np.nan, time), np.append(np.nan, sequence), lines, usual)
+    return float(np.mean(steps))
+
+
+def _check_times(path, time: np.ndarray, sequence: np.ndarray, lines: np.ndarray, dt: float):
+    """Every step within a sequence is dt. ``time`` and ``sequence`` start one row before."""
+    step = np.diff(time)
+    slack = TIME_TOLERANCE * dt + 4 * np.finfo(np.float64).eps * np.abs(time[1:])
+    # "not (... <= ...)" so that NaN counts as wrong.
+    bad = np.flatnonzero((sequence[1:] == sequence[:-1]) & ~(np.abs(step - dt) <= slack))
+    if len(bad):
+        raise InputError(
+            f"{path}: the time step is not uniform: {step[bad[0]]:.9g} in line {lines[bad[0]]} "
+            f"where {dt:.9g} is usual ({len(bad)} such row{'s' * (len(bad) != 1)})"
+        )
+
+
+# ---------------------------------------------------------------------------------------------
+# Outputs: nothing is overwritten unasked, nothing is left half written
+# ---------------------------------------------------------------------------------------------
+
+# What marks a folder as written by this package, so that --overwrite never deletes another.
+FOLDER_MARKS = ("model.json", "report.json")
+
+
+def ensure_new(path, overwrite: bool = False, *, folder: bool = False) -> Path:
+    """Check, before any work, that the file or folder ``path`` can be written. Writes nothing.
+
+    Raises InputError where it exists and ``overwrite`` is off, where it is of the other kind, where
+    it is a folder that this package did not write, or where its parent cannot be written.
+    """
+    path = Path(path)
+    try:
+        if path.is_dir() and not folder:
+            raise InputError(f"{path}: is a folder, expected a file to write")
+        if path.exists() and folder and not path.is_dir():
+            raise InputError(f"{path}: is a file, expected a folder to write")
+        if path.exists() and not (folder and not any(path.iterdir())):
+            if not overwrite:
+                raise InputError(f"{path}: exists already (--overwrite replaces it)")
+            if folder and not any((path / mark).is_file() for mark in FOLDER_MARKS):
+                raise InputError(
+                    f"{path}: is a folder without {' or '.join(FOLDER_MARKS)}; not overwritten"
+                )
+        parent = path.absolute().parent
+        while not parent.exists():
+            parent = parent.parent
+        if not parent.is_dir():
+            raise InputError(f"{path}: cannot be written: {parent} is not a folder")
+        if not os.access(parent, os.W_OK | os.X_OK):
+            raise InputError(f"{path}: cannot be written: no permission for {parent}")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    return path
+
+
+@contextlib.contextmanager
+def failures_as_work_errors(path) -> Iterator[None]:
+    """An OSError while writing ``path`` (a full disk), as a WorkError of one line."""
+    try:
+        yield
+    except OSError as error:
+        raise WorkError(f"{path}: writing failed: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def atomic_file(path) -> Iterator[Any]:
+    """A binary stream; ``path`` appears whole when the block ends, and not at all if it fails."""
+    path = Path(path)
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    with failures_as_work_errors(path):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with open(beside, "wb") as stream:
+                yield stream
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(beside, path)
+            sync_folder(path.parent)
+        finally:
+            beside.unlink(missing_ok=True)
+
+
+def atomic_write(path, content: str | bytes) -> None:
+    """Write a whole file, or leave what was there before. Raises WorkError."""
+    with atomic_file(path) as stream:
+        stream.write(content.encode() if isinstance(content, str) else content)
+
+
+@contextlib.contextmanager
+def atomic_folder(path) -> Iterator[Path]:
+    """A new folder to fill; it takes the place of ``path`` when the block ends without failing.
+
+    A folder cannot be exchanged for another in one step: the old one stands as ``.NAME.old`` for
+    an instant, and `restore_interrupted` brings it back if that instant was the last.
+    """
+    path = Path(path)
+    beside = path.absolute().with_name(f".{path.name}.{os.getpid()}.part")
+    old = _old(path)
+    with failures_as_work_errors(path):
+        restore_interrupted(path)
+        try:
+            shutil.rmtree(beside, ignore_errors=True)
+            beside.mkdir(parents=True)
+            yield beside
+            for file in sorted(beside.rglob("*")):
+                if file.is_file():
+                    with open(file, "rb") as stream:
+                        os.fsync(stream.fileno())
+            if path.exists():
+                os.rename(path, old)
+            os.rename(beside, path)
+            sync_folder(path.absolute().parent)
+            shutil.rmtree(old, ignore_errors=True)
+        finally:
+            shutil.rmtree(beside, ignore_errors=True)
+
+
+def restore_interrupted(path) -> None:
+    """Undo an exchange of folders that was killed half way; see `atomic_folder`."""
+    path = Path(path)
+    if _old(path).exists():
+        if path.exists():
+            shutil.rmtree(_old(path), ignore_errors=True)
+        else:
+            os.rename(_old(path), path)
+
+
+def _old(path: Path) -> Path:
+    return path.absolute().with_name(f".{path.name}.old")
+
+
+def sync_folder(folder) -> None:
+    """Make a rename in this folder outlast a crash, where the system can."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
