@@ -26,6 +26,7 @@ import shutil
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -237,17 +238,18 @@ def _open(path, dt: float | None, *, initial: bool = False) -> Iterator[_Source]
         raise InputError(f"{path}: expected a .npz, .npy or .csv file")
     if dt is not None:
         dt = _check_dt(dt, "the given dt")
-    with contextlib.ExitStack() as stack:
-        try:
-            if not path.exists():
-                raise InputError(f"{path}: no such file")
-            if not path.is_file():
-                raise InputError(f"{path}: is not a file")
-            if path.stat().st_size == 0:
-                raise InputError(f"{path}: is empty")
-            source = kinds[path.suffix.lower()](path, stack, dt, initial)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    try:
+        if not path.exists():
+            raise InputError(f"{path}: no such file")
+        if not path.is_file():
+            raise InputError(f"{path}: is not a file")
+        if path.stat().st_size == 0:
+            raise InputError(f"{path}: is empty")
+        stream = open(path, "rb")  # noqa: SIM115, closed below
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    with stream:
+        source = kinds[path.suffix.lower()](path, stream, dt, initial)
         unchecked = source.blocks
         if not initial:  # of initial states only the rows that are used are checked
             source.blocks = lambda rows: (block.checked(path) for block in unchecked(rows))
@@ -393,22 +395,21 @@ def _damage(path, name: str) -> Iterator[None]:
         raise InputError(f"{path}: {name} cannot be read: damaged? ({detail})") from error
 
 
-def _open_npy(path: Path, stack: contextlib.ExitStack, dt, initial: bool) -> _Source:
-    stream = stack.enter_context(open(path, "rb"))
+def _open_npy(path: Path, stream, dt, initial: bool) -> _Source:
     array = _StoredArray(path, "the array", stream, path.stat().st_size)
     dt = np.nan if initial else _agreed_dt(path, dt, None)
     return _array_source(path, array, None, dt, each_row=initial and len(array.shape) == 2)
 
 
-def _open_npz(path: Path, stack: contextlib.ExitStack, dt, initial: bool) -> _Source:
+def _open_npz(path: Path, stream, dt, initial: bool) -> _Source:
     with _damage(path, "the archive"):
-        archive = stack.enter_context(zipfile.ZipFile(path))
+        archive = zipfile.ZipFile(stream)
     names = [name.removesuffix(".npy") for name in archive.namelist()]
 
     def member(name: str) -> _StoredArray:
         with _damage(path, name):
-            stream = stack.enter_context(archive.open(f"{name}.npy"))
-        return _StoredArray(path, name, stream, archive.getinfo(f"{name}.npy").file_size)
+            opened = archive.open(f"{name}.npy")
+        return _StoredArray(path, name, opened, archive.getinfo(f"{name}.npy").file_size)
 
     if initial and "z0" in names:
         return _array_source(path, member("z0"), None, np.nan, each_row=True)
@@ -526,8 +527,8 @@ def _parse_header(line: str) -> tuple[list[str], dict[str, str]] | None:
     return (names, units) if any(re.fullmatch(r"[qp]\d+", n) for n in names) else None
 
 
-def _open_csv(path: Path, stack: contextlib.ExitStack, dt, initial: bool) -> _Source:
-    stream = stack.enter_context(open(path, encoding="utf-8-sig", newline=None))
+def _open_csv(path: Path, stream, dt, initial: bool) -> _Source:
+    stream = TextIOWrapper(stream, encoding="utf-8-sig")
     header, line, line_number = None, "", 0
     with _damage(path, "the header"):
         for line in stream:
