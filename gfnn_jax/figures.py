@@ -16,6 +16,7 @@ import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from gfnn_jax.metrics import error_statistics, kl_divergence
@@ -89,7 +90,7 @@ def error_growth(errors: Mapping, ylabel="position error", ax=None) -> Axes:
     ax = _axes(ax)
     _error_curves(ax, errors, ylabel)
     _guide(ax, 1.0, r"$\propto n$")
-    ax.legend()
+    _legend_above(ax)
     return ax
 
 
@@ -104,7 +105,7 @@ def element_errors(errors: Mapping, axes=None) -> tuple[Axes, Axes]:
     labels = ("error of semi-major axis $a$", "error of eccentricity $e$")
     for i, (ax, label) in enumerate(zip(axes, labels, strict=True)):
         _error_curves(ax, {name: (v[0], v[1 + i]) for name, v in errors.items()}, label)
-        ax.legend()
+        _legend_above(ax)
     return tuple(axes)
 
 
@@ -120,7 +121,7 @@ def energy_error(errors: Mapping, ax=None) -> Axes:
         _log_curve(ax, place, name, np.asarray(steps), size)
     _log_log(ax, r"energy error $|H-H_0|\,/\,|H_0|$ (RMS)")
     _guide(ax, 0.5, r"$\propto \sqrt{n}$")
-    ax.legend()
+    _legend_above(ax)
     return ax
 
 
@@ -142,7 +143,7 @@ def _error_curves(ax, errors, ylabel):
 
 
 def _log_curve(ax, place, name, steps, values):
-    """Draw what a log–log plot can show, marked about eight times; returns which points it shows."""
+    """Draw what a log–log plot can show, with about eight markers; returns which points."""
     shown = (steps > 0) & np.isfinite(values) & (values > 0)
     x = np.log(steps[shown])
     marks = []
@@ -225,26 +226,27 @@ def sections(points: Mapping, labels=("$q_2$", "$p_2$"), modulo=False, axes=None
     points: name -> (x (N,), y (N,)). All panels have the limits of the first, the reference;
     what lies outside is counted in the title, not shown.
     """
+    columns = min(3, len(points))
     if axes is None:
-        columns = min(3, len(points))
         rows = -(-len(points) // columns)
         figure = Figure(figsize=(HEIGHT * 0.85 * columns, HEIGHT * 0.92 * rows))
-        axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
-        for ax in axes[len(points) :]:
+        grid = figure.subplots(rows, columns, squeeze=False).ravel()
+        axes = grid[: len(points)]
+        for ax in grid[len(points) :]:
             ax.remove()
-    axes = list(axes)[: len(points)]
     limits = None
-    for ax, (name, (x, y)) in zip(axes, points.items(), strict=True):
+    for i, (ax, (name, (x, y))) in enumerate(zip(axes, points.items(), strict=True)):
         x, y = _points(ax, x, y, modulo, color=REFERENCE, marker="o")
-        _plane(ax, labels, modulo)
-        ax.label_outer()
+        below, left = i + columns >= len(points), i % columns == 0
+        _plane(ax, (labels[0] if below else None, labels[1] if left else None), modulo)
+        ax.tick_params(labelbottom=below, labelleft=left)
         if limits is None:
             limits = ax.get_xlim(), ax.get_ylim()
         ax.set(xlim=limits[0], ylim=limits[1])
         (x0, x1), (y0, y1) = limits
         outside = int(np.sum(~((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))))
         ax.set_title(f"{name} ({outside} of {x.size} outside)" if outside else name)
-    return axes
+    return list(axes)
 
 
 def _points(ax, x, y, modulo, **look):
@@ -295,7 +297,7 @@ def marginals(reference, samples: Mapping, bins: int, range, label, ax=None) -> 
             label=f"{name}, KL {divergence:.2g}",
         )
     ax.set(xlabel=label, ylabel=f"density ({bins} bins)", xlim=range)
-    _legend_above(ax)
+    _legend_above(ax, ncols=2)
     return ax
 
 
@@ -354,7 +356,7 @@ def speed_against_error(
     ]
     ax.annotate(
         "\n".join(names),
-        (1.03, 0.62),
+        (1.03, 0.7),
         xycoords="axes fraction",
         va="top",
         fontsize=7.5,
@@ -369,12 +371,12 @@ def _number_points(ax, x, y, order):
     ax.autoscale_view()
     points = ax.transData.transform(np.column_stack([x, y])) * 72 / ax.figure.dpi
     taken = list(points)
-    sides = np.array([(0, 9), (9, 0), (0, -9), (-9, 0), (8, 8), (8, -8), (-8, -8), (-8, 8)])
+    sides = np.array([(8, 8), (0, 10), (10, 0), (0, -10), (-10, 0), (-8, -8), (8, -8), (-8, 8)])
     for number, i in enumerate(order):
         places = points[i] + sides
         others = np.array(taken)
         nearest = np.min(np.linalg.norm(places[:, None] - others, axis=-1), axis=1)
-        side = int(np.argmax(np.minimum(nearest, 9)))
+        side = int(np.argmax(np.minimum(nearest, 10)))
         taken.append(places[side])
         ax.annotate(
             str(number + 1),
@@ -384,6 +386,7 @@ def _number_points(ax, x, y, order):
             ha="center",
             va="center",
             fontsize=8,
+            path_effects=[withStroke(linewidth=2, foreground="white")],
         )
 
 
@@ -421,12 +424,12 @@ def training_curve(train_rms, validation_rms, ax=None) -> Axes:
     return ax
 
 
-def _legend_above(ax, **options):
+def _legend_above(ax, ncols=3, **options):
     """Above the axes, where it covers no data: for plots whose curves fill the frame."""
     ax.legend(
         loc="lower left",
         bbox_to_anchor=(0, 1.0),
-        ncols=3,
+        ncols=ncols,
         frameon=False,
         borderaxespad=0.2,
         handlelength=2.4,

@@ -264,7 +264,7 @@ def kl_divergence(predicted, reference, bins: int, range: tuple[float, float]) -
 
 
 def section_crossings(trajectory, index: int, direction: int = 1):
-    """States (K, 2d) where z[index] passes through 0, upwards for ``direction`` +1, downwards for −1.
+    """States (K, 2d) where z[index] passes 0, upwards for ``direction`` +1, downwards for −1.
 
     trajectory: (L, 2d), evenly sampled, its coordinates continuous (angles not reduced mod 2π).
     Each change of sign is refined on the polynomial in time through the 16 saved states

@@ -1,0 +1,185 @@
+"""Figures show the arrays they were given, are labelled, and leave matplotlib's globals alone."""
+
+import subprocess
+import sys
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+from gfnn_jax import figures, metrics
+
+RNG = np.random.default_rng(0)
+STEPS = np.arange(101)
+
+
+def power_laws(num=8):
+    return 1e-6 * STEPS * RNG.lognormal(size=(num, 1))
+
+
+def samples(num=500):
+    return RNG.normal(size=num), RNG.normal(size=num)
+
+
+def line(ax, label):
+    (found,) = [line for line in ax.get_lines() if line.get_label() == label]
+    return np.array(found.get_data())
+
+
+def legend(ax):
+    return [text.get_text() for text in ax.get_legend().get_texts()]
+
+
+def every_figure():
+    """name -> a function that draws it; used for what must hold of all."""
+    error = {"GFNN": (STEPS, power_laws()), "HNN": (STEPS, 10 * power_laws())}
+    elements = {name: (STEPS, e, e) for name, (_, e) in error.items()}
+    orbits = {"reference": samples(), "GFNN": samples(), "HNN": samples(), "VFNN": samples()}
+    wave = np.sin(STEPS)
+    return {
+        "error_growth": lambda: figures.error_growth(error),
+        "element_errors": lambda: figures.element_errors(elements),
+        "energy_error": lambda: figures.energy_error(error),
+        "coordinates": lambda: figures.coordinates_against_time(
+            STEPS, wave, {"GFNN": wave}, "$q_1$"
+        ),
+        "phase_portrait": lambda: figures.phase_portrait(orbits, modulo=True),
+        "sections": lambda: figures.sections(orbits),
+        "marginals": lambda: figures.marginals(
+            samples()[0], {"GFNN": samples()[0]}, 20, (-3, 3), "$q_2$"
+        ),
+        "speed": lambda: figures.speed_against_error(
+            [1.0, 2.0], [1e-3, 1e-6], ["one", "two"], 1, tolerance=1e-5
+        ),
+        "work_precision": lambda: figures.work_precision({"GFNN": ([1, 2], [1e-3, 1e-6])}),
+        "training_curve": lambda: figures.training_curve(0.9**STEPS, 1.1 * 0.9**STEPS),
+    }
+
+
+@pytest.mark.parametrize("name", list(every_figure()))
+def test_every_figure_is_labelled_saved_and_leaves_matplotlib_as_it_was(name, tmp_path):
+    before = dict(matplotlib.rcParams)
+    axes = every_figure()[name]()
+    axes = list(axes) if isinstance(axes, (tuple, list)) else [axes]
+    assert axes[0].get_ylabel()
+    assert axes[-1].get_xlabel()
+    assert name == "sections" or all(ax.get_legend() is not None for ax in axes)
+    for suffix, magic in ((".png", b"\x89PNG"), (".pdf", b"%PDF")):
+        path = tmp_path / f"figure{suffix}"
+        figures.save(axes[0].figure, path)
+        assert path.read_bytes().startswith(magic)
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_pyplot_is_never_imported(tmp_path):
+    code = (
+        "import sys, numpy as np\n"
+        "from gfnn_jax import figures\n"
+        "ax = figures.training_curve(np.ones(3), np.ones(3))\n"
+        "figures.save(ax.figure, sys.argv[1])\n"
+        "assert 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "figure.png")], check=True)
+
+
+def test_error_growth_shows_the_mean_and_a_band_that_stays_positive():
+    error = power_laws()
+    ax = figures.error_growth({"GFNN": (STEPS, error)})
+    mean, std = error.mean(axis=0)[1:], error.std(axis=0)[1:]
+    np.testing.assert_allclose(line(ax, "GFNN"), [STEPS[1:], mean])
+    (band,) = ax.collections
+    corners = band.get_paths()[0].vertices
+    at_last = corners[corners[:, 0] == STEPS[-1], 1]
+    assert at_last.max() == pytest.approx((mean + std)[-1])
+    assert 0 < at_last.min() == pytest.approx((mean / (1 + std / mean))[-1])
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    x, guide = line(ax, r"$\propto n$")
+    np.testing.assert_allclose(guide / guide[0], x / x[0])
+    assert (guide < mean).all()
+
+
+def test_a_lost_prediction_ends_its_curve_and_is_counted():
+    error = power_laws(4)
+    error[0, 50:] = np.inf
+    error[1] = np.nan
+    ax = figures.error_growth({"HNN": (STEPS, error)})
+    assert line(ax, "HNN (1 of 3 lost)")[0].max() == 49
+
+
+def test_element_errors_draws_each_element_on_its_own_axes():
+    a, e = power_laws(), power_laws()
+    ax_a, ax_e = figures.element_errors({"GFNN": (STEPS, a, e)})
+    np.testing.assert_allclose(line(ax_a, "GFNN")[1], a.mean(axis=0)[1:])
+    np.testing.assert_allclose(line(ax_e, "GFNN")[1], e.mean(axis=0)[1:])
+    assert "semi-major" in ax_a.get_ylabel()
+    assert "eccentricity" in ax_e.get_ylabel()
+
+
+def test_energy_error_is_a_root_mean_square():
+    error = RNG.normal(size=(16, 101))
+    ax = figures.energy_error({"GFNN": (STEPS, error)})
+    np.testing.assert_allclose(line(ax, "GFNN")[1], np.sqrt(np.mean(error**2, axis=0))[1:])
+
+
+def test_coordinates_are_zoomed_to_the_window():
+    times, reference, predicted = 0.1 * STEPS, np.sin(STEPS), np.cos(STEPS)
+    ax = figures.coordinates_against_time(
+        times, reference, {"GFNN": predicted}, "$q_1$", window=(5, 7)
+    )
+    shown = (times >= 5) & (times <= 7)
+    np.testing.assert_array_equal(line(ax, "reference"), [times[shown], reference[shown]])
+    np.testing.assert_array_equal(line(ax, "GFNN"), [times[shown], predicted[shown]])
+
+
+def test_phase_portrait_modulo():
+    x, y = 20 * RNG.normal(size=(2, 300))
+    ax = figures.phase_portrait({"reference": (x, y)}, modulo=True)
+    np.testing.assert_array_equal(line(ax, "reference"), [x % (2 * np.pi), y % (2 * np.pi)])
+    assert ax.get_xlim() == (0, 2 * np.pi)
+
+
+def test_sections_share_the_limits_of_the_first_and_count_what_lies_outside():
+    near, far = samples(), (np.array([0.0, 99.0]), np.zeros(2))
+    first, second = figures.sections({"reference": near, "HNN": far})
+    assert first.get_xlim() == second.get_xlim()
+    assert second.get_title() == "HNN (1 of 2 outside)"
+    np.testing.assert_array_equal(first.get_lines()[0].get_xdata(), near[0])
+
+
+def test_marginals_show_densities_and_the_divergence():
+    reference, predicted = samples(5000)[0], 0.5 * samples(5000)[0]
+    ax = figures.marginals(reference, {"GFNN": predicted}, 30, (-4, 4), "$q_2$")
+    divergence = metrics.kl_divergence(predicted, reference, 30, (-4, 4))
+    assert legend(ax) == ["reference", f"GFNN, KL {divergence:.2g}"]
+    values, edges, _ = ax.patches[1].get_data()
+    assert np.sum(values * np.diff(edges)) == pytest.approx(1)
+    np.testing.assert_allclose(values, np.histogram(predicted, 30, (-4, 4), density=True)[0])
+
+
+def test_speed_against_error_marks_the_choice_and_the_front():
+    cost, error = [4.0, 1.0, 2.0, 3.0], [1e-8, 1e-2, 1e-5, 1e-4]
+    ax = figures.speed_against_error(cost, error, list("abcd"), chosen=2, tolerance=1e-4)
+    np.testing.assert_array_equal(line(ax, "candidate"), [cost, error])
+    np.testing.assert_array_equal(line(ax, "chosen").ravel(), [2.0, 1e-5])
+    np.testing.assert_array_equal(line(ax, "best for its cost"), [[1, 2, 4], [1e-2, 1e-5, 1e-8]])
+    texts = [text.get_text() for text in ax.texts]
+    assert texts[:4] == ["1", "2", "3", "4"]
+    assert texts[4].splitlines() == ["1  b", "2  c  (chosen)", "3  d", "4  a"]
+
+
+def test_training_curve_marks_the_best_epoch():
+    ax = figures.training_curve([4.0, 2.0, 1.0], [4.0, np.nan, 5.0])
+    np.testing.assert_array_equal(line(ax, "kept: epoch 1").ravel(), [1, 4.0])
+
+
+def test_methods_differ_in_colour_and_marker():
+    curves = {f"method {i}": ([1, 2], [1, 2]) for i in range(9)}
+    lines = figures.work_precision(curves).get_lines()
+    assert len({(to_hex(line.get_color()), line.get_marker()) for line in lines}) == 9
+    assert len({line.get_marker() for line in lines}) == 9
+
+
+def test_a_given_axes_is_drawn_on():
+    first = figures.training_curve([1.0], [1.0])
+    assert figures.work_precision({"GFNN": ([1, 2], [1, 2])}, ax=first) is first
