@@ -1,0 +1,257 @@
+"""Predictions out: written in chunks as they come, resumable, and finished in one stroke.
+
+A prediction is an array (B, S, 2d): B lanes, S saved states each. It is computed along the steps,
+all lanes at once, so the chunks are (B, c, 2d). Each goes, with what is needed to go on from it
+(the *carry*), into the folder ``OUT.partial`` beside the output, is made durable, and only then is
+entered in a journal with its SHA-256. A process killed at any moment thus loses the chunk it was
+at, and a chunk that is damaged or half written is found out and computed again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import warnings
+import zipfile
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.io import (
+    InputError,
+    atomic_file,
+    atomic_write,
+    ensure_new,
+    failures_as_work_errors,
+    sync_folder,
+)
+
+_FORMAT = 1
+# Memory for assembling the output.
+_ASSEMBLY_BYTES = 64 * 2**20
+
+
+class PredictionWriter:
+    """Writes one prediction file: ``trajectories`` (B, S, 2d), ``status`` (B,), ``left_at`` (B,),
+    ``steps`` (S,) and ``dt``, all float64 or int64.
+
+    out:       the ``.npz`` to write; ``OUT.partial`` holds the chunks until `finish`.
+    shape:     (B, 2d).
+    steps:     (S,) the step numbers of the saved states, 0 first.
+    dt:        the time step of the map.
+    identity:  a JSON-able dict that says which job this is (digests of the model and of the initial
+               states, say): a job is resumed only if all of it agrees.
+    resume:    go on with ``OUT.partial`` where there is one; else start.
+    overwrite: replace an existing output, and discard an unfinished one.
+
+    After construction ``saved`` is the number of states per lane already on disk, and ``carry``
+    what was saved with the last of them (None at the start).
+
+    Memory: one chunk while appending, about 64 MiB while finishing. Disk: the output twice while
+    finishing. Raises InputError where something is in the way, WorkError where writing fails;
+    what was there before then stays, and so do the finished chunks.
+    """
+
+    def __init__(
+        self,
+        out,
+        *,
+        shape: tuple[int, int],
+        steps: Any,
+        dt: float,
+        identity: dict[str, Any],
+        resume: bool = False,
+        overwrite: bool = False,
+    ):
+        self.out = Path(out)
+        self.partial = self.out.with_name(self.out.name + ".partial")
+        self.steps = np.asarray(steps, dtype=np.int64)
+        self.dt = float(dt)
+        self.lanes, self.width = shape
+        self.saved = 0
+        self.carry: dict[str, np.ndarray] | None = None
+        self._chunks: list[dict[str, Any]] = []  # the journal's entries: file, start, stop, sha256
+        job = {
+            **identity,
+            "format": _FORMAT,
+            "shape": [self.lanes, len(self.steps), self.width],
+            "steps": hashlib.sha256(self.steps.tobytes()).hexdigest(),
+            "dt": self.dt,
+        }
+        self._job = json.loads(json.dumps(job))  # as it will be read back
+        if self.out.suffix != ".npz":
+            raise InputError(f"{out}: a prediction is written as .npz")
+        if self.partial.exists() and resume and self._read_journal():
+            return
+        ensure_new(self.out, overwrite)
+        if self.partial.exists() and not (overwrite or resume):
+            raise InputError(
+                f"{self.partial}: an unfinished prediction (--resume goes on with it, --overwrite "
+                "discards it)"
+            )
+        with failures_as_work_errors(self.out):
+            self._discard()
+            self.partial.mkdir(parents=True)
+        self._write_journal()
+
+    @property
+    def total(self) -> int:
+        """States per lane in the finished output."""
+        return len(self.steps)
+
+    def append(self, states: Any, carry: dict[str, Any]) -> None:
+        """The next saved states (B, c, 2d), and the arrays needed to go on after them."""
+        states = np.ascontiguousarray(states, dtype=np.float64)
+        stop = self.saved + (states.shape[1] if states.ndim == 3 else 0)
+        expected = (self.lanes, stop - self.saved, self.width)
+        if states.shape != expected or not self.saved < stop <= self.total:
+            raise ValueError(
+                f"expected states ({self.lanes}, at most {self.total - self.saved}, {self.width}), "
+                f"got {states.shape}"
+            )
+        carry = {name: np.asarray(value) for name, value in carry.items()}
+        if any(value.dtype.hasobject for value in carry.values()):
+            raise TypeError("the carry must be arrays of numbers")
+        rest = BytesIO()
+        np.savez(rest, **carry)  # pyright: ignore[reportArgumentType]
+        name = f"{self.saved:012d}-{stop:012d}.chunk"
+        digest = hashlib.sha256(states.data)
+        digest.update(rest.getbuffer())
+        with failures_as_work_errors(self.out):
+            with open(self.partial / name, "wb") as stream:
+                stream.write(states.data)
+                stream.write(rest.getbuffer())
+                stream.flush()
+                os.fsync(stream.fileno())
+            sync_folder(self.partial)
+            entry = {"file": name, "start": self.saved, "stop": stop, "sha256": digest.hexdigest()}
+            with open(self._journal, "ab") as stream:
+                stream.write(json.dumps(entry).encode() + b"\n")
+                stream.flush()
+                os.fsync(stream.fileno())
+        self._chunks.append(entry)
+        self.saved, self.carry = stop, carry
+
+    def finish(self, status: Any, left_at: Any) -> None:
+        """Assemble the output from the chunks, put it in place at once, and remove the chunks.
+
+        status:  (B,) integers, 0 = ok.
+        left_at: (B,) the first step at which a lane was outside the domain, or −1.
+        """
+        if self.saved != self.total:
+            raise ValueError(f"{self.saved} of {self.total} states are there")
+        status = np.asarray(status).astype(np.int64).reshape(self.lanes)
+        left_at = np.asarray(left_at).astype(np.int64).reshape(self.lanes)
+        with atomic_file(self.out) as stream, zipfile.ZipFile(stream, "w") as archive:
+            shape = (self.lanes, self.total, self.width)
+            with _member(archive, "trajectories", shape, np.float64) as member:
+                self._assemble(member)
+            for name, array in (
+                ("status", status),
+                ("left_at", left_at),
+                ("steps", self.steps),
+                ("dt", np.asarray(self.dt)),
+            ):
+                with _member(archive, name, array.shape, array.dtype) as member:
+                    member.write(array.tobytes())
+        self._discard()
+
+    def _discard(self) -> None:
+        """Remove the folder of chunks, and nothing in it that is not ours."""
+        for path in [*self.partial.glob("*.chunk"), self._journal]:
+            path.unlink(missing_ok=True)
+        if self.partial.exists():
+            self.partial.rmdir()
+
+    def _assemble(self, member) -> None:
+        """(B, S, 2d) from chunks of (B, c, 2d), a few lanes at a time."""
+        lane = self.total * self.width * 8
+        together = max(1, _ASSEMBLY_BYTES // (2 * max(lane, 1)))
+        for first in range(0, self.lanes, together):
+            lanes = min(together, self.lanes - first)
+            pieces = (self._read_chunk(entry, first, lanes) for entry in self._chunks)
+            if lanes == 1:  # a lane may be larger than memory: piece after piece
+                for piece in pieces:
+                    member.write(piece.data)
+            else:
+                member.write(np.concatenate([*pieces], axis=1).data)
+
+    def _read_chunk(self, entry: dict[str, Any], first: int, lanes: int) -> np.ndarray:
+        saved = entry["stop"] - entry["start"]
+        row = saved * self.width
+        path = self.partial / entry["file"]
+        data = np.fromfile(path, np.float64, count=lanes * row, offset=8 * first * row)
+        return data.reshape(lanes, saved, self.width)
+
+    @property
+    def _journal(self) -> Path:
+        return self.partial / "journal.jsonl"
+
+    def _write_journal(self) -> None:
+        lines = [{"job": self._job}, *self._chunks]
+        atomic_write(self._journal, "".join(json.dumps(line) + "\n" for line in lines))
+
+    def _read_journal(self) -> bool:
+        """Take up the chunks that are whole; False if the job's first line was never written."""
+        lines = self._journal.read_bytes().splitlines() if self._journal.exists() else []
+        try:
+            job = json.loads(lines[0])["job"]
+        except (IndexError, KeyError, TypeError, ValueError):
+            warnings.warn(f"{self.partial}: no readable journal: starting again", stacklevel=3)
+            return False
+        for key in {**job, **self._job}:
+            if job.get(key) != self._job.get(key):
+                raise InputError(
+                    f"{self.partial}: belongs to another prediction: {key} is {job.get(key)} there "
+                    f"and {self._job.get(key)} here"
+                )
+        for line in lines[1:]:
+            carry = self._verified_carry(line)
+            if carry is None:
+                warnings.warn(
+                    f"{self.partial}: a chunk is damaged or half written: going on from saved "
+                    f"state {self.saved} instead",
+                    stacklevel=3,
+                )
+                break
+            entry = json.loads(line)
+            self._chunks.append(entry)
+            self.saved, self.carry = entry["stop"], carry
+        self._write_journal()  # without what is not used again
+        used = {entry["file"] for entry in self._chunks}
+        for path in self.partial.glob("*.chunk"):
+            if path.name not in used:
+                path.unlink()
+        return True
+
+    def _verified_carry(self, line: bytes) -> dict[str, np.ndarray] | None:
+        """The carry of the chunk in this line of the journal; None if anything of it is damaged."""
+        try:
+            entry = json.loads(line)
+            start, stop = int(entry["start"]), int(entry["stop"])
+            name = f"{start:012d}-{stop:012d}.chunk"
+            if start != self.saved or not start < stop <= self.total or entry["file"] != name:
+                return None
+            with open(self.partial / name, "rb") as stream:
+                if hashlib.file_digest(stream, "sha256").hexdigest() != entry["sha256"]:
+                    return None
+                stream.seek(self.lanes * (stop - start) * self.width * 8)
+                with np.load(BytesIO(stream.read()), allow_pickle=False) as carry:
+                    return dict(carry)
+        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+            return None
+
+
+def _member(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: Any):
+    """An open ``.npy`` member, its header written; ZipInfo's fixed date makes it repeatable."""
+    member = archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True)
+    header = {
+        "descr": np.lib.format.dtype_to_descr(np.dtype(dtype)),
+        "fortran_order": False,
+        "shape": shape,
+    }
+    np.lib.format.write_array_header_1_0(member, header)
+    return member
