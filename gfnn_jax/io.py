@@ -724,7 +724,7 @@ def failures_as_work_errors(path) -> Iterator[None]:
 def atomic_file(path) -> Iterator[Any]:
     """A binary stream; ``path`` appears whole when the block ends, and not at all if it fails."""
     path = Path(path)
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    beside = path.with_name(f".{path.name}.part")
     with failures_as_work_errors(path):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -752,7 +752,7 @@ def atomic_folder(path) -> Iterator[Path]:
     an instant, and `restore_interrupted` brings it back if that instant was the last.
     """
     path = Path(path)
-    beside = path.absolute().with_name(f".{path.name}.{os.getpid()}.part")
+    beside = path.absolute().with_name(f".{path.name}.part")
     old = _old(path)
     with failures_as_work_errors(path):
         restore_interrupted(path)

@@ -1,0 +1,311 @@
+"""Model folders and training checkpoints: saved whole, verified bit for bit when loaded.
+
+A folder holds
+
+- ``arrays/``: the arrays, by Orbax, under their names in the tree;
+- ``model.json``: everything else in plain text, with shape, dtype and SHA-256 of every array;
+- ``SHA256SUMS``: the digest of every file (``sha256sum -c SHA256SUMS`` checks it too).
+
+It appears under its name only when it is complete. Loading reads data only: no code runs from a
+loaded file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from gfnn_jax.io import InputError, atomic_folder, failures_as_work_errors, restore_interrupted
+
+FORMAT = 1
+_SUMS = "SHA256SUMS"
+_JSON = "model.json"
+
+
+def save_model(folder, arrays: dict[str, Any], description: dict[str, Any]) -> None:
+    """Save nested dicts of arrays and a JSON-able description as a model folder.
+
+    What was in ``folder`` is replaced; `io.ensure_new` asks first. Raises WorkError if writing
+    fails, and what was there before is then as it was.
+    """
+    _write(Path(folder), arrays, {"description": description})
+
+
+def load_model(folder) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The arrays (NumPy, the very bits and dtypes that were saved) and the description.
+
+    Raises InputError, in one line, where anything is missing, changed, or of another format, and
+    where the arrays are float64 while JAX's x64 mode is off, which would round them.
+    """
+    tree, record = _read(Path(folder))
+    wide = [leaf.dtype for leaf in jax.tree.leaves(tree) if _would_be_rounded(leaf)]
+    if wide:
+        raise InputError(
+            f"{folder}: holds {wide[0]} arrays: switch on JAX's float64 first "
+            '(jax.config.update("jax_enable_x64", True))'
+        )
+    return tree, record["description"]
+
+
+class TrainingCheckpoints:
+    """The last two checkpoints of a training, in ``folder/step_...``.
+
+    identity: a JSON-able dict that says which training this is (digests of data and settings);
+    `latest` refuses the checkpoints of another one.
+
+    A tree is made of dicts, lists, tuples and None, or of any registered PyTree node (an
+    optimiser's state), with NumPy or JAX arrays, Python numbers and booleans as leaves. Keys of
+    ``jax.random.key`` are saved as ``jax.random.key_data``.
+    """
+
+    def __init__(self, folder, identity: dict[str, Any]):
+        self.folder = Path(folder)
+        self.identity = json.loads(json.dumps(identity))
+
+    def save(self, step: int, tree: Any) -> None:
+        """Save the tree as that of ``step``; it and the one before it remain. Raises WorkError."""
+        _write(self._path(step), tree, {"step": int(step), "identity": self.identity})
+        before = [old for old in self._steps() if old < step]
+        # Later steps are damaged ones that were passed over, hidden folders what a kill left.
+        unused = [
+            self._path(old) for old in self._steps() if old != step and old not in before[-1:]
+        ]
+        for path in [*unused, *self.folder.glob(".step_*")]:
+            shutil.rmtree(path, ignore_errors=True)
+
+    def latest(self, like: Any = None) -> tuple[int, Any] | None:
+        """The newest whole checkpoint as (step, tree), or None.
+
+        Leaves come back bit for bit as they were saved: NumPy as NumPy, JAX as JAX, numbers as
+        numbers. ``like`` is a tree of the same structure, shapes and dtypes, needed where the tree
+        has nodes other than dicts, lists and tuples. A damaged checkpoint is passed over with a
+        warning. Raises InputError where the checkpoint is of another training, or differs from
+        ``like``, or is float64 while JAX's x64 mode is off.
+        """
+        for step in reversed(self._steps()):
+            path = self._path(step)
+            try:
+                tree, record = _read(path, like)
+            except Damaged as error:
+                warnings.warn(f"{error}: the checkpoint before it is used", stacklevel=2)
+                continue
+            if record["identity"] != self.identity:
+                keys = {**record["identity"], **self.identity}
+                other = [k for k in keys if record["identity"].get(k) != self.identity.get(k)]
+                raise InputError(f"{path}: belongs to another training ({', '.join(other)} differ)")
+            kinds = [leaf["kind"] for leaf in record["leaves"]]
+            leaves, structure = jax.tree.flatten(tree)
+            for leaf, kind, entry in zip(leaves, kinds, record["leaves"], strict=True):
+                if kind == "jax" and _would_be_rounded(leaf):
+                    raise InputError(
+                        f"{path}: {entry['name']} is {leaf.dtype}: switch on JAX's x64 mode first"
+                    )
+            leaves = [
+                jax.numpy.asarray(leaf) if kind == "jax" else leaf
+                for leaf, kind in zip(leaves, kinds, strict=True)
+            ]
+            return step, jax.tree.unflatten(structure, leaves)
+        return None
+
+    def _path(self, step: int) -> Path:
+        return self.folder / f"step_{step:012d}"
+
+    def _steps(self) -> list[int]:
+        return sorted(int(p.name[5:]) for p in self.folder.glob("step_*") if p.name[5:].isdigit())
+
+
+class Damaged(InputError):
+    """A folder that is incomplete or changed since it was saved."""
+
+
+# ---------------------------------------------------------------------------------------------
+# One folder
+# ---------------------------------------------------------------------------------------------
+
+
+def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
+    named, _ = jax.tree_util.tree_flatten_with_path(tree)
+    leaves, stored = [], {}
+    for number, (path, leaf) in enumerate(named):
+        name = jax.tree_util.keystr(path, simple=True, separator="/")
+        entry, array = _describe(name, leaf)
+        leaves.append(entry)
+        # The number keeps apart names that are equal once other characters are gone.
+        if array is not None and array.size:
+            entry["key"] = f"{number:04d}.{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}"
+            stored[entry["key"]] = array
+    record = {
+        "format": FORMAT,
+        **record,
+        "leaves": leaves,
+        "structure": _structure(tree, iter(range(len(leaves)))),
+    }
+    text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
+    with atomic_folder(folder) as new:
+        if stored:
+            _orbax().save((new / "arrays").absolute(), stored)
+        (new / _JSON).write_text(text, encoding="utf-8")
+        sums = [
+            f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(new).as_posix()}\n"
+            for file in sorted(new.rglob("*"))
+            if file.is_file()
+        ]
+        (new / _SUMS).write_text("".join(sums), encoding="utf-8")
+
+
+def _read(folder: Path, like: Any = None) -> tuple[Any, dict[str, Any]]:
+    """The tree, with NumPy leaves, and what stands in ``model.json``; both verified."""
+    with failures_as_work_errors(folder):
+        restore_interrupted(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    if not (folder / _JSON).is_file():
+        raise Damaged(f"{folder}: holds no {_JSON}")
+    try:
+        version = json.loads((folder / _JSON).read_bytes())["format"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise Damaged(f"{folder}: {_JSON} is damaged or unreadable ({error})") from error
+    if version != FORMAT:
+        other = f"{folder}: has format {version!r}, this release reads format {FORMAT}"
+        try:
+            _verify_files(folder)
+        except Damaged as error:
+            raise Damaged(f"{other}; or damaged: {error}") from error
+        raise InputError(other)
+    _verify_files(folder)
+    record = json.loads((folder / _JSON).read_bytes())
+    try:
+        stored = _orbax().restore((folder / "arrays").absolute()) if _any_stored(record) else {}
+        leaves = [_restored(folder, entry, stored) for entry in record["leaves"]]
+        if like is None:
+            return _rebuild(folder, record["structure"], leaves), record
+    except InputError:
+        raise
+    except Exception as error:
+        raise Damaged(f"{folder}: cannot be restored ({str(error)[:200]})") from error
+    return _as_like(folder, like, record["leaves"], leaves), record
+
+
+def _any_stored(record: dict[str, Any]) -> bool:
+    return any("key" in entry for entry in record["leaves"])
+
+
+def _orbax():
+    import orbax.checkpoint as ocp  # takes half a second
+
+    return ocp.PyTreeCheckpointer()
+
+
+def _verify_files(folder: Path) -> None:
+    """Every file listed in SHA256SUMS is there and unchanged. Files beside them are not ours."""
+    try:
+        listed = (folder / _SUMS).read_text(encoding="utf-8").splitlines()
+        sums = dict(reversed(line.split("  ", 1)) for line in listed)  # pyright: ignore
+    except (OSError, ValueError) as error:
+        raise Damaged(f"{folder}: {_SUMS} is missing or damaged") from error
+    if _JSON not in sums:
+        raise Damaged(f"{folder}: {_SUMS} does not list {_JSON}")
+    for name, digest in sums.items():
+        try:
+            content = (folder / name).read_bytes()
+        except (OSError, ValueError) as error:
+            raise Damaged(f"{folder}: {name} is missing or unreadable") from error
+        if hashlib.sha256(content).hexdigest() != digest:
+            raise Damaged(f"{folder}: {name} has changed since it was saved (digest differs)")
+
+
+def _describe(name: str, leaf: Any) -> tuple[dict[str, Any], np.ndarray | None]:
+    """What ``model.json`` says of a leaf, and the array to store."""
+    if isinstance(leaf, (bool, int, float)) and not isinstance(leaf, np.generic):
+        return {"name": name, "kind": "number", "value": leaf}, None
+    if isinstance(leaf, jax.Array) and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        raise TypeError(f"{name}: save jax.random.key_data of a key")
+    if not isinstance(leaf, (jax.Array, np.ndarray, np.generic)):
+        raise TypeError(f"{name}: a leaf must be an array or a number, got {type(leaf).__name__}")
+    array = np.ascontiguousarray(leaf).reshape(np.shape(leaf))
+    if array.dtype.kind not in "fiubcV" or array.dtype.hasobject or array.dtype.names:
+        raise TypeError(f"{name}: a leaf must hold numbers, got dtype {array.dtype}")
+    return {
+        "name": name,
+        "kind": "jax" if isinstance(leaf, jax.Array) else "numpy",
+        "shape": list(array.shape),
+        "dtype": str(array.dtype),
+        "sha256": hashlib.sha256(array.tobytes()).hexdigest(),
+    }, array
+
+
+def _restored(folder: Path, entry: dict[str, Any], stored: dict[str, Any]) -> Any:
+    name = entry["name"]
+    if entry["kind"] == "number":
+        return entry["value"]
+    shape, dtype = tuple(entry["shape"]), np.dtype(entry["dtype"])
+    array = np.asarray(stored[entry["key"]]) if "key" in entry else np.empty(shape, dtype)
+    if array.shape != shape or array.dtype != dtype:
+        raise Damaged(
+            f"{folder}: {name} should be {dtype} of shape {shape}, found {array.dtype} of shape "
+            f"{array.shape}"
+        )
+    if hashlib.sha256(array.tobytes()).hexdigest() != entry["sha256"]:
+        raise Damaged(f"{folder}: {name} has changed since it was saved (digest differs)")
+    return array
+
+
+def _would_be_rounded(leaf: Any) -> bool:
+    """Whether JAX, as configured, would make another dtype of this array."""
+    return isinstance(leaf, np.ndarray) and jax.dtypes.canonicalize_dtype(leaf.dtype) != leaf.dtype
+
+
+def _structure(tree: Any, numbers) -> Any:
+    """The tree in JSON, a leaf by its number; a node that JSON cannot name as {"node": type}."""
+    if tree is None:
+        return None
+    if type(tree) is dict and all(type(key) is str for key in tree):
+        return {"dict": {key: _structure(tree[key], numbers) for key in sorted(tree)}}
+    if type(tree) in (list, tuple):
+        return {type(tree).__name__: [_structure(item, numbers) for item in tree]}
+    if jax.tree_util.all_leaves([tree]):
+        return next(numbers)
+    for _ in jax.tree.leaves(tree):
+        next(numbers)
+    return {"node": type(tree).__name__}
+
+
+def _rebuild(folder: Path, structure: Any, leaves: list[Any]) -> Any:
+    if structure is None:
+        return None
+    if isinstance(structure, int):
+        return leaves[structure]
+    ((kind, content),) = structure.items()
+    if kind == "node":
+        raise InputError(f"{folder}: holds a {content}: pass a tree like it")
+    if kind == "dict":
+        return {key: _rebuild(folder, item, leaves) for key, item in content.items()}
+    items = [_rebuild(folder, item, leaves) for item in content]
+    return tuple(items) if kind == "tuple" else items
+
+
+def _as_like(folder: Path, like: Any, entries: list[dict[str, Any]], leaves: list[Any]) -> Any:
+    """The leaves in the structure of ``like``, if names, shapes and dtypes are the same."""
+    named, structure = jax.tree_util.tree_flatten_with_path(like)
+    expected = [
+        _describe(jax.tree_util.keystr(path, simple=True, separator="/"), leaf)[0]
+        for path, leaf in named
+    ]
+    for want, have in zip(expected, entries, strict=False):
+        for what in ("name", "shape", "dtype"):
+            if want.get(what) != have.get(what):
+                raise InputError(
+                    f"{folder}: expected {want['name']} with {what} {want.get(what)}, found "
+                    f"{have['name']} with {what} {have.get(what)}"
+                )
+    if len(expected) != len(entries):
+        raise InputError(f"{folder}: expected {len(expected)} leaves, found {len(entries)}")
+    return jax.tree.unflatten(structure, leaves)
