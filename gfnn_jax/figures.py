@@ -306,7 +306,7 @@ def marginals(reference, samples: Mapping, bins: int, range, label, ax=None) -> 
 
 @style()
 def speed_against_error(
-    microseconds, errors, labels: Sequence[str], chosen: int, tolerance=None, ax=None
+    microseconds, errors, labels: Sequence[str], chosen, tolerance=None, ax=None
 ) -> Axes:
     """Candidates: one-step error against time per predicted step, both logarithmic.
 

@@ -243,7 +243,7 @@ def eccentricity(z):
 # Statistics of chaotic orbits
 
 
-def kl_divergence(predicted, reference, bins: int, range: tuple[float, float]) -> float:
+def kl_divergence(predicted, reference, bins: int, range) -> float:
     """D(predicted ‖ reference) = Σ P log(P/R) in nats, of the histograms of two sets of samples.
 
     The divergence of the predicted marginal *from* the reference, as the paper has it. ``bins``

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.special import jv
@@ -81,7 +81,7 @@ def test_growth_exponent_is_even_in_log_step_and_states_its_range():
     assert limited.value == pytest.approx(1.0)
     assert limited.last == 10_000
     plateau = np.maximum(1e-15 * steps, 1e-14)
-    above = metrics.growth_exponent(steps, plateau, floor=2e-14)
+    above = metrics.growth_exponent(steps, plateau, floor=2.05e-14)
     assert above.value == pytest.approx(1.0)
     assert above.first == 21
 
@@ -147,6 +147,7 @@ def kepler_state(a, e, anomaly, perihelion):
     return np.concatenate([turn @ q, turn @ p])
 
 
+@settings(deadline=None)  # the first call compiles
 @given(st.floats(0.1, 10), st.floats(1e-6, 0.95), st.floats(0, 6.28), st.floats(0, 6.28))
 def test_orbital_elements_of_constructed_orbits(a, e, anomaly, perihelion):
     z = kepler_state(a, e, anomaly, perihelion)
