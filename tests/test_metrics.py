@@ -127,6 +127,7 @@ def test_drift_exponent_tells_a_random_walk_from_a_trend_under_an_oscillation():
     walk = 1e-9 * rng.normal(size=(64, 40_000)).cumsum(axis=1)
     brouwer = metrics.drift_exponent(steps, oscillation + walk, window=100)
     assert abs(brouwer.value - 0.5) < 0.1
+    assert (brouwer.first, brouwer.last) == (1000, 39_900)
     assert brouwer.interval[0] < 0.5 < brouwer.interval[1] + 0.05
     trend = metrics.drift_exponent(steps, oscillation + 1e-9 * steps, window=100)
     assert trend.value == pytest.approx(1.0, abs=1e-3)
