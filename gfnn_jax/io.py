@@ -210,8 +210,9 @@ class _Block:
         ):
             if bad.any():
                 row, column = (int(i) for i in np.argwhere(bad)[0])
+                count = int(bad.sum())
                 raise InputError(
-                    f"{path}: {int(bad.sum())} value{'s' * (bad.sum() != 1)} {what}, first "
+                    f"{path}: {count} value{'s' * (count != 1)} {what}, first "
                     f"{self.locate(row, column)} = {self.states[row, column]}"
                 )
         return self
@@ -560,7 +561,8 @@ def _open_csv(path: Path, stream, dt, initial: bool) -> _Source:
     columns = [names.index(n) for n in wanted]
     each_row = initial and "t" not in names and "sequence" not in names
 
-    first = next(_csv_tables(path, stream, names, line_number, BLOCK_ROWS), None)
+    tables = _csv_tables(path, stream, names, line_number)
+    first = next(tables, None)
     if first is None:
         raise InputError(f"{path}: holds a header and no rows")
     found = None if initial or "t" not in names else _csv_dt(path, names, *first)
@@ -568,10 +570,9 @@ def _open_csv(path: Path, stream, dt, initial: bool) -> _Source:
     usual = dt if found is None else found
 
     def blocks(rows: int) -> Iterator[_Block]:
-        later = _csv_tables(path, stream, names, first[1][-1], rows)
         seen: set[float] = set()
         last = np.full(2, np.nan)  # sequence and time of the row before
-        for table, lines in itertools.chain(_cut(*first, rows), later):
+        for table, lines in _cut(itertools.chain([first], tables), rows):
             if each_row:
                 sequence = lines
             elif "sequence" in names:
@@ -603,16 +604,17 @@ def _open_csv(path: Path, stream, dt, initial: bool) -> _Source:
     return _Source(dim, float(dt), "float64", units, False, blocks)
 
 
-def _cut(table: np.ndarray, lines: np.ndarray, rows: int):
-    for start in range(0, len(table), rows):
-        yield table[start : start + rows], lines[start : start + rows]
+def _cut(tables, rows: int):
+    for table, lines in tables:
+        for start in range(0, len(table), rows):
+            yield table[start : start + rows], lines[start : start + rows]
 
 
-def _csv_tables(path, stream, names: list[str], line_number: int, rows: int):
-    """Tables (n, columns) with the line number of every row, n at most ``rows``."""
+def _csv_tables(path, stream, names: list[str], line_number: int):
+    """Tables (n, columns), n at most BLOCK_ROWS, with the line number of every row."""
     while True:
         with _damage(path, f"the text after line {line_number}"):
-            text = list(itertools.islice(stream, rows))
+            text = list(itertools.islice(stream, BLOCK_ROWS))
         if not text:
             return
         lines = np.arange(line_number + 1, line_number + 1 + len(text))

@@ -1,0 +1,510 @@
+"""Reading a user's data: every good file gives its numbers back, every bad one its line."""
+
+import builtins
+import subprocess
+import sys
+import tracemalloc
+import warnings
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from gfnn_jax import io
+from gfnn_jax.io import DataWarning, InputError, WorkError
+
+RNG = np.random.default_rng(0)
+Z = RNG.normal(size=(30, 4))
+QUICK = settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+def save(path, **arrays):
+    np.savez(path, **arrays)
+    return path
+
+
+def table(z, t=None, dt=0.1):
+    return np.column_stack([np.arange(len(z)) * dt if t is None else t, z])
+
+
+def csv(path, header, rows):
+    lines = [header, *(",".join(repr(float(x)) for x in row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+HEADER = "t,q1,q2,p1,p2"
+
+
+# ---------------------------------------------------------------------------------------------
+# Good files
+# ---------------------------------------------------------------------------------------------
+
+
+def test_pairs_file(tmp_path):
+    path = save(tmp_path / "d.npz", z0=Z[:-1], z1=Z[1:], dt=0.1)
+    data = io.read_trajectories(path)
+    pairs = data.pairs()
+    assert np.array_equal(pairs.z0, Z[:-1])
+    assert np.array_equal(pairs.z1, Z[1:])
+    assert (data.dim, data.dt, data.num_pairs, data.source) == (2, 0.1, 29, str(path))
+    assert len(data.digest) == 64
+
+
+@QUICK
+@given(
+    st.lists(st.integers(1, 9), min_size=1, max_size=6),
+    st.integers(1, 3),
+    st.integers(1, 12),
+    st.sampled_from([np.float64, np.float32, np.dtype(">f8"), np.int32]),
+    st.booleans(),
+    st.booleans(),
+)
+def test_sequences_of_any_length(tmp_path, lengths, dim, chunk, dtype, compressed, fortran):
+    """Padded rows are ignored, whatever stands in them, and chunks hold the same pairs."""
+    lengths = [*lengths, 2 * dim + 2]  # enough pairs
+    padded = np.full((len(lengths), max(lengths), 2 * dim), 0, dtype)
+    rng = np.random.default_rng(sum(lengths))
+    sequences = [(100 * rng.normal(size=(n, 2 * dim))).astype(dtype) for n in lengths]
+    if padded.dtype.kind == "f":
+        padded[:] = np.nan
+    for row, sequence in zip(padded, sequences, strict=True):
+        row[: len(sequence)] = sequence
+    padded = np.asfortranarray(padded) if fortran else padded
+    path = tmp_path / "d.npz"
+    (np.savez_compressed if compressed else np.savez)(
+        path, trajectories=padded, lengths=lengths, dt=2
+    )
+    data = io.read_trajectories(path)
+    assert data.states.dtype == np.float64
+    assert data.precision == str(np.dtype(dtype))
+    for read, written in zip(data.sequences, sequences, strict=True):
+        assert np.array_equal(read, written)
+    assert np.array_equal(data.last_states(), [s[-1] for s in sequences])
+    assert np.array_equal(io.read_initial_states(path, dim), data.last_states())
+    pairs = data.pairs()
+    assert np.array_equal(pairs.z0, np.concatenate([s[:-1] for s in sequences]))
+    assert np.array_equal(pairs.z1, np.concatenate([s[1:] for s in sequences]))
+    chunks = list(io.iterate_pairs(path, chunk))
+    assert max(map(len, chunks)) <= chunk
+    assert np.array_equal(np.concatenate([c.z0 for c in chunks]), pairs.z0)
+    assert np.array_equal(np.concatenate([c.z1 for c in chunks]), pairs.z1)
+
+
+FINITE = st.floats(-1e150, 1e150)
+
+
+@QUICK
+@given(
+    hnp.arrays(np.float64, st.tuples(st.integers(6, 20), st.just(4)), elements=FINITE),
+    st.permutations(["t", "sequence", "q1", "q2", "p1", "p2"]),
+    st.integers(1, 7),
+)
+def test_csv_round_trip(tmp_path, z, order, chunk):
+    """Columns in any order, by name, every bit of every number; t goes on from sequence to
+    sequence or starts again."""
+    sequence = np.where(np.arange(len(z)) < 2, 7, 3)
+    columns = {"t": np.arange(len(z)) * 0.25, "sequence": sequence}
+    columns |= dict(zip(["q1", "q2", "p1", "p2"], z.T, strict=True))
+    path = csv(tmp_path / "d.csv", ",".join(order), np.column_stack([columns[n] for n in order]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        try:
+            data = io.read_trajectories(path)
+        except InputError as error:
+            assert "pairs of consecutive" in str(error)  # noqa: PT017
+            return
+    assert data.dt == 0.25
+    assert list(data.lengths) == [2, len(z) - 2]
+    assert np.array_equal(data.states, z)
+    chunks = list(io.iterate_pairs(path, chunk))
+    assert np.array_equal(np.concatenate([c.z1 for c in chunks]), data.pairs().z1)
+
+
+def test_csv_headers(tmp_path):
+    """Units stay in the metadata; np.savetxt's commented header, comments and blank lines serve."""
+    path = tmp_path / "d.csv"
+    np.savetxt(
+        path, table(Z), delimiter=",", header="made by hand\nt [s],Q1 [km],q2 (km),p1,p2 [km/s]"
+    )
+    path.write_text(path.read_text() + "\n\n")
+    data = io.read_trajectories(path)
+    assert data.units == {"t": "s", "q1": "km", "q2": "km", "p2": "km/s"}
+    assert np.allclose(data.states, Z, rtol=1e-15)
+    assert data.dt == pytest.approx(0.1, rel=1e-13)
+    path = csv(tmp_path / "e.csv", "q1,q2,p1,p2,energy", np.column_stack([Z, Z[:, 0]]))
+    with pytest.warns(DataWarning, match="ignored: energy"):
+        assert np.array_equal(io.read_trajectories(path, dt=0.5).states, Z)
+
+
+def test_initial_states(tmp_path):
+    np.save(tmp_path / "z.npy", Z)
+    np.save(tmp_path / "m.npy", Z.reshape(5, 6, 4))
+    save(tmp_path / "z.npz", z0=Z)
+    rows = csv(tmp_path / "rows.csv", "q1,q2,p1,p2", Z)
+    orbit = csv(tmp_path / "orbit.csv", HEADER, table(Z))
+    for path in (tmp_path / "z.npy", tmp_path / "z.npz", rows):
+        assert np.array_equal(io.read_initial_states(path, 2), Z)
+    assert np.array_equal(io.read_initial_states(tmp_path / "m.npy", 2), Z[5::6])
+    assert np.array_equal(io.read_initial_states(orbit, 2), Z[-1:])
+    with pytest.raises(InputError, match=r"d = 3\), found 4 columns"):
+        io.read_initial_states(orbit, 3)
+
+
+def test_prediction_file_as_data(tmp_path):
+    """A prediction that kept every tenth step holds states ten time steps apart."""
+    arrays = {"trajectories": Z.reshape(3, 10, 4), "steps": np.arange(10) * 10}
+    assert io.read_trajectories(save(tmp_path / "p.npz", **arrays, dt=0.1)).dt == 1.0
+
+
+def test_given_dt(tmp_path):
+    np.save(tmp_path / "d.npy", Z)
+    assert io.read_trajectories(tmp_path / "d.npy", dt=0.1).dt == 0.1
+    path = save(tmp_path / "d.npz", z0=Z, z1=Z + 1, dt=np.float32(0.1))
+    assert io.read_trajectories(path, dt=0.1).dt == 0.1
+
+
+@pytest.mark.parametrize(
+    ("z0", "z1", "message"),
+    [
+        (Z, Z, "every state equals"),
+        (Z * [1, 1, 1, 0], (Z + 1) * [1, 1, 1, 0], "constant column.s. p2"),
+        (Z[:, [0, 0, 2, 3]], Z[:, [0, 0, 2, 3]] + 1, "q1 and q2 are equal"),
+    ],
+)
+def test_odd_columns_warn(tmp_path, z0, z1, message):
+    with pytest.warns(DataWarning, match=message):
+        io.read_trajectories(save(tmp_path / "d.npz", z0=z0, z1=z1, dt=1.0))
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".csv"])
+def test_streaming_memory_is_bounded(tmp_path, suffix):
+    rows = 150_000 if suffix == ".csv" else 500_000
+    z = np.random.default_rng(1).normal(size=(rows, 4))
+    path = tmp_path / f"d{suffix}"
+    if suffix == ".csv":
+        np.savetxt(path, z, delimiter=",", header="q1,q2,p1,p2", comments="")
+        # A block of lines as text, 130 bytes each, and as numbers; the whole file takes 20 MB.
+        limit = io.BLOCK_ROWS * 250
+    else:
+        limit = z.nbytes // 4
+        np.save(path, z) if suffix == ".npy" else np.savez_compressed(path, trajectories=z)
+    tracemalloc.start()
+    count = sum(len(pairs) for pairs in io.iterate_pairs(path, 10_000, dt=0.1))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert count == rows - 1
+    assert peak < limit
+
+
+# ---------------------------------------------------------------------------------------------
+# Bad files: one line each
+# ---------------------------------------------------------------------------------------------
+
+
+def bad(value, row=3, column=1):
+    z = Z.copy()
+    z[row, column] = value
+    return z
+
+
+def npz(**arrays):
+    return lambda tmp: save(tmp / "d.npz", **arrays)
+
+
+def npy(array):
+    def make(tmp):
+        np.save(tmp / "d.npy", array)
+        return tmp / "d.npy"
+
+    return make
+
+
+def text(content, name="d.csv"):
+    def make(tmp):
+        (tmp / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+        return tmp / name
+
+    return make
+
+
+def rows(header, values):
+    return lambda tmp: csv(tmp / "d.csv", header, values)
+
+
+def changed(change, make=None):
+    """The bytes of a good file, changed."""
+
+    def make_changed(tmp):
+        path = (make or npz(z0=Z[:-1], z1=Z[1:], dt=0.1))(tmp)
+        path.write_bytes(change(path.read_bytes()))
+        return path
+
+    return make_changed
+
+
+def flip(data, at):
+    return data[:at] + bytes([data[at] ^ 0x10]) + data[at + 1 :]
+
+
+def gap(tmp):
+    t = np.arange(30) * 0.1
+    t[20:] += 0.05
+    return csv(tmp / "d.csv", HEADER, table(Z, t))
+
+
+def folder(tmp):
+    (tmp / "d.npz").mkdir()
+    return tmp / "d.npz"
+
+
+def encrypted_flag(tmp):
+    path = npz(z0=Z, z1=Z, dt=0.1)(tmp)
+    data = bytearray(path.read_bytes())
+    data[6] |= 1
+    data[data.index(b"PK\x01\x02") + 8] |= 1
+    path.write_bytes(bytes(data))
+    return path
+
+
+STRINGS = np.array([["a", "b"]] * 9)
+BAD_FILES = {
+    "missing file": (lambda tmp: tmp / "none.npz", "no such file"),
+    "directory": (folder, "is not a file"),
+    "other suffix": (text("x", "d.txt"), "expected a .npz, .npy or .csv file"),
+    "no suffix": (text("x", "d"), "expected a .npz, .npy or .csv file"),
+    "empty file npz": (text("", "d.npz"), "is empty"),
+    "empty file npy": (text("", "d.npy"), "is empty"),
+    "empty file csv": (text(""), "is empty"),
+    "text as npz": (text("hello\nworld", "d.npz"), "cannot be read: damaged"),
+    "text as npy": (text("hello\nworld", "d.npy"), "cannot be read: damaged"),
+    "binary as csv": (text(bytes(range(128, 256))), "the header cannot be read"),
+    "truncated npz": (changed(lambda b: b[: len(b) // 2]), "cannot be read: damaged"),
+    "truncated npy": (changed(lambda b: b[:-8], npy(Z)), "bytes expected for shape (30, 4)"),
+    "too long npy": (changed(lambda b: b + b"x", npy(Z)), "bytes expected for shape (30, 4)"),
+    "flipped bit in npz": (changed(lambda b: flip(b, 700)), "damaged"),
+    "flipped header in npy": (changed(lambda b: flip(b, 20), npy(Z)), "damaged"),
+    "huge shape in npy": (
+        changed(lambda b: b.replace(b"(30, 4), }        ", b"(3000000000, 4), }"), npy(Z)),
+        "damaged",
+    ),
+    "encrypted npz": (encrypted_flag, "encrypted"),
+    "pickle": (npz(z0=np.array([None, {}]), z1=Z, dt=0.1), "found dtype object"),
+    "ragged object array": (
+        npz(trajectories=np.array([Z[:3], Z[:5]], dtype=object), dt=0.1),
+        "'lengths'",
+    ),
+    "no arrays": (npz(dt=0.1), "expected either the arrays z0 and z1"),
+    "wrong names": (npz(x=Z, y=Z, dt=0.1), "found x, y, dt"),
+    "z0 alone": (npz(z0=Z, dt=0.1), "found z0, dt"),
+    "both kinds": (npz(z0=Z, z1=Z, trajectories=Z[None], dt=0.1), "or trajectories"),
+    "odd dimension": (npz(z0=Z[:, :3], z1=Z[:, :3], dt=0.1), "even last dimension"),
+    "no columns": (npz(z0=Z[:, :0], z1=Z[:, :0], dt=0.1), "even last dimension"),
+    "shapes differ": (npz(z0=Z, z1=Z[:-1], dt=0.1), "found (30, 4) and (29, 4)"),
+    "one-dimensional": (npz(z0=Z[0], z1=Z[0], dt=0.1), "must both have shape (N, 2d)"),
+    "scalar array": (npy(np.float64(1)), "must have shape (L, 2d) or (M, L, 2d), found ()"),
+    "four-dimensional": (npz(trajectories=Z[None, None], dt=0.1), "must have shape"),
+    "complex": (npz(z0=Z + 1j, z1=Z, dt=0.1), "found dtype complex128"),
+    "strings": (npz(z0=STRINGS, z1=STRINGS, dt=0.1), "must hold real numbers"),
+    "booleans": (npy(Z > 0), "found dtype bool"),
+    "structured": (npy(np.zeros(9, [("q", float), ("p", float)])), "must hold real numbers"),
+    "nan": (npz(z0=bad(np.nan), z1=Z, dt=0.1), "1 value not finite (NaN or infinity), first z0[3"),
+    "infinity": (npz(z0=Z, z1=bad(-np.inf), dt=0.1), "first z1[3, 1] = -inf"),
+    "nan in trajectories": (
+        npz(trajectories=bad(np.nan, 7)[None], dt=0.1),
+        "trajectories[0, 7, 1]",
+    ),
+    "huge value": (npz(z0=bad(1e200), z1=Z, dt=0.1), "too large to be squared"),
+    "empty arrays": (npz(z0=Z[:0], z1=Z[:0], dt=0.1), "0 pairs"),
+    "no sequences": (npz(trajectories=Z[None][:0], dt=0.1), "0 pairs"),
+    "one pair": (npz(z0=Z[:1], z1=Z[1:2], dt=0.1), "1 pair of consecutive states"),
+    "too few pairs": (npz(z0=Z[:4], z1=Z[1:5], dt=0.1), "4 pairs of consecutive states found"),
+    "single states": (npz(trajectories=Z[:, None], dt=0.1), "0 pairs"),
+    "no dt": (npz(z0=Z, z1=Z), "holds no time step"),
+    "dt zero": (npz(z0=Z, z1=Z, dt=0.0), "finite and above 0"),
+    "dt negative": (npz(z0=Z, z1=Z, dt=-0.1), "finite and above 0"),
+    "dt nan": (npz(z0=Z, z1=Z, dt=np.nan), "finite and above 0"),
+    "dt array": (npz(z0=Z, z1=Z, dt=[0.1, 0.2]), "must be one number"),
+    "dt text": (npz(z0=Z, z1=Z, dt="0.1"), "must hold real numbers"),
+    "lengths too long": (npz(trajectories=Z[None], lengths=[31], dt=0.1), "lengths[0] = 31"),
+    "length zero": (npz(trajectories=Z[None], lengths=[0], dt=0.1), "outside 1..30"),
+    "lengths shape": (npz(trajectories=Z[None], lengths=[3, 3], dt=0.1), "of shape (1,), found"),
+    "lengths float": (npz(trajectories=Z[None], lengths=[3.0], dt=0.1), "must be integers"),
+    "csv without header": (rows("1.0,2.0,3.0", table(Z)), "expected a header"),
+    "csv header only": (rows(HEADER, []), "holds a header and no rows"),
+    "csv semicolons": (text("t;q1;p1\n0;1;2\n"), "expected a header"),
+    "csv without p2": (rows("t,q1,q2,p1", table(Z[:, :3])), "p2 missing"),
+    "csv p without q": (rows("t,q1,p1,p2", table(Z[:, :3])), "p2 without a partner"),
+    "csv column twice": (rows("t,q1,q1,p1", table(Z[:, :3])), "must name"),
+    "csv word": (text("t,q1,p1\n0,1,2\n1,x,2\n"), "line 3, q1: 'x' is not a number"),
+    "csv hole": (text("t,q1,p1\n0,1,2\n1,,2\n"), "line 3, q1: '' is not a number"),
+    "csv short row": (text("t,q1,p1\n0,1,2\n1,1\n"), "line 3: 3 columns expected, 2 found"),
+    "csv long row": (text("t,q1,p1\n0,1,2,3\n1,1,2,3\n"), "line 2: 3 columns expected, 4 found"),
+    "csv nan": (rows(HEADER, table(bad(np.nan))), "first line 5, q2 = nan"),
+    "csv gap": (gap, "not uniform: 0.15 in line 22 where 0.1 is usual (1 such row)"),
+    "csv time stands": (rows(HEADER, table(Z, np.zeros(30))), "must rise"),
+    "csv time nan": (rows(HEADER, table(Z, bad(np.nan)[:, 1])), "t must rise|not uniform"),
+    "csv no time": (rows("q1,q2,p1,p2", Z), "holds no time step"),
+    "csv sequences mixed": (
+        rows("sequence,q1,q2,p1,p2", table(Z, np.arange(30) % 2)),
+        "must stand together",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_bad_file(tmp_path, name):
+    make, message = BAD_FILES[name]
+    path = make(tmp_path)
+    dt = 0.1 if path.suffix == ".npy" or name == "csv sequences mixed" else None
+    for read in (io.read_trajectories, lambda p, dt: list(io.iterate_pairs(p, 10, dt=dt))):
+        if "pair" in message and "stand" not in message and read is not io.read_trajectories:
+            continue  # a stream may be as short as it likes
+        with pytest.raises(InputError) as caught:
+            read(path, dt=dt)
+        line = str(caught.value)
+        assert any(part in line for part in message.split("|")), line
+        assert "\n" not in line
+        assert len(line) < 400
+
+
+@pytest.mark.parametrize("dt", [0.0, -1.0, np.nan, np.inf, 0.2])
+def test_bad_given_dt(tmp_path, dt):
+    with pytest.raises(InputError, match="dt"):
+        io.read_trajectories(save(tmp_path / "d.npz", z0=Z, z1=Z + 1, dt=0.1), dt=dt)
+
+
+def test_no_permission(tmp_path, monkeypatch):
+    path = save(tmp_path / "d.npz", z0=Z, z1=Z, dt=0.1)
+
+    def refuse(*args, **kwargs):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(builtins, "open", refuse)
+    with pytest.raises(InputError, match="Permission denied"):
+        io.read_trajectories(path)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_damaged_bytes_never_escape(tmp_path_factory, data):
+    """Any flip or cut of any kind of file is read the same, or read as other text, or refused."""
+    tmp = tmp_path_factory.mktemp("damaged")
+    kind = data.draw(st.sampled_from(["npz", "zip", "npy", "csv"]))
+    path = tmp / f"d.{'npz' if kind == 'zip' else kind}"
+    if kind in ("npz", "zip"):
+        (np.savez if kind == "npz" else np.savez_compressed)(path, z0=Z[:9], z1=Z[1:10], dt=0.1)
+    elif kind == "npy":
+        np.save(path, Z[:9])
+    else:
+        csv(path, HEADER, table(Z[:9]))
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(content[: data.draw(st.integers(len(content) // 2, len(content)))])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        try:
+            read = io.read_trajectories(path, dt=None if kind in ("npz", "zip", "csv") else 0.1)
+        except InputError as error:
+            assert "\n" not in str(error)  # noqa: PT017
+        else:
+            if kind in ("npz", "zip"):  # the archive's checksums vouch for every bit
+                assert np.array_equal(read.pairs().z1, Z[1:10])
+
+
+def test_reading_needs_no_jax():
+    code = "import sys, gfnn_jax.io; sys.exit('jax' in sys.modules)"
+    package_needs_it = "import sys, gfnn_jax; sys.exit('jax' in sys.modules)"
+    if subprocess.run([sys.executable, "-c", package_needs_it], check=False).returncode == 0:
+        assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# ---------------------------------------------------------------------------------------------
+# Outputs
+# ---------------------------------------------------------------------------------------------
+
+
+def test_ensure_new(tmp_path):
+    (tmp_path / "file").write_text("kept")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").write_text("kept")
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "model.json").write_text("{}")
+    (tmp_path / "empty").mkdir()
+    for name, overwrite, folder, message in [
+        ("file", False, False, "exists already"),
+        ("file", True, True, "expected a folder"),
+        ("model", False, True, "exists already"),
+        ("model", True, False, "expected a file"),
+        ("other", True, True, "not overwritten"),
+        ("file/below", False, False, "not a folder|Not a directory"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            io.ensure_new(tmp_path / name, overwrite, folder=folder)
+    for name, overwrite, folder in [
+        ("new", False, False),
+        ("deep/new", False, True),
+        ("file", True, False),
+        ("model", True, True),
+        ("empty", False, True),
+    ]:
+        assert io.ensure_new(tmp_path / name, overwrite, folder=folder) == tmp_path / name
+    assert not (tmp_path / "deep").exists()
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_ensure_new_without_permission(tmp_path, monkeypatch):
+    monkeypatch.setattr(io.os, "access", lambda *args: False)
+    with pytest.raises(InputError, match="no permission"):
+        io.ensure_new(tmp_path / "new")
+
+
+def test_atomic_outputs_on_failure(tmp_path):
+    """A failure leaves what was there before, and no rubbish beside it."""
+    io.atomic_write(tmp_path / "a", "before")
+    with io.atomic_folder(tmp_path / "f") as new:
+        (new / "x").write_text("before")
+
+    def half_a_file():
+        with io.atomic_file(tmp_path / "a") as stream:
+            stream.write(b"half")
+            raise OSError(28, "No space left on device")
+
+    def half_a_folder():
+        with io.atomic_folder(tmp_path / "f") as new:
+            (new / "x").write_text("half")
+            raise OSError(28, "No space left on device")
+
+    for half in (half_a_file, half_a_folder):
+        with pytest.raises(WorkError, match="No space left"):
+            half()
+    with pytest.raises(KeyboardInterrupt), io.atomic_folder(tmp_path / "f") as new:
+        raise KeyboardInterrupt
+    assert (tmp_path / "a").read_text() == (tmp_path / "f" / "x").read_text() == "before"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "f"]
+    with io.atomic_folder(tmp_path / "f") as new:
+        (new / "y").write_text("after")
+    assert [p.name for p in (tmp_path / "f").iterdir()] == ["y"]
+
+
+def test_interrupted_exchange_of_folders(tmp_path):
+    (tmp_path / ".f.old").mkdir()
+    (tmp_path / ".f.old" / "x").write_text("before")
+    io.restore_interrupted(tmp_path / "f")
+    assert (tmp_path / "f" / "x").read_text() == "before"
+
+
+def test_zip_members_are_not_trusted(tmp_path):
+    """A member whose archive entry lies about its size is refused before it is read."""
+    path = tmp_path / "d.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("z0.npy", b"\x93NUMPY\x01\x00")
+        archive.writestr("z1.npy", b"")
+    with pytest.raises(InputError, match="damaged"):
+        io.read_trajectories(path, dt=1.0)
