@@ -78,7 +78,7 @@ class PredictionWriter:
             **identity,
             "format": _FORMAT,
             "shape": [self.lanes, len(self.steps), self.width],
-            "steps": hashlib.sha256(self.steps.tobytes()).hexdigest(),
+            "steps": hashlib.sha256(self.steps.data).hexdigest(),
             "dt": self.dt,
         }
         self._job = json.loads(json.dumps(job))  # as it will be read back

@@ -189,8 +189,8 @@ def test_streaming_memory_is_bounded(tmp_path, suffix):
     path = tmp_path / f"d{suffix}"
     if suffix == ".csv":
         np.savetxt(path, z, delimiter=",", header="q1,q2,p1,p2", comments="")
-        # A block of lines as text, 130 bytes each, and as numbers; the whole file takes 20 MB.
-        limit = io.BLOCK_ROWS * 250
+        # A block of lines as text and as numbers; the whole file so would take 57 MB.
+        limit = io.BLOCK_ROWS * 600
     else:
         limit = z.nbytes // 4
         np.save(path, z) if suffix == ".npy" else np.savez_compressed(path, trajectories=z)
