@@ -1,0 +1,302 @@
+"""Model folders and training checkpoints: the same bits back, or one line that says why not."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from gfnn_jax import checkpoints
+from gfnn_jax.checkpoints import TrainingCheckpoints, load_model, save_model
+from gfnn_jax.io import InputError, WorkError
+
+RNG = np.random.default_rng(0)
+ARRAYS = {
+    "mlp": {
+        "layer 0": {"kernel": RNG.normal(size=(4, 8)), "bias": np.zeros(8, np.float32)},
+        "layer/0": {"kernel": np.array([np.nan, -0.0, np.inf, 5e-324])},
+    },
+    "degrees": np.arange(6, dtype=np.int16).reshape(2, 3),
+    "count": np.float64(0.1),
+    "mask": np.array([True, False]),
+    "small": jnp.ones(3, jnp.bfloat16),
+    "strided": RNG.normal(size=(6, 4)).T[::2],
+    "no terms": np.zeros((0, 4)),
+    "bias": None,
+    "nothing": {},
+}
+DESCRIPTION = {"chart": "midpoint", "dt": 0.1, "angles": [0, 2], "name": "θ", "rollout": None}
+
+
+def assert_same(a, b):
+    """The same structure, types, dtypes and bits."""
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert np.shape(x) == np.shape(y)
+        assert np.asarray(x).dtype == np.asarray(y).dtype
+        assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
+
+
+@pytest.fixture
+def model(tmp_path):
+    save_model(tmp_path / "model", ARRAYS, DESCRIPTION)
+    return tmp_path / "model"
+
+
+@pytest.mark.parametrize("arrays", [ARRAYS, {}, {"a": None}, {"a": np.zeros(0)}])
+def test_model_round_trip(tmp_path, arrays):
+    save_model(tmp_path / "deep" / "m", arrays, DESCRIPTION)
+    loaded, description = load_model(tmp_path / "deep" / "m")
+    assert_same(loaded, arrays)
+    assert description == DESCRIPTION
+    assert os.listdir(tmp_path / "deep") == ["m"]
+
+
+def test_model_is_replaced_whole(model):
+    save_model(model, {"a": np.ones(2)}, {})
+    assert list(load_model(model)[0]) == ["a"]
+    (model / "report.json").write_text("{}")  # files beside the listed ones do no harm
+    assert list(load_model(model)[0]) == ["a"]
+
+
+def test_failed_save_changes_nothing(model, monkeypatch):
+    before = {p: p.read_bytes() for p in model.rglob("*") if p.is_file()}
+    with pytest.raises(TypeError, match="mlp/name: a leaf must be an array"):
+        save_model(model, {"mlp": {"name": "x"}}, {})
+    with pytest.raises(TypeError, match="key_data"):
+        save_model(model, {"key": jax.random.key(0)}, {})
+    with pytest.raises(TypeError, match="object"):
+        save_model(model, {"a": np.array([None])}, {})
+    with pytest.raises(TypeError, match="JSON"):
+        save_model(model, {}, {"a": object()})
+
+    def disk_full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoints.Path, "write_text", disk_full)
+    with pytest.raises(WorkError, match="No space left on device"):
+        save_model(model, {"a": np.ones(2)}, {})
+    assert before == {p: p.read_bytes() for p in model.rglob("*") if p.is_file()}
+    assert os.listdir(model.parent) == ["model"]
+
+
+def test_every_file_is_guarded(model):
+    """A flipped bit, a cut or a missing file anywhere in the folder is refused in one line."""
+    rng = random.Random(0)
+    for path in sorted(p for p in model.rglob("*") if p.is_file()):
+        whole = path.read_bytes()
+        flipped = bytearray(whole)
+        if whole:
+            flipped[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
+        for content in (bytes(flipped), whole[: len(whole) // 2], None):
+            if content == whole:
+                continue
+            path.unlink() if content is None else path.write_bytes(content)
+            with pytest.raises(InputError) as caught:
+                load_model(model)
+            assert "\n" not in str(caught.value)
+            path.write_bytes(whole)
+    load_model(model)
+
+
+def test_flipped_bit_is_named(model):
+    path = next(model.glob("arrays/d/*"))
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    with pytest.raises(InputError, match=rf"arrays/d/{path.name} has changed"):
+        load_model(model)
+
+
+def rewrite(folder, change):
+    """Change model.json as another release would: with its digest."""
+    record = json.loads((folder / "model.json").read_text())
+    old = checkpoints.hashlib.sha256((folder / "model.json").read_bytes()).hexdigest()
+    change(record)
+    (folder / "model.json").write_text(json.dumps(record))
+    new = checkpoints.hashlib.sha256((folder / "model.json").read_bytes()).hexdigest()
+    sums = folder / "SHA256SUMS"
+    sums.write_text(sums.read_text().replace(old, new))
+
+
+def kernel(record):
+    return next(leaf for leaf in record["leaves"] if leaf["name"] == "mlp/layer 0/kernel")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda r: r.update(format=2), "has format 2, this release reads format 1"),
+        (lambda r: r.pop("format"), "model.json is damaged"),
+        (lambda r: kernel(r).update(shape=[8, 4]), r"float64 of shape \(8, 4\), found"),
+        (lambda r: kernel(r).update(dtype="float32"), "should be float32 of shape"),
+        (lambda r: kernel(r).update(sha256="0"), "mlp/layer 0/kernel has changed"),
+        (lambda r: kernel(r).update(key="other"), "cannot be restored"),
+        (lambda r: r["leaves"].clear(), "cannot be restored"),
+    ],
+)
+def test_other_contents_are_refused(model, change, message):
+    rewrite(model, change)
+    with pytest.raises(InputError, match=message):
+        load_model(model)
+
+
+def test_no_model(tmp_path):
+    (tmp_path / "empty").mkdir()
+    for name, message in [("none", "no such folder"), ("empty", "holds no model.json")]:
+        with pytest.raises(InputError, match=message):
+            load_model(tmp_path / name)
+
+
+def test_float64_needs_x64(model):
+    with jax.enable_x64(False), pytest.raises(InputError, match=r"jax_enable_x64"):
+        load_model(model)
+    save_model(model, {"a": np.ones(3, np.float32)}, {})
+    with jax.enable_x64(False):
+        assert load_model(model)[0]["a"].dtype == np.float32
+
+
+# ---------------------------------------------------------------------------------------------
+# Training checkpoints
+# ---------------------------------------------------------------------------------------------
+
+
+def training_tree(seed):
+    params = {"w": jax.random.normal(jax.random.key(seed), (20, 3)), "b": jnp.zeros(3, jnp.float32)}
+    return {
+        "params": params,
+        "optimiser": optax.adam(1e-3).init(params),
+        "best": (np.float32(0.5), [np.arange(seed + 1), None]),
+        "epoch": seed,
+        "loss": 0.1 + seed,
+        "stopped": False,
+    }
+
+
+def test_checkpoints_round_trip(tmp_path):
+    saved = TrainingCheckpoints(tmp_path / "c", {"data": "d", "seed": 1})
+    assert saved.latest() is None
+    for step in (5, 10, 15):
+        saved.save(step, training_tree(3))
+    assert sorted(os.listdir(tmp_path / "c")) == ["step_000000000010", "step_000000000015"]
+    step, tree = TrainingCheckpoints(tmp_path / "c", {"seed": 1, "data": "d"}).latest(
+        training_tree(3)
+    )
+    assert step == 15
+    assert_same(tree, training_tree(3))
+    assert isinstance(tree["params"]["w"], jax.Array)
+    assert isinstance(tree["best"][1][0], np.ndarray)
+    assert (type(tree["epoch"]), type(tree["loss"]), tree["stopped"]) == (int, float, False)
+    with pytest.raises(InputError, match="pass a tree like it"):
+        saved.latest()
+    plain = {"a": (1, [2.5, np.ones(2)]), "b": None}
+    saved.save(20, plain)
+    assert_same(saved.latest()[1], plain)
+
+
+def test_checkpoints_refuse_another_training(tmp_path):
+    saved = TrainingCheckpoints(tmp_path, {"data": "d"})
+    saved.save(1, {"w": jnp.ones(3)})
+    with pytest.raises(InputError, match=r"another training \(data differ"):
+        TrainingCheckpoints(tmp_path, {"data": "e"}).latest()
+    for like, message in [
+        ({"w": jnp.ones(4)}, "expected w with shape"),
+        ({"w": jnp.ones(3, jnp.float32)}, "expected w with dtype float32, found w with dtype"),
+        ({"v": jnp.ones(3)}, "expected v with name v, found w"),
+        ({"w": jnp.ones(3), "x": 1}, "expected 2 leaves, found 1"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            saved.latest(like)
+    with jax.enable_x64(False), pytest.raises(InputError, match="w is float64"):
+        saved.latest()
+
+
+def test_damaged_checkpoint_is_passed_over(tmp_path):
+    saved = TrainingCheckpoints(tmp_path, {})
+    for step in (1, 2):
+        saved.save(step, {"w": np.full(3, step)})
+    newest = tmp_path / "step_000000000002"
+    for path in [p for p in newest.rglob("*") if p.is_file() and p.stat().st_size]:
+        whole = path.read_bytes()
+        path.write_bytes(bytes([whole[0] ^ 1]) + whole[1:])
+        with pytest.warns(UserWarning, match="the checkpoint before it is used"):
+            step, tree = saved.latest()
+        assert (step, tree["w"][0]) == (1, 1)
+        path.write_bytes(whole)
+    (newest / "model.json").unlink()
+    # The damaged one never crowds out a good one.
+    for step in (1, 2):
+        saved.save(step, {"w": np.full(3, 10 * step)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert saved.latest()[1]["w"][0] == 20
+
+
+def test_save_is_quick(tmp_path):
+    saved = TrainingCheckpoints(tmp_path, {})
+    tree = training_tree(0)
+    seconds = []
+    for step in range(6):
+        start = time.perf_counter()
+        saved.save(step, tree)
+        seconds.append(time.perf_counter() - start)
+    assert min(seconds) < 0.5  # 0.1 s on two cores where nothing else runs
+
+
+WORKER = textwrap.dedent(
+    """
+    import sys
+    import numpy as np
+    from gfnn_jax.checkpoints import TrainingCheckpoints
+
+    saved = TrainingCheckpoints(sys.argv[1], {})
+    step, tree = saved.latest() or (0, {"w": np.ones((100, 50)), "b": np.zeros(3)})
+    print("started", flush=True)
+    while step < 30:
+        step += 1
+        tree = {"w": tree["w"] + 0.01 * np.sin(tree["w"]), "b": tree["b"] + step}
+        saved.save(step, tree)
+    """
+)
+
+
+@pytest.mark.parametrize(
+    "kills", [2, pytest.param(20, marks=pytest.mark.slow)], ids=["short", "twenty"]
+)
+def test_sigkill(tmp_path, kills):
+    """Killed at random moments and resumed, the training ends with the uninterrupted bits."""
+    rng = random.Random(kills)
+    killed, rounds = 0, 0
+    while killed < kills:
+        folder = tmp_path / str(rounds)
+        rounds += 1
+        while True:
+            process = subprocess.Popen(
+                [sys.executable, "-c", WORKER, str(folder)], stdout=subprocess.PIPE, text=True
+            )
+            assert process.stdout.readline() == "started\n"
+            if killed < kills:
+                time.sleep(rng.uniform(0, 2.0))
+                process.send_signal(signal.SIGKILL)
+            code = process.wait()
+            process.stdout.close()
+            killed += code == -signal.SIGKILL
+            if code == 0:
+                break
+        w, b = np.ones((100, 50)), np.zeros(3)
+        for step in range(1, 31):
+            w, b = w + 0.01 * np.sin(w), b + step
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            step, tree = TrainingCheckpoints(folder, {}).latest()
+        assert step == 30
+        assert_same(tree, {"w": w, "b": b})
+        assert len(os.listdir(folder)) == 2
