@@ -1,0 +1,169 @@
+"""Levenberg–Marquardt on S: exact where S is representable, equal to SciPy's optimum, resumable."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+from jax.flatten_util import ravel_pytree
+
+from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
+
+
+def network(params, w):
+    hidden = jnp.tanh(w @ params["inner"] + params["bias"])
+    return hidden @ params["outer"]
+
+
+def network_params(seed, width, inputs=2):
+    rng = np.random.default_rng(seed)
+    return {
+        "inner": jnp.asarray(rng.standard_normal((inputs, width))),
+        "bias": jnp.asarray(rng.standard_normal(width)),
+        "outer": jnp.asarray(rng.standard_normal(width) / np.sqrt(width)),
+    }
+
+
+def gradient_data(scalar, num, seed, inputs=2):
+    """(w, ∇scalar(w)) for num points of the cube (−1, 1)^inputs."""
+    w = np.random.default_rng(seed).uniform(-1, 1, (num, inputs))
+    return w, np.asarray(jax.vmap(jax.grad(scalar))(jnp.asarray(w)))
+
+
+def pendulum(w):
+    return 0.5 * w[1] ** 2 - jnp.cos(2 * w[0])
+
+
+TRAINING, VALIDATION = gradient_data(pendulum, 130, 0), gradient_data(pendulum, 50, 1)
+
+
+def fit_pendulum(**options):
+    """13 hidden units; 130 pairs in chunks of 40 need padding."""
+    options = {"max_iterations": 12, "chunk": 40, **options}
+    return levenberg_marquardt(
+        network, network_params(2, 13), *TRAINING, validation=VALIDATION, **options
+    )
+
+
+def test_recovers_an_exactly_representable_scalar_to_roundoff():
+    exact = network_params(0, 4)
+    start = jax.tree.map(lambda a: a + 0.1 * jnp.cos(jnp.arange(a.size)).reshape(a.shape), exact)
+    training, validation = (
+        gradient_data(lambda w: network(exact, w), num, seed) for num, seed in ((101, 1), (50, 2))
+    )
+    result = levenberg_marquardt(network, start, *training, validation=validation, chunk=30)
+    assert result.stopped_because == "no progress"
+    assert result.iterations < 100
+    assert result.train_rms < 1e-13
+    assert result.validation_rms < 1e-13
+    recovered = jax.vmap(jax.grad(network, 1), (None, 0))(result.params, jnp.asarray(validation[0]))
+    np.testing.assert_allclose(recovered, validation[1], atol=1e-12)
+
+
+def test_finds_the_optimum_that_scipy_finds():
+    """Two hidden units on noisy data: a residual that stays, whose minimum is the same."""
+    exact = network_params(3, 2)
+    start = jax.tree.map(lambda a: 1.2 * a, exact)
+    w, wanted = gradient_data(lambda w: network(exact, w), 60, 3)
+    wanted = wanted + 0.05 * np.random.default_rng(5).standard_normal(wanted.shape)
+    theta, unravel = ravel_pytree(start)
+
+    @jax.jit
+    def residual(theta):
+        gradient = jax.vmap(jax.grad(network, 1), (None, 0))(unravel(theta), jnp.asarray(w))
+        return (gradient - wanted).ravel()
+
+    oracle = scipy.optimize.least_squares(
+        residual, theta, jac=jax.jit(jax.jacfwd(residual)), method="lm", xtol=1e-14, ftol=1e-14
+    )
+    result = levenberg_marquardt(network, start, w, wanted, validation=(w, wanted))
+    np.testing.assert_allclose(result.train_rms**2, 2 * oracle.cost / wanted.size, rtol=1e-6)
+
+
+def test_training_error_falls_at_every_iteration_whatever_the_chunk():
+    history = []
+    whole = fit_pendulum(on_progress=lambda state: history.append(state.train_rms), chunk=1_000)
+    assert len(history) == 12
+    assert np.all(np.diff(history) < 0)
+    assert whole.train_rms < 1e-2
+    np.testing.assert_allclose(fit_pendulum().train_rms, whole.train_rms, rtol=1e-4)
+
+
+def test_the_best_parameters_on_validation_are_returned():
+    states = []
+    w, wanted = (a[:12] for a in TRAINING)  # 24 numbers, 52 parameters: overfits the noise
+    wanted = wanted + 0.3 * np.random.default_rng(6).standard_normal(wanted.shape)
+    result = levenberg_marquardt(
+        network,
+        network_params(2, 13),
+        w,
+        wanted,
+        validation=VALIDATION,
+        max_iterations=15,
+        on_progress=states.append,
+    )
+    best = min(states, key=lambda state: state.validation_rms)
+    assert best.iteration < result.iterations
+    assert result.validation_rms == best.validation_rms
+    np.testing.assert_array_equal(ravel_pytree(result.params)[0], best.theta)
+
+
+def test_resuming_is_bit_identical_to_never_having_stopped():
+    states = []
+    whole = fit_pendulum(checkpoint=states.append)
+    resumed = fit_pendulum(resume=states[4])
+    assert resumed.iterations == whole.iterations == 12
+    assert (resumed.train_rms, resumed.validation_rms) == (whole.train_rms, whole.validation_rms)
+    for a, b in zip(jax.tree.leaves(whole.params), jax.tree.leaves(resumed.params), strict=True):
+        np.testing.assert_array_equal(a, b)
+    again = fit_pendulum(resume=states[-1])
+    assert again.iterations == 12
+    assert again.seconds == states[-1].seconds
+
+
+def test_stops_at_the_target_and_on_time():
+    result = fit_pendulum(target_rms=0.05)
+    assert result.stopped_because == "target"
+    assert result.validation_rms <= 0.05
+    assert result.iterations < 12
+    result = fit_pendulum(max_seconds=0.0)
+    assert (result.stopped_because, result.iterations) == ("seconds", 0)
+
+
+def test_a_step_into_non_finite_values_is_rejected():
+    """S = −log(b) w: the undamped step from b = 1 overshoots to b < 0, where S is NaN."""
+
+    def scalar(params, w):
+        return -jnp.log(params) @ w
+
+    w = np.zeros((3, 2))
+    wanted = np.full((3, 2), 6.0)
+    result = levenberg_marquardt(scalar, jnp.ones(2), w, wanted, validation=(w, wanted))
+    assert result.train_rms < 1e-10
+    np.testing.assert_allclose(result.params, np.exp(-6.0), rtol=1e-9)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("where", range(4))
+def test_non_finite_data_are_refused_by_name(bad, where):
+    data = [a.copy() for a in (*TRAINING, *VALIDATION)]
+    data[where][3, 1] = bad
+    names = (r"w", r"wanted", r"the validation's w", r"the validation's wanted")
+    with pytest.raises(ValueError, match=rf"^{names[where]} has entries that are NaN or infinite"):
+        levenberg_marquardt(network, network_params(0, 3), *data[:2], validation=tuple(data[2:]))
+
+
+def test_other_bad_input_is_refused():
+    params = network_params(0, 3)
+    w, wanted = TRAINING
+    single = jax.tree.map(lambda a: a.astype(jnp.float32), params)
+    with pytest.raises(TypeError, match=r"params must be float64, not float32"):
+        levenberg_marquardt(network, single, w, wanted, validation=VALIDATION)
+    with pytest.raises(ValueError, match=r"must be \(N, 2d\)"):
+        levenberg_marquardt(network, params, w, wanted[:-1], validation=VALIDATION)
+
+    def imaginary(params, w):
+        return jnp.sqrt(-w @ w) * params["outer"][0]
+
+    with pytest.raises(ValueError, match=r"not finite on the training pairs"):
+        levenberg_marquardt(imaginary, params, w, wanted, validation=VALIDATION)
