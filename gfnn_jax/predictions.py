@@ -36,15 +36,16 @@ _ASSEMBLY_BYTES = 64 * 2**20
 
 class PredictionWriter:
     """Writes one prediction file: ``trajectories`` (B, S, 2d), ``status`` (B,), ``left_at`` (B,),
-    ``steps`` (S,) and ``dt``, all float64 or int64.
+    ``steps`` (S,) and ``dt``, all float64 or int64, and ``job``, a digest of what was asked for.
 
     out:       the ``.npz`` to write; ``OUT.partial`` holds the chunks until `finish`.
     shape:     (B, 2d).
-    steps:     (S,) the step numbers of the saved states, 0 first.
+    num_steps, save_every: N and K; saved are the S = 1 + N // K states of steps 0, K, 2K, ...
     dt:        the time step of the map.
     identity:  a JSON-able dict that says which job this is (digests of the model and of the initial
                states, say): a job is resumed only if all of it agrees.
-    resume:    go on with ``OUT.partial`` where there is one; else start.
+    resume:    go on with ``OUT.partial`` where there is one; else start. Where ``out`` is this very
+               job, done, ``finished`` is set and there is nothing left to do.
     overwrite: replace an existing output, and discard an unfinished one.
 
     After construction ``saved`` is the number of states per lane already on disk, and ``carry``
@@ -60,7 +61,8 @@ class PredictionWriter:
         out,
         *,
         shape: tuple[int, int],
-        steps: Any,
+        num_steps: int,
+        save_every: int = 1,
         dt: float,
         identity: dict[str, Any],
         resume: bool = False,
@@ -68,7 +70,7 @@ class PredictionWriter:
     ):
         self.out = Path(out)
         self.partial = self.out.with_name(self.out.name + ".partial")
-        self.steps = np.asarray(steps, dtype=np.int64)
+        self.steps = range(0, num_steps + 1, save_every)
         self.dt = float(dt)
         self.lanes, self.width = shape
         self.saved = 0
@@ -78,13 +80,20 @@ class PredictionWriter:
             **identity,
             "format": _FORMAT,
             "shape": [self.lanes, len(self.steps), self.width],
-            "steps": hashlib.sha256(self.steps.data).hexdigest(),
+            "num_steps": num_steps,
+            "save_every": save_every,
             "dt": self.dt,
         }
         self._job = json.loads(json.dumps(job))  # as it will be read back
         if self.out.suffix != ".npz":
             raise InputError(f"{out}: a prediction is written as .npz")
-        if self.partial.exists() and resume and self._read_journal():
+        self.finished = False
+        if resume and self._journal.exists() and self._read_journal():
+            return
+        if resume and not overwrite and self._is_done():
+            self.finished, self.saved = True, self.total
+            with failures_as_work_errors(self.out):
+                self._discard()  # what a kill at the very end may have left
             return
         ensure_new(self.out, overwrite)
         if self.partial.exists() and not (overwrite or resume):
@@ -152,16 +161,32 @@ class PredictionWriter:
             for name, array in (
                 ("status", status),
                 ("left_at", left_at),
-                ("steps", self.steps),
                 ("dt", np.asarray(self.dt)),
+                ("job", np.asarray(self._job_digest)),
             ):
                 with _member(archive, name, array.shape, array.dtype) as member:
                     member.write(array.tobytes())
+            with _member(archive, "steps", (self.total,), np.int64) as member:
+                for first in range(0, self.total, 2**20):
+                    part = self.steps[first : first + 2**20]
+                    member.write(np.arange(part.start, part.stop, part.step, dtype=np.int64).data)
+        self.finished = True
         self._discard()
 
+    @property
+    def _job_digest(self) -> str:
+        return hashlib.sha256(json.dumps(self._job, sort_keys=True).encode()).hexdigest()
+
+    def _is_done(self) -> bool:
+        try:
+            with np.load(self.out, allow_pickle=False) as file:
+                return str(file["job"]) == self._job_digest
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return False
+
     def _discard(self) -> None:
-        """Remove the folder of chunks, and nothing in it that is not ours."""
-        for path in [*self.partial.glob("*.chunk"), self._journal]:
+        """Remove the folder of chunks, the journal first, and nothing in it that is not ours."""
+        for path in [self._journal, *self.partial.glob("*.chunk")]:
             path.unlink(missing_ok=True)
         if self.partial.exists():
             self.partial.rmdir()
@@ -196,7 +221,7 @@ class PredictionWriter:
 
     def _read_journal(self) -> bool:
         """Take up the chunks that are whole; False if the job's first line was never written."""
-        lines = self._journal.read_bytes().splitlines() if self._journal.exists() else []
+        lines = self._journal.read_bytes().splitlines()
         try:
             job = json.loads(lines[0])["job"]
         except (IndexError, KeyError, TypeError, ValueError):

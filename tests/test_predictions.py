@@ -1,6 +1,5 @@
 """The prediction writer: whatever interrupts it, the finished file is the same, bit for bit."""
 
-import os
 import random
 import resource
 import signal
@@ -28,7 +27,9 @@ STATUS, LEFT_AT = np.array([0, 1, 2]), np.array([-1, 7, 9])
 
 def writer(out, **options):
     options = {"identity": {"model": "m", "initial": "z0"}, **options}
-    return PredictionWriter(out, shape=(LANES, WIDTH), steps=STEPS, dt=0.1, **options)
+    return PredictionWriter(
+        out, shape=(LANES, WIDTH), num_steps=99, save_every=5, dt=0.1, **options
+    )
 
 
 def append(job, count):
@@ -127,11 +128,23 @@ def test_damaged_journal(tmp_path, whole, cut):
         assert complete(out, resume=True, overwrite=True) == whole
 
 
+def test_killed_at_the_very_end(tmp_path, whole):
+    """The output is there and its chunks are half removed: nothing is left to do but tidy up."""
+    out = tmp_path / "whole.npz"
+    (tmp_path / "whole.npz.partial").mkdir()
+    (tmp_path / "whole.npz.partial" / "000000000000-000000000006.chunk").write_bytes(b"left")
+    job = writer(out, resume=True)
+    assert (job.finished, job.saved) == (True, job.total)
+    assert [p.name for p in tmp_path.iterdir()] == ["whole.npz"]
+    assert out.read_bytes() == whole
+
+
 def test_refusals(tmp_path, whole):
     out = tmp_path / "whole.npz"
-    for resume in (False, True):
+    for options in ({}, {"resume": True, "identity": {"model": "other"}}):
         with pytest.raises(InputError, match="exists already"):
-            writer(out, resume=resume)
+            writer(out, **options)
+    assert writer(out, resume=True).finished
     assert out.read_bytes() == whole
     with pytest.raises(InputError, match=r"written as \.npz"):
         writer(tmp_path / "p.txt")
@@ -169,7 +182,7 @@ def test_full_disk(tmp_path, whole, when):
     assert out.read_bytes() == whole
     assert sorted(p.name for p in tmp_path.iterdir()) == ["whole.npz", "whole.npz.partial"]
     assert writer(out, resume=True).saved == (6 if when == "append" else 20)
-    assert complete(out, resume=True) == whole
+    assert complete(out, resume=True, overwrite=True) == whole
 
 
 def test_memory_is_bounded(tmp_path, monkeypatch):
@@ -179,7 +192,7 @@ def test_memory_is_bounded(tmp_path, monkeypatch):
         saved, chunk = 1_600_000 // lanes, 20_000 // lanes
         tracemalloc.start()
         job = PredictionWriter(
-            tmp_path / f"{lanes}.npz", shape=(lanes, 4), steps=np.arange(saved), dt=1.0, identity={}
+            tmp_path / f"{lanes}.npz", shape=(lanes, 4), num_steps=saved - 1, dt=1.0, identity={}
         )
         for start in range(0, saved, chunk):
             part = np.broadcast_to(np.arange(start, start + chunk)[:, None], (lanes, chunk, 4))
@@ -187,8 +200,7 @@ def test_memory_is_bounded(tmp_path, monkeypatch):
         job.finish(np.zeros(lanes), np.full(lanes, -1))
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        # The saved step numbers alone are 8 bytes a state.
-        assert peak < 8e6 + 3 * 8 * saved
+        assert peak < 10e6
         with np.load(tmp_path / f"{lanes}.npz") as file:
             assert np.array_equal(file["trajectories"][-1, :, 0], np.arange(saved))
 
@@ -199,9 +211,8 @@ WORKER = textwrap.dedent(
     import numpy as np
     from gfnn_jax.predictions import PredictionWriter
 
-    steps = np.arange(400)
     job = PredictionWriter(
-        sys.argv[1], shape=(50, 4), steps=steps, dt=0.1, identity={"model": "m"}, resume=True
+        sys.argv[1], shape=(50, 4), num_steps=399, dt=0.1, identity={"model": "m"}, resume=True
     )
     z = np.ones((50, 4)) if job.carry is None else job.carry["z"]
     print("started", flush=True)
@@ -211,7 +222,8 @@ WORKER = textwrap.dedent(
             states.append(z)
             z = z * 1.01 + np.sin(z)
         job.append(np.stack(states, axis=1), {"z": z})
-    job.finish(np.zeros(50), np.full(50, -1))
+    if not job.finished:
+        job.finish(np.zeros(50), np.full(50, -1))
     """
 )
 
@@ -233,8 +245,6 @@ def run_killed_and_resumed(out, kills, seed):
         done += code == -signal.SIGKILL
         if code == 0:
             return done
-        if os.path.exists(out):  # killed after the output was there: the partial folder remains
-            assert out.with_name(out.name + ".partial").exists()
     raise AssertionError("never finished")
 
 
