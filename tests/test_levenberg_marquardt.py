@@ -7,7 +7,7 @@ import pytest
 import scipy.optimize
 from jax.flatten_util import ravel_pytree
 
-from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
+from gfnn_jax.fitting.levenberg_marquardt import _compiled, levenberg_marquardt
 
 
 def network(params, w):
@@ -141,6 +141,24 @@ def test_a_step_into_non_finite_values_is_rejected():
     result = levenberg_marquardt(scalar, jnp.ones(2), w, wanted, validation=(w, wanted))
     assert result.train_rms < 1e-10
     np.testing.assert_allclose(result.params, np.exp(-6.0), rtol=1e-9)
+
+
+def test_memory_is_bounded_by_the_chunk_and_not_by_the_pairs():
+    theta, unravel = ravel_pytree(network_params(0, 50))
+    w, wanted = (jnp.tile(jnp.asarray(a), (10, 1)) for a in TRAINING)
+    chunk, num_parameters = 100, theta.size
+    linearize, attempt, _ = _compiled(
+        lambda theta, w: network(unravel(theta), w), theta, w, wanted, w, wanted, chunk
+    )
+    jacobian, matrix = 2 * chunk * num_parameters, num_parameters**2
+    assert len(w) * 2 * num_parameters > 4 * (jacobian + matrix)  # whole, it would not fit below
+
+    def numbers(compiled):
+        memory = compiled.memory_analysis()
+        return (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 8
+
+    assert numbers(linearize) < 1.3 * (2 * matrix + 2 * jacobian)
+    assert numbers(attempt) < 1.3 * (3 * matrix + jacobian)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -16,7 +16,8 @@ evaluations, no second Jacobian, and saves most of the iterations.
 Normal equations square the condition number of A. Damping makes that harmless here, where a step
 needs only to lead downhill, but it does take float64: anything less is refused.
 
-Memory: A is never held whole. The peak is about 3 P² + 3 · 2d · chunk · P numbers.
+Memory: A is never held whole. The peak is 2 P² + 2 · 2d · chunk · P numbers in linearising and 3 P²
+in a trial, whatever N; each also keeps a few activations of S for every pair of a chunk.
 """
 
 from __future__ import annotations
@@ -104,7 +105,8 @@ def levenberg_marquardt(
     w, wanted:   (N, 2d) each, as a chart makes them from pairs of states.
     validation:  (w, wanted) of pairs kept apart; the parameters that fit them best are returned.
     max_iterations, max_seconds: when to stop; seconds exclude compilation. Runs that stop by
-                 iterations repeat to the last bit on one machine; a clock does not.
+                 iterations repeat to the last bit on one machine with the same number of threads;
+                 the clock does not.
     target_rms:  stop once the validation RMS is as small.
     patience:    stop when train_rms fell by less than 1 % in so many iterations.
     chunk:       at most so many pairs have their Jacobian in memory at once.
