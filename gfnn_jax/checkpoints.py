@@ -208,7 +208,7 @@ def _verify_files(folder: Path) -> None:
     """Every file listed in SHA256SUMS is there and unchanged. Files beside them are not ours."""
     try:
         listed = (folder / _SUMS).read_text(encoding="utf-8").splitlines()
-        sums = dict(reversed(line.split("  ", 1)) for line in listed)  # pyright: ignore
+        sums = {name: digest for digest, name in (line.split("  ", 1) for line in listed)}
     except (OSError, ValueError) as error:
         raise Damaged(f"{folder}: {_SUMS} is missing or damaged") from error
     if _JSON not in sums:

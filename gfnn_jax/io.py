@@ -420,7 +420,9 @@ def _open_npz(path: Path, stream, dt, initial: bool) -> _Source:
             f"{path}: expected either the arrays z0 and z1, or trajectories; found "
             f"{', '.join(names[:8]) or 'none'}{', ...' * (len(names) > 8)}"
         )
-    found = _check_dt(member("dt").whole(), f"{path}: dt") if "dt" in names else None
+    found = None
+    if "dt" in names and not initial:
+        found = _check_dt(member("dt").whole(), f"{path}: dt")
     trajectories = None if is_pairs else member("trajectories")
     if trajectories is not None and found is not None and "steps" in names:
         found *= _stride(path, trajectories.shape, member("steps").whole())

@@ -47,6 +47,12 @@ def assert_same(a, b):
         assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
 
 
+def latest(saved, like=None):
+    found = saved.latest(like)
+    assert found is not None
+    return found
+
+
 @pytest.fixture
 def model(tmp_path):
     save_model(tmp_path / "model", ARRAYS, DESCRIPTION)
@@ -187,9 +193,8 @@ def test_checkpoints_round_trip(tmp_path):
     for step in (5, 10, 15):
         saved.save(step, training_tree(3))
     assert sorted(os.listdir(tmp_path / "c")) == ["step_000000000010", "step_000000000015"]
-    step, tree = TrainingCheckpoints(tmp_path / "c", {"seed": 1, "data": "d"}).latest(
-        training_tree(3)
-    )
+    again = TrainingCheckpoints(tmp_path / "c", {"seed": 1, "data": "d"})
+    step, tree = latest(again, training_tree(3))
     assert step == 15
     assert_same(tree, training_tree(3))
     assert isinstance(tree["params"]["w"], jax.Array)
@@ -199,7 +204,7 @@ def test_checkpoints_round_trip(tmp_path):
         saved.latest()
     plain = {"a": (1, [2.5, np.ones(2)]), "b": None}
     saved.save(20, plain)
-    assert_same(saved.latest()[1], plain)
+    assert_same(latest(saved)[1], plain)
 
 
 def test_checkpoints_refuse_another_training(tmp_path):
@@ -228,7 +233,7 @@ def test_damaged_checkpoint_is_passed_over(tmp_path):
         whole = path.read_bytes()
         path.write_bytes(bytes([whole[0] ^ 1]) + whole[1:])
         with pytest.warns(UserWarning, match="the checkpoint before it is used"):
-            step, tree = saved.latest()
+            step, tree = latest(saved)
         assert (step, tree["w"][0]) == (1, 1)
         path.write_bytes(whole)
     (newest / "model.json").unlink()
@@ -237,7 +242,7 @@ def test_damaged_checkpoint_is_passed_over(tmp_path):
         saved.save(step, {"w": np.full(3, 10 * step)})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert saved.latest()[1]["w"][0] == 20
+        assert latest(saved)[1]["w"][0] == 20
 
 
 def test_save_is_quick(tmp_path):
@@ -282,6 +287,7 @@ def test_sigkill(tmp_path, kills):
             process = subprocess.Popen(
                 [sys.executable, "-c", WORKER, str(folder)], stdout=subprocess.PIPE, text=True
             )
+            assert process.stdout is not None
             assert process.stdout.readline() == "started\n"
             if killed < kills:
                 time.sleep(rng.uniform(0, 2.0))
@@ -296,7 +302,7 @@ def test_sigkill(tmp_path, kills):
             w, b = w + 0.01 * np.sin(w), b + step
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            step, tree = TrainingCheckpoints(folder, {}).latest()
+            step, tree = latest(TrainingCheckpoints(folder, {}))
         assert step == 30
         assert_same(tree, {"w": w, "b": b})
         assert len(os.listdir(folder)) == 2

@@ -65,6 +65,7 @@ def test_any_chunks_and_interruptions(tmp_path, whole, plan):
             saved = job.saved
             job = writer(out, resume=True)
             assert job.saved == saved
+            assert job.carry is not None
             assert np.array_equal(job.carry["z"], STATES[:, saved - 1])
             assert job.carry["step"] == STEPS[saved - 1]
     if job.saved < job.total:
@@ -236,6 +237,7 @@ def run_killed_and_resumed(out, kills, seed):
         process = subprocess.Popen(
             [sys.executable, "-c", WORKER, str(out)], stdout=subprocess.PIPE, text=True
         )
+        assert process.stdout is not None
         assert process.stdout.readline() == "started\n"
         if done < kills:
             time.sleep(rng.uniform(0, 0.03))
