@@ -226,7 +226,7 @@ def _describe(name: str, leaf: Any) -> tuple[dict[str, Any], np.ndarray | None]:
     """What ``model.json`` says of a leaf, and the array to store."""
     if isinstance(leaf, (bool, int, float)) and not isinstance(leaf, np.generic):
         return {"name": name, "kind": "number", "value": leaf}, None
-    if isinstance(leaf, jax.Array) and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+    if isinstance(leaf, jax.Array) and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         raise TypeError(f"{name}: save jax.random.key_data of a key")
     if not isinstance(leaf, (jax.Array, np.ndarray, np.generic)):
         raise TypeError(f"{name}: a leaf must be an array or a number, got {type(leaf).__name__}")
