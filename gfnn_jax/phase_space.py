@@ -15,13 +15,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+# The axis of length 2d is called phase: jaxtyping would read "2d" as an expression.
 Scalar = Float[Array, ""]
-State = Float[Array, "2d"]
-States = Float[Array, "batch 2d"]
+State = Float[Array, "phase"]
+States = Float[Array, "batch phase"]
 
 
 def require_x64(what: str) -> None:
-    """Raises RuntimeError, naming ``what`` needs it, where JAX would silently compute in float32."""
+    """Raises RuntimeError where JAX would silently compute ``what`` in float32."""
     if not jax.config.jax_enable_x64:
         raise RuntimeError(
             f"{what} needs float64: call jax.config.update('jax_enable_x64', True) first"
@@ -35,19 +36,19 @@ def split(z):
 
 
 def apply_j(g):
-    """J g for gradients g of shape (..., 2d), with J = [[0, I], [-I, 0]]: (g_q, g_p) -> (g_p, -g_q)."""
+    """J g for gradients g of shape (..., 2d): (g_q, g_p) -> (g_p, -g_q)."""
     dim = g.shape[-1] // 2
     return jnp.concatenate([g[..., dim:], -g[..., :dim]], axis=-1)
 
 
-def symplectic_form(dim: int, dtype: Any = float) -> Float[Array, "2d 2d"]:
+def symplectic_form(dim: int, dtype: Any = float) -> Float[Array, "phase phase"]:
     """The matrix J of shape (2d, 2d)."""
     zero, one = jnp.zeros((dim, dim), dtype), jnp.eye(dim, dtype=dtype)
     return jnp.block([[zero, one], [-one, zero]])
 
 
 def symplecticity_defect(
-    jacobian: Float[Array, "*batch 2d 2d"], scale: Float[Array, "2d"] | None = None
+    jacobian: Float[Array, "*batch phase phase"], scale: State | None = None
 ) -> Float[Array, "*batch"]:
     """Largest entry of Mᵀ J M − J in magnitude, for Jacobians M of shape (..., 2d, 2d).
 
@@ -68,7 +69,7 @@ def symplecticity_defect(
 
 
 def hamiltonian_vector_field(hamiltonian: Callable) -> Callable:
-    """``field(z, t=0.0)`` = J ∇H(z, t) of shape (2d,), the right-hand side of the paper's eq. (1)."""
+    """``field(z, t=0.0)`` = J ∇H(z, t) of shape (2d,), the right-hand side of the paper's (1)."""
 
     def field(z, t=0.0):
         return apply_j(jax.grad(hamiltonian)(z, t))

@@ -1,4 +1,4 @@
-"""The scenes: the systems that come with the package, each a `Scene`, found by name or by function."""
+"""The scenes that come with the package, each a `Scene`, by function and by name."""
 
 from __future__ import annotations
 

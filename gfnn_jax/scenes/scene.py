@@ -31,7 +31,7 @@ class AroundOrbit:
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """A system as a user meets it. Exactly one of ``flow``, ``step``, ``hamiltonian`` is the reference.
+    """A system as a user meets it; one of ``flow``, ``step``, ``hamiltonian`` is its reference.
 
     They are taken in that order: an exact flow before an exact map before a numerical integration
     (a Hamiltonian may be given beside an exact flow; it is then an invariant, not the reference).
@@ -50,7 +50,7 @@ class Scene:
                    where it is not y itself: invariants of a symmetry, inverse distances.
     reversor:      signs (2d,) of a linear reversor ρ in the inner coordinates (ρᵀJρ = −J and
                    φ∘ρ∘φ = ρ, φ the map), where there is one; it halves a midpoint basis.
-    regular:       True where the orbits are regular, so that an error growth exponent means something.
+    regular:       True where the orbits are regular, so that error growth has an exponent.
     """
 
     name: str

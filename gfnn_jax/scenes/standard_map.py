@@ -1,4 +1,4 @@
-"""Chirikov's standard map: a symplectic map with no differential equation behind it (section 4.4)."""
+"""Chirikov's standard map: a symplectic map without an equation of motion (paper, section 4.4)."""
 
 from __future__ import annotations
 

@@ -33,8 +33,8 @@ def kepler_flow(z: State, t) -> State:
         n t = x − (1 − r/a) sin x + (q·p/√a) (1 − cos x),    n = a^(−3/2),
 
     which stays regular on a circle. Whole revolutions are removed first; x is found by Laguerre's
-    iteration as in Conway (Celest. Mech. 39, 1986), and the state follows by Gauss' f and g, written
-    so that nothing cancels. Accurate to roundoff times n t / (1 − e).
+    iteration (Conway, Celest. Mech. 39, 1986), and the state follows by Gauss' f and g, written so
+    that nothing cancels. Accurate to roundoff times n t / (1 − e).
     """
     q, p = split(z)
     r = jnp.sqrt(q @ q)

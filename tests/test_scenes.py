@@ -1,0 +1,242 @@
+"""The scenes: exact solutions, laws of data, symmetries, and orbits that are what they claim to be."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+from gfnn_jax import scenes
+from gfnn_jax import trajectories as tr
+from gfnn_jax.phase_space import hamiltonian_vector_field, symplectic_form, symplecticity_defect
+from gfnn_jax.scenes.two_body import angular_momentum, hamiltonian, kepler_flow
+
+FLOW = jax.jit(jax.vmap(kepler_flow))
+
+
+def kepler_state(a, e, mean_anomaly):
+    """Textbook oracle: E − e sin E = M by bracketing, periapsis on the positive x axis."""
+    turns = round(mean_anomaly / (2 * math.pi))
+    m = mean_anomaly - 2 * math.pi * turns
+    ecc = brentq(lambda x: x - e * math.sin(x) - m, m - 1, m + 1, xtol=1e-16, rtol=1e-15)
+    b, rate = math.sqrt(1 - e**2), a**-1.5 / (1 - e * math.cos(ecc))
+    return np.array(
+        [
+            a * (math.cos(ecc) - e),
+            a * b * math.sin(ecc),
+            -a * rate * math.sin(ecc),
+            a * b * rate * math.cos(ecc),
+        ]
+    )
+
+
+@given(
+    st.floats(0.1, 10),
+    st.floats(0, 0.95),
+    st.floats(-math.pi, math.pi),
+    st.floats(-20, 20),
+)
+@settings(max_examples=300, deadline=None)
+def test_kepler_flow_is_the_textbook_solution(a, e, mean_anomaly, phase):
+    z0 = kepler_state(a, e, mean_anomaly)
+    z = np.asarray(FLOW(jnp.array([z0]), jnp.array([phase * a**1.5]))[0])
+    scale = np.array([a, a, a**-0.5, a**-0.5]) / (1 - e) ** 2
+    np.testing.assert_array_less(
+        np.abs(z - kepler_state(a, e, mean_anomaly + phase)), 1e-13 * scale
+    )
+
+
+def test_kepler_flow_on_circles_whole_periods_and_long_times():
+    circle = jnp.array([[1.0, 0.0, 0.0, 1.0]])
+    for t in (0.0, 0.1, math.pi, -2.5, 1e4):
+        exact = [math.cos(t), math.sin(t), -math.sin(t), math.cos(t)]
+        atol = 1e-15 * max(1.0, 2 * abs(t))
+        np.testing.assert_allclose(FLOW(circle, jnp.array([t]))[0], exact, atol=atol, rtol=0)
+    z0 = jnp.array([kepler_state(1.0, 0.9, 0.3)])
+    z = FLOW(z0, jnp.array([2 * math.pi * 1000]))
+    np.testing.assert_allclose(z, z0, atol=1e-9, rtol=0)
+    for invariant in (hamiltonian, angular_momentum):
+        np.testing.assert_allclose(invariant(z[0]), invariant(z0[0]), rtol=3e-14)
+    # Circular orbits are an ordinary point of the derivatives too.
+    jacobian = jax.jacfwd(kepler_flow)(circle[0], 0.7)
+    assert symplecticity_defect(jacobian) < 1e-14
+    np.testing.assert_allclose(jax.jacrev(kepler_flow)(circle[0], 0.7), jacobian, atol=1e-14)
+    assert np.isnan(kepler_flow(jnp.array([1.0, 0.0, 0.0, 1.5]), 0.1)).all()  # unbound
+
+
+def test_two_body_law():
+    """Uniform in a, e, mean anomaly and direction of the periapsis; counterclockwise."""
+    q, p = np.split(
+        np.asarray(tr.sample_states(scenes.two_body(), 20_000, jax.random.key(0))), 2, 1
+    )
+    r = np.linalg.norm(q, axis=1)
+    a = 1 / (2 / r - (p**2).sum(1))
+    momentum = q[:, 0] * p[:, 1] - q[:, 1] * p[:, 0]
+    assert (momentum > 0).all()
+    laplace = np.stack([p[:, 1], -p[:, 0]], 1) * momentum[:, None] - q / r[:, None]
+    e = np.linalg.norm(laplace, axis=1)
+    ecc = np.arctan2((q * p).sum(1) / np.sqrt(a), 1 - r / a)
+    mean_anomaly = (ecc - e * np.sin(ecc)) % (2 * np.pi)
+    periapsis = np.arctan2(laplace[:, 1], laplace[:, 0]) % (2 * np.pi)
+    for value, low, high in (
+        (a, 0.8, 1.2),
+        (e, 0.0, 0.05),
+        (mean_anomaly, 0, 2 * np.pi),
+        (periapsis, 0, 2 * np.pi),
+    ):
+        assert low - 1e-12 <= value.min()
+        assert value.max() <= high + 1e-12
+        quantiles = (np.quantile(value, [0.1, 0.3, 0.5, 0.7, 0.9]) - low) / (high - low)
+        np.testing.assert_allclose(quantiles, [0.1, 0.3, 0.5, 0.7, 0.9], atol=0.015)
+
+
+@pytest.mark.parametrize(
+    "name", ["two-body", "henon-heiles-regular", "henon-heiles-printed", "pcr3bp"]
+)
+def test_reversor(name):
+    """ρᵀJρ = −J, and H∘ρ = H in the inner coordinates, so that φ∘ρ∘φ = ρ; features keep or flip."""
+    scene = scenes.make(name)
+    rho = jnp.array(scene.reversor, jnp.float64)
+    form = symplectic_form(scene.dim)
+    np.testing.assert_array_equal(form * jnp.outer(rho, rho), -form)
+    y = jax.vmap(scene.coordinates.forward)(tr.sample_states(scene, 20, jax.random.key(1)))
+    energy = jax.vmap(lambda y: scene.hamiltonian(scene.coordinates.inverse(y)))
+    np.testing.assert_allclose(energy(y * rho[None]), energy(y), atol=1e-14, rtol=0)
+    if scene.features is not None:
+        there, back = (jax.vmap(scene.features)(v) for v in (y, y * rho[None]))
+        np.testing.assert_allclose(jnp.abs(there), jnp.abs(back), atol=1e-14, rtol=0)
+
+
+def test_polar_coordinates_are_canonical():
+    scene = scenes.two_body()
+    z = tr.sample_states(scene, 50, jax.random.key(2))
+    jacobian = jax.vmap(jax.jacfwd(scene.coordinates.forward))(z)
+    assert symplecticity_defect(jacobian).max() < 1e-14
+    y = jax.vmap(scene.coordinates.forward)(z)
+    np.testing.assert_allclose(jax.vmap(scene.coordinates.inverse)(y), z, atol=1e-15, rtol=0)
+    np.testing.assert_allclose(y[:, 3], jax.vmap(angular_momentum)(z), atol=1e-15, rtol=0)
+
+
+def test_standard_map_is_the_papers_and_preserves_area():
+    step = scenes.standard_map(k=1.2).step
+    z = jnp.array([0.7, 2.0])
+    p = 2.0 + 1.2 * math.sin(0.7)
+    np.testing.assert_array_equal(step(z), [0.7 + p, p])
+    states = jax.random.uniform(jax.random.key(3), (100, 2), jnp.float64, 0, 7)
+    assert symplecticity_defect(jax.vmap(jax.jacfwd(step))(states)).max() < 1e-15
+
+
+def test_the_regular_standard_map_orbit_jumps_between_two_islands():
+    scene = scenes.standard_map()
+    orbit = tr.reference_trajectories(scene, jnp.array([scene.sampling.start]), 10_000)[0]
+    theta, p = np.asarray(orbit).T
+    np.testing.assert_array_less(np.abs(p - np.pi), 0.6)
+    assert (np.cos(theta[::2]) > 0.4).all()
+    assert (np.cos(theta[1::2]) < -0.4).all()
+
+
+def test_hamiltonians():
+    """Values worked out by hand, the critical energies, and the printed form's second invariant."""
+    z = jnp.array([0.1, 0.2, 0.3, 0.4])
+    base = (0.09 + 0.16) / 2 + (0.01 + 0.04) / 2 + 0.01 * 0.2
+    for printed, sign in ((False, -1), (True, 1)):
+        energy = scenes.henon_heiles(printed=printed).hamiltonian(z)
+        np.testing.assert_allclose(energy, base + sign * 0.008 / 3, rtol=1e-15)
+    saddle = jnp.array([0.0, 1.0, 0.0, 0.0])
+    np.testing.assert_allclose(scenes.henon_heiles().hamiltonian(saddle), 1 / 6, rtol=1e-15)
+    field = hamiltonian_vector_field(scenes.henon_heiles().hamiltonian)
+    np.testing.assert_allclose(field(saddle), 0, atol=1e-15)
+    # L4 is an equilibrium of the restricted three-body problem.
+    mu, height = 0.012150585, math.sqrt(3) / 2
+    l4 = jnp.array([0.5 - mu, height, -height, 0.5 - mu])
+    np.testing.assert_allclose(
+        hamiltonian_vector_field(scenes.pcr3bp().hamiltonian)(l4), 0, atol=1e-15
+    )
+    for energy in (1e-6, 1 / 12, 0.15, 1 / 6):
+        scene = scenes.henon_heiles(energy=energy)
+        start = jnp.array(scene.sampling.start)
+        np.testing.assert_allclose(scene.hamiltonian(start), energy, rtol=1e-14)
+
+
+LYAPUNOV_TIME = 2_000
+
+
+def exponents(scene, states):
+    """Lyapunov exponents up to LYAPUNOV_TIME, by the tangent map renormalised at every step."""
+    if scene.step is not None:
+        step, h = scene.step, 1.0
+    else:
+        field, h = (
+            hamiltonian_vector_field(scene.hamiltonian),
+            0.02 if scene.name == "pcr3bp" else 0.1,
+        )
+
+        def step(z):
+            k1 = field(z)
+            k2 = field(z + h / 2 * k1)
+            k3 = field(z + h / 2 * k2)
+            return z + h / 6 * (k1 + 2 * k2 + 2 * k3 + field(z + h * k3))
+
+    def advance(carry, _):
+        z, v, growth = carry
+        z, v = jax.jvp(step, (z,), (v,))
+        norm = jnp.linalg.norm(v)
+        return (z, v / norm, growth + jnp.log(norm)), None
+
+    def one(z):
+        start = (z, jnp.ones_like(z) / math.sqrt(z.size), 0.0)
+        return jax.lax.scan(advance, start, None, length=int(LYAPUNOV_TIME / h))[0][2]
+
+    return np.asarray(jax.jit(jax.vmap(one))(states)) / LYAPUNOV_TIME
+
+
+@pytest.mark.parametrize("name", scenes.names())
+def test_orbits_are_regular_or_chaotic_as_they_should_be(name):
+    """An exponent that falls as log(t)/t is regular: by t = 2,000 far below any chaotic one."""
+    scene = scenes.make(name)
+    if name == "pcr3bp":  # the orbit is regular; about one in twenty of its neighbours is not
+        assert exponents(scene, jnp.array([scene.sampling.start]))[0] < 0.008
+        found = exponents(scene, tr.sample_states(scene, 60, jax.random.key(4)))
+        assert np.median(found) < 0.008
+        assert np.mean(~(found < 0.02)) < 0.15
+    elif scene.regular:
+        found = exponents(scene, tr.sample_states(scene, 60, jax.random.key(4)))
+        assert np.quantile(found, 0.95) < 0.008
+    else:
+        found = exponents(scene, tr.sample_test_states(scene, 60, jax.random.key(4)))
+        assert found.min() > 0.05
+
+
+def test_chaotic_henon_heiles_stays_in_the_well():
+    scene = scenes.henon_heiles(energy=1 / 6)
+    for law in (scene.sampling, scene.test_states):
+        orbit = tr.reference_trajectories(scene, jnp.array([law.start]), 10_000)
+        assert np.abs(orbit[..., :2]).max() < 1.01
+
+
+def test_names_and_mistakes():
+    assert len(scenes.names()) == 7
+    for name in scenes.names():
+        assert scenes.make(name).name == name
+        assert "\n" not in scenes.make(name).purpose
+    assert scenes.make("two-body", dt=0.25).dt == 0.25
+    assert scenes.make("standard-map-regular", dt=1).dt == 1
+    with pytest.raises(ValueError, match=r"unknown scene 'twobody', did you mean 'two-body'\?"):
+        scenes.make("twobody")
+    with pytest.raises(ValueError, match="unknown scene 'xyz'; scenes: two-body, henon"):
+        scenes.make("xyz")
+    with pytest.raises(ValueError, match="dt = 1 only, not 0.5"):
+        scenes.make("standard-map-chaotic", dt=0.5)
+    for dt in (0.0, -1.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match="finite and > 0"):
+            scenes.make("pcr3bp", dt=dt)
+    for energy in (0.0, 0.2, math.nan):
+        with pytest.raises(ValueError, match="energy must be"):
+            scenes.henon_heiles(energy=energy)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        scenes.two_body().dt = 0.2

@@ -1,0 +1,166 @@
+"""Reference trajectories against other solutions, their errors over long times, and draws."""
+
+import dataclasses
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import gfnn_jax.trajectories as tr
+from gfnn_jax import scenes
+from gfnn_jax.phase_space import hamiltonian_vector_field
+
+INTEGRATED = ("henon-heiles-regular", "henon-heiles-printed", "pcr3bp")
+
+
+def integrated(name, **changes):
+    """The scene with its exact flow, if it has one, taken away."""
+    return dataclasses.replace(scenes.make(name), flow=None, **changes)
+
+
+@pytest.mark.parametrize("name", INTEGRATED)
+def test_flow_agrees_with_another_solver(name):
+    scene = scenes.make(name)
+    z0 = jnp.array([scene.sampling.start]) + 0.01 * jnp.arange(3.0)[:, None]
+    z = tr.reference_trajectories(scene, z0, 10)
+    field = jax.jit(hamiltonian_vector_field(scene.hamiltonian))
+    for lane in range(3):
+        other = solve_ivp(
+            lambda t, y: np.asarray(field(y)), (0, 10 * scene.dt), np.asarray(z0[lane]),
+            method="DOP853", rtol=3e-14, atol=1e-14,
+        )  # fmt: skip
+        np.testing.assert_allclose(z[lane, -1], other.y[:, -1], atol=3e-13, rtol=0)
+
+
+def test_integration_against_the_exact_kepler_solution():
+    scene = scenes.two_body()
+    z0 = tr.sample_states(scene, 10, jax.random.key(1))
+    exact = tr.reference_trajectories(scene, z0, 1000, save_every=10)
+    z = tr.reference_trajectories(integrated("two-body"), z0, 1000, save_every=10)
+    distance = np.linalg.norm(z - exact, axis=-1)
+    assert distance[:, 1].max() < 5e-14
+    assert distance.max() < 2e-11
+
+
+@pytest.mark.parametrize("name", INTEGRATED)
+def test_forward_and_back(name):
+    """The reversor turns time round: ρ φ_t ρ φ_t = 1."""
+    scene = scenes.make(name)
+    rho = jnp.array(scene.reversor, jnp.float64)
+    z0 = jnp.array([scene.sampling.start])
+    there = tr.reference_trajectories(scene, z0, 100)[:, -1]
+    back = tr.reference_trajectories(scene, there * rho[None], 100)[:, -1] * rho[None]
+    np.testing.assert_allclose(back, z0, atol=2e-12, rtol=0)
+
+
+def test_measured_error_of_the_reference():
+    z0 = jnp.array([scenes.henon_heiles().sampling.start])
+    assert 0 < tr.reference_error(scenes.henon_heiles(), z0, 1) < 2e-15
+    assert 1e-15 < tr.reference_error(scenes.henon_heiles(), z0, 1000) < 1e-11
+    # It sees a bad reference: the solver out of steps in one dt, and a chaotic orbit's growth.
+    assert np.isnan(tr.reference_error(scenes.henon_heiles(dt=5_000.0), z0, 1))
+    chaotic = scenes.henon_heiles(energy=1 / 6)
+    assert tr.reference_error(chaotic, jnp.array([chaotic.sampling.start]), 400) > 1e-6
+    start = jnp.array([scenes.standard_map().sampling.start])
+    assert 0 < tr.reference_error(scenes.standard_map(), start, 100) < 1e-11
+
+
+def test_saving_less_changes_no_state():
+    scene = scenes.henon_heiles()
+    z0 = jnp.array([scene.sampling.start])
+    every = tr.reference_trajectories(scene, z0, 12)
+    fourth = tr.reference_trajectories(scene, z0, 12, save_every=4)
+    assert every.shape == (1, 13, 4)
+    np.testing.assert_array_equal(every[:, ::4], fourth)
+
+
+def test_a_collision_is_nan_and_leaves_the_others_alone():
+    """A body released at rest falls into the centre at t = π/√8 ≈ 1.11; NaN stays NaN."""
+    scene = integrated("two-body", dt=0.3)
+    good = jnp.array([[1.0, 0.0, 0.0, 1.0], [0.0, 1.1, -0.9, 0.1]])
+    falling = jnp.array([[1.0, 0.0, 0.0, 0.0]])
+    broken = jnp.full((1, 4), jnp.nan)
+    z = tr.reference_trajectories(scene, jnp.concatenate([good, falling, broken]), 8)
+    assert np.isfinite(z[2, :4]).all()
+    assert np.isnan(z[2, 4:]).all()
+    assert np.isnan(z[3]).all()
+    alone = tr.reference_trajectories(scene, jnp.concatenate([good, good]), 8)
+    np.testing.assert_array_equal(z[:2], alone[:2])
+
+
+def test_time_dependent_hamiltonian():
+    """Forced oscillator q'' = −q + cos 2t from rest: q = (cos t − cos 2t)/3."""
+
+    def hamiltonian(z, t):
+        return (z[0] ** 2 + z[1] ** 2) / 2 - z[0] * jnp.cos(2.0 * t)
+
+    law = scenes.DrawnFrom(lambda key, num: jnp.zeros((num, 2)))
+    scene = scenes.Scene("forced", "test", 1, 0.7, law, hamiltonian=hamiltonian)
+    z = tr.reference_trajectories(scene, jnp.zeros((1, 2)), 20, save_every=2)
+    t = 1.4 * np.arange(11)
+    np.testing.assert_allclose(z[0, :, 0], (np.cos(t) - np.cos(2 * t)) / 3, atol=1e-13, rtol=0)
+
+
+@pytest.mark.parametrize("name", scenes.names())
+def test_pairs_are_the_same_bits_for_the_same_seed_and_conserve_the_invariants(name):
+    scene = scenes.make(name)
+    pairs, again, other = (tr.sample_pairs(scene, 16, jax.random.key(s)) for s in (3, 3, 4))
+    assert pairs.z0.shape == pairs.z1.shape == (16, 2 * scene.dim)
+    assert pairs.z0.dtype == pairs.z1.dtype == np.float64
+    assert pairs.dt == scene.dt
+    np.testing.assert_array_equal(pairs.z0, again.z0)
+    np.testing.assert_array_equal(pairs.z1, again.z1)
+    assert not (pairs.z0 == other.z0).any()
+    np.testing.assert_array_equal(pairs.z1, tr.reference_trajectories(scene, pairs.z0, 1)[:, 1])
+    for invariant in scene.invariants.values():
+        start, end = (jax.vmap(invariant)(z) for z in (pairs.z0, pairs.z1))
+        np.testing.assert_allclose(end, start, atol=1e-14, rtol=0)
+        assert np.ptp(start) > 1e-4
+
+
+@pytest.mark.parametrize("name", ["henon-heiles-regular", "pcr3bp", "standard-map-regular"])
+def test_spread_around_the_orbit(name):
+    """Centred Gaussian perturbations of every coordinate, of the paper's variance."""
+    scene = scenes.make(name)
+    law = dataclasses.replace(scene.sampling, num_steps=0)  # one state, so that σ is seen alone
+    z = tr.sample_states(dataclasses.replace(scene, sampling=law), 4_000, jax.random.key(6))
+    offset = z - jnp.array([law.start])
+    if scene.coordinates.angles:
+        offset = (offset + np.pi) % (2 * np.pi) - np.pi
+        assert ((z >= 0) & (z < 2 * np.pi)).all()
+    sigma = {"henon-heiles-regular": 0.01, "pcr3bp": 0.05, "standard-map-regular": 0.5}[name]
+    np.testing.assert_allclose(offset.std(axis=0), sigma, rtol=0.06)
+    np.testing.assert_allclose(offset.mean(axis=0), 0, atol=0.06 * sigma)
+    assert np.abs(np.corrcoef(offset.T) - np.eye(2 * scene.dim)).max() < 0.08
+
+
+def test_draws_run_all_along_the_orbit():
+    scene = scenes.henon_heiles(energy=1 / 6)
+    z = tr.sample_test_states(scene, 400, jax.random.key(7))
+    energy = jax.vmap(scene.hamiltonian)(z)
+    np.testing.assert_allclose(energy, 1 / 6 - 1e-3, atol=1e-12, rtol=0)
+    orbit = tr.reference_trajectories(scene, jnp.array([scene.test_states.start]), 10_000)[0]
+    index = np.array(
+        [np.flatnonzero((np.asarray(orbit) == row).all(axis=1))[0] for row in np.asarray(z)]
+    )
+    assert abs(index.mean() / 5_000 - 1) < 0.1
+    assert index.max() > 9_800
+
+
+def test_a_hundred_thousand_pairs_are_quick_and_finite():
+    pairs = tr.sample_pairs(scenes.pcr3bp(), 100_000, jax.random.key(8))
+    assert np.isfinite(pairs.z1).all()
+
+
+def test_float32_is_refused():
+    code = (
+        "import jax, gfnn_jax.trajectories as t, gfnn_jax.scenes as s;"
+        "t.sample_pairs(s.two_body(), 2, jax.random.key(0))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "needs float64: call jax.config.update('jax_enable_x64', True)" in done.stderr
