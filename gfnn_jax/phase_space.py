@@ -56,15 +56,15 @@ def symplecticity_defect(
     preserve is then J with the entry (q_i, p_i) multiplied by scale_q,i * scale_p,i; the defect is
     divided by the largest such product, so that it is a pure number.
     """
-    dim = jacobian.shape[-1] // 2
-    form = symplectic_form(dim, jacobian.dtype)
+    form = symplectic_form(jacobian.shape[-1] // 2, jacobian.dtype)
+    unit = jnp.ones((), jacobian.dtype)
+    weighted = form
     if scale is not None:
-        jacobian = jacobian * scale  # dZ/dy; the left factor of the form stays in z
+        jacobian = jacobian @ jnp.diag(scale)  # dZ/dy; the left factor of the form stays in z
         weighted = form * jnp.outer(scale, scale)
         unit = jnp.max(jnp.abs(weighted))
-    else:
-        weighted, unit = form, jnp.ones((), jacobian.dtype)
-    defect = jnp.swapaxes(jacobian, -1, -2) @ form @ jacobian - weighted
+    pulled_back = jnp.swapaxes(jacobian, -1, -2) @ form @ jacobian
+    defect = pulled_back - jnp.broadcast_to(weighted, pulled_back.shape)
     return jnp.max(jnp.abs(defect), axis=(-2, -1)) / unit
 
 

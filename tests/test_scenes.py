@@ -1,4 +1,4 @@
-"""The scenes: exact solutions, laws of data, symmetries, and orbits that are what they claim to be."""
+"""The scenes: exact solutions, laws of data, symmetries, orbits that are what they claim."""
 
 import dataclasses
 import math
@@ -225,12 +225,12 @@ def test_names_and_mistakes():
         assert scenes.make(name).name == name
         assert "\n" not in scenes.make(name).purpose
     assert scenes.make("two-body", dt=0.25).dt == 0.25
-    assert scenes.make("standard-map-regular", dt=1).dt == 1
+    assert scenes.make("standard-map-regular", dt=1.0).dt == 1.0
     with pytest.raises(ValueError, match=r"unknown scene 'twobody', did you mean 'two-body'\?"):
         scenes.make("twobody")
     with pytest.raises(ValueError, match="unknown scene 'xyz'; scenes: two-body, henon"):
         scenes.make("xyz")
-    with pytest.raises(ValueError, match="dt = 1 only, not 0.5"):
+    with pytest.raises(ValueError, match=r"dt = 1 only, not 0\.5"):
         scenes.make("standard-map-chaotic", dt=0.5)
     for dt in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="finite and > 0"):
