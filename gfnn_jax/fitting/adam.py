@@ -1,0 +1,238 @@
+"""Fit any S(params, w) to wanted gradients by Adam: the paper's training. The one home of optax.
+
+The loss is the paper's (3), a mean over pairs, with a weight for the size of each coordinate:
+
+    L(θ) = mean of ‖weight · (∇S(θ, w) − wanted)‖²
+
+``weight = h`` in all entries is the paper's; ``h / scale`` of the conjugate coordinate makes L
+independent of the units of q and p.
+
+An epoch is one compiled scan. Its order of the pairs is a function of the key and the epoch's
+number alone, so that nothing but the state below is needed to go on, and the same key gives the
+same bits.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+Rows = Float[Array | np.ndarray, "_ _"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """How to train.
+
+    batch_size:     pairs per iteration (all of them where there are fewer).
+    epochs:         parts of the training; each ends with a validation.
+    rate:           Adam's largest rate.
+    schedule:       one of ``SCHEDULES``: how the rate goes on from there.
+    epoch_length:   iterations of an epoch; None: one pass through the pairs, a rest of less than a
+                    batch left out.
+    dtype:          of parameters and arithmetic.
+    """
+
+    batch_size: int
+    epochs: int
+    rate: float
+    schedule: str
+    epoch_length: int | None = None
+    dtype: str = "float32"
+
+    def __post_init__(self):
+        if self.schedule not in SCHEDULES:
+            raise ValueError(
+                f"expected a schedule among {', '.join(SCHEDULES)}, got {self.schedule!r}"
+            )
+        if min(self.batch_size, self.epochs, self.epoch_length or 1) < 1 or not self.rate > 0:
+            raise ValueError(f"expected positive sizes and a positive rate, got {self}")
+
+    def rate_at(self, iteration, num_iterations: int):
+        """The rate of iteration 0, 1, ... of ``num_iterations``."""
+        return SCHEDULES[self.schedule](self.rate, num_iterations)(iteration)
+
+
+def _staircase(rate, num_iterations):
+    """× 0.95 every 100 iterations: the paper's own code."""
+    import optax  # loaded when first used
+
+    del num_iterations
+    return optax.exponential_decay(rate, transition_steps=100, decay_rate=0.95, staircase=True)
+
+
+def _cosine(rate, num_iterations):
+    """A rise over the first hundredth, then half a cosine down to a ten-thousandth."""
+    import optax
+
+    return optax.warmup_cosine_decay_schedule(
+        0.0, rate, max(1, num_iterations // 100), num_iterations, rate * 1e-4
+    )
+
+
+SCHEDULES: dict[str, Callable] = {"staircase": _staircase, "cosine": _cosine}
+
+# Paper, Experimental Details; for 100,000 pairs, and for the standard map's 1,000,000.
+PAPER = Recipe(batch_size=200, epochs=20, rate=0.01, schedule="staircase")
+PAPER_STANDARD_MAP = dataclasses.replace(PAPER, batch_size=1000, rate=0.001)
+
+
+class AdamFit(NamedTuple):
+    """params: those of the epoch with the lowest validation error, of the recipe's dtype.
+
+    train_rms, validation_rms: of that epoch, per component of weight · (∇S − wanted); the first is
+    a mean over its batches, while parameters moved. history: both of every epoch, (epochs,) each.
+    seconds: without compilation; with those of the run that was resumed. stopped_because: "epochs",
+    or a sentence that says where numbers ceased to be finite.
+    """
+
+    params: Any
+    train_rms: float
+    validation_rms: float
+    history: dict[str, np.ndarray]
+    epochs: int
+    seconds: float
+    compile_seconds: float
+    stopped_because: str
+
+
+def adam(
+    family: Callable,
+    params: Any,
+    train: tuple[Rows, Rows],
+    validation: tuple[Rows, Rows],
+    weight: Any,
+    *,
+    recipe: Recipe,
+    key: Any,
+    on_epoch: Callable[[int, float, float], Any] | None = None,
+    checkpoint: Callable[[int, dict[str, Any]], Any] | None = None,
+    resume: dict[str, Any] | None = None,
+) -> AdamFit:
+    """Minimise L over train = (w, wanted), each (N, 2d).
+
+    family:     ``S(params, w)`` -> scalar, for one w of shape (2d,).
+    params:     any pytree of floating-point arrays: the start.
+    validation: (w, wanted) of pairs kept apart.
+    weight:     (2d,).
+    key:        a ``jax.random.key``; decides the order of the pairs.
+    on_epoch:   called with (epochs done, train_rms, validation_rms) after each epoch.
+    checkpoint: called with (epochs done, state) after each epoch, to save the state: dicts and
+                lists of NumPy arrays and numbers (and the containers of ``params``). Given back as
+                ``resume`` the fit goes on as though it had never stopped, bit for bit on one
+                device; ``params`` then only lends its structure.
+
+    An interrupt (Ctrl-C) passes through; the last state given to ``checkpoint`` is whole.
+    Raises ValueError where shapes do not agree or data, parameters or ∇S are not finite at the
+    start. Where they cease to be finite later, the fit stops and says so.
+    """
+    import optax
+
+    dtype = jnp.dtype(recipe.dtype)
+    params, weight, train, validation = jax.tree.map(
+        lambda a: jnp.array(a, dtype), (params, jnp.asarray(weight), train, validation)
+    )
+    _check(train, validation, weight)
+    num_pairs, batch_size = len(train[0]), min(recipe.batch_size, len(train[0]))
+    length = recipe.epoch_length or num_pairs // batch_size
+    optimizer = optax.adam(lambda k: recipe.rate_at(k, recipe.epochs * length))
+
+    gradient = jax.vmap(jax.grad(family, argnums=1), (None, 0))
+
+    def loss(params, w, wanted):
+        """The paper's (3), for weight = h."""
+        error = weight * (gradient(params, w) - wanted)
+        return jnp.mean(jnp.sum(error**2, axis=-1))
+
+    def order(epoch):
+        """The pairs of each batch: as many permutations in a row as fill the epoch."""
+        in_pass = num_pairs // batch_size
+        keys = jax.random.split(jax.random.fold_in(key, epoch), -(-length // in_pass))
+        passes = jax.vmap(lambda k: jax.random.permutation(k, num_pairs))(keys)
+        return passes[:, : in_pass * batch_size].reshape(-1, batch_size)[:length]
+
+    def run_epoch(carry, epoch, w, wanted):
+        def iterate(carry, batch):
+            params, state = carry
+            value, slope = jax.value_and_grad(loss)(params, *batch)
+            updates, state = optimizer.update(slope, state, params)
+            return (optax.apply_updates(params, updates), state), value
+
+        batches = order(epoch)
+        carry, values = jax.lax.scan(iterate, carry, (w[batches], wanted[batches]))
+        return carry, jnp.mean(values)
+
+    started = time.perf_counter()
+    carry = (params, optimizer.init(params))
+    run_epoch = jax.jit(run_epoch, donate_argnums=0).lower(carry, 0, *train).compile()
+    validate = jax.jit(loss).lower(params, *validation).compile()
+    compile_seconds = time.perf_counter() - started
+
+    def rms(value):
+        return math.sqrt(float(value) / weight.size)
+
+    if resume is None:
+        start = rms(validate(params, *validation))
+        if not math.isfinite(start):
+            raise ValueError("∇S(params, w) is not finite on the validation pairs at the start")
+        epoch, seconds = 0, 0.0
+        best = {"params": jax.device_get(params), "train_rms": math.nan, "validation_rms": start}
+        history: dict[str, list[float]] = {"train_rms": [], "validation_rms": []}
+    else:
+        epoch, seconds, best = resume["epoch"], resume["seconds"], resume["best"]
+        history = {name: np.asarray(column).tolist() for name, column in resume["history"].items()}
+        structure = jax.tree.structure(carry)
+        carry = structure.unflatten([jnp.array(leaf) for leaf in resume["carry"]])
+
+    stopped_because = "epochs"
+    while epoch < recipe.epochs:
+        started = time.perf_counter()
+        carry, value = run_epoch(carry, epoch, *train)
+        epoch += 1
+        now = {"train_rms": rms(value), "validation_rms": rms(validate(carry[0], *validation))}
+        seconds += time.perf_counter() - started
+        for name, column in history.items():
+            column.append(now[name])
+        if not all(map(math.isfinite, now.values())):
+            stopped_because = f"not finite in epoch {epoch}: try a lower rate"
+            break
+        if now["validation_rms"] < best["validation_rms"]:
+            best = {"params": jax.device_get(carry[0]), **now}
+        if checkpoint is not None:
+            # Copies: the next epoch reuses the memory of the carry.
+            leaves = jax.device_get(jax.tree.leaves(carry))
+            columns = {name: np.array(column) for name, column in history.items()}
+            state = {"epoch": epoch, "seconds": seconds, "carry": leaves}
+            checkpoint(epoch, {**state, "best": best, "history": columns})
+        if on_epoch is not None:
+            on_epoch(epoch, now["train_rms"], now["validation_rms"])
+
+    return AdamFit(
+        params=jax.tree.map(jnp.asarray, best["params"]),
+        train_rms=best["train_rms"],
+        validation_rms=best["validation_rms"],
+        history={name: np.array(column) for name, column in history.items()},
+        epochs=epoch,
+        seconds=seconds,
+        compile_seconds=compile_seconds,
+        stopped_because=stopped_because,
+    )
+
+
+def _check(train, validation, weight):
+    for name, (w, wanted) in (("train", train), ("validation", validation)):
+        if w.shape != wanted.shape or w.ndim != 2 or w.shape[1:] != weight.shape or len(w) == 0:
+            raise ValueError(
+                f"{name}: expected w and wanted of shape (N, {weight.size}), N > 0, "
+                f"got {w.shape} and {wanted.shape}"
+            )
+        if not bool(jnp.all(jnp.isfinite(w)) & jnp.all(jnp.isfinite(wanted))):
+            raise ValueError(f"{name}: w or wanted has entries that are NaN or infinite")

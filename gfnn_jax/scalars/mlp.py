@@ -1,0 +1,120 @@
+"""S as a multilayer perceptron: the paper's networks and their kin. The one home of Flax.
+
+    S(θ, w) = s N_θ(x),        x the scaled variables of ``Inputs``, each angle as (cos, sin)
+
+N_θ has unit size whatever the units of the data: ``Inputs`` scales what it sees and s what it says.
+Any such scaling inside S leaves the map symplectic.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.scalars.inputs import Inputs
+
+# Widths of the hidden layers (paper, Experimental Details).
+PAPER_HIDDEN = (200, 100, 50, 20)
+PAPER_HIDDEN_STANDARD_MAP = (500, 500, 200, 20)
+
+# ∇S is what is fitted and its own derivative is what is solved with: S must be smooth.
+ACTIVATIONS: dict[str, Callable] = {
+    "tanh": jnp.tanh,
+    "sin": jnp.sin,
+    "softplus": jax.nn.softplus,
+    "silu": jax.nn.silu,
+    "gelu": jax.nn.gelu,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Mlp:
+    """A fully connected network with one output, linear in its last layer.
+
+    hidden:     widths of the hidden layers.
+    activation: one of ``ACTIVATIONS``.
+    amplitude:  s, the size of S over the data (``amplitude_of``), so that N_θ has unit size.
+
+    Raises ValueError for an unknown activation, and for widths that are not positive.
+    """
+
+    inputs: Inputs
+    hidden: tuple[int, ...] = PAPER_HIDDEN
+    activation: str = "tanh"
+    amplitude: float = 1.0
+
+    def __post_init__(self):
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(
+                f"expected an activation among {', '.join(ACTIVATIONS)}, got {self.activation!r}"
+            )
+        if not self.hidden or min(self.hidden) < 1:
+            raise ValueError(f"expected hidden layers of positive width, got {self.hidden}")
+
+    @property
+    def name(self) -> str:
+        return "mlp"
+
+    @property
+    def label(self) -> str:
+        """As candidates tables show it: what, and how large."""
+        return f"mlp {'-'.join(map(str, self.hidden))}"
+
+    @property
+    def num_inputs(self) -> int:
+        """Entries of what the network sees: an angle makes two."""
+        return self.inputs.num_variables + len(self.inputs.angles)
+
+    @property
+    def num_parameters(self) -> int:
+        # The last layer has no bias: a constant generates nothing.
+        widths = (self.num_inputs, *self.hidden)
+        layers = zip(widths[:-1], widths[1:], strict=True)
+        return sum((m + 1) * n for m, n in layers) + widths[-1]
+
+    def init(self, key, dtype: Any) -> dict[str, Any]:
+        """Parameters of this dtype: orthogonal weights, zero biases."""
+        return self._network(dtype).init(key, jnp.zeros(self.num_inputs, dtype))["params"]
+
+    def __call__(self, params, w):
+        """S(params, w): w (2d,) of any float dtype -> scalar, computed in the dtype of params."""
+        dtype = jax.tree.leaves(params)[0].dtype
+        x = self._seen(w).astype(dtype)
+        return self.amplitude * self._network(dtype).apply({"params": params}, x)[0]
+
+    def _seen(self, w):
+        """What the network sees at w (2d,): (num_inputs,)."""
+        x = self.inputs(w)
+        angles = np.array(self.inputs.angles, dtype=int)
+        others = np.setdiff1d(np.arange(self.inputs.num_variables), angles)
+        return jnp.concatenate([x[others], jnp.cos(x[angles]), jnp.sin(x[angles])])
+
+    def _network(self, dtype):
+        from flax import linen  # loaded when first used
+
+        def dense(width, use_bias=True):
+            return linen.Dense(
+                width,
+                use_bias=use_bias,
+                dtype=dtype,
+                param_dtype=dtype,
+                precision=jax.lax.Precision.HIGHEST,  # TF32 costs 7e-4 of ∇S
+                kernel_init=linen.initializers.orthogonal(),
+            )
+
+        layers = []
+        for width in self.hidden:
+            layers += [dense(width), ACTIVATIONS[self.activation]]
+        return linen.Sequential([*layers, dense(1, use_bias=False)])
+
+
+def amplitude_of(w, wanted) -> float:
+    """The size of a scalar whose gradient at w (N, 2d) is ``wanted`` (N, 2d), NumPy or JAX."""
+    w, wanted = np.asarray(w, np.float64), np.asarray(wanted, np.float64)
+    size = np.max(w.std(axis=0) * np.sqrt(np.mean(wanted**2, axis=0)))
+    return float(size) if size > 0 else 1.0
