@@ -11,8 +11,14 @@ import dataclasses
 from collections.abc import Callable
 
 import jax.numpy as jnp
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.spatial import cKDTree
 
 from gfnn_jax.phase_space import split
+
+TWO_PI = 2 * np.pi
 
 
 def _identity(z):
@@ -62,3 +68,79 @@ def polar(*, cyclic: bool) -> Coordinates:
     return Coordinates(
         "polar", angles=(1,), cyclic=(1,) if cyclic else (), forward=_to_polar, inverse=_from_polar
     )
+
+
+def circle_centre(angle) -> tuple[float, bool]:
+    """Centre of the shortest arc that holds all values of an angle (N,), and whether it is a circle.
+
+    The cut, where the angle jumps by 2π, lies opposite; data count as the whole circle where no gap
+    is wider than an eighth of it.
+    """
+    wrapped = np.sort(np.mod(angle, TWO_PI))
+    gaps = np.diff(wrapped, append=wrapped[0] + TWO_PI)
+    widest = int(np.argmax(gaps))
+    after_gap = wrapped[(widest + 1) % len(wrapped)]
+    centre = after_gap + 0.5 * (TWO_PI - gaps[widest])
+    return float(np.mod(centre + np.pi, TWO_PI) - np.pi), bool(gaps[widest] < TWO_PI / 8)
+
+
+def lift(y0, y1, coordinates: Coordinates):
+    """Pairs with angles lifted: y0 reduced, y1 − y0 continuous over the data.
+
+    y0, y1: (N, 2d) in the inner coordinates, angles wrapped or not. Returns y0, y1, the centre of
+    each angle's interval (a,), and which angles cover the circle (a,). The multiples of 2π in
+    y1 − y0 are found along a minimal spanning tree of neighbouring states: taking the nearest
+    image of every pair alone would tear a map whose angle moves by more than π.
+    """
+    y0, y1 = np.array(y0, dtype=np.float64), np.array(y1, dtype=np.float64)
+    centres, covered = [], []
+    for i in coordinates.angles:
+        centre, whole = circle_centre(y0[:, i])
+        turns = TWO_PI * np.round((y0[:, i] - centre) / TWO_PI)
+        y0[:, i] -= turns
+        y1[:, i] -= turns
+        centres.append(centre)
+        covered.append(whole)
+    if coordinates.angles:
+        order, parent = _spanning_order(_embedded(y0, coordinates))
+        for i in coordinates.angles:
+            difference = y1[:, i] - y0[:, i]
+            difference -= TWO_PI * np.round(difference / TWO_PI)
+            for node in order[1:]:
+                step = difference[node] - difference[parent[node]]
+                difference[node] -= TWO_PI * np.round(step / TWO_PI)
+            difference -= TWO_PI * np.round(np.median(difference) / TWO_PI)
+            y1[:, i] = y0[:, i] + difference
+    return y0, y1, np.array(centres), np.array(covered, dtype=bool)
+
+
+def _embedded(y, coordinates: Coordinates):
+    """States as points of a plain space: unit-sized, angles of a q as points of a circle."""
+    dim = y.shape[1] // 2
+    columns = []
+    for i in range(y.shape[1]):
+        if i in coordinates.cyclic:
+            continue
+        if i in coordinates.angles and i < dim:
+            columns += [np.cos(y[:, i]), np.sin(y[:, i])]
+        else:
+            spread = y[:, i].std()
+            columns.append(y[:, i] / (spread if spread > 0 else 1.0))
+    return np.column_stack(columns)
+
+
+def _spanning_order(points):
+    """Nodes of a minimal spanning tree of neighbours in breadth-first order, and their parents."""
+    count = len(points)
+    near = 8
+    while True:
+        near = min(near, count)
+        distance, neighbour = cKDTree(points).query(points, k=near)
+        distance, neighbour = distance.reshape(count, -1), neighbour.reshape(count, -1)
+        row = np.repeat(np.arange(count), distance.shape[1])
+        # A zero would mean "no edge" to the sparse graph.
+        graph = csr_array((distance.ravel() + 1e-12, (row, neighbour.ravel())), (count, count))
+        tree = minimum_spanning_tree(graph)
+        if near == count or connected_components(tree, directed=False)[0] == 1:
+            return breadth_first_order(tree, 0, directed=False)
+        near *= 4

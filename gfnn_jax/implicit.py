@@ -101,29 +101,31 @@ def iterate(
 
     def damped(state):
         step = direction(state.x, state.residual)
+        # Close to the floor only the full step makes sense: what is left is roundoff, or quadratic.
+        shortest = jnp.where(state.error < nearly, 1.0, 0.5**_HALVINGS)
 
-        def shorter(trial):
-            factor, _, _ = trial
-            return 0.5 * factor, *_error_at(0.5 * factor)
+        def trial(factor):
+            x = state.x - factor * step
+            return factor, x, *judge(x)
 
-        def _error_at(factor):
-            error = judge(state.x - factor * step)[2]
-            return error, ~(error < state.error) & (factor > 0.5**_HALVINGS)
+        def worse(t):
+            factor, _, _, _, error = t
+            return ~(error < state.error) & (factor > shortest)
 
         one = jnp.ones((), guess.dtype)
-        factor, _, _ = jax.lax.while_loop(lambda t: t[2], shorter, (one, *_error_at(one)))
-        x = state.x - factor * step
-        residual, aux, error = judge(x)
-        better = error < state.error
-        # No improvement: at the floor's level this is convergence, elsewhere it is a stall.
-        pick = partial(jnp.where, better)
+        _, x, residual, aux, error = jax.lax.while_loop(
+            worse, lambda t: trial(0.5 * t[0]), trial(one)
+        )
+        pick = partial(jnp.where, error < state.error)
+        iterations = state.iterations + 1
+        goes_on = (error > 1.0) & (error < 0.5 * state.error) | (error > nearly)
         return _Iterate(
             pick(x, state.x),
             pick(residual, state.residual),
             jax.tree.map(pick, aux, state.aux),
             pick(error, state.error),
-            state.iterations + 1,
-            better & (error > 1.0) & (state.iterations + 1 < most),
+            iterations,
+            (error < state.error) & goes_on & (iterations < most),
         )
 
     residual, aux, error = judge(guess)

@@ -1,0 +1,391 @@
+"""The symplectic map: a composition of small pieces, each symplectic, each with its inverse.
+
+    coordinates⁻¹ ∘ R^½ ∘ generated(S, chart) ∘ R^½ ∘ coordinates
+
+Maps are pytrees: their arrays can be passed through ``jit`` and differentiated; what is static
+(family, chart, coordinates) is a hashable constant.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from gfnn_jax import implicit
+from gfnn_jax.charts import AnyChart, Chart
+from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.domain import Domain
+from gfnn_jax.implicit import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, Info
+from gfnn_jax.phase_space import apply_j, require_x64, symplecticity_defect
+from gfnn_jax.rollout import scan_steps
+
+# A residual of this many eps of a coordinate's size is the floor: a few roundings of that size.
+_FLOOR_EPS = 4.0
+_FIXED_NEWTON = 3
+_MOST_NEWTON = 40
+# 2π in two parts, so that reducing an angle for millions of turns adds no drift.
+_TWO_PI = 2 * np.pi
+_TWO_PI_REST = 2.4492935982947064e-16
+
+
+def _register(data: tuple[str, ...], meta: tuple[str, ...]) -> Callable:
+    return partial(jax.tree_util.register_dataclass, data_fields=data, meta_fields=meta)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Equation:
+    """The implicit equation of a chart as the solver wants it: θ = (params, z), x the free part of w."""
+
+    scalar: Callable
+    chart: AnyChart
+    dt: float
+
+    def point(self, z, x):
+        return z.at[np.array(self.chart.free(z.shape[0] // 2))].set(x)
+
+    def __call__(self, theta, x):
+        params, z, known = theta
+        w = self.point(known, x)
+        gradient = jax.grad(self.scalar, argnums=1)(params, w)
+        return self.chart.residual(z, w, gradient, self.dt), (w, gradient)
+
+
+@_register(("params", "scale", "linear", "offset"), ("scalar", "chart", "dt"))
+@dataclasses.dataclass(frozen=True)
+class Generated:
+    """The map that S generates in a chart: Z − z = h J ∇S(w) (paper, eq. (4)).
+
+    scalar: ``S(params, w)``. scale: (2d,) sizes of the coordinates, for the roundoff floor.
+    linear (2d, 2d) and offset (2d,): a rough affine model of Z − z, where the solve starts; it
+    has no influence on the solution but, at a fold of S, on the branch that is found.
+    """
+
+    scalar: Any
+    params: Any
+    chart: AnyChart
+    dt: float
+    scale: Any
+    linear: Any
+    offset: Any
+
+    def solve(self, z, *, executed: bool = False):
+        """w, ∇S(w) and Info for the state z (2d,); ``executed`` keeps the iterations' derivative."""
+        equation = _Equation(self.scalar, self.chart, self.dt)
+        dim = z.shape[0] // 2
+        free = np.array(self.chart.free(dim))
+        known = self.chart.start(z)
+        rows = np.arange(dim, 2 * dim) if self.chart.name == "type1" else free
+        floor = _FLOOR_EPS * jnp.finfo(z.dtype).eps * (self.scale + jnp.abs(z))[rows]
+        guess = self.chart.point(z, z + self.offset + self.linear @ z)[free]
+        if executed:
+            _, (w, gradient), info = implicit.iterate(
+                equation, (self.params, z, known), guess, floor,
+                fixed=_FIXED_NEWTON, most=_MOST_NEWTON,
+            )  # fmt: skip
+        else:
+            _, (w, gradient), info = implicit.root(
+                equation, (self.params, z, known), jax.lax.stop_gradient(guess),
+                jax.lax.stop_gradient(floor), _FIXED_NEWTON, _MOST_NEWTON,
+            )  # fmt: skip
+        return w, gradient, info
+
+    def __call__(self, z, *, executed: bool = False):
+        """(Z, Info) of the state z (2d,)."""
+        w, gradient, info = self.solve(z, executed=executed)
+        return self.chart.image(z, w, gradient, self.dt), info
+
+    def inverse(self) -> Generated:
+        """The inverse map: the same S, the chart read from its other side."""
+        chart, dt = self.chart.reverse(self.dt)
+        eye = jnp.eye(self.linear.shape[0], dtype=self.linear.dtype)
+        linear = jnp.linalg.inv(eye + self.linear) - eye
+        offset = -(eye + linear) @ self.offset
+        return dataclasses.replace(self, chart=chart, dt=dt, linear=linear, offset=offset)
+
+    def determinant(self, z):
+        """det ∂w/∂z at the state z (2d,), which vanishes where the chart is singular.
+
+        Near-identity charts: 1/det(I − (½I + C) h J S''(w)).
+        """
+        w, _, _ = self.solve(z)
+        if not isinstance(self.chart, Chart):
+            jacobian = jax.jacfwd(lambda y: self(y)[0])(z)
+            return self.chart.determinant(jacobian)
+        dim = z.shape[0] // 2
+        second = jax.jacfwd(jax.grad(self.scalar, argnums=1), argnums=1)(self.params, w)
+        skew = self.chart.skew
+        half = jnp.repeat(jnp.array([0.5 + skew, 0.5 - skew], z.dtype), dim)
+        eye = jnp.eye(2 * dim, dtype=z.dtype)
+        return 1.0 / jnp.linalg.det(eye - half[:, None] * self.dt * apply_j(second.T).T)
+
+
+@_register(("matrix", "centre", "shift"), ())
+@dataclasses.dataclass(frozen=True)
+class Affine:
+    """z -> centre + shift + E (z − centre), E a symplectic matrix: half a base map (design R^½)."""
+
+    matrix: Any
+    centre: Any
+    shift: Any
+
+    def __call__(self, z, *, executed: bool = False):
+        """(Z, Info) of the state z (2d,)."""
+        del executed  # nothing is iterated
+        image = self.centre + self.shift + self.matrix @ (z - self.centre)
+        ok = Info(jnp.int32(OK), jnp.int32(0), jnp.zeros((), z.dtype))
+        return image, ok
+
+    def inverse(self) -> Affine:
+        """E⁻¹, which of a symplectic E is −J Eᵀ J."""
+        inverse = apply_j(apply_j(self.matrix).T)
+        return Affine(inverse, self.centre + self.shift, -self.shift)
+
+
+class Lanes(NamedTuple):
+    """Where a batch of rollouts stands; the whole state from which it can go on.
+
+    y: inner coordinates with angles reduced (B, 2d). turns: of the angles (B, a). rest: what
+    compensated summation still owes y. status, left_at (step at which the lane left the domain,
+    −1 if never), iterations (most Newton updates of a step), steps done: (B,).
+    """
+
+    y: Float[Array, "*batch phase"]
+    turns: Int[Array, "*batch angles"]
+    status: Int[Array, "*batch"]
+    left_at: Int[Array, "*batch"]
+    iterations: Int[Array, "*batch"]
+    steps: Int[Array, "*batch"]
+
+
+class RolloutInfo(NamedTuple):
+    """How each lane of a rollout ended: status, step at which it left the domain (−1 if it never
+    did), most Newton updates in a step."""
+
+    status: Int[Array, "batch"]
+    left_at: Int[Array, "batch"]
+    iterations: Int[Array, "batch"]
+
+
+@_register(("pieces", "domain", "scale", "cut"), ("coordinates", "dt"))
+@dataclasses.dataclass(frozen=True)
+class SymplecticMap:
+    """A learned map and what it knows of its data.
+
+    pieces:      applied in order, in the inner coordinates.
+    coordinates: the inner coordinates; the user's are outside.
+    domain:      where the data were, in the inner coordinates.
+    scale:       (2d,) sizes of the user's coordinates.
+    cut:         (a,) centre of the interval of length 2π in which each angle is kept.
+    dt:          the time one step takes.
+    """
+
+    pieces: tuple
+    coordinates: Coordinates
+    domain: Domain
+    scale: Any
+    cut: Any
+    dt: float
+
+    @property
+    def dim(self) -> int:
+        """Degrees of freedom."""
+        return self.scale.shape[0] // 2
+
+    # One state.
+
+    def _angles(self):
+        return np.array(self.coordinates.angles, dtype=int)
+
+    def _reduce(self, y):
+        """y with its angles inside the cut, and the turns taken out."""
+        angles = self._angles()
+        turns = jnp.round((y[angles] - self.cut) / _TWO_PI)
+        return y.at[angles].add(-turns * _TWO_PI).at[angles].add(-turns * _TWO_PI_REST), turns
+
+    def _outer(self, y, turns):
+        """The user's state of the reduced y and its turns."""
+        angles = self._angles()
+        return self.coordinates.inverse(y.at[angles].add(turns * _TWO_PI))
+
+    def _apply(self, y, *, executed: bool = False):
+        """All pieces in a row on a reduced y: (Y, Info), the worst of the pieces' infos."""
+        infos = []
+        for piece in self.pieces:
+            y, info = piece(y, executed=executed)
+            infos.append(info)
+        worst = Info(*(jnp.max(jnp.stack(column)) for column in zip(*infos, strict=True)))
+        return y, worst
+
+    def apply(self, z, *, executed: bool = False):
+        """(Z, Info) of one state z (2d,), in the user's coordinates; pure, for your own transforms."""
+        y, turns = self._reduce(self.coordinates.forward(z))
+        y1, info = self._apply(y, executed=executed)
+        finite = jnp.all(jnp.isfinite(y1))
+        left = jnp.where(self.domain.contains(y), OK, LEFT_DOMAIN)
+        status = jnp.where(info.status == OK, left, info.status)
+        status = jnp.where(finite, status, NON_FINITE).astype(jnp.int32)
+        return self._outer(y1, turns), info._replace(status=status)
+
+    # Batches.
+
+    def step(self, z):
+        """One step: (Z, Info) of z (2d,) or (B, 2d), NumPy or JAX; Info's leaves are () or (B,)."""
+        return self._batched(_step, z)
+
+    def inverse(self, z):
+        """One step back: (z, Info) of Z (2d,) or (B, 2d)."""
+        return self.reversed()._batched(_step, z)
+
+    def reversed(self) -> SymplecticMap:
+        """The inverse map, as a map of its own."""
+        pieces = tuple(piece.inverse() for piece in reversed(self.pieces))
+        return dataclasses.replace(self, pieces=pieces)
+
+    def defect(self, z) -> Float[Array, "*batch"]:
+        """Symplecticity defect of the executed step at z (2d,) or (B, 2d), coordinates of unit size.
+
+        By forward differentiation through the iterations that ran, never by the implicit rule, which
+        would look symplectic however badly the solve had converged.
+        """
+        return self._batched(_defect, z)
+
+    def determinant(self, z) -> Float[Array, "*batch"]:
+        """Chart determinant of the model at z (2d,) or (B, 2d): of the piece where it is smallest."""
+        return self._batched(_determinant, z)
+
+    def start(self, z0, *, stop_outside: bool = False) -> Lanes:
+        """Lanes at step 0 from z0 (B, 2d). Initial states outside the domain have that status."""
+        return _start(self, self._states(z0), stop_outside)
+
+    def advance(
+        self, lanes: Lanes, num_saved: int, *, save_every: int = 1, stop_outside: bool = False
+    ) -> tuple[Lanes, Float[Array, "batch saved phase"]]:
+        """``num_saved`` blocks of ``save_every`` steps: the lanes after them, the saved states."""
+        return _advance(self, lanes, num_saved, save_every, stop_outside)
+
+    def rollout(
+        self, z0, num_steps: int, *, save_every: int = 1, stop_outside: bool = False
+    ) -> tuple[Float[Array, "*batch saved phase"], RolloutInfo]:
+        """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d).
+
+        Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first, and a
+        RolloutInfo. A lane whose step fails, or that leaves the domain with ``stop_outside``,
+        repeats NaN from there on.
+        """
+        if save_every < 1 or num_steps < 0:
+            raise ValueError(
+                f"expected num_steps >= 0 and save_every >= 1, got {num_steps} and {save_every}"
+            )
+        z = self._states(z0)
+        single = z.ndim == 1
+        z = z[None] if single else z
+        lanes = self.start(z, stop_outside=stop_outside)
+        lanes, saved = self.advance(
+            lanes, num_steps // save_every, save_every=save_every, stop_outside=stop_outside
+        )
+        states = jnp.concatenate([z[:, None], saved], axis=1)
+        info = RolloutInfo(lanes.status, lanes.left_at, lanes.iterations)
+        if single:
+            states, info = jax.tree.map(lambda a: a[0], (states, info))
+        return states, info
+
+    def _states(self, z):
+        dtype = self.scale.dtype
+        if dtype == jnp.float64:
+            require_x64("a float64 map")
+        z = jnp.asarray(z, dtype)
+        if z.ndim not in (1, 2) or z.shape[-1] != 2 * self.dim:
+            raise ValueError(
+                f"expected states of shape ({2 * self.dim},) or (B, {2 * self.dim}), got {z.shape}"
+            )
+        return z
+
+    def _batched(self, function, z):
+        z = self._states(z)
+        out = function(self, z[None] if z.ndim == 1 else z)
+        return jax.tree.map(lambda a: a[0], out) if z.ndim == 1 else out
+
+
+@jax.jit
+def _step(map_, z):
+    return jax.vmap(map_.apply)(z)
+
+
+@jax.jit
+def _defect(map_, z):
+    def jacobian(z):
+        return jax.jacfwd(lambda x: map_.apply(x, executed=True)[0])(z)
+
+    return symplecticity_defect(jax.vmap(jacobian)(z), map_.scale)
+
+
+@jax.jit
+def _determinant(map_, z):
+    def smallest(z):
+        y = map_._reduce(map_.coordinates.forward(z))[0]
+        found = []
+        for piece in map_.pieces:
+            if isinstance(piece, Generated):
+                found.append(piece.determinant(y))
+            y, _ = piece(y)
+        found = jnp.stack(found)
+        return found[jnp.argmin(jnp.abs(found))]
+
+    return jax.vmap(smallest)(z)
+
+
+def _judge(status, inside, stop_outside: bool):
+    """Status after looking at the domain; only lanes that go on are looked at."""
+    outside = STOPPED_AT_EDGE if stop_outside else LEFT_DOMAIN
+    return jnp.where((status <= LEFT_DOMAIN) & ~inside, outside, status)
+
+
+@partial(jax.jit, static_argnums=2)
+def _start(map_, z, stop_outside):
+    def lane(z):
+        y, turns = map_._reduce(map_.coordinates.forward(z))
+        inside: Bool[Array, ""] = map_.domain.contains(y)
+        finite = jnp.all(jnp.isfinite(y))
+        status = _judge(jnp.where(finite, OK, NON_FINITE), inside, stop_outside)
+        zero = jnp.zeros((), jnp.int64 if jax.config.jax_enable_x64 else jnp.int32)
+        left_at = jnp.where(inside | ~finite, zero - 1, zero)
+        return Lanes(y, turns.astype(zero.dtype), status.astype(jnp.int32), left_at,
+                     jnp.zeros((), jnp.int32), zero)  # fmt: skip
+
+    return jax.vmap(lane)(z)
+
+
+@partial(jax.jit, static_argnums=(2, 3, 4))
+def _advance(map_, lanes, num_saved, save_every, stop_outside):
+    def step(lane: Lanes) -> Lanes:
+        going = lane.status <= LEFT_DOMAIN
+        y, info = map_._apply(jnp.where(going, lane.y, jnp.nan))
+        y, turns = map_._reduce(y)
+        inside = map_.domain.contains(y)
+        failed = jnp.where(jnp.all(jnp.isfinite(y)), info.status, NON_FINITE)
+        status = jnp.where(failed == OK, _judge(lane.status, inside, stop_outside), failed)
+        status = jnp.where(going, status, lane.status).astype(jnp.int32)
+        leaves = going & (failed == OK) & ~inside & (lane.left_at < 0)
+        return Lanes(
+            jnp.where(status <= LEFT_DOMAIN, y, jnp.nan),
+            lane.turns + jnp.where(jnp.isfinite(turns), turns, 0).astype(lane.turns.dtype),
+            status,
+            jnp.where(leaves, lane.steps + 1, lane.left_at),
+            jnp.maximum(lane.iterations, jnp.where(going, info.iterations, 0)),
+            lane.steps + 1,
+        )
+
+    def observe(lane: Lanes):
+        return map_._outer(lane.y, lane.turns.astype(lane.y.dtype))
+
+    def run(lane):
+        return scan_steps(step, lane, num_saved, save_every=save_every, observe=observe)
+
+    return jax.vmap(run)(lanes)
