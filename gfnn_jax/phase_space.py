@@ -77,9 +77,7 @@ def hamiltonian_vector_field(hamiltonian: Callable) -> Callable:
     return field
 
 
-@partial(
-    jax.tree_util.register_dataclass, data_fields=("z0", "z1"), meta_fields=("dt",)
-)
+@partial(jax.tree_util.register_dataclass, data_fields=("z0", "z1"), meta_fields=("dt",))
 @dataclasses.dataclass(frozen=True)
 class Pairs:
     """States and their images one time step later: what a map is learned from.
