@@ -120,7 +120,7 @@ def levenberg_marquardt(
 
     started = time.perf_counter()
     linearize, attempt, validation_rms = _compiled(
-        lambda theta, w: scalar(unravel(theta), w), theta, *data, chunk
+        lambda theta, w: scalar(unravel(theta), w), theta, *data, chunk=chunk
     )
     compile_seconds = time.perf_counter() - started
 
