@@ -53,7 +53,8 @@ class Recipe:
             raise ValueError(
                 f"expected a schedule among {', '.join(SCHEDULES)}, got {self.schedule!r}"
             )
-        if min(self.batch_size, self.epochs, self.epoch_length or 1) < 1 or not self.rate > 0:
+        length = 1 if self.epoch_length is None else self.epoch_length
+        if min(self.batch_size, self.epochs, length) < 1 or not self.rate > 0:
             raise ValueError(f"expected positive sizes and a positive rate, got {self}")
 
     def rate_at(self, iteration, num_iterations: int):
@@ -73,9 +74,8 @@ def _cosine(rate, num_iterations):
     """A rise over the first hundredth, then half a cosine down to a ten-thousandth."""
     import optax
 
-    return optax.warmup_cosine_decay_schedule(
-        0.0, rate, max(1, num_iterations // 100), num_iterations, rate * 1e-4
-    )
+    rise = num_iterations // 100
+    return optax.warmup_cosine_decay_schedule(rate * 1e-4, rate, rise, num_iterations, rate * 1e-4)
 
 
 SCHEDULES: dict[str, Callable] = {"staircase": _staircase, "cosine": _cosine}
@@ -83,6 +83,9 @@ SCHEDULES: dict[str, Callable] = {"staircase": _staircase, "cosine": _cosine}
 # Paper, Experimental Details; for 100,000 pairs, and for the standard map's 1,000,000.
 PAPER = Recipe(batch_size=200, epochs=20, rate=0.01, schedule="staircase")
 PAPER_STANDARD_MAP = dataclasses.replace(PAPER, batch_size=1000, rate=0.001)
+# As many iterations whatever the number of pairs.
+DEFAULT = Recipe(batch_size=200, epochs=60, rate=0.01, schedule="cosine", epoch_length=500)
+QUICK = dataclasses.replace(DEFAULT, epochs=16)
 
 
 class AdamFit(NamedTuple):
@@ -149,7 +152,7 @@ def adam(
 
     def loss(params, w, wanted):
         """The paper's (3), for weight = h."""
-        error = weight * (gradient(params, w) - wanted)
+        error = weight[None, :] * (gradient(params, w) - wanted)
         return jnp.mean(jnp.sum(error**2, axis=-1))
 
     def order(epoch):
@@ -163,7 +166,8 @@ def adam(
         def iterate(carry, batch):
             params, state = carry
             value, slope = jax.value_and_grad(loss)(params, *batch)
-            updates, state = optimizer.update(slope, state, params)
+            with jax.numpy_dtype_promotion("standard"):  # optax counts in int32
+                updates, state = optimizer.update(slope, state, params)
             return (optax.apply_updates(params, updates), state), value
 
         batches = order(epoch)

@@ -1,0 +1,237 @@
+"""Adam on S: the paper's loss and schedule, the same bits for the same key, resumable."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gfnn_jax.fitting import adam as adam_module
+from gfnn_jax.fitting.adam import DEFAULT, PAPER, PAPER_STANDARD_MAP, QUICK, Recipe, adam
+
+WEIGHT = np.array([0.5, 0.1])
+
+
+def pendulum(w):
+    return 0.5 * w[1] ** 2 - jnp.cos(2 * w[0])
+
+
+def network(params, w):
+    hidden = jnp.tanh(w.astype(params["inner"].dtype) @ params["inner"] + params["bias"])
+    return hidden @ params["outer"]
+
+
+def start(seed=0):
+    rng = np.random.default_rng(seed)
+    return {
+        "inner": jnp.asarray(rng.standard_normal((2, 11))),
+        "bias": jnp.asarray(rng.standard_normal(11)),
+        "outer": jnp.asarray(rng.standard_normal(11) / 4),
+    }
+
+
+def gradient_data(num, seed):
+    w = np.random.default_rng(seed).uniform(-1, 1, (num, 2))
+    return w, np.asarray(jax.vmap(jax.grad(pendulum))(jnp.asarray(w)))
+
+
+TRAIN, VALIDATION = gradient_data(330, 1), gradient_data(40, 2)
+SHORT = Recipe(batch_size=50, epochs=6, rate=0.02, schedule="cosine", dtype="float64")
+
+
+def fit(recipe=SHORT, *, params=None, train=TRAIN, seed=7, **options):
+    return adam(
+        network,
+        start() if params is None else params,
+        train,
+        VALIDATION,
+        WEIGHT,
+        recipe=recipe,
+        key=jax.random.key(seed),
+        **options,
+    )
+
+
+def numpy_gradient(params, w):
+    """∇ of the network by hand: (N, 2)."""
+    inner, bias, outer = (np.asarray(params[k]) for k in ("inner", "bias", "outer"))
+    return ((1 - np.tanh(w @ inner + bias) ** 2) * outer) @ inner.T
+
+
+def numpy_rms(params, w, wanted):
+    """Root of the loss per component, written out."""
+    total = 0.0
+    for row, target in zip(numpy_gradient(params, w), wanted, strict=True):
+        total += sum((WEIGHT[i] * (row[i] - target[i])) ** 2 for i in range(2))
+    return math.sqrt(total / len(w) / 2)
+
+
+def bits(tree):
+    return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree)]
+
+
+def test_the_loss_is_the_papers():
+    """At a rate that moves nothing, in batches that are all pairs, both errors are the start's."""
+    still = dataclasses.replace(SHORT, rate=1e-30, epochs=1, batch_size=330)
+    result = fit(still)
+    assert result.history["train_rms"][0] == pytest.approx(numpy_rms(start(), *TRAIN), rel=1e-12)
+    assert result.history["validation_rms"][0] == pytest.approx(
+        numpy_rms(start(), *VALIDATION), rel=1e-12
+    )
+
+
+def test_one_iteration_is_adams():
+    """The first update of Adam is the rate times the sign of the slope (but for its epsilon)."""
+    recipe = Recipe(330, epochs=1, rate=1e-3, schedule="staircase", dtype="float64")
+    w, wanted = TRAIN
+
+    def loss(outer):
+        return numpy_rms({**start(), "outer": outer}, w, wanted)
+
+    outer, step = np.asarray(start()["outer"]), 1e-6
+    slope = [
+        loss(outer + step * e) - loss(outer - step * e) for e in np.eye(len(outer))
+    ]  # its sign is that of the loss' slope
+    moved = np.asarray(fit(recipe).params["outer"]) - outer
+    np.testing.assert_allclose(moved, -1e-3 * np.sign(slope), rtol=1e-3)
+
+
+def test_every_pair_is_used_once_per_epoch():
+    """A loss that is linear in what a batch holds: its mean over an epoch is that of all pairs."""
+    still = dataclasses.replace(SHORT, rate=1e-30, epochs=3, batch_size=30)  # 11 batches of 330
+    result = fit(still)
+    np.testing.assert_allclose(result.history["train_rms"], numpy_rms(start(), *TRAIN), rtol=1e-12)
+
+
+def test_an_epochs_length_may_be_given():
+    """Longer than a pass: 20 batches of 50 from 330 pairs; Adam has then counted 40 iterations."""
+    states = []
+    recipe = dataclasses.replace(SHORT, epochs=2, epoch_length=20)
+    fit(recipe, checkpoint=lambda _, state: states.append(state))
+    counts = [leaf for leaf in states[-1]["carry"] if leaf.shape == ()]
+    assert counts
+    assert all(count == 40 for count in counts)
+
+
+def test_learns():
+    result = fit(dataclasses.replace(SHORT, epochs=30))
+    assert result.stopped_because == "epochs"
+    assert result.epochs == 30
+    assert result.train_rms < 0.2 * numpy_rms(start(), *TRAIN)
+    assert result.validation_rms < 0.2 * numpy_rms(start(), *VALIDATION)
+    assert result.validation_rms == pytest.approx(numpy_rms(result.params, *VALIDATION), rel=1e-12)
+
+
+@pytest.mark.parametrize("recipe", [PAPER, PAPER_STANDARD_MAP])
+def test_the_papers_schedule(recipe):
+    first = {PAPER: 0.01, PAPER_STANDARD_MAP: 0.001}[recipe]
+    for k in (0, 1, 99, 100, 101, 199, 200, 5000, 9999):
+        rate = recipe.rate_at(k, 10_000)
+        assert float(rate) == pytest.approx(first * 0.95 ** (k // 100), rel=1e-12)
+
+
+def test_the_papers_recipe():
+    assert (PAPER.batch_size, PAPER.epochs, PAPER.dtype) == (200, 20, "float32")
+    assert PAPER_STANDARD_MAP.batch_size == 1000
+    assert PAPER.epoch_length is None
+
+
+@pytest.mark.parametrize("recipe", [DEFAULT, QUICK])
+def test_the_cosine_rises_and_falls(recipe):
+    rates = np.array([float(recipe.rate_at(k, 1000)) for k in range(1000)])
+    assert rates.max() == pytest.approx(recipe.rate)
+    assert (np.diff(rates[:10]) > 0).all()
+    assert (np.diff(rates[10:]) < 0).all()
+    assert rates[-1] < 1e-3 * recipe.rate
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_computes_in_the_recipes_dtype(dtype):
+    result = fit(dataclasses.replace(SHORT, epochs=1, dtype=dtype))
+    assert {leaf.dtype for leaf in jax.tree.leaves(result.params)} == {jnp.dtype(dtype)}
+
+
+def test_the_same_key_gives_the_same_bits_and_another_key_others():
+    first, again, other = fit(), fit(), fit(seed=8)
+    assert bits(first.params) == bits(again.params)
+    assert bits(first.history) == bits(again.history)
+    assert bits(first.params) != bits(other.params)
+
+
+@pytest.mark.parametrize("stopped_after", [1, 4])
+def test_resumes_bit_for_bit(stopped_after):
+    """Interrupted between two epochs, and gone on from the last state that was saved."""
+    saved = {}
+
+    def stop(epoch, *_):
+        if epoch == stopped_after:
+            raise KeyboardInterrupt
+
+    whole = fit()
+    with pytest.raises(KeyboardInterrupt):
+        fit(checkpoint=saved.__setitem__, on_epoch=stop)
+    assert list(saved) == list(range(1, stopped_after + 1))
+    reported = []
+    rest = fit(
+        params=start(seed=99),
+        resume=saved[stopped_after],
+        on_epoch=lambda epoch, *_: reported.append(epoch),
+    )
+    assert reported == list(range(stopped_after + 1, 7))
+    assert bits(rest.params) == bits(whole.params)
+    assert bits(rest.history) == bits(whole.history)
+    assert rest.epochs == whole.epochs
+    assert (rest.train_rms, rest.validation_rms) == (whole.train_rms, whole.validation_rms)
+
+
+def test_the_best_epoch_is_kept():
+    """A rate far too high: the error does not end at its smallest, and the best is returned."""
+    result = fit(Recipe(50, epochs=12, rate=0.3, schedule="staircase", dtype="float64"))
+    errors = result.history["validation_rms"]
+    assert errors.argmin() != len(errors) - 1
+    assert result.validation_rms == errors.min()
+    assert result.train_rms == result.history["train_rms"][errors.argmin()]
+    assert result.validation_rms == pytest.approx(numpy_rms(result.params, *VALIDATION), rel=1e-12)
+
+
+def test_stops_where_numbers_cease_to_be_finite():
+    recipe = Recipe(50, epochs=8, rate=1e200, schedule="staircase", dtype="float64")
+    result = fit(recipe)
+    assert "not finite in epoch" in result.stopped_because
+    assert result.epochs < 8
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(result.params))
+    assert result.validation_rms == pytest.approx(numpy_rms(result.params, *VALIDATION), rel=1e-12)
+
+
+def test_refuses_what_is_not_finite_at_the_start():
+    w, wanted = (a.copy() for a in TRAIN)
+    wanted[3, 1] = np.nan
+    with pytest.raises(ValueError, match="NaN"):
+        fit(train=(w, wanted))
+    with pytest.raises(ValueError, match="not finite"):
+        fit(params={**start(), "outer": jnp.full(11, jnp.inf)})
+
+
+def test_refuses_shapes_that_do_not_agree():
+    w, wanted = TRAIN
+    with pytest.raises(ValueError, match="train: expected w and wanted of shape"):
+        fit(train=(w, wanted[:-1]))
+
+
+def test_refuses_unknown_schedules_and_sizes():
+    with pytest.raises(ValueError, match="staircase, cosine"):
+        dataclasses.replace(SHORT, schedule="linear")
+    for wrong in ({"batch_size": 0}, {"epochs": 0}, {"rate": 0.0}, {"epoch_length": 0}):
+        with pytest.raises(ValueError, match="positive"):
+            dataclasses.replace(SHORT, **wrong)
+
+
+def test_a_batch_is_never_more_than_the_pairs():
+    result = fit(dataclasses.replace(SHORT, batch_size=10_000, epochs=2))
+    assert result.epochs == 2
+
+
+def test_schedules_are_named():
+    assert set(adam_module.SCHEDULES) == {"staircase", "cosine"}
