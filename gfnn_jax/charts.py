@@ -21,7 +21,9 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from gfnn_jax.phase_space import apply_j, split
+from gfnn_jax.phase_space import State, apply_j, split
+
+Jacobians = Float[Array, "*batch phase phase"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,12 +48,12 @@ class Chart:
         return -apply_j(z1 - z0) / dt
 
     def free(self, dim: int) -> tuple[int, ...]:
-        """The entries of w that are unknown when z is given: d of them for types 2 and 3, else 2d."""
+        """The entries of w that z does not give: d of them for types 2 and 3, else 2d."""
         q_free = range(dim) if self.skew != -0.5 else ()
         p_free = range(dim, 2 * dim) if self.skew != 0.5 else ()
         return (*q_free, *p_free)
 
-    def start(self, z: Float[Array, "2d"]) -> Float[Array, "2d"]:
+    def start(self, z: State) -> State:
         """The first guess of w without any other knowledge: the map is near the identity."""
         return z
 
@@ -62,15 +64,22 @@ class Chart:
         move = jnp.concatenate([(0.5 + self.skew) * delta_q, (0.5 - self.skew) * delta_p])
         return (w - z - move)[jnp.array(self.free(dim))]
 
+    def sizes(self, scale, z, gradient, dt):
+        """Of the residual's entries: the unit scale + abs(z), and the size of what it is made of."""
+        free = jnp.array(self.free(z.shape[-1] // 2))
+        unit = scale + jnp.abs(z)
+        return unit[free], (unit + jnp.abs(dt * apply_j(gradient)))[free]
+
     def image(self, z, w, gradient, dt):
         """Z = z + h J∇S(w)."""
         return z + dt * apply_j(gradient)
 
     def reverse(self, dt) -> tuple[Chart, float]:
         """Chart and time step of the inverse map, which the same S generates: (−c, −h)."""
-        return CHARTS[{"type2": "type3", "type3": "type2"}.get(self.name, self.name)], -dt
+        named = {chart.skew: chart for chart in (TYPE2, TYPE3, MIDPOINT)}
+        return named.get(-self.skew, Chart(self.name, -self.skew)), -dt
 
-    def determinant(self, jacobian: Float[Array, "... 2d 2d"]) -> Float[Array, "..."]:
+    def determinant(self, jacobian: Jacobians) -> Float[Array, "*batch"]:
         """det ∂w/∂z = det(½(I + M) + C(M − I)) for Jacobians M of the map.
 
         The chart is valid where this keeps one sign and stays away from 0: there w determines z.
@@ -89,19 +98,22 @@ class TypeOne:
     """w = (q, Q): p = −h ∂S/∂q, P = h ∂S/∂Q.
 
     Not near the identity (the identity has no such S); for long steps and return maps where Q
-    turns with p. ``side`` says which half of w the given state is: 0 for the map, 1 for its inverse.
+    turns with p. ``side`` is the half of w that the given state has: 0 for the map, 1 for its
+    inverse.
     """
 
     name: str = "type1"
     side: int = 0
 
     def point(self, z0, z1):
-        """w = (q, Q)."""
-        return jnp.concatenate([split(z0)[0], split(z1)[0]], axis=-1)
+        """w = (q, Q), whichever of the two states is the given one."""
+        first, second = (z0, z1) if self.side == 0 else (z1, z0)
+        return jnp.concatenate([split(first)[0], split(second)[0]], axis=-1)
 
     def wanted(self, z0, z1, dt):
         """∇S(w) = (−p, P)/h."""
-        return jnp.concatenate([-split(z0)[1], split(z1)[1]], axis=-1) / dt
+        first, second = (z0, z1) if self.side == 0 else (z1, z0)
+        return jnp.concatenate([-split(first)[1], split(second)[1]], axis=-1) / dt
 
     def free(self, dim: int) -> tuple[int, ...]:
         """The half of w that the given state is not."""
@@ -118,6 +130,11 @@ class TypeOne:
         p = split(z)[1]
         return p + dt * g_q if self.side == 0 else p - dt * g_q1
 
+    def sizes(self, scale, z, gradient, dt):
+        """As for the other charts; the residual's entries are momenta."""
+        unit = split(scale + jnp.abs(z))[1]
+        return unit, unit + jnp.abs(dt * split(gradient)[self.side])
+
     def image(self, z, w, gradient, dt):
         """(Q, P) from (q, p), or (q, p) from (Q, P)."""
         (q, q1), (g_q, g_q1) = split(w), split(gradient)
@@ -127,10 +144,10 @@ class TypeOne:
 
     def reverse(self, dt) -> tuple[TypeOne, float]:
         """The same S read from its other side."""
-        return TypeOne(side=1 - self.side), dt
+        return TypeOne(self.name, 1 - self.side), dt
 
-    def determinant(self, jacobian: Float[Array, "... 2d 2d"]) -> Float[Array, "..."]:
-        """det ∂(q, Q)/∂(q, p) = det ∂Q/∂p."""
+    def determinant(self, jacobian: Jacobians) -> Float[Array, "*batch"]:
+        """det ∂(q, Q)/∂(q, p) = det ∂Q/∂p; up to sign the same from the other side."""
         dim = jacobian.shape[-1] // 2
         return jnp.linalg.det(jacobian[..., :dim, dim:])
 

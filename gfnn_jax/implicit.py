@@ -7,8 +7,8 @@ The solve finds x with r(θ, x) = 0 for one lane; a batch is a ``vmap`` of it. T
 - Finished lanes are frozen: a slow or bad lane costs the others the common loop, never a bit.
 - Status is data. Non-finite values are tested for, since ``while err > tol`` ends silently on NaN.
 
-Derivatives of ``root`` come from the implicit function theorem, in forward and reverse mode; those of
-``iterate`` from the iterations that ran, which is what an honest symplecticity defect needs.
+Derivatives of ``root`` come from the implicit function theorem, in forward and reverse mode; those
+of ``iterate`` from the iterations that ran, which is what an honest symplecticity defect needs.
 """
 
 from __future__ import annotations
@@ -23,22 +23,31 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 OK, LEFT_DOMAIN, STOPPED_AT_EDGE, NOT_CONVERGED, NON_FINITE = range(5)
-STATUS_NAMES = ("ok", "left the domain", "stopped at the domain's edge", "not converged", "non-finite")
+STATUS_NAMES = (
+    "ok",
+    "left the domain",
+    "stopped at the domain's edge",
+    "not converged",
+    "non-finite",
+)
 
 # Elimination is unrolled up to this size; beyond it LAPACK's call overhead no longer matters.
 _UNROLL_UP_TO = 8
 _HALVINGS = 12
+# A residual of this many eps of the size of its terms is the floor: a few roundings of that size.
+_FLOOR_EPS = 4.0
 
 
 class Info(NamedTuple):
-    """How a solve ended, per lane: status, Newton updates made, and the residual relative to scale."""
+    """How a solve ended, per lane: status, Newton updates made, and the residual relative to
+    the size of the terms that it is made of."""
 
     status: Int[Array, "*batch"]
     iterations: Int[Array, "*batch"]
     residual: Float[Array, "*batch"]
 
 
-def small_solve(matrix: Float[Array, "n n"], rhs: Float[Array, "n"]) -> Float[Array, "n"]:
+def small_solve(matrix: Matrix, rhs: Vector) -> Vector:
     """Solve matrix @ x = rhs by Gaussian elimination with partial pivoting, unrolled for n <= 8.
 
     Under vmap it compiles to a few fused loops over the batch, 10-25 times faster than a batched
@@ -69,98 +78,92 @@ class _Iterate(NamedTuple):
     x: Any
     residual: Any
     aux: Any
-    error: Any  # largest residual relative to its floor
+    merit: Any  # largest residual, what damping makes smaller
+    error: Any  # largest residual relative to its roundoff floor
     iterations: Any
     open: Any  # still to be improved
 
 
 def iterate(
-    evaluate: Callable, theta: Any, guess: Float[Array, "n"], floor: Float[Array, "n"],
-    *, fixed: int, most: int,
-):  # fmt: skip
-    """The iterations themselves: ``evaluate(theta, x) -> (residual (n,), aux)``.
+    evaluate: Callable, theta: Any, guess: Vector, *, fixed: int, most: int
+) -> tuple[Vector, Any, Info]:
+    """The iterations themselves: ``evaluate(theta, x) -> (residual (n,), size (n,), aux)``.
 
+    ``size`` is that of the terms whose difference the residual is: a few eps of it is roundoff.
     ``fixed`` Newton updates run in every lane, then damped ones while a lane is open, up to
-    ``most``. A lane closes when its residual is at the roundoff ``floor`` (n,), or when it no longer
-    shrinks below sqrt(eps) of the scale. Returns x, aux at x, Info.
+    ``most`` in all. A lane closes when its residual is at the roundoff floor, or is close to it and
+    no longer halves, or cannot be made smaller. Returns x, aux at x, Info.
     """
-    eps = jnp.finfo(guess.dtype).eps
-    nearly = 1.0 / jnp.sqrt(eps)  # in units of the floor: sqrt(eps) of the scale
+    eps = float(jnp.finfo(guess.dtype).eps)
+    settled = eps**-0.25  # in floors: 3e-12 of the size in float64, 1e-5 in float32
 
-    def judge(x):
-        residual, aux = evaluate(theta, x)
-        return residual, aux, jnp.max(jnp.abs(residual) / floor)
+    def judge(x, iterations):
+        residual, size, aux = evaluate(theta, x)
+        merit = jnp.max(jnp.abs(residual))
+        error = jnp.max(jnp.abs(residual) / size) / (_FLOOR_EPS * eps)
+        return _Iterate(x, residual, aux, merit, error, iterations, jnp.array(True))
 
-    def direction(x, residual):
-        return small_solve(jax.jacfwd(lambda y: evaluate(theta, y)[0])(x), residual)
-
-    def newton(state):
-        x = state.x - direction(state.x, state.residual)
-        residual, aux, error = judge(x)
-        return _Iterate(x, residual, aux, error, state.iterations + 1, state.open)
+    def direction(state):
+        matrix = jax.jacfwd(lambda x: evaluate(theta, x)[0])(state.x)
+        return small_solve(matrix, state.residual)
 
     def damped(state):
-        step = direction(state.x, state.residual)
-        # Close to the floor only the full step makes sense: what is left is roundoff, or quadratic.
-        shortest = jnp.where(state.error < nearly, 1.0, 0.5**_HALVINGS)
+        step = direction(state)
+        # Close to the floor only the full step makes sense: what is left is roundoff.
+        shortest = jnp.where(state.error < settled, 1.0, 0.5**_HALVINGS).astype(guess.dtype)
 
         def trial(factor):
-            x = state.x - factor * step
-            return factor, x, *judge(x)
+            return factor, judge(state.x - factor * step, state.iterations + 1)
 
-        def worse(t):
-            factor, _, _, _, error = t
-            return ~(error < state.error) & (factor > shortest)
+        def too_long(attempt):
+            factor, new = attempt
+            return state.open & ~(new.merit < state.merit) & (factor > shortest)
 
-        one = jnp.ones((), guess.dtype)
-        _, x, residual, aux, error = jax.lax.while_loop(
-            worse, lambda t: trial(0.5 * t[0]), trial(one)
+        _, new = jax.lax.while_loop(
+            too_long, lambda attempt: trial(0.5 * attempt[0]), trial(jnp.ones((), guess.dtype))
         )
-        pick = partial(jnp.where, error < state.error)
-        iterations = state.iterations + 1
-        goes_on = (error > 1.0) & (error < 0.5 * state.error) | (error > nearly)
-        return _Iterate(
-            pick(x, state.x),
-            pick(residual, state.residual),
-            jax.tree.map(pick, aux, state.aux),
-            pick(error, state.error),
-            iterations,
-            (error < state.error) & goes_on & (iterations < most),
+        better = new.merit < state.merit
+        goes_on = (new.error > settled) | (new.error > 1.0) & (new.merit < 0.5 * state.merit)
+        kept = jax.tree.map(partial(jnp.where, better), new, state)
+        return kept._replace(
+            iterations=new.iterations, open=better & goes_on & (new.iterations < most)
         )
 
-    residual, aux, error = judge(guess)
-    first = _Iterate(guess, residual, aux, error, jnp.zeros((), jnp.int32), jnp.array(True))
+    first = judge(guess, jnp.zeros((), jnp.int32))
     state = first
     for _ in range(fixed):
-        state = newton(state)
+        state = judge(state.x - direction(state), state.iterations + 1)
     # Where full Newton went astray, start again, damped: this lane only.
-    astray = ~(state.error < nearly) & ~(state.error < first.error)
-    state = jax.tree.map(partial(jnp.where, astray), first, state)
-    state = state._replace(open=(state.error > 1.0) & jnp.isfinite(state.error))
-    state = jax.lax.while_loop(lambda s: s.open, damped, state)
+    astray = ~(state.error < settled) & (~(state.merit < first.merit) & jnp.isfinite(first.merit))
+    state = jax.tree.map(
+        partial(jnp.where, astray), first._replace(iterations=state.iterations), state
+    )
     finite = jnp.isfinite(state.error)
-    status = jnp.where(state.error <= nearly, OK, jnp.where(finite, NOT_CONVERGED, NON_FINITE))
-    return state.x, state.aux, Info(status.astype(jnp.int32), state.iterations, state.error * eps)
+    state = state._replace(open=finite & (state.error > 1.0) & (state.iterations < most))
+    state = jax.lax.while_loop(lambda s: s.open, damped, state)
+    status = jnp.where(state.error <= settled, OK, jnp.where(finite, NOT_CONVERGED, NON_FINITE))
+    residual = state.error * (_FLOOR_EPS * eps)
+    return state.x, state.aux, Info(status.astype(jnp.int32), state.iterations, residual)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 4, 5))
-def root(evaluate, theta, guess, floor, fixed: int, most: int):
+@partial(jax.custom_jvp, nondiff_argnums=(0, 3, 4))
+def root(evaluate, theta, guess, fixed: int, most: int):
     """As ``iterate``, with derivatives in θ by the implicit function theorem.
 
-    dx = −(∂r/∂x)⁻¹ (∂r/∂θ) dθ; the guess and the floor have no influence. ``evaluate`` must not
-    close over anything that is differentiated.
+    dx = −(∂r/∂x)⁻¹ (∂r/∂θ) dθ; the guess has no influence. ``evaluate`` must not close over
+    anything that is differentiated.
     """
-    return iterate(evaluate, theta, guess, floor, fixed=fixed, most=most)
+    return iterate(evaluate, theta, guess, fixed=fixed, most=most)
 
 
 @root.defjvp
 def _root_jvp(evaluate, fixed, most, primals, tangents):
-    theta, guess, floor = primals
-    x, aux, info = root(evaluate, theta, guess, floor, fixed, most)
+    theta, guess = primals
+    x, aux, info = root(evaluate, theta, guess, fixed, most)
     _, residual_dot = jax.jvp(lambda t: evaluate(t, x)[0], (theta,), (tangents[0],))
     matrix = jax.jacfwd(lambda y: evaluate(theta, y)[0])(x)
     x_dot = -small_solve(matrix, residual_dot)
-    _, aux_dot = jax.jvp(lambda t, y: evaluate(t, y)[1], (theta, x), (tangents[0], x_dot))
+    _, aux_dot = jax.jvp(lambda t, y: evaluate(t, y)[2], (theta, x), (tangents[0], x_dot))
     integer_dot = np.zeros((), jax.dtypes.float0)
     info_dot = Info(integer_dot, integer_dot, jnp.zeros_like(info.residual))
     return (x, aux, info), (x_dot, aux_dot, info_dot)

@@ -26,8 +26,6 @@ from gfnn_jax.implicit import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, Info
 from gfnn_jax.phase_space import apply_j, require_x64, symplecticity_defect
 from gfnn_jax.rollout import scan_steps
 
-# A residual of this many eps of a coordinate's size is the floor: a few roundings of that size.
-_FLOOR_EPS = 4.0
 _FIXED_NEWTON = 3
 _MOST_NEWTON = 40
 # 2π in two parts, so that reducing an angle for millions of turns adds no drift.
@@ -41,7 +39,10 @@ def _register(data: tuple[str, ...], meta: tuple[str, ...]) -> Callable:
 
 @dataclasses.dataclass(frozen=True)
 class _Equation:
-    """The implicit equation of a chart as the solver wants it: θ = (params, z), x the free part of w."""
+    """The implicit equation of a chart as the solver wants it: x is the free part of w.
+
+    θ = (params, z, w where it is known, scale).
+    """
 
     scalar: Callable
     chart: AnyChart
@@ -51,10 +52,12 @@ class _Equation:
         return z.at[np.array(self.chart.free(z.shape[0] // 2))].set(x)
 
     def __call__(self, theta, x):
-        params, z, known = theta
+        params, z, known, scale = theta
         w = self.point(known, x)
         gradient = jax.grad(self.scalar, argnums=1)(params, w)
-        return self.chart.residual(z, w, gradient, self.dt), (w, gradient)
+        residual = self.chart.residual(z, w, gradient, self.dt)
+        unit, size = self.chart.sizes(scale, z, gradient, self.dt)
+        return residual / unit, jax.lax.stop_gradient(size / unit), (w, gradient)
 
 
 @_register(("params", "scale", "linear", "offset"), ("scalar", "chart", "dt"))
@@ -76,24 +79,21 @@ class Generated:
     offset: Any
 
     def solve(self, z, *, executed: bool = False):
-        """w, ∇S(w) and Info for the state z (2d,); ``executed`` keeps the iterations' derivative."""
+        """w, ∇S(w), Info at the state z (2d,); ``executed`` keeps the iterations' derivative."""
         equation = _Equation(self.scalar, self.chart, self.dt)
         dim = z.shape[0] // 2
         free = np.array(self.chart.free(dim))
         known = self.chart.start(z)
-        rows = np.arange(dim, 2 * dim) if self.chart.name == "type1" else free
-        floor = _FLOOR_EPS * jnp.finfo(z.dtype).eps * (self.scale + jnp.abs(z))[rows]
         guess = self.chart.point(z, z + self.offset + self.linear @ z)[free]
+        theta = (self.params, z, known, self.scale)
         if executed:
             _, (w, gradient), info = implicit.iterate(
-                equation, (self.params, z, known), guess, floor,
-                fixed=_FIXED_NEWTON, most=_MOST_NEWTON,
-            )  # fmt: skip
+                equation, theta, guess, fixed=_FIXED_NEWTON, most=_MOST_NEWTON
+            )
         else:
             _, (w, gradient), info = implicit.root(
-                equation, (self.params, z, known), jax.lax.stop_gradient(guess),
-                jax.lax.stop_gradient(floor), _FIXED_NEWTON, _MOST_NEWTON,
-            )  # fmt: skip
+                equation, theta, jax.lax.stop_gradient(guess), _FIXED_NEWTON, _MOST_NEWTON
+            )
         return w, gradient, info
 
     def __call__(self, z, *, executed: bool = False):
@@ -168,9 +168,9 @@ class RolloutInfo(NamedTuple):
     """How each lane of a rollout ended: status, step at which it left the domain (−1 if it never
     did), most Newton updates in a step."""
 
-    status: Int[Array, "batch"]
-    left_at: Int[Array, "batch"]
-    iterations: Int[Array, "batch"]
+    status: Int[Array, "*batch"]
+    left_at: Int[Array, "*batch"]
+    iterations: Int[Array, "*batch"]
 
 
 @_register(("pieces", "domain", "scale", "cut"), ("coordinates", "dt"))
@@ -224,7 +224,7 @@ class SymplecticMap:
         return y, worst
 
     def apply(self, z, *, executed: bool = False):
-        """(Z, Info) of one state z (2d,), in the user's coordinates; pure, for your own transforms."""
+        """(Z, Info) of one state z (2d,) in the user's coordinates; for your own transforms."""
         y, turns = self._reduce(self.coordinates.forward(z))
         y1, info = self._apply(y, executed=executed)
         finite = jnp.all(jnp.isfinite(y1))
@@ -249,15 +249,15 @@ class SymplecticMap:
         return dataclasses.replace(self, pieces=pieces)
 
     def defect(self, z) -> Float[Array, "*batch"]:
-        """Symplecticity defect of the executed step at z (2d,) or (B, 2d), coordinates of unit size.
+        """Symplecticity defect of the executed step at z (2d,) or (B, 2d), in units of ``scale``.
 
-        By forward differentiation through the iterations that ran, never by the implicit rule, which
-        would look symplectic however badly the solve had converged.
+        By forward differentiation through the iterations that ran, never by the implicit rule,
+        which would look symplectic however badly the solve had converged.
         """
         return self._batched(_defect, z)
 
     def determinant(self, z) -> Float[Array, "*batch"]:
-        """Chart determinant of the model at z (2d,) or (B, 2d): of the piece where it is smallest."""
+        """Chart determinant at z (2d,) or (B, 2d), of the piece where it is smallest."""
         return self._batched(_determinant, z)
 
     def start(self, z0, *, stop_outside: bool = False) -> Lanes:
