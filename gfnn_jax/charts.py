@@ -65,7 +65,7 @@ class Chart:
         return (w - z - move)[jnp.array(self.free(dim))]
 
     def sizes(self, scale, z, gradient, dt):
-        """Of the residual's entries: the unit scale + abs(z), and the size of what it is made of."""
+        """The unit of the residual's entries, scale + abs(z), and the size of their terms."""
         free = jnp.array(self.free(z.shape[-1] // 2))
         unit = scale + jnp.abs(z)
         return unit[free], (unit + jnp.abs(dt * apply_j(gradient)))[free]

@@ -28,9 +28,8 @@ from gfnn_jax.rollout import scan_steps
 
 _FIXED_NEWTON = 3
 _MOST_NEWTON = 40
-# 2π in two parts, so that reducing an angle for millions of turns adds no drift.
 _TWO_PI = 2 * np.pi
-_TWO_PI_REST = 2.4492935982947064e-16
+_TWO_PI_REST = 2.4492935982947064e-16  # what float64 leaves out of 2π
 
 
 def _register(data: tuple[str, ...], meta: tuple[str, ...]) -> Callable:
@@ -204,10 +203,18 @@ class SymplecticMap:
         return np.array(self.coordinates.angles, dtype=int)
 
     def _reduce(self, y):
-        """y with its angles inside the cut, and the turns taken out."""
+        """y with its angles inside the cut, and the turns taken out.
+
+        2π is subtracted in two parts, so that millions of turns add no drift. An angle so large
+        that its last digit is more than a radian has no meaning, and becomes NaN.
+        """
         angles = self._angles()
+        two_pi = np.asarray(_TWO_PI, y.dtype)
+        rest = _TWO_PI - float(two_pi) + _TWO_PI_REST
         turns = jnp.round((y[angles] - self.cut) / _TWO_PI)
-        return y.at[angles].add(-turns * _TWO_PI).at[angles].add(-turns * _TWO_PI_REST), turns
+        reduced = (y[angles] - turns * two_pi) - turns * rest
+        known = jnp.abs(turns) * float(jnp.finfo(y.dtype).eps) < 1.0
+        return y.at[angles].set(jnp.where(known, reduced, jnp.nan)), turns
 
     def _outer(self, y, turns):
         """The user's state of the reduced y and its turns."""

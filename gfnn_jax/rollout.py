@@ -7,9 +7,11 @@ ends in a step function is rolled out, timed and judged by the same code.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 
 def scan_steps(
@@ -35,12 +37,15 @@ def rollout(step: Callable, z0, num_steps: int, *, save_every: int = 1):
     """Roll out a plain step function z -> z from a batch of initial states.
 
     z0: (B, 2d). Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first.
+    Compiled once for each ``step``: pass the same function again, not a new lambda.
     """
+    return _rollout(step, jnp.asarray(z0), num_steps // save_every, save_every)
 
+
+@partial(jax.jit, static_argnums=(0, 2, 3))
+def _rollout(step, z0, num_saved, save_every):
     def lane(z):
-        _, saved = scan_steps(
-            step, z, num_steps // save_every, save_every=save_every, observe=lambda z: z
-        )
-        return jax.numpy.concatenate([z[None], saved])
+        _, saved = scan_steps(step, z, num_saved, save_every=save_every, observe=lambda z: z)
+        return jnp.concatenate([z[None], saved])
 
-    return jax.jit(jax.vmap(lane))(jax.numpy.asarray(z0))
+    return jax.vmap(lane)(z0)
