@@ -86,8 +86,8 @@ SCHEDULES: dict[str, Callable] = {"staircase": _staircase, "cosine": _cosine}
 PAPER = Recipe(batch_size=200, epochs=20, rate=0.01, schedule="staircase")
 PAPER_STANDARD_MAP = dataclasses.replace(PAPER, batch_size=1000, rate=0.001)
 # As many iterations whatever the number of pairs.
-DEFAULT = Recipe(batch_size=200, epochs=80, rate=0.01, schedule="cosine", epoch_length=500)
-QUICK = dataclasses.replace(DEFAULT, epochs=24)
+DEFAULT = Recipe(batch_size=200, epochs=160, rate=0.02, schedule="cosine", epoch_length=500)
+QUICK = dataclasses.replace(DEFAULT, epochs=30)
 
 
 class AdamFit(NamedTuple):
