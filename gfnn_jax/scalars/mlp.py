@@ -81,7 +81,7 @@ class Mlp:
 
     @property
     def operations(self) -> tuple[int, int]:
-        """Floating-point operations of ∇S (forward and back) and of its Jacobian (a tangent each)."""
+        """Floating-point operations of ∇S (forward, back) and of its Jacobian (a tangent each)."""
         gradient = 4 * (self.num_parameters - sum(self.hidden))
         return gradient, gradient * (1 + self.inputs.num_variables)
 
