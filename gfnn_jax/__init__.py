@@ -1,0 +1,93 @@
+"""Learn exactly symplectic maps from data, and predict with them for millions of steps.
+
+    scene = gfnn.scenes.henon_heiles(energy=1 / 12)
+    pairs = gfnn.sample_pairs(scene, num_pairs=4_096, key=jax.random.key(0))
+    fit = gfnn.fit(pairs, scene, tolerance=1e-8)
+    states, info = fit.map.rollout(z0, num_steps=1_000_000)
+
+Names are loaded when first used, so that importing the package costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gfnn_jax import figures, metrics, scenes
+    from gfnn_jax.charts import CHARTS, Chart
+    from gfnn_jax.io import InputError, WorkError
+    from gfnn_jax.maps import SymplecticMap
+    from gfnn_jax.models import load
+    from gfnn_jax.phase_space import Pairs
+    from gfnn_jax.scenes import Scene
+    from gfnn_jax.selection import Fit, FitError, FitWarning, fit
+    from gfnn_jax.trajectories import (
+        reference_trajectories,
+        sample_pairs,
+        sample_states,
+        sample_test_states,
+    )
+
+    __version__: str
+
+_MODULES = ("figures", "metrics", "scenes")
+_HOMES = {
+    "CHARTS": "charts",
+    "Chart": "charts",
+    "Fit": "selection",
+    "FitError": "selection",
+    "FitWarning": "selection",
+    "InputError": "io",
+    "Pairs": "phase_space",
+    "Scene": "scenes",
+    "SymplecticMap": "maps",
+    "WorkError": "io",
+    "fit": "selection",
+    "load": "models",
+    "reference_trajectories": "trajectories",
+    "sample_pairs": "trajectories",
+    "sample_states": "trajectories",
+    "sample_test_states": "trajectories",
+}
+
+__all__ = [
+    "CHARTS",
+    "Chart",
+    "Fit",
+    "FitError",
+    "FitWarning",
+    "InputError",
+    "Pairs",
+    "Scene",
+    "SymplecticMap",
+    "WorkError",
+    "figures",
+    "fit",
+    "load",
+    "metrics",
+    "reference_trajectories",
+    "sample_pairs",
+    "sample_states",
+    "sample_test_states",
+    "scenes",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return importlib.import_module(f"gfnn_jax.{name}")
+    if name in _HOMES:
+        value = getattr(importlib.import_module(f"gfnn_jax.{_HOMES[name]}"), name)
+    elif name == "__version__":
+        from importlib.metadata import version
+
+        value = version("gfnn_jax")
+    else:
+        raise AttributeError(f"module 'gfnn_jax' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -1,0 +1,7 @@
+"""``python -m gfnn_jax`` is ``gfnn``."""
+
+import sys
+
+from gfnn_jax.cli import main
+
+sys.exit(main())

@@ -1,0 +1,212 @@
+"""Symplectic maps on disk: a model folder with a description that a human can read.
+
+A map is a tree of frozen dataclasses. Its arrays go to the folder's arrays, bit for bit; all the
+rest, the type of every node and its constants, is text. Loading builds nothing but the types of a
+fixed table, and no code runs from a loaded file: the two kinds of function that a map may hold, a
+scene's change of coordinates and its features, are taken from a scene, by its name.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.charts import Chart, TypeOne
+from gfnn_jax.checkpoints import load_model, save_model
+from gfnn_jax.coordinates import CARTESIAN, Coordinates
+from gfnn_jax.domain import Domain
+from gfnn_jax.io import InputError, ensure_new
+from gfnn_jax.maps import Affine, Generated, SymplecticMap
+from gfnn_jax.scalars.inputs import Inputs
+from gfnn_jax.scalars.mlp import Mlp
+from gfnn_jax.scalars.products import Products
+from gfnn_jax.scalars.sines import Sines
+from gfnn_jax.scenes import SCENES
+from gfnn_jax.scenes.scene import Scene
+
+_TYPES: dict[str, type] = {
+    kind.__name__: kind
+    for kind in (
+        SymplecticMap, Generated, Affine, Chart, TypeOne, Domain, Products, Sines, Mlp, Inputs,
+    )
+}  # fmt: skip
+# Stands in the description where a function of the scene belongs.
+_OF_SCENE = "of the scene"
+_PACKAGES = ("gfnn_jax", "jax", "jaxlib", "flax", "optax", "diffrax", "numpy", "scipy")
+
+
+def save(
+    map_: SymplecticMap,
+    folder,
+    *,
+    scene: Scene | None = None,
+    record: dict[str, Any] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Save a map as a model folder.
+
+    scene:  whose coordinates or features the map uses, where it is not one of the package's own;
+            `load` must be given it again.
+    record: JSON-able, anything worth keeping: where the data came from, how the fit went.
+
+    Raises InputError where ``folder`` exists (unless ``overwrite``) or the map holds a function
+    that cannot be found again by a name, WorkError where writing fails.
+    """
+    ensure_new(folder, overwrite, folder=True)
+    lender = _lender(map_, scene)
+    text, arrays = _encode(map_)
+    description = {
+        "scene": lender,
+        "map": text,
+        "record": record or {},
+        "versions": versions(),
+    }
+    save_model(folder, arrays, description)
+
+
+def load(folder, scene: Scene | None = None) -> SymplecticMap:
+    """The map of a model folder; it predicts the very bits that the saved one did.
+
+    scene: the scene that the map was learned in, where it is not one of the package's own.
+
+    Raises InputError, in one line, where the folder is damaged, of another format, or needs a scene
+    that was not given.
+    """
+    arrays, description = load_model(folder)
+    name = description.get("scene")
+    if scene is None and name is not None:
+        if name not in SCENES:
+            raise InputError(f"{folder}: was learned in the scene '{name}': pass that scene")
+        scene = SCENES[name]()
+    if scene is not None and name is not None and scene.name != name:
+        raise InputError(f"{folder}: was learned in the scene '{name}', not in '{scene.name}'")
+    try:
+        return _decode(description["map"], arrays, scene)
+    except InputError as error:
+        raise InputError(f"{folder}: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{folder}: does not describe a map of this release ({error})") from error
+
+
+def record(folder) -> dict[str, Any]:
+    """What was saved beside a map as its record. Raises InputError as `load` does."""
+    return load_model(folder)[1]["record"]
+
+
+def digest(folder) -> str:
+    """SHA-256 that identifies a saved model: of its description, which has every array's own."""
+    return hashlib.sha256((Path(folder) / "model.json").read_bytes()).hexdigest()
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of what a result depends on; None for a package that is not installed."""
+    found: dict[str, str | None] = {}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = None
+    return found
+
+
+def _features(map_: SymplecticMap) -> list:
+    found = [getattr(getattr(piece, "scalar", None), "inputs", None) for piece in map_.pieces]
+    return [inputs.features for inputs in found if inputs is not None and inputs.features]
+
+
+def _lender(map_: SymplecticMap, scene: Scene | None) -> str | None:
+    """Name of the scene that lends the map its functions; None where it needs none."""
+    features = _features(map_)
+    changed = map_.coordinates.forward is not CARTESIAN.forward
+    if not (features or changed):
+        return None
+    for lender in [scene] if scene is not None else [make() for make in SCENES.values()]:
+        same_coordinates = not changed or lender.coordinates == map_.coordinates
+        if same_coordinates and all(f is lender.features for f in features):
+            return lender.name
+    what = "coordinates" if changed else "features"
+    raise InputError(
+        f"the map uses {what} of a scene that is not known: pass it (scene=...), and again to load"
+    )
+
+
+# A tree of dataclasses <-> text and arrays.
+
+
+def _encode(value: Any) -> tuple[Any, Any]:
+    """(text, arrays) of a node; None for arrays where there are none, and for text likewise."""
+    if isinstance(value, (jax.Array, np.ndarray)) or isinstance(value, dict):
+        return None, value
+    if isinstance(value, Coordinates):
+        text = {"name": value.name, "angles": list(value.angles), "cyclic": list(value.cyclic)}
+        change = None if value.forward is CARTESIAN.forward else _OF_SCENE
+        return {"type": "Coordinates", **text, "change": change}, None
+    if type(value).__name__ in _TYPES:
+        text = {"type": type(value).__name__}
+        return _encode_all(
+            {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}, text
+        )
+    if isinstance(value, tuple) and any(dataclasses.is_dataclass(item) for item in value):
+        return _encode_all({str(i): item for i, item in enumerate(value)}, {"type": "tuple"})
+    if isinstance(value, tuple):
+        return [_encode(item)[0] for item in value], None
+    if isinstance(value, np.generic):
+        return value.item(), None
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value, None
+    if callable(value) and not dataclasses.is_dataclass(value):
+        return _OF_SCENE, None  # _lender has made sure of it
+    raise InputError(f"a map that holds a {type(value).__name__} cannot be saved")
+
+
+def _encode_all(items: dict[str, Any], text: dict[str, Any]) -> tuple[Any, Any]:
+    arrays = {}
+    for name, item in items.items():
+        words, numbers = _encode(item)
+        if numbers is not None:
+            arrays[name] = numbers
+        if words is not None or numbers is None:
+            text[name] = words
+    return text, arrays or None
+
+
+def _decode(text: Any, arrays: Any, scene: Scene | None) -> Any:
+    if isinstance(text, list):
+        return tuple(_decode(item, None, scene) for item in text)
+    if not isinstance(text, dict):
+        return text
+    kind = text["type"]
+    if kind == "Coordinates":
+        return _decode_coordinates(text, scene)
+    items = {}
+    for name in {**text, **(arrays or {})}:
+        numbers = (arrays or {}).get(name)
+        if name == "type":
+            continue
+        if name == "features" and text[name] == _OF_SCENE:
+            if scene is None or scene.features is None:
+                raise InputError("needs the features of its scene, which has none")
+            items[name] = scene.features
+        elif name in text:
+            items[name] = _decode(text[name], numbers, scene)
+        else:
+            items[name] = jax.tree.map(jnp.asarray, numbers)
+    if kind == "tuple":
+        return tuple(items[str(i)] for i in range(len(items)))
+    return _TYPES[kind](**items)
+
+
+def _decode_coordinates(text: dict[str, Any], scene: Scene | None) -> Coordinates:
+    angles, cyclic = tuple(text["angles"]), tuple(text["cyclic"])
+    if text["change"] is None:
+        return Coordinates(text["name"], angles, cyclic)
+    if scene is None or (scene.coordinates.angles, scene.coordinates.cyclic) != (angles, cyclic):
+        raise InputError(f"needs the {text['name']} coordinates of its scene, which has others")
+    return scene.coordinates

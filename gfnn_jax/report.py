@@ -1,0 +1,152 @@
+"""report.json: what was done, how accurate it is, how fast, and with what.
+
+Every key is always there; what does not apply, or is not finite, is null.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import jax
+import numpy as np
+
+from gfnn_jax.implicit import STATUS_NAMES
+from gfnn_jax.models import versions
+from gfnn_jax.selection import Fit
+
+STEPS_REPORTED = (1, 10, 100, 1000)
+
+
+def device() -> str:
+    """The device that JAX computes on by default."""
+    first = jax.devices()[0]
+    return f"{first.platform}: {first.device_kind}"
+
+
+def assemble(
+    fit: Fit,
+    *,
+    scene: str | None,
+    dt: float,
+    seed: int,
+    data: dict[str, Any],
+    rollout: dict[str, Any] | None,
+) -> dict[str, Any]:
+    """The report of a fit, and of the rollouts with it where there were any (see `rollout_part`).
+
+    data: what is known of the pairs beside their number: source, digest, what was warned of.
+    """
+    chosen = fit.chosen
+    return {
+        "scene": scene,
+        "dt": dt,
+        "seed": seed,
+        "dtype": str(fit.map.scale.dtype),
+        "device": device(),
+        "versions": versions(),
+        "data": {
+            "num_pairs": fit.num_pairs,
+            "symplecticity_defect": fit.data_defect,
+            **data,
+        },
+        "model": {
+            "scalar": chosen.scalar,
+            "label": chosen.label,
+            "chart": chosen.chart,
+            "num_parameters": chosen.num_parameters,
+            "base_map": fit.based,
+        },
+        "fit": {
+            "seconds": chosen.fit_seconds,
+            "compile_seconds": chosen.compile_seconds,
+            "total_seconds": fit.seconds,
+            "train_rms": chosen.train_rms,
+            "validation_rms": chosen.validation_rms,
+            "validation_bound": chosen.validation_bound,
+            "tolerance": fit.tolerance,
+            "tolerance_met": fit.met,
+            "messages": list(fit.messages),
+        },
+        "map": {
+            "symplecticity_defect": fit.symplecticity_defect,
+            "chart_determinant_min": fit.model_determinant_min,
+            "chart_determinants_of_data": {n: j.low for n, j in fit.judgements.items()},
+            "newton_iterations_max": chosen.newton_iterations_max,
+        },
+        "rollout": rollout,
+        "candidates": [
+            {
+                "scalar": c.scalar,
+                "label": c.label,
+                "chart": c.chart,
+                "num_parameters": c.num_parameters,
+                "validation_rms": c.validation_rms,
+                "validation_bound": c.validation_bound,
+                "work": c.work,
+                "microseconds_per_step": c.microseconds_per_step,
+                "fit_seconds": c.fit_seconds,
+                "chosen": c.chosen,
+            }
+            for c in fit.candidates
+        ],
+    }
+
+
+def rollout_part(
+    *,
+    num_trajectories: int,
+    num_steps: int,
+    seconds: float,
+    status,
+    statistics,
+    growth,
+    drift,
+) -> dict[str, Any]:
+    """The report's ``rollout``.
+
+    seconds: without compilation. status: (B,) codes. statistics: ErrorStatistics of the position
+    error at every step (num_steps + 1,). growth, drift: Estimates, or None where they do not apply.
+    """
+    reported = [n for n in STEPS_REPORTED if n <= num_steps]
+    none = {str(n): None for n in STEPS_REPORTED}
+    return {
+        "num_trajectories": num_trajectories,
+        "num_excluded": statistics.num_excluded,
+        "num_lost": statistics.num_lost,
+        "num_steps": num_steps,
+        "seconds": seconds,
+        "microseconds_per_step": 1e6 * seconds / (num_steps * num_trajectories),
+        "status_counts": status_counts(status),
+        "error": none | {str(n): float(statistics.mean[n]) for n in reported},
+        "error_median": none | {str(n): float(statistics.median[n]) for n in reported},
+        "growth_exponent": growth.value if growth else None,
+        "growth_exponent_interval": list(growth.interval) if growth else None,
+        "energy_drift": drift.value if drift else None,
+        "energy_drift_interval": list(drift.interval) if drift else None,
+    }
+
+
+def status_counts(status) -> dict[str, int]:
+    """How many lanes ended with each status, by its name."""
+    counts = np.bincount(np.asarray(status), minlength=len(STATUS_NAMES))
+    return {name: int(n) for name, n in zip(STATUS_NAMES, counts, strict=True)}
+
+
+def to_json(report: dict[str, Any]) -> str:
+    """Strict JSON: numbers that are not finite become null."""
+    return json.dumps(finite(report), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def finite(value: Any) -> Any:
+    """The same tree of dicts and lists with None for numbers that are not finite."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    if isinstance(value, (np.generic, np.ndarray, jax.Array)) and np.ndim(value) == 0:
+        value = np.asarray(value).item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
