@@ -131,8 +131,9 @@ def iterate(
 
     first = judge(guess, jnp.zeros((), jnp.int32))
     state = first
-    for _ in range(fixed):
-        state = judge(state.x - direction(state), state.iterations + 1)
+    state = jax.lax.fori_loop(
+        0, fixed, lambda _, s: judge(s.x - direction(s), s.iterations + 1), first
+    )
     # Where full Newton went astray, start again, damped: this lane only.
     astray = ~(state.error < settled) & (~(state.merit < first.merit) & jnp.isfinite(first.merit))
     state = jax.tree.map(
