@@ -10,6 +10,7 @@ m parameters, whatever the number of pairs.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 from functools import partial
 from typing import NamedTuple
@@ -40,7 +41,6 @@ class LeastSquaresFit(NamedTuple):
     ridge: float
 
 
-@partial(jax.jit, static_argnums=(0,))
 def _rows(family, w, wanted, weight):
     """Weighted rows [A b] of a chunk: (N 2d, m + 1)."""
     features = jax.vmap(family.gradient_features)(w) * weight[None, :, None]
@@ -48,9 +48,10 @@ def _rows(family, w, wanted, weight):
     return rows.reshape(-1, rows.shape[-1])
 
 
-@jax.jit
-def _fold(factor, rows):
-    """R of the stacked [R; rows]: the QR step that forgets the rows."""
+@partial(jax.jit, static_argnums=(0,))
+def _fold(family, factor, w, wanted, weight):
+    """R of the stacked [R; rows of this chunk]: the QR step that forgets the rows."""
+    rows = _rows(family, w, wanted, weight)
     return jnp.linalg.qr(jnp.concatenate([factor, rows]), mode="r")
 
 
@@ -59,63 +60,98 @@ def chunk_size(num_parameters: int, dim: int) -> int:
     return max(64, _CHUNK_BYTES // (8 * 2 * dim * (num_parameters + 1)))
 
 
-def triangular_factor(family, chunks: Iterable, weight) -> tuple[np.ndarray, int]:
-    """R of [A b] over chunks of (w, wanted), and the number of rows seen.
+class Reduced(NamedTuple):
+    """All that the data say about a family: the triangular factors of [A b], terms by rising degree.
 
-    Each chunk: w and wanted of shape (n, 2d). weight: (2d,) of the rows of one pair.
+    factor, rows: of the training rows; validation_factor, validation_rows: of those held out.
+    Leading columns answer for every smaller family whose terms are the leading ones.
     """
-    m = family.num_parameters + 1
-    factor, seen = jnp.zeros((0, m)), 0
-    for w, wanted in chunks:
-        rows = _rows(family, jnp.asarray(w), jnp.asarray(wanted), jnp.asarray(weight))
-        factor = _fold(factor, rows)
-        seen += rows.shape[0]
-    return np.asarray(factor), seen
+
+    factor: np.ndarray
+    rows: int
+    validation_factor: np.ndarray
+    validation_rows: int
+    seconds: float
+    compile_seconds: float
 
 
-def solve(factor: np.ndarray, num_rows: int, validation_factor: np.ndarray, validation_rows: int):
-    """Coefficients from the triangular factors of the training and of the validation rows.
+def reduce(family, train, validation, weight) -> Reduced:
+    """Reduce (w, wanted) of training and held-out pairs, (N, 2d) each, for a linear family.
+
+    weight: (2d,), what a row of ∇S is multiplied by: h divided by the scale of the conjugate
+    coordinate, so that the result does not depend on the units of q and p.
+    """
+    started = time.perf_counter()
+    n = chunk_size(family.num_parameters, train[0].shape[-1] // 2)
+    weight = jnp.asarray(weight)
+    stage = _Stage(family, weight)
+    factors = []
+    for w, wanted in (train, validation):
+        factors.append(
+            stage.factor((w[i : i + n], wanted[i : i + n]) for i in range(0, len(w), n))
+        )
+    seconds = time.perf_counter() - started - stage.compile_seconds
+    (factor, rows), (held, held_rows) = factors
+    return Reduced(factor, rows, held, held_rows, seconds, stage.compile_seconds)
+
+
+class _Stage:
+    """The chunk-wise reduction of one family's rows, compilation timed apart."""
+
+    def __init__(self, family, weight):
+        self.family, self.weight = family, weight
+        self.compile_seconds = 0.0
+        self._compiled = {}
+
+    def factor(self, chunks: Iterable) -> tuple[np.ndarray, int]:
+        """R of [A b] over chunks of (w, wanted), and the number of rows seen."""
+        m = self.family.num_parameters + 1
+        factor, seen = jnp.zeros((0, m)), 0
+        for w, wanted in chunks:
+            factor = self._fold(factor, jnp.asarray(w), jnp.asarray(wanted))
+            seen += w.size
+        return np.asarray(factor), seen
+
+    def _fold(self, factor, w, wanted):
+        shape = (factor.shape, w.shape)
+        if shape not in self._compiled:
+            started = time.perf_counter()
+            lowered = _fold.lower(self.family, factor, w, wanted, self.weight)
+            self._compiled[shape] = lowered.compile()
+            self.compile_seconds += time.perf_counter() - started
+        return self._compiled[shape](factor, w, wanted, self.weight)
+
+
+def solve(reduced: Reduced, num_terms: int) -> LeastSquaresFit:
+    """Coefficients of the leading ``num_terms`` terms.
 
     Scaled columns; the ridge parameter with the smallest validation error among a ladder, zero
     included, so that noisy or too few data give a regularised fit and clean ones the plain one.
     """
-    a, b = factor[:, :-1], factor[:, -1]
+    a, b = reduced.factor[:, :num_terms], reduced.factor[:, -1]
+    held_a, held_b = reduced.validation_factor[:, :num_terms], reduced.validation_factor[:, -1]
     column = np.linalg.norm(a, axis=0)
     column = np.where(column > 0, column, 1.0)
     u, s, vt = np.linalg.svd(a / column, full_matrices=False)
     along = u.T @ b
-    eps = np.finfo(np.float64).eps
-    cutoff = eps * max(a.shape) * s[0]
-    rank = int(np.sum(s > cutoff))
-    inverse = [np.where(s > cutoff, s, np.inf) for _ in _RIDGES[:1]]
-    filters = [1.0 / inverse[0]] + [s / (s**2 + (r * s[0]) ** 2) for r in _RIDGES[1:]]
-    candidates = (vt.T @ (np.stack(filters) * along).T) / column[:, None]
-    errors = np.linalg.norm(
-        validation_factor[:, :-1] @ candidates - validation_factor[:, -1:], axis=0
-    )
-    # Prefer the least ridge that is as good as the best one to within a few per cent.
-    best = int(np.argmax(errors <= 1.02 * errors.min()))
-    c = candidates[:, best]
+    cutoff = np.finfo(np.float64).eps * max(a.shape) * s[0]
+    known = s > cutoff
+    plain = np.where(known, 1.0 / np.where(known, s, 1.0), 0.0)
+    filters = np.stack([plain, *(s / (s**2 + (r * s[0]) ** 2) for r in _RIDGES[1:])])
+    tried = (vt.T @ (filters * along).T) / column[:, None]
+    errors = np.linalg.norm(held_a @ tried - held_b[:, None], axis=0)
+    best = int(np.argmin(errors))
+    c = tried[:, best]
     return LeastSquaresFit(
         coefficients=jnp.asarray(c),
-        train_rms=float(np.linalg.norm(a @ c - b) / np.sqrt(num_rows)),
-        validation_rms=float(errors[best] / np.sqrt(validation_rows)),
-        rank=rank,
+        train_rms=float(np.linalg.norm(a @ c - b) / np.sqrt(reduced.rows)),
+        validation_rms=float(errors[best] / np.sqrt(reduced.validation_rows)),
+        rank=int(known.sum()),
         condition=float(s[0] / s[-1]) if s[-1] > 0 else float("inf"),
         ridge=_RIDGES[best],
     )
 
 
 def fit(family, train, validation, weight) -> LeastSquaresFit:
-    """Fit a linear family to train = (w, wanted), each (N, 2d); validation likewise, held out.
-
-    weight: (2d,), what a row of ∇S is multiplied by: h divided by the scale of the conjugate
-    coordinate, so that the result does not depend on the units of q and p.
-    """
-
-    def chunks(w, wanted):
-        n = chunk_size(family.num_parameters, w.shape[-1] // 2)
-        return ((w[i : i + n], wanted[i : i + n]) for i in range(0, len(w), n))
-
-    factors = [triangular_factor(family, chunks(*data), weight) for data in (train, validation)]
-    return solve(*factors[0], *factors[1])
+    """Fit one linear family: ``reduce`` and ``solve`` in one go."""
+    return solve(reduce(family, train, validation, weight), family.num_parameters)

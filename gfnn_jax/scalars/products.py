@@ -25,32 +25,40 @@ from gfnn_jax.scalars.inputs import Inputs
 
 
 def chebyshev(x, degree: int):
-    """T_0..T_degree at x, their first and second derivatives: each (degree + 1,).
+    """T_0..T_degree of each x (n,), their first and second derivatives: each (degree + 1, n).
 
-    T_{k+1} = 2x T_k − T_{k−1}, differentiated twice.
+    By doubling, T_{k+j} = 2 T_k T_j − T_{k−j} for j = 1..k, differentiated twice: a handful of
+    vector operations whatever the degree.
     """
-    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
-    value, first, second = [one, x], [zero, one], [zero, zero]
-    for _ in range(degree - 1):
-        second.append(4 * first[-1] + 2 * x * second[-1] - second[-2])
-        first.append(2 * value[-1] + 2 * x * first[-1] - first[-2])
-        value.append(2 * x * value[-1] - value[-2])
-    return tuple(jnp.stack(f[: degree + 1]) for f in (value, first, second))
+    one, zero = jnp.ones_like(x), jnp.zeros_like(x)
+    t, d, dd = jnp.stack([one, x]), jnp.stack([zero, one]), jnp.stack([zero, zero])
+    while (k := t.shape[0] - 1) < degree:
+        j = slice(1, min(k, degree - k) + 1)
+        mirror = slice(k - 1, None if k - j.stop < 0 else k - j.stop, -1)
+        more_dd = 2 * (dd[k] * t[j] + 2 * d[k] * d[j] + t[k] * dd[j]) - dd[mirror]
+        more_d = 2 * (d[k] * t[j] + t[k] * d[j]) - d[mirror]
+        more_t = 2 * t[k] * t[j] - t[mirror]
+        t, d, dd = (jnp.concatenate(f) for f in ((t, more_t), (d, more_d), (dd, more_dd)))
+    return t[: degree + 1], d[: degree + 1], dd[: degree + 1]
 
 
 def fourier(x, degree: int):
-    """1, cos x, sin x, cos 2x, sin 2x, ... up to harmonic ``degree``, and two derivatives."""
-    c, s = jnp.cos(x), jnp.sin(x)
-    cosines, sines = [jnp.ones_like(x)], [jnp.zeros_like(x)]
-    for _ in range(degree):
-        cosines.append(c * cosines[-1] - s * sines[-1])
-        sines.append(s * cosines[-2] + c * sines[-1])
-    value, first, second = [cosines[0]], [sines[0]], [sines[0]]
-    for k in range(1, degree + 1):
-        value += [cosines[k], sines[k]]
-        first += [-k * sines[k], k * cosines[k]]
-        second += [-k * k * cosines[k], -k * k * sines[k]]
-    return tuple(jnp.stack(f) for f in (value, first, second))
+    """1, cos x, .., cos Dx, sin x, .., sin Dx of each x (n,), and two derivatives: each (2D + 1, n).
+
+    By doubling, e^{i(k+j)x} = e^{ikx} e^{ijx}.
+    """
+    c, s = jnp.stack([jnp.ones_like(x), jnp.cos(x)]), jnp.stack([jnp.zeros_like(x), jnp.sin(x)])
+    while (k := c.shape[0] - 1) < degree:
+        j = slice(1, min(k, degree - k) + 1)
+        more_c, more_s = c[k] * c[j] - s[k] * s[j], s[k] * c[j] + c[k] * s[j]
+        c, s = jnp.concatenate([c, more_c]), jnp.concatenate([s, more_s])
+    c, s = c[: degree + 1], s[: degree + 1]
+    n = jnp.arange(degree + 1, dtype=x.dtype)[:, None]
+    return (
+        jnp.concatenate([c, s[1:]]),
+        jnp.concatenate([-n * s, (n * c)[1:]]),
+        jnp.concatenate([-n * n * c, -(n * n * s)[1:]]),
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,17 +75,18 @@ class _Half:
         terms = [()]
         for angle in self.is_angle:
             count = 2 * self.degree + 1 if angle else self.degree + 1
-            order = [(k + 1) // 2 if angle else k for k in range(count)]
             terms = [
                 (*t, k) for t in terms for k in range(count)
-                if order[k] + self._order(t) <= self.degree
+                if self._harmonic(k) + self._order(t) <= self.degree
             ]  # fmt: skip
         return np.array(terms, dtype=np.int32).reshape(len(terms), len(self.is_angle))
 
+    def _harmonic(self, k: int) -> int:
+        """Degree of the k-th one-dimensional function: the sines follow the cosines."""
+        return k if k <= self.degree else k - self.degree
+
     def _order(self, term) -> int:
-        return sum(
-            (k + 1) // 2 if a else k for k, a in zip(term, self.is_angle[: len(term)], strict=True)
-        )
+        return sum(self._harmonic(k) for k in term)
 
     @cached_property
     def orders(self) -> np.ndarray:
@@ -91,19 +100,21 @@ class _Half:
         for j, (angle, flips) in enumerate(zip(self.is_angle, self.signs, strict=True)):
             if flips < 0:
                 k = self.indices[:, j]
-                odd = (k > 0) & (k % 2 == 0) if angle else k % 2 == 1  # sines; odd degrees
+                odd = k > self.degree if angle else k % 2 == 1  # sines; odd degrees
                 sign = np.where(odd, -sign, sign)
         return sign
 
     def tables(self, x):
         """Products u (terms,), gradient (variables, terms), Hessian (variables, variables, terms)."""
-        one_d = [
-            (fourier if angle else chebyshev)(x[j], self.degree)
-            for j, angle in enumerate(self.is_angle)
-        ]
-        picked = [
-            [f[self.indices[:, j]] for f in functions] for j, functions in enumerate(one_d)
-        ]
+        angle = np.array(self.is_angle, dtype=bool)
+        plain, circle = np.flatnonzero(~angle), np.flatnonzero(angle)
+        polynomials = chebyshev(x[plain], self.degree) if plain.size else None
+        harmonics = fourier(x[circle], self.degree) if circle.size else None
+        picked = []
+        for j, k in enumerate(self.indices.T):
+            functions, among = (harmonics, circle) if angle[j] else (polynomials, plain)
+            column = int(np.flatnonzero(among == j)[0])
+            picked.append([f[k, column] for f in functions])
         n, terms = len(picked), len(self.indices)
         unit = jnp.ones(terms, x.dtype)
 
@@ -181,6 +192,15 @@ class Products:
     @property
     def num_parameters(self) -> int:
         return len(self.terms)
+
+    @property
+    def operations(self) -> tuple[int, int]:
+        """Floating-point operations of ∇S and of its Jacobian: the two products with C, the tables."""
+        (m, i), (n, j) = (h.indices.shape for h in self.halves)
+        tables = sum(t * k * (k - 1) + 10 * self.degree * k for t, k in ((m, i), (n, j)))
+        gradient = 4 * m * n + 2 * (m * i + n * j) + tables
+        mixed = 2 * i * m * n + 2 * i * j * n
+        return gradient, gradient + mixed + 2 * (m * i * i + n * j * j)
 
     def unflatten(self, coefficients):
         """Coefficients (num_parameters,) -> the matrix C, the parameters of ``S``."""

@@ -33,6 +33,12 @@ class Sines:
     def label(self) -> str:
         return f"{self.name} {self.num_parameters}"
 
+    @property
+    def operations(self) -> tuple[int, int]:
+        """Floating-point operations of ∇S and of its Jacobian."""
+        n = self.inputs.num_variables
+        return 4 * self.num_parameters * n, 2 * self.num_parameters * n * (n + 1)
+
     @cached_property
     def _frequencies(self) -> tuple[np.ndarray, np.ndarray]:
         """k (num_parameters, variables) and b (num_parameters,); integer k for angles."""
