@@ -41,9 +41,8 @@ class Domain:
 
     def contains(self, y):
         """Whether the state y (2d,) lies where data were; False for non-finite y."""
-        if not self.keep:
-            return jnp.all(jnp.isfinite(y))
-        return self._christoffel(y) <= self.limit
+        finite = jnp.all(jnp.isfinite(y))
+        return finite & (self._christoffel(y) <= self.limit) if self.keep else finite
 
     def _christoffel(self, y):
         x = (y[np.array(self.keep)] - self.centre) / self.scale
