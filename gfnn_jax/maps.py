@@ -60,7 +60,7 @@ class _Equation:
 
 
 @_register(("params", "scale", "linear", "offset"), ("scalar", "chart", "dt"))
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Generated:
     """The map that S generates in a chart: Z − z = h J ∇S(w) (paper, eq. (4)).
 
@@ -126,7 +126,7 @@ class Generated:
 
 
 @_register(("matrix", "centre", "shift"), ())
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Affine:
     """z -> centre + shift + E (z − centre), E a symplectic matrix: half a base map (design R^½)."""
 
@@ -173,7 +173,7 @@ class RolloutInfo(NamedTuple):
 
 
 @_register(("pieces", "domain", "scale", "cut"), ("coordinates", "dt"))
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class SymplecticMap:
     """A learned map and what it knows of its data.
 
