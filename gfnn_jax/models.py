@@ -117,8 +117,10 @@ def versions() -> dict[str, str | None]:
 
 
 def _features(map_: SymplecticMap) -> list:
-    found = [getattr(getattr(piece, "scalar", None), "inputs", None) for piece in map_.pieces]
-    return [inputs.features for inputs in found if inputs is not None and inputs.features]
+    """The functions that stand in for w in the map's scalars."""
+    scalars = [piece.scalar for piece in map_.pieces if isinstance(piece, Generated)]
+    inputs = [getattr(scalar, "inputs", None) for scalar in scalars]
+    return [i.features for i in inputs if i is not None and i.features is not None]
 
 
 def _lender(map_: SymplecticMap, scene: Scene | None) -> str | None:
@@ -142,17 +144,17 @@ def _lender(map_: SymplecticMap, scene: Scene | None) -> str | None:
 
 def _encode(value: Any) -> tuple[Any, Any]:
     """(text, arrays) of a node; None for arrays where there are none, and for text likewise."""
-    if isinstance(value, (jax.Array, np.ndarray)) or isinstance(value, dict):
+    if isinstance(value, (jax.Array, np.ndarray, dict)):
         return None, value
     if isinstance(value, Coordinates):
         text = {"name": value.name, "angles": list(value.angles), "cyclic": list(value.cyclic)}
         change = None if value.forward is CARTESIAN.forward else _OF_SCENE
         return {"type": "Coordinates", **text, "change": change}, None
-    if type(value).__name__ in _TYPES:
-        text = {"type": type(value).__name__}
-        return _encode_all(
-            {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}, text
-        )
+    if type(value) in _TYPES.values():
+        items = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+        if items.get("features") is not None:
+            items["features"] = _OF_SCENE  # _lender has found whose they are
+        return _encode_all(items, {"type": type(value).__name__})
     if isinstance(value, tuple) and any(dataclasses.is_dataclass(item) for item in value):
         return _encode_all({str(i): item for i, item in enumerate(value)}, {"type": "tuple"})
     if isinstance(value, tuple):
@@ -161,9 +163,7 @@ def _encode(value: Any) -> tuple[Any, Any]:
         return value.item(), None
     if value is None or isinstance(value, (bool, int, float, str)):
         return value, None
-    if callable(value) and not dataclasses.is_dataclass(value):
-        return _OF_SCENE, None  # _lender has made sure of it
-    raise InputError(f"a map that holds a {type(value).__name__} cannot be saved")
+    raise InputError(f"a map that holds a {type(value).__name__} of your own cannot be saved")
 
 
 def _encode_all(items: dict[str, Any], text: dict[str, Any]) -> tuple[Any, Any]:

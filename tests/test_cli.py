@@ -1,0 +1,536 @@
+"""The command line: exit statuses, one line per refusal, nothing harmed, reports, resuming."""
+
+import contextlib
+import errno
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gfnn_jax import cli, models, pipeline, selection
+from gfnn_jax.charts import MIDPOINT
+from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.domain import covering
+from gfnn_jax.maps import Generated, SymplecticMap
+from gfnn_jax.phase_space import Pairs
+from gfnn_jax.scalars.inputs import box_inputs
+from gfnn_jax.scalars.products import Products
+
+DT = 0.1
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory, monkeypatch):
+    """Compiled programs of the tests do not go to the user's cache."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+    yield
+    jax.config.update("jax_compilation_cache_dir", None)
+
+
+def kepler(a, e, mean_anomaly, orientation):
+    """Plain NumPy: states (N, 4) of Kepler ellipses, q first."""
+    x = mean_anomaly.copy()
+    for _ in range(20):
+        x -= (x - e * np.sin(x) - mean_anomaly) / (1 - e * np.cos(x))
+    rate, b = a**-1.5 / (1 - e * np.cos(x)), a * np.sqrt(1 - e**2)
+    q = np.stack([a * (np.cos(x) - e), b * np.sin(x)])
+    p = np.stack([-a * np.sin(x) * rate, b * np.cos(x) * rate])
+    turn = np.array([[np.cos(orientation), -np.sin(orientation)],
+                     [np.sin(orientation), np.cos(orientation)]])  # fmt: skip
+    return np.vstack([np.einsum("ijn,jn->in", turn, v) for v in (q, p)]).T
+
+
+def kepler_orbits(num, times, seed=0):
+    """(num, len(times), 4) on exact orbits of the two-body scene's law."""
+    rng = np.random.default_rng(seed)
+    a, e = rng.uniform(0.8, 1.2, num), rng.uniform(0, 0.05, num)
+    phase, turn = rng.uniform(0, 2 * np.pi, (2, num))
+    return np.stack([kepler(a, e, phase + a**-1.5 * t, turn) for t in times], axis=1)
+
+
+def oscillator(num, times, seed=0):
+    """(num, len(times), 2): q'' = −q, exactly."""
+    q, p = np.random.default_rng(seed).uniform(-1, 1, (2, num, 1))
+    t = np.asarray(times)
+    return np.stack([q * np.cos(t) + p * np.sin(t), p * np.cos(t) - q * np.sin(t)], axis=-1)
+
+
+def pairs_file(path, z=None, **more):
+    z = oscillator(200, [0, DT]) if z is None else z
+    np.savez(path, **({"z0": z[:, 0], "z1": z[:, 1], "dt": DT} | more))
+    return path
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    """A saved map of one degree of freedom that no fit was needed for: S near ½(q² + p²)."""
+    folder = tmp_path_factory.mktemp("models") / "m"
+    z = np.random.default_rng(0).uniform(-1, 1, (100, 2))
+    family = Products(box_inputs(z), 2)
+    params = family.unflatten(jnp.linspace(0.1, 0.3, family.num_parameters))
+    zero = jnp.zeros(2)
+    generated = Generated(family, params, MIDPOINT, DT, jnp.ones(2), jnp.diag(zero), zero)
+    map_ = SymplecticMap((generated,), CARTESIAN, covering(z), jnp.ones(2), jnp.zeros(0), DT)
+    models.save(map_, folder)
+    np.save(folder.parent / "z0.npy", np.array([[0.1, 0.2], [0.3, -0.4], [30.0, 0.0]]))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """A fit, for tests of what is done with one."""
+    z = oscillator(200, [0, DT])
+    return selection.fit(Pairs(z[:, 0], z[:, 1], DT), chart="type2", tolerance=1e-2)
+
+
+def gfnn(*arguments):
+    return cli.main([str(a) for a in arguments])
+
+
+def predict(model, out, *more, num_steps=50):
+    return gfnn("predict", model, "--initial", model.parent / "z0.npy", "--num-steps", num_steps,
+                "--out", out, *more)  # fmt: skip
+
+
+def files(folder):
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+# Usage
+
+
+def test_constants_are_those_of_selection():
+    assert cli.CHARTS == selection.CHART_NAMES
+    assert cli.SCALARS == selection.SCALARS
+
+
+def test_scenes(capsys):
+    assert gfnn("scenes") == 0
+    out = capsys.readouterr().out
+    assert out.splitlines()[0].split()[:5] == ["two-body", "dim", "2", "dt", "0.1"]
+    assert len(out.splitlines()) == 7
+
+
+@pytest.mark.parametrize("command", [(), ("run",), ("fit",), ("predict",), ("scenes",)])
+def test_help(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        gfnn(*command, "--help")
+    assert stop.value.code == 0
+    assert "usage: gfnn" in capsys.readouterr().out
+
+
+BAD_USAGE = [
+    ((), "required: COMMAND"),
+    (("rum",), "invalid choice: 'rum'"),
+    (("run",), "required: SCENE"),
+    (("run", "two-bdy"), "unknown scene 'two-bdy', did you mean 'two-body'?"),
+    (("run", "two-body", "--dt", "0"), "expected a finite number > 0, got 0"),
+    (("run", "two-body", "--dt", "nan"), "expected a finite number > 0, got nan"),
+    (("run", "two-body", "--dt", "one"), "invalid _positive value: 'one'"),
+    (("run", "standard-map-regular", "--dt", "0.5"), "is a map without time"),
+    (("run", "two-body", "--tolerance", "-1"), "expected a finite number > 0, got -1"),
+    (("run", "two-body", "--chart", "type5"), "invalid choice: 'type5'"),
+    (("run", "two-body", "--scalar", "spline"), "invalid choice: 'spline'"),
+    (("run", "two-body", "--scalar", "features"), "the scene two-body declares none"),
+    (("run", "two-body", "--seed", "-1"), "expected an integer from 0"),
+    (("run", "two-body", "--seed", "1.5"), "invalid _seed value: '1.5'"),
+    (("run", "two-body", "--quik"), "unrecognized arguments: --quik"),
+    (("run", "two-body", "--out", "{file}"), "is a file, expected a folder"),
+    (("run", "two-body", "--out", "{file}/x"), "is not a folder"),
+    (("run", "two-body", "--out", "{folder}"), "exists already (--overwrite replaces it)"),
+    (("run", "two-body", "--out", "{folder}", "--overwrite"), "not overwritten"),
+    (("fit", "{data}"), "required: --out"),
+    (("fit", "{tmp}/none.npz", "--out", "{new}"), "no such file"),
+    (("fit", "{file}", "--out", "{new}"), "expected a .npz, .npy or .csv file"),
+    (("fit", "{empty}", "--out", "{new}"), "is empty"),
+    (("fit", "{folder}", "--out", "{new}"), "expected a .npz"),
+    (("fit", "{data}", "--out", "{folder}"), "exists already"),
+    (("fit", "{data}", "--out", "{new}", "--dt", "0.2"), "disagrees with the file's dt"),
+    (("fit", "{nodt}", "--out", "{new}"), "holds no time step"),
+    (("fit", "{nan}", "--out", "{new}"), "1 value not finite (NaN or infinity), first z1"),
+    (("fit", "{few}", "--out", "{new}"), "at least 3 are needed"),
+    (("fit", "{sixteen}", "--out", "{new}"), "expected at least 8 pairs for d = 1, got 7"),
+    (("fit", "{odd}", "--out", "{new}"), "must have an even last dimension"),
+    (("fit", "{data}", "--out", "{new}", "--scene", "two-body"), "has dim 2, the pairs have 1"),
+    (("fit", "{data}", "--out", "{new}", "--scene", "pluto"), "unknown scene 'pluto'"),
+    (("fit", "{data}", "--out", "{new}", "--angles", "5"), "expected angles among 0..1, got 5"),
+    (("fit", "{data}", "--out", "{new}", "--angles", "q"), "invalid _indices value: 'q'"),
+    (("fit", "{data}", "--out", "{new}", "--tolerance", "0"), "expected a finite number > 0"),
+    (("fit", "{data}", "--out", "{new}", "--scalar", "features"), "needs a scene that declares"),
+    (("predict", "{model}"), "required: --initial, --num-steps, --out"),
+    (("predict", "{tmp}/none", "{to}"), "no such file or folder"),
+    (("predict", "{folder}", "{to}"), "holds no model.json"),
+    (("predict", "{model}", "{to}", "--initial", "{tmp}/none.npy"), "no such file"),
+    (("predict", "{model}", "{to}", "--initial", "{wide}"), "expected states of 2 columns"),
+    (("predict", "{model}", "{to}", "--num-steps", "0"), "expected an integer > 0, got 0"),
+    (("predict", "{model}", "{to}", "--num-steps", "1e3"), "invalid _count value: '1e3'"),
+    (("predict", "{model}", "{to}", "--save-every", "-1"), "expected an integer > 0, got -1"),
+    (("predict", "{model}", "{to}", "--outside", "maybe"), "invalid choice: 'maybe'"),
+    (("predict", "{model}", "{to}", "--out", "{data}"), "exists already"),
+    (("predict", "{model}", "{to}", "--out", "{new}.csv"), "is written as .npz"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    BAD_USAGE,
+    ids=lambda x: " ".join(x) if type(x) is tuple else "",
+)
+def test_refusals(arguments, message, tmp_path, model, capsys, monkeypatch):
+    """Exit status 2, one line, nothing written."""
+    monkeypatch.chdir(tmp_path)
+    z = oscillator(200, [0, DT])
+    broken = z.copy()
+    broken[3, 1, 0] = np.nan
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "thesis.txt").write_text("mine")
+    (tmp_path / "file.txt").write_text("mine")
+    (tmp_path / "empty.npz").touch()
+    np.save(tmp_path / "wide.npy", np.zeros((3, 4)))
+    np.savez(tmp_path / "nodt.npz", z0=z[:, 0], z1=z[:, 1])
+    np.save(tmp_path / "z0.npy", np.zeros((3, 2)))
+    to = f"--initial {tmp_path / 'z0.npy'} --num-steps 10 --out {tmp_path / 'new.npz'}".split()
+    places = {
+        "tmp": tmp_path, "new": tmp_path / "new", "folder": tmp_path / "folder", "model": model,
+        "file": tmp_path / "file.txt", "empty": tmp_path / "empty.npz",
+        "wide": tmp_path / "wide.npy", "nodt": tmp_path / "nodt.npz",
+        "data": pairs_file(tmp_path / "data.npz"), "nan": pairs_file(tmp_path / "nan.npz", broken),
+        "few": pairs_file(tmp_path / "few.npz", z[:2]),
+        "sixteen": pairs_file(tmp_path / "sixteen.npz", z[:7]),
+        "odd": pairs_file(tmp_path / "odd.npz", np.ones((9, 2, 3))),
+    }  # fmt: skip
+    before = files(tmp_path)
+    expanded = [b for a in arguments for b in (to if a == "{to}" else [a.format(**places)])]
+    assert gfnn(*expanded) == 2
+    err = capsys.readouterr().err
+    lines = [line for line in err.splitlines() if not line.startswith("[")]
+    assert len(lines) == 1
+    assert lines[0].startswith("gfnn: ")
+    assert message in lines[0]
+    assert files(tmp_path) == before
+
+
+def test_usage_is_refused_in_a_moment():
+    started = time.perf_counter()
+    command = [sys.executable, "-m", "gfnn_jax", "fit", "nowhere.npz", "--out", "m"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == "gfnn: nowhere.npz: no such file\n"
+    assert time.perf_counter() - started < 5
+
+
+# Fit and predict
+
+
+REPORT_KEYS = {
+    "": {"scene", "dt", "seed", "dtype", "device", "versions", "data", "model", "fit", "map",
+         "rollout", "candidates"},
+    "data": {"num_pairs"},
+    "model": {"scalar", "chart", "num_parameters"},
+    "fit": {"seconds", "compile_seconds", "train_rms", "validation_rms"},
+    "map": {"symplecticity_defect", "chart_determinant_min", "newton_iterations_max"},
+    "rollout": {"num_trajectories", "num_excluded", "num_steps", "seconds",
+                "microseconds_per_step", "status_counts", "error", "error_median",
+                "growth_exponent", "energy_drift"},
+}  # fmt: skip
+CANDIDATE_KEYS = {"scalar", "chart", "num_parameters", "validation_rms", "microseconds_per_step",
+                  "fit_seconds", "chosen"}  # fmt: skip
+
+
+def read_report(folder):
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    report = json.loads((folder / "report.json").read_text(), parse_constant=refuse)
+    for part, keys in REPORT_KEYS.items():
+        found = report[part] if part else report
+        assert found is None or keys <= set(found)
+    assert all(set(candidate) >= CANDIDATE_KEYS for candidate in report["candidates"])
+    assert [c["chosen"] for c in report["candidates"]].count(True) == 1
+    return report
+
+
+@pytest.mark.parametrize(
+    ("num_pairs", "tolerance"), [(400, 3e-2), pytest.param(6_000, 1e-5, marks=pytest.mark.slow)]
+)
+def test_pairs_from_plain_numpy(num_pairs, tolerance, tmp_path, capsys):
+    """Kepler orbits that know nothing of the package: fit, then predict, as good as promised."""
+    data = pairs_file(tmp_path / "d.npz", kepler_orbits(num_pairs, [0, DT]))
+    assert gfnn("fit", data, "--out", tmp_path / "m", "--tolerance", tolerance) == 0
+    assert f"candidates for tolerance {tolerance:g}" in capsys.readouterr().out
+    report = read_report(tmp_path / "m")
+    assert report["rollout"] is None
+    assert report["scene"] is None
+    assert report["data"]["num_pairs"] == num_pairs
+    assert report["fit"]["validation_rms"] <= tolerance
+    assert report["map"]["symplecticity_defect"] <= 1e-12
+
+    num_steps = 100
+    orbits = kepler_orbits(20, DT * np.arange(num_steps + 1), seed=1)
+    np.save(tmp_path / "z0.npy", orbits[:, 0])
+    assert gfnn("predict", tmp_path / "m", "--initial", tmp_path / "z0.npy", "--num-steps",
+                num_steps, "--save-every", 5, "--out", tmp_path / "p.npz") == 0  # fmt: skip
+    with np.load(tmp_path / "p.npz") as predicted:
+        assert predicted["dt"] == DT
+        np.testing.assert_array_equal(predicted["steps"], np.arange(0, num_steps + 1, 5))
+        np.testing.assert_array_equal(predicted["status"], np.zeros(20))
+        trajectories = predicted["trajectories"]
+    np.testing.assert_array_equal(trajectories[:, 0], orbits[:, 0])
+    error = np.sqrt(np.mean((trajectories - orbits[:, ::5]) ** 2, axis=(0, 2)))
+    assert (error <= 3 * tolerance * np.maximum(1, np.arange(0, num_steps + 1, 5))).all()
+
+
+def test_fit_of_csv(tmp_path):
+    times = DT * np.arange(4)
+    rows = [
+        f"{i},{t!r},{q!r},{p!r}"
+        for i, sequence in enumerate(oscillator(60, times).tolist())
+        for t, (q, p) in zip(times.tolist(), sequence, strict=True)
+    ]
+    data = tmp_path / "d.csv"
+    data.write_text("\n".join(["sequence,t,q1 [m],p1", *rows]) + "\n")
+    assert gfnn("fit", data, "--out", tmp_path / "m", "--chart", "midpoint") == 0
+    report = read_report(tmp_path / "m")
+    assert report["data"]["num_pairs"] == 180
+    assert report["data"]["units"] == {"q1": "m"}
+    assert report["fit"]["tolerance"] == 1e-6
+    assert report["fit"]["validation_rms"] < 1e-12  # a quadratic S is exact
+
+
+def test_a_model_is_kept_and_known_again(fitted, tmp_path, capsys, monkeypatch):
+    """An existing model is refused, replaced on demand, and the very job known again."""
+    monkeypatch.setattr(pipeline, "select", lambda *args, **kwargs: fitted)
+    fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
+    assert gfnn(*fit) == 0
+    before = files(tmp_path)
+    assert gfnn(*fit) == 2
+    capsys.readouterr()
+    assert gfnn(*fit, "--resume") == 0
+    assert "from this very job" in capsys.readouterr().out
+    assert gfnn(*fit, "--resume", "--seed", 1) == 2
+    assert files(tmp_path) == before
+    assert gfnn(*fit, "--overwrite", "--seed", 1) == 0
+    assert read_report(tmp_path / "m")["seed"] == 1
+
+
+def test_a_training_that_was_stopped(fitted, tmp_path, capsys, monkeypatch):
+    """It leaves its checkpoints beside the output; they are resumed or discarded, as asked."""
+    started_from = []
+
+    def training(*args, checkpoints, **kwargs):
+        found = checkpoints.latest()
+        started_from.append(found and found[0])
+        if found is None:
+            checkpoints.save(7, {"theta": np.arange(3.0)})
+            raise KeyboardInterrupt
+        return fitted
+
+    monkeypatch.setattr(pipeline, "select", training)
+    fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
+    assert gfnn(*fit) == 130
+    assert gfnn(*fit) == 2
+    assert "m.partial: an unfinished fit" in capsys.readouterr().err
+    assert gfnn(*fit, "--resume", "--seed", 1) == 2
+    assert "belongs to another training (seed differ)" in capsys.readouterr().err
+    assert gfnn(*fit, "--overwrite") == 130
+    assert gfnn(*fit, "--resume") == 0
+    assert started_from == [None, None, 7]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["d.npz", "m"]
+
+
+def test_warnings_are_one_line(fitted, tmp_path, capsys, monkeypatch):
+    def warn(*args, **kwargs):
+        warnings.warn("nothing meets the tolerance", selection.FitWarning, stacklevel=2)
+        return fitted
+
+    monkeypatch.setattr(pipeline, "select", warn)
+    assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m") == 0
+    assert "gfnn: warning: nothing meets the tolerance" in capsys.readouterr().err.splitlines()
+
+
+def test_a_chart_that_folds_is_refused(tmp_path, capsys):
+    dt = np.pi / 2
+    data = pairs_file(tmp_path / "d.npz", oscillator(300, [0, dt]), dt=dt)
+    assert gfnn("fit", data, "--out", tmp_path / "m", "--chart", "type2") == 2
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert message.startswith("gfnn: chart type2 is singular over the data")
+    assert message.endswith("use --chart midpoint")
+    assert not (tmp_path / "m").exists()
+
+
+@pytest.mark.parametrize("outside", ["continue", "stop"])
+def test_leaving_the_domain_is_told(outside, model, tmp_path, capsys):
+    assert predict(model, tmp_path / "p.npz", "--outside", outside) == 0
+    with np.load(tmp_path / "p.npz") as predicted:
+        assert predicted["status"].tolist() == [0, 0, 1 if outside == "continue" else 2]
+        assert predicted["left_at"].tolist() == [-1, -1, 0]
+        lost = np.isnan(predicted["trajectories"][2, 1:]).all()
+        assert lost == (outside == "stop")
+    assert "left the data's domain: trajectory 2 at step 0" in capsys.readouterr().out
+
+
+# Stops, failures and resuming
+
+
+@contextlib.contextmanager
+def stopped_after(num_chunks, stop):
+    """The prediction is stopped after so many chunks."""
+    append = pipeline.PredictionWriter.append
+    count = 0
+
+    def counting(writer, states, carry):
+        nonlocal count
+        append(writer, states, carry)
+        count += 1
+        if count == num_chunks:
+            stop()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "_CHUNK_LANE_STEPS", 30)
+        patch.setattr(pipeline.PredictionWriter, "append", counting)
+        yield
+
+
+def interrupt():
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("stop", "status"),
+    [(interrupt, 130), (lambda: signal.raise_signal(signal.SIGTERM), 143)],
+)
+def test_a_prediction_resumes_to_the_same_bits(stop, status, model, tmp_path, capsys):
+    with stopped_after(math.inf, stop):
+        assert predict(model, tmp_path / "whole.npz") == 0
+    with stopped_after(3, stop):
+        assert predict(model, tmp_path / "p.npz") == status
+        assert not (tmp_path / "p.npz").exists()
+        assert "--resume" in capsys.readouterr().err.splitlines()[-1]
+        assert predict(model, tmp_path / "p.npz") == 2
+        assert predict(model, tmp_path / "p.npz", "--resume", num_steps=60) == 2
+    with stopped_after(math.inf, stop):
+        assert predict(model, tmp_path / "p.npz", "--resume") == 0
+        assert predict(model, tmp_path / "p.npz", "--resume") == 0  # nothing left to do
+    assert (tmp_path / "p.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["p.npz", "whole.npz"]
+
+
+def test_a_full_disk(model, fitted, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(pipeline, "select", lambda *args, **kwargs: fitted)
+    assert predict(model, tmp_path / "p.npz") == 0
+    before = files(tmp_path)
+    with monkeypatch.context() as patch:
+
+        def full(handle):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        patch.setattr(os, "fsync", full)
+        assert predict(model, tmp_path / "p.npz", "--overwrite", num_steps=7) == 1
+        data = pairs_file(tmp_path / "d.npz")
+        assert gfnn("fit", data, "--out", tmp_path / "m") == 1
+    errors = [e for e in capsys.readouterr().err.splitlines() if e.startswith("gfnn: ")]
+    assert len(errors) == 2
+    assert all("No space left on device" in e for e in errors)
+    assert not (tmp_path / "m").exists()
+    assert before.items() <= files(tmp_path).items()
+
+
+def test_a_changed_model_is_refused(model, tmp_path, capsys):
+    for file in model.rglob("*"):
+        if file.is_file():
+            copy = tmp_path / "m" / file.relative_to(model)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(file.read_bytes())
+    text = (tmp_path / "m" / "model.json").read_text()
+    (tmp_path / "m" / "model.json").write_text(text.replace('"dt": 0.1', '"dt": 0.2'))
+    np.save(tmp_path / "z0.npy", np.zeros((1, 2)))
+    assert predict(tmp_path / "m", tmp_path / "p.npz") == 2
+    assert "has changed since it was saved" in capsys.readouterr().err
+
+
+# Runs
+
+
+def check_run(folder, scene):
+    report = read_report(folder)
+    assert report["scene"] == scene
+    rollout = report["rollout"]
+    assert rollout["num_steps"] == 1_000
+    assert sum(rollout["status_counts"].values()) == rollout["num_trajectories"]
+    assert set(rollout["error"]) == set(rollout["error_median"]) == {"1", "10", "100", "1000"}
+    assert report["map"]["symplecticity_defect"] <= 1e-12
+    assert models.load(folder / "model").dt == report["dt"]
+    assert {"error.png", "portrait.png", "candidates.png"} <= {p.name for p in folder.glob("*.png")}
+    return report
+
+
+def test_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    scene = "standard-map-regular"
+    assert gfnn("run", scene, "--quick", "--tolerance", 1e-3, "--chart", "type2") == 0
+    report = check_run(tmp_path / "runs" / scene, scene)
+    assert report["model"]["chart"] == "type2"
+    assert report["rollout"]["energy_drift"] is None
+    assert report["rollout"]["error"]["1000"] < 1
+    assert "mean position error" in capsys.readouterr().out
+    before = files(tmp_path)
+    assert gfnn("run", scene) == 2
+    assert files(tmp_path) == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "error"),
+    [
+        ("two-body", 1e-7),
+        ("henon-heiles-regular", 1e-8),
+        ("henon-heiles-chaotic", None),
+        ("henon-heiles-printed", 1e-8),
+        ("pcr3bp", None),
+        ("standard-map-regular", 1e-8),
+        ("standard-map-chaotic", None),
+    ],
+)
+def test_run_of_every_scene(scene, error, tmp_path):
+    assert gfnn("run", scene, "--quick", "--out", tmp_path / "r") == 0
+    report = check_run(tmp_path / "r", scene)
+    if error is not None:
+        assert report["rollout"]["error"]["1000"] <= error
+        assert 0.8 <= report["rollout"]["growth_exponent"] <= 1.2
+
+
+@pytest.mark.slow
+def test_run_of_a_network(tmp_path):
+    assert gfnn("run", "two-body", "--quick", "--scalar", "mlp", "--out", tmp_path / "r") == 0
+    report = check_run(tmp_path / "r", "two-body")
+    assert report["model"]["scalar"] == "mlp"
+    assert report["rollout"]["error"]["1000"] <= 0.15
+
+
+@pytest.mark.slow
+def test_killed_predictions_resume(model, tmp_path):
+    """Twenty SIGKILLs at random moments of a prediction: the same bits in the end."""
+    num_steps = 3_000_000
+    command = [sys.executable, "-m", "gfnn_jax", "predict", model, "--initial",
+               model.parent / "z0.npy", "--num-steps", num_steps, "--save-every", 1_000,
+               "--resume", "--out"]  # fmt: skip
+    command = [str(c) for c in command]
+    assert subprocess.run([*command, tmp_path / "whole.npz"], check=False).returncode == 0
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        process = subprocess.Popen([*command, tmp_path / "p.npz"])
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=rng.uniform(2, 6))
+        process.kill()
+        process.wait()
+    assert subprocess.run([*command, tmp_path / "p.npz"], check=False).returncode == 0
+    assert (tmp_path / "p.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()

@@ -1,0 +1,154 @@
+"""Saved maps: the same bits after loading, for every family, chart, base map and kind of angle."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gfnn_jax import models
+from gfnn_jax.charts import CHARTS, MIDPOINT, TYPE2
+from gfnn_jax.coordinates import CARTESIAN, Coordinates
+from gfnn_jax.domain import covering
+from gfnn_jax.io import InputError
+from gfnn_jax.maps import Affine, Generated, SymplecticMap
+from gfnn_jax.scalars.inputs import box_inputs
+from gfnn_jax.scalars.mlp import Mlp
+from gfnn_jax.scalars.products import Products
+from gfnn_jax.scalars.sines import Sines
+from gfnn_jax.scenes import DrawnFrom, Scene, pcr3bp, two_body
+
+RNG = np.random.default_rng(0)
+STATES = 1.0 + 0.1 * RNG.standard_normal((40, 4))
+
+
+def a_map(family, params, chart=MIDPOINT, coordinates=CARTESIAN, half=None) -> SymplecticMap:
+    width = STATES.shape[1]
+    y = np.asarray(jax.vmap(coordinates.forward)(jnp.asarray(STATES)))
+    zero = jnp.zeros(width)
+    generated = Generated(family, params, chart, 0.1, jnp.ones(width), jnp.diag(zero), zero)
+    return SymplecticMap(
+        (generated,) if half is None else (half, generated, half),
+        coordinates,
+        covering(y, ignore=coordinates.cyclic),
+        jnp.asarray(STATES.std(axis=0)),
+        jnp.zeros(len(coordinates.angles)),
+        0.1,
+    )
+
+
+def polynomial(coordinates=CARTESIAN, features=None, degree=2, angles=()):
+    y = jax.vmap(coordinates.forward)(jnp.asarray(STATES))
+    inputs = box_inputs(y, angles=angles, cyclic=coordinates.cyclic, features=features)
+    family = Products(inputs, degree)
+    return family, family.unflatten(jnp.asarray(0.01 * RNG.standard_normal(family.num_parameters)))
+
+
+def network(dtype):
+    family = Mlp(box_inputs(STATES, angles=(0,)), hidden=(5, 4), amplitude=0.01)
+    return family, family.init(jax.random.key(0), dtype)
+
+
+def some_maps():
+    for name, chart in CHARTS.items():
+        yield name, a_map(*polynomial(), chart=chart)
+    sines = Sines(box_inputs(STATES), 20)
+    yield "sines", a_map(sines, jnp.asarray(0.01 * RNG.standard_normal(20)), chart=TYPE2)
+    yield "mlp", a_map(*network(jnp.float64))
+    yield "mlp float32", a_map(*network(jnp.float32))
+    yield "angles", a_map(*polynomial(angles=(0,)), coordinates=Coordinates("plain", (0, 2)))
+    yield "polar", a_map(*polynomial(two_body().coordinates), coordinates=two_body().coordinates)
+    yield "features", a_map(*polynomial(features=pcr3bp().features))
+    c, s = np.cos(0.4), np.sin(0.4)
+    turn = np.kron(np.array([[c, s], [-s, c]]), np.eye(2))
+    half = Affine(jnp.asarray(turn), jnp.ones(4), jnp.full(4, 0.01))
+    yield "base map", a_map(*polynomial(), half=half)
+
+
+@pytest.mark.parametrize(("name", "saved"), list(some_maps()), ids=lambda x: x if type(x) is str else "")
+def test_loads_the_same_bits(name, saved, tmp_path):
+    models.save(saved, tmp_path / "m", record={"note": "θ"})
+    loaded = models.load(tmp_path / "m")
+    assert jax.tree.structure(loaded) == jax.tree.structure(saved)
+    for a, b in zip(jax.tree.leaves(saved), jax.tree.leaves(loaded), strict=True):
+        assert a.dtype == b.dtype
+        assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
+    if name in ("type2", "polar", "mlp", "base map"):  # the others run the same program too
+        before, after = saved.rollout(STATES, 3)[0], loaded.rollout(STATES, 3)[0]
+        assert np.isfinite(np.asarray(before)).all()
+        assert np.asarray(before).tobytes() == np.asarray(after).tobytes()
+    assert models.record(tmp_path / "m") == {"note": "θ"}
+
+
+def test_the_description_is_for_humans(tmp_path):
+    models.save(a_map(*polynomial()), tmp_path / "m")
+    text = (tmp_path / "m" / "model.json").read_text()
+    description = json.loads(text)["description"]
+    piece = description["map"]["pieces"]["0"]
+    assert piece["scalar"]["type"] == "Products"
+    assert piece["scalar"]["degree"] == 2
+    assert piece["chart"]["name"] == "midpoint"
+    assert description["map"]["dt"] == 0.1
+    assert description["versions"]["jax"] == jax.__version__
+
+
+def test_an_existing_model_is_kept(tmp_path):
+    models.save(a_map(*polynomial()), tmp_path / "m")
+    before = models.digest(tmp_path / "m")
+    other = a_map(*polynomial(degree=3))
+    with pytest.raises(InputError, match="exists already"):
+        models.save(other, tmp_path / "m")
+    assert models.digest(tmp_path / "m") == before
+    models.save(other, tmp_path / "m", overwrite=True)
+    assert models.digest(tmp_path / "m") != before
+
+
+def test_a_scene_of_ones_own(tmp_path):
+    """Its features can be saved where the scene is given, and loaded where it is given again."""
+
+    def features(z):
+        return z**2
+
+    saved = a_map(*polynomial(features=features))
+    mine = Scene("mine", "a test", 2, 0.1, DrawnFrom(lambda key, num: STATES), features=features)
+    with pytest.raises(InputError, match="features of a scene that is not known"):
+        models.save(saved, tmp_path / "m")
+    assert not (tmp_path / "m").exists()
+    models.save(saved, tmp_path / "m", scene=mine)
+    with pytest.raises(InputError, match="learned in the scene 'mine': pass that scene"):
+        models.load(tmp_path / "m")
+    with pytest.raises(InputError, match="learned in the scene 'mine', not in 'two-body'"):
+        models.load(tmp_path / "m", scene=two_body())
+    with pytest.raises(InputError, match="needs the features of its scene"):
+        models.load(tmp_path / "m", scene=dataclasses.replace(mine, features=None))
+    assert jax.tree.structure(models.load(tmp_path / "m", mine)) == jax.tree.structure(saved)
+
+
+def test_a_function_of_ones_own_is_refused(tmp_path):
+    def scalar(params, w):
+        return params * (w @ w)
+
+    with pytest.raises(InputError, match="a function of your own cannot be saved"):
+        models.save(a_map(scalar, jnp.asarray(0.1)), tmp_path / "m")
+    assert not (tmp_path / "m").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d["map"].update(type="Popen"), "does not describe a map"),
+        (lambda d: d["map"].pop("dt"), "does not describe a map"),
+        (lambda d: d["map"]["pieces"]["0"].update(surprise=1), "does not describe a map"),
+        (lambda d: d.pop("map"), "does not describe a map"),
+        (lambda d: d.update(scene="nowhere"), "pass that scene"),
+    ],
+)
+def test_a_foreign_description(change, message, tmp_path):
+    models.save(a_map(*polynomial()), tmp_path / "m")
+    arrays, description = models.load_model(tmp_path / "m")
+    change(description)
+    models.save_model(tmp_path / "m", arrays, description)
+    with pytest.raises(InputError, match=message):
+        models.load(tmp_path / "m")
