@@ -16,17 +16,27 @@ import scipy.linalg
 from gfnn_jax.maps import Affine
 
 
-def fit_half_map(y0, y1, scale, *, angles: tuple[int, ...] = ()) -> Affine | None:
+def fit_half_map(
+    y0,
+    y1,
+    scale,
+    *,
+    angles: tuple[int, ...] = (),
+    reversor: tuple[int, ...] | None = None,
+) -> Affine | None:
     """R^½ for the pairs y0 -> y1, each (N, 2d), angles lifted: least squares, made symplectic.
 
     The regression's matrix M is turned into a Hamiltonian one, the projection of log M. R commutes
-    with the shift of an angle: it only shifts angles and shears them by the momenta. None where M
-    has no real logarithm (a pair of negative eigenvalues).
+    with the shift of an angle: it only shifts angles and shears them by the momenta. With the signs
+    (2d,) of a reversor ρ, the field is made reversible (ρc = c, ρAρ = −A, ρb = −b), and so the
+    rest of the map stays. None where M has no real logarithm (a pair of negative eigenvalues).
     """
     y0, y1 = np.asarray(y0), np.asarray(y1)
     width = y0.shape[1]
     dim = width // 2
     centre = y0.mean(axis=0)
+    signs = np.ones(width) if reversor is None else np.array(reversor, dtype=float)
+    centre = 0.5 * (centre + signs * centre)
     plain = [i for i in range(width) if i not in angles]
     x, image = (y0 - centre) / scale, (y1 - centre) / scale
     design = np.column_stack([np.ones(len(x)), x[:, plain]])
@@ -46,7 +56,11 @@ def fit_half_map(y0, y1, scale, *, angles: tuple[int, ...] = ()) -> Affine | Non
     for i in angles:  # the quadratic Hamiltonian must not depend on an angle
         symmetric[i, :] = symmetric[:, i] = 0.0
     generator = form @ symmetric
-    half, half_shift = _flow(generator, _field_for(generator, shift), 0.5)
+    field = _field_for(generator, shift)
+    if reversor is not None:
+        generator = 0.5 * (generator - signs[:, None] * generator * signs[None, :])
+        field = 0.5 * (field - signs * field)
+    half, half_shift = _flow(generator, field, 0.5)
     return Affine(jnp.asarray(half), jnp.asarray(centre), jnp.asarray(half_shift))
 
 

@@ -71,7 +71,7 @@ def polar(*, cyclic: bool) -> Coordinates:
 
 
 def circle_centre(angle) -> tuple[float, bool]:
-    """Centre of the shortest arc that holds all values of an angle (N,), and whether it is a circle.
+    """Centre of the shortest arc that holds all values of an angle (N,); whether it is a circle.
 
     The cut, where the angle jumps by 2π, lies opposite; data count as the whole circle where no gap
     is wider than an eighth of it.

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -44,8 +44,12 @@ _SINES = (100, 200, 400, 800, 1_600)
 _MOST_TERMS = 1_500
 # Rows × terms² of one factorisation: about ten seconds on two cores.
 _MOST_WORK = 1.2e11
-# Once a ladder has stopped gaining this much from rung to rung, larger families only fit noise.
-_WORTHWHILE = 0.8
+# Where the best chart's determinant falls below this, the map is far from the identity.
+_FAR = 0.7
+_ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
+# A rung that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
+# the odd degrees), and larger families only fit noise.
+_WORTHWHILE, _STALLED = 0.8, 3
 # So often another chart's ladder of the same functions may be better before this one is left.
 _BEATEN = 3
 _NORMAL_95 = 1.645
@@ -98,7 +102,9 @@ class Fit:
     map: the chosen map. candidates: every candidate met on the way, by rising cost. tolerance: what
     was asked for, and ``met`` whether the chosen map's upper 95 % bound is within it. judgements:
     chart -> its determinant over the data. data_defect: how far the pairs' local Jacobians are from
-    symplectic (median). based: whether a base map was factored out. seconds: of it all.
+    symplectic (median). based: whether a base map was factored out. noise: standard deviation per
+    coordinate that the residuals suggest where larger models stopped helping, else None. messages:
+    the warnings. seconds: of it all.
     """
 
     map: SymplecticMap
@@ -111,6 +117,7 @@ class Fit:
     seconds: float
     symplecticity_defect: float
     model_determinant_min: float
+    noise: float | None
     messages: tuple[str, ...]
 
     @property
@@ -194,7 +201,9 @@ def fit(
             "symplectic map): are q and p in order, p momenta and not velocities, and no friction?"
         )
     judgements = {name: judge_chart(c, jacobians, prepared.scale) for name, c in CHARTS.items()}
-    charts, half, judgements = _choose_charts(chart, prepared, jacobians, judgements, warn)
+    charts, half, judgements = _choose_charts(
+        chart, prepared, scene.reversor if scene else None, jacobians, judgements, warn
+    )
     if half is not None:
         prepared = _factor_out(prepared, half)
         on_progress("no chart covers the data by itself: an affine base map is factored out")
@@ -208,7 +217,7 @@ def fit(
         ladders = [
             _Ladder(prepared, c, rows, *k) for c, k in _kinds(scalar, charts, prepared, scene)
         ]
-    candidates = _walk(ladders, tolerance, on_progress)
+    candidates, stalled = _walk(ladders, tolerance, on_progress)
     if not candidates:
         raise FitError(
             f"expected more pairs: {len(pairs)} are too few for the smallest model of this kind"
@@ -216,8 +225,17 @@ def fit(
     chosen = _choose(candidates, tolerance)
     if chosen.validation_bound > tolerance:
         warn(
-            f"no candidate meets the tolerance {tolerance:g}: the most accurate has a one-step error "
-            f"of {chosen.validation_rms:.2e} (95 % bound {chosen.validation_bound:.2e})"
+            f"no candidate meets the tolerance {tolerance:g}: the most accurate has a one-step "
+            f"error of {chosen.validation_rms:.2e} (95 % bound {chosen.validation_bound:.2e})"
+        )
+    noise = None
+    spread = float(np.max(np.std(np.asarray(pairs.z0), axis=0)))
+    if (chosen.chart, chosen.scalar) in stalled and chosen.validation_rms > _ROUNDOFF * spread:
+        # Noise of both states enters the difference: σ √2 for a map near the identity.
+        noise = chosen.validation_rms / np.sqrt(2.0)
+        warn(
+            f"larger models are no more accurate: the pairs seem to carry noise of about {noise:.1e} "
+            "on every coordinate, or a structure that these functions cannot represent"
         )
     on_progress("timing the candidates")
     test = np.asarray(pairs.z0)[held_out]
@@ -238,6 +256,7 @@ def fit(
         seconds=time.perf_counter() - started,
         symplecticity_defect=float(jnp.max(chosen.map.defect(test))),
         model_determinant_min=_smallest(chosen.map.determinant(test)),
+        noise=noise,
         messages=tuple(messages),
     )
 
@@ -325,8 +344,12 @@ def _factor_out(prepared: _Prepared, half: Affine) -> _Prepared:
 # Charts.
 
 
-def _choose_charts(request, prepared: _Prepared, jacobians, judgements, warn):
-    """Charts to try, half of the base map or None, and the judgements that stand for them."""
+def _choose_charts(request, prepared: _Prepared, reversor, jacobians, judgements, warn):
+    """Charts to try, half of the base map or None, and the judgements that stand for them.
+
+    A base map is factored out where no chart is valid without it; with ``auto`` also where the map
+    is far from the identity and the base map brings it nearer: S is smoother then.
+    """
     angular = bool(prepared.coordinates.angles)
     near_identity = {n: c for n, c in CHARTS.items() if n != "type1"}
     valid = [n for n in near_identity if judgements[n].valid and judgements[n].sign > 0]
@@ -342,23 +365,23 @@ def _choose_charts(request, prepared: _Prepared, jacobians, judgements, warn):
             return [CHARTS[request]], None, judgements
         if valid:
             raise FitError(_about(request, judgement, "is singular over the data", valid))
-    elif valid:
-        # Midpoint and one of types 2 and 3, which mirror each other.
-        one_sided = [n for n in ("type2", "type3") if n in valid][:1]
-        chosen = [n for n in ("midpoint", *one_sided) if n in valid]
-        return [CHARTS[n] for n in chosen], None, judgements
-
     half = fit_half_map(
-        prepared.y0, prepared.y1, prepared.scale, angles=prepared.coordinates.angles
-    )
-    if half is not None:
+        prepared.y0, prepared.y1, prepared.scale,
+        angles=prepared.coordinates.angles, reversor=reversor,
+    )  # fmt: skip
+    closest = max((judgements[n].low for n in valid), default=0.0)
+    if half is not None and closest < _FAR:
         back = np.asarray(half.inverse().matrix)
         inner = back @ jacobians @ back
         based = {n: judge_chart(c, inner, prepared.scale) for n, c in CHARTS.items()}
-        tried = ["midpoint", "type2", "type3"] if request == "auto" else [request]
+        tried = ("midpoint", "type2", "type3") if request == "auto" else (request,)
         good = [n for n in tried if based[n].valid and based[n].sign > 0]
-        if good:
+        if good and based[good[0]].low > closest:
             return [CHARTS[n] for n in good[:2]], half, based
+    if valid:
+        # Midpoint and one of types 2 and 3, which mirror each other.
+        one_sided = [n for n in ("type2", "type3") if n in valid][:1]
+        return [CHARTS[n] for n in ("midpoint", *one_sided) if n in valid], None, judgements
     if request in ("auto", "type1") and judgements["type1"].valid and not angular:
         return [TYPE1], None, judgements
     lows = ", ".join(f"{n} {j.low:.2g}" for n, j in judgements.items())
@@ -398,14 +421,13 @@ class _Rung:
     work: float
 
 
-def _kinds(scalar, charts: list[AnyChart], prepared: _Prepared, scene) -> Iterator[tuple]:
+def _kinds(scalar, charts: Sequence[AnyChart], prepared: _Prepared, scene) -> Iterator[tuple]:
     """(chart, (kind, features, reversor)) of each ladder that applies to what was asked for."""
     features = scene.features if scene is not None else None
     high_dimensional = prepared.y0.shape[1] > 4
     for chart in charts:
-        # A base map's axes are not the reversor's, and only the midpoint S inherits the parity.
-        even = scene is not None and chart == MIDPOINT and prepared.half is None
-        reversor = scene.reversor if even else None
+        # Only the midpoint S inherits the parity.
+        reversor = scene.reversor if scene is not None and chart == MIDPOINT else None
         if scalar in ("auto", "polynomial"):
             yield chart, ("polynomial", None, reversor)
         if scalar in ("auto", "features") and features is not None:
@@ -537,14 +559,14 @@ def _every_few_seconds(checkpoints) -> Callable | None:
     return save
 
 
-def _walk(ladders, tolerance: float, on_progress) -> list[Candidate]:
+def _walk(ladders, tolerance: float, on_progress) -> tuple[list[Candidate], set[tuple[str, str]]]:
     """Climb all ladders together by rising work, until the next rung costs more than one that is
     accurate enough. A ladder is left that no longer gains, or that another chart's with the same
     functions keeps beating."""
     rungs = [(rung.work, i, rung) for i, ladder in enumerate(ladders) for rung in ladder.rungs]
     candidates: list[Candidate] = []
     best = [np.inf] * len(ladders)
-    beaten = [0] * len(ladders)
+    beaten, stalled = [0] * len(ladders), [0] * len(ladders)
     left: set[int] = set()
     cheapest = np.inf
     for work, i, rung in sorted(rungs, key=lambda r: r[:2]):
@@ -558,7 +580,8 @@ def _walk(ladders, tolerance: float, on_progress) -> list[Candidate]:
         if candidate.validation_bound <= tolerance:
             cheapest = min(cheapest, work)
             left.add(i)
-        elif candidate.validation_rms > _WORTHWHILE * best[i] and candidate.num_parameters > 50:
+        stalled[i] = stalled[i] + 1 if candidate.validation_rms > _WORTHWHILE * best[i] else 0
+        if stalled[i] == _STALLED:
             left.add(i)
         best[i] = min(best[i], candidate.validation_rms)
         beaten[i] += any(
@@ -570,7 +593,13 @@ def _walk(ladders, tolerance: float, on_progress) -> list[Candidate]:
         )
         if beaten[i] == _BEATEN:
             left.add(i)
-    return candidates
+    ends = {(c.chart, c.scalar) for c in candidates}
+    stalled_ladders = set()
+    for chart, scalar in ends:
+        errors = [c.validation_rms for c in candidates if (c.chart, c.scalar) == (chart, scalar)]
+        if len(errors) > 2 and min(errors[-2:]) > _WORTHWHILE * min(errors[:-2]):
+            stalled_ladders.add((chart, scalar))
+    return candidates, stalled_ladders
 
 
 def _data(prepared: _Prepared, chart: AnyChart, rows):

@@ -33,7 +33,7 @@ class LeastSquaresFit(NamedTuple):
     ridge: the parameter that validation chose, relative to the largest singular value.
     """
 
-    coefficients: Float[Array, "m"]
+    coefficients: Float[Array, "_"]
     train_rms: float
     validation_rms: float
     rank: int
@@ -61,7 +61,7 @@ def chunk_size(num_parameters: int, dim: int) -> int:
 
 
 class Reduced(NamedTuple):
-    """All that the data say about a family: the triangular factors of [A b], terms by rising degree.
+    """All that the data say about a family: the triangular factors of [A b], small terms first.
 
     factor, rows: of the training rows; validation_factor, validation_rows: of those held out.
     Leading columns answer for every smaller family whose terms are the leading ones.
@@ -87,9 +87,7 @@ def reduce(family, train, validation, weight) -> Reduced:
     stage = _Stage(family, weight)
     factors = []
     for w, wanted in (train, validation):
-        factors.append(
-            stage.factor((w[i : i + n], wanted[i : i + n]) for i in range(0, len(w), n))
-        )
+        factors.append(stage.factor((w[i : i + n], wanted[i : i + n]) for i in range(0, len(w), n)))
     seconds = time.perf_counter() - started - stage.compile_seconds
     (factor, rows), (held, held_rows) = factors
     return Reduced(factor, rows, held, held_rows, seconds, stage.compile_seconds)

@@ -69,9 +69,7 @@ def box_inputs(
     positions = tuple(keep.index(i) for i in angles if i in keep) if features is None else ()
     for i in positions:
         centre[i], scale[i] = 0.0, 1.0
-    return Inputs(
-        keep, positions, tuple(map(float, centre)), tuple(map(float, scale)), features
-    )
+    return Inputs(keep, positions, tuple(map(float, centre)), tuple(map(float, scale)), features)
 
 
 def variable_signs(inputs: Inputs, reversor: tuple[int, ...], w) -> tuple[int, ...]:

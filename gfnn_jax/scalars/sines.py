@@ -1,6 +1,6 @@
 """Random sine features: S linear in its parameters where polynomials have too many terms.
 
-    S(c, w) = Σ c_j sin(k_j·x + b_j),   k_j normal with standard deviation ``bandwidth``, b_j uniform
+    S(c, w) = Σ c_j sin(k_j·x + b_j),   k_j normal of deviation ``bandwidth``, b_j uniform
 
 (Rahimi & Recht, NIPS 2007). The frequencies are drawn once from ``seed`` and never trained, so the
 fit is one least-squares solve; the number of features does not grow with the dimension.
@@ -20,7 +20,7 @@ from gfnn_jax.scalars.inputs import Inputs
 
 @dataclasses.dataclass(frozen=True)
 class Sines:
-    """``num_parameters`` random sines of the variables of ``inputs``, angles through sin and cos."""
+    """``num_parameters`` random sines of the variables; whole wave numbers for angles."""
 
     inputs: Inputs
     num_parameters: int
