@@ -234,8 +234,8 @@ def fit(
         # Noise of both states enters the difference: σ √2 for a map near the identity.
         noise = chosen.validation_rms / np.sqrt(2.0)
         warn(
-            f"larger models are no more accurate: the pairs seem to carry noise of about {noise:.1e} "
-            "on every coordinate, or a structure that these functions cannot represent"
+            f"larger models are no more accurate: the pairs seem to carry noise of about "
+            f"{noise:.1e} on every coordinate, or a structure these functions cannot represent"
         )
     on_progress("timing the candidates")
     test = np.asarray(pairs.z0)[held_out]
