@@ -24,6 +24,7 @@ from gfnn_jax.io import InputError, WorkError, ensure_new
 # Equal to those of `selection`, which would bring JAX; a test compares them.
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
 SCALARS = ("auto", "polynomial", "features", "sines", "mlp")
+_SECONDS_BETWEEN_LINES = 2.0
 
 
 class _Terminated(KeyboardInterrupt):
@@ -275,12 +276,17 @@ def _set_up_jax() -> None:
 
 @contextlib.contextmanager
 def _progress() -> Iterator[Any]:
-    """``say(message)``: a status line on a terminal, else a line each, on standard error."""
+    """``say(message)`` on standard error: a status line on a terminal, else a line now and then."""
     started = time.perf_counter()
     if not sys.stderr.isatty():
+        last = -math.inf
 
         def say(message: str) -> None:
-            print(f"[{time.perf_counter() - started:6.1f} s] {message}", file=sys.stderr)
+            nonlocal last
+            now = time.perf_counter() - started
+            if now > last + _SECONDS_BETWEEN_LINES:
+                print(f"[{now:6.1f} s] {message}", file=sys.stderr)
+                last = now
 
         yield say
         return

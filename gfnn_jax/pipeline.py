@@ -375,7 +375,7 @@ def predict(
         writer.append(z0[:, None], lanes._asdict())
     else:
         lanes = Lanes(**{name: jnp.asarray(value) for name, value in writer.carry.items()})
-    chunk = _chunk_length(*z0.shape, save_every)
+    chunk = _chunk_length(z0.shape[0], z0.shape[1], save_every)
     while writer.saved < writer.total:
         say(f"step {(writer.saved - 1) * save_every} of {num_steps}")
         count = min(chunk, writer.total - writer.saved)

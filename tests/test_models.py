@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gfnn_jax import models
-from gfnn_jax.charts import CHARTS, MIDPOINT, TYPE2
+from gfnn_jax.charts import CHARTS, MIDPOINT, TYPE2, AnyChart
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.domain import covering
 from gfnn_jax.io import InputError
@@ -24,7 +24,9 @@ RNG = np.random.default_rng(0)
 STATES = 1.0 + 0.1 * RNG.standard_normal((40, 4))
 
 
-def a_map(family, params, chart=MIDPOINT, coordinates=CARTESIAN, half=None) -> SymplecticMap:
+def a_map(
+    family, params, chart: AnyChart = MIDPOINT, coordinates=CARTESIAN, half=None
+) -> SymplecticMap:
     width = STATES.shape[1]
     y = np.asarray(jax.vmap(coordinates.forward)(jnp.asarray(STATES)))
     zero = jnp.zeros(width)
@@ -67,7 +69,9 @@ def some_maps():
     yield "base map", a_map(*polynomial(), half=half)
 
 
-@pytest.mark.parametrize(("name", "saved"), list(some_maps()), ids=lambda x: x if type(x) is str else "")
+@pytest.mark.parametrize(
+    ("name", "saved"), list(some_maps()), ids=lambda x: x if type(x) is str else ""
+)
 def test_loads_the_same_bits(name, saved, tmp_path):
     models.save(saved, tmp_path / "m", record={"note": "θ"})
     loaded = models.load(tmp_path / "m")
