@@ -197,6 +197,12 @@ class SymplecticMap:
         """Degrees of freedom."""
         return self.scale.shape[0] // 2
 
+    def save(self, folder, **options) -> None:
+        """Write a model folder, which ``gfnn.load`` reads; see `models.save` for the options."""
+        from gfnn_jax import models  # stands after this module: a shorthand for its function
+
+        models.save(self, folder, **options)
+
     # One state.
 
     def _angles(self):
