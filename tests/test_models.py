@@ -73,7 +73,7 @@ def some_maps():
     ("name", "saved"), list(some_maps()), ids=lambda x: x if type(x) is str else ""
 )
 def test_loads_the_same_bits(name, saved, tmp_path):
-    models.save(saved, tmp_path / "m", record={"note": "θ"})
+    saved.save(tmp_path / "m", record={"note": "θ"})
     loaded = models.load(tmp_path / "m")
     assert jax.tree.structure(loaded) == jax.tree.structure(saved)
     for a, b in zip(jax.tree.leaves(saved), jax.tree.leaves(loaded), strict=True):
