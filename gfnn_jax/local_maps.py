@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.charts import AnyChart
 from gfnn_jax.phase_space import symplecticity_defect
@@ -65,7 +66,7 @@ def local_jacobians(y0, y1, scale, *, seed: int = 0) -> np.ndarray:
 def judge_chart(chart: AnyChart, jacobians, scale) -> ChartJudgement:
     """The chart's determinant over the data; type 1's in coordinates of unit size."""
     dim = len(scale) // 2
-    determinant = np.asarray(chart.determinant(np.asarray(jacobians)))
+    determinant = np.asarray(chart.determinant(jnp.asarray(jacobians)))
     if chart.name == "type1":
         determinant = determinant * np.prod(scale[dim:] / scale[:dim])
     sign = 1 if np.median(determinant) >= 0 else -1
@@ -80,4 +81,4 @@ def data_defect(jacobians, scale) -> float:
     Far below 1 for pairs of a symplectic map, up to the local fits' error; of order 1 where q and p
     are swapped in one snapshot, where velocities stand for momenta, or where there is friction.
     """
-    return float(np.median(symplecticity_defect(np.asarray(jacobians), np.asarray(scale))))
+    return float(np.median(symplecticity_defect(jnp.asarray(jacobians), jnp.asarray(scale))))

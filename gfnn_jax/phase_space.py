@@ -23,7 +23,7 @@ States = Float[Array, "batch phase"]
 
 def require_x64(what: str) -> None:
     """Raises RuntimeError where JAX would silently compute ``what`` in float32."""
-    if not jax.config.jax_enable_x64:
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise RuntimeError(
             f"{what} needs float64: call jax.config.update('jax_enable_x64', True) first"
         )

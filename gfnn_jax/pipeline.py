@@ -163,8 +163,8 @@ def _measure(map_: SymplecticMap, scene: Scene, z0, reference) -> _Measured:
     predicted, steps = np.asarray(states), np.arange(NUM_STEPS + 1)
     error = metrics.position_error(predicted, reference, _angles_of_z(scene))
     energy, drift = None, None
-    if "energy" in scene.invariants or scene.hamiltonian is not None:
-        hamiltonian = scene.invariants.get("energy", scene.hamiltonian)
+    hamiltonian = scene.invariants.get("energy", scene.hamiltonian)
+    if hamiltonian is not None:
         energy = metrics.energy_error(jax.vmap(jax.vmap(hamiltonian))(states))
         drift = metrics.energy_drift(steps, energy)
     growth = metrics.growth_exponent(steps, error) if scene.regular else None

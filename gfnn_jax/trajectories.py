@@ -44,6 +44,7 @@ def _integrator(hamiltonian, dt):
             max_steps=MAX_SOLVER_STEPS,
             throw=False,
         )
+        assert solution.ys is not None  # saved at its end
         return jnp.where(solution.result == diffrax.RESULTS.successful, solution.ys[-1], jnp.nan)
 
     return jax.vmap(advance, in_axes=(None, 0))

@@ -85,7 +85,7 @@ class Mlp:
         gradient = 4 * (self.num_parameters - sum(self.hidden))
         return gradient, gradient * (1 + self.inputs.num_variables)
 
-    def init(self, key, dtype: Any) -> dict[str, Any]:
+    def init(self, key, dtype: Any) -> Any:
         """Parameters of this dtype: orthogonal weights, zero biases."""
         return self._network(dtype).init(key, jnp.zeros(self.num_inputs, dtype))["params"]
 

@@ -117,7 +117,7 @@ class _Half:
         for j, k in enumerate(self.indices.T):
             functions, among = (harmonics, circle) if angle[j] else (polynomials, plain)
             column = int(np.flatnonzero(among == j)[0])
-            picked.append([f[k, column] for f in functions])
+            picked.append([f[k, column] for f in functions])  # pyright: ignore[reportOptionalIterable]
         n, terms = len(picked), len(self.indices)
         unit = jnp.ones(terms, x.dtype)
 
