@@ -56,27 +56,26 @@ def small_solve(matrix: Matrix, rhs: Vector) -> Vector:
     n = rhs.shape[0]
     if n > _UNROLL_UP_TO:
         return jnp.linalg.solve(matrix, rhs)
-    rows = [[matrix[i, j] for j in range(n)] + [rhs[i]] for i in range(n)]
+    rows = [jnp.append(matrix[i], rhs[i]) for i in range(n)]
     for k in range(n):
         for i in range(k + 1, n):  # bubble the largest pivot up
             swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
-            upper = [jnp.where(swap, b, a) for a, b in zip(rows[k], rows[i], strict=True)]
-            lower = [jnp.where(swap, a, b) for a, b in zip(rows[k], rows[i], strict=True)]
-            rows[k], rows[i] = upper, lower
-        inverse = 1.0 / rows[k][k]
+            rows[k], rows[i] = jnp.where(swap, rows[i], rows[k]), jnp.where(swap, rows[k], rows[i])
+        scaled = rows[k] / rows[k][k]
         for i in range(k + 1, n):
-            factor = rows[i][k] * inverse
-            rows[i] = [a - factor * b for a, b in zip(rows[i], rows[k], strict=True)]
-    x: list[Any] = [None] * n
+            rows[i] = rows[i] - rows[i][k] * scaled
+        rows[k] = scaled
+    x = [row[n] for row in rows]
     for k in reversed(range(n)):
-        tail = sum((rows[k][j] * x[j] for j in range(k + 1, n)), start=jnp.zeros_like(rhs[0]))
-        x[k] = (rows[k][n] - tail) / rows[k][k]
+        for j in range(k + 1, n):
+            x[k] = x[k] - rows[k][j] * x[j]
     return jnp.stack(x)
 
 
 class _Iterate(NamedTuple):
     x: Any
     residual: Any
+    matrix: Any  # ∂r/∂x at x
     aux: Any
     merit: Any  # largest residual, what damping makes smaller
     error: Any  # largest residual relative to its roundoff floor
@@ -90,58 +89,53 @@ def iterate(
     """The iterations themselves: ``evaluate(theta, x) -> (residual (n,), size (n,), aux)``.
 
     ``size`` is that of the terms whose difference the residual is: a few eps of it is roundoff.
-    ``fixed`` Newton updates run in every lane, then damped ones while a lane is open, up to
-    ``most`` in all. A lane closes when its residual is at the roundoff floor, or is close to it and
-    no longer halves, or cannot be made smaller. Returns x, aux at x, Info.
+    Newton's method, a step halved until the residual falls: ``fixed`` iterations in every lane,
+    then more while a lane is open, up to ``most``. A lane closes when its residual is at the
+    roundoff floor, or is close to it and no longer halves, or cannot be made smaller. The residual
+    and its Jacobian are evaluated together, once per iterate: they share most of their work.
+    Returns x, aux at x, Info.
     """
     eps = float(jnp.finfo(guess.dtype).eps)
     settled = eps**-0.25  # in floors: 3e-12 of the size in float64, 1e-5 in float32
 
-    def judge(x, iterations):
-        residual, size, aux = evaluate(theta, x)
+    def at(x, iterations):
+        def with_aux(x):
+            residual, size, aux = evaluate(theta, x)
+            return residual, (residual, size, aux)
+
+        matrix, (residual, size, aux) = jax.jacfwd(with_aux, has_aux=True)(x)
         merit = jnp.max(jnp.abs(residual))
         error = jnp.max(jnp.abs(residual) / size) / (_FLOOR_EPS * eps)
-        return _Iterate(x, residual, aux, merit, error, iterations, jnp.array(True))
+        return _Iterate(x, residual, matrix, aux, merit, error, iterations, jnp.array(True))
 
-    def direction(state):
-        matrix = jax.jacfwd(lambda x: evaluate(theta, x)[0])(state.x)
-        return small_solve(matrix, state.residual)
-
-    def damped(state):
-        step = direction(state)
+    def newton(state):
+        step = small_solve(state.matrix, state.residual)
         # Close to the floor only the full step makes sense: what is left is roundoff.
         shortest = jnp.where(state.error < settled, 1.0, 0.5**_HALVINGS).astype(guess.dtype)
-
-        def trial(factor):
-            return factor, judge(state.x - factor * step, state.iterations + 1)
+        iterations = state.iterations + 1
 
         def too_long(attempt):
             factor, new = attempt
             return state.open & ~(new.merit < state.merit) & (factor > shortest)
 
-        _, new = jax.lax.while_loop(
-            too_long, lambda attempt: trial(0.5 * attempt[0]), trial(jnp.ones((), guess.dtype))
-        )
+        def halved(attempt):
+            factor = 0.5 * attempt[0]
+            return factor, at(state.x - factor * step, iterations)
+
+        # The loop makes the first trial too: a step of twice the length, never tried, is halved.
+        untried = state._replace(merit=jnp.full_like(state.merit, jnp.inf))
+        two = jnp.full_like(shortest, 2.0)
+        _, new = jax.lax.while_loop(too_long, halved, (two, untried))
         better = new.merit < state.merit
         goes_on = (new.error > settled) | (new.error > 1.0) & (new.merit < 0.5 * state.merit)
+        goes_on = better & goes_on | (iterations < fixed)
         kept = jax.tree.map(partial(jnp.where, better), new, state)
-        return kept._replace(
-            iterations=new.iterations, open=better & goes_on & (new.iterations < most)
-        )
+        return kept._replace(iterations=iterations, open=goes_on & (iterations < most))
 
-    first = judge(guess, jnp.zeros((), jnp.int32))
-    state = first
-    state = jax.lax.fori_loop(
-        0, fixed, lambda _, s: judge(s.x - direction(s), s.iterations + 1), first
-    )
-    # Where full Newton went astray, start again, damped: this lane only.
-    astray = ~(state.error < settled) & (~(state.merit < first.merit) & jnp.isfinite(first.merit))
-    state = jax.tree.map(
-        partial(jnp.where, astray), first._replace(iterations=state.iterations), state
-    )
+    first = at(guess, jnp.zeros((), jnp.int32))
+    first = first._replace(open=jnp.isfinite(first.error))
+    state = jax.lax.while_loop(lambda s: s.open, newton, first)
     finite = jnp.isfinite(state.error)
-    state = state._replace(open=finite & (state.error > 1.0) & (state.iterations < most))
-    state = jax.lax.while_loop(lambda s: s.open, damped, state)
     status = jnp.where(state.error <= settled, OK, jnp.where(finite, NOT_CONVERGED, NON_FINITE))
     residual = state.error * (_FLOOR_EPS * eps)
     return state.x, state.aux, Info(status.astype(jnp.int32), state.iterations, residual)
@@ -165,6 +159,6 @@ def _root_jvp(evaluate, fixed, most, primals, tangents):
     matrix = jax.jacfwd(lambda y: evaluate(theta, y)[0])(x)
     x_dot = -small_solve(matrix, residual_dot)
     _, aux_dot = jax.jvp(lambda t, y: evaluate(t, y)[2], (theta, x), (tangents[0], x_dot))
-    integer_dot = np.zeros((), jax.dtypes.float0)
+    integer_dot: Any = np.zeros((), jax.dtypes.float0)
     info_dot = Info(integer_dot, integer_dot, jnp.zeros_like(info.residual))
     return (x, aux, info), (x_dot, aux_dot, info_dot)
