@@ -32,6 +32,12 @@ _TWO_PI = 2 * np.pi
 _TWO_PI_REST = 2.4492935982947064e-16  # what float64 leaves out of 2π
 
 
+def _two_pi(dtype):
+    """2π as the sum of a number of this dtype and a small rest."""
+    near = np.asarray(_TWO_PI, dtype)
+    return near, _TWO_PI - float(near) + _TWO_PI_REST
+
+
 def _register(data: tuple[str, ...], meta: tuple[str, ...]) -> Callable:
     return partial(jax.tree_util.register_dataclass, data_fields=data, meta_fields=meta)
 
@@ -55,8 +61,8 @@ class _Equation:
         w = self.point(known, x)
         gradient = jax.grad(self.scalar, argnums=1)(params, w)
         residual = self.chart.residual(z, w, gradient, self.dt)
-        unit, size = self.chart.sizes(scale, z, gradient, self.dt)
-        return residual / unit, jax.lax.stop_gradient(size / unit), (w, gradient)
+        unit, size = jax.lax.stop_gradient(self.chart.sizes(scale, z, gradient, self.dt))
+        return residual / unit, size / unit, (w, gradient)
 
 
 @_register(("params", "scale", "linear", "offset"), ("scalar", "chart", "dt"))
@@ -215,8 +221,7 @@ class SymplecticMap:
         that its last digit is more than a radian has no meaning, and becomes NaN.
         """
         angles = self._angles()
-        two_pi = np.asarray(_TWO_PI, y.dtype)
-        rest = _TWO_PI - float(two_pi) + _TWO_PI_REST
+        two_pi, rest = _two_pi(y.dtype)
         turns = jnp.round((y[angles] - self.cut) / _TWO_PI)
         reduced = (y[angles] - turns * two_pi) - turns * rest
         known = jnp.abs(turns) * float(jnp.finfo(y.dtype).eps) < 1.0
@@ -225,7 +230,9 @@ class SymplecticMap:
     def _outer(self, y, turns):
         """The user's state of the reduced y and its turns."""
         angles = self._angles()
-        return self.coordinates.inverse(y.at[angles].add(turns * _TWO_PI))
+        two_pi, rest = _two_pi(y.dtype)
+        whole = (y[angles] + turns * rest) + turns * two_pi
+        return self.coordinates.inverse(y.at[angles].set(whole))
 
     def _apply(self, y, *, executed: bool = False):
         """All pieces in a row on a reduced y: (Y, Info), the worst of the pieces' infos."""
@@ -367,7 +374,7 @@ def _start(map_, z, stop_outside):
         inside: Bool[Array, ""] = map_.domain.contains(y)
         finite = jnp.all(jnp.isfinite(y))
         status = _judge(jnp.where(finite, OK, NON_FINITE), inside, stop_outside)
-        zero = jnp.zeros((), jnp.int64 if jax.config.jax_enable_x64 else jnp.int32)
+        zero = jnp.zeros((), jnp.result_type(int))
         left_at = jnp.where(inside | ~finite, zero - 1, zero)
         return Lanes(y, turns.astype(zero.dtype), status.astype(jnp.int32), left_at,
                      jnp.zeros((), jnp.int32), zero)  # fmt: skip
