@@ -1,0 +1,531 @@
+"""How accurate the chosen maps are, and what they cost: every target of the project, measured.
+
+    python benchmarks/targets.py                     all rows that have no result yet, then tables
+    python benchmarks/targets.py pcr3bp --overwrite  one row again
+    python benchmarks/targets.py --quick             small sizes, into runs/targets, no tables
+
+A row's result is one JSON file in benchmarks/results. The tables of benchmarks/RESULTS.md and of
+README.md, and the README's figure, are made from these files alone; --tables makes them again.
+All errors are those of states that no fit has seen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import datetime
+import json
+import math
+import os
+import platform
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+from scipy.integrate import solve_ivp  # noqa: E402
+
+import gfnn_jax as gfnn  # noqa: E402
+from gfnn_jax import figures, metrics, report  # noqa: E402
+from gfnn_jax.charts import TYPE2  # noqa: E402
+from gfnn_jax.coordinates import CARTESIAN, TWO_PI  # noqa: E402
+from gfnn_jax.domain import covering  # noqa: E402
+from gfnn_jax.fitting.adam import PAPER, adam  # noqa: E402
+from gfnn_jax.maps import Generated, SymplecticMap  # noqa: E402
+from gfnn_jax.models import versions  # noqa: E402
+from gfnn_jax.scalars.inputs import box_inputs  # noqa: E402
+from gfnn_jax.scalars.mlp import PAPER_HIDDEN, Mlp, amplitude_of  # noqa: E402
+from gfnn_jax.scenes import DrawnFrom, Scene, henon_heiles  # noqa: E402
+
+HERE = Path(__file__).resolve().parent
+RESULTS, TABLES, README = HERE / "results", HERE / "RESULTS.md", HERE.parent / "README.md"
+FIGURE = HERE / "figures" / "two_body_error.png"
+SEED = 0
+NUM_STEPS = 1_000
+
+Numbers = dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A line of the table.
+
+    title:   what is learned, from what.
+    targets: measured quantity -> the most it may be. "pairs" and "fit_seconds" are among them.
+    measure: ``measure(quick)`` -> dict of what was measured, with the targets' keys among them.
+    """
+
+    title: str
+    targets: Numbers
+    measure: Callable[[bool], Numbers]
+
+
+# Measuring
+
+
+def angles_of(scene: Scene | None) -> tuple[int, ...]:
+    """Indices of the user's coordinates that are angles."""
+    if scene is None or scene.coordinates.forward is not CARTESIAN.forward:
+        return ()
+    return scene.coordinates.angles
+
+
+def finite(pairs: gfnn.Pairs) -> gfnn.Pairs:
+    """Without the states that collide or escape within the step."""
+    return pairs.take(np.flatnonzero(np.isfinite(np.asarray(pairs.z1)).all(axis=1)))
+
+
+def drawn(scene: Scene, num_pairs: int, quick: bool) -> tuple[gfnn.Pairs, gfnn.Pairs]:
+    """Pairs to learn from, and fresh ones of another key to judge by."""
+    key, fresh = jax.random.split(jax.random.key(SEED))
+    pairs = gfnn.sample_pairs(scene, num_pairs, key)
+    return finite(pairs), finite(gfnn.sample_pairs(scene, 200 if quick else 2_000, fresh))
+
+
+def one_step_rms(map_: SymplecticMap, fresh: gfnn.Pairs, angles=()) -> float:
+    """Per-component RMS of the one-step state error."""
+    error = np.asarray(map_.step(fresh.z0)[0]) - np.asarray(fresh.z1)
+    turned = list(angles)
+    error[:, turned] -= TWO_PI * np.round(error[:, turned] / TWO_PI)
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def rolled_out(map_: SymplecticMap, scene: Scene, quick: bool) -> Numbers:
+    """Position errors of rollouts from fresh states, at step 1,000 and on the way."""
+    key = jax.random.fold_in(jax.random.key(SEED), 1)
+    z0 = gfnn.sample_test_states(scene, 10 if quick else 100, key)
+    reference = np.asarray(gfnn.reference_trajectories(scene, z0, NUM_STEPS))
+    states, info = map_.rollout(z0, NUM_STEPS)
+    error = np.asarray(metrics.position_error(np.asarray(states), reference, angles_of(scene)))
+    statistics = metrics.error_statistics(error)
+    steps = np.unique(np.round(np.geomspace(1, NUM_STEPS, 40)).astype(int))
+    return {
+        "error_mean": float(statistics.mean[-1]),
+        "error_median": float(statistics.median[-1]),
+        "num_trajectories": len(error),
+        "num_excluded": statistics.num_excluded,
+        "status_counts": report.status_counts(info.status),
+        "curve": {
+            "steps": steps.tolist(),
+            "error": [[float(f"{e:.3e}") for e in lane] for lane in error[:, steps]],
+        },
+    }
+
+
+def fitted(pairs: gfnn.Pairs, scene: Scene | None, fresh: gfnn.Pairs, **options):
+    """(fit, what was measured of it)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)  # kept in fit.messages
+        fit = gfnn.fit(pairs, scene, seed=SEED, on_progress=lambda m: print(f"  {m}"), **options)
+    return fit, {
+        "one_step_rms": one_step_rms(fit.map, fresh, angles_of(scene)),
+        "pairs": len(pairs),
+        "fit_seconds": fit.chosen.fit_seconds,
+        "compile_seconds": fit.chosen.compile_seconds,
+        "total_seconds": fit.seconds,
+        **described(fit),
+    }
+
+
+def described(fit: gfnn.Fit) -> Numbers:
+    """The chosen candidate."""
+    return {
+        "chart": fit.chosen.chart,
+        "label": fit.chosen.label,
+        "base_map": fit.based,
+        "num_parameters": fit.chosen.num_parameters,
+        "kflop_per_step": fit.chosen.work / 1e3,
+        "microseconds_per_step": fit.chosen.microseconds_per_step,
+        "validation_rms": fit.chosen.validation_rms,
+        "validation_bound": fit.chosen.validation_bound,
+        "tolerance": fit.tolerance,
+        "symplecticity_defect": fit.symplecticity_defect,
+        "determinants": {name: j.low for name, j in fit.judgements.items()},
+        "messages": list(fit.messages),
+    }
+
+
+# The scenes
+
+
+def scene_row(name: str, title: str, pairs: int, seconds: float, rms: float, **targets) -> Row:
+    """A scene by its name, at a tolerance equal to the target."""
+
+    def measure(quick: bool) -> Numbers:
+        scene = gfnn.scenes.make(name)
+        data, fresh = drawn(scene, pairs, quick)
+        fit, measured = fitted(data, scene, fresh, tolerance=rms)
+        if targets:
+            measured |= rolled_out(fit.map, scene, quick)
+        return measured
+
+    limits = {"pairs": pairs, "fit_seconds": seconds, "one_step_rms": rms, **targets}
+    return Row(title, limits, measure)
+
+
+def cartesian_two_body(quick: bool) -> Numbers:
+    data, fresh = drawn(gfnn.scenes.two_body(), 10_000, quick)
+    return fitted(data, None, fresh, tolerance=1e-6)[1]
+
+
+def network_on_two_body(quick: bool) -> Numbers:
+    data, fresh = drawn(gfnn.scenes.two_body(), 3_000 if quick else 6_000, quick)
+    options = {"max_iterations": 40} if quick else {}
+    return fitted(data, None, fresh, scalar="mlp", tolerance=2e-6, **options)[1]
+
+
+def paper_recipe(quick: bool) -> Numbers:
+    """The paper's network and training on two bodies: what the figure compares with."""
+    scene = gfnn.scenes.two_body()
+    data, fresh = drawn(scene, 10_000 if quick else 100_000, quick)
+    z0, z1 = jnp.asarray(data.z0), jnp.asarray(data.z1)
+    w, wanted = TYPE2.point(z0, z1), TYPE2.wanted(z0, z1, scene.dt)
+    family = Mlp(box_inputs(w), PAPER_HIDDEN, "tanh", amplitude_of(w, wanted))
+    cut = len(data) // 10
+    trained = adam(
+        family, family.init(jax.random.key(SEED), jnp.float32), (w[cut:], wanted[cut:]),
+        (w[:cut], wanted[:cut]), scene.dt * np.ones(4), recipe=PAPER, key=jax.random.key(SEED),
+        on_epoch=lambda epoch, _, rms: print(f"  epoch {epoch}: {rms:.2e}"),
+    )  # fmt: skip
+    params = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), trained.params)
+    scale = jnp.asarray(z0.std(axis=0))
+    generated = Generated(
+        family, params, TYPE2, scene.dt, scale, jnp.zeros((4, 4)), jnp.zeros(4)
+    )  # fmt: skip
+    map_ = SymplecticMap((generated,), CARTESIAN, covering(z0), scale, jnp.zeros(0), scene.dt)
+    return {
+        "one_step_rms": one_step_rms(map_, fresh),
+        "pairs": len(data),
+        "fit_seconds": trained.seconds,
+        "compile_seconds": trained.compile_seconds,
+        "chart": "type2",
+        "label": f"{family.label}, Adam",
+        "num_parameters": family.num_parameters,
+        "symplecticity_defect": float(jnp.max(map_.defect(fresh.z0[:200]))),
+        **rolled_out(map_, scene, quick),
+    }
+
+
+# Far from the identity
+
+
+def driven_pendulum(nu: float) -> Row:
+    """H = p²/2 − cos q (1 + 0.15 cos νt), a whole period per step."""
+
+    def hamiltonian(z, t):
+        return z[1] ** 2 / 2 - jnp.cos(z[0]) * (1 + 0.15 * jnp.cos(nu * t))
+
+    def disc(key, num):
+        radius, angle = jax.random.uniform(key, (2, num), jnp.float64)
+        radius, angle = 0.8 * jnp.sqrt(radius), 2 * jnp.pi * angle
+        return jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle)], axis=-1)
+
+    def measure(quick: bool) -> Numbers:
+        scene = Scene(
+            name="driven pendulum", purpose="stroboscopic map", dim=1, dt=2 * math.pi / nu,
+            sampling=DrawnFrom(disc), hamiltonian=hamiltonian,
+        )  # fmt: skip
+        data, fresh = drawn(scene, 3_000, quick)
+        return fitted(data, None, fresh, tolerance=1e-10)[1]
+
+    title = f"driven pendulum, ν = {nu:g}, one period per step, told nothing"
+    return Row(title, {"pairs": 3_000, "one_step_rms": 1e-10}, measure)
+
+
+def henon_heiles_field(_, z):
+    x, y, px, py = z
+    return np.array([px, py, -x - 2 * x * y, -y - x * x + y * y])
+
+
+def crossing(start, energy: float):
+    """Next (y, p_y) on x = 0, ẋ > 0. Found by an event, then made exact by Hénon's trick: the last
+    piece is integrated with x as the independent variable."""
+    y, py = start
+    px = math.sqrt(2 * energy - py**2 - y**2 + 2 / 3 * y**3)
+    exact: dict[str, Any] = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14}
+
+    def section(_, z):
+        return z[0]
+
+    section.terminal, section.direction = True, 1.0  # type: ignore[attr-defined]
+    off = solve_ivp(henon_heiles_field, (0, 0.5), [0.0, y, px, py], **exact).y[:, -1]
+    near = solve_ivp(henon_heiles_field, (0, 30), off, events=section, **exact).y[:, -1]
+
+    def by_x(x, rest):
+        rate = henon_heiles_field(0.0, (x, *rest))
+        return rate[1:] / rate[0]
+
+    y, _, py = solve_ivp(by_x, (near[0], 0.0), near[1:], **exact).y[:, -1]
+    return y, py
+
+
+def return_map(quick: bool) -> Numbers:
+    num_fresh = 50 if quick else 400
+    rng = np.random.default_rng(SEED)
+    radius, angle = (
+        0.22 * np.sqrt(rng.uniform(size=400 + num_fresh)),
+        TWO_PI * rng.uniform(size=400 + num_fresh),
+    )
+    z0 = np.stack([0.2755 + radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    z1 = np.array([crossing(z, 0.1) for z in z0])
+    pairs, fresh = gfnn.Pairs(z0[:400], z1[:400], 1.0), gfnn.Pairs(z0[400:], z1[400:], 1.0)
+    return fitted(pairs, None, fresh, tolerance=1e-5)[1]
+
+
+# What the choice does
+
+
+def bounded_states(key, num):
+    """Uniform over the well of Hénon and Heiles below E = 1/8."""
+    energy = gfnn.scenes.henon_heiles().invariants["energy"]
+    box = np.array([0.7, 0.7, 0.5, 0.5])
+    z = box * jax.random.uniform(key, (100 * num, 4), jnp.float64, -1, 1)
+    return z[np.flatnonzero(np.asarray(jax.vmap(energy)(z)) < 1 / 8)[:num]]
+
+
+def long_step(quick: bool) -> Numbers:
+    """Hénon–Heiles at dt = 1.3: type 2 is refused with advice, auto succeeds."""
+    scene = dataclasses.replace(henon_heiles(1 / 12, 1.3), sampling=DrawnFrom(bounded_states))
+    data, fresh = drawn(scene, 4_000, quick)
+    try:
+        gfnn.fit(data, scene, chart="type2")
+        refusal = ""
+    except gfnn.FitError as error:
+        refusal = str(error)
+    _, measured = fitted(data, scene, fresh, tolerance=1e-6)
+    return measured | {"refusal": refusal, "advice_missing": int("midpoint" not in refusal)}
+
+
+def three_tolerances(quick: bool) -> Numbers:
+    """Hénon–Heiles: three tolerances choose three maps of rising cost."""
+    scene = gfnn.scenes.make("henon-heiles-regular")
+    data, fresh = drawn(scene, 2_000 if quick else 4_000, quick)
+    chosen = [fitted(data, scene, fresh, tolerance=t)[1] for t in (1e-4, 1e-7, 1e-10)]
+    cost = [c["kflop_per_step"] for c in chosen]
+    return {
+        "pairs": len(data),
+        "chosen": chosen,
+        "label": ", ".join(c["label"] for c in chosen),
+        "chart": ", ".join(c["chart"] for c in chosen),
+        "tolerances_missed": sum(c["one_step_rms"] > c["tolerance"] for c in chosen),
+        "cost_not_rising": sum(b <= a for a, b in pairwise(cost)),
+        "fit_seconds": max(c["fit_seconds"] for c in chosen),
+    }
+
+
+ROWS: dict[str, Row] = {
+    "two-body": scene_row("two-body", "two-body", 4_000, 10, 1e-10, error_mean=1e-7),
+    "henon-heiles-regular": scene_row(
+        "henon-heiles-regular", "Hénon–Heiles, regular", 4_000, 10, 1e-12, error_mean=1e-8
+    ),
+    "henon-heiles-chaotic": scene_row(
+        "henon-heiles-chaotic", "Hénon–Heiles, chaotic", 8_000, 20, 1e-10
+    ),
+    "pcr3bp": scene_row("pcr3bp", "three bodies, planar", 10_000, 60, 5e-7, error_median=3e-4),
+    "standard-map-regular": scene_row(
+        "standard-map-regular", "standard map, K = 0.6", 1_000, 5, 1e-12, error_mean=1e-8
+    ),
+    "standard-map-chaotic": scene_row(
+        "standard-map-chaotic", "standard map, K = 1.2", 1_000, 5, 1e-12
+    ),
+    "cartesian-two-body": Row(
+        "two-body, Cartesian, told nothing",
+        {"pairs": 10_000, "fit_seconds": 60, "one_step_rms": 1e-6},
+        cartesian_two_body,
+    ),
+    "network-two-body": Row(
+        "two-body, Cartesian, a network",
+        {"pairs": 20_000, "fit_seconds": 120, "one_step_rms": 3e-6},
+        network_on_two_body,
+    ),
+    "driven-pendulum-1": driven_pendulum(1.0),
+    "driven-pendulum-1.8": driven_pendulum(1.8),
+    "return-map": Row(
+        "Hénon–Heiles return map, E = 0.1, told nothing",
+        {"pairs": 400, "one_step_rms": 1e-5},
+        return_map,
+    ),
+    "long-step": Row(
+        "Hénon–Heiles, E < 1/8, dt = 1.3",
+        {"pairs": 4_000, "advice_missing": 0, "one_step_rms": 1e-6},
+        long_step,
+    ),
+    "three-tolerances": Row(
+        "Hénon–Heiles at 1e-4, 1e-7, 1e-10",
+        {"pairs": 4_000, "tolerances_missed": 0, "cost_not_rising": 0},
+        three_tolerances,
+    ),
+    "paper-recipe": Row("two-body, the paper's network and training", {}, paper_recipe),
+}
+
+
+# Results and tables
+
+
+def run(name: str, folder: Path, quick: bool) -> None:
+    """Measure a row and write its result."""
+    row = ROWS[name]
+    print(f"{name}: {row.title}")
+    started = time.perf_counter()
+    measured = row.measure(quick)
+    result = {
+        "row": name,
+        "title": row.title,
+        "quick": quick,
+        "targets": row.targets,
+        "met": {key: bool(measured[key] <= most) for key, most in row.targets.items()},
+        "measured": measured,
+        "seconds": time.perf_counter() - started,
+        "seed": SEED,
+        "dtype": "float64",
+        "device": report.device(),
+        "machine": {
+            "processor": platform.machine(),
+            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
+            "load": os.getloadavg()[0],
+        },
+        "python": platform.python_version(),
+        "versions": versions(),
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    text = report.to_json(result)
+    (folder / f"{name}.json").write_text(text, encoding="utf-8")
+    verdict = "met" if all(result["met"].values()) else f"NOT met: {result['met']}"
+    print(f"{name}: {verdict}, {result['seconds']:.0f} s")
+
+
+def results(folder: Path) -> dict[str, Numbers]:
+    """Results so far, in the order of the rows."""
+    paths = {name: folder / f"{name}.json" for name in ROWS}
+    return {n: json.loads(p.read_text(encoding="utf-8")) for n, p in paths.items() if p.exists()}
+
+
+def number(value) -> str:
+    """As a table shows it."""
+    if value is None:
+        return "–"
+    if isinstance(value, int) or (isinstance(value, float) and value >= 1000):
+        return f"{value:,.0f}"
+    return f"{value:.2g}" if 0.01 <= abs(value) < 1000 or value == 0 else f"{value:.1e}"
+
+
+def against(result: Numbers, key: str) -> str:
+    """Measured (at most target)."""
+    value, target = result["measured"].get(key), result["targets"].get(key)
+    if value is None:
+        return "–"
+    shown = number(value)
+    if target is None:
+        return shown
+    return f"{shown} (≤ {target:.0e})" if target < 0.01 else f"{shown} (≤ {target:,g})"
+
+
+def verdict(result: Numbers) -> str:
+    missed = [key.replace("_", " ") for key, met in result["met"].items() if not met]
+    if not result["met"]:
+        return "–"
+    return "no: " + ", ".join(missed) if missed else "yes"
+
+
+def table(found: dict[str, Numbers], *, full: bool) -> str:
+    """Markdown: a line per result, each figure with its target in parentheses."""
+    heads = ["what is learned", "pairs", "one-step RMS", "error at step 1,000", "fit, s", "map"]
+    heads += ["parameters", "µs/step", "defect", "compile, s", "all of it, s"] if full else []
+    heads += ["targets met"]
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    for result in found.values():
+        m = result["measured"]
+        at_end = "error_median" if "error_median" in result["targets"] else "error_mean"
+        cells = [
+            result["title"], number(m["pairs"]), against(result, "one_step_rms"),
+            against(result, at_end) + (" median" if at_end == "error_median" else ""),
+            against(result, "fit_seconds"),
+            f"{m['chart']} {m['label']}" + (", base map" if m.get("base_map") else ""),
+        ]  # fmt: skip
+        if full:
+            keys = ("num_parameters", "microseconds_per_step", "symplecticity_defect",
+                    "compile_seconds", "total_seconds")  # fmt: skip
+            cells += [number(m.get(key)) for key in keys]
+        lines.append("| " + " | ".join([*cells, verdict(result)]) + " |")
+    return "\n".join(lines)
+
+
+def between_markers(path: Path, name: str, text: str) -> None:
+    """Put ``text`` between <!-- name --> and <!-- /name --> of a file."""
+    before, after = f"<!-- {name} -->\n", f"<!-- /{name} -->"
+    whole = path.read_text(encoding="utf-8")
+    start, end = whole.index(before) + len(before), whole.index(after)
+    path.write_text(whole[:start] + text + "\n" + whole[end:], encoding="utf-8")
+
+
+def provenance(found: dict[str, Numbers]) -> str:
+    """One sentence on where and when the numbers were taken."""
+    machines = {
+        f"{r['machine']['processor']}, {r['machine']['cores']} cores, {r['device']}"
+        for r in found.values()
+    }
+    dates = sorted({r["date"] for r in found.values()})
+    jaxes = sorted({r["versions"]["jax"] for r in found.values()})
+    loads = [r["machine"]["load"] for r in found.values()]
+    span = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
+    return (
+        f"Measured {span} on {' and '.join(sorted(machines))}, jax {', '.join(jaxes)}, float64, "
+        f"seed {SEED}; other work on the machine at the time: load average {min(loads):.1f} to "
+        f"{max(loads):.1f}."
+    )
+
+
+def tables() -> None:
+    """The tables of README.md and RESULTS.md and the README's figure, from the results."""
+    found = results(RESULTS)
+    if not found:
+        return
+    between_markers(TABLES, "targets", f"{table(found, full=True)}\n\n{provenance(found)}")
+    between_markers(README, "results", f"{table(found, full=False)}\n\n{provenance(found)}")
+    figure(found)
+
+
+def figure(found: dict[str, Numbers]) -> None:
+    """Error against step number of two bodies: the map that is chosen, the paper's training."""
+    names = {
+        "two-body": "chosen by gfnn.fit",
+        "paper-recipe": "the paper's network and training",
+    }
+    curves = {}
+    for name, label in names.items():
+        if name in found:
+            m = found[name]["measured"]
+            label = f"{label}: {m['pairs']:,} pairs, {m['num_parameters']:,} parameters"
+            curves[label] = (np.array(m["curve"]["steps"]), np.array(m["curve"]["error"]))
+    if curves:
+        FIGURE.parent.mkdir(exist_ok=True)
+        figures.save(figures.error_growth(curves).figure, FIGURE)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("rows", nargs="*", choices=[[], *ROWS], metavar="ROW", help=", ".join(ROWS))
+    parser.add_argument("--quick", action="store_true", help="small sizes; writes no tables")
+    parser.add_argument("--overwrite", action="store_true", help="measure finished rows again")
+    parser.add_argument("--tables", action="store_true", help="only make the tables again")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
+    arguments = parser.parse_args(argv)
+    folder = arguments.out or (Path("runs") / "targets" if arguments.quick else RESULTS)
+    for name in [] if arguments.tables else arguments.rows or ROWS:
+        if arguments.overwrite or not (folder / f"{name}.json").exists():
+            run(name, folder, arguments.quick)
+    if folder == RESULTS:
+        tables()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""What the README shows runs as printed."""
+
+import re
+import shlex
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from gfnn_jax import cli
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", README, re.S)
+
+
+def gfnn_commands():
+    lines = [line for block in blocks("sh") for line in block.splitlines()]
+    return [shlex.split(line)[1:] for line in lines if line.startswith("gfnn ")]
+
+
+@pytest.fixture(scope="module")
+def example():
+    """The names that the example leaves behind, and the line that its text is made of."""
+    code, _ = blocks("python")
+    names: dict = {}
+    strict = jax.config.jax_numpy_dtype_promotion  # pyright: ignore[reportAttributeAccessIssue]
+    # As in a user's session, where nothing is strict.
+    jax.config.update("jax_numpy_rank_promotion", "allow")
+    jax.config.update("jax_numpy_dtype_promotion", "standard")
+    exec(compile(code, "README.md", "exec"), names)
+    yield code, names
+    jax.config.update("jax_numpy_rank_promotion", "raise")
+    jax.config.update("jax_numpy_dtype_promotion", strict)
+
+
+def test_the_example_runs(example):
+    code, names = example
+    assert len(code.splitlines()) <= 12
+    assert names["states"].shape == (10, 1001, 4)
+    assert not np.any(names["info"].status)
+    assert names["fit"].met
+
+
+def test_the_gradient_is_one(example):
+    _, names = example
+    names = names | {"z": names["z0"][0]}
+    expression = re.search(r"`(jax\.grad\(.*?\)\(z\))`", README)
+    assert expression
+    gradient = np.asarray(eval(expression[1], names))
+
+    def later(z):
+        return float(names["fit"].map.rollout(z, 20)[0][-1, 0])
+
+    z = np.asarray(names["z"])
+    for i, unit in enumerate(1e-5 * np.eye(4)):
+        difference = (later(z + unit) - later(z - unit)) / 2e-5
+        np.testing.assert_allclose(gradient[i], difference, atol=1e-6)
+
+
+def test_your_own_data_in_python(example, tmp_path, monkeypatch):
+    _, names = example
+    monkeypatch.chdir(tmp_path)
+    pairs = names["pairs"].take(slice(0, 500))
+    mine = {"gfnn": names["gfnn"], "z0": pairs.z0, "z1": pairs.z1}
+    exec(compile(blocks("python")[1], "README.md", "exec"), mine)
+    assert mine["states"].shape == (500, 1001, 4)
+
+
+def test_your_own_data_by_commands(example, tmp_path, monkeypatch):
+    _, names = example
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    pairs = names["pairs"].take(slice(0, 500))
+    np.savez("data.npz", z0=pairs.z0, z1=pairs.z1, dt=pairs.dt)
+    fit, predict = gfnn_commands()
+    predict[predict.index("100000")] = "1000"
+    assert cli.main(fit) == 0
+    assert cli.main(predict) == 0
+    with np.load("prediction.npz") as done:
+        assert done["trajectories"].shape == (500, 11, 4)
+    jax.config.update("jax_compilation_cache_dir", None)
+
+
+def test_links_lead_somewhere():
+    local = re.findall(r"\]\((?!https?:)([^)#]+)\)", README)
+    missing = [path for path in local if not (ROOT / path).exists()]
+    assert not missing
+
+
+def test_ci_runs_the_test_command():
+    (command,) = [c for c in blocks("sh")[1].split("&&") if "pytest" in c]
+    assert command.strip().removeprefix(".venv/bin/") in (ROOT / ".ci/run").read_text()
