@@ -50,7 +50,7 @@ _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not n
 # A rung that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
 # the odd degrees), and larger families only fit noise.
 _WORTHWHILE, _STALLED = 0.8, 3
-# So often another chart's ladder of the same functions may be better before this one is left.
+# So often another ladder may be better before this one is left.
 _BEATEN = 3
 _NORMAL_95 = 1.645
 _NOMINAL_NEWTON = 3
@@ -480,8 +480,9 @@ class _Ladder:
             self.rows.pairs, self.rows.held_out,
         )  # fmt: skip
         params = family.unflatten(solved.coefficients)
+        label = f"features {family.degree}" if self.kind == "features" else family.label
         return Candidate(
-            label=family.label, scalar=self.kind, chart=self.chart.name,
+            label=label, scalar=self.kind, chart=self.chart.name,
             num_parameters=family.num_parameters, validation_rms=rms, validation_bound=bound,
             work=counted_work(family, iterations.mean()),
             microseconds_per_step=None, fit_seconds=seconds,
@@ -563,8 +564,7 @@ def _every_few_seconds(checkpoints) -> Callable | None:
 
 def _walk(ladders, tolerance: float, on_progress) -> tuple[list[Candidate], set[tuple[str, str]]]:
     """Climb all ladders together by rising work, until the next rung costs more than one that is
-    accurate enough. A ladder is left that no longer gains, or that another chart's with the same
-    functions keeps beating."""
+    accurate enough. A ladder is left that no longer gains, or that another keeps beating."""
     rungs = [(rung.work, i, rung) for i, ladder in enumerate(ladders) for rung in ladder.rungs]
     candidates: list[Candidate] = []
     best = [np.inf] * len(ladders)
@@ -586,13 +586,7 @@ def _walk(ladders, tolerance: float, on_progress) -> tuple[list[Candidate], set[
         if stalled[i] == _STALLED:
             left.add(i)
         best[i] = min(best[i], candidate.validation_rms)
-        beaten[i] += any(
-            rival.validation_rms < candidate.validation_rms
-            for rival in candidates[:-1]
-            if rival.scalar == candidate.scalar
-            and rival.chart != candidate.chart
-            and rival.work <= 1.1 * candidate.work
-        )
+        beaten[i] += any(_beats(rival, candidate) for rival in candidates)
         if beaten[i] == _BEATEN:
             left.add(i)
     ends = {(c.chart, c.scalar) for c in candidates}
@@ -602,6 +596,18 @@ def _walk(ladders, tolerance: float, on_progress) -> tuple[list[Candidate], set[
         if len(errors) > 2 and min(errors[-2:]) > _WORTHWHILE * min(errors[:-2]):
             stalled_ladders.add((chart, scalar))
     return candidates, stalled_ladders
+
+
+def _beats(rival: Candidate, candidate: Candidate) -> bool:
+    """Whether a rung of another ladder is better for no more work: at all for the same functions in
+    another chart, by far for other functions, which may gain faster later."""
+    if (rival.chart, rival.scalar) == (candidate.chart, candidate.scalar):
+        return False
+    margin = 1.0 if rival.scalar == candidate.scalar else 10.0
+    return (
+        rival.work <= 1.1 * candidate.work
+        and margin * rival.validation_rms < candidate.validation_rms
+    )
 
 
 def _data(prepared: _Prepared, chart: AnyChart, rows):
