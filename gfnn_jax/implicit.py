@@ -56,16 +56,17 @@ def small_solve(matrix: Matrix, rhs: Vector) -> Vector:
     n = rhs.shape[0]
     if n > _UNROLL_UP_TO:
         return jnp.linalg.solve(matrix, rhs)
-    rows = [jnp.append(matrix[i], rhs[i]) for i in range(n)]
+    # The right-hand side apart from the rows: only so is all this linear in it.
+    rows, x = [matrix[i] for i in range(n)], [rhs[i] for i in range(n)]
     for k in range(n):
         for i in range(k + 1, n):  # bubble the largest pivot up
             swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
             rows[k], rows[i] = jnp.where(swap, rows[i], rows[k]), jnp.where(swap, rows[k], rows[i])
-        scaled = rows[k] / rows[k][k]
+            x[k], x[i] = jnp.where(swap, x[i], x[k]), jnp.where(swap, x[k], x[i])
+        rows[k], x[k] = rows[k] / rows[k][k], x[k] / rows[k][k]
         for i in range(k + 1, n):
-            rows[i] = rows[i] - rows[i][k] * scaled
-        rows[k] = scaled
-    x = [row[n] for row in rows]
+            factor = rows[i][k]
+            rows[i], x[i] = rows[i] - factor * rows[k], x[i] - factor * x[k]
     for k in reversed(range(n)):
         for j in range(k + 1, n):
             x[k] = x[k] - rows[k][j] * x[j]
