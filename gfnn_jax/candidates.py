@@ -1,0 +1,322 @@
+"""Candidates: one chart, one family, one size, fitted; its error measured and its cost counted.
+
+A ladder holds the sizes of one family in one chart. The linear families of a stage are answered by
+one factorisation: their terms are the leading columns of the largest.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.charts import MIDPOINT, AnyChart
+from gfnn_jax.coordinates import CARTESIAN, TWO_PI
+from gfnn_jax.fitting import least_squares
+from gfnn_jax.fitting.levenberg_marquardt import LMState, levenberg_marquardt
+from gfnn_jax.maps import Generated, SymplecticMap
+from gfnn_jax.phase_space import Pairs
+from gfnn_jax.preparation import Prepared
+from gfnn_jax.scalars.inputs import box_inputs, variable_signs
+from gfnn_jax.scalars.mlp import Mlp, amplitude_of
+from gfnn_jax.scalars.products import Products
+from gfnn_jax.scalars.sines import Sines
+
+# Degrees whose numbers of terms grow by about a half from one to the next; a stage is fitted by one
+# factorisation of the rows of its largest degree.
+_STAGES = ((2, 3, 4, 5, 6), (7, 8, 9, 10), (12, 14, 16), (18, 20))
+_SINES = (100, 200, 400, 800, 1_600)
+_MOST_TERMS = 1_500
+# Rows × terms² of one factorisation: about ten seconds on two cores.
+_MOST_WORK = 1.2e11
+_NOMINAL_NEWTON = 3
+# The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
+_MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
+_CHECKPOINT_SECONDS = 10.0
+_NORMAL_95 = 1.645
+_TIMED_LANES, _TIMED_FRONT = 1_000, 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """One rung of the ladder: what it is, how accurate, how fast.
+
+    validation_rms: per-component RMS of the one-step state error on held-out pairs, in the user's
+    coordinates; validation_bound: its upper 95 % bound. work: floating-point operations per
+    predicted step. fit_seconds: of its least-squares solve or training, compilation apart.
+    """
+
+    label: str
+    scalar: str
+    chart: str
+    num_parameters: int
+    validation_rms: float
+    validation_bound: float
+    work: float
+    microseconds_per_step: float | None
+    fit_seconds: float
+    compile_seconds: float
+    train_rms: float
+    newton_iterations_max: int
+    condition: float | None
+    rank: int | None
+    map: SymplecticMap
+    chosen: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Rows:
+    """The pairs, and which of them are for training and which are held out."""
+
+    pairs: Pairs
+    training: np.ndarray
+    held_out: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Rung:
+    """One size of a family; ``stage`` is the largest of those fitted by the same factorisation."""
+
+    family: Any
+    stage: Any
+    work: float
+
+
+def kinds(scalar, charts: Sequence[AnyChart], prepared: Prepared, scene) -> Iterator[tuple]:
+    """(chart, (kind, features, reversor)) of each ladder that applies to what was asked for."""
+    features = scene.features if scene is not None else None
+    high_dimensional = prepared.y0.shape[1] > 4
+    for chart in charts:
+        # Only the midpoint S inherits the parity.
+        reversor = scene.reversor if scene is not None and chart == MIDPOINT else None
+        if scalar in ("auto", "polynomial"):
+            yield chart, ("polynomial", None, reversor)
+        if scalar in ("auto", "features") and features is not None:
+            yield chart, ("features", features, reversor)
+        if scalar == "sines" or (scalar == "auto" and high_dimensional):
+            yield chart, ("sines", None, None)
+
+
+class Ladder:
+    """The sizes of one linear family in one chart, fitted on demand."""
+
+    def __init__(self, prepared: Prepared, chart, rows: Rows, kind, features, reversor):
+        self.prepared, self.chart, self.rows, self.kind = prepared, chart, rows, kind
+        self.train, self.weight = _data(prepared, chart, rows.training)
+        self.held, _ = _data(prepared, chart, rows.held_out)
+        coordinates, dim = prepared.coordinates, prepared.y0.shape[1] // 2
+        angles = tuple(a for a in coordinates.angles if a < dim)
+        w = self.train[0]
+        inputs = box_inputs(
+            w, angles=angles, cyclic=coordinates.cyclic, features=features, reversor=reversor
+        )
+        if kind == "sines":
+            stages: list[list[Any]] = [[Sines(inputs, count)] for count in _SINES]
+        else:
+            signs = variable_signs(inputs, reversor, w) if reversor is not None else None
+            stages = [[Products(inputs, degree, signs) for degree in s] for s in _STAGES]
+        size = len(rows.training), w.shape[1]
+        stages = [[f for f in stage if _affordable(f.num_parameters, *size)] for stage in stages]
+        self.rungs = [
+            Rung(f, stage[-1], counted_work(f, _NOMINAL_NEWTON))
+            for stage in stages for f in stage
+        ]  # fmt: skip
+        self._reduced: dict[Any, least_squares.Reduced] = {}
+
+    def fit(self, rung: Rung, on_progress) -> Candidate:
+        """Fit this rung; its stage's factorisation is made once."""
+        top = rung.stage
+        if top not in self._reduced:
+            on_progress(f"{self.chart.name}: {top.num_parameters} terms of {top.label}")
+            self._reduced = {top: least_squares.reduce(top, self.train, self.held, self.weight)}
+        reduced, family = self._reduced[top], rung.family
+        started = time.perf_counter()
+        solved = least_squares.solve(reduced, family.num_parameters)
+        seconds = reduced.seconds + time.perf_counter() - started
+        # Judged through the stage's largest family, zeros added: one compilation for all its rungs.
+        padding = top.num_parameters - family.num_parameters
+        padded = top.unflatten(jnp.pad(solved.coefficients, (0, padding)))
+        rms, bound, iterations = validation_error(
+            compose(self.prepared, self.chart, top, padded, self.rows.pairs),
+            self.rows.pairs, self.rows.held_out,
+        )  # fmt: skip
+        params = family.unflatten(solved.coefficients)
+        label = f"features {family.degree}" if self.kind == "features" else family.label
+        return Candidate(
+            label=label, scalar=self.kind, chart=self.chart.name,
+            num_parameters=family.num_parameters, validation_rms=rms, validation_bound=bound,
+            work=counted_work(family, iterations.mean()),
+            microseconds_per_step=None, fit_seconds=seconds,
+            compile_seconds=reduced.compile_seconds, train_rms=solved.train_rms,
+            newton_iterations_max=int(iterations.max()), condition=solved.condition,
+            rank=solved.rank,
+            map=compose(self.prepared, self.chart, family, params, self.rows.pairs),
+        )  # fmt: skip
+
+
+class Network:
+    """The one rung of a network, trained by Levenberg–Marquardt."""
+
+    def __init__(self, prepared, chart, rows, tolerance, max_iterations, seed, checkpoints):
+        self.prepared, self.chart, self.rows = prepared, chart, rows
+        self.tolerance, self.max_iterations = tolerance, max_iterations
+        self.seed, self.checkpoints = seed, checkpoints
+        (w, wanted), self.weight = _data(prepared, chart, rows.training[:_MLP_PAIRS])
+        coordinates, dim = prepared.coordinates, prepared.y0.shape[1] // 2
+        angles = tuple(a for a in coordinates.angles if a < dim)
+        inputs = box_inputs(w, angles=angles, cyclic=coordinates.cyclic)
+        family = Mlp(inputs, _MLP_HIDDEN, _MLP_ACTIVATION, amplitude_of(w, wanted))
+        self.train, self.rungs = (w, wanted), [Rung(family, family, 0.0)]
+
+    def fit(self, rung: Rung, on_progress) -> Candidate:
+        """Train the network."""
+        family, weight = rung.family, jnp.asarray(self.weight)
+        held, _ = _data(self.prepared, self.chart, self.rows.held_out)
+
+        # u = w / weight makes the rows of ∇S weight·∇S, free of units.
+        def scaled(params, u):
+            return family(params, weight * u)
+
+        def scale(data):
+            return data[0] / weight[None, :], data[1] * weight[None, :]
+
+        def report(state: LMState) -> None:
+            on_progress(
+                f"{self.chart.name} {family.label}: iteration {state.iteration}, "
+                f"validation {state.validation_rms:.2e} of the data's spread"
+            )
+
+        theta = np.zeros(family.num_parameters)
+        like = LMState(theta, theta, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0, 0.0)  # its structure counts
+        resume = self.checkpoints.latest(like) if self.checkpoints else None
+        result = levenberg_marquardt(
+            scaled, family.init(jax.random.key(self.seed), jnp.float64), *scale(self.train),
+            validation=scale(held), max_iterations=self.max_iterations,
+            target_rms=0.5 * self.tolerance / float(np.max(self.prepared.scale)),
+            on_progress=report, checkpoint=_every_few_seconds(self.checkpoints),
+            resume=resume[1] if resume else None,
+        )  # fmt: skip
+        map_ = compose(self.prepared, self.chart, family, result.params, self.rows.pairs)
+        rms, bound, iterations = validation_error(map_, self.rows.pairs, self.rows.held_out)
+        return Candidate(
+            label=family.label, scalar=family.name, chart=self.chart.name,
+            num_parameters=family.num_parameters, validation_rms=rms, validation_bound=bound,
+            work=counted_work(family, iterations.mean()),
+            microseconds_per_step=None, fit_seconds=result.seconds,
+            compile_seconds=result.compile_seconds, train_rms=result.train_rms,
+            newton_iterations_max=int(iterations.max()), condition=None, rank=None, map=map_,
+        )  # fmt: skip
+
+
+def _every_few_seconds(checkpoints) -> Callable | None:
+    """A checkpoint callback that saves when ten seconds have passed since it last did."""
+    if checkpoints is None:
+        return None
+    last = time.monotonic()
+
+    def save(state: LMState) -> None:
+        nonlocal last
+        if time.monotonic() - last > _CHECKPOINT_SECONDS:
+            checkpoints.save(state.iteration, state)
+            last = time.monotonic()
+
+    return save
+
+
+def _data(prepared: Prepared, chart: AnyChart, rows):
+    """(w, wanted) of these rows, and the weight that makes a row of ∇S unit-free."""
+    y0, y1 = jnp.asarray(prepared.y0[rows]), jnp.asarray(prepared.y1[rows])
+    scale, dim = prepared.scale, len(prepared.scale) // 2
+    # ∂S/∂q is a change of p and conversely; in type 1 both are momenta.
+    conjugate = np.tile(scale[dim:], 2) if chart.name == "type1" else np.roll(scale, dim)
+    return (chart.point(y0, y1), chart.wanted(y0, y1, prepared.dt)), prepared.dt / conjugate
+
+
+def _affordable(terms: int, num_pairs: int, width: int) -> bool:
+    """Whether the data determine so many terms, and factorising them takes seconds."""
+    rows = num_pairs * width
+    return terms <= min(_MOST_TERMS, rows // 3) and rows * terms**2 <= _MOST_WORK
+
+
+def compose(prepared: Prepared, chart, family, params, pairs: Pairs) -> SymplecticMap:
+    generated = Generated(
+        family, params, chart, prepared.dt,
+        *(jnp.asarray(a) for a in (prepared.scale, prepared.linear, prepared.offset)),
+    )  # fmt: skip
+    half = prepared.half
+    spread = np.std(np.asarray(pairs.z0), axis=0)
+    return SymplecticMap(
+        pieces=(generated,) if half is None else (half, generated, half),
+        coordinates=prepared.coordinates,
+        domain=prepared.domain,
+        scale=jnp.asarray(np.where(spread > 0, spread, 1.0)),
+        cut=jnp.asarray(prepared.cut),
+        dt=prepared.dt,
+    )
+
+
+def validation_error(map_: SymplecticMap, pairs: Pairs, rows) -> tuple[float, float, np.ndarray]:
+    """Per-component RMS of Z_predicted − Z on these pairs, its upper 95 % bound, Newton iterations.
+
+    In the user's coordinates, angles modulo 2π. Infinite where a lane fails. The bound is that of
+    the mean square, by the central limit theorem.
+    """
+    z0, z1 = np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows]
+    predicted, info = map_.step(z0)
+    error = np.asarray(predicted) - z1
+    if map_.coordinates.forward is CARTESIAN.forward:
+        angles = list(map_.coordinates.angles)
+        error[:, angles] -= TWO_PI * np.round(error[:, angles] / TWO_PI)
+    square = np.mean(error**2, axis=1)
+    if not np.isfinite(square).all():
+        return float("inf"), float("inf"), np.asarray(info.iterations)
+    bound = square.mean() + _NORMAL_95 * square.std() / np.sqrt(len(square))
+    return float(np.sqrt(square.mean())), float(np.sqrt(bound)), np.asarray(info.iterations)
+
+
+def counted_work(family, iterations: float) -> float:
+    """Floating-point operations per predicted step: those of ∇S and of its Jacobian, counted.
+
+    ``iterations`` Newton updates need one evaluation more than updates, and a Jacobian each.
+    """
+    gradient, jacobian = family.operations
+    return float((1 + iterations) * gradient + iterations * jacobian)
+
+
+def timed(candidates: list[Candidate], chosen: Candidate, states) -> list[Candidate]:
+    """Candidates with the measured time per trajectory-step, compilation apart.
+
+    Of the chosen one and of a few along the front of those that no cheaper one beats: a compilation
+    each is what it costs.
+    """
+    front, best = [], np.inf
+    for candidate in sorted(candidates, key=lambda c: c.work):
+        if candidate.validation_rms < best:
+            front.append(candidate)
+            best = candidate.validation_rms
+    few = {id(front[i]) for i in np.linspace(0, len(front) - 1, _TIMED_FRONT).round().astype(int)}
+    few.add(id(chosen))
+    return [
+        dataclasses.replace(c, microseconds_per_step=_microseconds_per_step(c.map, states))
+        if id(c) in few
+        else c
+        for c in candidates
+    ]
+
+
+def _microseconds_per_step(map_: SymplecticMap, states) -> float:
+    """Of a batch of 1,000 lanes, the best of five steps."""
+    z = np.resize(states, (_TIMED_LANES, states.shape[1]))
+
+    def run() -> float:
+        started = time.perf_counter()
+        jax.block_until_ready(map_.step(z))
+        return time.perf_counter() - started
+
+    run()
+    return 1e6 * min(run() for _ in range(5)) / _TIMED_LANES
