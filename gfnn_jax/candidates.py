@@ -34,7 +34,7 @@ _SINES = (100, 200, 400, 800, 1_600)
 _MOST_TERMS = 1_500
 # Rows × terms² of one factorisation: about ten seconds on two cores.
 _MOST_WORK = 1.2e11
-_NOMINAL_NEWTON = 3
+_NOMINAL_NEWTON = 3.0
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
 _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
 _CHECKPOINT_SECONDS = 10.0
