@@ -495,8 +495,8 @@ def tables() -> None:
     caption = (
         "*Two bodies, 100 orbits that no fit has seen: mean position error, and a band of one "
         "standard deviation. Both maps are exactly symplectic, and the error of both grows in "
-        f"proportion to the step number. {figure(found)}. `python benchmarks/targets.py` draws "
-        "this figure.*"
+        f"proportion to the step number ({figure(found)}). Drawn by "
+        "`benchmarks/targets.py`.*"
     )
     between_markers(README, "figure", textwrap.fill(caption, 100, break_long_words=False))
 
