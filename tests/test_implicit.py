@@ -17,7 +17,7 @@ from gfnn_jax.maps import Generated
 EPS = np.finfo(np.float64).eps
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 5, 8, 9, 12])
+@pytest.mark.parametrize("n", [1, 2, 4, 7, 9])
 def test_small_solve_agrees_with_numpy(n):
     rng = np.random.default_rng(n)
     matrix, rhs = rng.standard_normal((20, n, n)), rng.standard_normal((20, n))
