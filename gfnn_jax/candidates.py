@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -231,10 +231,52 @@ def _every_few_seconds(checkpoints) -> Callable | None:
 def _data(prepared: Prepared, chart: AnyChart, rows):
     """(w, wanted) of these rows, and the weight that makes a row of ∇S unit-free."""
     y0, y1 = jnp.asarray(prepared.y0[rows]), jnp.asarray(prepared.y1[rows])
-    scale, dim = prepared.scale, len(prepared.scale) // 2
-    # ∂S/∂q is a change of p and conversely; in type 1 both are momenta.
-    conjugate = np.tile(scale[dim:], 2) if chart.name == "type1" else np.roll(scale, dim)
-    return (chart.point(y0, y1), chart.wanted(y0, y1, prepared.dt)), prepared.dt / conjugate
+    weight = _weight(chart, prepared.scale, prepared.dt)
+    return (chart.point(y0, y1), chart.wanted(y0, y1, prepared.dt)), weight
+
+
+def _weight(chart: AnyChart, scale, dt):
+    """h over the scale of what each entry of ∇S changes, (2d,): ∂S/∂q changes p and conversely; in
+    type 1 both entries are momenta."""
+    dim = len(scale) // 2
+    return dt / (np.tile(scale[dim:], 2) if chart.name == "type1" else np.roll(scale, dim))
+
+
+def refitted(candidate: Candidate, chunks: Iterable[Pairs], held: Pairs) -> tuple[Candidate, int]:
+    """A candidate of a linear family fitted anew to all of these pairs, and their number.
+
+    chunks: pairs that need never be in memory together. held: those that judge it, as before.
+    """
+    map_ = candidate.map
+    index = next(i for i, piece in enumerate(map_.pieces) if isinstance(piece, Generated))
+    generated = map_.pieces[index]
+    weight = _weight(generated.chart, np.asarray(generated.scale), map_.dt)
+    as_seen = jax.jit(jax.vmap(map_.generated_pair))
+    count = 0
+
+    def rows(pairs: Pairs):
+        y0, y1 = as_seen(jnp.asarray(pairs.z0), jnp.asarray(pairs.z1))
+        return generated.chart.point(y0, y1), generated.chart.wanted(y0, y1, map_.dt)
+
+    def counted():
+        nonlocal count
+        for pairs in chunks:
+            count += len(pairs)
+            yield rows(pairs)
+
+    reduced = least_squares.reduce_chunks(generated.scalar, counted(), [rows(held)], weight)
+    solved = least_squares.solve(reduced, candidate.num_parameters)
+    generated = dataclasses.replace(
+        generated, params=generated.scalar.unflatten(solved.coefficients)
+    )
+    pieces = (*map_.pieces[:index], generated, *map_.pieces[index + 1 :])
+    map_ = dataclasses.replace(map_, pieces=pieces)
+    rms, bound, _ = validation_error(map_, held, np.arange(len(held)))
+    refit = dataclasses.replace(
+        candidate, map=map_, validation_rms=rms, validation_bound=bound,
+        train_rms=solved.train_rms, fit_seconds=candidate.fit_seconds + reduced.seconds,
+    )  # fmt: skip
+    return refit, count
 
 
 def _affordable(terms: int, num_pairs: int, width: int) -> bool:

@@ -137,6 +137,31 @@ def read_trajectories(path, *, dt: float | None = None) -> TrajectoryData:
     )
 
 
+def read_sample(
+    path, *, dt: float | None = None, num_pairs: int = 200_000, seed: int = 0
+) -> TrajectoryData:
+    """As `read_trajectories`, of a file larger than memory: a random sample of its pairs.
+
+    The file is read once, block by block, and checked all through; each pair is kept with the
+    same probability, as a sequence of two states. Memory is that of the sample and a few blocks.
+    """
+    rng = np.random.default_rng(seed)
+    kept, priority, found = None, np.empty(0), 0
+    for pairs in iterate_pairs(path, BLOCK_ROWS, dt=dt):
+        rows = np.stack([pairs.z0, pairs.z1], axis=1)
+        kept = rows if kept is None else np.concatenate([kept, rows])
+        priority = np.concatenate([priority, rng.random(len(rows))])
+        dt, found = pairs.dt, found + len(rows)
+        if len(kept) > num_pairs:
+            first = np.argpartition(priority, num_pairs)[:num_pairs]
+            kept, priority = kept[first], priority[first]
+    if kept is None or dt is None:
+        raise InputError(f"{path}: no pair of consecutive states found")
+    states = kept.reshape(-1, kept.shape[-1])
+    lengths = np.full(len(kept), 2)
+    return TrajectoryData(states, lengths, dt, str(path), _digest(path))
+
+
 def iterate_pairs(path, chunk: int, *, dt: float | None = None) -> Iterator[Any]:
     """The pairs of a file larger than memory, as `Pairs` of at most ``chunk`` pairs each.
 

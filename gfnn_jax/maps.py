@@ -253,6 +253,22 @@ class SymplecticMap:
         status = jnp.where(finite, status, NON_FINITE).astype(jnp.int32)
         return self._outer(y1, turns), info._replace(status=status)
 
+    def generated_pair(self, z0, z1):
+        """A pair (2d,) each as the generated piece sees it: inner coordinates, the angles of z1
+        lifted to the nearest image of the map's own prediction, the base map factored out."""
+        index = next(i for i, piece in enumerate(self.pieces) if isinstance(piece, Generated))
+        angles = self._angles()
+        y0, _ = self._reduce(self.coordinates.forward(z0))
+        predicted, _ = self._apply(y0)
+        y1 = self.coordinates.forward(z1)
+        turns = jnp.round((y1[angles] - predicted[angles]) / _TWO_PI)
+        y1 = y1.at[angles].add(-turns * _TWO_PI)
+        for piece in self.pieces[:index]:
+            y0, _ = piece(y0)
+        for piece in reversed(self.pieces[index + 1 :]):
+            y1, _ = piece.inverse()(y1)
+        return y0, y1
+
     # Batches.
 
     def step(self, z):

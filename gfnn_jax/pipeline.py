@@ -26,14 +26,16 @@ from gfnn_jax.io import (
     atomic_folder,
     ensure_new,
     failures_as_work_errors,
+    iterate_pairs,
     read_initial_states,
+    read_sample,
     read_trajectories,
 )
 from gfnn_jax.maps import Lanes, SymplecticMap
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.predictions import PredictionWriter
 from gfnn_jax.scenes import Scene
-from gfnn_jax.selection import Fit, FitError
+from gfnn_jax.selection import Fit, FitError, refit
 from gfnn_jax.selection import fit as select
 from gfnn_jax.trajectories import reference_trajectories, sample_pairs, sample_test_states
 
@@ -56,6 +58,9 @@ _LINEAR: dict[str, tuple[int, float]] = {
 _NETWORK, _NETWORK_QUICK = (6_000, 1e-6, 250), (3_000, 1e-5, 60)
 _QUICK_PAIRS, _QUICK_TRAJECTORIES = 4_000, 25
 
+# A larger file is never in memory whole: candidates are chosen on a sample of its pairs, and the
+# chosen one is fitted to all of them chunk by chunk.
+_LARGE_BYTES, _FIT_CHUNK, _HELD = 2**29, 50_000, 2_000
 # A chunk of a prediction: what is held in memory at once, and how much work a kill may lose.
 _CHUNK_BYTES, _CHUNK_LANE_STEPS = 32 * 2**20, 400_000
 
@@ -242,7 +247,8 @@ def fit(
     done.
     """
     scene = _scene(scene_name, None) if scene_name is not None else None
-    trajectories = read_trajectories(data, dt=dt)
+    large = data.is_file() and data.stat().st_size > _LARGE_BYTES
+    trajectories = (read_sample if large else read_trajectories)(data, dt=dt)
     job = {
         "command": "fit", "data": trajectories.digest, "dt": trajectories.dt, "scene": scene_name,
         "angles": list(angles), "tolerance": tolerance, "chart": chart, "scalar": scalar,
@@ -255,6 +261,11 @@ def fit(
             trajectories.pairs(), scene, tolerance=tolerance, chart=chart, scalar=scalar,
             angles=angles, seed=seed, iterations=None, checkpoints=checkpoints, say=say,
         )  # fmt: skip
+        if large and scalar != "mlp":
+            say("all pairs of the file, for the chosen candidate")
+            # Among millions of pairs those that judge a thousand terms need not be left out.
+            held = trajectories.pairs().take(slice(_HELD))
+            chosen = refit(chosen, iterate_pairs(data, _FIT_CHUNK, dt=dt), held)
         result = report.assemble(
             chosen, scene=scene_name, dt=trajectories.dt, seed=seed, rollout=None,
             data={

@@ -11,13 +11,13 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.candidates import Candidate, Ladder, Network, Rows, kinds, timed
+from gfnn_jax.candidates import Candidate, Ladder, Network, Rows, kinds, refitted, timed
 from gfnn_jax.charts import CHARTS
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.local_maps import ChartJudgement, data_defect, judge_chart, local_jacobians
@@ -184,6 +184,17 @@ def fit(
         noise=noise,
         messages=tuple(messages),
     )
+
+
+def refit(fitted: Fit, chunks: Iterable[Pairs], held: Pairs) -> Fit:
+    """The chosen map of a fit, fitted anew to more pairs than fit into memory.
+
+    fitted: of a sample of them, by a linear family. chunks: all of the pairs. held: pairs (of the
+    sample, held out or new) that choose the ridge and judge the result.
+    """
+    chosen, num_pairs = refitted(fitted.chosen, chunks, held)
+    candidates = tuple(chosen if c.chosen else c for c in fitted.candidates)
+    return dataclasses.replace(fitted, map=chosen.map, candidates=candidates, num_pairs=num_pairs)
 
 
 def _check_request(pairs, scene, tolerance, chart, scalar, angles) -> None:

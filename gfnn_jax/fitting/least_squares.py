@@ -81,15 +81,21 @@ def reduce(family, train, validation, weight) -> Reduced:
     weight: (2d,), what a row of ∇S is multiplied by: h divided by the scale of the conjugate
     coordinate, so that the result does not depend on the units of q and p.
     """
-    started = time.perf_counter()
     n = chunk_size(family.num_parameters, train[0].shape[-1] // 2)
-    weight = jnp.asarray(weight)
-    stage = _Stage(family, weight)
-    factors = []
-    for w, wanted in (train, validation):
-        factors.append(stage.factor((w[i : i + n], wanted[i : i + n]) for i in range(0, len(w), n)))
+
+    def chunks(w, wanted):
+        return ((w[i : i + n], wanted[i : i + n]) for i in range(0, len(w), n))
+
+    return reduce_chunks(family, chunks(*train), chunks(*validation), weight)
+
+
+def reduce_chunks(family, train: Iterable, validation: Iterable, weight) -> Reduced:
+    """As ``reduce``, of chunks of (w, wanted) that need never be in memory together."""
+    started = time.perf_counter()
+    stage = _Stage(family, jnp.asarray(weight))
+    factor, rows = stage.factor(train)
+    held, held_rows = stage.factor(validation)
     seconds = time.perf_counter() - started - stage.compile_seconds
-    (factor, rows), (held, held_rows) = factors
     return Reduced(factor, rows, held, held_rows, seconds, stage.compile_seconds)
 
 

@@ -1,0 +1,67 @@
+"""Files larger than memory: a sample chooses the candidate, all pairs fit it."""
+
+import jax
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax import pipeline, selection
+from gfnn_jax.io import iterate_pairs, read_sample, read_trajectories
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    scene = gfnn.scenes.make("standard-map-regular")
+    pairs = gfnn.sample_pairs(scene, 3_000, jax.random.key(0))
+    rng = np.random.default_rng(0)
+    z0, z1 = (np.asarray(z) + 1e-4 * rng.standard_normal(z.shape) for z in (pairs.z0, pairs.z1))
+    path = tmp_path_factory.mktemp("data") / "pairs.npz"
+    np.savez(path, z0=z0, z1=z1, dt=1.0)
+    return path
+
+
+def test_a_sample_is_of_the_files_own_pairs_each_once(file):
+    whole = read_trajectories(file).pairs()
+    sample = read_sample(file, num_pairs=500, seed=1)
+    rows = {tuple(r) for r in np.hstack([whole.z0, whole.z1])}
+    drawn = [tuple(r) for r in sample.states.reshape(500, -1)]
+    assert len(set(drawn)) == 500
+    assert set(drawn) <= rows
+    again = read_sample(file, num_pairs=500, seed=1)
+    np.testing.assert_array_equal(again.states, sample.states)
+    # Uniform over the file: the mean row of 500 among 3,000, within five standard deviations.
+    place = {tuple(r): i for i, r in enumerate(np.hstack([whole.z0, whole.z1]))}
+    mean = np.mean([place[r] for r in drawn])
+    assert abs(mean - 1500) < 5 * 3_000 / np.sqrt(12 * 500)
+
+
+def test_all_pairs_fit_better_than_the_sample(file, tmp_path, monkeypatch):
+    monkeypatch.setattr(pipeline, "_LARGE_BYTES", 0)
+    monkeypatch.setattr(pipeline, "read_sample", lambda p, dt: read_sample(p, dt=dt, num_pairs=200))
+    ran = pipeline.fit(file, out=tmp_path / "m", scene_name="standard-map-regular", tolerance=1e-3)
+    assert ran is not None
+    assert ran.report["data"]["num_pairs"] == 3_000
+    scene = gfnn.scenes.make("standard-map-regular")
+    test = gfnn.sample_pairs(scene, 500, jax.random.key(9))
+    sample = selection.fit(
+        read_sample(file, num_pairs=200).pairs(), scene, tolerance=1e-3, chart=ran.fit.chosen.chart
+    )
+
+    def error(map_):
+        difference = np.asarray(map_.step(test.z0)[0] - test.z1)
+        return np.sqrt(np.mean((difference - 2 * np.pi * np.round(difference / 2 / np.pi)) ** 2))
+
+    # 15 times the pairs: the error that the noise leaves falls by about √15.
+    assert error(ran.fit.map) < 0.6 * error(sample.map)
+
+
+def test_refitting_to_the_same_pairs_in_chunks_changes_nothing(file):
+    scene = gfnn.scenes.make("standard-map-regular")
+    pairs = read_trajectories(file).pairs()
+    fit = selection.fit(pairs, scene, tolerance=1e-3)
+    once = selection.refit(fit, [pairs], pairs)
+    chunked = selection.refit(fit, iterate_pairs(file, 700), pairs)
+    assert chunked.num_pairs == once.num_pairs == 3_000
+    np.testing.assert_allclose(
+        chunked.map.step(pairs.z0)[0], once.map.step(pairs.z0)[0], rtol=0, atol=1e-12
+    )
