@@ -229,8 +229,10 @@ def _summarise(ran: Any, out: Path) -> None:
         return
     from rich.console import Console
 
+    from gfnn_jax.selection import candidates_table
+
     wide = Console() if sys.stdout.isatty() else Console(width=120)
-    wide.print(ran.fit.table)
+    wide.print(candidates_table(ran.fit))
     report = ran.report
     print(
         f"{report['model']['chart']} {report['model']['label']}: one-step error "

@@ -9,6 +9,7 @@ predicted step), so that one seed always chooses the same map; the measured time
 from __future__ import annotations
 
 import dataclasses
+import io
 import time
 import warnings
 from collections.abc import Callable, Iterable
@@ -73,9 +74,13 @@ class Fit:
         return self.chosen.validation_bound <= self.tolerance
 
     @property
-    def table(self):
-        """The candidates as a ``rich`` table; ``print`` shows it as text."""
-        return candidates_table(self)
+    def table(self) -> str:
+        """Every candidate by rising cost, the chosen one marked: text for ``print``."""
+        from rich.console import Console  # loaded when first used
+
+        text = io.StringIO()
+        Console(width=120, file=text).print(candidates_table(self))
+        return text.getvalue()
 
 
 def fit(
