@@ -307,16 +307,16 @@ def marginals(reference, samples: Mapping, bins: int, range, label, ax=None) -> 
 
 @style()
 def speed_against_error(
-    microseconds, errors, labels: Sequence[str], chosen, tolerance=None, ax=None
+    kiloflops, errors, labels: Sequence[str], chosen, tolerance=None, ax=None
 ) -> Axes:
-    """Candidates: one-step error against time per predicted step, both logarithmic.
+    """Candidates: one-step error against the counted work of a predicted step, both logarithmic.
 
-    microseconds, errors: (K,). The points are numbered by rising cost and named on the right; the
+    kiloflops, errors: (K,). The points are numbered by rising cost and named on the right; the
     chosen one is ringed, the staircase joins those that no other beats in both, and the dotted
     line is the tolerance asked for.
     """
     ax = _axes(ax, WIDTH * 1.6, HEIGHT * 1.15)
-    cost, error = np.asarray(microseconds, float), np.asarray(errors, float)
+    cost, error = np.asarray(kiloflops, float), np.asarray(errors, float)
     order = np.argsort(cost, kind="stable")
     best = np.minimum.accumulate(error[order])
     front = np.flatnonzero(np.append(True, best[1:] < best[:-1]))
@@ -345,7 +345,7 @@ def speed_against_error(
     ax.set(
         xscale="log",
         yscale="log",
-        xlabel="time per step and trajectory (µs)",
+        xlabel="work per step and trajectory (thousand operations)",
         ylabel="one-step error (RMS)",
     )
     ax.margins(0.12)

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax import figures, metrics, models, report, scenes
+from gfnn_jax.candidates import Candidate
 from gfnn_jax.checkpoints import TrainingCheckpoints
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.io import (
@@ -192,10 +193,10 @@ def _figures(fit: Fit, scene: Scene, measured: _Measured, reference) -> dict[str
     drawn = {"error": figures.error_growth({"GFNN": (steps, measured.error)})}
     if measured.energy_error is not None:
         drawn["energy"] = figures.energy_error({"GFNN": (steps, measured.energy_error)})
-    timed = [c for c in fit.candidates if c.microseconds_per_step is not None]
+    shown = [c for c in fit.candidates if np.isfinite(c.validation_rms)]
     drawn["candidates"] = figures.speed_against_error(
-        [c.microseconds_per_step for c in timed], [c.validation_rms for c in timed],
-        [f"{c.chart} {c.label}" for c in timed], timed.index(fit.chosen), fit.tolerance,
+        [c.work / 1e3 for c in shown], [c.validation_rms for c in shown],
+        [_labelled(c) for c in shown], shown.index(fit.chosen), fit.tolerance,
     )  # fmt: skip
     if scene.name == "two-body":
         errors = [
@@ -224,6 +225,13 @@ def _figures(fit: Fit, scene: Scene, measured: _Measured, reference) -> dict[str
 
 
 # gfnn fit
+
+
+def _labelled(candidate: Candidate) -> str:
+    """Chart, family and size, with the time of a step where it was measured."""
+    microseconds = candidate.microseconds_per_step
+    timed = f", {microseconds:.1f} µs" if microseconds is not None else ""
+    return f"{candidate.chart} {candidate.label}{timed}"
 
 
 def fit(

@@ -49,6 +49,7 @@ def assemble(
         "data": {
             "num_pairs": fit.num_pairs,
             "symplecticity_defect": fit.data_defect,
+            "noise": fit.noise,
             **data,
         },
         "model": {
@@ -87,6 +88,8 @@ def assemble(
                 "work": c.work,
                 "microseconds_per_step": c.microseconds_per_step,
                 "fit_seconds": c.fit_seconds,
+                "rank": c.rank,
+                "condition": c.condition,
                 "chosen": c.chosen,
             }
             for c in fit.candidates
