@@ -1,0 +1,247 @@
+"""gfnn.fit: what is refused, what is chosen, and that the choice is as accurate as it says."""
+
+import dataclasses
+import math
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax.scenes import DrawnFrom, Scene, henon_heiles
+from gfnn_jax.scenes.two_body import angular_momentum
+
+
+def pendulum(z, num_steps=50, dt=0.4):
+    """A map that is exactly symplectic: small leapfrog steps of a pendulum. NumPy, z (N, 2)."""
+    q, p = np.array(z).T
+    h = dt / num_steps
+    for _ in range(num_steps):
+        p = p - h / 2 * np.sin(q)
+        q = q + h * p
+        p = p - h / 2 * np.sin(q)
+    return np.stack([q, p], axis=1)
+
+
+def disc(num, radius=1.0, seed=0):
+    rng = np.random.default_rng(seed)
+    r, angle = radius * np.sqrt(rng.uniform(size=num)), rng.uniform(0, 2 * np.pi, num)
+    return np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1)
+
+
+def pendulum_pairs(num=400, seed=0):
+    z = disc(num, seed=seed)
+    return gfnn.Pairs(z, pendulum(z), 0.4)
+
+
+def quiet_fit(*arguments, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)
+        return gfnn.fit(*arguments, **options)
+
+
+def rms(map_, z0, z1):
+    return float(np.sqrt(np.mean((np.asarray(map_.step(z0)[0]) - np.asarray(z1)) ** 2)))
+
+
+@pytest.fixture(scope="module")
+def pendulum_fit():
+    return quiet_fit(pendulum_pairs(), tolerance=1e-8)
+
+
+@pytest.fixture(scope="module")
+def long_steps():
+    """Hénon–Heiles at dt = 1.3, states all over the well below E = 1/8."""
+    energy = henon_heiles().invariants["energy"]
+
+    def draw(key, num):
+        box = jnp.array([[0.7, 0.7, 0.5, 0.5]])
+        z = box * jax.random.uniform(key, (100 * num, 4), jnp.float64, -1, 1)
+        return z[np.flatnonzero(np.asarray(jax.vmap(energy)(z)) < 1 / 8)[:num]]
+
+    scene = dataclasses.replace(henon_heiles(dt=1.3), sampling=DrawnFrom(draw))
+    return scene, gfnn.sample_pairs(scene, 1_500, jax.random.key(0))
+
+
+# Refusals
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"chart": "type4"}, "expected a chart among"),
+        ({"scalar": "spline"}, "expected a scalar among"),
+        ({"scalar": "features"}, "needs a scene that declares features"),
+        ({"tolerance": 0.0}, "tolerance > 0"),
+        ({"tolerance": math.nan}, "tolerance > 0"),
+        ({"angles": (2,)}, "angles among 0..1"),
+        ({"scene": "two-body"}, "has dim 2, the pairs have 1"),
+        ({"scene": "standard-map-regular", "angles": (0,)}, "a scene or angles"),
+        ({"rows": 5}, "at least 8 pairs"),
+        ({"nan": True}, "row 3"),
+        ({"cut": True}, "of one shape"),
+        ({"angles": (0,), "chart": "type1"}, "no meaning for angles"),
+    ],
+)
+def test_refuses_in_one_line(change, words):
+    pairs = pendulum_pairs().take(slice(0, change.pop("rows", 400)))
+    if change.pop("nan", False):
+        pairs.z1[3, 0] = np.nan
+    if change.pop("cut", False):
+        pairs = gfnn.Pairs(pairs.z0[1:], pairs.z1, pairs.dt)
+    if "scene" in change:
+        change["scene"] = gfnn.scenes.make(change["scene"])
+    with pytest.raises(gfnn.FitError, match=words) as refused:
+        gfnn.fit(pairs, **change)
+    assert "\n" not in str(refused.value)
+
+
+def test_needs_float64():
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(RuntimeError, match="jax_enable_x64"):
+            gfnn.fit(pendulum_pairs())
+    finally:
+        jax.config.update("jax_enable_x64", True)
+
+
+def test_a_folded_chart_is_refused_with_advice(long_steps):
+    scene, pairs = long_steps
+    with pytest.raises(gfnn.FitError, match=r"falls to -.*negative for 6\d %.*midpoint") as refused:
+        gfnn.fit(pairs, scene, chart="type2")
+    assert "\n" not in str(refused.value)
+
+
+def test_auto_takes_the_chart_that_covers(long_steps):
+    scene, pairs = long_steps
+    fit = quiet_fit(pairs, scene, tolerance=1e-2)
+    assert fit.met
+    assert fit.chosen.chart == "midpoint"
+    assert not fit.judgements["type2"].valid or fit.based
+
+
+def test_friction_is_noticed():
+    z = disc(400)
+    damped = gfnn.Pairs(z, pendulum(z) * np.array([[1.0, 0.5]]), 0.4)
+    with pytest.warns(gfnn.FitWarning, match="do not look symplectic"):
+        gfnn.fit(damped, tolerance=1.0)
+
+
+def test_a_tolerance_out_of_reach_gives_the_best_and_says_so():
+    with pytest.warns(gfnn.FitWarning, match="no candidate meets"):
+        fit = gfnn.fit(pendulum_pairs(60), tolerance=1e-18)
+    assert not fit.met
+    assert fit.chosen.validation_rms == min(c.validation_rms for c in fit.candidates)
+
+
+# The choice
+
+
+def test_three_tolerances_choose_three_maps_of_rising_cost():
+    scene = henon_heiles()
+    pairs = gfnn.sample_pairs(scene, 1_000, jax.random.key(0))
+    fresh = gfnn.sample_pairs(scene, 500, jax.random.key(1))
+    tolerances = (1e-3, 1e-5, 1e-6)
+    fits = [quiet_fit(pairs, scene, tolerance=t) for t in tolerances]
+    work = [fit.chosen.work for fit in fits]
+    assert work[0] < work[1] < work[2]
+    for fit, tolerance in zip(fits, tolerances, strict=True):
+        assert fit.met
+        assert rms(fit.map, fresh.z0, fresh.z1) <= tolerance
+        cheaper = [c for c in fit.candidates if c.work < fit.chosen.work]
+        assert all(c.validation_bound > tolerance for c in cheaper)
+
+
+def test_one_seed_chooses_one_map(pendulum_fit):
+    again = quiet_fit(pendulum_pairs(), tolerance=1e-8)
+    names = [(c.chart, c.label, c.validation_rms) for c in pendulum_fit.candidates]
+    assert names == [(c.chart, c.label, c.validation_rms) for c in again.candidates]
+    z = disc(20, seed=2)
+    np.testing.assert_array_equal(again.map.step(z)[0], pendulum_fit.map.step(z)[0])
+
+
+def test_the_choice_is_as_accurate_as_it_says(pendulum_fit):
+    fit, z = pendulum_fit, disc(2_000, seed=3)
+    assert fit.met
+    assert rms(fit.map, z, pendulum(z)) < 2 * fit.chosen.validation_bound
+    assert fit.symplecticity_defect < 1e-13
+    assert sum(c.chosen for c in fit.candidates) == 1
+    assert fit.chosen.map is fit.map
+    assert fit.chosen.microseconds_per_step is not None
+    assert fit.chosen.label in fit.table
+
+
+def test_units_do_not_matter(pendulum_fit):
+    """q and p in other units, each in its own: the same functions give the same map."""
+    pairs, unit = pendulum_pairs(), np.array([[3e3, 7e-2]])
+    other = quiet_fit(gfnn.Pairs(pairs.z0 * unit, pairs.z1 * unit, 0.4), tolerance=1e-3)
+    maps = {(c.chart, c.label): c.map for c in pendulum_fit.candidates}
+    z, compared = disc(200, seed=4), 0
+    for candidate in other.candidates:
+        if (candidate.chart, candidate.label) in maps:
+            theirs = np.asarray(candidate.map.step(z * unit)[0]) / unit
+            ours = maps[candidate.chart, candidate.label].step(z)[0]
+            np.testing.assert_allclose(theirs, ours, rtol=0, atol=1e-9)
+            compared += 1
+    assert compared >= 2
+
+
+# What must come out
+
+
+def test_the_standard_map_is_found_to_roundoff():
+    scene = gfnn.scenes.standard_map()
+    pairs = gfnn.sample_pairs(scene, 300, jax.random.key(0))
+    fresh = gfnn.sample_pairs(scene, 500, jax.random.key(1))
+    fit = quiet_fit(pairs, scene, tolerance=1e-12)
+    assert fit.chosen.chart == "type2"
+    assert rms(fit.map, fresh.z0, fresh.z1) < 1e-13
+
+
+def test_angular_momentum_is_conserved_to_roundoff():
+    """By a map of low accuracy too: the angle is cyclic, S does not see it."""
+    scene = gfnn.scenes.two_body()
+    fit = quiet_fit(gfnn.sample_pairs(scene, 500, jax.random.key(0)), scene, tolerance=1e-2)
+    z0 = gfnn.sample_test_states(scene, 10, jax.random.key(1))
+    states, info = fit.map.rollout(z0, 1_000)
+    momentum = jax.vmap(jax.vmap(angular_momentum))(states)
+    assert not np.any(info.status)
+    assert float(jnp.max(jnp.abs(momentum - momentum[:, :1]))) < 1e-13
+
+
+def test_a_base_map_is_found_where_it_is_needed():
+    """A driven pendulum, one period of the drive per step: no chart covers it by itself."""
+
+    def hamiltonian(z, t):
+        return z[1] ** 2 / 2 - jnp.cos(z[0]) * (1 + 0.15 * jnp.cos(1.8 * t))
+
+    scene = Scene(
+        name="driven", purpose="", dim=1, dt=2 * math.pi / 1.8, hamiltonian=hamiltonian,
+        sampling=DrawnFrom(lambda key, num: jnp.asarray(disc(num, 0.8, int(key[-1])))),
+    )  # fmt: skip
+    data = gfnn.sample_pairs(scene, 600, np.array([0, 5]))
+    fresh = gfnn.sample_pairs(scene, 200, np.array([0, 6]))
+    fit = quiet_fit(data, tolerance=1e-6)
+    assert fit.based
+    assert fit.met
+    assert rms(fit.map, fresh.z0, fresh.z1) < 1e-6
+    assert fit.symplecticity_defect < 1e-12
+
+
+def test_noise_is_not_learned():
+    """Noise of size σ leaves an error of order σ, a symplectic map and bounded rollouts."""
+    sigma, pairs = 1e-3, pendulum_pairs(1_000)
+    noise = sigma * np.random.default_rng(7).normal(size=(2, *pairs.z0.shape))
+    noisy = gfnn.Pairs(pairs.z0 + noise[0], pairs.z1 + noise[1], 0.4)
+    with pytest.warns(gfnn.FitWarning):
+        fit = gfnn.fit(noisy, tolerance=1e-8)
+    assert fit.noise is not None
+    assert 0.5 * sigma < fit.noise < 2 * sigma
+    z = disc(500, radius=0.9, seed=8)
+    assert rms(fit.map, z, pendulum(z)) < sigma
+    assert fit.symplecticity_defect < 1e-13
+    states, info = fit.map.rollout(z[:20], 2_000)
+    assert np.all(np.asarray(info.status) <= 1)
+    assert float(jnp.max(jnp.abs(states))) < 1.5
