@@ -515,7 +515,8 @@ def figure(found: dict[str, Numbers]) -> str:
             )
     if curves:
         FIGURE.parent.mkdir(exist_ok=True)
-        figures.save(figures.error_growth(curves).figure, FIGURE)
+        axes: Any = figures.error_growth(curves)
+        figures.save(axes.figure, FIGURE)
     return "; ".join(sizes)
 
 

@@ -15,8 +15,8 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 ORDER = (
     "phase_space", "coordinates", "scenes", "trajectories", "io", "predictions", "charts",
     "domain", "scalars", "checkpoints", "fitting", "implicit", "rollout", "maps", "models",
-    "local_maps", "base_map", "preparation", "candidates", "selection", "baselines", "metrics", "figures", "report",
-    "pipeline", "cli", "__main__",
+    "local_maps", "base_map", "preparation", "candidates", "selection", "baselines",
+    "metrics", "figures", "report", "pipeline", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of a later module imports it when called.
 SHORTHANDS = {("maps", "models")}
