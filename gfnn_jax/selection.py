@@ -158,14 +158,17 @@ def fit(
             f"no candidate meets the tolerance {tolerance:g}: the most accurate has a one-step "
             f"error of {chosen.validation_rms:.2e} (95 % bound {chosen.validation_bound:.2e})"
         )
-    noise = None
+    noise, dim = None, pairs.dim
     spread = float(np.max(np.std(np.asarray(pairs.z0), axis=0)))
     if (chosen.chart, chosen.scalar) in stalled and chosen.validation_rms > _ROUNDOFF * spread:
-        # Noise of both states enters the difference: σ √2 for a map near the identity.
+        # Noise of both states enters the difference: σ √2 for a map near the identity. The fit
+        # averages it over the rows that each coefficient has.
         noise = chosen.validation_rms / np.sqrt(2.0)
+        implied = chosen.validation_rms * np.sqrt(chosen.num_parameters / (training.size * 2 * dim))
         warn(
-            f"larger models are no more accurate: the pairs seem to carry noise of about "
-            f"{noise:.1e} on every coordinate, or a structure these functions cannot represent"
+            "larger models are no more accurate: the pairs seem to carry noise of about "
+            f"{noise:.1e} on every coordinate (the map's own error is then about {implied:.1e}), "
+            "or a structure that these functions cannot represent"
         )
     on_progress("timing the candidates")
     test = np.asarray(pairs.z0)[held_out]
