@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 
+import gfnn_jax
 from gfnn_jax import cli
 
 ROOT = Path(__file__).parent.parent
@@ -62,27 +63,31 @@ def test_the_gradient_is_one(example):
         np.testing.assert_allclose(gradient[i], difference, atol=1e-6)
 
 
-def test_your_own_data_in_python(example, tmp_path, monkeypatch):
-    _, names = example
-    monkeypatch.chdir(tmp_path)
-    pairs = names["pairs"].take(slice(0, 500))
-    mine = {"gfnn": names["gfnn"], "z0": pairs.z0, "z1": pairs.z1}
-    exec(compile(blocks("python")[1], "README.md", "exec"), mine)
-    assert mine["states"].shape == (500, 1001, 4)
-
-
-def test_your_own_data_by_commands(example, tmp_path, monkeypatch):
-    _, names = example
+@pytest.fixture
+def mine(tmp_path, monkeypatch):
+    """Pairs of an oscillator, in a folder of their own."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    pairs = names["pairs"].take(slice(0, 500))
-    np.savez("data.npz", z0=pairs.z0, z1=pairs.z1, dt=pairs.dt)
+    c, s = np.cos(0.1), np.sin(0.1)
+    z0 = np.random.default_rng(0).uniform(-1, 1, (200, 2))
+    return {"z0": z0, "z1": z0 @ np.array([[c, -s], [s, c]])}
+
+
+def test_your_own_data_in_python(mine):
+    names = {"gfnn": gfnn_jax, **mine}
+    exec(compile(blocks("python")[1], "README.md", "exec"), names)
+    assert names["fit"].met
+    assert names["states"].shape == (200, 1001, 2)
+
+
+def test_your_own_data_by_commands(mine):
+    np.savez("data.npz", **mine, dt=0.1)
     fit, predict = gfnn_commands()
     predict[predict.index("100000")] = "1000"
     assert cli.main(fit) == 0
     assert cli.main(predict) == 0
     with np.load("prediction.npz") as done:
-        assert done["trajectories"].shape == (500, 11, 4)
+        assert done["trajectories"].shape == (200, 11, 2)
     jax.config.update("jax_compilation_cache_dir", None)
 
 
@@ -94,4 +99,5 @@ def test_links_lead_somewhere():
 
 def test_ci_runs_the_test_command():
     (command,) = [c for c in blocks("sh")[1].split("&&") if "pytest" in c]
-    assert command.strip().removeprefix(".venv/bin/") in (ROOT / ".ci/run").read_text()
+    arguments = command.strip().removeprefix(".venv/bin/python")
+    assert f'"$bin/python"{arguments}' in (ROOT / ".ci/run").read_text()
