@@ -17,6 +17,9 @@ from gfnn_jax.phase_space import symplecticity_defect
 _CENTRES = 400
 # Neighbours per unknown of a local fit: enough to average noise, few enough to stay local.
 _NEIGHBOURS_PER_TERM = 3
+# From so many pairs on the neighbourhoods keep their size: more pairs then average the noise away
+# instead of shrinking them below it.
+_LOCAL_ENOUGH, _MOST_NEIGHBOURS = 4_000, 1_000
 # A determinant this far from zero is safe; below the lower figure the chart folds inside the data.
 SAFE, SINGULAR = 0.2, 0.03
 
@@ -45,11 +48,12 @@ def local_jacobians(y0, y1, scale, *, seed: int = 0) -> np.ndarray:
     quadratic fit where there are pairs enough, else a local linear one.
     """
     n, width = y0.shape
-    x, image = np.asarray(y0) / scale, np.asarray(y1) / scale
+    x, move = np.asarray(y0) / scale, (np.asarray(y1) - np.asarray(y0)) / scale
     i, j = np.triu_indices(width)
     quadratic = n >= 20 * (1 + width + len(i))
     terms = 1 + width + (len(i) if quadratic else 0)
-    count = min(n, _NEIGHBOURS_PER_TERM * terms)
+    fewest = _NEIGHBOURS_PER_TERM * terms
+    count = min(n, max(fewest, min(_MOST_NEIGHBOURS, fewest * n // _LOCAL_ENOUGH)))
     chosen = np.random.default_rng(seed).permutation(n)[:_CENTRES]
     _, near = cKDTree(x).query(x[chosen], k=count)
     offset = x[near] - x[chosen][:, None, :]
@@ -57,9 +61,10 @@ def local_jacobians(y0, y1, scale, *, seed: int = 0) -> np.ndarray:
     if quadratic:
         columns.append(offset[..., i] * offset[..., j])
     design = np.concatenate(columns, axis=-1)
-    # The pseudo-inverse leaves unknown what the neighbours do not span: a thin tube of data.
-    solution = np.linalg.pinv(design, rcond=1e-8) @ image[near]
-    slope = np.swapaxes(solution[:, 1 : 1 + width], 1, 2)
+    # The pseudo-inverse takes the map for the identity in what the neighbours do not span: a thin
+    # tube of data, the torus of a single orbit.
+    solution = np.linalg.pinv(design, rcond=1e-8) @ move[near]
+    slope = np.eye(width) + np.swapaxes(solution[:, 1 : 1 + width], 1, 2)
     return slope * scale[:, None] / scale[None, :]
 
 
