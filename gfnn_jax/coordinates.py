@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from gfnn_jax.phase_space import split
 
 TWO_PI = 2 * np.pi
+_NEAR = 8  # neighbours that are looked at first when states are joined to a tree
 
 
 def _identity(z):
@@ -132,15 +133,33 @@ def _embedded(y, coordinates: Coordinates):
 def _spanning_order(points):
     """Nodes of a minimal spanning tree of neighbours in breadth-first order, and their parents."""
     count = len(points)
-    near = 8
+    distance, to = cKDTree(points).query(points, k=np.arange(1, min(_NEAR, count) + 1))
+    edges = np.repeat(np.arange(count), distance.shape[1]), to.ravel(), distance.ravel()
     while True:
-        near = min(near, count)
-        distance, neighbour = cKDTree(points).query(points, k=near)
-        distance, neighbour = distance.reshape(count, -1), neighbour.reshape(count, -1)
-        row = np.repeat(np.arange(count), distance.shape[1])
+        row, column, length = edges
         # A zero would mean "no edge" to the sparse graph.
-        graph = csr_array((distance.ravel() + 1e-12, (row, neighbour.ravel())), (count, count))
-        tree = minimum_spanning_tree(graph)
-        if near == count or connected_components(tree, directed=False)[0] == 1:
-            return breadth_first_order(tree, 0, directed=False)
-        near *= 4
+        graph = csr_array((length + 1e-12, (row, column)), (count, count))
+        number, part = connected_components(graph, directed=False)
+        if number == 1:
+            return breadth_first_order(minimum_spanning_tree(graph), 0, directed=False)
+        edges = [np.concatenate(both) for both in zip(edges, _bridges(points, part), strict=True)]
+
+
+def _bridges(points, part):
+    """The shortest edge from each part of the points (``part`` numbers them) to another part.
+
+    Any two parts differ in some bit of their numbers: for each bit, one side is sought among the
+    other. Memory is that of the points, however far apart the parts are.
+    """
+    distance, to = np.full(len(points), np.inf), np.zeros(len(points), dtype=int)
+    for bit in range(int(part.max()).bit_length()):
+        for side in (0, 1):
+            here = (part >> bit) & 1 == side
+            ours, others = np.flatnonzero(here), np.flatnonzero(~here)
+            found, index = cKDTree(points[others]).query(points[ours])
+            nearer = found < distance[ours]
+            distance[ours[nearer]] = found[nearer]
+            to[ours[nearer]] = others[index[nearer]]
+    order = np.lexsort((distance, part))
+    shortest = order[np.unique(part[order], return_index=True)[1]]
+    return shortest, to[shortest], distance[shortest]
