@@ -151,6 +151,15 @@ def _seed(text: str) -> int:
     return value
 
 
+def _check_exists(path: Path) -> None:
+    try:
+        if path.exists():
+            return
+    except OSError as error:  # a name too long, a folder that may not be entered
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    raise InputError(f"{path}: no such file or folder")
+
+
 def _indices(text: str) -> tuple[int, ...]:
     return tuple(int(part) for part in text.split(","))
 
@@ -185,8 +194,7 @@ def _run(arguments: argparse.Namespace) -> None:
 def _fit(arguments: argparse.Namespace) -> None:
     if not arguments.resume:
         ensure_new(arguments.out, arguments.overwrite, folder=True)
-    if not arguments.data.exists():
-        raise InputError(f"{arguments.data}: no such file")
+    _check_exists(arguments.data)
     _set_up_jax()
     from gfnn_jax import pipeline
 
@@ -205,8 +213,7 @@ def _predict(arguments: argparse.Namespace) -> None:
     if not arguments.resume:
         ensure_new(arguments.out, arguments.overwrite)
     for path in (arguments.model, arguments.initial):
-        if not path.exists():
-            raise InputError(f"{path}: no such file or folder")
+        _check_exists(path)
     _set_up_jax()
     from gfnn_jax import pipeline
 

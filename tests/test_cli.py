@@ -150,6 +150,7 @@ BAD_USAGE = [
     (("run", "two-body", "--out", "{folder}", "--overwrite"), "not overwritten"),
     (("fit", "{data}"), "required: --out"),
     (("fit", "{tmp}/none.npz", "--out", "{new}"), "no such file"),
+    (("fit", "n" * 300, "--out", "{new}"), "File name too long"),
     (("fit", "{file}", "--out", "{new}"), "expected a .npz, .npy or .csv file"),
     (("fit", "{empty}", "--out", "{new}"), "is empty"),
     (("fit", "{folder}", "--out", "{new}"), "expected a .npz"),
@@ -224,7 +225,7 @@ def test_usage_is_refused_in_a_moment():
     command = [sys.executable, "-m", "gfnn_jax", "fit", "nowhere.npz", "--out", "m"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert done.stderr == "gfnn: nowhere.npz: no such file\n"
+    assert done.stderr == "gfnn: nowhere.npz: no such file or folder\n"
     assert time.perf_counter() - started < 5
 
 
