@@ -116,15 +116,13 @@ class Ladder:
             w, angles=angles, cyclic=coordinates.cyclic, features=features, reversor=reversor
         )
         if kind == "sines":
-            stages: list[list[Any]] = [[Sines(inputs, count)] for count in _SINES]
+            stages: Iterable[Iterable[Any]] = ([Sines(inputs, count)] for count in _SINES)
         else:
             signs = variable_signs(inputs, reversor, w) if reversor is not None else None
-            stages = [[Products(inputs, degree, signs) for degree in s] for s in _STAGES]
-        size = len(rows.training), w.shape[1]
-        stages = [[f for f in stage if _affordable(f.num_parameters, *size)] for stage in stages]
+            stages = ((Products(inputs, degree, signs) for degree in s) for s in _STAGES)
         self.rungs = [
             Rung(f, stage[-1], counted_work(f, _NOMINAL_NEWTON))
-            for stage in stages for f in stage
+            for stage in _determined(stages, w.size) for f in stage
         ]  # fmt: skip
         self._reduced: dict[Any, least_squares.Reduced] = {}
 
@@ -133,7 +131,10 @@ class Ladder:
         top = rung.stage
         if top not in self._reduced:
             on_progress(f"{self.chart.name}: {top.num_parameters} terms of {top.label}")
-            self._reduced = {top: least_squares.reduce(top, self.train, self.held, self.weight)}
+            # Shuffled rows: the first of them are a sample, where all would take too long.
+            most = int(_MOST_WORK / (top.num_parameters**2 * self.train[0].shape[1]))
+            train = tuple(array[:most] for array in self.train)
+            self._reduced = {top: least_squares.reduce(top, train, self.held, self.weight)}
         reduced, family = self._reduced[top], rung.family
         started = time.perf_counter()
         solved = least_squares.solve(reduced, family.num_parameters)
@@ -279,10 +280,25 @@ def refitted(candidate: Candidate, chunks: Iterable[Pairs], held: Pairs) -> tupl
     return refit, count
 
 
-def _affordable(terms: int, num_pairs: int, width: int) -> bool:
-    """Whether the data determine so many terms, and factorising them takes seconds."""
-    rows = num_pairs * width
-    return terms <= min(_MOST_TERMS, rows // 3) and rows * terms**2 <= _MOST_WORK
+def _determined(stages: Iterable[Iterable[Any]], rows: int) -> Iterator[list[Any]]:
+    """The families, stage by stage, whose terms so many rows determine.
+
+    Sizes rise, so the first that is too large is the last that is looked at: in many dimensions the
+    terms of a high degree could not even be counted.
+    """
+    most = min(_MOST_TERMS, rows // 3)
+    for stage in stages:
+        kept = []
+        for family in stage:
+            if family.num_parameters > most:
+                break
+            kept.append(family)
+        else:
+            yield kept
+            continue
+        if kept:
+            yield kept
+        return
 
 
 def compose(prepared: Prepared, chart, family, params, pairs: Pairs) -> SymplecticMap:
