@@ -19,8 +19,9 @@ from gfnn_jax.charts import MIDPOINT, AnyChart
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI
 from gfnn_jax.fitting import least_squares
 from gfnn_jax.fitting.levenberg_marquardt import LMState, levenberg_marquardt
+from gfnn_jax.implicit import LEFT_DOMAIN
 from gfnn_jax.maps import Generated, SymplecticMap
-from gfnn_jax.phase_space import Pairs
+from gfnn_jax.phase_space import Pairs, sizes
 from gfnn_jax.preparation import Prepared
 from gfnn_jax.scalars.inputs import box_inputs, variable_signs
 from gfnn_jax.scalars.mlp import Mlp, amplitude_of
@@ -307,12 +308,11 @@ def compose(prepared: Prepared, chart, family, params, pairs: Pairs) -> Symplect
         *(jnp.asarray(a) for a in (prepared.scale, prepared.linear, prepared.offset)),
     )  # fmt: skip
     half = prepared.half
-    spread = np.std(np.asarray(pairs.z0), axis=0)
     return SymplecticMap(
         pieces=(generated,) if half is None else (half, generated, half),
         coordinates=prepared.coordinates,
         domain=prepared.domain,
-        scale=jnp.asarray(np.where(spread > 0, spread, 1.0)),
+        scale=jnp.asarray(sizes(pairs.z0)),
         cut=jnp.asarray(prepared.cut),
         dt=prepared.dt,
     )
@@ -331,7 +331,7 @@ def validation_error(map_: SymplecticMap, pairs: Pairs, rows) -> tuple[float, fl
         angles = list(map_.coordinates.angles)
         error[:, angles] -= TWO_PI * np.round(error[:, angles] / TWO_PI)
     square = np.mean(error**2, axis=1)
-    if not np.isfinite(square).all():
+    if not np.isfinite(square).all() or (np.asarray(info.status) > LEFT_DOMAIN).any():
         return float("inf"), float("inf"), np.asarray(info.iterations)
     bound = square.mean() + _NORMAL_95 * square.std() / np.sqrt(len(square))
     return float(np.sqrt(square.mean())), float(np.sqrt(bound)), np.asarray(info.iterations)

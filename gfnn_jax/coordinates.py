@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
-from gfnn_jax.phase_space import split
+from gfnn_jax.phase_space import sizes, split
 
 TWO_PI = 2 * np.pi
 _NEAR = 8  # neighbours that are looked at first when states are joined to a tree
@@ -117,7 +117,7 @@ def lift(y0, y1, coordinates: Coordinates):
 
 def _embedded(y, coordinates: Coordinates):
     """States as points of a plain space: unit-sized, angles of a q as points of a circle."""
-    dim = y.shape[1] // 2
+    dim, unit = y.shape[1] // 2, sizes(y)
     columns = []
     for i in range(y.shape[1]):
         if i in coordinates.cyclic:
@@ -125,8 +125,7 @@ def _embedded(y, coordinates: Coordinates):
         if i in coordinates.angles and i < dim:
             columns += [np.cos(y[:, i]), np.sin(y[:, i])]
         else:
-            spread = y[:, i].std()
-            columns.append(y[:, i] / (spread if spread > 0 else 1.0))
+            columns.append(y[:, i] / unit[i])
     return np.column_stack(columns)
 
 

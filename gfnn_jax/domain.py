@@ -17,6 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gfnn_jax.phase_space import sizes
+
 # κ is of degree 4 in y: a factor 2 is a margin of about a fifth of the region's size.
 _MARGIN = 2.0
 
@@ -66,9 +68,7 @@ def covering(y, *, ignore: tuple[int, ...] = ()) -> Domain:
         empty = jnp.zeros((0,))
         return Domain((), empty, empty, jnp.zeros((0, 0)), jnp.zeros(()))
     x = y[:, keep]
-    centre = x.mean(axis=0)
-    deviation = x.std(axis=0)
-    scale = np.where(deviation > 0, deviation, np.maximum(np.abs(centre), 1e-300))
+    centre, scale = x.mean(axis=0), sizes(x)
     v = np.asarray(jax.vmap(_monomials)(jnp.asarray((x - centre) / scale)))
     # Data on a surface (one energy, say) leave G singular; the floor gives the surface a thickness.
     values, vectors = np.linalg.eigh(v.T @ v / len(v))

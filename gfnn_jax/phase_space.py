@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 # The axis of length 2d is called phase: jaxtyping would read "2d" as an expression.
@@ -33,6 +34,16 @@ def split(z):
     """z of shape (..., 2d) -> q, p of shape (..., d). NumPy or JAX arrays."""
     dim = z.shape[-1] // 2
     return z[..., :dim], z[..., dim:]
+
+
+def sizes(z):
+    """Size of each column of z (N, k): its standard deviation; of a constant one its magnitude,
+    or 1 where it is zero. NumPy."""
+    z = np.asarray(z)
+    deviation, largest = z.std(axis=0), np.abs(z).max(axis=0)
+    # The deviation of a constant column is roundoff, not zero.
+    constant = deviation <= 1e-14 * largest
+    return np.where(constant, np.where(largest > 0, largest, 1.0), deviation)
 
 
 def apply_j(g):

@@ -17,7 +17,7 @@ from gfnn_jax.coordinates import Coordinates, lift
 from gfnn_jax.domain import Domain, covering
 from gfnn_jax.local_maps import SAFE, ChartJudgement, judge_chart
 from gfnn_jax.maps import Affine
-from gfnn_jax.phase_space import Pairs
+from gfnn_jax.phase_space import Pairs, sizes
 
 # Where the best chart's determinant falls below this, the map is far from the identity.
 _FAR = 0.7
@@ -55,8 +55,7 @@ def prepare(pairs: Pairs, coordinates: Coordinates) -> Prepared:
         coordinates,
     )
     whole = tuple(i for i, c in zip(coordinates.angles, covered, strict=True) if c)
-    spread = y0.std(axis=0)
-    scale = np.where(spread > 0, spread, np.maximum(np.abs(y0).max(axis=0), 1e-300))
+    scale = sizes(y0)
     linear, offset = _affine_model(y0, y1 - y0, scale, coordinates)
     return Prepared(
         y0=y0, y1=y1, half=None, scale=scale, coordinates=coordinates,

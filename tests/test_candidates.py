@@ -11,7 +11,7 @@ from gfnn_jax.scalars.products import Products
 
 
 def test_a_size_too_large_to_count_is_never_looked_at():
-    """Twelve variables: the terms of degree 4 are too many, those of degree 20 would fill a disk."""
+    """Twelve variables: degree 4 has too many terms, degree 20 would fill a disk."""
     inputs = box_inputs(np.random.default_rng(0).uniform(-1, 1, (100, 12)))
     looked_at = []
 
@@ -35,3 +35,17 @@ def test_more_pairs_never_take_a_candidate_away(monkeypatch):
     fit = gfnn.fit(pairs, chart="type2", tolerance=1e-12)
     assert fit.met
     assert fit.chosen.label == "polynomial 4"
+
+
+def test_a_degree_of_freedom_at_rest_does_no_harm():
+    z = np.random.default_rng(0).uniform(-1, 1, (200, 2))
+    q, p = z.T
+    kicked = p - 0.3 * q
+    rest = np.zeros_like(q)
+    z0 = np.stack([q, rest, p, rest + 0.1], axis=1)
+    z1 = np.stack([q + 0.3 * kicked, rest, kicked, rest + 0.1], axis=1)
+    fit = gfnn.fit(gfnn.Pairs(z0, z1, 0.3), tolerance=1e-10)
+    assert fit.met
+    states, info = fit.map.rollout(z0[:5], 100)
+    assert not np.any(info.status)
+    np.testing.assert_allclose(states[:, -1, [1, 3]], z0[:5][:, [1, 3]], atol=1e-10)

@@ -8,7 +8,9 @@ from gfnn_jax.local_maps import data_defect, judge_chart, local_jacobians
 
 def turned(z, angle=0.5):
     q, p = z.T
-    return np.stack([q * np.cos(angle) + p * np.sin(angle), p * np.cos(angle) - q * np.sin(angle)]).T
+    return np.stack(
+        [q * np.cos(angle) + p * np.sin(angle), p * np.cos(angle) - q * np.sin(angle)]
+    ).T
 
 
 def test_more_noisy_pairs_are_judged_no_worse():
