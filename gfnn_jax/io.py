@@ -146,12 +146,12 @@ def read_sample(
     same probability, as a sequence of two states. Memory is that of the sample and a few blocks.
     """
     rng = np.random.default_rng(seed)
-    kept, priority, found = None, np.empty(0), 0
+    kept, priority = None, np.empty(0)
     for pairs in iterate_pairs(path, BLOCK_ROWS, dt=dt):
         rows = np.stack([pairs.z0, pairs.z1], axis=1)
         kept = rows if kept is None else np.concatenate([kept, rows])
         priority = np.concatenate([priority, rng.random(len(rows))])
-        dt, found = pairs.dt, found + len(rows)
+        dt = pairs.dt
         if len(kept) > num_pairs:
             first = np.argpartition(priority, num_pairs)[:num_pairs]
             kept, priority = kept[first], priority[first]
@@ -159,7 +159,9 @@ def read_sample(
         raise InputError(f"{path}: no pair of consecutive states found")
     states = kept.reshape(-1, kept.shape[-1])
     lengths = np.full(len(kept), 2)
-    return TrajectoryData(states, lengths, dt, str(path), _digest(path))
+    with _open(path, dt) as source:
+        precision, units = source.precision, source.units
+    return TrajectoryData(states, lengths, dt, str(path), _digest(path), precision, units)
 
 
 def iterate_pairs(path, chunk: int, *, dt: float | None = None) -> Iterator[Any]:

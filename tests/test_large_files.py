@@ -20,6 +20,16 @@ def file(tmp_path_factory):
     return path
 
 
+def test_a_sample_knows_precision_and_units_as_the_whole_does(tmp_path):
+    states = np.random.default_rng(0).standard_normal((50, 2))
+    np.save(tmp_path / "z.npy", states.astype(np.float32))
+    assert read_sample(tmp_path / "z.npy", dt=0.1).precision == "float32"
+    header = "t,q1 [km],p1 [km/s]"
+    rows = np.column_stack([0.1 * np.arange(50), states])
+    np.savetxt(tmp_path / "z.csv", rows, delimiter=",", header=header)
+    assert read_sample(tmp_path / "z.csv").units == {"q1": "km", "p1": "km/s"}
+
+
 def test_a_sample_is_of_the_files_own_pairs_each_once(file):
     whole = read_trajectories(file).pairs()
     sample = read_sample(file, num_pairs=500, seed=1)
