@@ -278,7 +278,9 @@ def return_map(quick: bool) -> Numbers:
     z0 = np.stack([0.2755 + radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     z1 = np.array([crossing(z, 0.1) for z in z0])
     pairs, fresh = gfnn.Pairs(z0[:400], z1[:400], 1.0), gfnn.Pairs(z0[400:], z1[400:], 1.0)
-    return fitted(pairs, None, fresh, tolerance=1e-5)[1]
+    # The disc's rim, where the map bends most, is rare among 400 states: asking for more than is
+    # there takes the most accurate map instead of the first that looks good enough inside.
+    return fitted(pairs, None, fresh, tolerance=1e-7)[1]
 
 
 # What the choice does

@@ -30,7 +30,7 @@ from gfnn_jax.scenes.scene import Scene
 SCALARS = ("auto", "polynomial", "features", "sines", "mlp")
 CHART_NAMES = ("auto", *CHARTS)
 
-_VALIDATION_FRACTION, _MOST_VALIDATION = 0.15, 2_000
+_VALIDATION_FRACTION, _MOST_VALIDATION = 0.1, 2_000
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 # A rung that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
 # the odd degrees), and larger families only fit noise.
