@@ -161,7 +161,12 @@ def _check_exists(path: Path) -> None:
 
 
 def _indices(text: str) -> tuple[int, ...]:
-    return tuple(int(part) for part in text.split(","))
+    parts = text.split(",")
+    if not all(part.strip().isdecimal() for part in parts) or len(set(parts)) < len(parts):
+        raise argparse.ArgumentTypeError(
+            f"expected different whole numbers separated by commas, as 0,2; got '{text}'"
+        )
+    return tuple(map(int, parts))
 
 
 # The commands. The heavy imports are here, after the checks that need none of them.

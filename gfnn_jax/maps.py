@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gfnn_jax import implicit
 from gfnn_jax.charts import AnyChart, Chart
-from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.coordinates import TWO_PI, Coordinates
 from gfnn_jax.domain import Domain
 from gfnn_jax.implicit import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, Info
 from gfnn_jax.phase_space import apply_j, require_x64, symplecticity_defect
@@ -28,14 +28,13 @@ from gfnn_jax.rollout import scan_steps
 
 _FIXED_NEWTON = 3
 _MOST_NEWTON = 40
-_TWO_PI = 2 * np.pi
 _TWO_PI_REST = 2.4492935982947064e-16  # what float64 leaves out of 2π
 
 
 def _two_pi(dtype):
     """2π as the sum of a number of this dtype and a small rest."""
-    near = np.asarray(_TWO_PI, dtype)
-    return near, _TWO_PI - float(near) + _TWO_PI_REST
+    near = np.asarray(TWO_PI, dtype)
+    return near, TWO_PI - float(near) + _TWO_PI_REST
 
 
 def _register(data: tuple[str, ...], meta: tuple[str, ...]) -> Callable:
@@ -222,7 +221,7 @@ class SymplecticMap:
         """
         angles = self._angles()
         two_pi, rest = _two_pi(y.dtype)
-        turns = jnp.round((y[angles] - self.cut) / _TWO_PI)
+        turns = jnp.round((y[angles] - self.cut) / TWO_PI)
         reduced = (y[angles] - turns * two_pi) - turns * rest
         known = jnp.abs(turns) * float(jnp.finfo(y.dtype).eps) < 1.0
         return y.at[angles].set(jnp.where(known, reduced, jnp.nan)), turns
@@ -261,8 +260,8 @@ class SymplecticMap:
         y0, _ = self._reduce(self.coordinates.forward(z0))
         predicted, _ = self._apply(y0)
         y1 = self.coordinates.forward(z1)
-        turns = jnp.round((y1[angles] - predicted[angles]) / _TWO_PI)
-        y1 = y1.at[angles].add(-turns * _TWO_PI)
+        turns = jnp.round((y1[angles] - predicted[angles]) / TWO_PI)
+        y1 = y1.at[angles].add(-turns * TWO_PI)
         for piece in self.pieces[:index]:
             y0, _ = piece(y0)
         for piece in reversed(self.pieces[index + 1 :]):

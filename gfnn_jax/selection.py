@@ -31,6 +31,7 @@ SCALARS = ("auto", "polynomial", "features", "sines", "mlp")
 CHART_NAMES = ("auto", *CHARTS)
 
 _VALIDATION_FRACTION, _MOST_VALIDATION = 0.1, 2_000
+_JUDGED = 200  # states at which the chosen map's defect and determinant are taken
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 # A rung that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
 # the odd degrees), and larger families only fit noise.
@@ -138,7 +139,7 @@ def fit(
     )
     if half is not None:
         prepared = factor_out(prepared, half)
-        on_progress("no chart covers the data by itself: an affine base map is factored out")
+        on_progress("the map is far from the identity: an affine base map is factored out")
 
     rows = Rows(pairs, training, held_out)
     if scalar == "mlp":
@@ -177,7 +178,7 @@ def fit(
     chosen = next(c for c in candidates if (c.chart, c.scalar, c.label) == chosen_label)
     ordered = sorted(candidates, key=lambda c: (c.work, c.validation_rms))
     ordered = tuple(dataclasses.replace(c, chosen=c is chosen) for c in ordered)
-    test = test[:200]
+    test = test[:_JUDGED]
     return Fit(
         map=chosen.map,
         candidates=ordered,
@@ -198,11 +199,22 @@ def refit(fitted: Fit, chunks: Iterable[Pairs], held: Pairs) -> Fit:
     """The chosen map of a fit, fitted anew to more pairs than fit into memory.
 
     fitted: of a sample of them, by a linear family. chunks: all of the pairs. held: pairs (of the
-    sample, held out or new) that choose the ridge and judge the result.
+    sample, held out or new) that choose the ridge and judge the result. Charts, domain, noise and
+    messages remain those that the sample gave.
     """
+    started = time.perf_counter()
     chosen, num_pairs = refitted(fitted.chosen, chunks, held)
     candidates = tuple(chosen if c.chosen else c for c in fitted.candidates)
-    return dataclasses.replace(fitted, map=chosen.map, candidates=candidates, num_pairs=num_pairs)
+    test = np.asarray(held.z0)[:_JUDGED]
+    return dataclasses.replace(
+        fitted,
+        map=chosen.map,
+        candidates=candidates,
+        num_pairs=num_pairs,
+        symplecticity_defect=float(jnp.max(chosen.map.defect(test))),
+        model_determinant_min=_smallest(chosen.map.determinant(test)),
+        seconds=fitted.seconds + time.perf_counter() - started,
+    )
 
 
 def _check_request(pairs, scene, tolerance, chart, scalar, angles) -> None:
