@@ -174,16 +174,19 @@ def test_the_choice_is_as_accurate_as_it_says(pendulum_fit):
 
 
 def test_units_do_not_matter(pendulum_fit):
-    """q and p in other units, each in its own: the same functions give the same map."""
+    """q, p and time in other units, each in its own: the same functions give the same map, and the
+    same states are outside the domain."""
     pairs, unit = pendulum_pairs(), np.array([[3e3, 7e-2]])
-    other = quiet_fit(gfnn.Pairs(pairs.z0 * unit, pairs.z1 * unit, 0.4), tolerance=1e-3)
+    other = quiet_fit(gfnn.Pairs(pairs.z0 * unit, pairs.z1 * unit, 60.0 * pairs.dt), tolerance=1e-3)
     maps = {(c.chart, c.label): c.map for c in pendulum_fit.candidates}
-    z, compared = disc(200, seed=4), 0
+    z, compared = np.concatenate([disc(200, seed=4), 1.5 * disc(50, seed=5)]), 0
     for candidate in other.candidates:
         if (candidate.chart, candidate.label) in maps:
-            theirs = np.asarray(candidate.map.step(z * unit)[0]) / unit
-            ours = maps[candidate.chart, candidate.label].step(z)[0]
-            np.testing.assert_allclose(theirs, ours, rtol=0, atol=1e-9)
+            theirs, status = candidate.map.step(z * unit)
+            ours, expected = maps[candidate.chart, candidate.label].step(z)
+            np.testing.assert_allclose(np.asarray(theirs) / unit, ours, rtol=0, atol=1e-9)
+            np.testing.assert_array_equal(status.status, expected.status)
+            assert set(np.asarray(expected.status)) == {0, 1}
             compared += 1
     assert compared >= 2
 
