@@ -57,7 +57,7 @@ _LINEAR: dict[str, tuple[int, float]] = {
 }
 # Of a network: pairs, tolerance, iterations; and of a quick look.
 _NETWORK, _NETWORK_QUICK = (6_000, 1e-6, 250), (3_000, 1e-5, 60)
-_QUICK_PAIRS, _QUICK_TRAJECTORIES = 4_000, 25
+_QUICK_PAIRS, _QUICK_TRAJECTORIES, _QUICK_TOLERANCE = 4_000, 25, 1e-7
 
 # A larger file is never in memory whole: candidates are chosen on a sample of its pairs, and the
 # chosen one is fitted to all of them chunk by chunk.
@@ -103,7 +103,8 @@ def run(
     """Reference data of a scene, fit, rollouts, metrics, figures and report, into the folder out.
 
     tolerance: of the one-step error; None: the scene's own, close to the best that can be had.
-    quick: fewer pairs and fewer rollouts. resume: None where ``out`` is this very job, done.
+    quick: fewer pairs and rollouts, a tolerance of 1e-7 at best. resume: None where ``out`` is
+    this very job, done.
     """
     scene = _scene(name, dt)
     if scalar == "features" and scene.features is None:
@@ -113,7 +114,8 @@ def run(
         num_pairs, default, iterations = _NETWORK_QUICK if quick else _NETWORK
     else:
         num_pairs, default = _LINEAR[name]
-        num_pairs = min(num_pairs, _QUICK_PAIRS) if quick else num_pairs
+        if quick:
+            num_pairs, default = min(num_pairs, _QUICK_PAIRS), max(default, _QUICK_TOLERANCE)
     tolerance = default if tolerance is None else tolerance
     num_trajectories = _QUICK_TRAJECTORIES if quick else NUM_TRAJECTORIES
     job = {

@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax import candidates
@@ -25,6 +26,7 @@ def test_a_size_too_large_to_count_is_never_looked_at():
     assert looked_at == [2, 3, 4]
 
 
+@pytest.mark.slow
 def test_more_pairs_never_take_a_candidate_away(monkeypatch):
     """Where a factorisation of all rows would take too long, it is of a sample of them."""
     monkeypatch.setattr(candidates, "_MOST_WORK", 500 * 27**2)
@@ -37,6 +39,7 @@ def test_more_pairs_never_take_a_candidate_away(monkeypatch):
     assert fit.chosen.label == "polynomial 4"
 
 
+@pytest.mark.slow
 def test_a_degree_of_freedom_at_rest_does_no_harm():
     z = np.random.default_rng(0).uniform(-1, 1, (200, 2))
     q, p = z.T

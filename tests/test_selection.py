@@ -139,6 +139,7 @@ def test_a_tolerance_out_of_reach_gives_the_best_and_says_so():
 # The choice
 
 
+@pytest.mark.slow
 def test_three_tolerances_choose_three_maps_of_rising_cost():
     scene = henon_heiles()
     pairs = gfnn.sample_pairs(scene, 1_000, jax.random.key(0))
