@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax import cli, models, pipeline, selection
+from gfnn_jax import checkpoints, cli, models, pipeline, selection
 from gfnn_jax.charts import MIDPOINT
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.domain import covering
@@ -537,3 +537,51 @@ def test_killed_predictions_resume(model, tmp_path):
         process.wait()
     assert subprocess.run([*command, tmp_path / "p.npz"], check=False).returncode == 0
     assert (tmp_path / "p.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
+
+
+# Every iteration of the training is saved and told.
+TRAINING = """
+import sys
+from gfnn_jax import candidates, cli
+
+candidates._CHECKPOINT_SECONDS = cli._SECONDS_BETWEEN_LINES = 0.0
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
+def killed_training(arguments, seconds):
+    """Start a training and kill it so many seconds after a few iterations; whether it was so."""
+    command = [sys.executable, "-c", TRAINING, *(str(a) for a in arguments)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    with process, process.stderr as told:
+        iterations = (line for line in told if ": iteration " in line)
+        for _ in range(3):
+            next(iterations, None)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(seconds)
+        process.kill()
+    assert process.returncode in (0, -signal.SIGKILL)
+    return process.returncode != 0
+
+
+@pytest.mark.parametrize(
+    ("kills", "tolerance"), [(1, 1e-3), pytest.param(20, 1e-14, marks=pytest.mark.slow)]
+)
+def test_killed_trainings_resume(kills, tolerance, tmp_path):
+    """SIGKILLs at random moments of a training: the same map in the end, to the last bit."""
+    data = pairs_file(tmp_path / "d.npz", oscillator(100, [0, 1.0]), dt=1.0)
+    fit = ("fit", data, "--scalar", "mlp", "--chart", "type2", "--tolerance", tolerance, "--out")
+    assert gfnn(*fit, tmp_path / "whole") == 0
+    whole, described = checkpoints.load_model(tmp_path / "whole")
+    rng, killed = np.random.default_rng(0), 0
+    while killed < kills:
+        out = tmp_path / f"after_{killed}"
+        resumed = (*fit, out, "--resume")
+        while killed < kills and killed_training(resumed, rng.uniform(0, kills / 5)):
+            killed += 1
+            assert list((tmp_path / f"{out.name}.partial").glob("step_*"))
+        assert gfnn(*resumed) == 0
+        arrays, as_described = checkpoints.load_model(out)
+        jax.tree.map(np.testing.assert_array_equal, arrays, whole)
+        assert as_described["map"] == described["map"]
