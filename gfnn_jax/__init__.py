@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gfnn_jax import figures, metrics, scenes
     from gfnn_jax.charts import CHARTS, Chart
-    from gfnn_jax.io import InputError, WorkError
+    from gfnn_jax.errors import InputError, WorkError
     from gfnn_jax.maps import SymplecticMap
     from gfnn_jax.models import load
     from gfnn_jax.phase_space import Pairs
@@ -38,11 +38,11 @@ _HOMES = {
     "Fit": "selection",
     "FitError": "selection",
     "FitWarning": "selection",
-    "InputError": "io",
+    "InputError": "errors",
     "Pairs": "phase_space",
     "Scene": "scenes",
     "SymplecticMap": "maps",
-    "WorkError": "io",
+    "WorkError": "errors",
     "fit": "selection",
     "load": "models",
     "reference_trajectories": "trajectories",

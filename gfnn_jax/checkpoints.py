@@ -23,7 +23,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from gfnn_jax.io import InputError, atomic_folder, failures_as_work_errors, restore_interrupted
+from gfnn_jax.errors import InputError
+from gfnn_jax.outputs import atomic_folder, failures_as_work_errors, restore_interrupted
 
 FORMAT = 1
 _SUMS = "SHA256SUMS"
@@ -33,7 +34,7 @@ _JSON = "model.json"
 def save_model(folder, arrays: dict[str, Any], description: dict[str, Any]) -> None:
     """Save nested dicts of arrays and a JSON-able description as a model folder.
 
-    What was in ``folder`` is replaced; `io.ensure_new` asks first. Raises WorkError if writing
+    What was in ``folder`` is replaced; `outputs.ensure_new` asks first. Raises WorkError if writing
     fails, and what was there before is then as it was.
     """
     _write(Path(folder), arrays, {"description": description})

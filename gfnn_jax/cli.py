@@ -19,7 +19,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from gfnn_jax.io import InputError, WorkError, ensure_new
+from gfnn_jax.errors import InputError, WorkError
+from gfnn_jax.outputs import ensure_new
 
 # Equal to those of `selection`, which would bring JAX; a test compares them.
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")

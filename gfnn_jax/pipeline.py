@@ -22,17 +22,10 @@ from gfnn_jax import figures, metrics, models, report, scenes
 from gfnn_jax.candidates import Candidate
 from gfnn_jax.checkpoints import TrainingCheckpoints
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.io import (
-    InputError,
-    atomic_folder,
-    ensure_new,
-    failures_as_work_errors,
-    iterate_pairs,
-    read_initial_states,
-    read_sample,
-    read_trajectories,
-)
+from gfnn_jax.errors import InputError
+from gfnn_jax.io import iterate_pairs, read_initial_states, read_sample, read_trajectories
 from gfnn_jax.maps import Lanes, SymplecticMap
+from gfnn_jax.outputs import atomic_folder, ensure_new, failures_as_work_errors
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.predictions import PredictionWriter
 from gfnn_jax.scenes import Scene

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.io import (
-    InputError,
+from gfnn_jax.errors import InputError
+from gfnn_jax.outputs import (
     atomic_file,
     atomic_write,
     ensure_new,

@@ -18,7 +18,7 @@ import pytest
 
 from gfnn_jax import checkpoints
 from gfnn_jax.checkpoints import TrainingCheckpoints, load_model, save_model
-from gfnn_jax.io import InputError, WorkError
+from gfnn_jax.errors import InputError, WorkError
 
 RNG = np.random.default_rng(0)
 ARRAYS = {

@@ -585,3 +585,34 @@ def test_killed_trainings_resume(kills, tolerance, tmp_path):
         arrays, as_described = checkpoints.load_model(out)
         jax.tree.map(np.testing.assert_array_equal, arrays, whole)
         assert as_described["map"] == described["map"]
+
+
+# Runs a command and prints its peak of resident memory. A process of its own: a child's figure
+# includes the memory of the process that it was forked from, which is small here.
+MEASURE = """
+import resource, subprocess, sys
+
+subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL)
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("lanes", "num_steps", "save_every"), [(1, 10_000_000, 1_000), (1_000, 125_000, 1)]
+)
+def test_memory_of_a_long_prediction(lanes, num_steps, save_every, model, tmp_path):
+    """Ten million steps of one trajectory, and an output of 2 GB: each within 1 GB of memory."""
+    z0, out = tmp_path / "z0.npy", tmp_path / "p.npz"
+    np.save(z0, np.random.default_rng(0).uniform(-0.5, 0.5, (lanes, 2)))
+    command = [sys.executable, "-c", MEASURE, sys.executable, "-m", "gfnn_jax", "predict", model,
+               "--initial", z0, "--num-steps", num_steps, "--save-every", save_every,
+               "--out", out]  # fmt: skip
+    done = subprocess.run([str(c) for c in command], check=True, stdout=subprocess.PIPE)
+    bytes_per_unit = 1 if sys.platform == "darwin" else 1024
+    assert int(done.stdout) * bytes_per_unit < 1e9
+    assert out.stat().st_size > lanes * num_steps // save_every * 16
+    with np.load(out) as predicted:
+        assert predicted["steps"][-1] == num_steps
+        assert predicted["status"].shape == (lanes,)
+    out.unlink()

@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gfnn_jax import predictions
-from gfnn_jax.io import InputError, WorkError
+from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.predictions import PredictionWriter
 
 LANES, SAVED, WIDTH = 3, 20, 4

@@ -1,0 +1,17 @@
+"""The two ways in which a job ends early, each told in one line."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """Bad usage or bad input, in one line: what was expected and what came."""
+
+    def __init__(self, message: str):
+        super().__init__(" ".join(message.split()))
+
+
+class WorkError(RuntimeError):
+    """A failure during the work (a full disk), in one line; what was there before is as it was."""
+
+    def __init__(self, message: str):
+        super().__init__(" ".join(message.split()))

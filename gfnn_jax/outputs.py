@@ -1,0 +1,135 @@
+"""Files and folders written whole or not at all; nothing is overwritten unasked.
+
+Nothing here needs JAX, so that a refusal comes at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from gfnn_jax.errors import InputError, WorkError
+
+# What marks a folder as written by this package, so that --overwrite never deletes another.
+FOLDER_MARKS = ("model.json", "report.json")
+
+
+def ensure_new(path, overwrite: bool = False, *, folder: bool = False) -> Path:
+    """Check, before any work, that the file or folder ``path`` can be written. Writes nothing.
+
+    Raises InputError where it exists and ``overwrite`` is off, where it is of the other kind, where
+    it is a folder that this package did not write, or where its parent cannot be written.
+    """
+    path = Path(path)
+    try:
+        if path.is_dir() and not folder:
+            raise InputError(f"{path}: is a folder, expected a file to write")
+        if path.exists() and folder and not path.is_dir():
+            raise InputError(f"{path}: is a file, expected a folder to write")
+        if path.exists() and not (folder and not any(path.iterdir())):
+            if not overwrite:
+                raise InputError(f"{path}: exists already (--overwrite replaces it)")
+            if folder and not any((path / mark).is_file() for mark in FOLDER_MARKS):
+                raise InputError(
+                    f"{path}: is a folder without {' or '.join(FOLDER_MARKS)}; not overwritten"
+                )
+        parent = path.absolute().parent
+        while not parent.exists():
+            parent = parent.parent
+        if not parent.is_dir():
+            raise InputError(f"{path}: cannot be written: {parent} is not a folder")
+        if not os.access(parent, os.W_OK | os.X_OK):
+            raise InputError(f"{path}: cannot be written: no permission for {parent}")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    return path
+
+
+@contextlib.contextmanager
+def failures_as_work_errors(path) -> Iterator[None]:
+    """An OSError while writing ``path`` (a full disk), as a WorkError of one line."""
+    try:
+        yield
+    except OSError as error:
+        raise WorkError(f"{path}: writing failed: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def atomic_file(path) -> Iterator[Any]:
+    """A binary stream; ``path`` appears whole when the block ends, and not at all if it fails."""
+    path = Path(path)
+    beside = path.with_name(f".{path.name}.part")
+    with failures_as_work_errors(path):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with open(beside, "wb") as stream:
+                yield stream
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(beside, path)
+            sync_folder(path.parent)
+        finally:
+            beside.unlink(missing_ok=True)
+
+
+def atomic_write(path, content: str | bytes) -> None:
+    """Write a whole file, or leave what was there before. Raises WorkError."""
+    with atomic_file(path) as stream:
+        stream.write(content.encode() if isinstance(content, str) else content)
+
+
+@contextlib.contextmanager
+def atomic_folder(path) -> Iterator[Path]:
+    """A new folder to fill; it takes the place of ``path`` when the block ends without failing.
+
+    A folder cannot be exchanged for another in one step: the old one stands as ``.NAME.old`` for
+    an instant, and `restore_interrupted` brings it back if that instant was the last.
+    """
+    path = Path(path)
+    beside = path.absolute().with_name(f".{path.name}.part")
+    old = _old(path)
+    with failures_as_work_errors(path):
+        restore_interrupted(path)
+        try:
+            shutil.rmtree(beside, ignore_errors=True)
+            beside.mkdir(parents=True)
+            yield beside
+            for file in sorted(beside.rglob("*")):
+                if file.is_file():
+                    with open(file, "rb") as stream:
+                        os.fsync(stream.fileno())
+            if path.exists():
+                os.rename(path, old)
+            os.rename(beside, path)
+            sync_folder(path.absolute().parent)
+            shutil.rmtree(old, ignore_errors=True)
+        finally:
+            shutil.rmtree(beside, ignore_errors=True)
+
+
+def restore_interrupted(path) -> None:
+    """Undo an exchange of folders that was killed half way; see `atomic_folder`."""
+    path = Path(path)
+    if _old(path).exists():
+        if path.exists():
+            shutil.rmtree(_old(path), ignore_errors=True)
+        else:
+            os.rename(_old(path), path)
+
+
+def _old(path: Path) -> Path:
+    return path.absolute().with_name(f".{path.name}.old")
+
+
+def sync_folder(folder) -> None:
+    """Make a rename in this folder outlast a crash, where the system can."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -1,0 +1,76 @@
+"""Outputs: nothing is overwritten unasked, nothing is left half written."""
+
+import pytest
+
+from gfnn_jax import outputs
+from gfnn_jax.errors import InputError, WorkError
+
+
+def test_ensure_new(tmp_path):
+    (tmp_path / "file").write_text("kept")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").write_text("kept")
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "model.json").write_text("{}")
+    (tmp_path / "empty").mkdir()
+    for name, overwrite, folder, message in [
+        ("file", False, False, "exists already"),
+        ("file", True, True, "expected a folder"),
+        ("model", False, True, "exists already"),
+        ("model", True, False, "expected a file"),
+        ("other", True, True, "not overwritten"),
+        ("file/below", False, False, "not a folder|Not a directory"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            outputs.ensure_new(tmp_path / name, overwrite, folder=folder)
+    for name, overwrite, folder in [
+        ("new", False, False),
+        ("deep/new", False, True),
+        ("file", True, False),
+        ("model", True, True),
+        ("empty", False, True),
+    ]:
+        assert outputs.ensure_new(tmp_path / name, overwrite, folder=folder) == tmp_path / name
+    assert not (tmp_path / "deep").exists()
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_ensure_new_without_permission(tmp_path, monkeypatch):
+    monkeypatch.setattr(outputs.os, "access", lambda *args: False)
+    with pytest.raises(InputError, match="no permission"):
+        outputs.ensure_new(tmp_path / "new")
+
+
+def test_atomic_outputs_on_failure(tmp_path):
+    """A failure leaves what was there before, and no rubbish beside it."""
+    outputs.atomic_write(tmp_path / "a", "before")
+    with outputs.atomic_folder(tmp_path / "f") as new:
+        (new / "x").write_text("before")
+
+    def half_a_file():
+        with outputs.atomic_file(tmp_path / "a") as stream:
+            stream.write(b"half")
+            raise OSError(28, "No space left on device")
+
+    def half_a_folder():
+        with outputs.atomic_folder(tmp_path / "f") as new:
+            (new / "x").write_text("half")
+            raise OSError(28, "No space left on device")
+
+    for half in (half_a_file, half_a_folder):
+        with pytest.raises(WorkError, match="No space left"):
+            half()
+    with pytest.raises(KeyboardInterrupt), outputs.atomic_folder(tmp_path / "f") as new:
+        raise KeyboardInterrupt
+    assert (tmp_path / "a").read_text() == (tmp_path / "f" / "x").read_text() == "before"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "f"]
+    with outputs.atomic_folder(tmp_path / "f") as new:
+        (new / "y").write_text("after")
+    assert [p.name for p in (tmp_path / "f").iterdir()] == ["y"]
+
+
+def test_interrupted_exchange_of_folders(tmp_path):
+    (tmp_path / ".f.old").mkdir()
+    (tmp_path / ".f.old" / "x").write_text("before")
+    outputs.restore_interrupted(tmp_path / "f")
+    assert (tmp_path / "f" / "x").read_text() == "before"
