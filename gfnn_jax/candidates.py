@@ -177,15 +177,8 @@ class Network:
 
     def fit(self, rung: Rung, on_progress) -> Candidate:
         """Train the network."""
-        family, weight = rung.family, jnp.asarray(self.weight)
+        family = rung.family
         held, _ = _data(self.prepared, self.chart, self.rows.held_out)
-
-        # u = w / weight makes the rows of ∇S weight·∇S, free of units.
-        def scaled(params, u):
-            return family(params, weight * u)
-
-        def scale(data):
-            return data[0] / weight[None, :], data[1] * weight[None, :]
 
         def report(state: LMState) -> None:
             on_progress(
@@ -197,8 +190,8 @@ class Network:
         like = LMState(theta, theta, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0, 0.0)  # its structure counts
         resume = self.checkpoints.latest(like) if self.checkpoints else None
         result = levenberg_marquardt(
-            scaled, family.init(jax.random.key(self.seed), jnp.float64), *scale(self.train),
-            validation=scale(held), max_iterations=self.max_iterations,
+            family, family.init(jax.random.key(self.seed), jnp.float64), *self.train,
+            validation=held, weight=self.weight, max_iterations=self.max_iterations,
             target_rms=0.5 * self.tolerance / float(np.max(self.prepared.scale)),
             on_progress=report, checkpoint=_every_few_seconds(self.checkpoints),
             resume=resume[1] if resume else None,

@@ -25,6 +25,7 @@ from gfnn_jax.domain import Domain
 from gfnn_jax.implicit import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, Info
 from gfnn_jax.phase_space import apply_j, require_x64, symplecticity_defect
 from gfnn_jax.rollout import scan_steps
+from gfnn_jax.scalars import as_pytree
 
 _FIXED_NEWTON = 3
 _MOST_NEWTON = 40
@@ -45,10 +46,9 @@ def _register(data: tuple[str, ...], meta: tuple[str, ...]) -> Callable:
 class _Equation:
     """The implicit equation of a chart as the solver wants it: x is the free part of w.
 
-    θ = (params, z, w where it is known, scale).
+    θ = (scalar, params, z, w where it is known, scale).
     """
 
-    scalar: Callable
     chart: AnyChart
     dt: float
 
@@ -56,20 +56,21 @@ class _Equation:
         return z.at[np.array(self.chart.free(z.shape[0] // 2))].set(x)
 
     def __call__(self, theta, x):
-        params, z, known, scale = theta
+        scalar, params, z, known, scale = theta
         w = self.point(known, x)
-        gradient = jax.grad(self.scalar, argnums=1)(params, w)
+        gradient = jax.grad(scalar, argnums=1)(params, w)
         residual = self.chart.residual(z, w, gradient, self.dt)
         unit, size = jax.lax.stop_gradient(self.chart.sizes(scale, z, gradient, self.dt))
         return residual / unit, size / unit, (w, gradient)
 
 
-@_register(("params", "scale", "linear", "offset"), ("scalar", "chart", "dt"))
+@_register(("scalar", "params", "scale", "linear", "offset"), ("chart", "dt"))
 @dataclasses.dataclass(frozen=True, eq=False)
 class Generated:
     """The map that S generates in a chart: Z − z = h J ∇S(w) (paper, eq. (4)).
 
-    scalar: ``S(params, w)``. scale: (2d,) sizes of the coordinates, for the roundoff floor.
+    scalar: ``S(params, w)``; what it holds of the data are leaves of the map, and a plain function
+    is wrapped to have none. scale: (2d,) sizes of the coordinates, for the roundoff floor.
     linear (2d, 2d) and offset (2d,): a rough affine model of Z − z, where the solve starts; it
     has no influence on the solution but, at a fold of S, on the branch that is found.
     """
@@ -82,14 +83,17 @@ class Generated:
     linear: Any
     offset: Any
 
+    def __post_init__(self):
+        object.__setattr__(self, "scalar", as_pytree(self.scalar))
+
     def solve(self, z, *, executed: bool = False):
         """w, ∇S(w), Info at the state z (2d,); ``executed`` keeps the iterations' derivative."""
-        equation = _Equation(self.scalar, self.chart, self.dt)
+        equation = _Equation(self.chart, self.dt)
         dim = z.shape[0] // 2
         free = np.array(self.chart.free(dim))
         known = self.chart.start(z)
         guess = self.chart.point(z, z + self.offset + self.linear @ z)[free]
-        theta = (self.params, z, known, self.scale)
+        theta = (self.scalar, self.params, z, known, self.scale)
         if executed:
             _, (w, gradient), info = implicit.iterate(
                 equation, theta, guess, fixed=_FIXED_NEWTON, most=_MOST_NEWTON

@@ -144,8 +144,10 @@ def _lender(map_: SymplecticMap, scene: Scene | None) -> str | None:
 
 def _encode(value: Any) -> tuple[Any, Any]:
     """(text, arrays) of a node; None for arrays where there are none, and for text likewise."""
-    if isinstance(value, (jax.Array, np.ndarray, dict)):
+    if isinstance(value, dict) or (isinstance(value, (jax.Array, np.ndarray)) and value.ndim > 0):
         return None, value
+    if isinstance(value, (np.generic, np.ndarray, jax.Array)):
+        return value.item(), None
     if isinstance(value, Coordinates):
         text = {"name": value.name, "angles": list(value.angles), "cyclic": list(value.cyclic)}
         change = None if value.forward is CARTESIAN.forward else _OF_SCENE
@@ -159,11 +161,10 @@ def _encode(value: Any) -> tuple[Any, Any]:
         return _encode_all({str(i): item for i, item in enumerate(value)}, {"type": "tuple"})
     if isinstance(value, tuple):
         return [_encode(item)[0] for item in value], None
-    if isinstance(value, np.generic):
-        return value.item(), None
     if value is None or isinstance(value, (bool, int, float, str)):
         return value, None
-    raise InputError(f"a map that holds a {type(value).__name__} of your own cannot be saved")
+    kind = "function" if callable(value) else type(value).__name__
+    raise InputError(f"a map that holds a {kind} of your own cannot be saved")
 
 
 def _encode_all(items: dict[str, Any], text: dict[str, Any]) -> tuple[Any, Any]:

@@ -8,6 +8,7 @@ import scipy.optimize
 from jax.flatten_util import ravel_pytree
 
 from gfnn_jax.fitting.levenberg_marquardt import _compiled, levenberg_marquardt
+from gfnn_jax.scalars import as_pytree
 
 
 def network(params, w):
@@ -148,13 +149,13 @@ def test_memory_is_bounded_by_the_chunk_and_not_by_the_pairs():
     w, wanted = (jnp.tile(jnp.asarray(a), (10, 1)) for a in TRAINING)
     chunk, num_parameters = 100, theta.size
     linearize, attempt, _ = _compiled(
-        lambda theta, w: network(unravel(theta), w), theta, w, wanted, w, wanted, chunk
+        as_pytree(network), unravel, theta, (w, wanted), (w, wanted), jnp.ones(2), chunk
     )
     jacobian, matrix = 2 * chunk * num_parameters, num_parameters**2
     assert len(w) * 2 * num_parameters > 4 * (jacobian + matrix)  # whole, it would not fit below
 
     def numbers(compiled):
-        memory = compiled.memory_analysis()
+        memory = compiled.func.memory_analysis()
         return (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 8
 
     assert numbers(linearize) < 1.3 * (2 * matrix + 2 * jacobian)

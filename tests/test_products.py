@@ -61,8 +61,9 @@ def family_of(case, degree=4, even=False):
 def naive(family, coefficients, w):
     """Σ c_j times the product of its one-dimensional functions, as the definition says."""
     x = family.inputs(w)
-    a, b = family.halves
-    which = np.concatenate([a.indices[family.terms[:, 0]], b.indices[family.terms[:, 1]]], axis=1)
+    a, b = family.basis.halves
+    row, column = family.basis.terms.T
+    which = np.concatenate([a.indices[row], b.indices[column]], axis=1)
     degree, product = family.degree, coefficients
     for j, column in enumerate(which.T):
         if j in family.inputs.angles:
@@ -134,8 +135,8 @@ def test_terms_by_count():
 
 
 def _orders(family):
-    a, b = family.halves
-    return [(a.orders[i], b.orders[j]) for i, j in family.terms]
+    a, b = family.basis.halves
+    return [(a.orders[i], b.orders[j]) for i, j in family.basis.terms]
 
 
 @pytest.mark.parametrize("case", ["plain", "angles and cyclic", "features"])

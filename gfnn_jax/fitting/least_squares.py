@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,11 +47,15 @@ def _rows(family, w, wanted, weight):
     return rows.reshape(-1, rows.shape[-1])
 
 
-@partial(jax.jit, static_argnums=(0,))
+@jax.jit
 def _fold(family, factor, w, wanted, weight):
     """R of the stacked [R; rows of this chunk]: the QR step that forgets the rows."""
     rows = _rows(family, w, wanted, weight)
     return jnp.linalg.qr(jnp.concatenate([factor, rows]), mode="r")
+
+
+# Compiled once for each kind of family and shape of chunk, whatever the data.
+_COMPILED: dict[Any, Any] = {}
 
 
 def chunk_size(num_parameters: int, dim: int) -> int:
@@ -105,7 +108,6 @@ class _Stage:
     def __init__(self, family, weight):
         self.family, self.weight = family, weight
         self.compile_seconds = 0.0
-        self._compiled = {}
 
     def factor(self, chunks: Iterable) -> tuple[np.ndarray, int]:
         """R of [A b] over chunks of (w, wanted), and the number of rows seen."""
@@ -117,13 +119,13 @@ class _Stage:
         return np.asarray(factor), seen
 
     def _fold(self, factor, w, wanted):
-        shape = (factor.shape, w.shape)
-        if shape not in self._compiled:
+        arguments = (self.family, factor, w, wanted, self.weight)
+        kind = (jax.tree.structure(self.family), factor.shape, w.shape)
+        if kind not in _COMPILED:
             started = time.perf_counter()
-            lowered = _fold.lower(self.family, factor, w, wanted, self.weight)
-            self._compiled[shape] = lowered.compile()
+            _COMPILED[kind] = _fold.lower(*arguments).compile()
             self.compile_seconds += time.perf_counter() - started
-        return self._compiled[shape](factor, w, wanted, self.weight)
+        return _COMPILED[kind](*arguments)
 
 
 def solve(reduced: Reduced, num_terms: int) -> LeastSquaresFit:

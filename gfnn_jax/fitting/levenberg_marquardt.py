@@ -25,6 +25,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -33,6 +34,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
+
+from gfnn_jax.scalars import as_pytree
 
 # δ₂ is a correction: where it is not small beside δ₁ the expansion has failed and δ₁ goes alone.
 LARGEST_ACCELERATION = 0.75
@@ -89,6 +92,7 @@ def levenberg_marquardt(
     wanted: Rows,
     *,
     validation: tuple[Rows, Rows],
+    weight: Any = 1.0,
     max_iterations: int = 200,
     max_seconds: float | None = None,
     target_rms: float = 0.0,
@@ -98,12 +102,14 @@ def levenberg_marquardt(
     checkpoint: Callable[[LMState], Any] | None = None,
     resume: LMState | None = None,
 ) -> LMResult:
-    """Minimise the mean of ‖∇S(params, w) − wanted‖² over the pairs.
+    """Minimise the mean of ‖weight · (∇S(params, w) − wanted)‖² over the pairs.
 
-    scalar:      ``S(params, w)`` -> scalar, for one w of shape (2d,).
+    scalar:      ``S(params, w)`` -> scalar, for one w of shape (2d,). What a pytree holds is passed
+                 to the compiled code, so that it serves every set of data of the same shape.
     params:      any pytree of float64 arrays: the start.
     w, wanted:   (N, 2d) each, as a chart makes them from pairs of states.
     validation:  (w, wanted) of pairs kept apart; the parameters that fit them best are returned.
+    weight:      (2d,), or one for all: what makes a row of ∇S unit-free.
     max_iterations, max_seconds: when to stop; seconds exclude compilation. Runs that stop by
                  iterations repeat to the last bit on one machine with the same number of threads;
                  the clock does not.
@@ -115,12 +121,13 @@ def levenberg_marquardt(
                  had never stopped, bit for bit (``params`` then only lends its structure).
     """
     theta, unravel = ravel_pytree(params)
-    data = [jnp.asarray(a) for a in (w, wanted, *validation)]
-    _check(theta, *data)
+    train, held = ([jnp.asarray(a) for a in rows] for rows in ((w, wanted), validation))
+    weight = jnp.broadcast_to(jnp.asarray(weight, theta.dtype), train[0].shape[-1:])
+    _check(theta, *train, *held)
 
     started = time.perf_counter()
     linearize, attempt, validation_rms = _compiled(
-        lambda theta, w: scalar(unravel(theta), w), theta, *data, chunk=chunk
+        as_pytree(scalar), unravel, theta, train, held, weight, chunk
     )
     compile_seconds = time.perf_counter() - started
 
@@ -145,7 +152,7 @@ def levenberg_marquardt(
             stopped_because = "no progress"
             break
         theta, loss, damping = step
-        train_rms = math.sqrt(loss / data[0].size)
+        train_rms = math.sqrt(loss / train[0].size)
         seconds = seconds_before + time.perf_counter() - started
         state = _next_state(state, theta, damping, train_rms, validation_rms(theta), seconds)
         for report in (on_progress, checkpoint):
@@ -184,34 +191,38 @@ def _descend(theta, damping, linearize, attempt):
     return None
 
 
-def _compiled(value, theta, w, wanted, w_validation, wanted_validation, chunk):
+def _compiled(scalar, unravel, theta, train, validation, weight, chunk):
     """An iteration's three computations, compiled ahead so that their time is known apart.
-
-    value(theta, w) is S of flattened parameters (P,).
 
     linearize(theta)                       -> AᵀA (P, P), Aᵀr (P,), F
     attempt(theta, matrix, slope, damping) -> trial theta (P,), its F, the decrease δ₁ promises
     validation_rms(theta)                  -> float
     """
-    chunks = _chunked(w, wanted, chunk)
-    units = jnp.eye(w.shape[1], dtype=w.dtype)
-    gradient = jax.vmap(jax.grad(value, argnums=1), (None, 0))
+    train = (scalar, _chunked(*train, weight, chunk))
+    validation = (scalar, *validation, weight[None, :])
+    units = jnp.eye(weight.size, dtype=weight.dtype)
 
-    def residual(theta, w, wanted, weight):
-        return weight * (gradient(theta, w) - wanted)
+    def value(scalar, theta, w):
+        """S of flattened parameters (P,)."""
+        return scalar(unravel(theta), w)
 
-    def jacobian(theta, w, weight):
+    gradient = jax.vmap(jax.grad(value, argnums=2), (None, None, 0))
+
+    def residual(scalar, theta, w, wanted, weight):
+        return weight * (gradient(scalar, theta, w) - wanted)
+
+    def jacobian(scalar, theta, w, weight):
         """A of one chunk, (rows · 2d, P): a reverse sweep through each directional derivative of S,
         which costs less than reversing the reverse sweep of ∇S."""
 
         def directional(theta, w, unit):
-            return jax.jvp(lambda w: value(theta, w), (w,), (unit,))[1]
+            return jax.jvp(lambda w: value(scalar, theta, w), (w,), (unit,))[1]
 
         over_units = jax.vmap(jax.grad(directional), (None, None, 0))
         rows = jax.vmap(over_units, (None, 0, None))(theta, w, units)
         return (weight[:, :, None] * rows).reshape(-1, theta.size)
 
-    def total(term):
+    def total(term, chunks):
         """The sum of term(w, wanted, weight) over the chunks, one at a time."""
 
         def add(sums, part):
@@ -222,57 +233,63 @@ def _compiled(value, theta, w, wanted, w_validation, wanted_validation, chunk):
             add, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), chunks
         )[0]
 
-    def linearize(theta):
+    def linearize(train, theta):
+        scalar, chunks = train
+
         def term(w, wanted, weight):
-            r = residual(theta, w, wanted, weight).ravel()
-            a = jacobian(theta, w, weight)
+            r = residual(scalar, theta, w, wanted, weight).ravel()
+            a = jacobian(scalar, theta, w, weight)
             return a.T @ a, a.T @ r, r @ r
 
-        return total(term)
+        return total(term, chunks)
 
-    def loss(theta):
-        return total(lambda *part: jnp.sum(residual(theta, *part) ** 2))
-
-    def attempt(theta, matrix, slope, damping):
+    def attempt(train, theta, matrix, slope, damping):
+        scalar, chunks = train
         factor = jnp.linalg.cholesky(matrix + damping * jnp.eye(theta.size, dtype=theta.dtype))
         step = -cho_solve((factor, True), slope)
 
         def bend(*part):
             """Aᵀ r″(δ₁, δ₁) of one chunk: two nested directional derivatives, one reverse sweep."""
-            _, pull_back = jax.vjp(lambda theta: residual(theta, *part), theta)
+
+            def residual_at(theta):
+                return residual(scalar, theta, *part)
+
+            _, pull_back = jax.vjp(residual_at, theta)
 
             def along(theta):
-                return jax.jvp(lambda theta: residual(theta, *part), (theta,), (step,))[1]
+                return jax.jvp(residual_at, (theta,), (step,))[1]
 
             return pull_back(jax.jvp(along, (theta,), (step,))[1])[0]
 
-        correction = -0.5 * cho_solve((factor, True), total(bend))
+        correction = -0.5 * cho_solve((factor, True), total(bend, chunks))
         ratio = 2 * jnp.linalg.norm(correction) / jnp.linalg.norm(step)
         trial = theta + step + jnp.where(ratio <= LARGEST_ACCELERATION, correction, 0)
-        return trial, loss(trial), step @ (damping * step - slope)
+        loss = total(lambda *part: jnp.sum(residual(scalar, trial, *part) ** 2), chunks)
+        return trial, loss, step @ (damping * step - slope)
 
-    def validation_loss(theta):
-        return jnp.mean((gradient(theta, w_validation) - wanted_validation) ** 2)
+    def validation_loss(validation, theta):
+        scalar, *rows = validation
+        return jnp.mean(residual(scalar, theta, *rows) ** 2)
 
     matrix = jax.ShapeDtypeStruct((theta.size, theta.size), theta.dtype)
     damping = jax.ShapeDtypeStruct((), theta.dtype)
-    validate = jax.jit(validation_loss).lower(theta).compile()
+    validate = jax.jit(validation_loss).lower(validation, theta).compile()
     return (
-        jax.jit(linearize).lower(theta).compile(),
-        jax.jit(attempt).lower(theta, matrix, theta, damping).compile(),
-        lambda theta: math.sqrt(float(validate(theta))),
+        partial(jax.jit(linearize).lower(train, theta).compile(), train),
+        partial(jax.jit(attempt).lower(train, theta, matrix, theta, damping).compile(), train),
+        lambda theta: math.sqrt(float(validate(validation, theta))),
     )
 
 
-def _chunked(w, wanted, chunk):
-    """w, wanted and weights as equal chunks (num_chunks, rows, 2d or 1); weight 0 marks padding."""
+def _chunked(w, wanted, weight, chunk):
+    """w, wanted and weights as equal chunks (num_chunks, rows, 2d); weight 0 marks padding."""
     num_chunks = -(-len(w) // chunk)
     rows = -(-len(w) // num_chunks)
     padding = num_chunks * rows - len(w)
     # Padding repeats a state, where S is as finite as on the data.
     take = np.concatenate([np.arange(len(w)), np.zeros(padding, int)])
-    weight = jnp.asarray(np.arange(take.size) < len(w), w.dtype)[:, None]
-    return tuple(a.reshape(num_chunks, rows, -1) for a in (w[take], wanted[take], weight))
+    weights = jnp.asarray(np.arange(take.size) < len(w), w.dtype)[:, None] * weight[None, :]
+    return tuple(a.reshape(num_chunks, rows, -1) for a in (w[take], wanted[take], weights))
 
 
 def _first_state(theta, validation_rms):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,11 @@ import numpy as np
 _MARGIN = 1.0 + 1e-9  # the data's extremes lie just inside the box
 
 
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("centre", "scale"),
+    meta_fields=("keep", "angles", "features"),
+)
 @dataclasses.dataclass(frozen=True)
 class Inputs:
     """The variables x of S: w without its cyclic entries, or the scene's features, scaled.
@@ -20,13 +27,14 @@ class Inputs:
     angles:   positions within the variables that are angles; they are neither shifted nor scaled.
     features: ``features(w)`` -> (k,), where S is a function of features of w instead of w itself.
     centre, scale: of the variables, so that the data fill [-1, 1]; any scaling inside S leaves the
-              map symplectic. Tuples of floats, so that a family is a hashable constant.
+              map symplectic. They are leaves of the pytree that a family is: what is compiled for
+              one set of data serves the next.
     """
 
     keep: tuple[int, ...]
     angles: tuple[int, ...]
-    centre: tuple[float, ...]
-    scale: tuple[float, ...]
+    centre: tuple[Any, ...]
+    scale: tuple[Any, ...]
     features: Callable | None = None
 
     @property
@@ -39,7 +47,8 @@ class Inputs:
 
     def __call__(self, w):
         """The scaled variables (k,) at w (2d,)."""
-        centre, scale = np.asarray(self.centre, w.dtype), np.asarray(self.scale, w.dtype)
+        centre, scale = (jnp.stack([jnp.asarray(c, w.dtype) for c in side])
+                         for side in (self.centre, self.scale))  # fmt: skip
         return (self.raw(w) - centre) / scale
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -35,6 +36,11 @@ ACTIVATIONS: dict[str, Callable] = {
 }
 
 
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("inputs", "amplitude"),
+    meta_fields=("hidden", "activation"),
+)
 @dataclasses.dataclass(frozen=True)
 class Mlp:
     """A fully connected network with one output, linear in its last layer.
@@ -49,7 +55,7 @@ class Mlp:
     inputs: Inputs
     hidden: tuple[int, ...] = DEFAULT_HIDDEN
     activation: str = "silu"
-    amplitude: float = 1.0
+    amplitude: Any = 1.0
 
     def __post_init__(self):
         if self.activation not in ACTIVATIONS:
@@ -93,7 +99,8 @@ class Mlp:
         """S(params, w): w (2d,) of any float dtype -> scalar, computed in the dtype of params."""
         dtype = jax.tree.leaves(params)[0].dtype
         x = self._seen(w).astype(dtype)
-        return self.amplitude * self._network(dtype).apply({"params": params}, x)[0]
+        amplitude = jnp.asarray(self.amplitude, dtype)
+        return amplitude * self._network(dtype).apply({"params": params}, x)[0]
 
     def _seen(self, w):
         """What the network sees at w (2d,): (num_inputs,)."""

@@ -15,7 +15,7 @@ Because S is linear in C, the derivative rules below are complete: ``jax.grad``,
 from __future__ import annotations
 
 import dataclasses
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 
 import jax
 import jax.numpy as jnp
@@ -145,6 +145,43 @@ class _Half:
 
 
 @dataclasses.dataclass(frozen=True)
+class Basis:
+    """Which products exist: all that is static about a family, made once for each kind."""
+
+    is_angle: tuple[bool, ...]
+    degree: int
+    signs: tuple[int, ...] | None
+
+    @property
+    def cut(self) -> int:
+        """The first variable of the second half."""
+        return (len(self.is_angle) + 1) // 2
+
+    @cached_property
+    def halves(self) -> tuple[_Half, _Half]:
+        cut, signs = self.cut, self.signs or (1,) * len(self.is_angle)
+        return (
+            _Half(self.is_angle[:cut], signs[:cut], self.degree),
+            _Half(self.is_angle[cut:], signs[cut:], self.degree),
+        )
+
+    @cached_property
+    def terms(self) -> np.ndarray:
+        """Rows (a, b) of the coefficients that exist, by rising degree: (num_parameters, 2)."""
+        a, b = self.halves
+        order = a.orders[:, None] + b.orders[None, :]
+        exists = (order <= self.degree) & (order > 0)  # a constant generates nothing
+        if self.signs is not None:
+            exists &= a.parities[:, None] * b.parities[None, :] > 0
+        rows = np.argwhere(exists)
+        return rows[np.argsort(order[exists], kind="stable")]
+
+
+_basis = cache(Basis)
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=("inputs",), meta_fields=("degree", "signs"))
+@dataclasses.dataclass(frozen=True)
 class Products:
     """Chebyshev × Fourier products of total degree at most ``degree`` in the inputs' variables.
 
@@ -164,40 +201,19 @@ class Products:
         """As candidates tables show it: what, and how large."""
         return f"{self.name} {self.degree}"
 
-    @cached_property
-    def _cut(self) -> int:
-        return (self.inputs.num_variables + 1) // 2
-
-    @cached_property
-    def halves(self) -> tuple[_Half, _Half]:
-        n = self.inputs.num_variables
-        angle = tuple(j in self.inputs.angles for j in range(n))
-        signs = self.signs or (1,) * n
-        cut = self._cut
-        return (
-            _Half(angle[:cut], signs[:cut], self.degree),
-            _Half(angle[cut:], signs[cut:], self.degree),
-        )
-
-    @cached_property
-    def terms(self) -> np.ndarray:
-        """Rows (a, b) of the coefficients that exist, by rising degree: (num_parameters, 2)."""
-        a, b = self.halves
-        order = a.orders[:, None] + b.orders[None, :]
-        exists = (order <= self.degree) & (order > 0)  # a constant generates nothing
-        if self.signs is not None:
-            exists &= a.parities[:, None] * b.parities[None, :] > 0
-        rows = np.argwhere(exists)
-        return rows[np.argsort(order[exists], kind="stable")]
+    @property
+    def basis(self) -> Basis:
+        is_angle = tuple(j in self.inputs.angles for j in range(self.inputs.num_variables))
+        return _basis(is_angle, self.degree, self.signs)
 
     @property
     def num_parameters(self) -> int:
-        return len(self.terms)
+        return len(self.basis.terms)
 
     @property
     def operations(self) -> tuple[int, int]:
         """Floating-point operations of ∇S and of its Jacobian: the products with C, the tables."""
-        (m, i), (n, j) = (h.indices.shape for h in self.halves)
+        (m, i), (n, j) = (h.indices.shape for h in self.basis.halves)
         tables = sum(t * k * (k - 1) + 10 * self.degree * k for t, k in ((m, i), (n, j)))
         gradient = 4 * m * n + 2 * (m * i + n * j) + tables
         mixed = 2 * i * m * n + 2 * i * j * n
@@ -205,49 +221,44 @@ class Products:
 
     def unflatten(self, coefficients):
         """Coefficients (num_parameters,) -> the matrix C, the parameters of ``S``."""
-        a, b = self.halves
+        a, b = self.basis.halves
+        row, col = self.basis.terms.T
         c = jnp.zeros((len(a.indices), len(b.indices)), coefficients.dtype)
-        return c.at[self.terms[:, 0], self.terms[:, 1]].set(coefficients)
+        return c.at[row, col].set(coefficients)
 
     def __call__(self, params, w):
         """S(params, w): params the matrix C, w (2d,) -> scalar."""
-        return _chain(self, params, w)
+        return _polynomial(self.basis, params, self.inputs(w))
 
     def gradient_features(self, w):
         """∇ of every term at w: (2d, num_parameters), the rows of the least-squares problem."""
         x, slope = self.inputs(w), jax.jacfwd(self.inputs)(w)
-        a, b = self.halves
-        u, du, _ = a.tables(x[: self._cut])
-        v, dv, _ = b.tables(x[self._cut :])
-        row, col = self.terms[:, 0], self.terms[:, 1]
+        u, du, _, v, dv, _ = _tables(self.basis, x)
+        row, col = self.basis.terms.T
         by_variable = jnp.concatenate([du[:, row] * v[None, col], u[None, row] * dv[:, col]])
         return slope.T @ by_variable
 
 
-def _chain(family: Products, matrix, w):
-    return _polynomial(family, matrix, family.inputs(w))
+def _tables(basis, x):
+    """u, ∇u, ∇²u of the first half and v, ∇v, ∇²v of the second at the variables x (k,)."""
+    a, b = basis.halves
+    return (*a.tables(x[: basis.cut]), *b.tables(x[basis.cut :]))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _polynomial(family, matrix, x):
-    a, b = family.halves
-    u = a.tables(x[: family._cut])[0]
-    v = b.tables(x[family._cut :])[0]
+def _polynomial(basis, matrix, x):
+    u, _, _, v, _, _ = _tables(basis, x)
     return _dot(u, _dot(matrix, v))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _gradient(family, matrix, x):
-    a, b = family.halves
-    u, du, _ = a.tables(x[: family._cut])
-    v, dv, _ = b.tables(x[family._cut :])
+def _gradient(basis, matrix, x):
+    u, du, _, v, dv, _ = _tables(basis, x)
     return jnp.concatenate([_dot(du, _dot(matrix, v)), _dot(dv, _dot(u, matrix))])
 
 
-def _hessian(family, matrix, x):
-    a, b = family.halves
-    u, du, ddu = a.tables(x[: family._cut])
-    v, dv, ddv = b.tables(x[family._cut :])
+def _hessian(basis, matrix, x):
+    u, du, ddu, v, dv, ddv = _tables(basis, x)
     aa, bb = _dot(ddu, _dot(matrix, v)), _dot(ddv, _dot(u, matrix))
     ab = _dot(_dot(du, matrix), dv.T)
     return jnp.block([[aa, ab], [ab.T, bb]])
@@ -260,14 +271,14 @@ def _is_zero(tangent) -> bool:
 def _linear_rule(value, derivative):
     """d f(C, x) = f(dC, x) + f'(C, x) dx for f linear in C; a symbolic zero costs nothing."""
 
-    def rule(family, primals, tangents):
+    def rule(basis, primals, tangents):
         (matrix, x), (matrix_dot, x_dot) = primals, tangents
-        out = value(family, matrix, x)
+        out = value(basis, matrix, x)
         out_dot = jnp.zeros_like(out)
         if not _is_zero(matrix_dot):
-            out_dot = out_dot + value(family, matrix_dot, x)
+            out_dot = out_dot + value(basis, matrix_dot, x)
         if not _is_zero(x_dot):
-            out_dot = out_dot + _dot(derivative(family, matrix, x), x_dot)
+            out_dot = out_dot + _dot(derivative(basis, matrix, x), x_dot)
         return out, out_dot
 
     return rule

@@ -9,7 +9,7 @@ fit is one least-squares solve; the number of features does not grow with the di
 from __future__ import annotations
 
 import dataclasses
-from functools import cached_property
+from functools import cached_property, partial
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,11 @@ import numpy as np
 from gfnn_jax.scalars.inputs import Inputs
 
 
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("inputs",),
+    meta_fields=("num_parameters", "bandwidth", "seed"),
+)
 @dataclasses.dataclass(frozen=True)
 class Sines:
     """``num_parameters`` random sines of the variables; whole wave numbers for angles."""
