@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +49,8 @@ class Candidate:
 
     validation_rms: per-component RMS of the one-step state error on held-out pairs, in the user's
     coordinates; validation_bound: its upper 95 % bound. work: floating-point operations per
-    predicted step. fit_seconds: of its least-squares solve or training, compilation apart.
+    predicted step. deviations: (2d,) the error's RMS in each coordinate. fit_seconds: of its
+    least-squares solve or training, compilation apart.
     """
 
     label: str
@@ -58,6 +59,7 @@ class Candidate:
     num_parameters: int
     validation_rms: float
     validation_bound: float
+    deviations: np.ndarray
     work: float
     microseconds_per_step: float | None
     fit_seconds: float
@@ -68,6 +70,11 @@ class Candidate:
     rank: int | None
     map: SymplecticMap
     chosen: bool = False
+
+    @property
+    def relative_rms(self) -> float:
+        """RMS of the error in units of the data's spread, whatever units they came in."""
+        return float(np.sqrt(np.mean((self.deviations / np.asarray(self.map.scale)) ** 2)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,7 +150,7 @@ class Ladder:
         # Judged through the stage's largest family, zeros added: one compilation for all its rungs.
         padding = top.num_parameters - family.num_parameters
         padded = top.unflatten(jnp.pad(solved.coefficients, (0, padding)))
-        rms, bound, iterations = validation_error(
+        error = validation_error(
             compose(self.prepared, self.chart, top, padded, self.rows.pairs),
             self.rows.pairs, self.rows.held_out,
         )  # fmt: skip
@@ -151,11 +158,12 @@ class Ladder:
         label = f"features {family.degree}" if self.kind == "features" else family.label
         return Candidate(
             label=label, scalar=self.kind, chart=self.chart.name,
-            num_parameters=family.num_parameters, validation_rms=rms, validation_bound=bound,
-            work=counted_work(family, iterations.mean()),
+            num_parameters=family.num_parameters, validation_rms=error.rms,
+            validation_bound=error.bound, deviations=error.deviations,
+            work=counted_work(family, error.iterations.mean()),
             microseconds_per_step=None, fit_seconds=seconds,
             compile_seconds=reduced.compile_seconds, train_rms=solved.train_rms,
-            newton_iterations_max=int(iterations.max()), condition=solved.condition,
+            newton_iterations_max=int(error.iterations.max()), condition=solved.condition,
             rank=solved.rank,
             map=compose(self.prepared, self.chart, family, params, self.rows.pairs),
         )  # fmt: skip
@@ -197,14 +205,16 @@ class Network:
             resume=resume[1] if resume else None,
         )  # fmt: skip
         map_ = compose(self.prepared, self.chart, family, result.params, self.rows.pairs)
-        rms, bound, iterations = validation_error(map_, self.rows.pairs, self.rows.held_out)
+        error = validation_error(map_, self.rows.pairs, self.rows.held_out)
         return Candidate(
             label=family.label, scalar=family.name, chart=self.chart.name,
-            num_parameters=family.num_parameters, validation_rms=rms, validation_bound=bound,
-            work=counted_work(family, iterations.mean()),
+            num_parameters=family.num_parameters, validation_rms=error.rms,
+            validation_bound=error.bound, deviations=error.deviations,
+            work=counted_work(family, error.iterations.mean()),
             microseconds_per_step=None, fit_seconds=result.seconds,
             compile_seconds=result.compile_seconds, train_rms=result.train_rms,
-            newton_iterations_max=int(iterations.max()), condition=None, rank=None, map=map_,
+            newton_iterations_max=int(error.iterations.max()), condition=None, rank=None,
+            map=map_,
         )  # fmt: skip
 
 
@@ -266,9 +276,10 @@ def refitted(candidate: Candidate, chunks: Iterable[Pairs], held: Pairs) -> tupl
     )
     pieces = (*map_.pieces[:index], generated, *map_.pieces[index + 1 :])
     map_ = dataclasses.replace(map_, pieces=pieces)
-    rms, bound, _ = validation_error(map_, held, np.arange(len(held)))
+    error = validation_error(map_, held, np.arange(len(held)))
     refit = dataclasses.replace(
-        candidate, map=map_, validation_rms=rms, validation_bound=bound,
+        candidate, map=map_, validation_rms=error.rms, validation_bound=error.bound,
+        deviations=error.deviations,
         train_rms=solved.train_rms, fit_seconds=candidate.fit_seconds + reduced.seconds,
     )  # fmt: skip
     return refit, count
@@ -311,23 +322,35 @@ def compose(prepared: Prepared, chart, family, params, pairs: Pairs) -> Symplect
     )
 
 
-def validation_error(map_: SymplecticMap, pairs: Pairs, rows) -> tuple[float, float, np.ndarray]:
-    """Per-component RMS of Z_predicted − Z on these pairs, its upper 95 % bound, Newton iterations.
+class ValidationError(NamedTuple):
+    """Z_predicted − Z on held-out pairs, in the user's coordinates, angles modulo 2π.
 
-    In the user's coordinates, angles modulo 2π. Infinite where a lane fails. The bound is that of
-    the mean square, by the central limit theorem.
+    rms: RMS per component. bound: its upper 95 % bound, that of the mean square by the central
+    limit theorem. deviations: (2d,) RMS in each coordinate. iterations: of Newton, (N,). All but
+    the iterations are infinite where a lane fails.
     """
+
+    rms: float
+    bound: float
+    deviations: np.ndarray
+    iterations: np.ndarray
+
+
+def validation_error(map_: SymplecticMap, pairs: Pairs, rows) -> ValidationError:
+    """How far the map is from the images of these rows of the pairs."""
     z0, z1 = np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows]
     predicted, info = map_.step(z0)
     error = np.asarray(predicted) - z1
     if map_.coordinates.forward is CARTESIAN.forward:
         angles = list(map_.coordinates.angles)
         error[:, angles] -= TWO_PI * np.round(error[:, angles] / TWO_PI)
-    square = np.mean(error**2, axis=1)
+    deviations, square = np.sqrt(np.mean(error**2, axis=0)), np.mean(error**2, axis=1)
+    iterations = np.asarray(info.iterations)
     if not np.isfinite(square).all() or (np.asarray(info.status) > LEFT_DOMAIN).any():
-        return float("inf"), float("inf"), np.asarray(info.iterations)
+        return ValidationError(np.inf, np.inf, np.full_like(deviations, np.inf), iterations)
     bound = square.mean() + _NORMAL_95 * square.std() / np.sqrt(len(square))
-    return float(np.sqrt(square.mean())), float(np.sqrt(bound)), np.asarray(info.iterations)
+    rms = float(np.sqrt(square.mean()))
+    return ValidationError(rms, float(np.sqrt(bound)), deviations, iterations)
 
 
 def counted_work(family, iterations: float) -> float:

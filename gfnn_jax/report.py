@@ -49,7 +49,7 @@ def assemble(
         "data": {
             "num_pairs": fit.num_pairs,
             "symplecticity_defect": fit.data_defect,
-            "noise": fit.noise,
+            "noise": None if fit.noise is None else fit.noise.tolist(),
             **data,
         },
         "model": {

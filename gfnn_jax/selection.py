@@ -30,7 +30,7 @@ from gfnn_jax.scenes.scene import Scene
 SCALARS = ("auto", "polynomial", "features", "sines", "mlp")
 CHART_NAMES = ("auto", *CHARTS)
 
-_VALIDATION_FRACTION, _MOST_VALIDATION = 0.1, 2_000
+_VALIDATION_FRACTION, _FEWEST_VALIDATION, _MOST_VALIDATION = 0.1, 4, 2_000
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 # A rung that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
@@ -47,9 +47,9 @@ class Fit:
     map: the chosen map. candidates: every candidate met on the way, by rising cost. tolerance: what
     was asked for, and ``met`` whether the chosen map's upper 95 % bound is within it. judgements:
     chart -> its determinant over the data. data_defect: how far the pairs' local Jacobians are from
-    symplectic (median). based: whether a base map was factored out. noise: standard deviation per
-    coordinate that the residuals suggest where larger models stopped helping, else None. messages:
-    the warnings. seconds: of it all.
+    symplectic (median). based: whether a base map was factored out. noise: (2d,) standard deviation
+    of each coordinate's noise that the residuals suggest where larger models stopped helping, else
+    None. messages: the warnings. seconds: of it all.
     """
 
     map: SymplecticMap
@@ -62,7 +62,7 @@ class Fit:
     seconds: float
     symplecticity_defect: float
     model_determinant_min: float
-    noise: float | None
+    noise: np.ndarray | None
     messages: tuple[str, ...]
 
     @property
@@ -99,7 +99,7 @@ def fit(
 ) -> Fit:
     """Learn the map of these pairs: the cheapest candidate within ``tolerance``, else the best.
 
-    pairs:     states and images, (N, 2d) each, NumPy or JAX.
+    pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
     tolerance: bound on the one-step state error's RMS per component, in the user's units.
     chart:     "auto" or one of type1, type2, type3, midpoint.
@@ -159,17 +159,17 @@ def fit(
             f"no candidate meets the tolerance {tolerance:g}: the most accurate has a one-step "
             f"error of {chosen.validation_rms:.2e} (95 % bound {chosen.validation_bound:.2e})"
         )
-    noise, dim = None, pairs.dim
-    spread = float(np.max(np.std(np.asarray(pairs.z0), axis=0)))
-    if (chosen.chart, chosen.scalar) in stalled and chosen.validation_rms > _ROUNDOFF * spread:
+    noise = None
+    if (chosen.chart, chosen.scalar) in stalled and chosen.relative_rms > _ROUNDOFF:
         # Noise of both states enters the difference: σ √2 for a map near the identity. The fit
         # averages it over the rows that each coefficient has.
-        noise = chosen.validation_rms / np.sqrt(2.0)
-        implied = chosen.validation_rms * np.sqrt(chosen.num_parameters / (training.size * 2 * dim))
+        noise = chosen.deviations / np.sqrt(2.0)
+        implied = np.sqrt(2.0 * chosen.num_parameters / (training.size * 2 * pairs.dim))
         warn(
             "larger models are no more accurate: the pairs seem to carry noise of about "
-            f"{noise:.1e} on every coordinate (the map's own error is then about {implied:.1e}), "
-            "or a structure that these functions cannot represent"
+            f"{', '.join(f'{sigma:.1e}' for sigma in noise)} on the coordinates in their order "
+            f"(the map's own error is then about {implied:.1g} of it), or a structure that these "
+            "functions cannot represent"
         )
     on_progress("timing the candidates")
     test = np.asarray(pairs.z0)[held_out]
@@ -251,15 +251,50 @@ def _check_request(pairs, scene, tolerance, chart, scalar, angles) -> None:
 
 
 def _split(pairs: Pairs, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows for training and rows held out, shuffled by the seed."""
-    order = np.random.default_rng(seed).permutation(len(pairs))
-    held = min(_MOST_VALIDATION, max(4, int(_VALIDATION_FRACTION * len(pairs))))
-    return order[held:], order[:held]
+    """Rows for training and rows held out, shuffled by the seed.
+
+    Where the image of one pair is the state of the next, both are of one sequence. They share the
+    noise of that state and lie on one orbit, so that a random half would judge the other too
+    kindly: whole sequences are held out then. A sequence longer than all that is to be held out is
+    cut into blocks in time first.
+    """
+    rng, count = np.random.default_rng(seed), len(pairs)
+    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
+    wanted = max(_FEWEST_VALIDATION, int(_VALIDATION_FRACTION * count))
+    goes_on = np.all(z1[:-1] == z0[1:], axis=1)  # from each row to the next
+    if not goes_on.any():
+        order, wanted = rng.permutation(count), min(wanted, _MOST_VALIDATION)
+        return order[wanted:], order[:wanted]
+    block = _blocks(goes_on, wanted)
+    sizes = np.bincount(block)
+    order = rng.permutation(len(sizes))
+    # Blocks in random order until there are rows enough: the last one may bring more.
+    chosen = order[np.cumsum(sizes[order]) - sizes[order] < wanted]
+    held = np.isin(block, chosen)
+    # Beside a block that was cut out, a training pair would share its outermost state.
+    border = goes_on & (held[1:] != held[:-1])
+    apart = ~held
+    apart[:-1] &= ~border
+    apart[1:] &= ~border
+    held_out = rng.permutation(np.flatnonzero(held))[:_MOST_VALIDATION]
+    return rng.permutation(np.flatnonzero(apart)), held_out
+
+
+def _blocks(goes_on: np.ndarray, wanted: int) -> np.ndarray:
+    """The number of the block that each row is in: a sequence, or, of one longer than ``wanted``,
+    a quarter of ``wanted`` consecutive rows."""
+    starts = np.concatenate([[True], ~goes_on])
+    sequence = np.cumsum(starts) - 1
+    place = np.arange(len(starts)) - np.flatnonzero(starts)[sequence]
+    length = np.bincount(sequence)[sequence]
+    cut = (length > wanted) & (place % max(_FEWEST_VALIDATION, wanted // 4) == 0)
+    return np.cumsum(starts | cut) - 1
 
 
 def _walk(ladders, tolerance: float, on_progress) -> tuple[list[Candidate], set[tuple[str, str]]]:
     """Climb all ladders together by rising work, until the next rung costs more than one that is
-    accurate enough. A ladder is left that no longer gains, or that another keeps beating."""
+    accurate enough. A ladder is left that no longer gains, or that another keeps beating. Only the
+    tolerance is in the user's units: which ladders are left does not depend on them."""
     rungs = [(rung.work, i, rung) for i, ladder in enumerate(ladders) for rung in ladder.rungs]
     candidates: list[Candidate] = []
     best = [np.inf] * len(ladders)
@@ -277,17 +312,17 @@ def _walk(ladders, tolerance: float, on_progress) -> tuple[list[Candidate], set[
         if candidate.validation_bound <= tolerance:
             cheapest = min(cheapest, work)
             left.add(i)
-        stalled[i] = stalled[i] + 1 if candidate.validation_rms > _WORTHWHILE * best[i] else 0
+        stalled[i] = stalled[i] + 1 if candidate.relative_rms > _WORTHWHILE * best[i] else 0
         if stalled[i] == _STALLED:
             left.add(i)
-        best[i] = min(best[i], candidate.validation_rms)
+        best[i] = min(best[i], candidate.relative_rms)
         beaten[i] += any(_beats(rival, candidate) for rival in candidates)
         if beaten[i] == _BEATEN:
             left.add(i)
     ends = {(c.chart, c.scalar) for c in candidates}
     stalled_ladders = set()
     for chart, scalar in ends:
-        errors = [c.validation_rms for c in candidates if (c.chart, c.scalar) == (chart, scalar)]
+        errors = [c.relative_rms for c in candidates if (c.chart, c.scalar) == (chart, scalar)]
         if len(errors) > 2 and min(errors[-2:]) > _WORTHWHILE * min(errors[:-2]):
             stalled_ladders.add((chart, scalar))
     return candidates, stalled_ladders
@@ -300,8 +335,7 @@ def _beats(rival: Candidate, candidate: Candidate) -> bool:
         return False
     margin = 1.0 if rival.scalar == candidate.scalar else 10.0
     return (
-        rival.work <= 1.1 * candidate.work
-        and margin * rival.validation_rms < candidate.validation_rms
+        rival.work <= 1.1 * candidate.work and margin * rival.relative_rms < candidate.relative_rms
     )
 
 
@@ -309,7 +343,7 @@ def _choose(candidates: list[Candidate], tolerance: float) -> Candidate:
     meeting = [c for c in candidates if c.validation_bound <= tolerance]
     if meeting:
         return min(meeting, key=lambda c: c.work)
-    return min(candidates, key=lambda c: c.validation_rms)
+    return min(candidates, key=lambda c: c.relative_rms)
 
 
 def _smallest(determinant) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
+from gfnn_jax import selection
 from gfnn_jax.scenes import DrawnFrom, Scene, henon_heiles
 from gfnn_jax.scenes.two_body import angular_momentum
 
@@ -133,7 +134,56 @@ def test_a_tolerance_out_of_reach_gives_the_best_and_says_so():
     with pytest.warns(gfnn.FitWarning, match="no candidate meets"):
         fit = gfnn.fit(pendulum_pairs(60), tolerance=1e-18)
     assert not fit.met
-    assert fit.chosen.validation_rms == min(c.validation_rms for c in fit.candidates)
+    assert fit.chosen.relative_rms == min(c.relative_rms for c in fit.candidates)
+
+
+# What is held out
+
+
+def in_sequence(*sequences):
+    """Pairs of consecutive states of each sequence (L, 2d), one sequence after the other."""
+    return gfnn.Pairs(
+        np.concatenate([s[:-1] for s in sequences]), np.concatenate([s[1:] for s in sequences]), 0.4
+    )
+
+
+def walks(*lengths):
+    rng = np.random.default_rng(0)
+    return [rng.normal(size=(length + 1, 2)) for length in lengths]
+
+
+def test_independent_pairs_are_held_out_at_random():
+    pairs = pendulum_pairs(400)
+    training, held_out = selection._split(pairs, seed=3)
+    assert np.array_equal(np.sort(np.concatenate([training, held_out])), np.arange(400))
+    assert len(held_out) == 40
+    assert np.ptp(held_out) > 300
+    assert np.array_equal(held_out, selection._split(pairs, seed=3)[1])
+    assert not np.array_equal(held_out, selection._split(pairs, seed=4)[1])
+
+
+@pytest.mark.parametrize("lengths", [(20,) * 30, (7, 1, 40, 3, 12) * 10])
+def test_whole_sequences_are_held_out(lengths):
+    pairs = in_sequence(*walks(*lengths))
+    sequence = np.repeat(np.arange(len(lengths)), lengths)
+    training, held_out = selection._split(pairs, seed=1)
+    assert np.array_equal(np.sort(np.concatenate([training, held_out])), np.arange(len(pairs)))
+    assert not set(sequence[training]) & set(sequence[held_out])
+    assert 0.1 * len(pairs) <= len(held_out) < 0.2 * len(pairs)
+    assert np.array_equal(held_out, selection._split(pairs, seed=1)[1])
+    assert not np.array_equal(held_out, selection._split(pairs, seed=2)[1])
+
+
+@pytest.mark.parametrize("lengths", [(1_000,), (16,), (700, 5, 5), (300, 300)])
+def test_of_long_sequences_blocks_in_time_are_held_out(lengths):
+    pairs = in_sequence(*walks(*lengths))
+    training, held_out = selection._split(pairs, seed=1)
+    blocks = np.split(np.sort(held_out), np.flatnonzero(np.diff(np.sort(held_out)) > 1) + 1)
+    assert len(held_out) / len(blocks) >= 4
+    assert len(training) > 0.6 * len(pairs)
+    assert not set(training) & set(held_out)
+    states = {tuple(z) for z in np.concatenate([pairs.z0[held_out], pairs.z1[held_out]])}
+    assert not states & {tuple(z) for z in np.concatenate([pairs.z0[training], pairs.z1[training]])}
 
 
 # The choice
@@ -234,15 +284,38 @@ def test_a_base_map_is_found_where_it_is_needed():
     assert fit.symplecticity_defect < 1e-12
 
 
-def test_noise_is_not_learned():
+SIGMA = 1e-3
+
+
+@pytest.fixture(scope="module")
+def noisy_pairs():
+    pairs = pendulum_pairs(1_000)
+    noise = SIGMA * np.random.default_rng(7).normal(size=(2, *pairs.z0.shape))
+    return gfnn.Pairs(pairs.z0 + noise[0], pairs.z1 + noise[1], 0.4)
+
+
+@pytest.fixture(scope="module")
+def noisy_fit(noisy_pairs):
+    with pytest.warns(gfnn.FitWarning, match="carry noise"):
+        return gfnn.fit(noisy_pairs, tolerance=1e-18)
+
+
+def test_noise_is_told_in_the_units_of_each_coordinate(noisy_pairs, noisy_fit):
+    """The choice, and whether there is noise, do not depend on units; how much is in those."""
+    unit = np.array([1e9, 1e-9])
+    z0, z1 = noisy_pairs.z0 * unit[None, :], noisy_pairs.z1 * unit[None, :]
+    other = quiet_fit(gfnn.Pairs(z0, z1, 60 * 0.4), tolerance=1e-18)
+    assert other.noise is not None
+    np.testing.assert_allclose(other.noise / unit, noisy_fit.noise, rtol=1e-6)
+    labels = [[(c.chart, c.label) for c in fit.candidates] for fit in (other, noisy_fit)]
+    assert labels[0] == labels[1]
+
+
+def test_noise_is_not_learned(noisy_fit):
     """Noise of size σ leaves an error of order σ, a symplectic map and bounded rollouts."""
-    sigma, pairs = 1e-3, pendulum_pairs(1_000)
-    noise = sigma * np.random.default_rng(7).normal(size=(2, *pairs.z0.shape))
-    noisy = gfnn.Pairs(pairs.z0 + noise[0], pairs.z1 + noise[1], 0.4)
-    with pytest.warns(gfnn.FitWarning):
-        fit = gfnn.fit(noisy, tolerance=1e-8)
+    sigma, fit = SIGMA, noisy_fit
     assert fit.noise is not None
-    assert 0.5 * sigma < fit.noise < 2 * sigma
+    assert np.all((0.5 * sigma < fit.noise) & (fit.noise < 2 * sigma))
     z = disc(500, radius=0.9, seed=8)
     assert rms(fit.map, z, pendulum(z)) < sigma
     assert fit.symplecticity_defect < 1e-13
