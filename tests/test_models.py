@@ -12,7 +12,7 @@ from gfnn_jax import models
 from gfnn_jax.charts import CHARTS, MIDPOINT, TYPE2, AnyChart
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.domain import covering
-from gfnn_jax.io import InputError
+from gfnn_jax.errors import InputError
 from gfnn_jax.maps import Affine, Generated, SymplecticMap
 from gfnn_jax.scalars.inputs import box_inputs
 from gfnn_jax.scalars.mlp import Mlp
