@@ -262,12 +262,32 @@ def read_report(folder):
     return report
 
 
+def csv_file(path, sequences, header):
+    """Plain Python: sequences (M, L, 2d), every bit of every number."""
+    rows = [
+        ",".join(map(repr, (i, DT * n, *z)))
+        for i, sequence in enumerate(sequences.tolist())
+        for n, z in enumerate(sequence)
+    ]
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
 @pytest.mark.parametrize(
-    ("num_pairs", "tolerance"), [(400, 3e-2), pytest.param(6_000, 1e-5, marks=pytest.mark.slow)]
+    ("suffix", "num_pairs", "tolerance", "num_steps"),
+    [
+        ("npz", 400, 3e-2, 100),
+        pytest.param("npz", 6_000, 1e-5, 1_000, marks=pytest.mark.slow),
+        pytest.param("csv", 6_000, 1e-5, 1_000, marks=pytest.mark.slow),
+    ],
 )
-def test_pairs_from_plain_numpy(num_pairs, tolerance, tmp_path, capsys):
+def test_pairs_from_plain_numpy(suffix, num_pairs, tolerance, num_steps, tmp_path, capsys):
     """Kepler orbits that know nothing of the package: fit, then predict, as good as promised."""
-    data = pairs_file(tmp_path / "d.npz", kepler_orbits(num_pairs, [0, DT]))
+    data, orbits = tmp_path / f"d.{suffix}", kepler_orbits(num_pairs, [0, DT])
+    if suffix == "npz":
+        pairs_file(data, orbits)
+    else:
+        csv_file(data, orbits, "sequence,t,q1,q2,p1,p2")
     assert gfnn("fit", data, "--out", tmp_path / "m", "--tolerance", tolerance) == 0
     assert f"candidates for tolerance {tolerance:g}" in capsys.readouterr().out
     report = read_report(tmp_path / "m")
@@ -277,7 +297,6 @@ def test_pairs_from_plain_numpy(num_pairs, tolerance, tmp_path, capsys):
     assert report["fit"]["validation_rms"] <= tolerance
     assert report["map"]["symplecticity_defect"] <= 1e-12
 
-    num_steps = 100
     orbits = kepler_orbits(20, DT * np.arange(num_steps + 1), seed=1)
     np.save(tmp_path / "z0.npy", orbits[:, 0])
     assert gfnn("predict", tmp_path / "m", "--initial", tmp_path / "z0.npy", "--num-steps",
@@ -293,14 +312,8 @@ def test_pairs_from_plain_numpy(num_pairs, tolerance, tmp_path, capsys):
 
 
 def test_fit_of_csv(tmp_path):
-    times = DT * np.arange(4)
-    rows = [
-        f"{i},{t!r},{q!r},{p!r}"
-        for i, sequence in enumerate(oscillator(60, times).tolist())
-        for t, (q, p) in zip(times.tolist(), sequence, strict=True)
-    ]
-    data = tmp_path / "d.csv"
-    data.write_text("\n".join(["sequence,t,q1 [m],p1", *rows]) + "\n")
+    sequences = oscillator(60, DT * np.arange(4))
+    data = csv_file(tmp_path / "d.csv", sequences, "sequence,t,q1 [m],p1")
     assert gfnn("fit", data, "--out", tmp_path / "m", "--chart", "midpoint") == 0
     report = read_report(tmp_path / "m")
     assert report["data"]["num_pairs"] == 180
