@@ -22,9 +22,8 @@ from gfnn_jax.charts import Chart, TypeOne
 from gfnn_jax.checkpoints import load_model, save_model
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.domain import Domain
-from gfnn_jax.errors import InputError
+from gfnn_jax.io import InputError, ensure_new
 from gfnn_jax.maps import Affine, Generated, SymplecticMap
-from gfnn_jax.outputs import ensure_new
 from gfnn_jax.scalars.inputs import Inputs
 from gfnn_jax.scalars.mlp import Mlp
 from gfnn_jax.scalars.products import Products
