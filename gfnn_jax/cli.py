@@ -1,4 +1,4 @@
-"""The command line: ``gfnn scenes | run | fit | predict``.
+"""The command line: ``gfnn scenes | run | fit | predict | compare``.
 
 Exit status 0 on success, 2 on bad usage or bad input, 1 on a failure during the work, 130 on
 Ctrl-C and 143 on SIGTERM, each but the first with one line that says why. Nothing heavy is
@@ -109,6 +109,24 @@ def _parser() -> argparse.ArgumentParser:
         help="what to do where a trajectory leaves the data's domain (default %(default)s)",
     )  # fmt: skip
     _add_output_options(command)
+
+    command = commands.add_parser(
+        "compare", help="the same data through other methods",
+        description="A scene learned by GFNN and by the methods that the paper compares with.",
+    )  # fmt: skip
+    command.set_defaults(command=_compare)
+    command.add_argument("scene", metavar="SCENE", help="a name that `gfnn scenes` lists")
+    command.add_argument(
+        "--methods", type=_names, default=(), metavar="A,B", help="default: all that apply"
+    )
+    command.add_argument("--out", type=Path, metavar="DIR", help="default runs/compare-SCENE")
+    command.add_argument("--quick", action="store_true", help="fewer pairs, a cap of 2 s")
+    command.add_argument("--seed", type=_seed, default=0, metavar="N")
+    command.add_argument(
+        "--cap", type=_positive, metavar="SECONDS",
+        help="most training time of a method (default 60)",
+    )  # fmt: skip
+    _add_output_options(command)
     return parser
 
 
@@ -159,6 +177,10 @@ def _check_exists(path: Path) -> None:
     except OSError as error:  # a name too long, a folder that may not be entered
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     raise InputError(f"{path}: no such file or folder")
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(","))
 
 
 def _indices(text: str) -> tuple[int, ...]:
@@ -234,6 +256,29 @@ def _predict(arguments: argparse.Namespace) -> None:
     print(f"{arguments.out}: {num_lanes} trajectories of {arguments.num_steps} steps, "
           f"{predicted.seconds:.1f} s")  # fmt: skip
     _print_status(predicted.status, predicted.left_at)
+
+
+def _compare(arguments: argparse.Namespace) -> None:
+    out = arguments.out or Path("runs") / f"compare-{arguments.scene}"
+    if not arguments.resume:
+        ensure_new(out, arguments.overwrite, folder=True)
+    _set_up_jax()
+    from gfnn_jax import comparison
+
+    with _progress() as say:
+        compared = comparison.compare(
+            arguments.scene, methods=arguments.methods, out=out, quick=arguments.quick,
+            seed=arguments.seed, cap=arguments.cap, overwrite=arguments.overwrite,
+            resume=arguments.resume, say=say,
+        )  # fmt: skip
+    if compared is None:
+        print(f"{out}: is there already, from this very job")
+        return
+    from rich.console import Console
+
+    wide = Console() if sys.stdout.isatty() else Console(width=120)
+    wide.print(comparison.table(compared.report))
+    print(f"written to {out}")
 
 
 def _summarise(ran: Any, out: Path) -> None:

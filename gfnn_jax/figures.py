@@ -201,6 +201,25 @@ def coordinates_against_time(
 
 
 @style()
+def coordinates_in_two_panels(times, reference, predictions: Mapping, labels, window) -> Figure:
+    """Two coordinates of an orbit over each other: reference two of (L,), predictions name -> two.
+
+    The legend stands once, above both panels; see `coordinates_against_time`.
+    """
+    figure = Figure(figsize=(WIDTH * 1.6, HEIGHT * 1.5))
+    axes = figure.subplots(2, 1, sharex=True)
+    for i, ax in enumerate(axes):
+        both = {name: values[i] for name, values in predictions.items()}
+        coordinates_against_time(times, reference[i], both, labels[i], window, ax=ax)
+        low, high = np.nanmin(reference[i]), np.nanmax(reference[i])
+        margin = 0.3 * (high - low)
+        ax.set_ylim(low - margin, high + margin)  # what runs away leaves the frame
+    axes[0].set_xlabel("")
+    axes[1].get_legend().remove()
+    return figure
+
+
+@style()
 def phase_portrait(orbits: Mapping, labels=("$q$", "$p$"), modulo=False, ax=None) -> Axes:
     """Orbits over each other: name -> (x (N,), y (N,)); the one named "reference" in black.
 
@@ -300,6 +319,17 @@ def marginals(reference, samples: Mapping, bins: int, range, label, ax=None) -> 
     ax.set(xlabel=label, ylabel=f"density ({bins} bins)", xlim=range)
     _legend_above(ax, ncols=2)
     return ax
+
+
+@style()
+def marginal_panels(panels: Mapping, bins: int) -> Figure:
+    """Histograms side by side: label -> (reference (M,), name -> samples (N,), range)."""
+    figure = Figure(figsize=(WIDTH * len(panels), HEIGHT * 1.3))
+    for ax, (label, (reference, samples, limits)) in zip(
+        np.ravel(figure.subplots(1, len(panels))), panels.items(), strict=True
+    ):
+        marginals(reference, samples, bins, limits, label, ax=ax)
+    return figure
 
 
 # Cost and training

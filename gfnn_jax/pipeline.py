@@ -39,7 +39,7 @@ REPORT, MODEL = "report.json", "model"
 NUM_STEPS, NUM_TRAJECTORIES = 1_000, 100
 
 # Of a linear family: pairs, and a tolerance that is close to the best that they allow.
-_LINEAR: dict[str, tuple[int, float]] = {
+LINEAR: dict[str, tuple[int, float]] = {
     "two-body": (4_000, 1e-10),
     "henon-heiles-regular": (4_000, 1e-12),
     "henon-heiles-chaotic": (8_000, 1e-10),
@@ -50,7 +50,7 @@ _LINEAR: dict[str, tuple[int, float]] = {
 }
 # Of a network: pairs, tolerance, iterations; and of a quick look.
 _NETWORK, _NETWORK_QUICK = (6_000, 1e-6, 250), (3_000, 1e-5, 60)
-_QUICK_PAIRS, _QUICK_TRAJECTORIES, _QUICK_TOLERANCE = 4_000, 25, 1e-7
+QUICK_PAIRS, QUICK_TRAJECTORIES, QUICK_TOLERANCE = 4_000, 25, 1e-7
 
 # A larger file is never in memory whole: candidates are chosen on a sample of its pairs, and the
 # chosen one is fitted to all of them chunk by chunk.
@@ -99,18 +99,18 @@ def run(
     quick: fewer pairs and rollouts, a tolerance of 1e-7 at best. resume: None where ``out`` is
     this very job, done.
     """
-    scene = _scene(name, dt)
+    scene = scene_named(name, dt)
     if scalar == "features" and scene.features is None:
         raise InputError(f"scalar 'features': the scene {name} declares none")
     iterations = None
     if scalar == "mlp":
         num_pairs, default, iterations = _NETWORK_QUICK if quick else _NETWORK
     else:
-        num_pairs, default = _LINEAR[name]
+        num_pairs, default = LINEAR[name]
         if quick:
-            num_pairs, default = min(num_pairs, _QUICK_PAIRS), max(default, _QUICK_TOLERANCE)
+            num_pairs, default = min(num_pairs, QUICK_PAIRS), max(default, QUICK_TOLERANCE)
     tolerance = default if tolerance is None else tolerance
-    num_trajectories = _QUICK_TRAJECTORIES if quick else NUM_TRAJECTORIES
+    num_trajectories = QUICK_TRAJECTORIES if quick else NUM_TRAJECTORIES
     job = {
         "command": "run", "scene": name, "dt": scene.dt, "seed": seed, "chart": chart,
         "scalar": scalar, "tolerance": tolerance, "num_pairs": num_pairs, "quick": quick,
@@ -132,10 +132,10 @@ def run(
         say(f"reference trajectories of {NUM_STEPS} steps")
         reference = np.asarray(reference_trajectories(scene, z0, NUM_STEPS))
         say(f"rollouts of {NUM_STEPS} steps")
-        measured = _measure(fit.map, scene, z0, reference)
+        measured = measure(rolled_out(fit.map, z0), scene, reference)
         result = report.assemble(
             fit, scene=name, dt=scene.dt, seed=seed, rollout=measured.report,
-            data={"source": "reference data of the scene", "digest": _digest(pairs)},
+            data={"source": "reference data of the scene", "digest": pairs_digest(pairs)},
         )  # fmt: skip
         say("figures")
         with atomic_folder(out) as folder:
@@ -146,7 +146,15 @@ def run(
     return Ran(fit, out, result)
 
 
-class _Measured(NamedTuple):
+class Rollouts(NamedTuple):
+    """States (B, L, 2d), status (B,), and how long they took, without compilation."""
+
+    states: np.ndarray
+    status: np.ndarray
+    seconds: float
+
+
+class Measured(NamedTuple):
     """Rollouts of the test states (B, L, 2d), their errors (B, L), and the report's part."""
 
     steps: np.ndarray
@@ -156,33 +164,39 @@ class _Measured(NamedTuple):
     report: dict[str, Any]
 
 
-def _measure(map_: SymplecticMap, scene: Scene, z0, reference) -> _Measured:
-    states, info = jax.block_until_ready(map_.rollout(z0, NUM_STEPS))  # compiles
+def rolled_out(map_: SymplecticMap, z0) -> Rollouts:
+    """``NUM_STEPS`` steps from z0 (B, 2d), twice: the first time compiles."""
+    jax.block_until_ready(map_.rollout(z0, NUM_STEPS))
     started = time.perf_counter()
     states, info = jax.block_until_ready(map_.rollout(z0, NUM_STEPS))
-    seconds = time.perf_counter() - started
-    predicted, steps = np.asarray(states), np.arange(NUM_STEPS + 1)
-    error = metrics.position_error(predicted, reference, _angles_of_z(scene))
+    return Rollouts(np.asarray(states), np.asarray(info.status), time.perf_counter() - started)
+
+
+def measure(rollouts: Rollouts, scene: Scene, reference) -> Measured:
+    """Errors against the reference (B, L, 2d), energy and growth: the same for every method."""
+    predicted, steps = rollouts.states, np.arange(NUM_STEPS + 1)
+    error = metrics.position_error(predicted, reference, angles_of_z(scene))
     energy, drift = None, None
     hamiltonian = scene.invariants.get("energy", scene.hamiltonian)
     if hamiltonian is not None:
-        energy = metrics.energy_error(jax.vmap(jax.vmap(hamiltonian))(states))
+        energy = metrics.energy_error(jax.vmap(jax.vmap(hamiltonian))(jnp.asarray(predicted)))
         drift = metrics.energy_drift(steps, energy)
     growth = metrics.growth_exponent(steps, error) if scene.regular else None
     part = report.rollout_part(
-        num_trajectories=len(predicted), num_steps=NUM_STEPS, seconds=seconds, status=info.status,
-        statistics=metrics.error_statistics(error), growth=growth, drift=drift,
+        num_trajectories=len(predicted), num_steps=NUM_STEPS, seconds=rollouts.seconds,
+        status=rollouts.status, statistics=metrics.error_statistics(error), growth=growth,
+        drift=drift,
     )  # fmt: skip
-    return _Measured(steps, predicted, error, energy, part)
+    return Measured(steps, predicted, error, energy, part)
 
 
-def _angles_of_z(scene: Scene) -> tuple[int, ...]:
+def angles_of_z(scene: Scene) -> tuple[int, ...]:
     """Indices of the user's coordinates that are angles."""
     coordinates = scene.coordinates
     return coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
 
 
-def _figures(fit: Fit, scene: Scene, measured: _Measured, reference) -> dict[str, Any]:
+def _figures(fit: Fit, scene: Scene, measured: Measured, reference) -> dict[str, Any]:
     """The scene's figures by file name."""
     steps, predicted = measured.steps, measured.predicted
     drawn = {"error": figures.error_growth({"GFNN": (steps, measured.error)})}
@@ -249,7 +263,7 @@ def fit(
     scene_name: lends its coordinates and features. resume: None where ``out`` is this very job,
     done.
     """
-    scene = _scene(scene_name, None) if scene_name is not None else None
+    scene = scene_named(scene_name, None) if scene_name is not None else None
     large = data.is_file() and data.stat().st_size > _LARGE_BYTES
     trajectories = (read_sample if large else read_trajectories)(data, dt=dt)
     job = {
@@ -284,7 +298,7 @@ def fit(
     return Ran(chosen, out, result)
 
 
-def _scene(name: str, dt: float | None) -> Scene:
+def scene_named(name: str, dt: float | None) -> Scene:
     try:
         return scenes.make(name, dt)
     except ValueError as error:
@@ -306,7 +320,7 @@ def _record(result: dict[str, Any]) -> dict[str, Any]:
     return report.finite(finite)
 
 
-def _digest(pairs: Pairs) -> str:
+def pairs_digest(pairs: Pairs) -> str:
     digest = hashlib.sha256(np.ascontiguousarray(pairs.z0).data)
     digest.update(np.ascontiguousarray(pairs.z1).data)
     return digest.hexdigest()

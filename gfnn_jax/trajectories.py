@@ -6,6 +6,7 @@ Every key is a ``jax.random.key``; everything is float64 and needs x64 to be on.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 
 import diffrax
@@ -94,6 +95,36 @@ def reference_trajectories(
         scene.hamiltonian,
     )
     return jnp.concatenate([z0[:, None], jnp.moveaxis(saved, 0, 1)], axis=1)
+
+
+def flow_step(field: Callable, dt: float, tolerance: float) -> Callable:
+    """``step(z)``: the state (2d,) one ``dt`` later along ż = field(z), by an adaptive Runge–Kutta
+    method of orders 5 and 4 (Dopri5, also known as RK45).
+
+    What a learned vector field predicts; no reference. Not symplectic beyond ``tolerance``, the
+    local error allowed, absolute and relative. Where it fails the state becomes NaN. Can be
+    differentiated forwards, through the steps that ran.
+    """
+    term = diffrax.ODETerm(lambda t, z, _: field(z))
+    controller = diffrax.PIDController(rtol=tolerance, atol=tolerance)
+
+    def step(z):
+        solution = diffrax.diffeqsolve(
+            term,
+            diffrax.Dopri5(),
+            0.0,
+            dt,
+            None,
+            z,
+            stepsize_controller=controller,
+            max_steps=MAX_SOLVER_STEPS,
+            adjoint=diffrax.ForwardMode(),
+            throw=False,
+        )
+        assert solution.ys is not None  # saved at its end
+        return jnp.where(solution.result == diffrax.RESULTS.successful, solution.ys[-1], jnp.nan)
+
+    return step
 
 
 def reference_error(scene: Scene, z0: States, num_steps: int) -> float:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax.fitting.adam import DEFAULT, PAPER, PAPER_STANDARD_MAP, QUICK, Recipe, adam
+from gfnn_jax.fitting.adam import DEFAULT, PAPER, PAPER_STANDARD_MAP, QUICK, Recipe, adam, minimise
 
 WEIGHT = np.array([0.5, 0.1])
 
@@ -230,6 +230,30 @@ def test_refuses_unknown_schedules_and_sizes():
     for wrong in ({"batch_size": 0}, {"epochs": 0}, {"rate": 0.0}, {"epoch_length": 0}):
         with pytest.raises(ValueError, match="positive"):
             dataclasses.replace(SHORT, **wrong)
+
+
+def test_any_loss_of_a_batch():
+    """The mean of rows (a batch of them all each time) by its squared distances."""
+    rows = np.random.default_rng(3).standard_normal((40, 3))
+    result = minimise(
+        lambda centre, rows: jnp.mean(jnp.sum((rows - centre[None, :]) ** 2, axis=-1)),
+        jnp.zeros(3), (rows,), (rows,), components=3, key=jax.random.key(0),
+        recipe=Recipe(40, epochs=40, epoch_length=10, rate=0.1, schedule="cosine", dtype="float64"),
+    )  # fmt: skip
+    np.testing.assert_allclose(result.params, rows.mean(axis=0), atol=1e-4)
+    expected = np.sqrt(np.mean(rows.var(axis=0)))
+    assert result.validation_rms == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_cap_ends_the_training_and_its_rate():
+    """In time that is short the schedule is gone through faster, and the fit says why it ended."""
+    recipe = dataclasses.replace(SHORT, epochs=10**6, epoch_length=20)
+    result = fit(recipe, cap=0.3)
+    assert result.stopped_because == "the cap of 0.3 s"
+    assert 2 <= result.epochs < 10**6
+    assert result.seconds < 0.6
+    uncapped = fit(dataclasses.replace(recipe, epochs=2), cap=1e6)
+    assert uncapped.stopped_because == "epochs"
 
 
 def test_a_batch_is_never_more_than_the_pairs():

@@ -16,7 +16,7 @@ ORDER = (
     "errors", "phase_space", "coordinates", "scenes", "trajectories", "outputs", "io",
     "predictions", "charts", "domain", "scalars", "checkpoints", "fitting", "implicit", "rollout",
     "maps", "models", "local_maps", "base_map", "preparation", "candidates", "selection",
-    "baselines", "metrics", "figures", "report", "pipeline", "cli", "__main__",
+    "baselines", "metrics", "figures", "report", "pipeline", "comparison", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of a later module imports it when called.
 SHORTHANDS = {("maps", "models")}

@@ -1,11 +1,12 @@
-"""Fit any S(params, w) to wanted gradients by Adam: the paper's training. The one home of optax.
+"""Minimise a loss by Adam, among them the paper's for S(params, w). The one home of optax.
 
-The loss is the paper's (3), a mean over pairs, with a weight for the size of each coordinate:
+`adam` fits S to wanted gradients. Its loss is the paper's (3), a mean over pairs, with a weight for
+the size of each coordinate:
 
     L(θ) = mean of ‖weight · (∇S(θ, w) − wanted)‖²
 
 ``weight = h`` in all entries is the paper's; ``h / scale`` of the conjugate coordinate makes L
-independent of the units of q and p.
+independent of the units of q and p. `minimise` takes any loss of a batch.
 
 An epoch is one compiled scan. Its order of the pairs is a function of the key and the epoch's
 number alone, so that nothing but the state below is needed to go on, and the same key gives the
@@ -96,7 +97,7 @@ class AdamFit(NamedTuple):
     train_rms, validation_rms: of that epoch, per component of weight · (∇S − wanted); the first is
     a mean over its batches, while parameters moved. history: both of every epoch, (epochs,) each.
     seconds: without compilation; with those of the run that was resumed. stopped_because: "epochs",
-    or a sentence that says where numbers ceased to be finite.
+    or words that say that the cap was reached, or where numbers ceased to be finite.
     """
 
     params: Any
@@ -121,6 +122,7 @@ def adam(
     on_epoch: Callable[[int, float, float], Any] | None = None,
     checkpoint: Callable[[int, dict[str, Any]], Any] | None = None,
     resume: dict[str, Any] | None = None,
+    cap: float | None = None,
 ) -> AdamFit:
     """Minimise L over train = (w, wanted), each (N, 2d).
 
@@ -128,31 +130,12 @@ def adam(
     params:     any pytree of floating-point arrays: the start.
     validation: (w, wanted) of pairs kept apart.
     weight:     (2d,).
-    key:        a ``jax.random.key``; decides the order of the pairs.
-    on_epoch:   called with (epochs done, train_rms, validation_rms) after each epoch.
-    checkpoint: called with (epochs done, state) after each epoch, to save the state: dicts and
-                lists of NumPy arrays and numbers (and the containers of ``params``). Given back as
-                ``resume`` the fit goes on as though it had never stopped, bit for bit on one
-                device; ``params`` then only lends its structure.
-
-    An interrupt (Ctrl-C) passes through; the last state given to ``checkpoint`` is whole.
-    Raises ValueError where shapes do not agree or data, parameters or ∇S are not finite at the
-    start, RuntimeError where float64 is asked for and JAX's x64 mode is off. Where numbers cease
-    to be finite later, the fit stops and says so.
+    The other arguments, and what is raised later, are those of `minimise`. Raises ValueError where
+    shapes do not agree or data are not finite.
     """
-    import optax
-
-    dtype = jnp.dtype(recipe.dtype)
-    if dtype == jnp.float64:
-        require_x64("training in float64")
-    params, weight, train, validation = jax.tree.map(
-        lambda a: jnp.array(a, dtype), (params, jnp.asarray(weight), train, validation)
-    )
+    weight = jnp.asarray(weight, recipe.dtype)
+    train, validation = ((jnp.asarray(w), jnp.asarray(wanted)) for w, wanted in (train, validation))
     _check(train, validation, weight)
-    num_pairs, batch_size = len(train[0]), min(recipe.batch_size, len(train[0]))
-    length = recipe.epoch_length or num_pairs // batch_size
-    optimizer = optax.adam(lambda k: recipe.rate_at(k, recipe.epochs * length))
-
     gradient = jax.vmap(jax.grad(family, argnums=1), (None, 0))
 
     def loss(params, w, wanted):
@@ -160,44 +143,105 @@ def adam(
         error = weight[None, :] * (gradient(params, w) - wanted)
         return jnp.mean(jnp.sum(error**2, axis=-1))
 
+    return minimise(
+        loss, params, train, validation, components=weight.size, recipe=recipe, key=key,
+        on_epoch=on_epoch, checkpoint=checkpoint, resume=resume, cap=cap,
+    )  # fmt: skip
+
+
+def minimise(
+    loss: Callable,
+    params: Any,
+    train: tuple,
+    validation: tuple,
+    *,
+    components: int,
+    recipe: Recipe,
+    key: Any,
+    on_epoch: Callable[[int, float, float], Any] | None = None,
+    checkpoint: Callable[[int, dict[str, Any]], Any] | None = None,
+    resume: dict[str, Any] | None = None,
+    cap: float | None = None,
+) -> AdamFit:
+    """Minimise ``loss(params, *batch)``, a mean over the rows of a batch, over all rows of train.
+
+    params:     any pytree of floating-point arrays: the start.
+    train, validation: tuples of arrays that agree in their first axis, the rows.
+    components: what a row's loss is a sum of: the errors reported are √(loss / components).
+    key:        a ``jax.random.key``; decides the order of the rows.
+    on_epoch:   called with (epochs done, train_rms, validation_rms) after each epoch.
+    checkpoint: called with (epochs done, state) after each epoch, to save the state: dicts and
+                lists of NumPy arrays and numbers (and the containers of ``params``). Given back as
+                ``resume`` the fit goes on as though it had never stopped, bit for bit on one
+                device; ``params`` then only lends its structure.
+    cap:        seconds after which no epoch is begun, compilation apart. The rate then goes through
+                its whole schedule in the time there is: what the schedule sees is the larger of the
+                share of the epochs and the share of the time that has passed.
+
+    An interrupt (Ctrl-C) passes through; the last state given to ``checkpoint`` is whole.
+    Raises ValueError where the loss is not finite at the start, RuntimeError where float64 is asked
+    for and JAX's x64 mode is off. Where numbers cease to be finite later, the fit stops and says
+    so.
+    """
+    import optax
+
+    dtype = jnp.dtype(recipe.dtype)
+    if dtype == jnp.float64:
+        require_x64("training in float64")
+    params, train, validation = jax.tree.map(
+        lambda a: jnp.array(a, dtype), (params, train, validation)
+    )
+    num_rows, batch_size = len(train[0]), min(recipe.batch_size, len(train[0]))
+    length = recipe.epoch_length or num_rows // batch_size
+    optimizer = optax.scale_by_adam()
+
+    def rates(epoch, seconds):
+        """The rate of each iteration of an epoch: (length,)."""
+        passed = max(epoch / recipe.epochs, seconds / cap if cap else 0.0)
+        first = round(passed * recipe.epochs * length)
+        with jax.numpy_dtype_promotion("standard"):
+            return recipe.rate_at(first + jnp.arange(length), recipe.epochs * length).astype(dtype)
+
     def order(epoch):
-        """The pairs of each batch (length, batch_size): permutations in a row that fill the epoch.
+        """The rows of each batch (length, batch_size): permutations in a row that fill the epoch.
 
         By NumPy: XLA permutes by sorting, which on a CPU takes as long as a small network's epoch.
         """
         seed = jax.random.key_data(jax.random.fold_in(key, epoch))
         random = np.random.default_rng(np.asarray(seed))
-        in_pass = num_pairs // batch_size
+        in_pass = num_rows // batch_size
         passes = [
-            random.permutation(num_pairs)[: in_pass * batch_size].reshape(in_pass, batch_size)
+            random.permutation(num_rows)[: in_pass * batch_size].reshape(in_pass, batch_size)
             for _ in range(-(-length // in_pass))
         ]
         return np.concatenate(passes)[:length].astype(np.int32)
 
-    def run_epoch(carry, batches, w, wanted):
-        def iterate(carry, batch):
-            params, state = carry
-            value, slope = jax.value_and_grad(loss)(params, *batch)
+    def run_epoch(carry, batches, rates, *rows):
+        def iterate(carry, chosen):
+            (params, state), (batch, rate) = carry, chosen
+            value, slope = jax.value_and_grad(loss)(params, *(array[batch] for array in rows))
             with jax.numpy_dtype_promotion("standard"):  # optax counts in int32
-                updates, state = optimizer.update(slope, state, params)
+                direction, state = optimizer.update(slope, state, params)
+            updates = jax.tree.map(lambda a: -rate * a, direction)
             return (optax.apply_updates(params, updates), state), value
 
-        carry, values = jax.lax.scan(iterate, carry, (w[batches], wanted[batches]))
+        carry, values = jax.lax.scan(iterate, carry, (batches, rates))
         return carry, jnp.mean(values)
 
     started = time.perf_counter()
     carry = (params, optimizer.init(params))
-    run_epoch = jax.jit(run_epoch, donate_argnums=0).lower(carry, order(0), *train).compile()
+    run_epoch = jax.jit(run_epoch, donate_argnums=0)
+    run_epoch = run_epoch.lower(carry, order(0), rates(0, 0.0), *train).compile()
     validate = jax.jit(loss).lower(params, *validation).compile()
     compile_seconds = time.perf_counter() - started
 
     def rms(value):
-        return math.sqrt(float(value) / weight.size)
+        return math.sqrt(float(value) / components)
 
     if resume is None:
         start = rms(validate(params, *validation))
         if not math.isfinite(start):
-            raise ValueError("∇S(params, w) is not finite on the validation pairs at the start")
+            raise ValueError("the loss is not finite on the validation rows at the start")
         epoch, seconds = 0, 0.0
         best = {"params": _copied(params), "train_rms": math.nan, "validation_rms": start}
         history: dict[str, list[float]] = {"train_rms": [], "validation_rms": []}
@@ -209,8 +253,11 @@ def adam(
 
     stopped_because = "epochs"
     while epoch < recipe.epochs:
+        if cap is not None and epoch > 0 and seconds * (1 + 0.5 / epoch) > cap:
+            stopped_because = f"the cap of {cap:g} s"
+            break
         started = time.perf_counter()
-        carry, value = run_epoch(carry, order(epoch), *train)
+        carry, value = run_epoch(carry, order(epoch), rates(epoch, seconds), *train)
         epoch += 1
         now = {"train_rms": rms(value), "validation_rms": rms(validate(carry[0], *validation))}
         seconds += time.perf_counter() - started

@@ -98,11 +98,11 @@ class Mlp:
     def __call__(self, params, w):
         """S(params, w): w (2d,) of any float dtype -> scalar, computed in the dtype of params."""
         dtype = jax.tree.leaves(params)[0].dtype
-        x = self._seen(w).astype(dtype)
+        x = self.seen(w).astype(dtype)
         amplitude = jnp.asarray(self.amplitude, dtype)
         return amplitude * self._network(dtype).apply({"params": params}, x)[0]
 
-    def _seen(self, w):
+    def seen(self, w):
         """What the network sees at w (2d,): (num_inputs,)."""
         x = self.inputs(w)
         angles = np.array(self.inputs.angles, dtype=int)
@@ -110,24 +110,30 @@ class Mlp:
         return jnp.concatenate([x[others], jnp.cos(x[angles]), jnp.sin(x[angles])])
 
     def _network(self, dtype):
-        from flax import linen  # loaded when first used
+        return network(self.num_inputs, self.hidden, 1, self.activation, dtype)
 
-        def dense(fan_in, width, use_bias=True):
-            # A widening layer's columns are short; this brings every unit's input to the size of x.
-            gain = max(1.0, width / fan_in) ** 0.5
-            return linen.Dense(
-                width,
-                use_bias=use_bias,
-                dtype=dtype,
-                param_dtype=dtype,
-                precision=jax.lax.Precision.HIGHEST,  # TF32 costs 7e-4 of ∇S
-                kernel_init=linen.initializers.orthogonal(gain),
-            )
 
-        layers = []
-        for fan_in, width in pairwise((self.num_inputs, *self.hidden)):
-            layers += [dense(fan_in, width), ACTIVATIONS[self.activation]]
-        return linen.Sequential([*layers, dense(self.hidden[-1], 1, use_bias=False)])
+def network(num_inputs: int, hidden: tuple[int, ...], num_outputs: int, activation: str, dtype):
+    """A fully connected network (num_inputs,) -> (num_outputs,): a Flax module. Orthogonal weights,
+    no bias in the last layer."""
+    from flax import linen  # loaded when first used
+
+    def dense(fan_in, width, use_bias=True):
+        # A widening layer's columns are short; this brings every unit's input to the size of x.
+        gain = max(1.0, width / fan_in) ** 0.5
+        return linen.Dense(
+            width,
+            use_bias=use_bias,
+            dtype=dtype,
+            param_dtype=dtype,
+            precision=jax.lax.Precision.HIGHEST,  # TF32 costs 7e-4 of ∇S
+            kernel_init=linen.initializers.orthogonal(gain),
+        )
+
+    layers = []
+    for fan_in, width in pairwise((num_inputs, *hidden)):
+        layers += [dense(fan_in, width), ACTIVATIONS[activation]]
+    return linen.Sequential([*layers, dense(hidden[-1], num_outputs, use_bias=False)])
 
 
 def amplitude_of(w, wanted) -> float:

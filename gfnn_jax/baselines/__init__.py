@@ -1,0 +1,43 @@
+"""The methods that the paper compares with, and one that came after. Each ends in a step function.
+
+`METHODS` names them; each is ``learn(sequences, budget) -> Learned``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+from gfnn_jax.baselines.fields import hnn, vfnn
+from gfnn_jax.baselines.learned import Budget, Learned, Sequences
+from gfnn_jax.baselines.p_sympnet import p_sympnet
+from gfnn_jax.baselines.srnn import o_net, srnn
+from gfnn_jax.baselines.sympnets import g_sympnet, la_sympnet
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """title: as figures and tables show it. length: states in a sequence, 2 for pairs.
+
+    only_coupled: of use only where the system is not separable.
+    """
+
+    title: str
+    learn: Callable[[Sequences, Budget], Learned]
+    length: int = 2
+    only_coupled: bool = False
+
+
+METHODS: dict[str, Method] = {
+    "vfnn": Method("VFNN", vfnn),
+    "hnn": Method("HNN", hnn),
+    "srnn-2": Method("SRNN (2)", srnn),
+    "srnn-5": Method("SRNN (5)", srnn, length=5),
+    "onet-2": Method("O-NET (2)", o_net, only_coupled=True),
+    "onet-5": Method("O-NET (5)", o_net, length=5, only_coupled=True),
+    "la-sympnet": Method("LA-SympNet", la_sympnet),
+    "g-sympnet": Method("G-SympNet", g_sympnet),
+    "p-sympnet": Method("P-SympNet", p_sympnet),
+}
+
+__all__ = ["METHODS", "Budget", "Learned", "Method", "Sequences"]

@@ -1,0 +1,88 @@
+"""Learned vector fields: VFNN without structure, HNN as that of a learned Hamiltonian.
+
+Both learn ż ≈ (z₁ − z₀)/dt, the paper's finite differences, and predict with an adaptive
+Runge–Kutta method. The finite difference is off by dt/2 · z̈, which no network makes good.
+
+HNN: Greydanus, Dzamba & Yosinski, "Hamiltonian Neural Networks", NeurIPS 2019, and their public
+code, greydanus/hamiltonian-nn, experiment-2body: 200-200 tanh, Adam at 1e-3, batches of 200,
+10,000 iterations, RK45. VFNN is their baseline, the same network with 2d outputs. Ours beside that:
+inputs and outputs of unit size, and the rate's decay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.baselines.learned import Budget, Learned, Sequences, periodic, train
+from gfnn_jax.fitting.adam import Recipe
+from gfnn_jax.phase_space import apply_j, sizes
+from gfnn_jax.scalars.inputs import box_inputs
+from gfnn_jax.scalars.mlp import Mlp, amplitude_of, network
+from gfnn_jax.trajectories import flow_step
+
+HIDDEN, ACTIVATION = (200, 200), "tanh"
+RECIPE = Recipe(batch_size=200, epochs=40, epoch_length=250, rate=1e-3, schedule="cosine")
+TOLERANCE = 1e-9  # of a prediction's step, as in their experiments on two bodies
+
+
+def vfnn(sequences: Sequences, budget: Budget) -> Learned:
+    """ż = N(z), a network with 2d outputs."""
+    field, params = network_field(sequences, HIDDEN, budget.key)
+    return _learn_field(field, params, sequences, budget, "vector field 200-200")
+
+
+def hnn(sequences: Sequences, budget: Budget) -> Learned:
+    """ż = J ∇H(z), H a network."""
+    z, velocity = sequences.derivatives()
+    wanted = -np.asarray(apply_j(jnp.asarray(velocity)))  # ∇H
+    inputs = box_inputs(z, angles=q_angles(sequences))
+    family = Mlp(inputs, HIDDEN, ACTIVATION, amplitude_of(z, wanted))
+
+    def field(params, z):
+        return apply_j(jax.grad(family, argnums=1)(params, z))
+
+    params = family.init(budget.key, jnp.float32)
+    return _learn_field(field, params, sequences, budget, "Hamiltonian 200-200")
+
+
+def network_field(sequences: Sequences, hidden: tuple[int, ...], key) -> tuple[Callable, Any]:
+    """``field(params, z)`` -> (2d,), a tanh network of the size of the data, and its start."""
+    z, velocity = sequences.derivatives()
+    inputs, unit = Mlp(box_inputs(z, angles=q_angles(sequences)), hidden), sizes(velocity)
+
+    def net(dtype):
+        return network(inputs.num_inputs, hidden, z.shape[1], ACTIVATION, dtype)
+
+    def field(params, z):
+        dtype = jax.tree.leaves(params)[0].dtype
+        seen = inputs.seen(z).astype(dtype)
+        return jnp.asarray(unit, dtype) * net(dtype).apply({"params": params}, seen)
+
+    start = jnp.zeros(inputs.num_inputs, jnp.float32)
+    return field, net(jnp.float32).init(key, start)["params"]
+
+
+def q_angles(sequences: Sequences) -> tuple[int, ...]:
+    """The angles among the q, which networks see as cosine and sine."""
+    return tuple(i for i in sequences.angles if i < sequences.dim)
+
+
+def _learn_field(field, params, sequences: Sequences, budget: Budget, label: str) -> Learned:
+    lanes = jax.vmap(field, (None, 0))
+
+    def loss(params, z, velocity):
+        return jnp.mean(jnp.sum((lanes(params, z) - velocity) ** 2, axis=-1))
+
+    rows = sequences.derivatives()
+    params, trained = train(loss, params, rows, rows[0].shape[1], RECIPE, budget)
+    # Along a solution the angles need not be reduced again: the field is that of the reduced state.
+    step = periodic(
+        lambda params, z: flow_step(lambda y: field(params, y), sequences.dt, TOLERANCE)(z),
+        sequences.angles,
+    )
+    return Learned(lambda z: step(params, z), params, label, trained)

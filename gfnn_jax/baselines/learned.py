@@ -1,0 +1,123 @@
+"""What every baseline shares: sequences to learn from, a training of a map, what comes out.
+
+A baseline ends in a step function z -> Z of one state (2d,), q first, which `gfnn_jax.rollout`
+rolls out. It learns in float32, as the public codes do, and predicts in the dtype of the state.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.coordinates import TWO_PI
+from gfnn_jax.fitting.adam import AdamFit, Recipe, minimise
+
+HELD = 2_000  # rows that validate, at most a tenth of all
+
+
+@dataclasses.dataclass(frozen=True)
+class Sequences:
+    """States (N, L, 2d) that are one ``dt`` apart, float64; L = 2 makes pairs.
+
+    angles: indices of z with period 2π for the map; z[:, 0] is reduced, the rest is continuous.
+    separable: whether the system may be taken as H = T(p) + V(q).
+    """
+
+    z: np.ndarray
+    dt: float
+    angles: tuple[int, ...] = ()
+    separable: bool = True
+
+    @property
+    def dim(self) -> int:
+        """Degrees of freedom d."""
+        return self.z.shape[-1] // 2
+
+    @property
+    def num_pairs(self) -> int:
+        """States whose image is known."""
+        return self.z.shape[0] * (self.z.shape[1] - 1)
+
+    def derivatives(self) -> tuple[np.ndarray, np.ndarray]:
+        """z and ż ≈ (z₁ − z₀)/dt, both (pairs, 2d): the paper's first-order finite differences."""
+        z0, z1 = self.z[:, :-1], self.z[:, 1:]
+        width = self.z.shape[-1]
+        return z0.reshape(-1, width), ((z1 - z0) / self.dt).reshape(-1, width)
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """key: a ``jax.random.key``. cap: most seconds of training, compilation apart; None: no cap.
+
+    say: called with a line on the progress of the training.
+    """
+
+    key: Any
+    cap: float | None = None
+    say: Callable[[str], Any] = lambda message: None
+
+
+class Learned(NamedTuple):
+    """step: z (2d,) -> Z. params: float64. training: how it went; its errors are of its loss."""
+
+    step: Callable
+    params: Any
+    label: str
+    training: AdamFit
+
+    @property
+    def num_parameters(self) -> int:
+        return sum(leaf.size for leaf in jax.tree.leaves(self.params))
+
+
+def periodic(step: Callable, angles: tuple[int, ...]) -> Callable:
+    """``step(params, z)`` evaluated at the image of z in [0, 2π), where the data were."""
+    if not angles:
+        return step
+    index = np.array(angles)
+
+    def wrapped(params, z):
+        turns = TWO_PI * jnp.floor(z[index] / TWO_PI)
+        return step(params, z.at[index].add(-turns)).at[index].add(turns)
+
+    return wrapped
+
+
+def train(
+    loss: Callable, params: Any, rows: tuple, components: int, recipe: Recipe, budget: Budget
+) -> tuple[Any, AdamFit]:
+    """Minimise ``loss(params, *batch)``; the first rows are kept apart. (params in float64, how)"""
+    held = min(HELD, len(rows[0]) // 10)
+    trained = minimise(
+        loss, params, tuple(r[held:] for r in rows), tuple(r[:held] for r in rows),
+        components=components, recipe=recipe, key=budget.key, cap=budget.cap,
+        on_epoch=lambda epoch, _, rms: budget.say(f"epoch {epoch}: error {rms:.1e}"),
+    )  # fmt: skip
+    return jax.tree.map(lambda a: jnp.asarray(a, float), trained.params), trained
+
+
+def learn_map(
+    step: Callable, params: Any, sequences: Sequences, recipe: Recipe, budget: Budget, label: str
+) -> Learned:
+    """Fit ``step(params, z) -> Z``, applied again and again, to all states of the sequences.
+
+    The loss is the squared distance, averaged over the states of a sequence but its first.
+    """
+    step = periodic(step, sequences.angles)
+
+    def loss(params, z):
+        def advance(now, wanted):
+            now = jax.vmap(step, (None, 0))(params, now)
+            return now, jnp.mean(jnp.sum((now - wanted) ** 2, axis=-1))
+
+        _, errors = jax.lax.scan(advance, z[:, 0], jnp.moveaxis(z[:, 1:], 1, 0))
+        return jnp.mean(errors)
+
+    width = sequences.z.shape[-1]
+    params, trained = train(loss, params, (sequences.z,), width, recipe, budget)
+    return Learned(lambda z: step(params, z), params, label, trained)

@@ -1,0 +1,67 @@
+"""The paper's own recipe for GFNN: its network as S, type 2, trained by Adam.
+
+Chen & Tao, ICML 2021, "Experimental Details": hidden layers 200-100-50-20 and batches of 200 from a
+rate of 0.01; for the standard map 500-500-200-20 and batches of 1,000 from 0.001; 20 passes through
+the pairs. The step is solved to roundoff, as everywhere here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.baselines.fields import q_angles
+from gfnn_jax.baselines.learned import HELD, Budget, Sequences
+from gfnn_jax.charts import TYPE2
+from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.domain import covering
+from gfnn_jax.fitting.adam import PAPER, PAPER_STANDARD_MAP, AdamFit, adam
+from gfnn_jax.maps import Generated, SymplecticMap
+from gfnn_jax.phase_space import sizes
+from gfnn_jax.scalars.inputs import box_inputs
+from gfnn_jax.scalars.mlp import PAPER_HIDDEN, PAPER_HIDDEN_STANDARD_MAP, Mlp, amplitude_of
+
+_PART = 50  # iterations between looks at the clock
+_MOST_STATES = 20_000  # that describe the domain
+
+
+class PaperGfnn(NamedTuple):
+    """map: in the user's own coordinates. family: the network. training: of ∇S."""
+
+    map: SymplecticMap
+    family: Mlp
+    training: AdamFit
+
+
+def paper_gfnn(pairs: Sequences, budget: Budget) -> PaperGfnn:
+    """Learn S(q, P) from pairs; with periodic coordinates by the standard map's recipe."""
+    hidden, recipe = PAPER_HIDDEN, PAPER
+    if pairs.angles:
+        hidden, recipe = PAPER_HIDDEN_STANDARD_MAP, PAPER_STANDARD_MAP
+    z0, z1 = jnp.asarray(pairs.z[:, 0]), jnp.asarray(pairs.z[:, 1])
+    w, wanted = TYPE2.point(z0, z1), TYPE2.wanted(z0, z1, pairs.dt)
+    family = Mlp(
+        box_inputs(w, angles=q_angles(pairs)), hidden, "tanh", amplitude_of(w, wanted)
+    )  # fmt: skip
+    held = min(HELD, len(w) // 10)
+    iterations = recipe.epochs * (len(w) // recipe.batch_size)
+    recipe = dataclasses.replace(recipe, epochs=max(1, iterations // _PART), epoch_length=_PART)
+    training = adam(
+        family, family.init(budget.key, jnp.float32), (w[held:], wanted[held:]),
+        (w[:held], wanted[:held]), pairs.dt * np.ones(2 * pairs.dim), recipe=recipe,
+        key=budget.key, cap=budget.cap,
+        on_epoch=lambda epoch, _, rms: budget.say(f"{epoch * _PART} iterations: error {rms:.1e}"),
+    )  # fmt: skip
+    params = jax.tree.map(lambda a: jnp.asarray(a, float), training.params)
+    scale = jnp.asarray(sizes(z0))
+    flat = jnp.zeros((2 * pairs.dim, 2 * pairs.dim))
+    generated = Generated(family, params, TYPE2, pairs.dt, scale, flat, flat[0])
+    coordinates = Coordinates("cartesian", angles=pairs.angles)
+    cut = jnp.full(len(pairs.angles), np.pi)  # z0 is in [0, 2π)
+    domain = covering(z0[:_MOST_STATES], ignore=pairs.angles)
+    map_ = SymplecticMap((generated,), coordinates, domain, scale, cut, pairs.dt)
+    return PaperGfnn(map_, family, training)

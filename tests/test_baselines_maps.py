@@ -1,0 +1,154 @@
+"""Baselines whose step is an explicit map: SympNets, P-SympNet, SRNN's integrators."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gfnn_jax.baselines.p_sympnet import p_init, p_step
+from gfnn_jax.baselines.srnn import leapfrog, tao
+from gfnn_jax.baselines.sympnets import g_init, g_step, la_init, la_step
+from gfnn_jax.phase_space import apply_j, split, symplecticity_defect
+from gfnn_jax.scenes import henon_heiles, pcr3bp
+from gfnn_jax.trajectories import reference_trajectories, sample_states
+
+DT = 0.1
+STATES = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (20, 4)))
+
+
+def roughened(params, seed=1):
+    """Float64 parameters far from the small ones that a training starts with."""
+    rng = np.random.default_rng(seed)
+    return jax.tree.map(
+        lambda a: jnp.asarray(a, float) + 0.3 * rng.standard_normal(a.shape), params
+    )
+
+
+def largest_defect(step, states):
+    return float(jnp.max(symplecticity_defect(jax.vmap(jax.jacfwd(step))(states))))
+
+
+KEY = jax.random.key(0)
+SYMPLECTIC = {
+    "la": (la_step, la_init(KEY, 2, 6, 4)),
+    "g": (g_step, g_init(KEY, 2, 7, 9)),
+    "p": (lambda params, z: p_step(params, z, DT), p_init(KEY, 2, 7, 3)),
+}
+
+
+@pytest.mark.parametrize("name", SYMPLECTIC)
+def test_symplectic_whatever_the_parameters(name):
+    step, params = SYMPLECTIC[name]
+    params = roughened(params)
+    moved = jax.vmap(lambda z: step(params, z))(STATES) - STATES
+    assert float(jnp.max(jnp.abs(moved))) > 0.1  # not the identity
+    size = float(jnp.max(jnp.abs(jax.vmap(jax.jacfwd(lambda z: step(params, z)))(STATES))))
+    assert largest_defect(lambda z: step(params, z), STATES) < 1e-14 * size**2
+
+
+def test_la_module_by_module():
+    """A state through the paper's shears one after another, written out (their eqs. of LA)."""
+    params = roughened(la_init(KEY, 2, 3, 4))
+    q, p = np.array(STATES[0, :2]), np.array(STATES[0, 2:])
+    for i in range(3):
+        for j, half in enumerate(np.asarray(params["half"][i])):
+            if j % 2 == 0:
+                p = p + (half + half.T) @ q
+            else:
+                q = q + (half + half.T) @ p
+        q, p = q + params["shift"][i, :2], p + params["shift"][i, 2:]
+        if i < 2:
+            active = np.asarray(params["active"][i])
+            if i % 2 == 0:
+                p = p + active / (1 + np.exp(-q))
+            else:
+                q = q + active / (1 + np.exp(-p))
+    np.testing.assert_allclose(la_step(params, STATES[0]), np.concatenate([q, p]), rtol=1e-12)
+
+
+def test_a_gradient_module_is_a_shear_by_a_gradient():
+    """One module moves p by the gradient of Σ aᵢ softplus(kᵢ·q + bᵢ)."""
+    params = roughened(g_init(KEY, 2, 1, 9))
+    inner, bias, outer = (params[k][0] for k in ("inner", "bias", "outer"))
+    for z in STATES[:3]:
+        q, p = split(z)
+        potential = jax.grad(lambda q: jnp.sum(outer * jax.nn.softplus(inner @ q + bias)))
+        np.testing.assert_allclose(
+            g_step(params, z), jnp.concatenate([q, p + potential(q)]), rtol=1e-12
+        )
+
+
+def test_a_ridge_is_the_exact_flow():
+    """One layer against the flow of H = f(w·z), by many small steps of its own field."""
+    params = roughened(p_init(KEY, 2, 1, 4))
+    direction, coefficients = params["direction"][0], params["coefficient"][0]
+
+    def hamiltonian(z):
+        return sum(c * (direction @ z) ** (i + 2) for i, c in enumerate(coefficients))
+
+    def midpoint(_, z):
+        field = apply_j(jax.grad(hamiltonian)(z))
+        return z + DT / 100 * apply_j(jax.grad(hamiltonian)(z + DT / 200 * field))
+
+    z = STATES[0]
+    flowed = jax.lax.fori_loop(0, 100, midpoint, z)
+    np.testing.assert_allclose(p_step(params, z, DT), flowed, rtol=1e-12, atol=1e-14)
+    assert float(hamiltonian(flowed)) == pytest.approx(float(hamiltonian(z)), rel=1e-12)
+
+
+def test_ridges_make_the_oscillator():
+    """q²/2, p²/2, q²/2 in turn is leapfrog of the oscillator: a known map, to roundoff."""
+    params = {
+        "direction": jnp.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0]]),
+        "coefficient": jnp.array([[0.25], [0.5], [0.25]]),
+    }
+    z = jnp.array([0.3, -0.7])
+    q, p = 0.3, -0.7 - DT / 2 * 0.3
+    q = q + DT * p
+    np.testing.assert_allclose(p_step(params, z, DT), [q, p - DT / 2 * q], rtol=1e-14)
+
+
+def hamiltonian_step(step_of, scene):
+    """SRNN's step with the exact H in place of the network's."""
+    gradient = jax.grad(scene.hamiltonian)
+    if step_of is leapfrog:
+        return lambda dt: leapfrog(
+            lambda _, z: split(apply_j(gradient(z)))[0],
+            lambda _, z: split(apply_j(gradient(z)))[1],
+            dt,
+        )
+    return lambda dt: tao(lambda _, z: scene.hamiltonian(z), dt)
+
+
+@pytest.mark.parametrize(("step_of", "make"), [(leapfrog, henon_heiles), (tao, pcr3bp)])
+def test_integrators_are_of_second_order(step_of, make):
+    """With the exact H: the error of a step is that of order 2, eight times less at half the dt."""
+    scene = make()
+    states = sample_states(scene, 8, jax.random.key(3))
+    errors = []
+    for dt in (0.02, 0.01):
+        exact = reference_trajectories(make(dt=dt), states, 1)[:, 1]
+        step = hamiltonian_step(step_of, scene)(dt)
+        errors.append(np.max(np.abs(jax.vmap(lambda z, s=step: s(None, z))(states) - exact)))
+    assert errors[0] < 1e-3
+    assert errors[0] / errors[1] == pytest.approx(8, rel=0.1)
+
+
+def test_leapfrog_is_symplectic_and_reversible():
+    step = hamiltonian_step(leapfrog, henon_heiles())(0.5)
+    assert largest_defect(lambda z: step(None, z), 0.3 * STATES) < 1e-14
+    back = hamiltonian_step(leapfrog, henon_heiles())(-0.5)
+    for z in 0.3 * STATES[:5]:
+        np.testing.assert_allclose(back(None, step(None, z)), z, atol=1e-14)
+
+
+def test_taos_step_is_symplectic_in_the_doubled_phase_space_only():
+    """Of the plain state the defect is of the order of dt³, the distance between the copies."""
+    scene = pcr3bp()
+    states = sample_states(scene, 8, jax.random.key(3))
+    defects = []
+    for dt in (0.02, 0.01):
+        step = hamiltonian_step(tao, scene)(dt)
+        defects.append(largest_defect(lambda z, s=step: s(None, z), states))
+    assert 1e-8 < defects[0] < 1e-2
+    assert defects[0] / defects[1] == pytest.approx(8, rel=0.6)

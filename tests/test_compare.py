@@ -1,0 +1,132 @@
+"""``gfnn compare``: the same data through other methods, and what becomes of an interrupted one."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from gfnn_jax import cli, comparison, pipeline, scenes
+from gfnn_jax.baselines.paper_gfnn import paper_gfnn
+from gfnn_jax.errors import InputError
+
+CHEAP = ("p-sympnet", "hnn")
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Little data, short rollouts."""
+    monkeypatch.setattr(comparison, "_QUICK_PAIRS", 500)
+    monkeypatch.setattr(comparison, "_QUICK_TRAJECTORIES", 3)
+    monkeypatch.setattr(comparison, "_NUM_FRESH", 50)
+    monkeypatch.setattr(pipeline, "NUM_STEPS", 100)
+    monkeypatch.setattr(comparison, "NUM_STEPS", 100)
+
+
+def compare(out, methods=CHEAP, scene="two-body", **options):
+    return comparison.compare(scene, methods=methods, out=out, quick=True, cap=0.2, **options)
+
+
+def test_the_report_and_the_figures(small, tmp_path):
+    out = tmp_path / "out"
+    compared = compare(out)
+    report = json.loads((out / "report.json").read_text())
+    assert report == compared.report
+    assert list(report["methods"]) == ["hnn", "p-sympnet"]
+    for part in report["methods"].values():
+        assert {"model", "data", "fit", "map", "rollout"} <= set(part)
+        assert part["data"] == {"num_pairs": 500, "sequence_length": 2}
+        assert part["fit"]["capped"]
+        assert part["kl"] is None
+        assert set(part["rollout"]["error"]) == {"1", "10", "100", "1000"}
+        assert part["rollout"]["error"]["1000"] is None  # of 100 steps
+        assert part["rollout"]["num_trajectories"] == 3
+    assert report["methods"]["p-sympnet"]["map"]["symplecticity_defect"] < 1e-12
+    assert 1e-12 < report["methods"]["hnn"]["map"]["symplecticity_defect"] < 1e-6
+    drawn = {path.stem for path in out.glob("*.png")}
+    assert drawn == {"error", "energy", "elements", "coordinates"}
+    assert not (tmp_path / "out.partial").exists()
+
+
+def test_an_interrupted_comparison_keeps_what_is_finished(small, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+
+    def stop(line):
+        if line.startswith("P-SympNet"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        compare(out, say=stop)
+    assert not out.exists()
+    kept = (tmp_path / "out.partial" / "hnn.json").read_text()
+    with pytest.raises(InputError, match="an unfinished comparison"):
+        compare(out)
+    with pytest.raises(InputError, match="of another comparison"):
+        compare(out, resume=True, seed=1)
+    learned = []
+    assert compare(out, resume=True, say=learned.append) is not None
+    assert not any(line.startswith("HNN") for line in learned)
+    report = json.loads((out / "report.json").read_text())
+    assert report["methods"]["hnn"]["fit"] == json.loads(kept)["fit"]
+    assert compare(out, resume=True) is None  # done, this very job
+    with pytest.raises(InputError, match="exists already"):
+        compare(out)
+
+
+def test_bad_usage_is_one_line(tmp_path, capsys):
+    for arguments, message in (
+        (["compare", "two-bodies"], "did you mean 'two-body'"),
+        (["compare", "two-body", "--methods", "hnn,rnn"], "unknown method 'rnn'; methods: vfnn"),
+        (["compare", "two-body", "--cap", "0"], "expected a finite number > 0"),
+    ):
+        assert cli.main([*arguments, "--out", str(tmp_path / "new")]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_which_scenes_are_separable():
+    assert comparison.separable(scenes.make("two-body"))
+    assert comparison.separable(scenes.make("henon-heiles-regular"))
+    assert comparison.separable(scenes.make("standard-map-regular"))
+    assert not comparison.separable(scenes.make("pcr3bp"))
+
+
+def test_methods_that_apply():
+    everywhere = comparison._chosen((), scenes.make("two-body"))
+    assert set(comparison.TITLES) - set(everywhere) == {"onet-2", "onet-5"}
+    assert set(comparison._chosen((), scenes.make("pcr3bp"))) == set(comparison.TITLES)
+
+
+def test_the_same_data_for_every_method(small):
+    data = comparison._Data(scenes.make("two-body"), 3, True)
+    again = comparison._Data(scenes.make("two-body"), 3, True)
+    np.testing.assert_array_equal(data.sequences(2).z, again.sequences(2).z)
+    assert data.sequences(2) is data.sequences(2)
+    assert data.sequences(5).z.shape == (500, 5, 4)  # on two bodies as many as pairs
+    other = comparison._Data(scenes.make("standard-map-regular"), 3, True)
+    assert other.sequences(5).num_pairs == other.sequences(2).num_pairs
+
+
+def test_divergences_of_a_chaotic_scene(small):
+    scene = scenes.make("standard-map-chaotic")
+    data = comparison._Data(scene, 0, True)
+    same = comparison._divergences(scene, data.reference, data.reference)
+    assert same == {"θ": 0.0, "p": 0.0}
+    shifted = comparison._divergences(scene, data.reference + 2 * np.pi, data.reference)
+    assert max(shifted.values()) < 1e-9  # modulo 2π
+    still = np.broadcast_to(data.reference[:, :1], data.reference.shape)
+    assert min(comparison._divergences(scene, still, data.reference).values()) > 1
+    assert comparison._divergences(scenes.make("two-body"), None, None) is None
+
+
+def test_the_papers_recipe_on_the_standard_map(small):
+    """Its map commutes with the shifts by 2π, and S sees no more of θ than cos and sin."""
+    data = comparison._Data(scenes.make("standard-map-regular"), 0, True)
+    budget = comparison.Budget(jax.random.key(0), cap=0.1)
+    learned = paper_gfnn(data.sequences(2), budget)
+    z = np.array([[1.0, 2.0], [1.0 + 2 * np.pi, 2.0 - 4 * np.pi]])
+    image = np.asarray(learned.map.step(z)[0])
+    np.testing.assert_allclose(image[1] - image[0], [2 * np.pi, -4 * np.pi], atol=1e-12)
+    assert learned.family.hidden == (500, 500, 200, 20)
