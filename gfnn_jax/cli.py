@@ -88,7 +88,10 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("data", type=Path, metavar="DATA")
     command.add_argument("--out", type=Path, metavar="MODEL", required=True, help="folder to write")
     command.add_argument("--dt", type=_positive, metavar="H", help="time step, if DATA has none")
-    command.add_argument("--scene", metavar="NAME", help="lends its coordinates and features")
+    command.add_argument(
+        "--scene", metavar="NAME",
+        help="lends its coordinates and features; the features assume the scene's units",
+    )  # fmt: skip
     command.add_argument(
         "--angles", type=_indices, default=(), metavar="0,2", help="indices in z with period 2π"
     )

@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,15 +24,16 @@ from gfnn_jax.charts import CHARTS
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.local_maps import ChartJudgement, data_defect, judge_chart, local_jacobians
 from gfnn_jax.maps import SymplecticMap
-from gfnn_jax.phase_space import Pairs, require_x64
+from gfnn_jax.phase_space import Pairs, require_x64, split
 from gfnn_jax.preparation import FitError, FitWarning, choose_charts, factor_out, prepare
-from gfnn_jax.scenes.scene import Scene
+from gfnn_jax.scenes.scene import AroundOrbit, Scene
 
 SCALARS = ("auto", "polynomial", "features", "sines", "mlp")
 CHART_NAMES = ("auto", *CHARTS)
 
 _VALIDATION_FRACTION, _FEWEST_VALIDATION, _MOST_VALIDATION = 0.1, 4, 2_000
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken
+_OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; those in other units do
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 # A rung that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
 # the odd degrees), and larger families only fit noise.
@@ -123,6 +125,8 @@ def fit(
         messages.append(message)
         warnings.warn(message, FitWarning, stacklevel=3)
 
+    if scene is not None and scene.features is not None and scalar in ("auto", "features"):
+        _compare_sizes(pairs, scene, warn)
     training, held_out = _split(pairs, seed)
     on_progress("looking at the map's local Jacobians")
     prepared = prepare(pairs, coordinates)
@@ -248,6 +252,25 @@ def _check_request(pairs, scene, tolerance, chart, scalar, angles) -> None:
         raise FitError(
             f"expected at least {8 * pairs.dim} pairs for d = {pairs.dim}, got {len(pairs)}"
         )
+
+
+def _compare_sizes(pairs: Pairs, scene: Scene, warn) -> None:
+    """Warn where the pairs are of another size than the scene's states: 1/r₁ and the like know
+    where the scene's bodies are, in its units."""
+    sampling = scene.sampling
+    if isinstance(sampling, AroundOrbit):
+        states = np.asarray(sampling.start)[None, :]
+    else:
+        states = np.asarray(sampling.draw(jax.random.key(0), 100))
+    for name, ours, theirs in zip(
+        ("positions", "momenta"), split(np.asarray(pairs.z0)), split(states), strict=True
+    ):
+        size, usual = (float(np.median(np.linalg.norm(x, axis=1))) for x in (ours, theirs))
+        if usual > 0 and not 1 / _OTHER_SIZE < size / usual < _OTHER_SIZE:
+            warn(
+                f"the {name} are {size / usual:.2g} times the size of those in the scene "
+                f"{scene.name}, whose features assume its own units: are the data in these?"
+            )
 
 
 def _split(pairs: Pairs, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -130,6 +130,27 @@ def test_friction_is_noticed():
         gfnn.fit(damped, tolerance=1.0)
 
 
+@pytest.mark.parametrize(
+    ("unit", "words"), [(1.0, None), (2.0, None), (3.8e5, "3.8e.05 times the size"), (0.2, "0.2 t")]
+)
+def test_features_in_other_units_are_noticed(unit, words):
+    """1/r₁ of kilometres means nothing: the scene's lengths are in the distance of its bodies."""
+
+    class LookedAt(Exception):
+        pass
+
+    def stop(message):
+        raise LookedAt
+
+    z = np.array([[0.49, 0.0, 0.0, 1.4]]) + 0.1 * np.random.default_rng(0).normal(size=(100, 4))
+    pairs = gfnn.Pairs(unit * z, unit * z, 0.1)
+    with warnings.catch_warnings(record=True) as caught, pytest.raises(LookedAt):
+        gfnn.fit(pairs, gfnn.scenes.pcr3bp(), on_progress=stop)
+    told = [str(w.message) for w in caught]
+    assert len(told) == (2 if words else 0)
+    assert all(words in t.replace("+", ".") for t in told)
+
+
 def test_a_tolerance_out_of_reach_gives_the_best_and_says_so():
     with pytest.warns(gfnn.FitWarning, match="no candidate meets"):
         fit = gfnn.fit(pendulum_pairs(60), tolerance=1e-18)
