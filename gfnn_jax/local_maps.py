@@ -1,6 +1,7 @@
-"""What the pairs say about the map before any fit: local Jacobians, from neighbouring pairs.
+"""What the pairs say about the map by themselves: local Jacobians, from neighbouring pairs.
 
 From them come the determinant of each chart over the data, and how symplectic the data are.
+Neighbours also tell which pairs are wrong, and the residuals of a fit whether there is friction.
 """
 
 from __future__ import annotations
@@ -20,6 +21,10 @@ _NEIGHBOURS_PER_TERM = 3
 # From so many pairs on the neighbourhoods keep their size: more pairs then average the noise away
 # instead of shrinking them below it.
 _LOCAL_ENOUGH, _MOST_NEIGHBOURS = 4_000, 1_000
+# Neighbourhoods grow until noise leaves no more than this error in the Jacobian's entries.
+_SLOPE_ERROR = 0.05
+# A pair is odd that its neighbours' fit misses by so many standard deviations.
+_ODD, _ODD_ROUNDS = 30.0, 5
 # A determinant this far from zero is safe; below the lower figure the chart folds inside the data.
 SAFE, SINGULAR = 0.2, 0.03
 
@@ -45,7 +50,8 @@ def local_jacobians(y0, y1, scale, *, seed: int = 0) -> np.ndarray:
     """Jacobians of y0 -> y1 at up to 400 of the states: (n, 2d, 2d).
 
     y0, y1: (N, 2d) with angles lifted; scale (2d,) makes the coordinates comparable. A local
-    quadratic fit where there are pairs enough, else a local linear one.
+    quadratic fit where there are pairs enough, else a local linear one; over more neighbours where
+    the pairs are noisy.
     """
     n, width = y0.shape
     x, move = np.asarray(y0) / scale, (np.asarray(y1) - np.asarray(y0)) / scale
@@ -55,17 +61,72 @@ def local_jacobians(y0, y1, scale, *, seed: int = 0) -> np.ndarray:
     fewest = _NEIGHBOURS_PER_TERM * terms
     count = min(n, max(fewest, min(_MOST_NEIGHBOURS, fewest * n // _LOCAL_ENOUGH)))
     chosen = np.random.default_rng(seed).permutation(n)[:_CENTRES]
-    _, near = cKDTree(x).query(x[chosen], k=count)
-    offset = x[near] - x[chosen][:, None, :]
-    columns = [np.ones((*offset.shape[:2], 1)), offset]
-    if quadratic:
-        columns.append(offset[..., i] * offset[..., j])
-    design = np.concatenate(columns, axis=-1)
-    # The pseudo-inverse takes the map for the identity in what the neighbours do not span: a thin
-    # tube of data, the torus of a single orbit.
-    solution = np.linalg.pinv(design, rcond=1e-8) @ move[near]
+    tree = cKDTree(x)
+    while True:
+        _, near = tree.query(x[chosen], k=count)
+        offset = x[near] - x[chosen][:, None, :]
+        columns = [np.ones((*offset.shape[:2], 1)), offset]
+        if quadratic:
+            columns.append(offset[..., i] * offset[..., j])
+        design = np.concatenate(columns, axis=-1)
+        # The pseudo-inverse takes the map for the identity in what the neighbours do not span: a
+        # thin tube of data, the torus of a single orbit.
+        inverse = np.linalg.pinv(design, rcond=1e-8)
+        solution = inverse @ move[near]
+        rest = move[near] - design @ solution
+        noise = np.sqrt(np.sum(rest**2, axis=1) / max(1, count - terms))
+        spread = np.sqrt(np.sum(inverse[:, 1 : 1 + width] ** 2, axis=-1))
+        error = np.median(noise.max(axis=1) * spread.max(axis=1))
+        if error <= _SLOPE_ERROR or count >= min(n, _MOST_NEIGHBOURS):
+            break
+        count = min(n, _MOST_NEIGHBOURS, 2 * count)
     slope = np.eye(width) + np.swapaxes(solution[:, 1 : 1 + width], 1, 2)
     return slope * scale[:, None] / scale[None, :]
+
+
+def odd_pairs(y0, y1, scale) -> np.ndarray:
+    """Rows of the pairs whose move contradicts that of the pairs around them: wrong pairs.
+
+    y0, y1: (N, 2d) with angles lifted. A pair's move is predicted from its neighbours, by an affine
+    fit; it is odd where it misses by many times what that fit leaves over among them: the deleted
+    studentised residual. A steep or noisy map leaves much over everywhere, and none is odd. Odd
+    pairs hide each other: the others are looked at again without those found.
+    """
+    x, move = np.asarray(y0) / scale, (np.asarray(y1) - np.asarray(y0)) / scale
+    rows, odd = np.arange(len(x)), []
+    for _ in range(_ODD_ROUNDS):
+        worst = _studentised(x[rows], move[rows]) > _ODD
+        if not worst.any():
+            break
+        odd.append(rows[worst])
+        rows = rows[~worst]
+    return np.sort(np.concatenate([np.zeros(0, int), *odd]))
+
+
+def _studentised(x, move):
+    """The error of each move (N, 2d) predicted by its neighbours, over its standard deviation."""
+    n, width = x.shape
+    terms = 1 + width
+    count = _NEIGHBOURS_PER_TERM * terms
+    if n <= count:
+        return np.zeros(n)
+    tree, floor = cKDTree(x), 1e-13 * (1 + np.abs(move).max())
+    error, deviation = np.empty(n), np.empty(n)
+    for block in np.array_split(np.arange(n), 1 + n // 10_000):  # in bounded memory
+        near = tree.query(x[block], k=count + 1)[1][:, 1:]
+        offset = x[near] - x[block][:, None, :]
+        design = np.concatenate([np.ones((*offset.shape[:2], 1)), offset], axis=-1)
+        moves, kept = move[near], np.ones(near.shape)
+        for _ in range(2):  # the second time without the neighbour that fits worst: it may be odd
+            inverse = np.linalg.pinv(design * kept[..., None], rcond=1e-8)
+            solution = inverse @ (moves * kept[..., None])
+            rest = np.sum((moves - design @ solution) ** 2, axis=-1) * kept
+            deviation[block] = np.sqrt(rest.sum(axis=1) / (kept.sum(axis=1) - terms))
+            kept = np.where(rest == rest.max(axis=1, keepdims=True), 0.0, 1.0)
+        growth = np.sqrt(1 + np.sum(inverse[:, 0] ** 2, axis=-1))
+        error[block] = np.linalg.norm(move[block] - solution[:, 0], axis=1) / growth
+    # With so few neighbours a fit is now and then exact by chance.
+    return error / (np.maximum(deviation, np.median(deviation)) + floor)
 
 
 def judge_chart(chart: AnyChart, jacobians, scale) -> ChartJudgement:
@@ -87,3 +148,20 @@ def data_defect(jacobians, scale) -> float:
     are swapped in one snapshot, where velocities stand for momenta, or where there is friction.
     """
     return float(np.median(symplecticity_defect(jnp.asarray(jacobians), jnp.asarray(scale))))
+
+
+def volume_change(z, residual) -> tuple[float, float]:
+    """(change of phase-space volume per step, its standard error) that a symplectic fit left over.
+
+    z, residual: (N, 2d), states and Z − Z_predicted. The residual of a symplectic map is noise or
+    has no divergence; friction is linear in z to first order, and its trace is the rate at which
+    volumes shrink. (0, inf) where a linear law explains less than half of the residual.
+    """
+    z, residual = np.asarray(z), np.asarray(residual)
+    design = np.column_stack([np.ones(len(z)), (z - z.mean(axis=0))])
+    solution = np.linalg.lstsq(design, residual, rcond=None)[0]
+    rest = residual - design @ solution
+    if np.mean(rest**2) > 0.5 * np.mean(residual**2):
+        return 0.0, np.inf
+    variance = np.linalg.pinv(design.T @ design).diagonal()[1:] * rest.var(axis=0)
+    return float(np.trace(solution[1:])), float(np.sqrt(variance.sum()))
