@@ -122,7 +122,7 @@ def _studentised(x, move):
             solution = inverse @ (moves * kept[..., None])
             rest = np.sum((moves - design @ solution) ** 2, axis=-1) * kept
             deviation[block] = np.sqrt(rest.sum(axis=1) / (kept.sum(axis=1) - terms))
-            kept = np.where(rest == rest.max(axis=1, keepdims=True), 0.0, 1.0)
+            kept[np.arange(len(block)), np.argmax(rest, axis=1)] = 0.0
         growth = np.sqrt(1 + np.sum(inverse[:, 0] ** 2, axis=-1))
         error[block] = np.linalg.norm(move[block] - solution[:, 0], axis=1) / growth
     # With so few neighbours a fit is now and then exact by chance.

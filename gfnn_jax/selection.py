@@ -22,16 +22,35 @@ import numpy as np
 from gfnn_jax.candidates import Candidate, Ladder, Network, Rows, kinds, refitted, timed
 from gfnn_jax.charts import CHARTS
 from gfnn_jax.coordinates import Coordinates
+<<<<<<< HEAD
 from gfnn_jax.local_maps import ChartJudgement, data_defect, judge_chart, local_jacobians
 from gfnn_jax.maps import SymplecticMap
 from gfnn_jax.phase_space import Pairs, require_x64, split
+=======
+from gfnn_jax.local_maps import (
+    ChartJudgement,
+    data_defect,
+    judge_chart,
+    local_jacobians,
+    odd_pairs,
+    volume_change,
+)
+from gfnn_jax.maps import Generated, SymplecticMap
+from gfnn_jax.phase_space import Pairs, require_x64
+>>>>>>> 9831272 (A fit names wrong pairs and friction, and goes on under much noise)
 from gfnn_jax.preparation import FitError, FitWarning, choose_charts, factor_out, prepare
 from gfnn_jax.scenes.scene import AroundOrbit, Scene
 
 SCALARS = ("auto", "polynomial", "features", "sines", "mlp")
 CHART_NAMES = ("auto", *CHARTS)
 
+<<<<<<< HEAD
 _VALIDATION_FRACTION, _FEWEST_VALIDATION, _MOST_VALIDATION = 0.1, 4, 2_000
+=======
+_VALIDATION_FRACTION, _MOST_VALIDATION = 0.1, 2_000
+_MOST_ODD = 0.05  # of the pairs may be left out as wrong
+_CERTAIN = 5.0  # standard errors that make a change of volume certain
+>>>>>>> 9831272 (A fit names wrong pairs and friction, and goes on under much noise)
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken
 _OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; those in other units do
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
@@ -112,8 +131,8 @@ def fit(
 
     Raises FitError, in one line, where the data are too few or not finite or a chart that was asked
     for is singular over them (naming the chart to use instead). Warns (FitWarning) where nothing
-    meets the tolerance, where a chart is close to singular, and where the pairs do not look
-    symplectic.
+    meets the tolerance, where a chart is close to singular, where pairs contradict their neighbours
+    (a few are left out), and where the pairs do not look symplectic.
     """
     started = time.perf_counter()
     require_x64("a fit")
@@ -127,9 +146,20 @@ def fit(
 
     if scene is not None and scene.features is not None and scalar in ("auto", "features"):
         _compare_sizes(pairs, scene, warn)
-    training, held_out = _split(pairs, seed)
     on_progress("looking at the map's local Jacobians")
     prepared = prepare(pairs, coordinates)
+    odd = odd_pairs(prepared.y0, prepared.y1, prepared.scale)
+    if len(odd):
+        few = len(odd) <= _MOST_ODD * len(pairs)
+        rows = ", ".join(map(str, odd[:5])) + (", …" if len(odd) > 5 else "")
+        warn(
+            f"{len(odd)} of {len(pairs)} pairs contradict the pairs around them (rows {rows}): "
+            + ("taken for wrong, they are left out" if few else "too many to be left out")
+        )
+        if few:
+            pairs = pairs.take(np.setdiff1d(np.arange(len(pairs)), odd))
+            prepared = prepare(pairs, coordinates)
+    training, held_out = _split(pairs, seed)
     jacobians = local_jacobians(prepared.y0, prepared.y1, prepared.scale, seed=seed)
     defect = data_defect(jacobians, prepared.scale)
     if defect > 0.3:
@@ -175,6 +205,14 @@ def fit(
             f"(the map's own error is then about {implied:.1g} of it), or a structure that these "
             "functions cannot represent"
         )
+    if noise is not None:
+        y0, y1 = (y[training[:_MOST_VALIDATION]] for y in (prepared.y0, prepared.y1))
+        change, error = volume_change(y0, y1 - _generated(chosen.map, y0))
+        if abs(change) > _CERTAIN * error:
+            warn(
+                f"what is left over is no noise: phase-space volumes change by {change:.2g} "
+                f"(± {error:.1g}) of themselves in a step, as by friction: no symplectic map does"
+            )
     on_progress("timing the candidates")
     test = np.asarray(pairs.z0)[held_out]
     chosen_label = (chosen.chart, chosen.scalar, chosen.label)
@@ -367,6 +405,12 @@ def _choose(candidates: list[Candidate], tolerance: float) -> Candidate:
     if meeting:
         return min(meeting, key=lambda c: c.work)
     return min(candidates, key=lambda c: c.relative_rms)
+
+
+def _generated(map_: SymplecticMap, y0) -> np.ndarray:
+    """Images of prepared states (N, 2d) under what was fitted, without base map and coordinates."""
+    piece = next(piece for piece in map_.pieces if isinstance(piece, Generated))
+    return np.asarray(jax.jit(jax.vmap(lambda y: piece(y)[0]))(jnp.asarray(y0)))
 
 
 def _smallest(determinant) -> float:

@@ -1,9 +1,16 @@
 """What neighbouring pairs say of a map, where they are many and noisy, or on a single orbit."""
 
 import numpy as np
+import pytest
 
 from gfnn_jax.charts import CHARTS
-from gfnn_jax.local_maps import data_defect, judge_chart, local_jacobians
+from gfnn_jax.local_maps import (
+    data_defect,
+    judge_chart,
+    local_jacobians,
+    odd_pairs,
+    volume_change,
+)
 
 
 def turned(z, angle=0.5):
@@ -32,3 +39,55 @@ def test_a_single_orbit_looks_symplectic():
     jacobians = local_jacobians(z[:-1], z[1:], scale)
     assert data_defect(jacobians, scale) < 0.1
     assert judge_chart(CHARTS["midpoint"], jacobians, scale).low > 0.9
+
+
+def test_noise_as_large_as_a_tenth_of_the_data_folds_no_chart():
+    rng = np.random.default_rng(1)
+    z = rng.uniform(-1, 1, (1_000, 2))
+    noise = 5e-2 * rng.standard_normal((2, *z.shape))
+    scale = z.std(axis=0)
+    jacobians = local_jacobians(z + noise[0], turned(z) + noise[1], scale)
+    assert abs(judge_chart(CHARTS["midpoint"], jacobians, scale).low - np.cos(0.25) ** 2) < 0.2
+
+
+def bent(z):
+    """A symplectic map that is steep in places."""
+    q, p = z.T
+    p = p + 0.5 * np.sin(3 * q)
+    return np.stack([q + 0.5 * p, p], axis=1)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1e-6, 3e-3])
+def test_wrong_pairs_are_found_and_right_ones_are_not(sigma):
+    rng = np.random.default_rng(2)
+    z = np.concatenate([rng.uniform(-1, 1, (1_500, 2)), 0.3 * rng.standard_normal((500, 2))])
+    z1 = bent(z)
+    scale = z.std(axis=0)
+    noise = sigma * rng.standard_normal((2, *z.shape))
+    assert len(odd_pairs(z + noise[0], z1 + noise[1], scale)) == 0
+    wrong = np.sort(rng.permutation(len(z))[:20])
+    # Off by something like the data's size, never by nothing.
+    angle = rng.uniform(0, 2 * np.pi, 20)
+    z1[wrong] += np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    np.testing.assert_array_equal(odd_pairs(z + noise[0], z1 + noise[1], scale), wrong)
+
+
+def test_few_or_coinciding_pairs_are_not_odd():
+    z = np.random.default_rng(3).uniform(-1, 1, (5, 2))
+    assert len(odd_pairs(z, turned(z), z.std(axis=0))) == 0
+    many = np.tile(z, (20, 1))
+    assert len(odd_pairs(many, turned(many), many.std(axis=0))) == 0
+
+
+def test_volume_change_tells_friction_from_noise_and_from_a_hamiltonian_residual():
+    rng = np.random.default_rng(4)
+    z = rng.uniform(-1, 1, (2_000, 4)) * [1, 2, 3, 4]
+    noise = 1e-3 * rng.standard_normal(z.shape)
+    friction = -1e-2 * z * [0, 0, 1, 1]
+    change, error = volume_change(z, friction + noise)
+    assert abs(change + 2e-2) < 5 * error
+    assert error < 1e-4
+    assert volume_change(z, noise) == (0.0, np.inf)
+    squeeze = 1e-2 * z * [1, 1, -1, -1]  # linear and Hamiltonian: no volume is lost
+    change, error = volume_change(z, squeeze + noise)
+    assert abs(change) < 5 * error
