@@ -373,6 +373,23 @@ ROWS: dict[str, Row] = {
 # Results and tables
 
 
+def circumstances() -> Numbers:
+    """Where, when and with what a result was measured."""
+    return {
+        "seed": SEED,
+        "dtype": "float64",
+        "device": report.device(),
+        "machine": {
+            "processor": platform.machine(),
+            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
+            "load": os.getloadavg()[0],
+        },
+        "python": platform.python_version(),
+        "versions": versions(),
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+    }
+
+
 def run(name: str, folder: Path, quick: bool) -> None:
     """Measure a row and write its result."""
     row = ROWS[name]
@@ -387,17 +404,7 @@ def run(name: str, folder: Path, quick: bool) -> None:
         "met": {key: bool(measured[key] <= most) for key, most in row.targets.items()},
         "measured": measured,
         "seconds": time.perf_counter() - started,
-        "seed": SEED,
-        "dtype": "float64",
-        "device": report.device(),
-        "machine": {
-            "processor": platform.machine(),
-            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
-            "load": os.getloadavg()[0],
-        },
-        "python": platform.python_version(),
-        "versions": versions(),
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        **circumstances(),
     }
     folder.mkdir(parents=True, exist_ok=True)
     text = report.to_json(result)

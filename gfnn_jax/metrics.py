@@ -301,6 +301,29 @@ def section_crossings(trajectory, index: int, direction: int = 1):
     return crossings[np.isfinite(crossings).all(axis=1)]
 
 
+def curve_distance(z, curve, harmonics: int = 64):
+    """Distance of states (..., 2) of (θ, p) from an invariant curve that winds around the cylinder.
+
+    curve: (M, 2), points of the curve, an orbit of the reference: with M at least a few times
+    ``harmonics``, p as a trigonometric polynomial of θ is fitted to them by least squares, which
+    for an analytic curve is exact to roundoff. The distance is p's, times the cosine of the slope.
+    """
+    z, curve = np.asarray(z, float), np.asarray(curve, float)
+    k = np.arange(1, harmonics + 1)
+
+    def design(theta):
+        angle = theta[..., None] * k
+        return np.concatenate(
+            [np.ones((*theta.shape, 1)), np.cos(angle), np.sin(angle)], axis=-1
+        )  # fmt: skip
+
+    coefficients = np.linalg.lstsq(design(curve[:, 0]), curve[:, 1], rcond=None)[0]
+    constant, even, odd = np.split(coefficients, [1, 1 + harmonics])
+    slope = design(z[..., 0]) @ np.concatenate([0 * constant, k * odd, -k * even])
+    height = design(z[..., 0]) @ coefficients
+    return np.abs(z[..., 1] - height) / np.sqrt(1 + slope**2)
+
+
 def lyapunov_exponent(step, z0, num_steps: int):
     """Largest Lyapunov exponent per step of the map ``step(z) -> z`` along the orbit of z0 (2d,).
 

@@ -22,11 +22,6 @@ import numpy as np
 from gfnn_jax.candidates import Candidate, Ladder, Network, Rows, kinds, refitted, timed
 from gfnn_jax.charts import CHARTS
 from gfnn_jax.coordinates import Coordinates
-<<<<<<< HEAD
-from gfnn_jax.local_maps import ChartJudgement, data_defect, judge_chart, local_jacobians
-from gfnn_jax.maps import SymplecticMap
-from gfnn_jax.phase_space import Pairs, require_x64, split
-=======
 from gfnn_jax.local_maps import (
     ChartJudgement,
     data_defect,
@@ -36,21 +31,16 @@ from gfnn_jax.local_maps import (
     volume_change,
 )
 from gfnn_jax.maps import Generated, SymplecticMap
-from gfnn_jax.phase_space import Pairs, require_x64
->>>>>>> 9831272 (A fit names wrong pairs and friction, and goes on under much noise)
+from gfnn_jax.phase_space import Pairs, require_x64, split
 from gfnn_jax.preparation import FitError, FitWarning, choose_charts, factor_out, prepare
 from gfnn_jax.scenes.scene import AroundOrbit, Scene
 
 SCALARS = ("auto", "polynomial", "features", "sines", "mlp")
 CHART_NAMES = ("auto", *CHARTS)
 
-<<<<<<< HEAD
 _VALIDATION_FRACTION, _FEWEST_VALIDATION, _MOST_VALIDATION = 0.1, 4, 2_000
-=======
-_VALIDATION_FRACTION, _MOST_VALIDATION = 0.1, 2_000
 _MOST_ODD = 0.05  # of the pairs may be left out as wrong
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
->>>>>>> 9831272 (A fit names wrong pairs and friction, and goes on under much noise)
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken
 _OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; those in other units do
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise

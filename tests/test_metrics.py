@@ -281,3 +281,17 @@ def test_diffusion_coefficient_of_a_random_walk_and_of_the_standard_map():
     estimate = metrics.diffusion_coefficient(np.stack(momenta, axis=1))
     expected = kick**2 / 4 * (1 - 2 * jv(2, kick) + 2 * jv(2, kick) ** 2)
     assert estimate.value == pytest.approx(expected, rel=0.06)
+
+
+def test_curve_distance_of_points_beside_a_known_curve():
+    theta = np.linspace(0, 2 * np.pi, 500)
+    height = lambda t: 3 + 0.4 * np.sin(t) + 0.1 * np.cos(3 * t)  # noqa: E731
+    curve = np.stack([theta, height(theta)], axis=1)
+    away, at = 1e-5, np.linspace(-4, 20, 50)
+    slope = 0.4 * np.cos(at) - 0.3 * np.sin(3 * at)
+    normal = np.stack([-slope, np.ones_like(at)]) / np.sqrt(1 + slope**2)
+    points = np.stack([at, height(at)]) + away * normal
+    np.testing.assert_allclose(metrics.curve_distance(points.T, curve, 8), away, rtol=1e-4)
+    on_it = np.stack([at, height(at)], axis=1).reshape(5, 10, 2)
+    assert metrics.curve_distance(on_it, curve, 8).shape == (5, 10)
+    assert metrics.curve_distance(on_it, curve, 8).max() < 1e-13
