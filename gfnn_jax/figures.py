@@ -96,6 +96,19 @@ def error_growth(errors: Mapping, ylabel="position error", ax=None) -> Axes:
 
 
 @style()
+def proportionality(points: Mapping, xlabel, ylabel, ax=None) -> Axes:
+    """One positive quantity against another, log–log: name -> (x (K,), y (K,)). The dotted line is
+    proportional to x."""
+    ax = _axes(ax)
+    for place, (name, (x, y)) in enumerate(points.items()):
+        ax.plot(x, y, label=name, **_look(place))
+    ax.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
+    _guide(ax, 1.0, r"$\propto\varepsilon$")
+    _legend_above(ax)
+    return ax
+
+
+@style()
 def element_errors(errors: Mapping, axes=None) -> tuple[Axes, Axes]:
     """Errors of semi-major axis and eccentricity against step (paper, Fig. 2, upper row).
 

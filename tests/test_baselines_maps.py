@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 
 from gfnn_jax.baselines.p_sympnet import p_init, p_step
 from gfnn_jax.baselines.srnn import leapfrog, tao
@@ -44,6 +45,13 @@ def test_symplectic_whatever_the_parameters(name):
     assert float(jnp.max(jnp.abs(moved))) > 0.1  # not the identity
     size = float(jnp.max(jnp.abs(jax.vmap(jax.jacfwd(lambda z: step(params, z)))(STATES))))
     assert largest_defect(lambda z: step(params, z), STATES) < 1e-14 * size**2
+
+
+@pytest.mark.parametrize("name", SYMPLECTIC)
+def test_gradients_with_respect_to_the_parameters(name):
+    """What a training follows, against finite differences."""
+    step, params = SYMPLECTIC[name]
+    check_grads(lambda params: step(params, STATES[0]), (roughened(params),), 1, modes=("rev",))
 
 
 def test_la_module_by_module():

@@ -1,0 +1,383 @@
+"""The paper's theorems as measurements: how the error of a prediction grows.
+
+    python benchmarks/error_growth.py               all pieces without a result yet, then the tables
+    python benchmarks/error_growth.py vfnn --overwrite   one piece again
+    python benchmarks/error_growth.py --quick       small sizes, into runs/error-growth, no tables
+
+A piece's result is one JSON file in benchmarks/results; the section of benchmarks/RESULTS.md and
+the figures are made from these files alone.
+
+The knob on the one-step error ε is the degree at which a fitted S, a polynomial accurate to
+1e-10 or better, is cut off: what is left is a symplectic map whose S is wrong by as much as the
+terms that went. ε is measured on fresh pairs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import json
+import os
+import platform
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from targets import (  # switches float64 on
+    RESULTS,
+    SEED,
+    TABLES,
+    angles_of,
+    between_markers,
+    drawn,
+    number,
+    one_step_rms,
+    provenance,
+)
+
+import gfnn_jax as gfnn
+from gfnn_jax import figures, metrics, report
+from gfnn_jax.baselines import METHODS, Budget, Sequences
+from gfnn_jax.maps import Generated
+from gfnn_jax.models import versions
+from gfnn_jax.rollout import rollout
+
+FIGURES = Path(__file__).resolve().parent / "figures"
+NUM_PAIRS, NUM_STEPS, LONGEST = 4_000, 1_000, 20_000
+SATURATED = 0.1  # a position error of this size is no longer small against the orbit
+
+Numbers = dict[str, Any]
+
+
+@functools.cache
+def ladder(name: str, quick: bool):
+    """The scene, and (ε, label, map) for each degree at which S is cut off."""
+    scene = gfnn.scenes.make(name)
+    pairs, fresh = drawn(scene, 1_000 if quick else NUM_PAIRS, quick)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)
+        fit = gfnn.fit(
+            pairs, scene, tolerance=1e-7 if quick else 1e-10, chart="midpoint",
+            scalar="polynomial", seed=SEED, on_progress=lambda line: print(f"  {line}"),
+        )  # fmt: skip
+    index = next(i for i, piece in enumerate(fit.map.pieces) if isinstance(piece, Generated))
+    whole: Any = fit.map.pieces[index]
+    first, second = whole.scalar.basis.halves
+    degrees = first.orders[:, None] + second.orders[None, :]
+    found = []
+    for degree in range(2, whole.scalar.degree + 1):
+        cut = dataclasses.replace(whole, params=jnp.where(degrees <= degree, whole.params, 0.0))
+        pieces = (*fit.map.pieces[:index], cut, *fit.map.pieces[index + 1 :])
+        map_ = dataclasses.replace(fit.map, pieces=pieces)
+        found.append((one_step_rms(map_, fresh, angles_of(scene)), f"degree {degree}", map_))
+        print(f"  {name}: degree {degree}, one step {found[-1][0]:.1e}", flush=True)
+    return scene, found
+
+
+def growth(name: str) -> Callable[[bool], Numbers]:
+    """Position error against the step number at many ε, with the exponent of each."""
+
+    def measure(quick: bool) -> Numbers:
+        scene, maps = ladder(name, quick)
+        key = jax.random.fold_in(jax.random.key(SEED), 1)
+        z0 = gfnn.sample_test_states(scene, 8 if quick else 50, key)
+        reference = np.asarray(gfnn.reference_trajectories(scene, z0, NUM_STEPS))
+        steps = np.arange(NUM_STEPS + 1)
+        shown = np.unique(np.round(np.geomspace(1, NUM_STEPS, 30)).astype(int))
+        rows = []
+        for error, label, map_ in maps:
+            states, _ = map_.rollout(z0, NUM_STEPS)
+            position = metrics.position_error(np.asarray(states), reference, angles_of(scene))
+            statistics = metrics.error_statistics(position)
+            usable = statistics.mean < SATURATED
+            last = int(steps[usable][-1]) if usable.all() else int(np.argmin(usable)) - 1
+            exponent = metrics.growth_exponent(steps, position, last=max(last, 12))
+            rows.append({
+                "label": label, "one_step_rms": error, "last": last,
+                "exponent": exponent.value, "interval": list(exponent.interval),
+                "error_end": float(statistics.mean[-1]),
+                "error_100": float(statistics.mean[100]),
+                "curve": {"steps": shown.tolist(), "mean": statistics.mean[shown].tolist(),
+                          "std": statistics.std[shown].tolist()},
+            })  # fmt: skip
+        return {"scene": name, "rows": rows, "proportionality": slope(rows, "error_100")}
+
+    return measure
+
+
+def slope(rows: list[Numbers], key: str) -> Numbers:
+    """Exponent b of ``key`` ∝ εᵇ over all rows that are finite and not saturated, with its interval
+    (Student's t), and the decades that ε spans."""
+    from scipy.stats import linregress, t
+
+    used = [r for r in rows if np.isfinite(r[key]) and 1e-12 < r[key] < SATURATED]
+    x, y = (np.log10([r[k] for r in used]) for k in ("one_step_rms", key))
+    if len(used) < 3:
+        return {"exponent": None, "interval": None, "decades": None, "points": len(used)}
+    fitted: Any = linregress(x, y)
+    half = float(t.ppf(0.975, len(used) - 2)) * fitted.stderr
+    return {
+        "exponent": float(fitted.slope),
+        "interval": [float(fitted.slope - half), float(fitted.slope + half)],
+        "decades": float(np.ptp(x)), "points": len(used),
+    }  # fmt: skip
+
+
+def actions(quick: bool) -> Numbers:
+    """Two bodies: the action √a (Delaunay's L) over 1/(ε dt) steps, at most LONGEST."""
+    scene, maps = ladder("two-body", quick)
+    z0 = gfnn.sample_test_states(scene, 8, jax.random.fold_in(jax.random.key(SEED), 2))
+    start = np.sqrt(np.asarray(metrics.semi_major_axis(z0)))
+    rows = []
+    for error, label, map_ in maps:
+        most = 2_000 if quick else LONGEST
+        num_steps = int(min(most, 1 / (error * scene.dt)))
+        every = max(1, num_steps // 500)
+        states, _ = map_.rollout(z0, num_steps, save_every=every)
+        action = np.sqrt(np.asarray(metrics.semi_major_axis(states)))
+        change = np.max(np.abs(action - start[:, None]), axis=0)
+        tenth = len(change) // 10
+        rows.append({
+            "label": label, "one_step_rms": error, "num_steps": num_steps,
+            "whole_time": bool(num_steps < most),
+            "largest": float(change.max()), "largest_in_first_tenth": float(change[:tenth].max()),
+        })  # fmt: skip
+    return {"rows": rows, "proportionality": slope(rows, "largest")}
+
+
+def vfnn(quick: bool) -> Numbers:
+    """A learned vector field on two bodies beside the map of about the same one-step error."""
+    scene = gfnn.scenes.two_body()
+    key = jax.random.key(SEED)
+    num = 5_000 if quick else 100_000
+    pairs = gfnn.sample_pairs(scene, num, key)
+    fresh = gfnn.sample_pairs(scene, 1_000, jax.random.fold_in(key, 3))
+    z = np.stack([np.asarray(pairs.z0), np.asarray(pairs.z1)], axis=1)
+    learned = METHODS["vfnn"].learn(Sequences(z, scene.dt), Budget(key, 2.0 if quick else 20.0))
+    z0 = gfnn.sample_test_states(scene, 8 if quick else 50, jax.random.fold_in(key, 1))
+    steps = np.arange(NUM_STEPS + 1)
+    reference = np.asarray(gfnn.reference_trajectories(scene, z0, NUM_STEPS))
+    step_error = np.asarray(rollout(learned.step, jnp.asarray(fresh.z0), 1))[:, 1] - fresh.z1
+    states = np.asarray(rollout(learned.step, z0, NUM_STEPS))
+    vfnn_rms = float(np.sqrt(np.mean(np.asarray(step_error) ** 2)))
+    _, maps = ladder("two-body", quick)
+    error, label, map_ = min(maps, key=lambda m: abs(np.log(m[0] / vfnn_rms)))
+    label = f"generated, {label}"
+    curves = {}
+    for name, predicted in (("VFNN", states), (label, np.asarray(map_.rollout(z0, NUM_STEPS)[0]))):
+        position = metrics.position_error(predicted, reference)
+        energy = metrics.absolute_error(
+            metrics.semi_major_axis(predicted), metrics.semi_major_axis(reference)
+        )
+        shown = np.unique(np.round(np.geomspace(1, NUM_STEPS, 40)).astype(int))
+        mean = metrics.error_statistics(position).mean
+        last = int(np.argmax(mean > SATURATED)) or NUM_STEPS
+        curves[name] = {
+            "steps": shown.tolist(), "mean": mean[shown].tolist(),
+            "axis": metrics.error_statistics(energy).mean[shown].tolist(),
+            "last": last,
+            "exponent": metrics.growth_exponent(steps, position, first=2, last=last)._asdict(),
+            "axis_exponent": metrics.growth_exponent(steps, energy, first=2, last=last)._asdict(),
+        }  # fmt: skip
+    return {
+        "vfnn_one_step_rms": vfnn_rms,
+        "map_one_step_rms": error, "map": label, "curves": curves,
+    }  # fmt: skip
+
+
+def generic_bound(quick: bool) -> Numbers:
+    """Theorem "genericPredictionErrorBound" on its own example: f(x) = x, learned as x + δ.
+
+    From x₀ = 0 the error of Euler's steps is δ ((1 + h)ⁿ − 1), and the bound
+    (exp(LT) − 1)/L · (δ + L h/2) with L = 1. As h → 0 their ratio goes to 1.
+    """
+    del quick
+    delta, time_end = 1e-2, 5.0
+    rows = []
+    for h in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5):
+        n = round(time_end / h)
+
+        def euler(x, h=h):
+            return x + h * (x + delta)
+
+        x = np.asarray(rollout(euler, jnp.zeros((1, 1)), n, save_every=max(1, n // 50)))[0, :, 0]
+        times = np.linspace(0, time_end, len(x))
+        bound = np.expm1(time_end) * (delta + h / 2)
+        late = times > 2
+        rate = np.polyfit(times[late], np.log(np.abs(x[late])), 1)[0]
+        rows.append({"h": h, "error": float(x[-1]), "bound": float(bound),
+                     "ratio": float(x[-1] / bound), "rate": float(rate)})  # fmt: skip
+    return {"delta": delta, "time": time_end, "rows": rows}
+
+
+GROWTH = ("two-body", "henon-heiles-printed", "henon-heiles-regular")
+PIECES: dict[str, Callable[[bool], Numbers]] = {
+    **{f"growth-{name}": growth(name) for name in GROWTH},
+    "growth-actions": actions,
+    "growth-vfnn": vfnn,
+    "growth-generic-bound": generic_bound,
+}
+
+
+def run(name: str, folder: Path, quick: bool) -> None:
+    """Measure a piece and write its result."""
+    print(name, flush=True)
+    started = time.perf_counter()
+    measured = PIECES[name](quick)
+    result = {
+        "piece": name, "quick": quick, "measured": measured,
+        "seconds": time.perf_counter() - started, "seed": SEED, "dtype": "float64",
+        "device": report.device(),
+        "machine": {
+            "processor": platform.machine(), "cores": len(os.sched_getaffinity(0)),
+            "load": os.getloadavg()[0],
+        },
+        "versions": versions(), "date": time.strftime("%Y-%m-%d", time.gmtime()),
+    }  # fmt: skip
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.json").write_text(report.to_json(result), encoding="utf-8")
+    print(f"{name}: {result['seconds']:.0f} s", flush=True)
+
+
+def interval(row: Numbers, key: str = "exponent") -> str:
+    """Value with its 95 % interval."""
+    if row.get(key) is None:
+        return "–"
+    low, high = row["interval"]
+    low, high = ("?" if v is None else f"{v:.2f}" for v in (low, high))
+    return f"{row[key]:.2f} ({low} to {high})"
+
+
+def section(found: dict[str, Numbers]) -> str:
+    """Markdown of all results."""
+    m = {name.removeprefix("growth-"): r["measured"] for name, r in found.items()}
+    lines: list[str] = []
+    scenes = [m[name] for name in GROWTH if name in m]
+    if scenes:
+        lines += [
+            "**Growth with the step number and proportionality to ε.** Every line one learned map; "
+            "the exponent α of error ∝ nᵅ, from step 10 up to where the error is a tenth, with its "
+            "95 % interval.", "",
+            "| scene | S cut off at | ε, one step | error at step 100 | at 1,000 | α |",
+            "|---" * 6 + "|",
+        ]  # fmt: skip
+        lines += [
+            f"| {s['scene']} | {r['label']} | {number(r['one_step_rms'])} | "
+            f"{number(r['error_100'])} | {number(r['error_end'])} | {interval(r)} |"
+            for s in scenes for r in s["rows"]
+        ]  # fmt: skip
+        lines += ["", "Error at step 100 ∝ εᵇ, with b:", ""]
+        for s in scenes:
+            p = s["proportionality"]
+            decades = "" if p["decades"] is None else f" over {p['decades']:.1f} decades of ε"
+            lines.append(f"- {s['scene']}: b = {interval(p)}{decades}, {p['points']} maps")
+        lines += ["", "![Error against ε](figures/growth_proportionality.png)",
+                  "![Growth on two bodies](figures/growth_two_body.png)", ""]  # fmt: skip
+    if "actions" in m:
+        lines += [
+            "**Actions.** Two bodies: the largest change of Delaunay's action √a over 1/(ε dt) "
+            f"steps (at most {LONGEST:,}), 8 orbits.", "",
+            "| S cut off at | ε | steps | all of 1/(ε dt) | largest change | in the first tenth | "
+            "change/ε |",
+            "|---" * 7 + "|",
+        ]  # fmt: skip
+        for r in m["actions"]["rows"]:
+            quotient = None if r["largest"] is None else r["largest"] / r["one_step_rms"]
+            lines.append(
+                f"| {r['label']} | {number(r['one_step_rms'])} | {r['num_steps']:,} | "
+                f"{'yes' if r['whole_time'] else 'no'} | {number(r['largest'])} | "
+                f"{number(r['largest_in_first_tenth'])} | {number(quotient)} |"
+            )
+        p = m["actions"]["proportionality"]
+        lines += ["", f"Largest change ∝ εᵇ with b = {interval(p)}.", ""]
+    if "vfnn" in m:
+        v = m["vfnn"]
+        lines += [
+            "**A learned vector field.** Two bodies, one-step error "
+            f"{number(v['vfnn_one_step_rms'])} beside a map's {number(v['map_one_step_rms'])}; "
+            "exponents until the mean position error is a tenth.", "",
+            "| | until step | α of the position | α of the semi-major axis |", "|---" * 4 + "|",
+        ]  # fmt: skip
+        for name, c in v["curves"].items():
+            e, a = ({"exponent": c[k]["value"], "interval": c[k]["interval"]}
+                    for k in ("exponent", "axis_exponent"))  # fmt: skip
+            lines.append(f"| {name} | {c['last']} | {interval(e)} | {interval(a)} |")
+        lines += ["", "![A learned vector field](figures/growth_vfnn.png)", ""]
+    if "generic-bound" in m:
+        g = m["generic-bound"]
+        lines += [
+            f"**The generic bound attained.** f(x) = x learned as x + δ, δ = {g['delta']}, Euler's "
+            f"steps to T = {g['time']:g} from x = 0.", "",
+            "| h | error | bound | error/bound | rate of growth (bound: L = 1) |",
+            "|---" * 5 + "|",
+        ]  # fmt: skip
+        lines += [
+            f"| {number(r['h'])} | {r['error']:.4g} | {r['bound']:.4g} | {r['ratio']:.3f} | "
+            f"{r['rate']:.3f} |" for r in g["rows"]
+        ]  # fmt: skip
+    return "\n".join(lines).rstrip()
+
+
+def draw(found: dict[str, Numbers]) -> None:
+    """The figures, from the results."""
+    m = {name.removeprefix("growth-"): r["measured"] for name, r in found.items()}
+    FIGURES.mkdir(exist_ok=True)
+
+    def finite(values):
+        return np.array([np.nan if v is None else v for v in values])
+
+    points = {
+        name: (finite([r["one_step_rms"] for r in m[name]["rows"]]),
+               finite([r["error_100"] for r in m[name]["rows"]]))
+        for name in GROWTH if name in m
+    }  # fmt: skip
+    if points:
+        ax: Any = figures.proportionality(points, r"one-step error $\varepsilon$ (RMS)",
+                                          "position error at step 100")  # fmt: skip
+        figures.save(ax.figure, FIGURES / "growth_proportionality.png")
+    if "two-body" in m:
+        curves = {
+            f"ε = {r['one_step_rms']:.0e}": (np.array(r["curve"]["steps"]),
+                                             finite(r["curve"]["mean"])[None])
+            for r in m["two-body"]["rows"]
+        }  # fmt: skip
+        ax = figures.error_growth(curves)
+        figures.save(ax.figure, FIGURES / "growth_two_body.png")
+    if "vfnn" in m:
+        curves = {
+            name: (np.array(c["steps"]), finite(c["mean"])[None])
+            for name, c in m["vfnn"]["curves"].items()
+        }
+        ax = figures.error_growth(curves)
+        figures.save(ax.figure, FIGURES / "growth_vfnn.png")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("pieces", nargs="*", choices=[[], *PIECES], metavar="PIECE",
+                        help=", ".join(PIECES))  # fmt: skip
+    parser.add_argument("--quick", action="store_true", help="small sizes; writes no tables")
+    parser.add_argument("--overwrite", action="store_true", help="measure finished pieces again")
+    parser.add_argument("--tables", action="store_true", help="only make tables and figures again")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
+    arguments = parser.parse_args(argv)
+    folder = arguments.out or (Path("runs/error-growth") if arguments.quick else RESULTS)
+    for name in [] if arguments.tables else arguments.pieces or PIECES:
+        if arguments.overwrite or not (folder / f"{name}.json").exists():
+            run(name, folder, arguments.quick)
+    if folder == RESULTS:
+        paths = {name: folder / f"{name}.json" for name in PIECES}
+        found = {n: json.loads(p.read_text("utf-8")) for n, p in paths.items() if p.exists()}
+        if found:
+            draw(found)
+            between_markers(TABLES, "growth", f"{section(found)}\n\n{provenance(found)}")
+
+
+if __name__ == "__main__":
+    main()
