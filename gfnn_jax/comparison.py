@@ -47,7 +47,10 @@ TITLES = {name: method.title for name, method in METHODS.items()} | {
     OURS: "GFNN (ours)",
 }
 CAP, QUICK_CAP = 60.0, 2.0
+RUNAWAY = 100.0  # a prediction so many times larger than any reference is lost
 BINS = 50  # of the histograms that KL divergences compare
+
+ELEMENTS = {"axis": metrics.semi_major_axis, "eccentricity": metrics.eccentricity}
 
 _NUM_FRESH, _NUM_DEFECTS = 2_000, 200
 _QUICK_PAIRS, _QUICK_TRAJECTORIES = 10_000, 10
@@ -102,10 +105,12 @@ def compare(
     reported, measured = {}, {}
     for method in chosen:
         part, rollouts = finished.read(method)
+        rollouts = without_runaways(rollouts, data.reference)
         measured[TITLES[method]] = m = pipeline.measure(rollouts, scene, data.reference)
         reported[method] = {
-            "title": TITLES[method], **part, "rollout": m.report, "curve": _curve(m),
+            "title": TITLES[method], **part, "rollout": m.report, "curve": _curve(m.error),
             "kl": _divergences(scene, m.predicted, data.reference),
+            "elements": _elements(scene, m.predicted, data.reference),
         }  # fmt: skip
     result = {
         "scene": name, "dt": scene.dt, "seed": seed, "dtype": "float64",
@@ -236,6 +241,19 @@ def _rolled_out(learned: Learned, z0) -> Rollouts:
     return Rollouts(states, status, seconds)
 
 
+def without_runaways(rollouts: Rollouts, reference) -> Rollouts:
+    """What has left the reference's size by far is lost, as what is not finite: NaN from there on.
+
+    Some learned maps go on for long with numbers of no meaning, which would fill every mean.
+    """
+    with np.errstate(invalid="ignore"):
+        away = ~(np.abs(rollouts.states) < RUNAWAY * np.nanmax(np.abs(reference))).all(axis=-1)
+    lost = np.logical_or.accumulate(away, axis=1)
+    states = np.where(lost[..., None], np.nan, rollouts.states)
+    status = np.where(lost[:, -1] & (rollouts.status == OK), NON_FINITE, rollouts.status)
+    return Rollouts(states, status, rollouts.seconds)
+
+
 def _training(training: Any, cap: float) -> dict[str, Any]:
     """The report's part on an Adam training. Its errors are those of the method's own loss."""
     return {
@@ -317,10 +335,20 @@ def _one_step_rms(step, data: _Data) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def _curve(measured: Measured) -> dict[str, Any]:
-    """Error statistics at about 13 steps a decade."""
+def _elements(scene: Scene, predicted, reference) -> dict[str, Any] | None:
+    """Curves of the errors of semi-major axis and eccentricity, of two bodies."""
+    if scene.name != "two-body":
+        return None
+    return {
+        name: _curve(metrics.absolute_error(element(predicted), element(reference)))
+        for name, element in ELEMENTS.items()
+    }
+
+
+def _curve(error) -> dict[str, Any]:
+    """Statistics of an error (B, L) at about 13 steps a decade."""
     steps = np.unique(np.round(np.geomspace(1, NUM_STEPS, 40)).astype(int))
-    statistics = metrics.error_statistics(measured.error)
+    statistics = metrics.error_statistics(error)
     return {
         "steps": steps.tolist(),
         **{name: [float(f"{v:.4e}") for v in getattr(statistics, name)[steps]]
@@ -389,8 +417,7 @@ def draw(scene: Scene, measured: dict[str, Measured], reference) -> dict[str, An
     predicted = {n: m.predicted for n, m in measured.items()}
     if scene.name == "two-body":
         elements = {
-            n: (steps, *(metrics.absolute_error(f(z), f(reference))
-                         for f in (metrics.semi_major_axis, metrics.eccentricity)))
+            n: (steps, *(metrics.absolute_error(f(z), f(reference)) for f in ELEMENTS.values()))
             for n, z in predicted.items()
         }  # fmt: skip
         drawn["elements"] = figures.element_errors(elements)[0].figure

@@ -121,6 +121,18 @@ def test_divergences_of_a_chaotic_scene(small):
     assert comparison._divergences(scenes.make("two-body"), None, None) is None
 
 
+def test_a_runaway_is_lost_from_there_on():
+    reference = np.ones((2, 4, 2))
+    states = reference.copy()
+    states[1, 2, 0] = 101.0
+    status = np.zeros(2, int)
+    kept = comparison.without_runaways(pipeline.Rollouts(states, status, 1.0), reference)
+    np.testing.assert_array_equal(kept.states[0], 1.0)
+    assert np.isnan(kept.states[1, 2:]).all()
+    np.testing.assert_array_equal(kept.states[1, :2], 1.0)
+    assert kept.status.tolist() == [0, 4]
+
+
 def test_the_papers_recipe_on_the_standard_map(small):
     """Its map commutes with the shifts by 2π, and S sees no more of θ than cos and sin."""
     data = comparison._Data(scenes.make("standard-map-regular"), 0, True)
