@@ -199,7 +199,7 @@ def paper_recipe(quick: bool) -> Numbers:
     params = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), trained.params)
     scale = jnp.asarray(z0.std(axis=0))
     generated = Generated(
-        family, params, TYPE2, scene.dt, scale, jnp.zeros((4, 4)), jnp.zeros(4)
+        family, params, TYPE2, scene.dt, scale
     )  # fmt: skip
     map_ = SymplecticMap((generated,), CARTESIAN, covering(z0), scale, jnp.zeros(0), scene.dt)
     return {

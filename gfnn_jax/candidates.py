@@ -27,6 +27,7 @@ from gfnn_jax.scalars.inputs import box_inputs, variable_signs
 from gfnn_jax.scalars.mlp import Mlp, amplitude_of
 from gfnn_jax.scalars.products import Products
 from gfnn_jax.scalars.sines import Sines
+from gfnn_jax.starts import affordable, fit_starts
 
 # Degrees whose numbers of terms grow by about a half from one to the next; a stage is fitted by one
 # factorisation of the rows of its largest degree.
@@ -35,7 +36,7 @@ _SINES = (100, 200, 400, 800, 1_600)
 _MOST_TERMS = 1_500
 # Rows × terms² of one factorisation: about ten seconds on two cores.
 _MOST_WORK = 1.2e11
-_NOMINAL_NEWTON = 3.0
+_NOMINAL_UPDATES = 1.0
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
 _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
 _CHECKPOINT_SECONDS = 10.0
@@ -117,6 +118,7 @@ class Ladder:
         self.prepared, self.chart, self.rows, self.kind = prepared, chart, rows, kind
         self.train, self.weight = _data(prepared, chart, rows.training)
         self.held, _ = _data(prepared, chart, rows.held_out)
+        self.starts = fit_starts(chart, prepared, features)
         coordinates, dim = prepared.coordinates, prepared.y0.shape[1] // 2
         angles = tuple(a for a in coordinates.angles if a < dim)
         w = self.train[0]
@@ -129,7 +131,7 @@ class Ladder:
             signs = variable_signs(inputs, reversor, w) if reversor is not None else None
             stages = ((Products(inputs, degree, signs) for degree in s) for s in _STAGES)
         self.rungs = [
-            Rung(f, stage[-1], counted_work(f, _NOMINAL_NEWTON))
+            Rung(f, stage[-1], counted_work(f, _NOMINAL_UPDATES))
             for stage in _determined(stages, w.size) for f in stage
         ]  # fmt: skip
         self._reduced: dict[Any, least_squares.Reduced] = {}
@@ -151,7 +153,7 @@ class Ladder:
         padding = top.num_parameters - family.num_parameters
         padded = top.unflatten(jnp.pad(solved.coefficients, (0, padding)))
         error = validation_error(
-            compose(self.prepared, self.chart, top, padded, self.rows.pairs),
+            self._composed(top, padded),
             self.rows.pairs, self.rows.held_out,
         )  # fmt: skip
         params = family.unflatten(solved.coefficients)
@@ -165,8 +167,12 @@ class Ladder:
             compile_seconds=reduced.compile_seconds, train_rms=solved.train_rms,
             newton_iterations_max=int(error.iterations.max()), condition=solved.condition,
             rank=solved.rank,
-            map=compose(self.prepared, self.chart, family, params, self.rows.pairs),
+            map=self._composed(family, params),
         )  # fmt: skip
+
+    def _composed(self, family, params) -> SymplecticMap:
+        starts = affordable(self.starts, family)
+        return compose(self.prepared, self.chart, family, params, starts, self.rows.pairs)
 
 
 class Network:
@@ -204,7 +210,8 @@ class Network:
             on_progress=report, checkpoint=_every_few_seconds(self.checkpoints),
             resume=resume[1] if resume else None,
         )  # fmt: skip
-        map_ = compose(self.prepared, self.chart, family, result.params, self.rows.pairs)
+        starts = affordable(fit_starts(self.chart, self.prepared), family)
+        map_ = compose(self.prepared, self.chart, family, result.params, starts, self.rows.pairs)
         error = validation_error(map_, self.rows.pairs, self.rows.held_out)
         return Candidate(
             label=family.label, scalar=family.name, chart=self.chart.name,
@@ -306,11 +313,9 @@ def _determined(stages: Iterable[Iterable[Any]], rows: int) -> Iterator[list[Any
         return
 
 
-def compose(prepared: Prepared, chart, family, params, pairs: Pairs) -> SymplecticMap:
-    generated = Generated(
-        family, params, chart, prepared.dt,
-        *(jnp.asarray(a) for a in (prepared.scale, prepared.linear, prepared.offset)),
-    )  # fmt: skip
+def compose(prepared: Prepared, chart, family, params, starts, pairs: Pairs) -> SymplecticMap:
+    scale = jnp.asarray(prepared.scale)
+    generated = Generated(family, params, chart, prepared.dt, scale, *starts)
     half = prepared.half
     return SymplecticMap(
         pieces=(generated,) if half is None else (half, generated, half),
@@ -356,10 +361,10 @@ def validation_error(map_: SymplecticMap, pairs: Pairs, rows) -> ValidationError
 def counted_work(family, iterations: float) -> float:
     """Floating-point operations per predicted step: those of ∇S and of its Jacobian, counted.
 
-    ``iterations`` Newton updates need one evaluation more than updates, and a Jacobian each.
+    ``iterations`` updates need a gradient each, beside the one that comes with the Jacobian.
     """
     gradient, jacobian = family.operations
-    return float((1 + iterations) * gradient + iterations * jacobian)
+    return float(jacobian + iterations * gradient)
 
 
 def timed(candidates: list[Candidate], chosen: Candidate, states) -> list[Candidate]:

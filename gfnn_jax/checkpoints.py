@@ -26,7 +26,7 @@ import numpy as np
 from gfnn_jax.errors import InputError
 from gfnn_jax.outputs import atomic_folder, failures_as_work_errors, restore_interrupted
 
-FORMAT = 1
+FORMAT = 2
 _SUMS = "SHA256SUMS"
 _JSON = "model.json"
 

@@ -34,6 +34,8 @@ STATUS_NAMES = (
 # Elimination is unrolled up to this size; beyond it LAPACK's call overhead no longer matters.
 _UNROLL_UP_TO = 8
 _HALVINGS = 12
+# A frozen Jacobian serves while each update leaves at most this part of the residual.
+_CONTRACTION = 0.1
 # A residual of this many eps of the size of its terms is the floor: a few roundings of that size.
 _FLOOR_EPS = 4.0
 
@@ -76,44 +78,74 @@ def small_solve(matrix: Matrix, rhs: Vector) -> Vector:
 class _Iterate(NamedTuple):
     x: Any
     residual: Any
-    matrix: Any  # ∂r/∂x at x
     aux: Any
     merit: Any  # largest residual, what damping makes smaller
     error: Any  # largest residual relative to its roundoff floor
     iterations: Any
+    contracts: Any  # the frozen Jacobian still serves
     open: Any  # still to be improved
 
 
 def iterate(
-    evaluate: Callable, theta: Any, guess: Vector, *, fixed: int, most: int
+    evaluate: Callable, theta: Any, guess: Vector, *, most: int
 ) -> tuple[Vector, Any, Info]:
     """The iterations themselves: ``evaluate(theta, x) -> (residual (n,), size (n,), aux)``.
 
     ``size`` is that of the terms whose difference the residual is: a few eps of it is roundoff.
-    Newton's method, a step halved until the residual falls: ``fixed`` iterations in every lane,
-    then more while a lane is open, up to ``most``. A lane closes when its residual is at the
-    roundoff floor, or is close to it and no longer halves, or cannot be made smaller. The residual
-    and its Jacobian are evaluated together, once per iterate: they share most of their work.
+    Updates with the Jacobian at the guess (it is evaluated there together with the residual, with
+    which it shares most of its work) as long as they contract: from a good guess one or two. Then,
+    for the lanes that are left, Newton's method with a fresh Jacobian, a step halved until the
+    residual falls. A lane closes when its residual is at the roundoff floor, or is close to it and
+    no longer halves, or cannot be made smaller. At most ``most`` updates.
     Returns x, aux at x, Info.
     """
     eps = float(jnp.finfo(guess.dtype).eps)
     settled = eps**-0.25  # in floors: 3e-12 of the size in float64, 1e-5 in float32
+    true = jnp.array(True)
+
+    def judged(x, iterations, residual, size, aux):
+        merit = jnp.max(jnp.abs(residual))
+        error = jnp.max(jnp.abs(residual) / size) / (_FLOOR_EPS * eps)
+        return _Iterate(x, residual, aux, merit, error, iterations, true, true)
 
     def at(x, iterations):
+        residual, size, aux = evaluate(theta, x)
+        return judged(x, iterations, residual, size, aux)
+
+    def linearised(x, iterations):
+        """The iterate at x and its Jacobian ∂r/∂x."""
+
         def with_aux(x):
             residual, size, aux = evaluate(theta, x)
             return residual, (residual, size, aux)
 
         matrix, (residual, size, aux) = jax.jacfwd(with_aux, has_aux=True)(x)
-        merit = jnp.max(jnp.abs(residual))
-        error = jnp.max(jnp.abs(residual) / size) / (_FLOOR_EPS * eps)
-        return _Iterate(x, residual, matrix, aux, merit, error, iterations, jnp.array(True))
+        return judged(x, iterations, residual, size, aux), matrix
+
+    def updated(state, new):
+        """The better of two iterates, and whether it can be improved further."""
+        better, halved = new.merit < state.merit, new.merit < 0.5 * state.merit
+        kept = jax.tree.map(partial(jnp.where, better), new, state)
+        left = (kept.error > settled) | (kept.error > 1.0) & halved
+        room = left & (new.iterations < most)
+        contracts = room & (new.merit < _CONTRACTION * state.merit)
+        return kept._replace(
+            iterations=new.iterations, contracts=contracts, open=room & (better | state.contracts)
+        )
+
+    first, matrix = linearised(guess, jnp.zeros((), jnp.int32))
+    inverse = small_solve(matrix, jnp.eye(guess.shape[0], dtype=guess.dtype))
+
+    def frozen(state):
+        step = jnp.sum(inverse * state.residual[None, :], axis=1)
+        return updated(state, at(state.x - step, state.iterations + 1))
 
     def newton(state):
-        step = small_solve(state.matrix, state.residual)
+        iterations = state.iterations + 1
+        _, matrix = linearised(state.x, iterations)
+        step = small_solve(matrix, state.residual)
         # Close to the floor only the full step makes sense: what is left is roundoff.
         shortest = jnp.where(state.error < settled, 1.0, 0.5**_HALVINGS).astype(guess.dtype)
-        iterations = state.iterations + 1
 
         def too_long(attempt):
             factor, new = attempt
@@ -127,35 +159,32 @@ def iterate(
         untried = state._replace(merit=jnp.full_like(state.merit, jnp.inf))
         two = jnp.full_like(shortest, 2.0)
         _, new = jax.lax.while_loop(too_long, halved, (two, untried))
-        better = new.merit < state.merit
-        goes_on = (new.error > settled) | (new.error > 1.0) & (new.merit < 0.5 * state.merit)
-        goes_on = better & goes_on | (iterations < fixed)
-        kept = jax.tree.map(partial(jnp.where, better), new, state)
-        return kept._replace(iterations=iterations, open=goes_on & (iterations < most))
+        state = state._replace(contracts=~true)
+        return updated(state, new._replace(iterations=iterations))
 
-    first = at(guess, jnp.zeros((), jnp.int32))
-    first = first._replace(open=jnp.isfinite(first.error))
-    state = jax.lax.while_loop(lambda s: s.open, newton, first)
+    state = frozen(first)
+    state = jax.lax.while_loop(lambda s: s.open & s.contracts, frozen, state)
+    state = jax.lax.while_loop(lambda s: s.open, newton, state)
     finite = jnp.isfinite(state.error)
     status = jnp.where(state.error <= settled, OK, jnp.where(finite, NOT_CONVERGED, NON_FINITE))
     residual = state.error * (_FLOOR_EPS * eps)
     return state.x, state.aux, Info(status.astype(jnp.int32), state.iterations, residual)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 3, 4))
-def root(evaluate, theta, guess, fixed: int, most: int):
+@partial(jax.custom_jvp, nondiff_argnums=(0, 3))
+def root(evaluate, theta, guess, most: int):
     """As ``iterate``, with derivatives in θ by the implicit function theorem.
 
     dx = −(∂r/∂x)⁻¹ (∂r/∂θ) dθ; the guess has no influence. ``evaluate`` must not close over
     anything that is differentiated.
     """
-    return iterate(evaluate, theta, guess, fixed=fixed, most=most)
+    return iterate(evaluate, theta, guess, most=most)
 
 
 @root.defjvp
-def _root_jvp(evaluate, fixed, most, primals, tangents):
+def _root_jvp(evaluate, most, primals, tangents):
     theta, guess = primals
-    x, aux, info = root(evaluate, theta, guess, fixed, most)
+    x, aux, info = root(evaluate, theta, guess, most)
     _, residual_dot = jax.jvp(lambda t: evaluate(t, x)[0], (theta,), (tangents[0],))
     matrix = jax.jacfwd(lambda y: evaluate(theta, y)[0])(x)
     x_dot = -small_solve(matrix, residual_dot)

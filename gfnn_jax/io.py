@@ -31,7 +31,6 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.errors import InputError
-from gfnn_jax.outputs import ensure_new  # noqa: F401, for models until it imports from there
 
 # Times in text files carry few digits: relative agreement asked of time steps.
 TIME_TOLERANCE = 1e-5

@@ -27,7 +27,6 @@ from gfnn_jax.phase_space import apply_j, require_x64, symplecticity_defect
 from gfnn_jax.rollout import scan_steps
 from gfnn_jax.scalars import as_pytree
 
-_FIXED_NEWTON = 3
 _MOST_NEWTON = 40
 _TWO_PI_REST = 2.4492935982947064e-16  # what float64 leaves out of 2π
 
@@ -64,15 +63,15 @@ class _Equation:
         return residual / unit, size / unit, (w, gradient)
 
 
-@_register(("scalar", "params", "scale", "linear", "offset"), ("chart", "dt"))
+@_register(("scalar", "params", "scale", "there", "back"), ("chart", "dt"))
 @dataclasses.dataclass(frozen=True, eq=False)
 class Generated:
     """The map that S generates in a chart: Z − z = h J ∇S(w) (paper, eq. (4)).
 
     scalar: ``S(params, w)``; what it holds of the data are leaves of the map, and a plain function
     is wrapped to have none. scale: (2d,) sizes of the coordinates, for the roundoff floor.
-    linear (2d, 2d) and offset (2d,): a rough affine model of Z − z, where the solve starts; it
-    has no influence on the solution but, at a fold of S, on the branch that is found.
+    there, back: where the solve of the map, and of its inverse, starts (a ``starts.Start``); None:
+    at the chart's own first guess.
     """
 
     scalar: Any
@@ -80,8 +79,8 @@ class Generated:
     chart: AnyChart
     dt: float
     scale: Any
-    linear: Any
-    offset: Any
+    there: Any = None
+    back: Any = None
 
     def __post_init__(self):
         object.__setattr__(self, "scalar", as_pytree(self.scalar))
@@ -92,15 +91,13 @@ class Generated:
         dim = z.shape[0] // 2
         free = np.array(self.chart.free(dim))
         known = self.chart.start(z)
-        guess = self.chart.point(z, z + self.offset + self.linear @ z)[free]
+        guess = known[free] if self.there is None else known[free] + self.there(z)
         theta = (self.scalar, self.params, z, known, self.scale)
         if executed:
-            _, (w, gradient), info = implicit.iterate(
-                equation, theta, guess, fixed=_FIXED_NEWTON, most=_MOST_NEWTON
-            )
+            _, (w, gradient), info = implicit.iterate(equation, theta, guess, most=_MOST_NEWTON)
         else:
             _, (w, gradient), info = implicit.root(
-                equation, theta, jax.lax.stop_gradient(guess), _FIXED_NEWTON, _MOST_NEWTON
+                equation, theta, jax.lax.stop_gradient(guess), _MOST_NEWTON
             )
         return w, gradient, info
 
@@ -112,10 +109,7 @@ class Generated:
     def inverse(self) -> Generated:
         """The inverse map: the same S, the chart read from its other side."""
         chart, dt = self.chart.reverse(self.dt)
-        eye = jnp.eye(self.linear.shape[0], dtype=self.linear.dtype)
-        linear = jnp.linalg.inv(eye + self.linear) - eye
-        offset = -(eye + linear) @ self.offset
-        return dataclasses.replace(self, chart=chart, dt=dt, linear=linear, offset=offset)
+        return dataclasses.replace(self, chart=chart, dt=dt, there=self.back, back=self.there)
 
     def determinant(self, z):
         """det ∂w/∂z at the state z (2d,), which vanishes where the chart is singular.

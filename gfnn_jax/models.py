@@ -22,19 +22,22 @@ from gfnn_jax.charts import Chart, TypeOne
 from gfnn_jax.checkpoints import load_model, save_model
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.domain import Domain
-from gfnn_jax.io import InputError, ensure_new
+from gfnn_jax.errors import InputError
 from gfnn_jax.maps import Affine, Generated, SymplecticMap
+from gfnn_jax.outputs import ensure_new
 from gfnn_jax.scalars.inputs import Inputs
 from gfnn_jax.scalars.mlp import Mlp
 from gfnn_jax.scalars.products import Products
 from gfnn_jax.scalars.sines import Sines
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.scene import Scene
+from gfnn_jax.starts import Start
 
 _TYPES: dict[str, type] = {
     kind.__name__: kind
     for kind in (
-        SymplecticMap, Generated, Affine, Chart, TypeOne, Domain, Products, Sines, Mlp, Inputs,
+        SymplecticMap, Generated, Start, Affine, Chart, TypeOne, Domain,
+        Products, Sines, Mlp, Inputs,
     )
 }  # fmt: skip
 # Stands in the description where a function of the scene belongs.
@@ -118,9 +121,8 @@ def versions() -> dict[str, str | None]:
 
 def _features(map_: SymplecticMap) -> list:
     """The functions that stand in for w in the map's scalars."""
-    scalars = [piece.scalar for piece in map_.pieces if isinstance(piece, Generated)]
-    inputs = [getattr(scalar, "inputs", None) for scalar in scalars]
-    return [i.features for i in inputs if i is not None and i.features is not None]
+    inputs = jax.tree.leaves(map_, is_leaf=lambda node: isinstance(node, Inputs))
+    return [i.features for i in inputs if isinstance(i, Inputs) and i.features is not None]
 
 
 def _lender(map_: SymplecticMap, scene: Scene | None) -> str | None:

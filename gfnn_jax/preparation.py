@@ -42,8 +42,6 @@ class Prepared:
     coordinates: Coordinates
     domain: Domain
     cut: np.ndarray
-    linear: np.ndarray
-    offset: np.ndarray
     dt: float
 
 
@@ -56,31 +54,18 @@ def prepare(pairs: Pairs, coordinates: Coordinates) -> Prepared:
     )
     whole = tuple(i for i, c in zip(coordinates.angles, covered, strict=True) if c)
     scale = sizes(y0)
-    linear, offset = _affine_model(y0, y1 - y0, scale, coordinates)
     return Prepared(
         y0=y0, y1=y1, half=None, scale=scale, coordinates=coordinates,
         domain=covering(y0, ignore=(*coordinates.cyclic, *whole)),
-        cut=centres, linear=linear, offset=offset, dt=float(pairs.dt),
+        cut=centres, dt=float(pairs.dt),
     )  # fmt: skip
-
-
-def _affine_model(y, difference, scale, coordinates: Coordinates):
-    """The affine model of Z − z where the implicit solve starts; angles have no part in it."""
-    width = y.shape[1]
-    free = [i for i in range(width) if i not in coordinates.angles]
-    design = np.column_stack([np.ones(len(y)), y[:, free] / scale[free]])
-    solution = np.linalg.lstsq(design, difference, rcond=1e-10)[0]
-    linear = np.zeros((width, width))
-    linear[:, free] = solution[1:].T / scale[free]
-    return linear, solution[0]
 
 
 def factor_out(prepared: Prepared, half: Affine) -> Prepared:
     y0 = np.asarray(jax.vmap(lambda y: half(y)[0])(jnp.asarray(prepared.y0)))
     back = half.inverse()
     y1 = np.asarray(jax.vmap(lambda y: back(y)[0])(jnp.asarray(prepared.y1)))
-    linear, offset = _affine_model(y0, y1 - y0, prepared.scale, prepared.coordinates)
-    return dataclasses.replace(prepared, y0=y0, y1=y1, half=half, linear=linear, offset=offset)
+    return dataclasses.replace(prepared, y0=y0, y1=y1, half=half)
 
 
 def choose_charts(request, prepared: Prepared, reversor, jacobians, judgements, warn):

@@ -46,10 +46,10 @@ def equation(residual):
     return evaluate
 
 
-@functools.partial(jax.jit, static_argnums=(0, 3, 4))
-def solved(evaluate, theta, guess, fixed=3, most=40):
+@functools.partial(jax.jit, static_argnums=(0, 3))
+def solved(evaluate, theta, guess, most=40):
     """A batch of solves: theta (B, ...), guess (B, n)."""
-    return jax.vmap(lambda t, x: root(evaluate, t, x, fixed, most))(theta, guess)
+    return jax.vmap(lambda t, x: root(evaluate, t, x, most))(theta, guess)
 
 
 @equation
@@ -63,8 +63,8 @@ def test_roots_to_roundoff_from_far_away():
     np.testing.assert_allclose(x, np.sqrt(theta), rtol=1e-14, atol=1e-11)
     np.testing.assert_array_equal(aux, x[:, 0])
     assert (info.status == OK).all()
-    assert (info.iterations[0], info.iterations[3]) == (5, 3)
-    assert info.iterations[2] > 5
+    assert info.iterations[3] == 1  # one update is always made
+    assert (info.iterations[:3] > 3).all()
     assert info.residual[3] == 0
 
 
@@ -121,8 +121,8 @@ def test_residual_above_the_floor_by_roundoff_ends_ok_at_once():
 
 
 def test_iterations_never_exceed_their_limit():
-    for fixed, most in ((1, 1), (1, 4), (3, 3)):
-        _, _, info = solved(square, jnp.full((1, 1), 1e4), jnp.ones((1, 1)), fixed, most)
+    for most in (1, 3, 4):
+        _, _, info = solved(square, jnp.full((1, 1), 1e4), jnp.ones((1, 1)), most)
         assert info.iterations[0] == most
         assert info.status[0] == NOT_CONVERGED
 
@@ -134,12 +134,12 @@ def coupled(theta, x):
 
 
 def solution(theta, guess=None):
-    x, aux, _ = root(coupled, theta, jnp.zeros(2), 3, 40)
+    x, aux, _ = root(coupled, theta, jnp.zeros(2), 40)
     return jnp.stack([x[0], aux])
 
 
 def unrolled(theta):
-    x, aux, _ = iterate(coupled, theta, jnp.zeros(2), fixed=3, most=40)
+    x, aux, _ = iterate(coupled, theta, jnp.zeros(2), most=40)
     return jnp.stack([x[0], aux])
 
 
@@ -172,7 +172,7 @@ def test_derivatives_of_batches_pass_the_integers_of_info():
     """Status and counts have no tangent; vmap, jit, grad and their orders must not mind."""
 
     def total(theta):
-        x, _, info = root(coupled, theta, jnp.zeros(2), 3, 40)
+        x, _, info = root(coupled, theta, jnp.zeros(2), 40)
         return jnp.sum(x) + jnp.where(info.status == OK, 0.0, 1.0) * x[0], info
 
     thetas = jnp.stack([THETA, 2 * THETA, -THETA])
@@ -188,10 +188,10 @@ def test_executed_derivative_of_an_unfinished_solve_is_wrong_and_the_implicit_on
     """Why the symplecticity defect must go through the iterations."""
 
     def stopped(theta):
-        return iterate(coupled, theta, jnp.zeros(2), fixed=1, most=1)[0]
+        return iterate(coupled, theta, jnp.zeros(2), most=1)[0]
 
     def implicit(theta):
-        return root(coupled, theta, jnp.zeros(2), 1, 1)[0]
+        return root(coupled, theta, jnp.zeros(2), 1)[0]
 
     step = 1e-6
     move = jnp.asarray([step, 0.0])
@@ -220,7 +220,7 @@ DT, LANES = 0.1, 64
 @functools.partial(jax.jit, static_argnums=0)
 def rough_steps(chart, params, z):
     def lane(z):
-        piece = Generated(rough, params, chart, DT, jnp.ones(2), jnp.zeros((2, 2)), jnp.zeros(2))
+        piece = Generated(rough, params, chart, DT, jnp.ones(2))
         image, info = piece(z)
         w = chart.point(z, image)
         hessian = jax.hessian(rough, argnums=1)(params, w)
@@ -270,7 +270,7 @@ def test_rough_steps_that_converge_are_common_enough_to_be_a_test():
 def test_float32_solves_in_float32():
     piece = Generated(
         rough, jnp.full((4, 5), 0.1, jnp.float32), TYPE2, DT,
-        jnp.ones(2, jnp.float32), jnp.zeros((2, 2), jnp.float32), jnp.zeros(2, jnp.float32),
+        jnp.ones(2, jnp.float32),
     )  # fmt: skip
     image, info = jax.jit(piece)(jnp.asarray([0.3, 0.4], jnp.float32))
     assert image.dtype == info.residual.dtype == jnp.float32

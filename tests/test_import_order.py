@@ -14,8 +14,8 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 # A module imports only from those before it; the modules of a folder share its place.
 ORDER = (
     "errors", "phase_space", "coordinates", "scenes", "trajectories", "outputs", "io",
-    "predictions", "charts", "domain", "scalars", "checkpoints", "fitting", "implicit", "rollout",
-    "maps", "models", "local_maps", "base_map", "preparation", "candidates", "selection",
+    "predictions", "charts", "domain", "scalars", "starts", "checkpoints", "fitting", "implicit",
+    "rollout", "maps", "models", "local_maps", "base_map", "preparation", "candidates", "selection",
     "baselines", "metrics", "figures", "report", "pipeline", "comparison", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of a later module imports it when called.

@@ -29,8 +29,7 @@ def a_map(
 ) -> SymplecticMap:
     width = STATES.shape[1]
     y = np.asarray(jax.vmap(coordinates.forward)(jnp.asarray(STATES)))
-    zero = jnp.zeros(width)
-    generated = Generated(family, params, chart, 0.1, jnp.ones(width), jnp.diag(zero), zero)
+    generated = Generated(family, params, chart, 0.1, jnp.ones(width))
     return SymplecticMap(
         (generated,) if half is None else (half, generated, half),
         coordinates,

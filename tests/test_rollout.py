@@ -20,7 +20,7 @@ KICK = 0.6
 
 
 def make_map(scalar, chart, dt, data, coordinates=CARTESIAN, params=None):
-    piece = Generated(scalar, params, chart, dt, jnp.ones(2), jnp.zeros((2, 2)), jnp.zeros(2))
+    piece = Generated(scalar, params, chart, dt, jnp.ones(2))
     domain = covering(data, ignore=coordinates.angles)
     cut = jnp.zeros(len(coordinates.angles))
     return SymplecticMap((piece,), coordinates, domain, jnp.ones(2), cut, dt)

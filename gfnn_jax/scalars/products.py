@@ -15,6 +15,7 @@ Because S is linear in C, the derivative rules below are complete: ``jax.grad``,
 from __future__ import annotations
 
 import dataclasses
+import math
 from functools import cache, cached_property, partial
 
 import jax
@@ -176,6 +177,38 @@ class Basis:
         rows = np.argwhere(exists)
         return rows[np.argsort(order[exists], kind="stable")]
 
+    def design(self, x) -> np.ndarray:
+        """The products at N variables x (N, k), the constant first: (N, 1 + terms), by NumPy."""
+        columns = []
+        for angle, values in zip(self.is_angle, np.asarray(x).T, strict=True):
+            phases = values[:, None] * np.arange(self.degree + 1)
+            columns.append(
+                np.hstack([np.cos(phases), np.sin(phases[:, 1:])])
+                if angle
+                else np.polynomial.chebyshev.chebvander(values, self.degree)
+            )
+        a, b = self.halves
+        (row, column), ones = self.terms.T, np.ones((len(x), 1))
+        u = math.prod((f[:, k] for f, k in zip(columns, a.indices.T, strict=False)), start=ones)
+        v = math.prod(
+            (f[:, k] for f, k in zip(columns[self.cut :], b.indices.T, strict=True)), start=ones
+        )
+        return np.hstack(
+            [
+                ones,
+                np.broadcast_to(u, (len(x), len(a.indices)))[:, row]
+                * np.broadcast_to(v, (len(x), len(b.indices)))[:, column],
+            ]
+        )
+
+    def placed(self, coefficients) -> np.ndarray:
+        """Coefficients (1 + terms, k) of the columns of ``design`` as k matrices (k, m, n)."""
+        a, b = self.halves
+        c = np.zeros((coefficients.shape[1], len(a.indices), len(b.indices)))
+        c[:, 0, 0] = coefficients[0]
+        c[:, self.terms[:, 0], self.terms[:, 1]] = coefficients[1:].T
+        return c
+
 
 _basis = cache(Basis)
 
@@ -237,6 +270,12 @@ class Products:
         row, col = self.basis.terms.T
         by_variable = jnp.concatenate([du[:, row] * v[None, col], u[None, row] * dv[:, col]])
         return slope.T @ by_variable
+
+
+def values(family: Products, matrices, x):
+    """Σ C_ab u_a v_b of each matrix in (k, m, n) at the scaled variables x: (k,)."""
+    u, _, _, v, _, _ = _tables(family.basis, x)
+    return _dot(_dot(matrices, v), u)
 
 
 def _tables(basis, x):
