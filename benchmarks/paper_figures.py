@@ -168,8 +168,8 @@ def claims(found: dict[str, list[Numbers]]) -> list[str]:
             f"{name}, *GFNN has the smallest error, and it grows linearly*: by the median error at "
             f"step 1,000 the paper's recipe is {place(order, PAPER_GFNN, AFTER_PAPER)} among the "
             f"paper's methods and {place(order, PAPER_GFNN, (OURS,))} with P-SympNet; ours is "
-            f"{place(order, OURS)} of all. Next to GFNN comes {title[best]}. Growth exponents of "
-            f"the two GFNN rows: {exponents}."
+            f"{place(order, OURS)}. The best of the other methods is {title[best]}. Growth "
+            f"exponents of the two GFNN rows: {exponents}."
         )
     for name in ("henon-heiles-chaotic", "standard-map-chaotic"):
         if name not in found:

@@ -25,7 +25,7 @@ from gfnn_jax import figures, metrics, models, pipeline, report
 from gfnn_jax.baselines import METHODS, Budget, Learned, Sequences
 from gfnn_jax.baselines.paper_gfnn import paper_gfnn
 from gfnn_jax.coordinates import TWO_PI
-from gfnn_jax.errors import InputError
+from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.implicit import NON_FINITE, OK
 from gfnn_jax.outputs import atomic_folder, atomic_write, ensure_new, failures_as_work_errors
 from gfnn_jax.phase_space import Pairs, sizes, symplecticity_defect
@@ -99,7 +99,12 @@ def compare(
         if method in finished:
             continue
         say(f"{TITLES[method]}: data")
-        part, rollouts = _learn_and_roll(method, data, cap, say)
+        try:
+            part, rollouts = _learn_and_roll(method, data, cap, say)
+        except ValueError as error:  # no finite start, no fit: the others need not suffer
+            raise WorkError(
+                f"{TITLES[method]}: {error} (--methods leaves it out, --resume keeps the others)"
+            ) from error
         finished.add(method, part, rollouts)
     say("reference, measures and figures")
     reported, measured = {}, {}

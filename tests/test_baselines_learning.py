@@ -47,6 +47,15 @@ def test_a_flow_that_fails_is_nan():
     assert np.isnan(np.asarray(step(jnp.array([1.0, 1.0])))).any()
 
 
+def test_ridges_of_large_states_start_finite(monkeypatch):
+    """States in [0, 2π), as the standard map's, through all 24 layers."""
+    p_module = sys.modules[METHODS["p-sympnet"].learn.__module__]
+    monkeypatch.setattr(p_module, "RECIPE", dataclasses.replace(RECIPE, epochs=1))
+    z = np.random.default_rng(0).uniform(0, 2 * np.pi, (100, 2, 2))
+    learned = METHODS["p-sympnet"].learn(Sequences(z, 1.0, (0, 1)), Budget(jax.random.key(0)))
+    assert np.isfinite(learned.training.validation_rms)
+
+
 def test_finite_differences():
     sequences = oscillator(3, 4)
     z, velocity = sequences.derivatives()

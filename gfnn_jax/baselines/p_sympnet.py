@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gfnn_jax.baselines.learned import Budget, Learned, Sequences, learn_map
 from gfnn_jax.fitting.adam import Recipe
@@ -24,7 +25,10 @@ RECIPE = Recipe(batch_size=200, epochs=1_200, epoch_length=500, rate=1e-2, sched
 
 def p_sympnet(sequences: Sequences, budget: Budget) -> Learned:
     """``LAYERS`` ridge polynomials of the degrees 2 to ``DEGREE``."""
+    largest = float(np.max(np.sqrt(np.mean(sequences.z**2, axis=(0, 1)))))
     params = p_init(budget.key, sequences.dim, LAYERS, DEGREE)
+    # High powers of states much larger than 1 would overflow before the training begins.
+    params["direction"] = params["direction"] / max(1.0, largest)
     label = f"{LAYERS} ridge polynomials of degree {DEGREE}"
 
     def step(params, z):
