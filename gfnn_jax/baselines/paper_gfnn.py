@@ -58,8 +58,7 @@ def paper_gfnn(pairs: Sequences, budget: Budget) -> PaperGfnn:
     )  # fmt: skip
     params = jax.tree.map(lambda a: jnp.asarray(a, float), training.params)
     scale = jnp.asarray(sizes(z0))
-    flat = jnp.zeros((2 * pairs.dim, 2 * pairs.dim))
-    generated = Generated(family, params, TYPE2, pairs.dt, scale, flat, flat[0])
+    generated = Generated(family, params, TYPE2, pairs.dt, scale)
     coordinates = Coordinates("cartesian", angles=pairs.angles)
     cut = jnp.full(len(pairs.angles), np.pi)  # z0 is in [0, 2π)
     domain = covering(z0[:_MOST_STATES], ignore=pairs.angles)
