@@ -480,3 +480,30 @@ def _legend_above(ax, ncols=3, **options):
         columnspacing=1.2,
         **options,
     )
+
+
+@style()
+def digits_against_step_size(sweeps: Mapping, axes=None) -> list[Axes]:
+    """Digits kept against the time step, a panel for each system, a curve for each chart.
+
+    sweeps: system -> {"dt": (K,), chart: digits (K,), ...}; a fit that was refused is None or NaN,
+    and is drawn as a cross on the axis.
+    """
+    if axes is None:
+        figure = Figure(figsize=(WIDTH * 0.62 * len(sweeps), HEIGHT))
+        axes = list(np.atleast_1d(figure.subplots(1, len(sweeps), sharey=True)))
+    for ax, (system, curves) in zip(axes, sweeps.items(), strict=True):
+        dt = np.asarray(curves["dt"], float)
+        named = [(name, values) for name, values in curves.items() if name != "dt"]
+        for place, (name, values) in enumerate(named):
+            digits = np.array(values, dtype=float)  # None becomes NaN
+            look = _look(place)
+            ax.plot(dt, digits, label=name, **look)
+            lost = np.isnan(digits)
+            # Crosses of charts that fail alike stand above each other.
+            ax.plot(dt[lost], np.full(lost.sum(), -0.4 * place), ls="none", marker="x",
+                    color=look["color"])  # fmt: skip
+        ax.set(title=system, xlabel="time step $dt$")
+    axes[0].set_ylabel("digits kept in one step")
+    axes[0].legend(loc="lower left")
+    return axes

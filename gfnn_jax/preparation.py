@@ -108,7 +108,11 @@ def choose_charts(request, prepared: Prepared, reversor, jacobians, judgements, 
         return [CHARTS[n] for n in ("midpoint", *one_sided) if n in valid], None, judgements
     if request in ("auto", "type1") and judgements["type1"].valid and not angular:
         return [TYPE1], None, judgements
-    lows = ", ".join(f"{n} {j.low:.2g}" for n, j in judgements.items())
+    beyond = [n for n in near_identity if judgements[n].valid]
+    if request == "auto" and beyond:
+        warn(_about(beyond[0], judgements[beyond[0]], "lies beyond a fold throughout", ()))
+        return [CHARTS[beyond[0]]], None, judgements
+    lows = ", ".join(f"{n} {j.sign * j.low:.2g}" for n, j in judgements.items())
     raise FitError(
         f"no chart covers these data, with or without a base map (smallest determinants: {lows}): "
         "sample with a smaller dt, or learn a smaller region"

@@ -1,0 +1,227 @@
+"""The fast part of the hard cases: what is lost must be flagged or refused, never silent."""
+
+import math
+import re
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax import metrics
+from gfnn_jax.charts import TYPE2
+from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.domain import covering
+from gfnn_jax.implicit import NON_FINITE, OK
+from gfnn_jax.maps import Generated, SymplecticMap
+from gfnn_jax.scenes import standard_map
+
+DT, K = 0.4, 0.6
+
+
+def disc(num, radius=1.0, seed=0):
+    rng = np.random.default_rng(seed)
+    r, angle = radius * np.sqrt(rng.uniform(size=num)), rng.uniform(0, 2 * np.pi, num)
+    return np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1)
+
+
+def kick_and_drift(z):
+    """An exact symplectic map near the identity: half a kick, a drift, half a kick."""
+    q, p = np.asarray(z).T
+    p = p - DT / 2 * np.sin(q)
+    q = q + DT * p
+    return np.stack([q, p - DT / 2 * np.sin(q)], axis=1)
+
+
+def turned(z, angle):
+    """The oscillator's exact map."""
+    q, p = np.asarray(z).T
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([q * c + p * s, p * c - q * s], axis=1)
+
+
+def fit(z0, z1, dt=DT, **options):
+    """(fit, its messages as one text)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)
+        fitted = gfnn.fit(gfnn.Pairs(z0, z1, dt), scalar="polynomial", **options)
+    return fitted, "; ".join(fitted.messages)
+
+
+def rms(map_, z0, z1):
+    return float(np.sqrt(np.mean((np.asarray(map_.step(z0)[0]) - z1) ** 2)))
+
+
+@pytest.fixture(scope="module")
+def clean():
+    z0 = disc(400)
+    return fit(z0, kick_and_drift(z0), chart="midpoint", tolerance=1e-6)[0].map
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """The standard map by its exact generating function S(θ, P) = P²/2 + K cos θ, in type 2."""
+
+    def scalar(k, w):
+        return w[1] ** 2 / 2 + k * jnp.cos(w[0])
+
+    generated = Generated(
+        scalar, jnp.float64(K), TYPE2, 1.0, jnp.ones(2), jnp.zeros((2, 2)), jnp.zeros(2)
+    )
+    coordinates = Coordinates("angles", angles=(0, 1))
+    domain = covering(disc(100), ignore=(0, 1))
+    return SymplecticMap((generated,), coordinates, domain, jnp.ones(2), jnp.zeros(2), 1.0)
+
+
+# Bad conditions for the solver
+
+
+@pytest.mark.parametrize("factor", [3.0, 100.0, 1e6, 1e150, 1e300])
+def test_no_start_far_outside_is_ok(clean, factor):
+    states, info = clean.rollout(factor * disc(30, seed=1) / 0.5, 20)
+    far = np.linalg.norm(factor * disc(30, seed=1) / 0.5, axis=1) > 2
+    status = np.asarray(info.status)
+    assert (status[far] != OK).all()
+    lost = np.isnan(np.asarray(states)[:, -1]).any(axis=1)
+    np.testing.assert_array_equal(lost, status > 1)
+
+
+def test_lanes_far_outside_change_no_bit_and_no_update_of_good_ones(clean):
+    good = disc(20, 0.8, seed=2)
+    alone, first = clean.rollout(good, 50)
+    mixed, second = clean.rollout(np.concatenate([good, [[1e3, 1.0], [np.nan, 0.0]]]), 50)
+    np.testing.assert_array_equal(alone, mixed[:20])
+    np.testing.assert_array_equal(first.iterations, second.iterations[:20])
+    assert second.status[21] == NON_FINITE
+
+
+# Bad data
+
+
+def test_wrong_pairs_are_named_and_left_out():
+    z0 = disc(800, seed=3)
+    z1 = kick_and_drift(z0)
+    wrong = np.arange(0, 800, 100)
+    z1[wrong] = z1[np.roll(wrong, 1)] + 0.5
+    fitted, said = fit(z0, z1, chart="midpoint", tolerance=1e-3)
+    assert "8 of 800 pairs contradict" in said
+    assert "rows 0, 100, 200, 300, 400, …" in said
+    assert fitted.num_pairs == 792
+    z = disc(200, seed=4)
+    assert rms(fitted.map, z, kick_and_drift(z)) < 1e-3
+
+
+def test_friction_is_told_from_noise():
+    z0, rate = disc(400, seed=5), 0.01
+    z1 = kick_and_drift(z0) * [1, math.exp(-rate * DT)]
+    _, said = fit(z0, z1, chart="midpoint", tolerance=1e-9)
+    change = re.search(r"phase-space volumes change by (\S+)", said)
+    assert change is not None
+    assert float(change[1]) == pytest.approx(math.expm1(-rate * DT), rel=0.2)
+
+
+@pytest.mark.slow
+def test_noise_of_a_tenth_is_fitted_not_refused():
+    z0 = disc(800, seed=6)
+    noise = 0.1 * np.random.default_rng(7).standard_normal((2, *z0.shape))
+    fitted, said = fit(z0 + noise[0], kick_and_drift(z0) + noise[1], tolerance=1e-3)
+    assert "noise" in said
+    z = disc(200, seed=8)
+    assert rms(fitted.map, z, kick_and_drift(z)) < 0.05
+
+
+# Long times
+
+
+def test_standard_map_stays_on_its_curve_and_comes_back(exact):
+    curve = np.empty((3_000, 2))
+    theta, p = 0.0, 4.0
+    for i in range(len(curve)):
+        curve[i] = theta, p
+        p += K * math.sin(theta)
+        theta = (theta + p) % (2 * math.pi)
+    lanes, reached = exact.start(curve[:1]), []
+    for _ in range(20):  # the reduced angle: beside the turns it would lose its last digits
+        lanes, _ = exact.advance(lanes, 1, save_every=1_000)
+        reached.append(np.asarray(lanes.y)[0] % (2 * np.pi))
+    assert lanes.status[0] == OK
+    assert metrics.curve_distance(np.array(reached), curve).max() < 1e-12
+    beside = np.array(reached) + np.array([0, 1e-6])
+    assert metrics.curve_distance(beside, curve).min() > 1e-7
+    start = jnp.asarray(curve[:1])
+    states, _ = exact.rollout(start, 5_000, save_every=5_000)
+    returned, _ = exact.reversed().rollout(states[:, -1], 5_000, save_every=5_000)
+    np.testing.assert_allclose(returned[:, -1], start, rtol=0, atol=1e-9)
+
+
+# Large steps
+
+
+def oscillated(angle, chart):
+    """Fit of the oscillator's map at dt = ``angle``: (error on fresh states, fit, messages)."""
+    z0, z = disc(300, seed=9), disc(100, seed=10)
+    fitted, said = fit(z0, turned(z0, angle), angle, chart=chart, tolerance=1e-8)
+    return rms(fitted.map, z, turned(z, angle)), fitted, said
+
+
+def test_type_2_ends_at_a_quarter_period_and_says_what_does_not():
+    with pytest.raises(gfnn.FitError, match=r"chart type2 is singular .*use --chart midpoint"):
+        oscillated(np.pi / 2, "type2")
+
+
+def test_half_a_period_has_no_base_map_and_is_learned_beyond_the_fold():
+    error, fitted, said = oscillated(np.pi, "auto")
+    assert error < 1e-8
+    assert not fitted.based
+    assert "beyond a fold" in said
+
+
+@pytest.mark.slow
+def test_midpoint_close_to_half_a_period_warns():
+    error, _, said = oscillated(3.0, "midpoint")
+    assert error < 1e-8
+    assert "close to singular" in said
+
+
+# Chaos
+
+
+@pytest.mark.parametrize("k", [0.9716, 2.0, 5.0])
+def test_chaotic_statistics_are_those_of_the_exact_map(exact, k):
+    generated = exact.pieces[0]
+    pieces = (Generated(generated.scalar, jnp.float64(k), *_rest(generated)),)
+    ours = SymplecticMap(pieces, exact.coordinates, exact.domain, exact.scale, exact.cut, exact.dt)
+    theirs = standard_map(k).step
+    z0 = jnp.asarray(np.random.default_rng(11).uniform(0, 2 * np.pi, (100, 2)))
+
+    def exponents(step):
+        return np.asarray(jax.jit(jax.vmap(lambda z: metrics.lyapunov_exponent(step, z, 300)))(z0))
+
+    mine, reference = exponents(lambda z: ours.apply(z)[0]), exponents(theirs)
+    scatter = math.hypot(mine.std(), reference.std()) / math.sqrt(len(z0))
+    assert abs(mine.mean() - reference.mean()) < 4 * scatter
+    if k == 5.0:  # ln(K/2) in the fully chaotic limit (Chirikov 1979)
+        assert mine.mean() == pytest.approx(math.log(k / 2), rel=0.1)
+
+
+def _rest(generated):
+    return (generated.chart, generated.dt, generated.scale, generated.linear, generated.offset)
+
+
+# Precision
+
+
+def test_float32_keeps_six_digits_and_says_its_dtype(clean):
+    single = jax.tree.map(
+        lambda a: a.astype(jnp.float32) if getattr(a, "dtype", None) == jnp.float64 else a, clean
+    )
+    z = disc(200, 0.9, seed=12)
+    image, info = single.step(z)
+    assert image.dtype == jnp.float32
+    assert (np.asarray(info.status) == OK).all()
+    error = np.asarray(image, float) - np.asarray(clean.step(z)[0])
+    assert np.abs(error).max() < 2e-6
+    states, _ = single.rollout(z, 1_000, save_every=1_000)
+    assert np.abs(np.asarray(states)).max() < 1.2
