@@ -138,8 +138,8 @@ def rough_map(strength: float, chart, seed: int, dim: int = 2) -> SymplecticMap:
     family = Mlp(box_inputs(states), (16, 16), "tanh", 1.0)
     params = family.init(jax.random.key(seed + 1), jnp.float64)
     params = jax.tree.map(lambda a: strength * a, params)
-    unit, zero = jnp.ones(2 * dim), jnp.zeros(2 * dim)
-    generated = Generated(family, params, chart, 0.1, unit, jnp.zeros((2 * dim, 2 * dim)), zero)
+    unit = jnp.ones(2 * dim)
+    generated = Generated(family, params, chart, 0.1, unit)
     return SymplecticMap((generated,), CARTESIAN, covering(states), unit, jnp.zeros(0), 0.1)
 
 
