@@ -62,6 +62,8 @@ FIGURES = HERE / "figures"
 LANES, STEPS, BACK, SINGLE, MAP_STEPS = 64, 1_000_000, 100_000, 10_000_000, 100_000_000
 # A case is silent where so many digits less than asked for are kept, and nothing was said.
 _SHORT = 1.0
+# The tolerance is for the RMS: at the rim of the data errors are so many times larger.
+_RIM = 100.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,11 +119,17 @@ def tried(name: str, pairs, scene, fresh, *, tolerance: float = 1e-6, **options)
         fit, measured = fitted(pairs, scene, fresh, tolerance=tolerance, **options)
     except gfnn.FitError as error:
         return Case(name, None, asked, failed=str(error)), None
-    error = measured["one_step_rms"] / spread
+    image, info = fit.map.step(fresh.z0)
+    error = np.asarray(image) - np.asarray(fresh.z1)
+    for i in angles_of(scene):
+        error[:, i] -= TWO_PI * np.round(error[:, i] / TWO_PI)
+    # Where the fit had nothing to say, every lane that is called ok must be about as good as asked.
+    bad = np.abs(error).max(axis=1) > _RIM * tolerance
+    wrong = 0 if fit.messages else int(np.sum(bad & (np.asarray(info.status) == OK)))
     said = "; ".join(brief(message) for message in fit.messages)
-    status = counts(fit.map.step(fresh.z0)[1].status)
-    flagged = "; ".join(part for part in (said, status) if part)
-    return Case(name, digits_of(error), asked, flagged), fit
+    flagged = "; ".join(part for part in (said, counts(info.status)) if part)
+    kept = digits_of(measured["one_step_rms"] / spread)
+    return Case(name, kept, asked, flagged, wrong=wrong), fit
 
 
 def brief(message: str) -> str:
@@ -287,8 +295,7 @@ def bad_data(quick: bool) -> tuple[list[Case], Numbers]:
         add(f"friction, rate {rate:g}", z0, z1 * [1, math.exp(-rate * scene.dt)])
     clusters = 0.05 * z0 + np.where(np.arange(len(z0)) % 2, 0.8, -0.8)[:, None] * [1, 0]
     images = gfnn.reference_trajectories(scene, jnp.asarray(clusters), 1)[:, 1]
-    add("two clusters, judged between them", clusters, np.asarray(images))
-    add("velocities of a body of mass 3 for momenta", *(z * [1, 1 / 3] for z in (z0, z1)))
+    add("two clusters, judged all over the disc", clusters, np.asarray(images))
     return cases, measured
 
 
