@@ -26,7 +26,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.io import iterate_pairs, read_initial_states, read_sample, read_trajectories
 from gfnn_jax.maps import Lanes, SymplecticMap
 from gfnn_jax.outputs import atomic_folder, ensure_new, failures_as_work_errors
-from gfnn_jax.phase_space import Pairs
+from gfnn_jax.phase_space import Pairs, sizes
 from gfnn_jax.predictions import PredictionWriter
 from gfnn_jax.scenes import Scene
 from gfnn_jax.selection import Fit, FitError, refit
@@ -57,6 +57,8 @@ QUICK_PAIRS, QUICK_TRAJECTORIES, QUICK_TOLERANCE = 4_000, 25, 1e-7
 _LARGE_BYTES, _FIT_CHUNK, _HELD = 2**29, 50_000, 2_000
 # A chunk of a prediction: what is held in memory at once, and how much work a kill may lose.
 _CHUNK_BYTES, _CHUNK_LANE_STEPS = 32 * 2**20, 400_000
+# A first step this many roundings from the reference is roundoff.
+_ROUNDINGS = 64
 
 
 class Ran(NamedTuple):
@@ -181,7 +183,10 @@ def measure(rollouts: Rollouts, scene: Scene, reference) -> Measured:
     if hamiltonian is not None:
         energy = metrics.energy_error(jax.vmap(jax.vmap(hamiltonian))(jnp.asarray(predicted)))
         drift = metrics.energy_drift(steps, energy)
-    growth = metrics.growth_exponent(steps, error) if scene.regular else None
+    # Roundoff grows by other laws than the error of a model: no exponent where it is all there is.
+    roundoff = _ROUNDINGS * np.finfo(float).eps * float(np.max(sizes(reference[:, 0])))
+    of_model = float(np.nanmean(error[:, 1])) > roundoff
+    growth = metrics.growth_exponent(steps, error) if scene.regular and of_model else None
     part = report.rollout_part(
         num_trajectories=len(predicted), num_steps=NUM_STEPS, seconds=rollouts.seconds,
         status=rollouts.status, statistics=metrics.error_statistics(error), growth=growth,

@@ -516,11 +516,14 @@ def test_run(tmp_path, monkeypatch, capsys):
     ],
 )
 def test_run_of_every_scene(scene, error, tmp_path):
-    assert gfnn("run", scene, "--quick", "--out", tmp_path / "r") == 0
+    accuracy = ("--tolerance", 1e-10) if error is not None else ()
+    assert gfnn("run", scene, "--quick", *accuracy, "--out", tmp_path / "r") == 0
     report = check_run(tmp_path / "r", scene)
     if error is not None:
         assert report["rollout"]["error"]["1000"] <= error
-        assert 0.8 <= report["rollout"]["growth_exponent"] <= 1.2
+        exponent = report["rollout"]["growth_exponent"]
+        exact = scene == "standard-map-regular"  # nothing but roundoff
+        assert exponent is None if exact else 0.8 <= exponent <= 1.2
 
 
 @pytest.mark.slow
