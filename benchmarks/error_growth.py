@@ -395,31 +395,31 @@ def draw(found: dict[str, Numbers]) -> None:
     m = {name.removeprefix("growth-"): r["measured"] for name, r in found.items()}
     FIGURES.mkdir(exist_ok=True)
 
-    def finite(values):
-        return np.array([np.nan if v is None else v for v in values])
+    def until_lost(curve: Numbers):
+        """Steps and errors (1, L) before the first trajectory was lost."""
+        whole = [v for v in curve["mean"] if v is not None]
+        return np.array(curve["steps"][: len(whole)]), np.array([whole])
+
+    def known(name: str, key: str):
+        return np.array([np.nan if r[key] is None else r[key] for r in m[name]["rows"]])
 
     points = {
-        name: (finite([r["one_step_rms"] for r in m[name]["rows"]]),
-               finite([r["error_100"] for r in m[name]["rows"]]))
-        for name in GROWTH if name in m
-    }  # fmt: skip
+        name: (known(name, "one_step_rms"), known(name, "error_100"))
+        for name in GROWTH
+        if name in m
+    }
     if points:
         ax: Any = figures.proportionality(points, r"one-step error $\varepsilon$ (RMS)",
                                           "position error at step 100")  # fmt: skip
         figures.save(ax.figure, FIGURES / "growth_proportionality.png")
     if "two-body" in m:
         curves = {
-            f"ε = {r['one_step_rms']:.0e}": (np.array(r["curve"]["steps"]),
-                                             finite(r["curve"]["mean"])[None])
-            for r in m["two-body"]["rows"] if r["error_end"] is not None
-        }  # fmt: skip
+            f"ε = {r['one_step_rms']:.0e}": until_lost(r["curve"]) for r in m["two-body"]["rows"]
+        }
         ax = figures.error_growth(curves)
         figures.save(ax.figure, FIGURES / "growth_two_body.png")
     if "vfnn" in m:
-        curves = {
-            name: (np.array(c["steps"]), finite(c["mean"])[None])
-            for name, c in m["vfnn"]["curves"].items()
-        }
+        curves = {name: until_lost(c) for name, c in m["vfnn"]["curves"].items()}
         ax = figures.error_growth(curves)
         figures.save(ax.figure, FIGURES / "growth_vfnn.png")
 
