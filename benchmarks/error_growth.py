@@ -239,6 +239,12 @@ def generic_bound(quick: bool) -> Numbers:
 
 
 GROWTH = ("two-body", "henon-heiles-printed", "henon-heiles-regular")
+# Why a regular scene need not be linear yet over these steps.
+NEAR_RESONANCE = {
+    "henon-heiles-printed": " (its two halves have nearly the same energy, so that the orbits are "
+    "close to the 1:1 resonance, which the theorem's Diophantine condition keeps away from: "
+    "actions then drift for as long as the beat of the two frequencies takes)"
+}
 PIECES: dict[str, Callable[[bool], Numbers]] = {
     **{f"growth-{name}": growth(name) for name in GROWTH},
     "growth-actions": actions,
@@ -288,6 +294,7 @@ def verdicts(m: dict[str, Numbers]) -> list[str]:
             f"{name}, *the error grows linearly, in proportion to ε*: "
             + (f"linear, α = {interval(row)}" if linear else
                f"faster than linear over these steps, α = {interval(row)} of the mean")
+            + ("" if linear else NEAR_RESONANCE.get(name, ""))
             + f"; proportional to ε over {p['decades']:.1f} decades, b = {interval(p)}."
         )  # fmt: skip
     if "actions" in m:
