@@ -6,7 +6,8 @@
 
 Each scene and seed is a piece, made by what `gfnn compare SCENE --seed N` runs; a piece that was
 interrupted goes on with its next method. Reports are kept in benchmarks/results, figures (of the
-first seed) in benchmarks/figures/compare; the section of RESULTS.md is made from the reports alone.
+first seed) in benchmarks/figures/compare; the section of RESULTS.md and the figures of errors are
+made from the reports alone.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from typing import Any
 import numpy as np
 from targets import RESULTS, TABLES, between_markers, number  # switches float64 on
 
-from gfnn_jax import comparison, report
+from gfnn_jax import comparison, figures, report
 from gfnn_jax.comparison import OURS, PAPER_GFNN, compare
 
 FIGURES = Path(__file__).resolve().parent / "figures" / "compare"
@@ -114,7 +115,10 @@ def scene_table(name: str, reports: list[Numbers]) -> str:
             return number(over_seeds(reports, method, *path))
 
         growth = over_seeds(reports, method, "rollout", "growth_exponent")
-        training = mean("fit", "seconds") + (" (cap)" if m["fit"]["capped"] else "")
+        stopped = m["fit"].get("stopped_because", "epochs")
+        training = mean("fit", "seconds") + (
+            " (cap)" if m["fit"]["capped"] else " (diverged)" if "finite" in stopped else ""
+        )
         cells = [m["title"], f"{m['model']['num_parameters']:,}", f"{m['data']['num_pairs']:,}",
                  training, mean("fit", "compile_seconds"),
                  mean("rollout", "microseconds_per_step"),
@@ -223,6 +227,34 @@ def section(found: dict[str, list[Numbers]]) -> str:
     return "\n".join(lines)
 
 
+def curves(methods: Numbers, *path: str) -> dict[str, tuple]:
+    """Title -> steps and two lanes that have the curve's mean and deviation, until one was lost."""
+    drawn = {}
+    for m in methods.values():
+        curve = m
+        for key in path:
+            curve = curve[key]
+        length = sum(v is not None for v in curve["mean"])
+        mean, std = (np.array(curve[k][:length], float) for k in ("mean", "std"))
+        lost = m["rollout"]["num_lost"]
+        title = f"{m['title']}, {lost} lost" if lost else m["title"]
+        drawn[title] = np.array(curve["steps"][:length]), np.stack([mean - std, mean + std])
+    return drawn
+
+
+def draw(name: str, methods: Numbers) -> None:
+    """The figures of errors against the step number, from a report."""
+    if not any(m["kl"] for m in methods.values()):
+        error: Any = figures.error_growth(curves(methods, "curve"))
+        figures.save(error.figure, FIGURES / f"{name}-error.png")
+    if all(m["elements"] for m in methods.values()):
+        axis, shape = (curves(methods, "elements", k) for k in ("axis", "eccentricity"))
+        both = {n: (axis[n][0], axis[n][1], shape[n][1]) for n in axis
+                if axis[n][1].shape == shape[n][1].shape}  # fmt: skip
+        elements: Any = figures.element_errors(both)[0]
+        figures.save(elements.figure, FIGURES / f"{name}-elements.png")
+
+
 def tables() -> None:
     found: dict[str, list[Numbers]] = {}
     for name, (seeds, _) in SCENES.items():
@@ -230,6 +262,7 @@ def tables() -> None:
         reports = [json.loads(p.read_text(encoding="utf-8")) for p in paths if p.exists()]
         if reports:
             found[name] = reports
+            draw(name, reports[0]["methods"])
     if found:
         between_markers(TABLES, "compare", section(found))
 
