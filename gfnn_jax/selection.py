@@ -91,7 +91,7 @@ class Fit:
         from rich.console import Console  # loaded when first used
 
         text = io.StringIO()
-        Console(width=120, file=text).print(candidates_table(self))
+        Console(width=120, file=text, force_jupyter=False).print(candidates_table(self))
         return text.getvalue()
 
 

@@ -1,0 +1,65 @@
+"""Every block of code in docs/ runs, page by page from the top; every link leads somewhere."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from gfnn_jax import cli
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+# Its commands are those of the README, which are tested always.
+SLOW = ("your-own-data",)
+INSTALL = ("python3 -m venv ", ".venv/bin/pip install ")
+
+
+def blocks(page):
+    return re.findall(r"^```(\w*)\n(.*?)^```", page.read_text(encoding="utf-8"), re.S | re.M)
+
+
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=pytest.mark.slow) if page.stem in SLOW else page for page in PAGES],
+    ids=lambda page: page.stem,
+)
+def test_code_runs(page, tmp_path, monkeypatch, as_a_user):
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": page.stem}
+    for language, code in blocks(page):
+        assert language in ("python", "sh", "text"), f"a block of {language or 'no language'}"
+        if language == "python":
+            exec(compile(code, str(page), "exec"), names)
+        for line in code.splitlines() if language == "sh" else ():
+            if line.startswith("gfnn "):
+                assert cli.main(shlex.split(line)[1:]) == 0
+            else:
+                assert line.startswith(INSTALL)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page):
+    local = re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text(encoding="utf-8"))
+    assert not [path for path in local if not (page.parent / path).exists()]
+
+
+def test_every_page_is_in_the_navigation():
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").split("nav:")[1]
+    assert sorted(re.findall(r"[\w-]+\.md", navigation)) == [page.name for page in PAGES]
+
+
+def test_every_public_name_is_in_the_reference():
+    import gfnn_jax
+
+    shown = re.findall(r"::: gfnn_jax\.(\w+)", (ROOT / "docs/reference.md").read_text("utf-8"))
+    data = {"CHARTS"}  # explained on the page of charts
+    assert set(shown) == set(gfnn_jax.__all__) - data
+
+
+@pytest.mark.slow
+def test_site_builds_without_warnings(tmp_path):
+    build = pytest.importorskip("mkdocs.commands.build").build
+    load_config = pytest.importorskip("mkdocs.config").load_config
+    build(load_config(str(ROOT / "mkdocs.yml"), site_dir=str(tmp_path), strict=True))
+    assert (tmp_path / "reference" / "index.html").exists()
