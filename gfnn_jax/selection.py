@@ -91,7 +91,9 @@ class Fit:
         from rich.console import Console  # loaded when first used
 
         text = io.StringIO()
-        Console(width=120, file=text, force_jupyter=False).print(candidates_table(self))
+        # Neither colours nor a notebook's own display: a string.
+        plain = Console(width=120, file=text, force_terminal=False, force_jupyter=False)
+        plain.print(candidates_table(self))
         return text.getvalue()
 
 

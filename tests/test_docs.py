@@ -5,7 +5,9 @@ import shlex
 from pathlib import Path
 
 import pytest
+from test_import_order import ORDER
 
+import gfnn_jax
 from gfnn_jax import cli
 
 ROOT = Path(__file__).parent.parent
@@ -49,9 +51,15 @@ def test_every_page_is_in_the_navigation():
     assert sorted(re.findall(r"[\w-]+\.md", navigation)) == [page.name for page in PAGES]
 
 
-def test_every_public_name_is_in_the_reference():
-    import gfnn_jax
+def test_architecture_has_every_module_in_the_order_of_imports():
+    table = (
+        (ROOT / "docs/architecture.md").read_text("utf-8").split("|---|---|")[1].split("\n\n")[0]
+    )
+    first = [line.split("|")[1] for line in table.strip().splitlines()]
+    assert re.findall(r"`(\w+)`", " ".join(first)) == [m for m in ORDER if m != "__main__"]
 
+
+def test_every_public_name_is_in_the_reference():
     shown = re.findall(r"::: gfnn_jax\.(\w+)", (ROOT / "docs/reference.md").read_text("utf-8"))
     data = {"CHARTS"}  # explained on the page of charts
     assert set(shown) == set(gfnn_jax.__all__) - data
