@@ -34,8 +34,6 @@ STATUS_NAMES = (
 # Elimination is unrolled up to this size; beyond it LAPACK's call overhead no longer matters.
 _UNROLL_UP_TO = 8
 _HALVINGS = 12
-# A frozen Jacobian serves while each update leaves at most this part of the residual.
-_CONTRACTION = 0.1
 # A residual of this many eps of the size of its terms is the floor: a few roundings of that size.
 _FLOOR_EPS = 4.0
 
@@ -77,12 +75,12 @@ def small_solve(matrix: Matrix, rhs: Vector) -> Vector:
 
 class _Iterate(NamedTuple):
     x: Any
-    residual: Any
     aux: Any
     merit: Any  # largest residual, what damping makes smaller
     error: Any  # largest residual relative to its roundoff floor
+    step: Any  # the Newton step from x, and the part of it to be tried next
+    factor: Any
     iterations: Any
-    contracts: Any  # the frozen Jacobian still serves
     open: Any  # still to be improved
 
 
@@ -92,78 +90,66 @@ def iterate(
     """The iterations themselves: ``evaluate(theta, x) -> (residual (n,), size (n,), aux)``.
 
     ``size`` is that of the terms whose difference the residual is: a few eps of it is roundoff.
-    Updates with the Jacobian at the guess (it is evaluated there together with the residual, with
-    which it shares most of its work) as long as they contract: from a good guess one or two. Then,
-    for the lanes that are left, Newton's method with a fresh Jacobian, a step halved until the
+    One update with the Jacobian at the guess, where it is evaluated together with the residual,
+    with which it shares most of its work: from a guess as close as the root of roundoff that is
+    all. For the lanes that are left, Newton's method with a fresh Jacobian, a step halved until the
     residual falls. A lane closes when its residual is at the roundoff floor, or is close to it and
     no longer halves, or cannot be made smaller. At most ``most`` updates.
     Returns x, aux at x, Info.
     """
     eps = float(jnp.finfo(guess.dtype).eps)
     settled = eps**-0.25  # in floors: 3e-12 of the size in float64, 1e-5 in float32
-    true = jnp.array(True)
+    one = jnp.ones((), guess.dtype)
 
-    def judged(x, iterations, residual, size, aux):
+    def judged(x, residual, size, aux, iterations):
         merit = jnp.max(jnp.abs(residual))
         error = jnp.max(jnp.abs(residual) / size) / (_FLOOR_EPS * eps)
-        return _Iterate(x, residual, aux, merit, error, iterations, true, true)
+        still = jnp.zeros_like(x)
+        return _Iterate(x, aux, merit, error, still, one, iterations, jnp.array(True))
 
-    def at(x, iterations):
-        residual, size, aux = evaluate(theta, x)
-        return judged(x, iterations, residual, size, aux)
-
-    def linearised(x, iterations):
-        """The iterate at x and its Jacobian ∂r/∂x."""
+    def linearised(x):
+        """(residual, size, aux) and the Jacobian ∂r/∂x at x."""
 
         def with_aux(x):
             residual, size, aux = evaluate(theta, x)
             return residual, (residual, size, aux)
 
-        matrix, (residual, size, aux) = jax.jacfwd(with_aux, has_aux=True)(x)
-        return judged(x, iterations, residual, size, aux), matrix
+        return jax.jacfwd(with_aux, has_aux=True)(x)
 
-    def updated(state, new):
-        """The better of two iterates, and whether it can be improved further."""
-        better, halved = new.merit < state.merit, new.merit < 0.5 * state.merit
-        kept = jax.tree.map(partial(jnp.where, better), new, state)
-        left = (kept.error > settled) | (kept.error > 1.0) & halved
-        room = left & (new.iterations < most)
-        contracts = room & (new.merit < _CONTRACTION * state.merit)
-        return kept._replace(
-            iterations=new.iterations, contracts=contracts, open=room & (better | state.contracts)
-        )
+    def goes_on(new, old):
+        halved = new.merit < 0.5 * old.merit
+        return (new.error > settled) | (new.error > 1.0) & halved
 
-    first, matrix = linearised(guess, jnp.zeros((), jnp.int32))
-    inverse = small_solve(matrix, jnp.eye(guess.shape[0], dtype=guess.dtype))
-
-    def frozen(state):
-        step = jnp.sum(inverse * state.residual[None, :], axis=1)
-        return updated(state, at(state.x - step, state.iterations + 1))
+    def frozen(x):
+        """The better of the guess and of its update with the Jacobian at the guess."""
+        matrix, (residual, size, aux) = linearised(x)
+        first = judged(x, residual, size, aux, jnp.ones((), jnp.int32))
+        x = x - small_solve(matrix, residual)
+        residual, size, aux = evaluate(theta, x)
+        second = judged(x, residual, size, aux, first.iterations)
+        kept = jax.tree.map(partial(jnp.where, second.merit < first.merit), second, first)
+        return kept._replace(open=goes_on(kept, first) & (kept.iterations < most))
 
     def newton(state):
-        iterations = state.iterations + 1
-        _, matrix = linearised(state.x, iterations)
-        step = small_solve(matrix, state.residual)
+        """Try a part of the step: take it where the residual falls, else halve the part."""
+        x = state.x - state.factor * state.step
+        matrix, (residual, size, aux) = linearised(x)
+        new = judged(x, residual, size, aux, state.iterations + 1)
+        better = new.merit < state.merit
+        further = goes_on(new, state) & (new.iterations < most)
+        new = new._replace(step=small_solve(matrix, residual), open=further)
         # Close to the floor only the full step makes sense: what is left is roundoff.
         shortest = jnp.where(state.error < settled, 1.0, 0.5**_HALVINGS).astype(guess.dtype)
+        halved = state._replace(factor=0.5 * state.factor, open=state.factor > shortest)
+        return jax.tree.map(partial(jnp.where, better), new, halved)
 
-        def too_long(attempt):
-            factor, new = attempt
-            return state.open & ~(new.merit < state.merit) & (factor > shortest)
-
-        def halved(attempt):
-            factor = 0.5 * attempt[0]
-            return factor, at(state.x - factor * step, iterations)
-
-        # The loop makes the first trial too: a step of twice the length, never tried, is halved.
-        untried = state._replace(merit=jnp.full_like(state.merit, jnp.inf))
-        two = jnp.full_like(shortest, 2.0)
-        _, new = jax.lax.while_loop(too_long, halved, (two, untried))
-        state = state._replace(contracts=~true)
-        return updated(state, new._replace(iterations=iterations))
-
-    state = frozen(first)
-    state = jax.lax.while_loop(lambda s: s.open & s.contracts, frozen, state)
+    state = frozen(guess)
+    # The loop begins by evaluating the Jacobian where the update has led: a step of nothing, which
+    # is taken, and not counted.
+    fresh = state._replace(
+        merit=jnp.full_like(state.merit, jnp.inf), iterations=state.iterations - 1
+    )
+    state = jax.tree.map(partial(jnp.where, state.open), fresh, state)
     state = jax.lax.while_loop(lambda s: s.open, newton, state)
     finite = jnp.isfinite(state.error)
     status = jnp.where(state.error <= settled, OK, jnp.where(finite, NOT_CONVERGED, NON_FINITE))

@@ -161,7 +161,7 @@ def test_base_map_around_a_generated_piece():
         images, halfway(plain.step(halfway(jnp.asarray(Z)))[0]), rtol=0, atol=1e-14
     )
     assert (info.status == OK).all()
-    assert info.iterations.min() >= 3  # the worst of the pieces', not the last one's
+    assert info.iterations.min() >= 1  # the worst of the pieces', not the last one's
     assert learned.defect(Z).max() < 1e-12
     np.testing.assert_allclose(learned.inverse(images)[0], Z, rtol=0, atol=1e-13)
     # The chart's determinant is that of the generated piece, where that piece acts.
