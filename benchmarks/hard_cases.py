@@ -815,10 +815,14 @@ def tables() -> None:
         return
     parts = []
     for name, result in found.items():
-        parts.append(f"### {PIECES[name].title}\n\n{table(result)}")
+        small = " (small sizes)" if result["quick"] else ""
+        parts.append(f"### {PIECES[name].title}{small}\n\n{table(result)}")
     total = sum(len(r["cases"]) for r in found.values())
     silent = sum(case["silent"] for r in found.values() for case in r["cases"])
     head = f"{total} cases, {silent} of them silent."
+    missing = [piece.title for name, piece in PIECES.items() if name not in found]
+    if missing:
+        parts.append(f"Not measured yet: {'; '.join(missing)}.")
     parts.append(provenance(found))
     between_markers(TABLES, "hard-cases", "\n\n".join([head, *parts]))
     draw(found)
