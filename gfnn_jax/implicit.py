@@ -33,7 +33,9 @@ STATUS_NAMES = (
 
 # Elimination is unrolled up to this size; beyond it LAPACK's call overhead no longer matters.
 _UNROLL_UP_TO = 8
-_HALVINGS = 12
+_HALVINGS = 30
+# How far a step may lead from the Newton path, as a part of its length.
+_OFF_PATH = 0.5
 # A residual of this many eps of the size of its terms is the floor: a few roundings of that size.
 _FLOOR_EPS = 4.0
 
@@ -53,9 +55,20 @@ def small_solve(matrix: Matrix, rhs: Vector) -> Vector:
     Under vmap it compiles to a few fused loops over the batch, 10-25 times faster than a batched
     LAPACK call at these sizes. Linear in ``rhs``, so it can be transposed.
     """
-    n = rhs.shape[0]
-    if n > _UNROLL_UP_TO:
+    if rhs.shape[0] > _UNROLL_UP_TO:
         return jnp.linalg.solve(matrix, rhs)
+    return _eliminate(matrix, rhs)[0]
+
+
+def _solve_and_sign(matrix, rhs):
+    """The solution, and the sign of the matrix' determinant."""
+    if rhs.shape[0] > _UNROLL_UP_TO:
+        return jnp.linalg.solve(matrix, rhs), jnp.linalg.slogdet(matrix)[0]
+    return _eliminate(matrix, rhs)
+
+
+def _eliminate(matrix, rhs):
+    n, sign = rhs.shape[0], jnp.ones((), matrix.dtype)
     # The right-hand side apart from the rows: only so is all this linear in it.
     rows, x = [matrix[i] for i in range(n)], [rhs[i] for i in range(n)]
     for k in range(n):
@@ -63,6 +76,8 @@ def small_solve(matrix: Matrix, rhs: Vector) -> Vector:
             swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
             rows[k], rows[i] = jnp.where(swap, rows[i], rows[k]), jnp.where(swap, rows[k], rows[i])
             x[k], x[i] = jnp.where(swap, x[i], x[k]), jnp.where(swap, x[k], x[i])
+            sign = jnp.where(swap, -sign, sign)
+        sign = sign * jnp.sign(rows[k][k])
         rows[k], x[k] = rows[k] / rows[k][k], x[k] / rows[k][k]
         for i in range(k + 1, n):
             factor = rows[i][k]
@@ -70,13 +85,14 @@ def small_solve(matrix: Matrix, rhs: Vector) -> Vector:
     for k in reversed(range(n)):
         for j in range(k + 1, n):
             x[k] = x[k] - rows[k][j] * x[j]
-    return jnp.stack(x)
+    return jnp.stack(x), sign
 
 
 class _Iterate(NamedTuple):
     x: Any
+    residual: Any
     aux: Any
-    merit: Any  # largest residual, what damping makes smaller
+    merit: Any  # largest residual
     error: Any  # largest residual relative to its roundoff floor
     step: Any  # the Newton step from x, and the part of it to be tried next
     factor: Any
@@ -92,9 +108,12 @@ def iterate(
     ``size`` is that of the terms whose difference the residual is: a few eps of it is roundoff.
     One update with the Jacobian at the guess, where it is evaluated together with the residual,
     with which it shares most of its work: from a guess as close as the root of roundoff that is
-    all. For the lanes that are left, Newton's method with a fresh Jacobian, a step halved until the
-    residual falls. A lane closes when its residual is at the roundoff floor, or is close to it and
-    no longer halves, or cannot be made smaller. At most ``most`` updates.
+    all. For the lanes that are left, Newton's method with a fresh Jacobian, a step halved until it
+    stays by the Newton path r(x) = (1 − t) r(guess) (Deuflhard, "Newton Methods for Nonlinear
+    Problems", 2004, chapter 3), which ends at the solution of the guess's own branch or at a fold:
+    there the sign of det ∂r/∂x would change, and the lane is given up, not led to another branch.
+    A lane closes when its residual is at the roundoff floor, or is close to it and no longer
+    halves, or cannot be made smaller. At most ``most`` updates.
     Returns x, aux at x, Info.
     """
     eps = float(jnp.finfo(guess.dtype).eps)
@@ -105,7 +124,7 @@ def iterate(
         merit = jnp.max(jnp.abs(residual))
         error = jnp.max(jnp.abs(residual) / size) / (_FLOOR_EPS * eps)
         still = jnp.zeros_like(x)
-        return _Iterate(x, aux, merit, error, still, one, iterations, jnp.array(True))
+        return _Iterate(x, residual, aux, merit, error, still, one, iterations, jnp.array(True))
 
     def linearised(x):
         """(residual, size, aux) and the Jacobian ∂r/∂x at x."""
@@ -116,40 +135,50 @@ def iterate(
 
         return jax.jacfwd(with_aux, has_aux=True)(x)
 
+    def by_the_path(new, old, factor):
+        """Whether the residual fell as it does along the path: to (1 − factor) of what it was."""
+        off = jnp.max(jnp.abs(new.residual - (1 - factor) * old.residual))
+        return off <= _OFF_PATH * factor * old.merit
+
     def goes_on(new, old):
         halved = new.merit < 0.5 * old.merit
         return (new.error > settled) | (new.error > 1.0) & halved
 
     def frozen(x):
-        """The better of the guess and of its update with the Jacobian at the guess."""
+        """The guess's update with the Jacobian there, or itself; the sign of that Jacobian."""
         matrix, (residual, size, aux) = linearised(x)
         first = judged(x, residual, size, aux, jnp.ones((), jnp.int32))
-        x = x - small_solve(matrix, residual)
+        step, sign = _solve_and_sign(matrix, residual)
+        x = x - step
         residual, size, aux = evaluate(theta, x)
         second = judged(x, residual, size, aux, first.iterations)
-        kept = jax.tree.map(partial(jnp.where, second.merit < first.merit), second, first)
-        return kept._replace(open=goes_on(kept, first) & (kept.iterations < most))
+        near_floor = (first.error <= settled) & (second.merit < first.merit)
+        better = near_floor | by_the_path(second, first, one)
+        kept = jax.tree.map(partial(jnp.where, better), second, first)
+        return kept._replace(open=goes_on(kept, first) & (kept.iterations < most)), sign
 
     def newton(state):
-        """Try a part of the step: take it where the residual falls, else halve the part."""
+        """Try a part of the step: take it where it stays by the path, else halve the part."""
         x = state.x - state.factor * state.step
         matrix, (residual, size, aux) = linearised(x)
         new = judged(x, residual, size, aux, state.iterations + 1)
-        better = new.merit < state.merit
+        step, sign_here = _solve_and_sign(matrix, residual)
+        near_floor = (state.error <= settled) & (new.merit < state.merit)
+        better = near_floor | by_the_path(new, state, state.factor) & (sign_here == sign)
         further = goes_on(new, state) & (new.iterations < most)
-        new = new._replace(step=small_solve(matrix, residual), open=further)
+        longer = jnp.minimum(one, 4 * state.factor)
+        new = new._replace(step=step, factor=longer, open=further)
         # Close to the floor only the full step makes sense: what is left is roundoff.
         shortest = jnp.where(state.error < settled, 1.0, 0.5**_HALVINGS).astype(guess.dtype)
         halved = state._replace(factor=0.5 * state.factor, open=state.factor > shortest)
         return jax.tree.map(partial(jnp.where, better), new, halved)
 
-    state = frozen(guess)
+    state, sign = frozen(guess)
     # The loop begins by evaluating the Jacobian where the update has led: a step of nothing, which
-    # is taken, and not counted.
-    fresh = state._replace(
-        merit=jnp.full_like(state.merit, jnp.inf), iterations=state.iterations - 1
-    )
-    state = jax.tree.map(partial(jnp.where, state.open), fresh, state)
+    # is taken, where the sign is that at the guess, and not counted.
+    begun = jnp.where(state.open, state.iterations - 1, state.iterations)
+    merit = jnp.where(state.open, jnp.inf, state.merit)
+    state = state._replace(iterations=begun, merit=merit)
     state = jax.lax.while_loop(lambda s: s.open, newton, state)
     finite = jnp.isfinite(state.error)
     status = jnp.where(state.error <= settled, OK, jnp.where(finite, NOT_CONVERGED, NON_FINITE))
