@@ -199,9 +199,11 @@ def training(quick: bool) -> Numbers:
 
 def startup(quick: bool) -> Numbers:
     """Seconds of fresh processes, the best of three."""
+    names = list(gfnn.__all__)
     commands = {
         "import jax": ["-c", "import jax"],
-        "import gfnn_jax": ["-c", "import gfnn_jax"],
+        "import gfnn_jax": ["-c", "import jax, gfnn_jax"],
+        "all public names": ["-c", f"import jax, gfnn_jax as g; [getattr(g, n) for n in {names}]"],
         "gfnn --help": ["-m", "gfnn_jax", "--help"],
         "gfnn scenes": ["-m", "gfnn_jax", "scenes"],
         "gfnn run nowhere": ["-m", "gfnn_jax", "run", "nowhere"],

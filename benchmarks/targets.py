@@ -40,6 +40,7 @@ from gfnn_jax.charts import TYPE2  # noqa: E402
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI  # noqa: E402
 from gfnn_jax.domain import covering  # noqa: E402
 from gfnn_jax.fitting.adam import PAPER, adam  # noqa: E402
+from gfnn_jax.implicit import OK  # noqa: E402
 from gfnn_jax.maps import Generated, SymplecticMap  # noqa: E402
 from gfnn_jax.models import versions  # noqa: E402
 from gfnn_jax.scalars.inputs import box_inputs  # noqa: E402
@@ -111,6 +112,7 @@ def rolled_out(map_: SymplecticMap, scene: Scene, quick: bool) -> Numbers:
     return {
         "error_mean": float(statistics.mean[-1]),
         "error_median": float(statistics.median[-1]),
+        "error_median_inside": float(np.nanmedian(error[np.asarray(info.status) == OK, -1])),
         "num_trajectories": len(error),
         "num_excluded": statistics.num_excluded,
         "status_counts": report.status_counts(info.status),
@@ -455,9 +457,12 @@ def table(found: dict[str, Numbers], *, full: bool) -> str:
     for result in found.values():
         m = result["measured"]
         at_end = "error_median" if "error_median" in result["targets"] else "error_mean"
+        error = against(result, at_end)
+        if at_end == "error_median":
+            inside = f"{number(m['error_median_inside'])} of those that stayed where the data are"
+            error = f"{error} median; {inside}" if full else f"{error} median"
         cells = [
-            result["title"], number(m["pairs"]), against(result, "one_step_rms"),
-            against(result, at_end) + (" median" if at_end == "error_median" else ""),
+            result["title"], number(m["pairs"]), against(result, "one_step_rms"), error,
             against(result, "fit_seconds"),
             f"{m['chart']} {m['label']}" + (", base map" if m.get("base_map") else ""),
         ]  # fmt: skip
