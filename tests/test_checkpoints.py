@@ -140,7 +140,7 @@ def kernel(record):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda r: r.update(format=2), "has format 2, this release reads format 1"),
+        (lambda r: r.update(format=3), "has format 3, this release reads format 2"),
         (lambda r: r.pop("format"), "model.json is damaged"),
         (lambda r: kernel(r).update(shape=[8, 4]), r"float64 of shape \(8, 4\), found"),
         (lambda r: kernel(r).update(dtype="float32"), "should be float32 of shape"),
