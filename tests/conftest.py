@@ -1,5 +1,7 @@
 """Strict numerics for every test: float64, no silent rank or dtype promotion, shapes checked."""
 
+import os
+
 import jax
 import pytest
 from jaxtyping import install_import_hook
@@ -10,15 +12,25 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 install_import_hook("gfnn_jax", "beartype.beartype")
 
 
+def pytest_configure(config):
+    """Compiling is most of the suite: its workers, the processes that tests start and the next run
+    share what was compiled once, in pytest's own cache."""
+    shared = {
+        "jax_compilation_cache_dir": str(config.cache.mkdir("compiled")),
+        "jax_persistent_cache_min_compile_time_secs": 0.1,
+    }
+    for name, value in shared.items():
+        os.environ[name.upper()] = str(value)
+        jax.config.update(name, value)
+
+
 @pytest.fixture
-def as_a_user(tmp_path, monkeypatch):
-    """A user's session: JAX as it comes, but for float64; the cache of compiled code elsewhere."""
+def as_a_user():
+    """A user's session: JAX as it comes, but for float64."""
     before = {name: getattr(jax.config, name) for name in
-              ("jax_numpy_rank_promotion", "jax_numpy_dtype_promotion",
-               "jax_compilation_cache_dir")}  # fmt: skip
+              ("jax_numpy_rank_promotion", "jax_numpy_dtype_promotion")}  # fmt: skip
     jax.config.update("jax_numpy_rank_promotion", "allow")
     jax.config.update("jax_numpy_dtype_promotion", "standard")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     yield
     for name, value in before.items():
         jax.config.update(name, value)

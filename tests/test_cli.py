@@ -28,14 +28,6 @@ from gfnn_jax.scalars.products import Products
 DT = 0.1
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory, monkeypatch):
-    """Compiled programs of the tests do not go to the user's cache."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
-    yield
-    jax.config.update("jax_compilation_cache_dir", None)
-
-
 def kepler(a, e, mean_anomaly, orientation):
     """Plain NumPy: states (N, 4) of Kepler ellipses, q first."""
     x = mean_anomaly.copy()
@@ -631,3 +623,14 @@ def test_memory_of_a_long_prediction(lanes, num_steps, save_every, model, tmp_pa
         assert predicted["steps"][-1] == num_steps
         assert predicted["status"].shape == (lanes,)
     out.unlink()
+
+
+def test_compiled_programs_are_kept_in_the_users_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    of_the_tests = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    try:
+        cli._set_up_jax()
+        assert jax.config.jax_compilation_cache_dir == str(tmp_path / "gfnn_jax")
+    finally:
+        jax.config.update("jax_compilation_cache_dir", of_the_tests)

@@ -67,7 +67,6 @@ def test_the_gradient_is_one(example):
 def mine(tmp_path, monkeypatch):
     """Pairs of an oscillator, in a folder of their own."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     c, s = np.cos(0.1), np.sin(0.1)
     z0 = np.random.default_rng(0).uniform(-1, 1, (200, 2))
     return {"z0": z0, "z1": z0 @ np.array([[c, -s], [s, c]])}
@@ -88,7 +87,6 @@ def test_your_own_data_by_commands(mine):
     assert cli.main(predict) == 0
     with np.load("prediction.npz") as done:
         assert done["trajectories"].shape == (200, 11, 2)
-    jax.config.update("jax_compilation_cache_dir", None)
 
 
 def test_links_lead_somewhere():
