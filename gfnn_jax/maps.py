@@ -2,8 +2,9 @@
 
     coordinates⁻¹ ∘ R^½ ∘ generated(S, chart) ∘ R^½ ∘ coordinates
 
-Maps are pytrees: their arrays can be passed through ``jit`` and differentiated; what is static
-(family, chart, coordinates) is a hashable constant.
+Maps are pytrees: their numbers can be passed through ``jit`` and differentiated; what is static
+(the kind of family, chart, coordinates) is a hashable constant, and what is compiled for one map
+serves all of its kind.
 """
 
 from __future__ import annotations
@@ -41,29 +42,33 @@ def _register(data: tuple[str, ...], meta: tuple[str, ...]) -> Callable:
     return partial(jax.tree_util.register_dataclass, data_fields=data, meta_fields=meta)
 
 
+def _as_leaf(dt, scale):
+    """A time step as an array like the others: ``tree.map`` meets nothing but arrays."""
+    return jnp.asarray(dt, scale.dtype) if isinstance(dt, int | float) else dt
+
+
 @dataclasses.dataclass(frozen=True)
 class _Equation:
     """The implicit equation of a chart as the solver wants it: x is the free part of w.
 
-    θ = (scalar, params, z, w where it is known, scale).
+    θ = (scalar, params, z, w where it is known, dt, scale).
     """
 
     chart: AnyChart
-    dt: float
 
     def point(self, z, x):
         return z.at[np.array(self.chart.free(z.shape[0] // 2))].set(x)
 
     def __call__(self, theta, x):
-        scalar, params, z, known, scale = theta
+        scalar, params, z, known, dt, scale = theta
         w = self.point(known, x)
         gradient = jax.grad(scalar, argnums=1)(params, w)
-        residual = self.chart.residual(z, w, gradient, self.dt)
-        unit, size = jax.lax.stop_gradient(self.chart.sizes(scale, z, gradient, self.dt))
+        residual = self.chart.residual(z, w, gradient, dt)
+        unit, size = jax.lax.stop_gradient(self.chart.sizes(scale, z, gradient, dt))
         return residual / unit, size / unit, (w, gradient)
 
 
-@_register(("scalar", "params", "scale", "there", "back"), ("chart", "dt"))
+@_register(("scalar", "params", "dt", "scale", "there", "back"), ("chart",))
 @dataclasses.dataclass(frozen=True, eq=False)
 class Generated:
     """The map that S generates in a chart: Z − z = h J ∇S(w) (paper, eq. (4)).
@@ -77,22 +82,23 @@ class Generated:
     scalar: Any
     params: Any
     chart: AnyChart
-    dt: float
+    dt: Any
     scale: Any
     there: Any = None
     back: Any = None
 
     def __post_init__(self):
         object.__setattr__(self, "scalar", as_pytree(self.scalar))
+        object.__setattr__(self, "dt", _as_leaf(self.dt, self.scale))
 
     def solve(self, z, *, executed: bool = False):
         """w, ∇S(w), Info at the state z (2d,); ``executed`` keeps the iterations' derivative."""
-        equation = _Equation(self.chart, self.dt)
+        equation = _Equation(self.chart)
         dim = z.shape[0] // 2
         free = np.array(self.chart.free(dim))
         known = self.chart.start(z)
         guess = known[free] if self.there is None else known[free] + self.there(z)
-        theta = (self.scalar, self.params, z, known, self.scale)
+        theta = (self.scalar, self.params, z, known, self.dt, self.scale)
         if executed:
             _, (w, gradient), info = implicit.iterate(equation, theta, guess, most=_MOST_NEWTON)
         else:
@@ -175,7 +181,7 @@ class RolloutInfo(NamedTuple):
     iterations: Int[Array, "*batch"]
 
 
-@_register(("pieces", "domain", "scale", "cut"), ("coordinates", "dt"))
+@_register(("pieces", "domain", "scale", "cut", "dt"), ("coordinates",))
 @dataclasses.dataclass(frozen=True, eq=False)
 class SymplecticMap:
     """A learned map and what it knows of its data.
@@ -193,7 +199,10 @@ class SymplecticMap:
     domain: Domain
     scale: Any
     cut: Any
-    dt: float
+    dt: Any
+
+    def __post_init__(self):
+        object.__setattr__(self, "dt", _as_leaf(self.dt, self.scale))
 
     @property
     def dim(self) -> int:

@@ -402,7 +402,7 @@ def predict(
     started = time.perf_counter()
     if writer.finished:
         with np.load(out, allow_pickle=False) as done:
-            return Predicted(done["status"], done["left_at"], map_.dt, 0.0)
+            return Predicted(done["status"], done["left_at"], float(map_.dt), 0.0)
     if writer.carry is None:
         lanes = map_.start(z0, stop_outside=stop_outside)
         writer.append(z0[:, None], lanes._asdict())
@@ -417,7 +417,7 @@ def predict(
     say(f"writing {out}")
     status, left_at = np.asarray(lanes.status), np.asarray(lanes.left_at)
     writer.finish(status, left_at)
-    return Predicted(status, left_at, map_.dt, time.perf_counter() - started)
+    return Predicted(status, left_at, float(map_.dt), time.perf_counter() - started)
 
 
 def _chunk_length(num_lanes: int, width: int, save_every: int) -> int:
