@@ -423,6 +423,7 @@ def large_steps(quick: bool) -> tuple[list[Case], Numbers]:
         if quick and system not in ("oscillator", "pendulum"):
             continue
         measured[system] = {"dt": list(steps)}
+        jax.clear_caches()  # a process may hold so many compiled programs, and no more
         kept: dict[float, gfnn.Fit] = {}
         for chart in ("type2", "midpoint", "auto"):
             found = []

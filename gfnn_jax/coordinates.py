@@ -75,14 +75,17 @@ def circle_centre(angle) -> tuple[float, bool]:
     """Centre of the shortest arc that holds all values of an angle (N,); whether it is a circle.
 
     The cut, where the angle jumps by 2π, lies opposite; data count as the whole circle where no gap
-    is wider than an eighth of it.
+    is wider than an eighth of it. Its centre is 0: numbers are finest there and alike on both sides,
+    so that what rounding does to a kick averages out.
     """
     wrapped = np.sort(np.mod(angle, TWO_PI))
     gaps = np.diff(wrapped, append=wrapped[0] + TWO_PI)
     widest = int(np.argmax(gaps))
+    if gaps[widest] < TWO_PI / 8:
+        return 0.0, True
     after_gap = wrapped[(widest + 1) % len(wrapped)]
     centre = after_gap + 0.5 * (TWO_PI - gaps[widest])
-    return float(np.mod(centre + np.pi, TWO_PI) - np.pi), bool(gaps[widest] < TWO_PI / 8)
+    return float(np.mod(centre + np.pi, TWO_PI) - np.pi), False
 
 
 def lift(y0, y1, coordinates: Coordinates):

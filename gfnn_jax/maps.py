@@ -47,6 +47,13 @@ def _as_leaf(dt, scale):
     return jnp.asarray(dt, scale.dtype) if isinstance(dt, int | float) else dt
 
 
+def _two_sum(a, b):
+    """a + b as rounded, and what the rounding lost, exactly (Knuth, TAOCP 2, section 4.2.2)."""
+    total = a + b
+    part = total - a
+    return total, (a - (total - part)) + (b - part)
+
+
 @dataclasses.dataclass(frozen=True)
 class _Equation:
     """The implicit equation of a chart as the solver wants it: x is the free part of w.
@@ -112,6 +119,14 @@ class Generated:
         w, gradient, info = self.solve(z, executed=executed)
         return self.chart.image(z, w, gradient, self.dt), info
 
+    def carried(self, z, rest):
+        """(Z, rest, Info) of z + rest, the rest being what rounding has lost so far (compensated
+        summation: Hairer, Lubich & Wanner, "Geometric Numerical Integration", section VIII.5)."""
+        w, gradient, info = self.solve(z)
+        if not isinstance(self.chart, Chart):  # Z is no sum
+            return self.chart.image(z, w, gradient, self.dt), jnp.zeros_like(z), info
+        return *_two_sum(z, self.dt * apply_j(gradient) + rest), info
+
     def inverse(self) -> Generated:
         """The inverse map: the same S, the chart read from its other side."""
         chart, dt = self.chart.reverse(self.dt)
@@ -150,6 +165,11 @@ class Affine:
         ok = Info(jnp.int32(OK), jnp.int32(0), jnp.zeros((), z.dtype))
         return image, ok
 
+    def carried(self, z, rest):
+        """(Z, rest, Info) of z + rest; a product's rounding is lost, no rest is left."""
+        image, ok = self(z)
+        return image + self.matrix @ rest, jnp.zeros_like(z), ok
+
     def inverse(self) -> Affine:
         """E⁻¹, which of a symplectic E is −J Eᵀ J."""
         inverse = apply_j(apply_j(self.matrix).T)
@@ -159,12 +179,13 @@ class Affine:
 class Lanes(NamedTuple):
     """Where a batch of rollouts stands; the whole state from which it can go on.
 
-    y: inner coordinates with angles reduced (B, 2d). turns: of the angles (B, a). status, left_at
-    (step at which the lane left the domain, −1 if never), iterations (most Newton updates of a
-    step), steps done: (B,).
+    y: inner coordinates with angles reduced (B, 2d); rest: what rounding has lost of them, less than
+    their last digit. turns: of the angles (B, a). status, left_at (step at which the lane left the
+    domain, −1 if never), iterations (most Newton updates of a step), steps done: (B,).
     """
 
     y: Float[Array, "*batch phase"]
+    rest: Float[Array, "*batch phase"]
     turns: Int[Array, "*batch angles"]
     status: Int[Array, "*batch"]
     left_at: Int[Array, "*batch"]
@@ -220,24 +241,31 @@ class SymplecticMap:
     def _angles(self):
         return np.array(self.coordinates.angles, dtype=int)
 
-    def _reduce(self, y):
-        """y with its angles inside the cut, and the turns taken out.
+    def _reduce(self, y, rest):
+        """y with its angles inside the cut, the rest, and the turns taken out.
 
-        2π is subtracted in two parts, so that millions of turns add no drift. An angle so large
-        that its last digit is more than a radian has no meaning, and becomes NaN.
+        2π is more than its own digits: what they leave out goes to the rest, so that millions of
+        turns add no drift. An angle so large that its last digit is more than a radian has no
+        meaning, and becomes NaN.
         """
         angles = self._angles()
-        two_pi, rest = _two_pi(y.dtype)
+        two_pi, beyond = _two_pi(y.dtype)
         turns = jnp.round((y[angles] - self.cut) / TWO_PI)
-        reduced = (y[angles] - turns * two_pi) - turns * rest
+        reduced, lost = _two_sum(y[angles] - turns * two_pi, rest[angles] - turns * beyond)
         known = jnp.abs(turns) * float(jnp.finfo(y.dtype).eps) < 1.0
-        return y.at[angles].set(jnp.where(known, reduced, jnp.nan)), turns
+        y = y.at[angles].set(jnp.where(known, reduced, jnp.nan))
+        return y, rest.at[angles].set(lost), turns
+
+    def _inner(self, z):
+        """The reduced y of a user's state, its rest and its turns."""
+        y = self.coordinates.forward(z)
+        return self._reduce(y, jnp.zeros_like(y))
 
     def _outer(self, y, turns):
         """The user's state of the reduced y and its turns."""
         angles = self._angles()
-        two_pi, rest = _two_pi(y.dtype)
-        whole = (y[angles] + turns * rest) + turns * two_pi
+        two_pi, beyond = _two_pi(y.dtype)
+        whole = (y[angles] + turns * beyond) + turns * two_pi
         return self.coordinates.inverse(y.at[angles].set(whole))
 
     def _apply(self, y, *, executed: bool = False):
@@ -246,12 +274,19 @@ class SymplecticMap:
         for piece in self.pieces:
             y, info = piece(y, executed=executed)
             infos.append(info)
-        worst = Info(*(jnp.max(jnp.stack(column)) for column in zip(*infos, strict=True)))
-        return y, worst
+        return y, _worst(infos)
+
+    def _carried(self, y, rest):
+        """As ``_apply``, with the rest that rounding leaves: (Y, rest, Info)."""
+        infos = []
+        for piece in self.pieces:
+            y, rest, info = piece.carried(y, rest)
+            infos.append(info)
+        return y, rest, _worst(infos)
 
     def apply(self, z, *, executed: bool = False):
         """(Z, Info) of one state z (2d,) in the user's coordinates; for your own transforms."""
-        y, turns = self._reduce(self.coordinates.forward(z))
+        y, _, turns = self._inner(z)
         y1, info = self._apply(y, executed=executed)
         finite = jnp.all(jnp.isfinite(y1))
         left = jnp.where(self.domain.contains(y), OK, LEFT_DOMAIN)
@@ -264,7 +299,7 @@ class SymplecticMap:
         lifted to the nearest image of the map's own prediction, the base map factored out."""
         index = next(i for i, piece in enumerate(self.pieces) if isinstance(piece, Generated))
         angles = self._angles()
-        y0, _ = self._reduce(self.coordinates.forward(z0))
+        y0, _, _ = self._inner(z0)
         predicted, _ = self._apply(y0)
         y1 = self.coordinates.forward(z1)
         turns = jnp.round((y1[angles] - predicted[angles]) / TWO_PI)
@@ -355,6 +390,10 @@ class SymplecticMap:
         return jax.tree.map(lambda a: a[0], out) if z.ndim == 1 else out
 
 
+def _worst(infos: list[Info]) -> Info:
+    return Info(*(jnp.max(jnp.stack(column)) for column in zip(*infos, strict=True)))
+
+
 @jax.jit
 def _step(map_, z):
     return jax.vmap(map_.apply)(z)
@@ -371,7 +410,7 @@ def _defect(map_, z):
 @jax.jit
 def _determinant(map_, z):
     def smallest(z):
-        y = map_._reduce(map_.coordinates.forward(z))[0]
+        y, _, _ = map_._inner(z)
         found = []
         for piece in map_.pieces:
             if isinstance(piece, Generated):
@@ -392,13 +431,13 @@ def _judge(status, inside, stop_outside: bool):
 @partial(jax.jit, static_argnums=2)
 def _start(map_, z, stop_outside):
     def lane(z):
-        y, turns = map_._reduce(map_.coordinates.forward(z))
+        y, rest, turns = map_._inner(z)
         inside: Bool[Array, ""] = map_.domain.contains(y)
         finite = jnp.all(jnp.isfinite(y))
         status = _judge(jnp.where(finite, OK, NON_FINITE), inside, stop_outside)
         zero = jnp.zeros((), jnp.result_type(int))
         left_at = jnp.where(inside | ~finite, zero - 1, zero)
-        return Lanes(y, turns.astype(zero.dtype), status.astype(jnp.int32), left_at,
+        return Lanes(y, rest, turns.astype(zero.dtype), status.astype(jnp.int32), left_at,
                      jnp.zeros((), jnp.int32), zero)  # fmt: skip
 
     return jax.vmap(lane)(z)
@@ -408,8 +447,8 @@ def _start(map_, z, stop_outside):
 def _advance(map_, lanes, num_saved, save_every, stop_outside):
     def step(lane: Lanes) -> Lanes:
         going = lane.status <= LEFT_DOMAIN
-        y, info = map_._apply(jnp.where(going, lane.y, jnp.nan))
-        y, turns = map_._reduce(y)
+        y, rest, info = map_._carried(jnp.where(going, lane.y, jnp.nan), lane.rest)
+        y, rest, turns = map_._reduce(y, rest)
         inside = map_.domain.contains(y)
         failed = jnp.where(jnp.all(jnp.isfinite(y)), info.status, NON_FINITE)
         status = jnp.where(failed == OK, _judge(lane.status, inside, stop_outside), failed)
@@ -417,6 +456,7 @@ def _advance(map_, lanes, num_saved, save_every, stop_outside):
         leaves = going & (failed == OK) & ~inside & (lane.left_at < 0)
         return Lanes(
             jnp.where(status <= LEFT_DOMAIN, y, jnp.nan),
+            rest,
             lane.turns + jnp.where(jnp.isfinite(turns), turns, 0).astype(lane.turns.dtype),
             status,
             jnp.where(leaves, lane.steps + 1, lane.left_at),
