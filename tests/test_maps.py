@@ -63,6 +63,18 @@ def test_one_state_and_a_batch_take_the_same_step():
     assert learned.defect(Z[3]).shape == ()
 
 
+def test_other_numbers_compile_nothing():
+    """A map of the same kind, with another time step and another S, uses the compiled step."""
+    learned = pendulum_map()
+    learned.step(Z)
+    compiled = maps._step._cache_size()
+    (piece,) = learned.pieces
+    other = dataclasses.replace(piece, dt=jnp.float64(0.1), params=jnp.float64(2.0))
+    images, _ = dataclasses.replace(learned, pieces=(other,), dt=jnp.float64(0.1)).step(Z)
+    assert maps._step._cache_size() == compiled
+    assert not np.allclose(images, learned.step(Z)[0], atol=1e-3)
+
+
 @pytest.mark.parametrize("bad", [np.zeros(3), np.zeros((2, 4)), np.zeros((1, 1, 2)), np.float64(1)])
 def test_states_of_another_shape_are_refused(bad):
     with pytest.raises(ValueError, match=r"expected states of shape \(2,\) or \(B, 2\)"):
