@@ -218,11 +218,10 @@ def section(found: dict[str, list[Numbers]]) -> str:
     some = next(iter(found.values()))[0]
     lines += [
         "",
-        f"Measured on {some['machine']['processor']}, {some['machine']['cores']} cores, "
+        f"Measured on {some['machine']['processor']}, {some['machine']['cores']} of its cores, "
         f"{some['device']}, jax {some['versions']['jax']}, float64 predictions of networks trained "
-        f"in float32, {some['date']}; other work on the machine at the time: load average "
-        f"{min(loads):.1f} to {max(loads):.1f}, so that a capped training had a share of the "
-        "machine only. KL: 50 bins.",
+        f"in float32, {some['date']}; load average {min(loads):.1f} to {max(loads):.1f}. KL: 50 "
+        "bins.",
     ]
     return "\n".join(lines)
 
