@@ -22,11 +22,17 @@ def results(pieces: Pieces, prefix: str, folder: Path = RESULTS) -> dict[str, Nu
 
 
 def main(
-    doc: str, pieces: Pieces, prefix: str, tables: Callable[[], None], argv: Sequence[str] | None
+    doc: str,
+    pieces: Pieces,
+    prefix: str,
+    tables: Callable[[], None],
+    argv: Sequence[str] | None,
+    quick_pieces: Sequence[str] = (),
 ) -> None:
     """The command line: measure what has no result yet, then make the tables.
 
     pieces: name -> ``measure(quick)`` -> what was measured. prefix: of the results' file names.
+    quick_pieces: those that --quick stands for, where all would take more than a minute.
     """
     parser = argparse.ArgumentParser(description=doc.splitlines()[0])
     parser.add_argument("--only", metavar="A,B", help=", ".join(pieces))
@@ -35,7 +41,8 @@ def main(
     parser.add_argument("--tables", action="store_true", help="only make tables and figures again")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
     arguments = parser.parse_args(argv)
-    chosen = arguments.only.split(",") if arguments.only else list(pieces)
+    every = quick_pieces if arguments.quick and quick_pieces else pieces
+    chosen = arguments.only.split(",") if arguments.only else list(every)
     unknown = [name for name in chosen if name not in pieces]
     if unknown:
         parser.error(f"unknown piece '{unknown[0]}'; pieces: {', '.join(pieces)}")

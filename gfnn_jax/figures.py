@@ -50,6 +50,7 @@ STYLE: dict[Any, Any] = {
     "pdf.fonttype": 42,
     "axes.prop_cycle": cycler(color=COLOURS),
 }
+_HALO = [withStroke(linewidth=2, foreground="white")]  # keeps text legible on lines
 WIDTH, HEIGHT = 4.8, 3.2  # inches, of one panel; a column of a paper is about 3.3 wide
 
 
@@ -430,7 +431,7 @@ def _number_points(ax, x, y, order):
             ha="center",
             va="center",
             fontsize=8,
-            path_effects=[withStroke(linewidth=2, foreground="white")],
+            path_effects=_HALO,
         )
 
 
@@ -443,6 +444,65 @@ def work_precision(curves: Mapping, ylabel="position error", ax=None) -> Axes:
     ax.set(xscale="log", yscale="log", xlabel="time per step and trajectory (µs)", ylabel=ylabel)
     ax.legend()
     return ax
+
+
+@style()
+def work_precision_panels(panels: Mapping, ylabel) -> Figure:
+    """Learned maps among what else there is, error against time, both logarithmic; side by side.
+
+    panels: title -> {"ours", "float32", "known", "others"}, each a mapping of name -> (cost (K,),
+    error (K,), size (K,) as text). Ours have a colour and a filled marker each, with the size
+    beside it; the same names in float32 are hollow, and the thick line joins those of ours that no
+    other of ours beats. Grey: what is told H. Crosses, numbered: single results of other methods.
+    """
+    figure = Figure(figsize=(WIDTH * 0.85 * len(panels) + 1.6, HEIGHT * 1.25))
+    axes = np.ravel(figure.subplots(1, len(panels), sharey=True))
+    for ax, (title, groups) in zip(axes, panels.items(), strict=True):
+        _front(ax, [*groups["ours"].values(), *groups["float32"].values()])
+        names = list(groups["ours"])
+        for place, (name, points) in enumerate(groups["ours"].items()):
+            look = _look(place) | {"linestyle": "none", "ms": 5.5}
+            ax.plot(*points[:2], label=name, **look)
+            for cost, error, size in zip(*points, strict=True):
+                ax.annotate(size, (cost, error), (5, 3), textcoords="offset points", fontsize=6,
+                            color=look["color"], path_effects=_HALO)  # fmt: skip
+            if name in groups["float32"]:
+                ax.plot(*groups["float32"][name][:2], mfc="white", **look)
+        if groups["float32"]:
+            ax.plot([], [], "o", mfc="white", color="#777777", label="hollow: in float32")
+        for place, (name, points) in enumerate(groups["known"].items()):
+            look = _look(place + len(names)) | {"color": "#777777", "linewidth": 0.8, "ms": 3.5}
+            ax.plot(*points[:2], label=f"{name} (told H)", **look)
+        costs, errors = (
+            np.array([np.ravel(v[i])[0] for v in groups["others"].values()]) for i in (0, 1)
+        )
+        if len(costs):
+            ax.plot(costs, errors, "x", color=REFERENCE, ms=4)
+        ax.set(xscale="log", yscale="log", title=title)
+        ax.set_xlabel("time per trajectory and unit time (µs)")
+        if len(costs):
+            _number_points(ax, costs, errors, np.arange(len(costs)))
+            for number, name in enumerate(groups["others"]):
+                ax.plot([], [], "x", color=REFERENCE, ms=4, label=f"{number + 1}  {name}")
+    axes[0].set_ylabel(ylabel)
+    handles = {}
+    for ax in axes:
+        for handle, name in zip(*ax.get_legend_handles_labels(), strict=True):
+            handles.setdefault(name, handle)
+    figure.legend(handles.values(), handles, loc="outside right center", frameon=False)
+    return figure
+
+
+def _front(ax, curves):
+    """The staircase through the points that no other beats in both cost and error."""
+    cost, error = (np.concatenate([np.ravel(c[i]) for c in curves]) for i in (0, 1))
+    order = np.lexsort((error, cost))
+    best = np.minimum.accumulate(error[order])
+    front = np.flatnonzero(np.append(True, best[1:] < best[:-1]))
+    ax.step(
+        cost[order][front], best[front], where="post", color=COLOURS[5], lw=4, alpha=0.45,
+        label="best of the learned maps", zorder=1.5,
+    )  # fmt: skip
 
 
 @style()

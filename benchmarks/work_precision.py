@@ -1,0 +1,428 @@
+"""Work against precision: which map to take, and what is faster where H is known.
+
+    python benchmarks/work_precision.py                  scenes without a result, then the tables
+    python benchmarks/work_precision.py --only two-body --overwrite
+    python benchmarks/work_precision.py --quick          small sizes, into runs/work-precision
+
+A scene's result is one JSON file, work-precision-*.json in benchmarks/results; the figures and the
+section of benchmarks/RESULTS.md are made from these files and from those of `gfnn compare`. All
+times are per trajectory and unit of the scene's time, the best of several, compilation apart.
+heyoka is in the extra ``benchmarks``; without it its row says so.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.metadata
+import json
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+# Sets float64, so it comes before all of JAX.
+from pieces import main as run_pieces
+from pieces import results
+from targets import (
+    HERE,
+    RESULTS,
+    SEED,
+    TABLES,
+    Numbers,
+    angles_of,
+    between_markers,
+    drawn,
+    number,
+    provenance,
+)
+
+# isort: split
+import jax
+import numpy as np
+from hard_cases import in_float32
+from integrators import runners
+
+import gfnn_jax as gfnn
+from gfnn_jax import figures, metrics
+from gfnn_jax.comparison import separable
+from gfnn_jax.implicit import LEFT_DOMAIN
+from gfnn_jax.scenes import Scene
+
+# scene: pairs to learn from, and the steps after which the error is taken.
+SCENES = {
+    "two-body": (4_000, 100),
+    "henon-heiles-regular": (4_000, 100),
+    "henon-heiles-chaotic": (8_000, 10),
+    "pcr3bp": (10_000, 100),
+    "standard-map-regular": (1_000, 100),
+    "standard-map-chaotic": (1_000, 10),
+}
+QUICK = ("standard-map-regular", "henon-heiles-regular")
+LANES, SINGLE_STEPS, STRIDE, MOST_SIZES = 1_000, 1_000, 10, 5
+FLOAT32_FLOOR = 1e-7  # of the data's spread: a larger map is no more accurate in float32
+CHARTS = ("midpoint", "type2")
+UNREACHABLE = 1e-300  # a tolerance for which a fit climbs its ladder to the end
+MLP_ITERATIONS = 100
+ASKED = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
+FIGURES = HERE / "figures"
+OURS, KNOWN, OTHERS = "ours", "H known", "baseline"
+
+
+# Measuring
+
+
+def timed(function: Callable[[], Any], most_seconds: float = 0.6) -> tuple[Any, float, float]:
+    """What the function returns, seconds of its fastest call, and what the first took longer."""
+
+    def once() -> tuple[Any, float]:
+        started = time.perf_counter()
+        out = jax.block_until_ready(function())
+        return out, time.perf_counter() - started
+
+    (out, first), (_, second) = once(), once()
+    repeats = int(np.clip(most_seconds / second, 1, 40))
+    fastest = min(second, *(once()[1] for _ in range(repeats)))
+    return out, fastest, max(0.0, first - fastest)
+
+
+class Bench:
+    """What all methods of a scene are judged by: states, their reference, the horizon."""
+
+    def __init__(self, scene: Scene, num_steps: int, quick: bool):
+        self.scene, self.num_steps = scene, num_steps
+        self.single_steps = 100 if quick else SINGLE_STEPS
+        key = jax.random.key(SEED)
+        self.z0 = gfnn.sample_test_states(scene, 50 if quick else LANES, key)
+        reached = gfnn.reference_trajectories(scene, self.z0, num_steps, save_every=num_steps)
+        self.reference = np.asarray(reached[:, -1])
+        self.stays = np.isfinite(self.reference).all(axis=1)
+
+    def judged(self, states, lost=None) -> Numbers:
+        """Median and mean position error at the horizon; a lane that is lost counts as infinitely
+        far in the median, and leaves no mean."""
+        states = np.array(states, dtype=float)
+        if lost is not None:
+            states[lost] = np.nan
+        error = np.asarray(
+            metrics.position_error(states, self.reference, angles_of(self.scene))
+        )[self.stays]  # fmt: skip
+        num_lost = int(np.sum(~np.isfinite(error)))
+        return {
+            "error_median": float(np.median(np.where(np.isfinite(error), error, np.inf))),
+            "error_mean": float(np.mean(error)) if num_lost == 0 else None,
+            "num_lost": num_lost,
+            "num_trajectories": len(error),
+        }
+
+    def together(self, batch: Callable, num_steps: int) -> tuple[Any, Numbers]:
+        """What a call returns that takes all states so many steps, and its time."""
+        out, seconds, compiling = timed(batch)
+        per_unit = 1e6 * seconds / (len(self.z0) * num_steps * self.scene.dt)
+        return out, {"microseconds_batch": per_unit, "compile_seconds_batch": compiling}
+
+    def alone(self, single: Callable) -> Numbers:
+        """Time of a call that takes one state ``single_steps``; None where it gets lost."""
+        out, seconds, compiling = timed(single)
+        per_unit = 1e6 * seconds / (self.single_steps * self.scene.dt)
+        there = bool(np.isfinite(np.asarray(out)).all())
+        return {
+            "microseconds_single": per_unit if there else None,
+            "compile_seconds_single": compiling,
+        }
+
+
+def map_point(bench: Bench, map_, *, alone: bool) -> Numbers:
+    """A learned map at the horizon, which short calls reach in a row: the fastest of many short
+    ones suffers least from other work on the machine."""
+    lanes, stride = map_.start(bench.z0), min(STRIDE, bench.num_steps)
+    _, times = bench.together(lambda: map_.advance(lanes, 1, save_every=stride)[1], stride)
+    if alone:
+        one, longer = map_.start(bench.z0[:1]), bench.single_steps
+        times |= bench.alone(lambda: map_.advance(one, 1, save_every=longer)[1])
+    for _ in range(bench.num_steps // stride):
+        lanes, states = map_.advance(lanes, 1, save_every=stride)
+    status = np.asarray(lanes.status)
+    left = int(np.sum(status[bench.stays] == LEFT_DOMAIN))
+    return {
+        **bench.judged(states[:, -1], lost=status > LEFT_DOMAIN),
+        "num_left_domain": left, **times,
+    }  # fmt: skip
+
+
+def front_of(cost, error) -> list[int]:
+    """Indices, by rising cost, of the points that no other beats in both."""
+    kept, best = [], np.inf
+    for i in np.lexsort((error, cost)).tolist():
+        if error[i] < best:
+            kept.append(i)
+            best = error[i]
+    return kept
+
+
+def thinned(items: list, most: int) -> list:
+    """At most so many of them, evenly, the first and the last among them."""
+    places = np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)
+    return [items[i] for i in np.unique(places)]
+
+
+def kinds_of(scene: Scene, quick: bool) -> Iterator[tuple[str, str]]:
+    """(chart, scalar) of each ladder."""
+    for chart in CHARTS[:1] if quick else CHARTS:
+        yield chart, "polynomial"
+        if scene.features is not None and not quick:
+            yield chart, "features"
+    if not quick:
+        yield CHARTS[0], "mlp"
+
+
+def our_maps(bench: Bench, num_pairs: int, quick: bool, omit) -> Iterator[Numbers]:
+    """Every chart and family, a few sizes along the front of each, in both precisions."""
+    scene = bench.scene
+    pairs, _ = drawn(scene, num_pairs, quick=True)
+    for chart, scalar in kinds_of(scene, quick):
+        name = f"{chart} {scalar}"
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", gfnn.FitWarning)
+                fit = gfnn.fit(
+                    pairs, scene, chart=chart, scalar=scalar, seed=SEED,
+                    tolerance=1e-3 if quick else UNREACHABLE, max_iterations=MLP_ITERATIONS,
+                )  # fmt: skip
+        except gfnn.FitError as error:
+            omit(name, str(error))
+            continue
+        print(f"  {name}: {len(fit.candidates)} sizes, {fit.seconds:.0f} s")
+        sizes = [c for c in fit.candidates if np.isfinite(c.validation_rms)]
+        if len(sizes) < len(fit.candidates):
+            lost = sorted({c.label for c in fit.candidates} - {c.label for c in sizes})
+            omit(name, f"lanes of the held-out pairs fail: {', '.join(lost)}")
+        front = front_of([c.work for c in sizes], [c.validation_rms for c in sizes])
+        at_floor = False
+        for candidate in thinned([sizes[i] for i in front], 1 if quick else MOST_SIZES):
+            about = {
+                "group": OURS, "method": f"{chart} {candidate.label.rsplit(maxsplit=1)[0]}",
+                "label": candidate.label, "chart": chart,
+                "num_parameters": candidate.num_parameters, "base_map": fit.based,
+                "one_step_rms": candidate.validation_rms, "fit_seconds": candidate.fit_seconds,
+            }  # fmt: skip
+            yield {**about, "dtype": "float64", **map_point(bench, candidate.map, alone=True)}
+            if not at_floor:
+                single = in_float32(candidate.map)
+                yield {**about, "dtype": "float32", **map_point(bench, single, alone=False)}
+            at_floor = candidate.relative_rms < FLOAT32_FLOOR
+
+
+def integrated(bench: Bench, quick: bool, omit) -> Iterator[Numbers]:
+    """Integrators that are told H, at rising precision."""
+    scene, z0, one = bench.scene, bench.z0, bench.z0[:1]
+    horizon, longer = bench.num_steps * scene.dt, bench.single_steps * scene.dt
+    for name, runner in runners(scene, separable(scene)):
+        if isinstance(runner, str):
+            omit(name, runner)
+            continue
+        if quick and name not in ("diffrax Dopri8", "heyoka", "Kahan–Li 8"):
+            continue
+        print(f"  {name}")
+        chosen = thinned(list(runner.precisions.items()), 2 if quick else LANES)
+        for label, precision in chosen:
+            many = functools.partial(runner.run, z0, horizon, precision)
+            reached, times = bench.together(many, bench.num_steps)
+            judged = bench.judged(reached)
+            if not np.isfinite(judged["error_median"]):
+                omit(f"{name}, {label}", f"{judged['num_lost']} trajectories fail")
+                continue
+            yield {
+                "group": KNOWN, "method": name, "label": label, "dtype": "float64",
+                "arrangement": runner.arrangement, **judged, **times,
+                **bench.alone(functools.partial(runner.run, one, longer, precision)),
+            }  # fmt: skip
+
+
+def scene_piece(name: str) -> Callable[[bool], Numbers]:
+    def measure(quick: bool) -> Numbers:
+        num_pairs, num_steps = SCENES[name]
+        omitted: list[dict[str, str]] = []
+
+        def omit(method: str, reason: str) -> None:
+            omitted.append({"method": method, "reason": reason})
+
+        scene = gfnn.scenes.make(name)
+        bench = Bench(scene, num_steps, quick)
+        points = [*our_maps(bench, 1_000 if quick else num_pairs, quick, omit),
+                  *integrated(bench, quick, omit)]  # fmt: skip
+        try:
+            extra = {"heyoka": importlib.metadata.version("heyoka")}
+        except importlib.metadata.PackageNotFoundError:
+            extra = {}
+        return {
+            "dt": scene.dt, "horizon_steps": num_steps, "horizon": num_steps * scene.dt,
+            "lanes": len(bench.z0), "pairs": num_pairs, "points": points, "omitted": omitted,
+            "versions": extra,
+        }  # fmt: skip
+
+    return measure
+
+
+PIECES = {name: scene_piece(name) for name in SCENES}
+
+
+# Figures and tables
+
+
+def others(name: str, result: Numbers) -> list[Numbers]:
+    """The other methods, at the same step of the same scene, as `gfnn compare` measured them: 100
+    trajectories together."""
+    path = RESULTS / f"compare-{name}-{SEED}.json"
+    if not path.exists():
+        return []
+    measured = result["measured"]
+    step = str(measured["horizon_steps"])
+    return [
+        {
+            "group": OTHERS, "method": m["title"], "label": m["model"]["label"],
+            "error_median": m["rollout"]["error_median"][step],
+            "microseconds_batch": m["rollout"]["microseconds_per_step"] / measured["dt"],
+            "num_parameters": m["model"]["num_parameters"], "num_lost": m["rollout"]["num_lost"],
+        }
+        for method, m in json.loads(path.read_text(encoding="utf-8"))["methods"].items()
+        if method != "gfnn"
+    ]  # fmt: skip
+
+
+def panel(points: list[Numbers], time_of: str) -> Numbers:
+    """One panel of the figure: group -> name -> (cost, error, size)."""
+    groups: Numbers = {"ours": {}, "float32": {}, "known": {}, "others": {}}
+    for p in points:
+        if p["error_median"] is None or p.get(time_of) is None:
+            continue
+        group = {OURS: "ours", KNOWN: "known", OTHERS: "others"}[p["group"]]
+        group = "float32" if p.get("dtype") == "float32" else group
+        costs, errors, sizes = groups[group].setdefault(p["method"], ([], [], []))
+        costs.append(p[time_of])
+        errors.append(p["error_median"])
+        sizes.append(p["label"].split()[-1])  # the degree, or the network's layers
+    return groups
+
+
+def draw(name: str, result: Numbers) -> None:
+    m = result["measured"]
+    points = [*m["points"], *others(name, result)]
+    panels = {f"{m['lanes']:,} trajectories together": panel(points, "microseconds_batch"),
+              "one trajectory alone": panel(points, "microseconds_single")}  # fmt: skip
+    label = f"median position error after {m['horizon_steps']} steps"
+    figures.save(
+        figures.work_precision_panels(panels, label), FIGURES / f"work_precision_{name}.png"
+    )  # fmt: skip
+
+
+def within(
+    points: Sequence[Numbers], error: float, time_of: str = "microseconds_batch"
+) -> Numbers | None:
+    """The fastest of these points whose error is at most this."""
+    timed_points = [p for p in points if None not in (p["error_median"], p.get(time_of))]
+    meeting = [p for p in timed_points if p["error_median"] <= error]
+    return min(meeting, key=lambda p: p[time_of], default=None)
+
+
+def called(point: Numbers) -> str:
+    """A map as the tables name it."""
+    precision = ", float32" if point["dtype"] == "float32" else ""
+    based = ", base map" if point["base_map"] else ""
+    return f"{point['chart']} {point['label']}{precision}{based}"
+
+
+def advice(name: str, result: Numbers) -> str:
+    """Which map to take for an error, and what is as accurate where H is known."""
+    m = result["measured"]
+    ours_all, known_all = ([p for p in m["points"] if p["group"] == g] for g in (OURS, KNOWN))
+    rows = []
+    for error in ASKED:
+        ours, known, other = (
+            within(points, error) for points in (ours_all, known_all, others(name, result))
+        )
+        alone = within(known_all, error, "microseconds_single")
+        if not (ours or known):
+            continue
+        row = {"error asked for": f"{error:.0e}"}
+        row |= {
+            "map to take": called(ours) if ours else "none",
+            "parameters": number(ours and ours["num_parameters"]),
+            "its error": number(ours and ours["error_median"]),
+            "µs together, alone": pair_of(ours, ours),
+            "compile, s": number(ours and ours["compile_seconds_batch"]),
+        }
+        if known_all:
+            row |= {
+                "fastest that is told H: together, alone": " and ".join(
+                    dict.fromkeys(p["method"] for p in (known, alone) if p)) or "none",
+                "its µs": pair_of(known, alone),
+                "times faster than the map": pair_of(known, alone, ours) if ours else "–",
+            }  # fmt: skip
+        row["fastest other learned method, µs"] = (
+            f"{other['method']}, {number(other['microseconds_batch'])}" if other else "none"
+        )
+        rows.append(row)
+    lines = ["| " + " | ".join(rows[0]) + " |", "|---" * len(rows[0]) + "|"]
+    return "\n".join([*lines, *("| " + " | ".join(row.values()) + " |" for row in rows)])
+
+
+def pair_of(together: Numbers | None, alone: Numbers | None, of: Numbers | None = None) -> str:
+    """Both times of a method, or how many of them the times of another one are."""
+    if together is None or alone is None:
+        return "–"
+    times = [together["microseconds_batch"], alone.get("microseconds_single")]
+    if of is not None:
+        slower = of["microseconds_batch"], of.get("microseconds_single")
+        times = [a and b and a / b for a, b in zip(slower, times, strict=True)]
+    return ", ".join(map(number, times))
+
+
+def failures(name: str, result: Numbers) -> str:
+    """What was left out, what failed, and where lanes were lost: one line of text."""
+    m = result["measured"]
+    reasons: dict[str, list[str]] = {}
+    for o in m["omitted"]:
+        reasons.setdefault(o["reason"], []).append(o["method"])
+    for p in [*m["points"], *others(name, result)]:
+        title = called(p) if p["group"] == OURS else f"{p['method']}, {p['label']}"
+        if p["num_lost"]:
+            reasons.setdefault(f"{p['num_lost']} trajectories lost", []).append(title)
+        elif p.get("num_left_domain", 0) > 0.05 * m["lanes"]:
+            left = f"{p['num_left_domain']} trajectories left the domain of the data"
+            reasons.setdefault(left, []).append(title)
+    if not others(name, result):
+        reasons["not compared on this scene yet"] = ["the other methods"]
+    said = [f"{', '.join(titles)}: {reason}" for reason, titles in reasons.items()]
+    return "Left out, lost or failed: " + ("; ".join(said) or "nothing") + "."
+
+
+def tables() -> None:
+    found = results(PIECES, "work-precision")
+    if not found:
+        return
+    parts = []
+    for name, result in found.items():
+        draw(name, result)
+        m = result["measured"]
+        compiling = [p["compile_seconds_batch"] for p in m["points"] if p["group"] == OURS]
+        parts.append(
+            f"### {name}\n\nErrors after {m['horizon_steps']} steps of {m['dt']:g}, "
+            f"{m['pairs']:,} pairs to learn from. Compilation of a map's rollout: "
+            f"{number(min(compiling))} to {number(max(compiling))} s.\n\n"
+            f"![Work and precision: {name}](figures/work_precision_{name}.png)\n\n"
+            f"{advice(name, result)}\n\n{failures(name, result)}"
+        )
+    versions = {k: v for r in found.values() for k, v in
+                {**r["versions"], **r["measured"]["versions"]}.items()}  # fmt: skip
+    names = ("jaxlib", "diffrax", "scipy", "numpy", "heyoka")
+    shown = ", ".join(f"{k} {versions[k]}" for k in names if k in versions)
+    parts.append(f"{provenance(found)} Also {shown}.")
+    between_markers(TABLES, "work-precision", "\n\n".join(parts))
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    run_pieces(__doc__ or "", PIECES, "work-precision", tables, argv, QUICK)
+
+
+if __name__ == "__main__":
+    main()
