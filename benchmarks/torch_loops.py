@@ -20,24 +20,33 @@ def _network(widths: tuple[int, ...]) -> torch.nn.Sequential:
 
 
 def _seconds(
-    batches: Iterator, widths: tuple[int, ...], weight: float, steps: int, *, fused: bool
+    batches: Iterator,
+    widths: tuple[int, ...],
+    weight: float,
+    runs: int,
+    length: int,
+    *,
+    fused: bool,
 ) -> float:
-    """Seconds per step of Adam on mean ‖weight · (∇S(w) − wanted)‖²; ∇S by one backward pass, its
-    slope in the weights by a second through the first."""
+    """Seconds per step of Adam on mean ‖weight · (∇S(w) − wanted)‖², in the fastest of so many runs
+    of so many steps; ∇S by one backward pass, its slope in the weights by a second through it."""
     network = _network(widths)
     optimizer = torch.optim.Adam(network.parameters(), lr=0.01, fused=fused)
-    started = 0.0
-    for step in range(WARM_UP + steps):
-        if step == WARM_UP:
-            started = time.perf_counter()
-        w, wanted = next(batches)
-        w.requires_grad_()
-        (gradient,) = torch.autograd.grad(network(w).sum(), w, create_graph=True)
-        loss = ((weight * (gradient - wanted)) ** 2).sum(dim=-1).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    return (time.perf_counter() - started) / steps
+
+    def run(steps: int) -> float:
+        started = time.perf_counter()
+        for _ in range(steps):
+            w, wanted = next(batches)
+            w.requires_grad_()
+            (gradient,) = torch.autograd.grad(network(w).sum(), w, create_graph=True)
+            loss = ((weight * (gradient - wanted)) ** 2).sum(dim=-1).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        return time.perf_counter() - started
+
+    run(WARM_UP)
+    return min(run(length) for _ in range(runs)) / length
 
 
 def _loaded(w, wanted, batch_size: int) -> Iterator:
@@ -56,11 +65,19 @@ def _indexed(w, wanted, batch_size: int) -> Iterator:
 
 
 def measure(
-    w, wanted, widths: tuple[int, ...], weight: float, batch_size: int, steps: int, threads: int
+    w,
+    wanted,
+    widths: tuple[int, ...],
+    weight: float,
+    batch_size: int,
+    runs: int,
+    length: int,
+    threads: int,
 ) -> dict[str, float | int | str]:
     """Microseconds per step of both loops, in float32, on so many threads.
 
-    w, wanted: NumPy arrays (N, 2d). widths: of the network, inputs and output included.
+    w, wanted: NumPy arrays (N, 2d). widths: of the network, inputs and output included. runs,
+    length: the fastest of so many runs of so many steps counts.
     """
     torch.set_num_threads(threads)
     torch.manual_seed(0)
@@ -69,7 +86,7 @@ def measure(
         "original": (_loaded, False), "careful": (_indexed, True)
     }  # fmt: skip
     microseconds = {
-        name: 1e6 * _seconds(batches(*rows, batch_size), widths, weight, steps, fused=fused)
+        name: 1e6 * _seconds(batches(*rows, batch_size), widths, weight, runs, length, fused=fused)
         for name, (batches, fused) in loops.items()
     }
     return {**microseconds, "threads": threads, "version": torch.__version__}

@@ -377,6 +377,35 @@ def pair_of(together: Numbers | None, alone: Numbers | None, of: Numbers | None 
     return ", ".join(map(number, times))
 
 
+def in_words(name: str, result: Numbers) -> str:
+    """Which map to take, and what is faster, in a few sentences."""
+    points = result["measured"]["points"]
+    ours, known = ([p for p in points if p["group"] == g] for g in (OURS, KNOWN))
+    takes: dict[str, float] = {}
+    ratios = []
+    for error in ASKED:
+        map_, told = within(ours, error), within(known, error)
+        if map_:
+            takes[called(map_)] = error
+        if map_ and told:
+            ratios.append(map_["microseconds_batch"] / told["microseconds_batch"])
+    said = ["Take " + "; ".join(f"{map_} down to {e:.0e}" for map_, e in takes.items()) + "."]
+    if ratios:
+        fastest = sorted({p["method"] for e in ASKED if (p := within(known, e))})
+        said.append(
+            f"Where H is known an integrator is faster: {', '.join(fastest)}, by "
+            f"{number(min(ratios))} to {number(max(ratios))} times, together."
+        )
+    compared = [p for p in others(name, result) if p["error_median"] is not None]
+    if compared:
+        best = min(compared, key=lambda p: p["error_median"])
+        said.append(
+            f"The best of the other learned methods, {best['method']}, has an error of "
+            f"{number(best['error_median'])} in {number(best['microseconds_batch'])} µs."
+        )
+    return " ".join(said)
+
+
 def failures(name: str, result: Numbers) -> str:
     """What was left out, what failed, and where lanes were lost: one line of text."""
     m = result["measured"]
@@ -409,6 +438,7 @@ def tables() -> None:
             f"### {name}\n\nErrors after {m['horizon_steps']} steps of {m['dt']:g}, "
             f"{m['pairs']:,} pairs to learn from. Compilation of a map's rollout: "
             f"{number(min(compiling))} to {number(max(compiling))} s.\n\n"
+            f"{in_words(name, result)}\n\n"
             f"![Work and precision: {name}](figures/work_precision_{name}.png)\n\n"
             f"{advice(name, result)}\n\n{failures(name, result)}"
         )
