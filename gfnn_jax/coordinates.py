@@ -75,8 +75,8 @@ def circle_centre(angle) -> tuple[float, bool]:
     """Centre of the shortest arc that holds all values of an angle (N,); whether it is a circle.
 
     The cut, where the angle jumps by 2π, lies opposite; data count as the whole circle where no gap
-    is wider than an eighth of it. Its centre is 0: numbers are finest there and alike on both sides,
-    so that what rounding does to a kick averages out.
+    is wider than an eighth of it. Its centre is 0: there numbers are finest, and alike on both
+    sides, so that what rounding does to a kick averages out.
     """
     wrapped = np.sort(np.mod(angle, TWO_PI))
     gaps = np.diff(wrapped, append=wrapped[0] + TWO_PI)
