@@ -181,7 +181,8 @@ class Lanes(NamedTuple):
 
     y: inner coordinates with angles reduced (B, 2d). rest: what rounding has lost of them, less
     than their last digit (B, 2d). turns: of the angles (B, a). status, left_at (step at which the
-    lane left the domain, −1 if never), iterations (most Newton updates of a step), steps done: (B,).
+    lane left the domain, −1 if never), iterations (most Newton updates of a step), steps done:
+    each (B,).
     """
 
     y: Float[Array, "*batch phase"]
