@@ -168,7 +168,8 @@ def thinned(items: list, most: int) -> list:
 def kinds_of(scene: Scene, quick: bool) -> Iterator[tuple[str, str]]:
     """(chart, scalar) of each ladder."""
     for chart in CHARTS[:1] if quick else CHARTS:
-        yield chart, "polynomial"
+        if scene.features is None or chart == CHARTS[0]:  # one row shows what features are worth
+            yield chart, "polynomial"
         if scene.features is not None and not quick:
             yield chart, "features"
     if not quick:

@@ -18,7 +18,7 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from gfnn_jax.metrics import error_statistics, kl_divergence
 
@@ -480,6 +480,7 @@ def work_precision_panels(panels: Mapping, ylabel) -> Figure:
             ax.plot(costs, errors, "x", color=REFERENCE, ms=4)
         ax.set(xscale="log", yscale="log", title=title)
         ax.set_xlabel("time per trajectory and unit time (µs)")
+        ax.xaxis.set_minor_formatter(NullFormatter())  # they would cover each other
         if len(costs):
             _number_points(ax, costs, errors, np.arange(len(costs)))
             for number, name in enumerate(groups["others"]):
