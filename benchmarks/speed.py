@@ -168,7 +168,7 @@ def training(quick: bool) -> Numbers:
     z0, z1 = jnp.asarray(pairs.z0), jnp.asarray(pairs.z1)
     w, wanted = TYPE2.point(z0, z1), TYPE2.wanted(z0, z1, scene.dt)
     family = Mlp(box_inputs(w), PAPER_HIDDEN, "tanh")
-    runs, length = (3, 20) if quick else (15, 200)
+    runs, length = (3, 20) if quick else (10, 100)
     recipe = dataclasses.replace(PAPER, epochs=runs + 1, epoch_length=length)
     ends = []
     adam(
