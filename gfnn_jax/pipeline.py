@@ -396,7 +396,7 @@ def predict(
         "outside": "stop" if stop_outside else "continue",
     }
     writer = PredictionWriter(
-        out, shape=z0.shape, num_steps=num_steps, save_every=save_every, dt=map_.dt,
+        out, shape=z0.shape, num_steps=num_steps, save_every=save_every, dt=float(map_.dt),
         identity=identity, overwrite=overwrite, resume=resume,
     )  # fmt: skip
     started = time.perf_counter()
