@@ -203,7 +203,7 @@ def _scenes(arguments: argparse.Namespace) -> None:
 
     for name, make in SCENES.items():
         scene = make()
-        print(f"{name:22} dim {scene.dim}  dt {scene.dt:<4g} {scene.purpose}")
+        print(f"{name:22} dim {scene.dim}  dt {scene.dt:<7g} {scene.purpose}")
 
 
 def _run(arguments: argparse.Namespace) -> None:

@@ -435,7 +435,7 @@ def draw(scene: Scene, measured: dict[str, Measured], reference) -> dict[str, An
         if scene.regular:  # one orbit
             shown = {n: z[:1] for n, z in shown.items()}
         points = {n: (z[..., 0], z[..., 1]) for n, z in shown.items()}
-        drawn["portraits"] = figures.sections(points, (r"$\theta$", "$p$"), modulo=True)[0].figure
+        drawn["portraits"] = figures.sections(points, *pipeline.plane_of(scene))[0].figure
     elif not scene.regular:
         sections = {n: section_points(z) for n, z in {"reference": reference, **predicted}.items()}
         points = {n: (z[:, 1], z[:, 3]) for n, z in sections.items()}
@@ -450,10 +450,10 @@ def _coordinates(scene: Scene, predicted, reference):
     lane = int(np.argmax(np.isfinite(reference).all(axis=(1, 2))))
     times = scene.dt * np.arange(NUM_STEPS + 1)
     window = (times[-31], times[-1]) if scene.dim == 1 else (0.9 * times[-1], times[-1])
-    labels = (r"$\theta$", "$p$") if scene.dim == 1 else ("$q_1$", "$q_2$")
+    labels, modulo = pipeline.plane_of(scene) if scene.dim == 1 else (("$q_1$", "$q_2$"), False)
 
     def shown(z, i):
-        return z[lane, :, i] % TWO_PI if scene.dim == 1 else z[lane, :, i]
+        return z[lane, :, i] % TWO_PI if modulo else z[lane, :, i]
 
     return figures.coordinates_in_two_panels(
         times,

@@ -47,6 +47,8 @@ LINEAR: dict[str, tuple[int, float]] = {
     "pcr3bp": (10_000, 5e-7),
     "standard-map-regular": (1_000, 1e-12),
     "standard-map-chaotic": (1_000, 1e-12),
+    "driven-pendulum": (3_000, 1e-10),
+    "henon-heiles-section": (1_000, 1e-10),
 }
 # Of a network: pairs, tolerance, iterations; and of a quick look.
 _NETWORK, _NETWORK_QUICK = (6_000, 1e-6, 250), (3_000, 1e-5, 60)
@@ -179,7 +181,8 @@ def measure(rollouts: Rollouts, scene: Scene, reference) -> Measured:
     predicted, steps = rollouts.states, np.arange(NUM_STEPS + 1)
     error = metrics.position_error(predicted, reference, angles_of_z(scene))
     energy, drift = None, None
-    hamiltonian = scene.invariants.get("energy", scene.hamiltonian)
+    conserved = scene.hamiltonian if scene.period is None else None
+    hamiltonian = scene.invariants.get("energy", conserved)
     if hamiltonian is not None:
         energy = metrics.energy_error(jax.vmap(jax.vmap(hamiltonian))(jnp.asarray(predicted)))
         drift = metrics.energy_drift(steps, energy)
@@ -201,6 +204,11 @@ def angles_of_z(scene: Scene) -> tuple[int, ...]:
     return coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
 
 
+def plane_of(scene: Scene) -> tuple[tuple[str, str], bool]:
+    """How one degree of freedom is drawn: names of its coordinates, whether modulo 2π."""
+    return ((r"$\theta$", "$p$"), True) if angles_of_z(scene) else (("$q$", "$p$"), False)
+
+
 def _figures(fit: Fit, scene: Scene, measured: Measured, reference) -> dict[str, Any]:
     """The scene's figures by file name."""
     steps, predicted = measured.steps, measured.predicted
@@ -218,7 +226,7 @@ def _figures(fit: Fit, scene: Scene, measured: Measured, reference) -> dict[str,
             for element in (metrics.semi_major_axis, metrics.eccentricity)
         ]
         drawn["elements"] = figures.element_errors({"GFNN": (steps, *errors)})[0]
-    if scene.name.startswith("henon-heiles"):
+    if scene.name.startswith("henon-heiles") and scene.dim == 2:
         sections = {
             name: np.concatenate([metrics.section_crossings(z, index=0) for z in trajectories])
             for name, trajectories in (("reference", reference), ("GFNN", predicted))
@@ -227,7 +235,7 @@ def _figures(fit: Fit, scene: Scene, measured: Measured, reference) -> dict[str,
     if scene.dim == 1:
         both = {"reference": reference, "GFNN": predicted}
         drawn["portrait"] = figures.sections(
-            {n: (z[..., 0], z[..., 1]) for n, z in both.items()}, (r"$\theta$", "$p$"), modulo=True
+            {n: (z[..., 0], z[..., 1]) for n, z in both.items()}, *plane_of(scene)
         )[0]
     else:
         lane = int(np.argmax(np.isfinite(reference).all(axis=(1, 2))))

@@ -19,50 +19,88 @@ from gfnn_jax.scenes.scene import DrawnFrom, Scene
 
 TOLERANCE = 1e-15  # 1e-14 costs 15 % less and drifts ten times more in energy
 MAX_SOLVER_STEPS = 1024  # for one dt; a state that needs more is about to collide
+LONGEST_RETURN = 1e6  # to a section: what does not come back uses up its steps before
+
+
+def _solve(field, start, end, z, until=None):
+    """z (2d,) carried by Dopri8 along dz/dt = field(z, t), from time ``start`` to ``end``, or with
+    ``until`` to the end of the first step after which ``until(z)`` holds. NaN where that fails.
+
+    The solver stops exactly there and never interpolates.
+    """
+    event = None if until is None else diffrax.Event(lambda t, y, args, **_: until(y))
+    # A dead lane gets an interval of length zero, so that the others do not wait for it.
+    end = jnp.where(jnp.all(jnp.isfinite(z)), end, start)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, z, _: field(z, t)),
+        diffrax.Dopri8(),
+        start,
+        end,
+        None,
+        z,
+        stepsize_controller=diffrax.PIDController(rtol=TOLERANCE, atol=TOLERANCE),
+        max_steps=MAX_SOLVER_STEPS,
+        event=event,
+        throw=False,
+    )
+    assert solution.ys is not None  # saved at its end
+    results = diffrax.RESULTS
+    wanted = results.successful if until is None else results.event_occurred
+    return jnp.where(solution.result == wanted, solution.ys[-1], jnp.nan)
 
 
 def _integrator(hamiltonian, dt):
-    """``advance(t, z)`` by one ``dt`` with Dopri8, for z (B, 2d); what fails becomes NaN for good.
+    """``advance(t, z)`` by one ``dt``, for z (B, 2d); what fails becomes NaN for good.
 
-    One solve for every dt: the solver stops exactly there, never interpolates, and a trajectory
-    does not depend on which of its states are saved.
+    One solve for every dt: a trajectory does not depend on which of its states are saved.
     """
     field = hamiltonian_vector_field(hamiltonian)
-    term = diffrax.ODETerm(lambda t, z, _: field(z, t))
-    controller = diffrax.PIDController(rtol=TOLERANCE, atol=TOLERANCE)
-
-    def advance(t, z):
-        # A dead lane gets an interval of length zero, so that the others do not wait for it.
-        end = jnp.where(jnp.all(jnp.isfinite(z)), t + dt, t)
-        solution = diffrax.diffeqsolve(
-            term,
-            diffrax.Dopri8(),
-            t,
-            end,
-            None,
-            z,
-            stepsize_controller=controller,
-            max_steps=MAX_SOLVER_STEPS,
-            throw=False,
-        )
-        assert solution.ys is not None  # saved at its end
-        return jnp.where(solution.result == diffrax.RESULTS.successful, solution.ys[-1], jnp.nan)
-
-    return jax.vmap(advance, in_axes=(None, 0))
+    return jax.vmap(lambda t, z: _solve(field, t, t + dt, z), in_axes=(None, 0))
 
 
-@partial(jax.jit, static_argnames=("flow", "step", "hamiltonian", "num_saved"))
-def _trajectories(z0, dt, save_every, num_saved, flow, step, hamiltonian):
+def _stroboscopic(hamiltonian, period, dt):
+    """The same for a Hamiltonian of this period in t, dt a whole number of them: one solve for
+    every period, from time 0, which therefore never grows so large that its digits are missed."""
+    one = _integrator(hamiltonian, period)
+    periods = jnp.round(dt / period).astype(int)
+    return lambda t, z: jax.lax.fori_loop(0, periods, lambda _, z: one(0.0, z), z)
+
+
+def _return_map(section):
+    """``step(z)``: the next crossing of the section, to roundoff, from z (2d,).
+
+    The orbit is followed to below the section and to beyond it; then back onto it with the
+    section's own coordinate as the independent variable (Hénon, Physica D 5, 1982).
+    """
+    field, i = hamiltonian_vector_field(section.hamiltonian), section.index
+
+    def by_coordinate(x, _):
+        rate = field(x)
+        return rate / rate[i]
+
+    def step(z):
+        x = section.lift(z)
+        x = _solve(field, 0.0, LONGEST_RETURN, x, until=lambda x: x[i] < 0)
+        x = _solve(field, 0.0, LONGEST_RETURN, x, until=lambda x: x[i] > 0)
+        return section.coordinates(_solve(by_coordinate, x[i], 0.0, x))
+
+    return step
+
+
+@partial(jax.jit, static_argnames=("num_saved", "flow", "step", "section", "hamiltonian", "period"))
+def _trajectories(z0, dt, save_every, num_saved, flow, step, section, hamiltonian, period):
     """States after save_every, 2 save_every, ... steps: (num_saved, B, 2d)."""
     if flow is not None:
         times = dt * (save_every * jnp.arange(1, num_saved + 1)).astype(float)
         return jax.lax.map(lambda t: jax.vmap(flow, in_axes=(0, None))(z0, t), times)
-    if step is not None:
-        lanes = jax.vmap(step)
+    if step is not None or section is not None:
+        lanes = jax.vmap(step or _return_map(section))
 
         def advance(t, z):
             return lanes(z)
 
+    elif period is not None:
+        advance = _stroboscopic(hamiltonian, period, dt)
     else:
         advance = _integrator(hamiltonian, dt)
 
@@ -80,7 +118,8 @@ def reference_trajectories(
 ) -> Float[Array, "batch saved phase"]:
     """Reference trajectories from ``z0`` (B, 2d): (B, 1 + num_steps // save_every, 2d), z0 first.
 
-    The scene's exact flow or exact map where it has one, else Dopri8. Time starts at 0. Angles are
+    The scene's exact flow or exact map where it has one, else Dopri8, to its section where it has
+    one. Time starts at 0. Angles are
     not reduced. From where a state escapes or collides its own row is NaN, and no other lane's.
     """
     require_x64("a reference trajectory")
@@ -92,7 +131,9 @@ def reference_trajectories(
         num_steps // save_every,
         scene.flow,
         scene.step,
+        scene.section,
         scene.hamiltonian,
+        scene.period,
     )
     return jnp.concatenate([z0[:, None], jnp.moveaxis(saved, 0, 1)], axis=1)
 
@@ -131,14 +172,16 @@ def reference_error(scene: Scene, z0: States, num_steps: int) -> float:
     """Measured error of the reference: the largest distance, over ``num_steps`` steps from z0,
     to a second reference that differs from it by errors only. z0 has shape (B, 2d).
 
-    For an integrated scene that second one takes every dt as two solves, so that both its steps and
-    its roundoff differ. An exact flow or map errs by roundoff only: there the initial state is
-    moved by one unit of it. Lanes that do not stay finite are left out; NaN where none does.
+    For an integrated scene that second one takes every solve as two, so that both its steps and
+    its roundoff differ. An exact flow or map errs by roundoff only, as does a return to a section:
+    there the initial state is moved by one unit of it. Lanes that do not stay finite are left out;
+    NaN where none does.
     """
     first = reference_trajectories(scene, z0, num_steps)
-    if scene.flow is None and scene.step is None:
-        halved = dataclasses.replace(scene, dt=scene.dt / 2)
-        second = reference_trajectories(halved, z0, 2 * num_steps, save_every=2)
+    if scene.flow is None and not scene.timeless:
+        halves = 2 if scene.period is None else 2 * round(scene.dt / scene.period)
+        halved = dataclasses.replace(scene, dt=scene.dt / halves, period=None)
+        second = reference_trajectories(halved, z0, halves * num_steps, save_every=halves)
     else:
         moved = jnp.asarray(z0, jnp.float64) * (1 + jnp.finfo(jnp.float64).eps)
         second = reference_trajectories(scene, moved, num_steps)

@@ -108,7 +108,7 @@ def test_scenes(capsys):
     assert gfnn("scenes") == 0
     out = capsys.readouterr().out
     assert out.splitlines()[0].split()[:5] == ["two-body", "dim", "2", "dt", "0.1"]
-    assert len(out.splitlines()) == 7
+    assert len(out.splitlines()) == 9
 
 
 @pytest.mark.parametrize("command", [(), ("run",), ("fit",), ("predict",), ("scenes",)])
@@ -505,6 +505,8 @@ def test_run(tmp_path, monkeypatch, capsys):
         ("pcr3bp", None),
         ("standard-map-regular", 1e-8),
         ("standard-map-chaotic", None),
+        ("driven-pendulum", None),
+        ("henon-heiles-section", None),
     ],
 )
 def test_run_of_every_scene(scene, error, tmp_path):

@@ -96,7 +96,8 @@ def test_two_body_law():
 
 
 @pytest.mark.parametrize(
-    "name", ["two-body", "henon-heiles-regular", "henon-heiles-printed", "pcr3bp"]
+    "name",
+    ["two-body", "henon-heiles-regular", "henon-heiles-printed", "pcr3bp", "driven-pendulum"],
 )
 def test_reversor(name):
     """ρᵀJρ = −J, and H∘ρ = H in the inner coordinates, so that φ∘ρ∘φ = ρ; features keep or flip."""
@@ -167,30 +168,36 @@ LYAPUNOV_TIME = 2_000
 
 
 def exponents(scene, states):
-    """Lyapunov exponents up to LYAPUNOV_TIME, by the tangent map renormalised at every step."""
+    """Lyapunov exponents up to LYAPUNOV_TIME, by the tangent map renormalised at every step; of a
+    return map those of the flow, of which they are a multiple."""
+    hamiltonian = scene.hamiltonian
+    if scene.section is not None:
+        hamiltonian, states = scene.section.hamiltonian, jax.vmap(scene.section.lift)(states)
     if scene.step is not None:
-        step, h = scene.step, 1.0
+        h = 1.0
+
+        def step(z, t):
+            return scene.step(z)
+
     else:
-        field, h = (
-            hamiltonian_vector_field(scene.hamiltonian),
-            0.02 if scene.name == "pcr3bp" else 0.1,
-        )
+        field = hamiltonian_vector_field(hamiltonian)
+        h = 0.02 if scene.name == "pcr3bp" else 0.1
 
-        def step(z):
-            k1 = field(z)
-            k2 = field(z + h / 2 * k1)
-            k3 = field(z + h / 2 * k2)
-            return z + h / 6 * (k1 + 2 * k2 + 2 * k3 + field(z + h * k3))
+        def step(z, t):
+            k1 = field(z, t)
+            k2 = field(z + h / 2 * k1, t + h / 2)
+            k3 = field(z + h / 2 * k2, t + h / 2)
+            return z + h / 6 * (k1 + 2 * k2 + 2 * k3 + field(z + h * k3, t + h))
 
-    def advance(carry, _):
+    def advance(carry, i):
         z, v, growth = carry
-        z, v = jax.jvp(step, (z,), (v,))
+        z, v = jax.jvp(lambda z: step(z, h * i), (z,), (v,))
         norm = jnp.linalg.norm(v)
         return (z, v / norm, growth + jnp.log(norm)), None
 
     def one(z):
         start = (z, jnp.ones_like(z) / math.sqrt(z.size), 0.0)
-        return jax.lax.scan(advance, start, None, length=int(LYAPUNOV_TIME / h))[0][2]
+        return jax.lax.scan(advance, start, jnp.arange(LYAPUNOV_TIME / h))[0][2]
 
     return np.asarray(jax.jit(jax.vmap(one))(states)) / LYAPUNOV_TIME
 
@@ -212,6 +219,16 @@ def test_orbits_are_regular_or_chaotic_as_they_should_be(name):
         assert found.min() > 0.05
 
 
+def test_orbits_of_the_section_stay_in_the_island_and_of_the_pendulum_near_the_disc():
+    section, pendulum = scenes.henon_heiles_section(), scenes.driven_pendulum()
+    law = jax.random.key(5)
+    z = tr.reference_trajectories(section, tr.sample_states(section, 40, law), 200)
+    y, p_y = np.moveaxis(np.asarray(z), -1, 0)
+    assert (((y - 0.25) / 0.32) ** 2 + (p_y / 0.2) ** 2 < 1).all()
+    z = tr.reference_trajectories(pendulum, tr.sample_test_states(pendulum, 40, law), 200)
+    assert np.linalg.norm(z, axis=-1).max() < 0.8
+
+
 def test_chaotic_henon_heiles_stays_in_the_well():
     scene = scenes.henon_heiles(energy=1 / 6)
     for law in (scene.sampling, scene.test_states):
@@ -220,7 +237,7 @@ def test_chaotic_henon_heiles_stays_in_the_well():
 
 
 def test_names_and_mistakes():
-    assert len(scenes.names()) == 7
+    assert len(scenes.names()) == 9
     for name in scenes.names():
         assert scenes.make(name).name == name
         assert "\n" not in scenes.make(name).purpose
@@ -232,6 +249,12 @@ def test_names_and_mistakes():
         scenes.make("xyz")
     with pytest.raises(ValueError, match=r"dt = 1 only, not 0\.5"):
         scenes.make("standard-map-chaotic", dt=0.5)
+    with pytest.raises(ValueError, match=r"dt = 1 only, not 2"):
+        scenes.make("henon-heiles-section", dt=2.0)
+    assert scenes.make("driven-pendulum", dt=4 * math.pi).dt == scenes.driven_pendulum(2).dt
+    for dt in (3.0, 0.1, 6.2832):
+        with pytest.raises(ValueError, match=r"whole number of periods of 6\.2831853\d*, not"):
+            scenes.make("driven-pendulum", dt=dt)
     for dt in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="finite and > 0"):
             scenes.make("pcr3bp", dt=dt)

@@ -36,6 +36,69 @@ def test_flow_agrees_with_another_solver(name):
         np.testing.assert_allclose(z[lane, -1], other.y[:, -1], atol=3e-13, rtol=0)
 
 
+def test_the_stroboscopic_map_agrees_with_another_solver_and_starts_at_time_0_every_time():
+    scene = scenes.driven_pendulum(periods=3)
+    z0 = tr.sample_states(scene, 3, jax.random.key(9))
+    z = tr.reference_trajectories(scene, z0, 2)
+    for start, path in zip(np.asarray(z0), np.asarray(z), strict=True):
+        other = solve_ivp(
+            lambda t, y: [y[1], -np.sin(y[0]) * (1 + 0.15 * np.cos(t))], (0, 2 * scene.dt), start,
+            t_eval=[scene.dt, 2 * scene.dt], method="DOP853", rtol=3e-14, atol=1e-15,
+        )  # fmt: skip
+        np.testing.assert_allclose(path[1:], other.y.T, atol=1e-12, rtol=0)
+    np.testing.assert_array_equal(tr.reference_trajectories(scene, z[:, 1], 1)[:, 1], z[:, 2])
+    assert 0 < tr.reference_error(scene, z0, 10) < 1e-12
+
+
+def returned(z):
+    """(y, p_y) of Hénon and Heiles at E = 0.1 at its next crossing of x = 0 upwards, by SciPy."""
+
+    def field(_, x):
+        return [x[2], x[3], -x[0] - 2 * x[0] * x[1], -x[1] - x[0] ** 2 + x[1] ** 2]
+
+    def crossing(_, x):
+        return x[0]
+
+    crossing.direction = 1.0
+    start = [0.0, z[0], np.sqrt(0.2 - z[1] ** 2 - z[0] ** 2 + 2 / 3 * z[0] ** 3), z[1]]
+    found = solve_ivp(
+        field, (0, 9), start, events=crossing, method="DOP853", rtol=3e-14, atol=1e-15,
+        max_step=0.05,
+    )  # fmt: skip
+    return next(x for t, x in zip(*found.t_events, *found.y_events, strict=True) if t > 1)[[1, 3]]
+
+
+def test_the_return_map():
+    """Against an event of another solver; its fixed point; area; what never comes back."""
+    scene = scenes.henon_heiles_section()
+
+    def step(z):
+        return np.asarray(tr.reference_trajectories(scene, jnp.asarray(z), 1)[:, 1])
+
+    z0 = np.asarray(tr.sample_states(scene, 8, jax.random.key(9)))
+    z1 = step(z0)
+    np.testing.assert_allclose(z1, [returned(z) for z in z0], atol=3e-13, rtol=0)
+    assert np.linalg.norm(z1 - z0, axis=1).min() > 1e-2
+    # Central differences of order 4 of the map's Jacobian.
+    h, unit = 5e-4, np.eye(2)
+    columns = [
+        (8 * (step(z0 + h * e) - step(z0 - h * e)) - step(z0 + 2 * h * e) + step(z0 - 2 * h * e))
+        / (12 * h)
+        for e in unit
+    ]
+    np.testing.assert_allclose(np.linalg.det(np.stack(columns, axis=-1)), 1, atol=1e-8, rtol=0)
+
+    rho = np.array([1, -1])
+    np.testing.assert_allclose(step(z1 * rho) * rho, z0, atol=3e-13, rtol=0)
+    fixed = np.array([[0.2755, 0.0]])
+    assert np.abs(step(fixed) - fixed).max() < 2e-5
+    # Beyond the energy no state is on the section; the others' bits do not change.
+    mixed = step(np.concatenate([z0, [[0.9, 0.0], [np.nan, 0.0]]]))
+    assert np.isnan(mixed[8:]).all()
+    np.testing.assert_array_equal(mixed[:8], step(np.concatenate([z0, z0[:2]]))[:8])
+    assert 0 < tr.reference_error(scene, jnp.asarray(z0), 100) < 1e-11
+
+
 def test_integration_against_the_exact_kepler_solution():
     scene = scenes.two_body()
     z0 = tr.sample_states(scene, 10, jax.random.key(1))

@@ -6,7 +6,13 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
+from gfnn_jax.phase_space import State
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,6 +20,18 @@ class DrawnFrom:
     """States drawn directly: ``draw(key, num)`` -> (num, 2d) float64."""
 
     draw: Callable
+
+
+def uniform_in_ellipse(centre: tuple[float, float], semi_axes: tuple[float, float]) -> DrawnFrom:
+    """States (q, p) of one degree of freedom, uniform inside an ellipse."""
+
+    def draw(key, num):
+        area, turn = jax.random.uniform(key, (2, num), jnp.float64)
+        radius, angle = jnp.sqrt(area), 2 * jnp.pi * turn
+        unit = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle)], axis=-1)
+        return jnp.array([centre]) + jnp.array([semi_axes]) * unit
+
+    return DrawnFrom(draw)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,8 +48,30 @@ class AroundOrbit:
 
 
 @dataclasses.dataclass(frozen=True)
+class Section:
+    """A surface of section x_index = 0 of an autonomous system, crossed upwards, at one energy.
+
+    The state z of the return map holds the other coordinates, in their order: dq∧dp of the whole
+    system is dq∧dp of these on the section, so that the map is symplectic (Poincaré).
+
+    hamiltonian: ``hamiltonian(x, t)`` -> scalar, of the whole system's state x (2d + 2,).
+    index:       which position of x is zero on the section.
+    lift:        ``lift(z)`` -> (2d + 2,): the state on the section, at the energy.
+    """
+
+    hamiltonian: Callable
+    index: int
+    lift: Callable
+
+    def coordinates(self, x: Float[Array, "whole"]) -> State:
+        """z (2d,) of a state x (2d + 2,) on the section."""
+        return jnp.delete(x, np.array([self.index, self.index + x.shape[0] // 2]))
+
+
+@dataclasses.dataclass(frozen=True)
 class Scene:
-    """A system as a user meets it; one of ``flow``, ``step``, ``hamiltonian`` is its reference.
+    """A system as a user meets it; one of ``flow``, ``step``, ``section`` and ``hamiltonian`` is
+    its reference.
 
     They are taken in that order: an exact flow before an exact map before a numerical integration
     (a Hamiltonian may be given beside an exact flow; it is then an invariant, not the reference).
@@ -43,7 +83,10 @@ class Scene:
     test_states:   the law of the states that rollouts start from; the training law where None.
     flow:          ``flow(z, t)`` -> (2d,): the exact solution.
     step:          ``step(z)`` -> (2d,): the exact map.
+    section:       the reference is the return map to it, and the scene a map without time.
     hamiltonian:   ``hamiltonian(z, t)`` -> scalar; autonomous ones ignore t (write ``t=0.0``).
+    period:        of a hamiltonian that depends on t. ``dt`` is a whole number of periods, so that
+                   every step is the same map.
     invariants:    name -> ``f(z)`` -> scalar, conserved exactly by the reference.
     coordinates:   the inner coordinates a fit uses (angles, cyclic coordinates, canonical change).
     features:      ``features(y)`` -> (k,): what S is a function of, in the inner coordinates,
@@ -61,7 +104,9 @@ class Scene:
     test_states: DrawnFrom | AroundOrbit | None = None
     flow: Callable | None = None
     step: Callable | None = None
+    section: Section | None = None
     hamiltonian: Callable | None = None
+    period: float | None = None
     invariants: Mapping[str, Callable] = dataclasses.field(default_factory=dict)
     coordinates: Coordinates = CARTESIAN
     features: Callable | None = None
@@ -71,3 +116,14 @@ class Scene:
     def __post_init__(self):
         if not (math.isfinite(self.dt) and self.dt > 0):
             raise ValueError(f"dt must be finite and > 0, not {self.dt}")
+        if self.period is not None:
+            periods = self.dt / self.period
+            if round(periods) < 1 or abs(periods - round(periods)) > 1e-9 * periods:
+                raise ValueError(
+                    f"dt must be a whole number of periods of {self.period}, not {self.dt}"
+                )
+
+    @property
+    def timeless(self) -> bool:
+        """Whether it is a map without time, exact or to a section."""
+        return self.step is not None or self.section is not None
