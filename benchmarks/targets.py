@@ -246,7 +246,7 @@ def return_map(quick: bool) -> Numbers:
     )
     y, p_y = FIXED_POINT
     z0 = np.stack([y + radius * np.cos(angle), p_y + radius * np.sin(angle)], axis=1)
-    z1 = np.asarray(gfnn.reference_trajectories(henon_heiles_section(), z0, 1)[:, 1])
+    z1 = np.asarray(gfnn.reference_trajectories(henon_heiles_section(), jnp.asarray(z0), 1)[:, 1])
     pairs, fresh = gfnn.Pairs(z0[:400], z1[:400], 1.0), gfnn.Pairs(z0[400:], z1[400:], 1.0)
     # The disc's rim, where the map bends most, is rare among 400 states: asking for more than is
     # there takes the most accurate map instead of the first that looks good enough inside.
