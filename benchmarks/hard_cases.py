@@ -2,7 +2,7 @@
 
     python benchmarks/hard_cases.py                          pieces that have no result yet, tables
     python benchmarks/hard_cases.py --only chaos --overwrite one piece again
-    python benchmarks/hard_cases.py --quick                  small sizes, into runs/hard-cases
+    python benchmarks/hard_cases.py --quick                  small sizes, into runs/hard
 
 A piece's result is one JSON file, hard-*.json in benchmarks/results; the section of
 benchmarks/RESULTS.md and the figures are made from these files alone. The long pieces are fastest
@@ -11,7 +11,6 @@ with one thread: XLA_FLAGS=--xla_cpu_multi_thread_eigen=false.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import functools
 import json
@@ -20,10 +19,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 # Sets float64, so it comes before all of JAX.
+from pieces import main as run_pieces
+from pieces import results
 from targets import (
     HERE,
     RESULTS,
@@ -33,9 +33,9 @@ from targets import (
     angles_of,
     between_markers,
     bounded_states,
-    circumstances,
     drawn,
     fitted,
+    in_float32,
     number,
     provenance,
 )
@@ -46,7 +46,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import gfnn_jax as gfnn
-from gfnn_jax import figures, metrics, report
+from gfnn_jax import figures, metrics
 from gfnn_jax.charts import MIDPOINT, TYPE2
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
 from gfnn_jax.domain import covering
@@ -88,14 +88,6 @@ class Case:
         kept = -math.inf if self.digits is None else self.digits
         short = self.asked is not None and kept < self.asked - _SHORT
         return self.wrong > 0 or (short and not self.flagged and not self.failed)
-
-
-@dataclasses.dataclass(frozen=True)
-class Piece:
-    """A table: ``measure(quick)`` -> its cases, and numbers for figures and text."""
-
-    title: str
-    measure: Callable[[bool], tuple[list[Case], Numbers]]
 
 
 def digits_of(error: float) -> float | None:
@@ -300,16 +292,6 @@ def bad_data(quick: bool) -> tuple[list[Case], Numbers]:
 
 
 # Long times
-
-
-def in_float32(map_: SymplecticMap) -> SymplecticMap:
-    """The same map, all of its arrays rounded to float32."""
-
-    def rounded(leaf):
-        is_double = getattr(leaf, "dtype", None) == jnp.float64
-        return leaf.astype(jnp.float32) if is_double else leaf
-
-    return jax.tree.map(rounded, map_)
 
 
 def drift_of(map_, scene, z0, num_steps, save_every, window):
@@ -744,6 +726,7 @@ def precision(quick: bool) -> tuple[list[Case], Numbers]:
     mine, version = fingerprint(quick), jax.__version__
     before = RESULTS / "hard-precision.json"
     others = json.loads(before.read_text("utf-8"))["measured"] if before.exists() else {}
+    others.pop("cases", None)
     for other, theirs in others.items():
         if other == version:
             continue
@@ -762,45 +745,37 @@ def x64_off() -> dict[str, str]:
     }
 
 
-PIECES: dict[str, Piece] = {
-    "solver": Piece("Bad conditions for the solver", solver),
-    "bad-data": Piece("Bad data", bad_data),
-    "long-times": Piece("Long times", long_times),
-    "large-steps": Piece("Large steps and chart singularities", large_steps),
-    "chaos": Piece("Chaos", chaos),
-    "singular": Piece("Singular", singular),
-    "precision": Piece("Precision and platforms", precision),
+# A table each: ``measure(quick)`` -> its cases, and numbers for figures and text.
+TABLE_OF: dict[str, tuple[str, Callable[[bool], tuple[list[Case], Numbers]]]] = {
+    "solver": ("Bad conditions for the solver", solver),
+    "bad-data": ("Bad data", bad_data),
+    "long-times": ("Long times", long_times),
+    "large-steps": ("Large steps and chart singularities", large_steps),
+    "chaos": ("Chaos", chaos),
+    "singular": ("Singular", singular),
+    "precision": ("Precision and platforms", precision),
 }
 
 
-# Results, tables, figures
-
-
-def run(name: str, folder: Path, quick: bool) -> None:
-    """Measure a piece and write its result."""
-    print(name)
-    started = time.perf_counter()
-    cases, measured = PIECES[name].measure(quick)
-    lines = [dataclasses.asdict(case) | {"silent": case.silent} for case in cases]
-    result = {"piece": name, "quick": quick, "cases": lines, "measured": measured,
-              "seconds": time.perf_counter() - started, **circumstances()}  # fmt: skip
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"hard-{name}.json").write_text(report.to_json(result), encoding="utf-8")
+def measure(quick: bool, name: str) -> Numbers:
+    cases, numbers = TABLE_OF[name][1](quick)
     silent = [case.name for case in cases if case.silent]
-    print(f"{name}: {len(cases)} cases, silent: {silent or 'none'}, {result['seconds']:.0f} s")
+    print(f"  {len(cases)} cases, silent: {silent or 'none'}")
+    lines = [dataclasses.asdict(case) | {"silent": case.silent} for case in cases]
+    return {"cases": lines, **numbers}
 
 
-def results(folder: Path) -> dict[str, Numbers]:
-    """Results so far, in the order of the pieces."""
-    paths = {name: folder / f"hard-{name}.json" for name in PIECES}
-    return {n: json.loads(p.read_text(encoding="utf-8")) for n, p in paths.items() if p.exists()}
+PIECES = {name: functools.partial(measure, name=name) for name in TABLE_OF}
+
+
+# Tables, figures
 
 
 def table(result: Numbers) -> str:
     """Markdown: a line per case."""
     heads = ["case", "digits kept", "asked for", "flagged", "failed", "silent"]
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
-    for case in result["cases"]:
+    for case in result["measured"]["cases"]:
         silent = "no" if not case["silent"] else f"**{case['wrong'] or 'yes'}**"
         cells = [case["name"], *(number(case[k]) if case[k] is None else f"{case[k]:.1f}"
                                  for k in ("digits", "asked")),
@@ -811,17 +786,17 @@ def table(result: Numbers) -> str:
 
 def tables() -> None:
     """The section of RESULTS.md and the figures, from the results."""
-    found = results(RESULTS)
+    found = results(PIECES, "hard")
     if not found:
         return
     parts = []
     for name, result in found.items():
         small = " (small sizes)" if result["quick"] else ""
-        parts.append(f"### {PIECES[name].title}{small}\n\n{table(result)}")
-    total = sum(len(r["cases"]) for r in found.values())
-    silent = sum(case["silent"] for r in found.values() for case in r["cases"])
+        parts.append(f"### {TABLE_OF[name][0]}{small}\n\n{table(result)}")
+    total = sum(len(r["measured"]["cases"]) for r in found.values())
+    silent = sum(case["silent"] for r in found.values() for case in r["measured"]["cases"])
     head = f"{total} cases, {silent} of them silent."
-    missing = [piece.title for name, piece in PIECES.items() if name not in found]
+    missing = [title for name, (title, _) in TABLE_OF.items() if name not in found]
     if missing:
         parts.append(f"Not measured yet: {'; '.join(missing)}.")
     parts.append(provenance(found))
@@ -835,35 +810,20 @@ def draw(found: dict[str, Numbers]) -> None:
     if "long-times" in found:
         curves = {}
         for name, m in found["long-times"]["measured"].items():
-            if "rms" in m:
+            if name != "cases" and "rms" in m:
                 curves[name] = (np.array(m["elapsed"]), np.array(m["rms"])[None])
                 low = m["float32"]
                 curves[f"{name}, float32"] = (np.array(low["elapsed"]), np.array(low["rms"])[None])
         axes: Any = figures.energy_error(curves)
         figures.save(axes.figure, FIGURES / "hard_energy_drift.png")
     if "large-steps" in found:
-        axes = figures.digits_against_step_size(found["large-steps"]["measured"])
+        swept = {n: m for n, m in found["large-steps"]["measured"].items() if n in SWEEPS}
+        axes = figures.digits_against_step_size(swept)
         figures.save(axes[0].figure, FIGURES / "hard_large_steps.png")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", metavar="A,B", help=", ".join(PIECES))
-    parser.add_argument("--quick", action="store_true", help="small sizes; writes no tables")
-    parser.add_argument("--overwrite", action="store_true", help="measure finished pieces again")
-    parser.add_argument("--tables", action="store_true", help="only make tables and figures again")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
-    arguments = parser.parse_args(argv)
-    chosen = arguments.only.split(",") if arguments.only else list(PIECES)
-    unknown = [name for name in chosen if name not in PIECES]
-    if unknown:
-        parser.error(f"unknown piece '{unknown[0]}'; pieces: {', '.join(PIECES)}")
-    folder = arguments.out or (Path("runs") / "hard-cases" if arguments.quick else RESULTS)
-    for name in [] if arguments.tables else chosen:
-        if arguments.overwrite or not (folder / f"hard-{name}.json").exists():
-            run(name, folder, arguments.quick)
-    if folder == RESULTS:
-        tables()
+    run_pieces(__doc__ or "", PIECES, "hard", tables, argv)
 
 
 if __name__ == "__main__":

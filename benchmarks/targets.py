@@ -128,6 +128,16 @@ def rolled_out(map_: SymplecticMap, scene: Scene, quick: bool) -> Numbers:
     }
 
 
+def in_float32(map_: SymplecticMap) -> SymplecticMap:
+    """The same map, all of its arrays rounded to float32."""
+
+    def rounded(leaf):
+        is_double = getattr(leaf, "dtype", None) == jnp.float64
+        return leaf.astype(jnp.float32) if is_double else leaf
+
+    return jax.tree.map(rounded, map_)
+
+
 def fitted(pairs: gfnn.Pairs, scene: Scene | None, fresh: gfnn.Pairs, **options):
     """(fit, what was measured of it)."""
     with warnings.catch_warnings():

@@ -32,6 +32,7 @@ from targets import (
     angles_of,
     between_markers,
     drawn,
+    in_float32,
     number,
     provenance,
 )
@@ -39,7 +40,6 @@ from targets import (
 # isort: split
 import jax
 import numpy as np
-from hard_cases import in_float32
 from integrators import runners
 
 import gfnn_jax as gfnn
