@@ -19,7 +19,7 @@ import numpy as np
 from gfnn_jax.charts import AnyChart
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.scalars.inputs import Inputs, box_inputs
-from gfnn_jax.scalars.products import Products, values
+from gfnn_jax.scalars.products import Products, operations_of_values, values
 
 # A start this close, in units of the data's spread, is the root of roundoff: nothing more to gain.
 _CLOSE = 1e-8
@@ -46,7 +46,7 @@ class Start:
     @property
     def operations(self) -> int:
         """Floating-point operations of an evaluation."""
-        return 2 * self.matrices.size
+        return operations_of_values(self.family, len(self.matrices))
 
     def __call__(self, z):
         """The difference (k,) at the state z (2d,)."""

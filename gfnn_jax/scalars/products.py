@@ -72,6 +72,7 @@ class _Half:
     is_angle: tuple[bool, ...]
     signs: tuple[int, ...]  # of each variable under the reversor
     degree: int
+    only_even: bool  # whether the other half has only even products to go with
 
     @cached_property
     def indices(self) -> np.ndarray:
@@ -83,6 +84,8 @@ class _Half:
                 (*t, k) for t in terms for k in range(count)
                 if self._harmonic(k) + self._order(t) <= self.degree
             ]  # fmt: skip
+        terms = [t for t in terms if not self.only_even or self._parity(t) > 0]
+        terms.sort(key=self._order)
         return np.array(terms, dtype=np.int32).reshape(len(terms), len(self.is_angle))
 
     def _harmonic(self, k: int) -> int:
@@ -97,16 +100,18 @@ class _Half:
         """Total degree of each product (terms,)."""
         return np.array([self._order(t) for t in self.indices.tolist()], dtype=int)
 
+    def _parity(self, term) -> int:
+        """Sign under the reversor: that of sines and odd degrees of the variables that flip."""
+        odd = [
+            k > self.degree if angle else k % 2
+            for k, angle in zip(term, self.is_angle, strict=True)
+        ]
+        return math.prod(sign if flips else 1 for sign, flips in zip(self.signs, odd, strict=True))
+
     @cached_property
     def parities(self) -> np.ndarray:
         """Sign of each product under the reversor (terms,)."""
-        sign = np.ones(len(self.indices), dtype=int)
-        for j, (angle, flips) in enumerate(zip(self.is_angle, self.signs, strict=True)):
-            if flips < 0:
-                k = self.indices[:, j]
-                odd = k > self.degree if angle else k % 2 == 1  # sines; odd degrees
-                sign = np.where(odd, -sign, sign)
-        return sign
+        return np.array([self._parity(t) for t in self.indices.tolist()], dtype=int)
 
     def tables(self, x):
         """Products u (terms,), their gradients (k, terms) and Hessians (k, k, terms)."""
@@ -161,10 +166,22 @@ class Basis:
     @cached_property
     def halves(self) -> tuple[_Half, _Half]:
         cut, signs = self.cut, self.signs or (1,) * len(self.is_angle)
+        even = [
+            self.signs is not None and min(part, default=1) > 0
+            for part in (signs[:cut], signs[cut:])
+        ]
         return (
-            _Half(self.is_angle[:cut], signs[:cut], self.degree),
-            _Half(self.is_angle[cut:], signs[cut:], self.degree),
+            _Half(self.is_angle[:cut], signs[:cut], self.degree, only_even=even[1]),
+            _Half(self.is_angle[cut:], signs[cut:], self.degree, only_even=even[0]),
         )
+
+    @cached_property
+    def corner(self) -> tuple[int, int]:
+        """Below so many rows and to the right of so many columns at once C is zero: a high degree
+        of one half leaves a low one for the other. For several matrices that is worth using."""
+        a, b = self.halves
+        low = self.degree // 2
+        return int(np.sum(a.orders <= low)), int(np.sum(b.orders < self.degree - low))
 
     @cached_property
     def terms(self) -> np.ndarray:
@@ -275,7 +292,17 @@ class Products:
 def values(family: Products, matrices, x):
     """Σ C_ab u_a v_b of each matrix in (k, m, n) at the scaled variables x: (k,)."""
     u, _, _, v, _, _ = _tables(family.basis, x)
-    return _dot(_dot(matrices, v), u)
+    row, column = family.basis.corner
+    low = _dot(_dot(matrices[:, :row], v), u[:row])
+    return low + _dot(_dot(matrices[:, row:, :column], v[:column]), u[row:])
+
+
+def operations_of_values(family: Products, count: int) -> int:
+    """Floating-point operations of ``values`` for so many matrices."""
+    (m, i), (n, j) = (h.indices.shape for h in family.basis.halves)
+    row, column = family.basis.corner
+    tables = m * (i - 1) + n * max(j - 1, 0) + 4 * family.degree * (i + j)
+    return 2 * count * (row * n + (m - row) * column + m) + tables
 
 
 def _tables(basis, x):
