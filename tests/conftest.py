@@ -24,6 +24,13 @@ def pytest_configure(config):
         jax.config.update(name, value)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _no_more_programs_than_a_module_needs():
+    """All of the suite's would fill gigabytes."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def as_a_user():
     """A user's session: JAX as it comes, but for float64."""

@@ -48,7 +48,8 @@ def test_a_sample_is_of_the_files_own_pairs_each_once(file):
 def test_all_pairs_fit_better_than_the_sample(file, tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "_LARGE_BYTES", 0)
     monkeypatch.setattr(pipeline, "read_sample", lambda p, dt: read_sample(p, dt=dt, num_pairs=200))
-    ran = pipeline.fit(file, out=tmp_path / "m", scene_name="standard-map-regular", tolerance=1e-3)
+    ran = pipeline.fit(file, out=tmp_path / "m", scene_name="standard-map-regular", tolerance=1e-3,
+                       chart="type2")  # fmt: skip
     assert ran is not None
     assert ran.report["data"]["num_pairs"] == 3_000
     scene = gfnn.scenes.make("standard-map-regular")
@@ -68,7 +69,7 @@ def test_all_pairs_fit_better_than_the_sample(file, tmp_path, monkeypatch):
 def test_refitting_to_the_same_pairs_in_chunks_changes_nothing(file):
     scene = gfnn.scenes.make("standard-map-regular")
     pairs = read_trajectories(file).pairs()
-    fit = selection.fit(pairs, scene, tolerance=1e-3)
+    fit = selection.fit(pairs, scene, tolerance=1e-3, chart="type2")
     once = selection.refit(fit, [pairs], pairs)
     chunked = selection.refit(fit, iterate_pairs(file, 700), pairs)
     assert chunked.num_pairs == once.num_pairs == 3_000

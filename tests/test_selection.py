@@ -117,7 +117,7 @@ def test_a_folded_chart_is_refused_with_advice(long_steps):
 
 def test_auto_takes_the_chart_that_covers(long_steps):
     scene, pairs = long_steps
-    fit = quiet_fit(pairs, scene, tolerance=1e-2)
+    fit = quiet_fit(pairs, scene, tolerance=1e-2, scalar="polynomial")
     assert fit.met
     assert fit.chosen.chart == "midpoint"
     assert not fit.judgements["type2"].valid or fit.based
@@ -153,7 +153,7 @@ def test_features_in_other_units_are_noticed(unit, words):
 
 def test_a_tolerance_out_of_reach_gives_the_best_and_says_so():
     with pytest.warns(gfnn.FitWarning, match="no candidate meets"):
-        fit = gfnn.fit(pendulum_pairs(60), chart="midpoint", tolerance=1e-18)
+        fit = gfnn.fit(pendulum_pairs(60), chart="midpoint", scalar="polynomial", tolerance=1e-18)
     assert not fit.met
     assert fit.chosen.relative_rms == min(c.relative_rms for c in fit.candidates)
 
@@ -281,7 +281,7 @@ def test_angular_momentum_is_conserved_to_roundoff():
     """By a map of low accuracy too: the angle is cyclic, S does not see it."""
     scene = gfnn.scenes.two_body()
     pairs = gfnn.sample_pairs(scene, 500, jax.random.key(0))
-    fit = quiet_fit(pairs, scene, chart="midpoint", tolerance=1e-2)
+    fit = quiet_fit(pairs, scene, chart="midpoint", scalar="polynomial", tolerance=1e-2)
     z0 = gfnn.sample_test_states(scene, 10, jax.random.key(1))
     states, info = fit.map.rollout(z0, 1_000)
     momentum = jax.vmap(jax.vmap(angular_momentum))(states)
