@@ -127,7 +127,9 @@ def scene_table(name: str, reports: list[Numbers]) -> str:
             cells += [mean("rollout", "error", str(n)) for n in (10, 100, 1000)]
             cells += [mean("rollout", "error_median", "1000")]
             cells += ["–" if growth is None else f"{growth:.2f}"]
-        cells += [mean("rollout", "energy_drift"), mean("map", "symplecticity_defect")]
+        unsolved = max(r["methods"][method]["map"].get("unsolved", 0.0) for r in reports)
+        cells += [mean("rollout", "energy_drift"), mean("map", "symplecticity_defect")
+                  + (f" ({100 * unsolved:.0f} % unsolved)" if unsolved else "")]  # fmt: skip
         cells += [mean("kl", label) for label in labels]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)

@@ -26,7 +26,7 @@ from gfnn_jax.baselines import METHODS, Budget, Learned, Sequences
 from gfnn_jax.baselines.paper_gfnn import paper_gfnn
 from gfnn_jax.coordinates import TWO_PI
 from gfnn_jax.errors import InputError, WorkError
-from gfnn_jax.implicit import NON_FINITE, OK
+from gfnn_jax.implicit import NON_FINITE, NOT_CONVERGED, OK
 from gfnn_jax.outputs import atomic_folder, atomic_write, ensure_new, failures_as_work_errors
 from gfnn_jax.phase_space import Pairs, sizes, symplecticity_defect
 from gfnn_jax.pipeline import NUM_STEPS, NUM_TRAJECTORIES, REPORT, Measured, Rollouts, Say
@@ -326,11 +326,16 @@ def _ours(data: _Data, say: Say):
 
 
 def _map_part(map_, data: _Data) -> dict[str, Any]:
+    """Where a step is not solved there is none whose defect could be told: those are counted."""
     z = jnp.asarray(data.fresh.z0[:_NUM_DEFECTS])
+    info = map_.step(z)[1]
+    solved = np.asarray(info.status) < NOT_CONVERGED
+    defects = np.asarray(map_.defect(z))[solved]
     return {
-        "symplecticity_defect": float(jnp.max(map_.defect(z))),
+        "symplecticity_defect": float(defects.max()) if len(defects) else None,
+        "unsolved": float(np.mean(~solved)),
         "chart_determinant_min": float(jnp.min(jnp.abs(map_.determinant(z)))),
-        "newton_iterations_max": int(jnp.max(map_.step(z)[1].iterations)),
+        "newton_iterations_max": int(jnp.max(info.iterations)),
     }
 
 
