@@ -22,12 +22,12 @@ from gfnn_jax.fitting.levenberg_marquardt import LMState, levenberg_marquardt
 from gfnn_jax.implicit import LEFT_DOMAIN
 from gfnn_jax.maps import Generated, SymplecticMap
 from gfnn_jax.phase_space import Pairs, sizes
-from gfnn_jax.preparation import Prepared
+from gfnn_jax.preparation import Prepared, factor_out, prepare
 from gfnn_jax.scalars.inputs import box_inputs, variable_signs
 from gfnn_jax.scalars.mlp import Mlp, amplitude_of
 from gfnn_jax.scalars.products import Products
 from gfnn_jax.scalars.sines import Sines
-from gfnn_jax.starts import affordable, fit_starts
+from gfnn_jax.starts import CLOSE, Starts, affordable, fit_starts
 
 # Degrees whose numbers of terms grow by about a half from one to the next; a stage is fitted by one
 # factorisation of the rows of its largest degree.
@@ -36,7 +36,8 @@ _SINES = (100, 200, 400, 800, 1_600)
 _MOST_TERMS = 1_500
 # Rows × terms² of one factorisation: about ten seconds on two cores.
 _MOST_WORK = 1.2e11
-_NOMINAL_UPDATES = 1.0
+# Where the starts of the data leave more updates than this on average, a map has its own.
+_ONE_UPDATE, _START_PAIRS = 1.1, 2_000
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
 _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
 _CHECKPOINT_SECONDS = 10.0
@@ -118,7 +119,7 @@ class Ladder:
         self.prepared, self.chart, self.rows, self.kind = prepared, chart, rows, kind
         self.train, self.weight = _data(prepared, chart, rows.training)
         self.held, _ = _data(prepared, chart, rows.held_out)
-        self.starts = fit_starts(chart, prepared, features)
+        self.features, self.starts = features, fit_starts(chart, prepared, features)
         coordinates, dim = prepared.coordinates, prepared.y0.shape[1] // 2
         angles = tuple(a for a in coordinates.angles if a < dim)
         w = self.train[0]
@@ -131,7 +132,7 @@ class Ladder:
             signs = variable_signs(inputs, reversor, w) if reversor is not None else None
             stages = ((Products(inputs, degree, signs) for degree in s) for s in _STAGES)
         self.rungs = [
-            Rung(f, stage[-1], counted_work(f, _NOMINAL_UPDATES))
+            Rung(f, stage[-1], counted_work(f, 1))
             for stage in _determined(stages, w.size) for f in stage
         ]  # fmt: skip
         self._reduced: dict[Any, least_squares.Reduced] = {}
@@ -156,23 +157,41 @@ class Ladder:
             self._composed(top, padded),
             self.rows.pairs, self.rows.held_out,
         )  # fmt: skip
+        starts, updates = self.starts, error.iterations
+        if updates.mean() > _ONE_UPDATE and np.isfinite(error.rms):
+            starts = self._own_starts(self._composed(top, padded))
+            updates = 1 if affordable(starts, family).error <= CLOSE else updates
         params = family.unflatten(solved.coefficients)
         label = f"features {family.degree}" if self.kind == "features" else family.label
         return Candidate(
             label=label, scalar=self.kind, chart=self.chart.name,
             num_parameters=family.num_parameters, validation_rms=error.rms,
             validation_bound=error.bound, deviations=error.deviations,
-            work=counted_work(family, error.iterations.mean()),
+            work=counted_work(family, updates) + affordable(starts, family).there.operations,
             microseconds_per_step=None, fit_seconds=seconds,
             compile_seconds=reduced.compile_seconds, train_rms=solved.train_rms,
             newton_iterations_max=int(error.iterations.max()), condition=solved.condition,
             rank=solved.rank,
-            map=self._composed(family, params),
+            map=self._composed(family, params, starts),
         )  # fmt: skip
 
-    def _composed(self, family, params) -> SymplecticMap:
-        starts = affordable(self.starts, family)
+    def _composed(self, family, params, starts=None) -> SymplecticMap:
+        starts = affordable(starts or self.starts, family)
         return compose(self.prepared, self.chart, family, params, starts, self.rows.pairs)
+
+    def _own_starts(self, map_: SymplecticMap) -> list[Starts]:
+        """Fitted to the map's own images of the training pairs: where S is coarse, those of the
+        data are no closer to its roots than S is to the data."""
+        pairs = self.rows.pairs
+        z = np.asarray(pairs.z0)[self.rows.training[:_START_PAIRS]]
+        size = len(self.rows.held_out)  # batches as validated: nothing is compiled
+        whole = np.resize(z, (-(-len(z) // size), size, z.shape[1]))
+        images = np.concatenate([map_.step(batch)[0] for batch in whole])[: len(z)]
+        finite = np.isfinite(images).all(axis=1)
+        own = prepare(Pairs(z[finite], images[finite], pairs.dt), self.prepared.coordinates)
+        if self.prepared.half is not None:
+            own = factor_out(own, self.prepared.half)
+        return fit_starts(self.chart, own, self.features)
 
 
 class Network:
@@ -217,7 +236,7 @@ class Network:
             label=family.label, scalar=family.name, chart=self.chart.name,
             num_parameters=family.num_parameters, validation_rms=error.rms,
             validation_bound=error.bound, deviations=error.deviations,
-            work=counted_work(family, error.iterations.mean()),
+            work=counted_work(family, error.iterations) + starts.there.operations,
             microseconds_per_step=None, fit_seconds=result.seconds,
             compile_seconds=result.compile_seconds, train_rms=result.train_rms,
             newton_iterations_max=int(error.iterations.max()), condition=None, rank=None,
@@ -313,9 +332,11 @@ def _determined(stages: Iterable[Iterable[Any]], rows: int) -> Iterator[list[Any
         return
 
 
-def compose(prepared: Prepared, chart, family, params, starts, pairs: Pairs) -> SymplecticMap:
+def compose(
+    prepared: Prepared, chart, family, params, starts: Starts, pairs: Pairs
+) -> SymplecticMap:
     scale = jnp.asarray(prepared.scale)
-    generated = Generated(family, params, chart, prepared.dt, scale, *starts)
+    generated = Generated(family, params, chart, prepared.dt, scale, starts.there, starts.back)
     half = prepared.half
     return SymplecticMap(
         pieces=(generated,) if half is None else (half, generated, half),
@@ -358,13 +379,15 @@ def validation_error(map_: SymplecticMap, pairs: Pairs, rows) -> ValidationError
     return ValidationError(rms, float(np.sqrt(bound)), deviations, iterations)
 
 
-def counted_work(family, iterations: float) -> float:
+def counted_work(family, iterations) -> float:
     """Floating-point operations per predicted step: those of ∇S and of its Jacobian, counted.
 
-    ``iterations`` updates need a gradient each, beside the one that comes with the Jacobian.
+    iterations: of some steps. One update takes a gradient beside the one that comes with the
+    Jacobian; more take another Jacobian each, and one where the first has led.
     """
     gradient, jacobian = family.operations
-    return float(jacobian + iterations * gradient)
+    more = np.where(np.asarray(iterations) > 1, iterations, 0).mean()
+    return float(jacobian + gradient + more * jacobian)
 
 
 def timed(candidates: list[Candidate], chosen: Candidate, states) -> list[Candidate]:
@@ -380,22 +403,21 @@ def timed(candidates: list[Candidate], chosen: Candidate, states) -> list[Candid
             best = candidate.validation_rms
     few = {id(front[i]) for i in np.linspace(0, len(front) - 1, _TIMED_FRONT).round().astype(int)}
     few.add(id(chosen))
-    return [
-        dataclasses.replace(c, microseconds_per_step=_microseconds_per_step(c.map, states))
-        if id(c) in few
-        else c
-        for c in candidates
-    ]
+    return [_measured(c, states) if id(c) in few else c for c in candidates]
 
 
-def _microseconds_per_step(map_: SymplecticMap, states) -> float:
-    """Of a batch of 1,000 lanes, the best of five steps."""
+def _measured(candidate: Candidate, states) -> Candidate:
+    """With the time per step of a batch of 1,000 lanes, the best of five, and its most updates."""
     z = np.resize(states, (_TIMED_LANES, states.shape[1]))
+    iterations = candidate.map.step(z)[1].iterations
 
     def run() -> float:
         started = time.perf_counter()
-        jax.block_until_ready(map_.step(z))
+        jax.block_until_ready(candidate.map.step(z))
         return time.perf_counter() - started
 
-    run()
-    return 1e6 * min(run() for _ in range(5)) / _TIMED_LANES
+    return dataclasses.replace(
+        candidate,
+        microseconds_per_step=1e6 * min(run() for _ in range(5)) / _TIMED_LANES,
+        newton_iterations_max=int(iterations.max()),
+    )

@@ -1,7 +1,8 @@
 """Where the implicit solve starts: an explicit polynomial model of a chart's unknowns.
 
-The model is fitted to the pairs that S is, where the unknowns are explicit in the data. It need not
-be symplectic: the solve corrects it and forgets it, but for two things. A start that is as close as
+The model is fitted to pairs, where the unknowns are explicit: those that S is fitted to, or states
+and their images by the map itself, to which a start of a coarse map can be closer. It need not be
+symplectic: the solve corrects it and forgets it, but for two things. A start that is as close as
 the root of roundoff leaves one Newton update to do, and beside a fold of S it decides which of the
 branches is found: that of the data.
 """
@@ -9,8 +10,9 @@ branches is found: that of the data.
 from __future__ import annotations
 
 import dataclasses
+import math
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,10 +24,11 @@ from gfnn_jax.scalars.inputs import Inputs, box_inputs
 from gfnn_jax.scalars.products import Products, operations_of_values, values
 
 # A start this close, in units of the data's spread, is the root of roundoff: nothing more to gain.
-_CLOSE = 1e-8
-# The model goes on a little outside the box, where rollouts of states at its edge do.
-_REACH = 1.2
-_DEGREES = range(1, 11)
+CLOSE = 5e-8
+# The model goes on a little outside the box, where rollouts of states at its edge do, but not
+# where T_n of its own degree is larger than 250.
+_REACH, _LARGEST = 1.2, 250.0
+_DEGREES = range(1, 21)
 _MOST_TERMS = 250
 _ROWS = 4_000
 
@@ -52,10 +55,19 @@ class Start:
         """The difference (k,) at the state z (2d,)."""
         x = self.family.inputs(z)
         angle = np.isin(np.arange(x.shape[0]), self.family.inputs.angles)
-        return values(self.family, self.matrices, jnp.where(angle, x, jnp.clip(x, -_REACH, _REACH)))
+        reach = min(_REACH, math.cosh(math.acosh(_LARGEST) / self.family.degree))
+        return values(self.family, self.matrices, jnp.where(angle, x, jnp.clip(x, -reach, reach)))
 
 
-def fit_starts(chart: AnyChart, prepared, features=None) -> list[tuple[Start, Start]]:
+class Starts(NamedTuple):
+    """Starts of a map and of its inverse, and the RMS error of the worse, in units of the data."""
+
+    there: Start
+    back: Start
+    error: float
+
+
+def fit_starts(chart: AnyChart, prepared, features=None) -> list[Starts]:
     """The starts of a chart's map and of its inverse, by rising degree.
 
     prepared: of the pairs, y0 and y1 (N, 2d) with their coordinates and dt. The degree rises until
@@ -66,7 +78,7 @@ def fit_starts(chart: AnyChart, prepared, features=None) -> list[tuple[Start, St
     rows = np.linspace(0, len(prepared.y0) - 1, min(_ROWS, len(prepared.y0))).astype(int)
     y0, y1 = prepared.y0[rows], prepared.y1[rows]
 
-    def fitted(chart: AnyChart, given, other) -> list[Start]:
+    def fitted(chart: AnyChart, given, other) -> list[tuple[Start, float]]:
         dim = given.shape[1] // 2
         free = np.array(chart.free(dim))
         known = np.asarray(jax.vmap(chart.start)(jnp.asarray(given)))
@@ -78,20 +90,26 @@ def fit_starts(chart: AnyChart, prepared, features=None) -> list[tuple[Start, St
         return _by_degree(inputs, given, (point - known)[:, free], sizes(point)[free])
 
     there, back = fitted(chart, y0, y1), fitted(chart.reverse(prepared.dt)[0], y1, y0)
-    return list(zip(there, back, strict=False))
+    # The one that is close first waits for the other.
+    rising = range(max(len(there), len(back)))
+    sides = ([side[min(i, len(side) - 1)] for i in rising] for side in (there, back))
+    return [
+        Starts(one, other, max(error, its_error))
+        for (one, error), (other, its_error) in zip(*sides, strict=True)
+    ]
 
 
-def affordable(starts: list[tuple[Start, Start]], family) -> tuple[Start, Start]:
-    """The closest starts that cost at most half of what the family's own gradient does."""
-    most = 0.5 * family.operations[0]
-    return max((s for s in starts if s[0].operations <= most), default=starts[0], key=_degree)
+def affordable(starts: list[Starts], family) -> Starts:
+    """The closest starts that cost at most half of what the family's own gradient does; such as
+    leave one update to do may cost what they spare, about three evaluations with a Jacobian."""
+    gradient, with_jacobian = family.operations
+    cheap = [s for s in starts if s.there.operations <= 0.5 * gradient] or starts[:1]
+    closest = starts[-1]
+    worth = closest.error <= CLOSE and closest.there.operations <= 3 * with_jacobian
+    return closest if worth and cheap[-1].error > CLOSE else cheap[-1]
 
 
-def _degree(starts: tuple[Start, Start]) -> int:
-    return starts[0].family.degree
-
-
-def _by_degree(inputs: Inputs, y, wanted, unit) -> list[Start]:
+def _by_degree(inputs: Inputs, y, wanted, unit) -> list[tuple[Start, float]]:
     held = np.arange(len(y)) % 5 == 0
     x = np.asarray(jax.vmap(inputs)(jnp.asarray(y)))
     found, closest = [], np.inf
@@ -104,11 +122,11 @@ def _by_degree(inputs: Inputs, y, wanted, unit) -> list[Start]:
         solution = np.linalg.lstsq(design[~held], wanted[~held], rcond=1e-13)[0]
         error = np.sqrt(np.mean((design[held] @ solution - wanted[held]) ** 2 / unit**2))
         if found and not error < 0.5 * closest:
-            if family.degree > found[-1].family.degree + 1:
+            if family.degree > found[-1][0].family.degree + 1:
                 break
             continue  # an odd map gains nothing by an even degree
         closest = error
-        found.append(Start(family, jnp.asarray(family.basis.placed(solution))))
-        if error < _CLOSE:
+        found.append((Start(family, jnp.asarray(family.basis.placed(solution))), float(error)))
+        if error < CLOSE:
             break
     return found
