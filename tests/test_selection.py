@@ -245,6 +245,14 @@ def test_the_choice_is_as_accurate_as_it_says(pendulum_fit):
     assert fit.chosen.label in fit.table
 
 
+def test_coarse_maps_start_from_their_own_images(pendulum_fit):
+    """The data's starts are no closer to the roots of a coarse map than it is to the data."""
+    coarse = [c for c in pendulum_fit.candidates if c.validation_rms > 1e-5]
+    updates = [int(c.map.step(disc(200, seed=2))[1].iterations.max()) for c in coarse]
+    assert len(coarse) > 3
+    assert set(updates) == {1}
+
+
 def test_units_do_not_matter():
     """q, p and time in other units, each in its own: the same functions give the same map, and the
     same states are outside the domain."""
