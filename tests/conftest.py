@@ -17,7 +17,7 @@ def pytest_configure(config):
     share what was compiled once, in pytest's own cache."""
     shared = {
         "jax_compilation_cache_dir": str(config.cache.mkdir("compiled")),
-        "jax_persistent_cache_min_compile_time_secs": 0.1,
+        "jax_persistent_cache_min_compile_time_secs": 0.02,
     }
     for name, value in shared.items():
         os.environ[name.upper()] = str(value)

@@ -45,6 +45,7 @@ def test_a_sample_is_of_the_files_own_pairs_each_once(file):
     assert abs(mean - 1500) < 5 * 3_000 / np.sqrt(12 * 500)
 
 
+@pytest.mark.slow
 def test_all_pairs_fit_better_than_the_sample(file, tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "_LARGE_BYTES", 0)
     monkeypatch.setattr(pipeline, "read_sample", lambda p, dt: read_sample(p, dt=dt, num_pairs=200))

@@ -9,7 +9,6 @@ import pytest
 from nbclient import NotebookClient
 
 NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
-QUICK = ("what_exactly_symplectic_means",)  # no fit in it; the others take a minute
 
 
 def read(path):
@@ -23,14 +22,8 @@ def test_has_no_outputs(path):
     assert not any(cell.outputs or cell.execution_count for cell in cells)
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        path if path.stem in QUICK else pytest.param(path, marks=pytest.mark.slow)
-        for path in NOTEBOOKS
-    ],
-    ids=lambda path: path.stem,
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_runs(path, tmp_path, monkeypatch):
     """Its own assertions hold, and its figures are drawn."""
     monkeypatch.setenv("GFNN_SMOKE", "1")
