@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -19,10 +20,10 @@ from gfnn_jax.charts import MIDPOINT, AnyChart
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI
 from gfnn_jax.fitting import least_squares
 from gfnn_jax.fitting.levenberg_marquardt import LMState, levenberg_marquardt
-from gfnn_jax.implicit import LEFT_DOMAIN
+from gfnn_jax.implicit import LEFT_DOMAIN, NOT_CONVERGED
 from gfnn_jax.maps import Generated, SymplecticMap
 from gfnn_jax.phase_space import Pairs, sizes
-from gfnn_jax.preparation import Prepared, factor_out, prepare
+from gfnn_jax.preparation import Prepared
 from gfnn_jax.scalars.inputs import box_inputs, variable_signs
 from gfnn_jax.scalars.mlp import Mlp, amplitude_of
 from gfnn_jax.scalars.products import Products
@@ -182,16 +183,23 @@ class Ladder:
     def _own_starts(self, map_: SymplecticMap) -> list[Starts]:
         """Fitted to the map's own images of the training pairs: where S is coarse, those of the
         data are no closer to its roots than S is to the data."""
-        pairs = self.rows.pairs
-        z = np.asarray(pairs.z0)[self.rows.training[:_START_PAIRS]]
+        prepared, rows = self.prepared, self.rows.training[:_START_PAIRS]
         size = len(self.rows.held_out)  # batches as validated: nothing is compiled
-        whole = np.resize(z, (-(-len(z) // size), size, z.shape[1]))
-        images = np.concatenate([map_.step(batch)[0] for batch in whole])[: len(z)]
-        finite = np.isfinite(images).all(axis=1)
-        own = prepare(Pairs(z[finite], images[finite], pairs.dt), self.prepared.coordinates)
-        if self.prepared.half is not None:
-            own = factor_out(own, self.prepared.half)
+        z0 = np.asarray(self.rows.pairs.z0)[np.resize(rows, (-(-len(rows) // size), size))]
+        images, infos = zip(*(map_.step(batch) for batch in z0), strict=True)
+        solved = np.concatenate([info.status < NOT_CONVERGED for info in infos])[: len(rows)]
+        y1 = np.array(self._as_prepared(jnp.concatenate(images)))[: len(rows)]
+        angles = list(prepared.coordinates.angles)  # on the data's own turn
+        y1[:, angles] += TWO_PI * np.round((prepared.y1[rows] - y1)[:, angles] / TWO_PI)
+        own = dataclasses.replace(prepared, y0=prepared.y0[rows][solved], y1=y1[solved])
         return fit_starts(self.chart, own, self.features)
+
+    @cached_property
+    def _as_prepared(self) -> Callable:
+        """Images (N, 2d) in the user's coordinates -> where S is learned."""
+        forward, half = self.prepared.coordinates.forward, self.prepared.half
+        back = (lambda y: y) if half is None else (lambda y: half.inverse()(y)[0])
+        return jax.jit(jax.vmap(lambda z: back(forward(z))))
 
 
 class Network:
