@@ -158,17 +158,18 @@ class Ladder:
             self._composed(top, padded),
             self.rows.pairs, self.rows.held_out,
         )  # fmt: skip
-        starts, updates = self.starts, error.iterations
+        starts, updates = affordable(self.starts, family), error.iterations
         if updates.mean() > _ONE_UPDATE and np.isfinite(error.rms):
-            starts = self._own_starts(self._composed(top, padded))
-            updates = 1 if affordable(starts, family).error <= CLOSE else updates
+            own = self._own_starts(self._composed(top, padded))
+            starts = affordable(own, family, spares=True)
+            updates = 1 if starts.error <= CLOSE else updates
         params = family.unflatten(solved.coefficients)
         label = f"features {family.degree}" if self.kind == "features" else family.label
         return Candidate(
             label=label, scalar=self.kind, chart=self.chart.name,
             num_parameters=family.num_parameters, validation_rms=error.rms,
             validation_bound=error.bound, deviations=error.deviations,
-            work=counted_work(family, updates) + affordable(starts, family).there.operations,
+            work=counted_work(family, updates) + starts.there.operations,
             microseconds_per_step=None, fit_seconds=seconds,
             compile_seconds=reduced.compile_seconds, train_rms=solved.train_rms,
             newton_iterations_max=int(error.iterations.max()), condition=solved.condition,
@@ -176,8 +177,8 @@ class Ladder:
             map=self._composed(family, params, starts),
         )  # fmt: skip
 
-    def _composed(self, family, params, starts=None) -> SymplecticMap:
-        starts = affordable(starts or self.starts, family)
+    def _composed(self, family, params, starts: Starts | None = None) -> SymplecticMap:
+        starts = starts or affordable(self.starts, family)
         return compose(self.prepared, self.chart, family, params, starts, self.rows.pairs)
 
     def _own_starts(self, map_: SymplecticMap) -> list[Starts]:

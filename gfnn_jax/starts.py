@@ -99,15 +99,19 @@ def fit_starts(chart: AnyChart, prepared, features=None) -> list[Starts]:
     ]
 
 
-def affordable(starts: list[Starts], family) -> Starts:
-    """The closest starts that cost at most half of what the family's own gradient does; such as
-    leave one update to do may cost what they spare: two or three evaluations with a Jacobian, whose
-    operations take about twice as long as those of a start."""
+def affordable(starts: list[Starts], family, *, spares: bool = False) -> Starts:
+    """The closest starts that cost at most half of what the family's own gradient does.
+
+    spares: whether they leave more than one update to do; then such as do not may cost what they
+    spare, two or three evaluations with a Jacobian, whose operations take about twice as long as
+    those of a start.
+    """
     gradient, with_jacobian = family.operations
-    cheap = [s for s in starts if s.there.operations <= 0.5 * gradient] or starts[:1]
     closest = starts[-1]
-    worth = closest.error <= CLOSE and closest.there.operations <= 5 * with_jacobian
-    return closest if worth and cheap[-1].error > CLOSE else cheap[-1]
+    if spares and closest.error <= CLOSE and closest.there.operations <= 5 * with_jacobian:
+        return closest
+    cheap = [s for s in starts if s.there.operations <= 0.5 * gradient]
+    return cheap[-1] if cheap else starts[0]
 
 
 def _by_degree(inputs: Inputs, y, wanted, unit) -> list[tuple[Start, float]]:
