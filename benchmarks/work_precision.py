@@ -63,6 +63,7 @@ FLOAT32_FLOOR = 1e-7  # of the data's spread: a larger map is no more accurate i
 CHARTS = ("midpoint", "type2")
 UNREACHABLE = 1e-300  # a tolerance for which a fit climbs its ladder to the end
 MLP_ITERATIONS = 100
+DRAWN = 10.0  # a larger error is that of a prediction far outside the scene
 ASKED = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 FIGURES = HERE / "figures"
 OURS, KNOWN, OTHERS = "ours", "H known", "baseline"
@@ -294,7 +295,7 @@ def panel(points: list[Numbers], time_of: str) -> Numbers:
     """One panel of the figure: group -> name -> (cost, error, size)."""
     groups: Numbers = {"ours": {}, "float32": {}, "known": {}, "others": {}}
     for p in points:
-        if p["error_median"] is None or p.get(time_of) is None:
+        if p["error_median"] is None or p.get(time_of) is None or p["error_median"] > DRAWN:
             continue
         group = {OURS: "ours", KNOWN: "known", OTHERS: "others"}[p["group"]]
         group = "float32" if p.get("dtype") == "float32" else group
