@@ -34,8 +34,12 @@ STATUS_NAMES = (
 # Elimination is unrolled up to this size; beyond it LAPACK's call overhead no longer matters.
 _UNROLL_UP_TO = 8
 _HALVINGS = 30
-# How far a step may lead from the Newton path, as a part of its length.
-_OFF_PATH = 0.5
+# How much the residual's slope along a step may change, as a part of the steeper slope; how far the
+# residual's change may be from what these slopes tell (the trapezoidal rule), as a part of it.
+_BENT, _OFF_PATH = 0.35, 0.05
+# The first step is tried whole where the update with the same step has left this of the residual,
+# else by this part: it may lead past any number of folds, and seldom does so by small steps.
+_STRAIGHT, _BEGIN = 0.01, 0.125
 # A residual of this many eps of the size of its terms is the floor: a few roundings of that size.
 _FLOOR_EPS = 4.0
 
@@ -112,6 +116,7 @@ def iterate(
     stays by the Newton path r(x) = (1 − t) r(guess) (Deuflhard, "Newton Methods for Nonlinear
     Problems", 2004, chapter 3), which ends at the solution of the guess's own branch or at a fold:
     there the sign of det ∂r/∂x would change, and the lane is given up, not led to another branch.
+    A step over a pair of folds keeps the sign and may shrink the residual; it shows in the slopes.
     A lane closes when its residual is at the roundoff floor, or is close to it and no longer
     halves, or cannot be made smaller. At most ``most`` updates.
     Returns x, aux at x, Info.
@@ -135,27 +140,17 @@ def iterate(
 
         return jax.jacfwd(with_aux, has_aux=True)(x)
 
-    def by_the_path(new, old, factor):
-        """Whether the residual fell as it does along the path: to (1 − factor) of what it was."""
-        off = jnp.max(jnp.abs(new.residual - (1 - factor) * old.residual))
-        return off <= _OFF_PATH * factor * old.merit
-
     def goes_on(new, old):
         halved = new.merit < 0.5 * old.merit
         return (new.error > settled) | (new.error > 1.0) & halved
 
     def frozen(x):
-        """The guess's update with the Jacobian there, or itself; the sign of that Jacobian."""
+        """The guess with its step, the sign of the Jacobian there, and what the step leads to."""
         matrix, (residual, size, aux) = linearised(x)
-        first = judged(x, residual, size, aux, jnp.ones((), jnp.int32))
         step, sign = _solve_and_sign(matrix, residual)
-        x = x - step
-        residual, size, aux = evaluate(theta, x)
-        second = judged(x, residual, size, aux, first.iterations)
-        near_floor = (first.error <= settled) & (second.merit < first.merit)
-        better = near_floor | by_the_path(second, first, one)
-        kept = jax.tree.map(partial(jnp.where, better), second, first)
-        return kept._replace(open=goes_on(kept, first) & (kept.iterations < most)), sign
+        first = judged(x, residual, size, aux, jnp.zeros((), jnp.int32))._replace(step=step)
+        second = judged(x - step, *evaluate(theta, x - step), jnp.ones((), jnp.int32))
+        return first, second, sign
 
     def newton(state):
         """Try a part of the step: take it where it stays by the path, else halve the part."""
@@ -163,22 +158,33 @@ def iterate(
         matrix, (residual, size, aux) = linearised(x)
         new = judged(x, residual, size, aux, state.iterations + 1)
         step, sign_here = _solve_and_sign(matrix, residual)
-        near_floor = (state.error <= settled) & (new.merit < state.merit)
-        better = near_floor | by_the_path(new, state, state.factor) & (sign_here == sign)
+        # The residual's slope along the step at its end; at its beginning it is -state.residual.
+        slope = -matrix @ state.step
+        steeper = jnp.maximum(jnp.max(jnp.abs(slope)), state.merit)
+        bent = jnp.max(jnp.abs(slope + state.residual)) / steeper
+        told = state.residual + 0.5 * state.factor * (slope - state.residual)
+        off = jnp.max(jnp.abs(residual - told)) / (state.factor * state.merit)
+        by_the_path = (bent <= _BENT) & (off <= _OFF_PATH) & (sign_here == sign)
+        better = by_the_path | (state.error <= settled) & (new.merit < state.merit)
         further = goes_on(new, state) & (new.iterations < most)
-        longer = jnp.minimum(one, 4 * state.factor)
-        new = new._replace(step=step, factor=longer, open=further)
+        # The next part is as long as the slope's change allows, if it goes on as it did.
+        longer = jnp.clip(0.95 * _BENT / bent, 0.5, 4.0) * state.factor
+        new = new._replace(step=step, factor=jnp.minimum(one, longer), open=further)
         # Close to the floor only the full step makes sense: what is left is roundoff.
         shortest = jnp.where(state.error < settled, 1.0, 0.5**_HALVINGS).astype(guess.dtype)
         halved = state._replace(factor=0.5 * state.factor, open=state.factor > shortest)
         return jax.tree.map(partial(jnp.where, better), new, halved)
 
-    state, sign = frozen(guess)
-    # The loop begins by evaluating the Jacobian where the update has led: a step of nothing, which
-    # is taken, where the sign is that at the guess, and not counted.
-    begun = jnp.where(state.open, state.iterations - 1, state.iterations)
-    merit = jnp.where(state.open, jnp.inf, state.merit)
-    state = state._replace(iterations=begun, merit=merit)
+    first, second, sign = frozen(guess)
+    smaller = second.merit < first.merit
+    done = smaller & ~goes_on(second, first)
+    begun = ~done & (smaller | (first.error > settled)) & (most > 1)
+    straight = (first.error <= settled) | (second.merit <= _STRAIGHT * first.merit)
+    state = jax.tree.map(partial(jnp.where, done), second, first)._replace(
+        factor=jnp.where(straight, one, _BEGIN),
+        iterations=jnp.where(begun, 0, 1).astype(jnp.int32),  # the loop makes the first one again
+        open=begun,
+    )
     state = jax.lax.while_loop(lambda s: s.open, newton, state)
     finite = jnp.isfinite(state.error)
     status = jnp.where(state.error <= settled, OK, jnp.where(finite, NOT_CONVERGED, NON_FINITE))

@@ -279,16 +279,17 @@ def test_float32_solves_in_float32():
     assert info.iterations < 6
 
 
-@pytest.mark.parametrize(("strength", "most"), [(0.5, 0), (1.5, 0), (8.0, 2)])
-def test_neighbours_are_not_led_to_different_branches(strength, most):
+@pytest.mark.parametrize("strength", [0.5, 1.5, 7.21, 8.0, 9.99, 11.76, 13.84, 50.0])
+def test_neighbours_are_not_led_to_different_branches(strength):
     """P − A sin(q + P) = p has folds from A = 1 on. A solve that may jump over a fold makes 285 of
-    20,000 neighbours at A = 8 end on different branches without a word; one that follows the Newton
-    path leaves the two where the guess itself crosses a fold."""
+    20,000 neighbours at A = 8 end on different branches without a word; one that looks at the
+    residual alone, 4; one that tries the whole step first, a few wherever that leads a period on
+    (7.21 to 13.84)."""
     piece = Generated(lambda a, w: a * jnp.cos(w[0] + w[1]), strength, TYPE2, 1.0, jnp.ones(2))
     p = np.linspace(-np.pi, np.pi, 20_001)
     image, info = jax.jit(jax.vmap(piece))(jnp.asarray(np.stack([0 * p, p], axis=1)))
     ok = np.asarray(info.status) == OK
     jumps = ok[1:] & ok[:-1] & (np.abs(np.diff(np.asarray(image)[:, 1])) > 0.1)
-    assert jumps.sum() <= most
+    assert not jumps.any()
     assert ok.mean() > 0.8
     assert ok.all() or strength > 1  # without folds nothing is given up

@@ -171,3 +171,36 @@ def test_columns_of_very_different_size_are_told_apart():
     exact = EXACT * np.where(np.arange(EXACT.size) % 2, 1.0, 1e-6)
     fit = least_squares.fit(FAMILY, *parts(W, gradients(FAMILY, exact, W)), ONE)
     np.testing.assert_allclose(fit.coefficients, exact, rtol=1e-6, atol=1e-12)
+
+
+def standard_kicks(num):
+    """Pairs of the standard map as type 2 sees them: S = P²/2 + 0.6 cos θ."""
+    rng = np.random.default_rng(1)
+    w = rng.uniform(0, 2 * np.pi, (num, 2))
+    return w, np.stack([-0.6 * np.sin(w[:, 0]), w[:, 1]], axis=1)
+
+
+def test_what_the_data_cannot_tell_from_zero_is_zero():
+    w, wanted = standard_kicks(800)
+    family = Products(box_inputs(w, angles=(0,)), 2)
+    fit = least_squares.fit(family, *parts(w, wanted), np.ones(2))
+    # cos θ, P and P² (the box is not centred at P = 0).
+    assert np.count_nonzero(fit.coefficients) == 3
+    assert fit.validation_rms < 1e-14
+    # An odd kick, evaluated in floating point, is odd to the last bit.
+    matrix = family.unflatten(fit.coefficients)
+    kick = jax.vmap(lambda q: jax.grad(family, argnums=1)(matrix, jnp.stack([q, 3.0]))[0])
+    theta = jnp.asarray(w[:, 0])
+    np.testing.assert_array_equal(kick(-theta), -kick(theta))
+
+
+def test_nothing_is_dropped_that_held_out_pairs_need(monkeypatch):
+    # Two columns so alike that rounding alone could make the coefficient of either.
+    monkeypatch.setattr(least_squares, "_RIDGES", (0.0,))
+    rng = np.random.default_rng(2)
+    one = rng.standard_normal(800)
+    columns = np.stack([one, one + 1e-14 * rng.standard_normal(800)], axis=1)
+    rows = np.column_stack([columns, columns @ np.array([0.05, 1.95])])
+    train, held = (np.linalg.qr(part, mode="r") for part in (rows[:600], rows[600:]))
+    fit = least_squares.solve(least_squares.Reduced(train, 600, held, 200, 0.0, 0.0), 2)
+    assert fit.validation_rms < 1e-12
