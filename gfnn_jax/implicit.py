@@ -149,7 +149,8 @@ def iterate(
         matrix, (residual, size, aux) = linearised(x)
         step, sign = _solve_and_sign(matrix, residual)
         first = judged(x, residual, size, aux, jnp.zeros((), jnp.int32))._replace(step=step)
-        second = judged(x - step, *evaluate(theta, x - step), jnp.ones((), jnp.int32))
+        residual, size, aux = evaluate(theta, x - step)
+        second = judged(x - step, residual, size, aux, jnp.ones((), jnp.int32))
         return first, second, sign
 
     def newton(state):
@@ -164,7 +165,8 @@ def iterate(
         bent = jnp.max(jnp.abs(slope + state.residual)) / steeper
         told = state.residual + 0.5 * state.factor * (slope - state.residual)
         off = jnp.max(jnp.abs(residual - told)) / (state.factor * state.merit)
-        by_the_path = (bent <= _BENT) & (off <= _OFF_PATH) & (sign_here == sign)
+        rounding = 1.0 / (state.factor * state.error)  # one floor, as a part of the change
+        by_the_path = (bent <= _BENT) & (off <= _OFF_PATH + 4 * rounding) & (sign_here == sign)
         better = by_the_path | (state.error <= settled) & (new.merit < state.merit)
         further = goes_on(new, state) & (new.iterations < most)
         # The next part is as long as the slope's change allows, if it goes on as it did.
@@ -179,7 +181,7 @@ def iterate(
     smaller = second.merit < first.merit
     done = smaller & ~goes_on(second, first)
     begun = ~done & (smaller | (first.error > settled)) & (most > 1)
-    straight = (first.error <= settled) | (second.merit <= _STRAIGHT * first.merit)
+    straight = (second.error <= settled) | (second.merit <= _STRAIGHT * first.merit)
     state = jax.tree.map(partial(jnp.where, done), second, first)._replace(
         factor=jnp.where(straight, one, _BEGIN),
         iterations=jnp.where(begun, 0, 1).astype(jnp.int32),  # the loop makes the first one again
