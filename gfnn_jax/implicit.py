@@ -97,6 +97,7 @@ class _Iterate(NamedTuple):
     residual: Any
     aux: Any
     merit: Any  # largest residual
+    floor: Any  # largest of the residuals' roundoff floors
     error: Any  # largest residual relative to its roundoff floor
     step: Any  # the Newton step from x, and the part of it to be tried next
     factor: Any
@@ -118,7 +119,7 @@ def iterate(
     there the sign of det ∂r/∂x would change, and the lane is given up, not led to another branch.
     A step over a pair of folds keeps the sign and may shrink the residual; it shows in the slopes.
     A lane closes when its residual is at the roundoff floor, or is close to it and no longer
-    halves, or cannot be made smaller. At most ``most`` updates.
+    halves, or cannot be made smaller. At most ``most`` updates, 1 or more.
     Returns x, aux at x, Info.
     """
     eps = float(jnp.finfo(guess.dtype).eps)
@@ -127,9 +128,20 @@ def iterate(
 
     def judged(x, residual, size, aux, iterations):
         merit = jnp.max(jnp.abs(residual))
+        floor = _FLOOR_EPS * eps * jnp.max(size)
         error = jnp.max(jnp.abs(residual) / size) / (_FLOOR_EPS * eps)
-        still = jnp.zeros_like(x)
-        return _Iterate(x, residual, aux, merit, error, still, one, iterations, jnp.array(True))
+        return _Iterate(
+            x,
+            residual,
+            aux,
+            merit,
+            floor,
+            error,
+            jnp.zeros_like(x),
+            one,
+            iterations,
+            jnp.array(True),
+        )
 
     def linearised(x):
         """(residual, size, aux) and the Jacobian ∂r/∂x at x."""
@@ -164,13 +176,13 @@ def iterate(
         steeper = jnp.maximum(jnp.max(jnp.abs(slope)), state.merit)
         bent = jnp.max(jnp.abs(slope + state.residual)) / steeper
         told = state.residual + 0.5 * state.factor * (slope - state.residual)
-        off = jnp.max(jnp.abs(residual - told)) / (state.factor * state.merit)
-        rounding = 1.0 / (state.factor * state.error)  # one floor, as a part of the change
-        by_the_path = (bent <= _BENT) & (off <= _OFF_PATH + 4 * rounding) & (sign_here == sign)
+        off = jnp.max(jnp.abs(residual - told))
+        near = _OFF_PATH * state.factor * state.merit + 4 * new.floor
+        by_the_path = (bent <= _BENT) & (off <= near) & (sign_here == sign)
         better = by_the_path | (state.error <= settled) & (new.merit < state.merit)
         further = goes_on(new, state) & (new.iterations < most)
         # The next part is as long as the slope's change allows, if it goes on as it did.
-        longer = jnp.clip(0.95 * _BENT / bent, 0.5, 4.0) * state.factor
+        longer = 0.95 * _BENT / jnp.clip(bent, 0.25 * _BENT, 2 * _BENT) * state.factor
         new = new._replace(step=step, factor=jnp.minimum(one, longer), open=further)
         # Close to the floor only the full step makes sense: what is left is roundoff.
         shortest = jnp.where(state.error < settled, 1.0, 0.5**_HALVINGS).astype(guess.dtype)
@@ -182,7 +194,7 @@ def iterate(
     done = smaller & ~goes_on(second, first)
     begun = ~done & (smaller | (first.error > settled)) & (most > 1)
     straight = (second.error <= settled) | (second.merit <= _STRAIGHT * first.merit)
-    state = jax.tree.map(partial(jnp.where, done), second, first)._replace(
+    state = jax.tree.map(partial(jnp.where, smaller & ~begun), second, first)._replace(
         factor=jnp.where(straight, one, _BEGIN),
         iterations=jnp.where(begun, 0, 1).astype(jnp.int32),  # the loop makes the first one again
         open=begun,

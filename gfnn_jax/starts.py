@@ -111,9 +111,11 @@ def affordable(starts: list[Starts], family, *, spares: bool = False) -> Starts:
     those of a start.
     """
     gradient, with_jacobian = family.operations
-    closest = starts[-1]
-    if spares and closest.error <= CLOSE and closest.there.operations <= 5 * with_jacobian:
-        return closest
+    close = [
+        s for s in starts if s.error <= CLOSE and s.there.operations <= 5 * with_jacobian
+    ]  # fmt: skip
+    if spares and close:
+        return close[-1]
     cheap = [s for s in starts if s.there.operations <= 0.5 * gradient]
     return cheap[-1] if cheap else starts[0]
 

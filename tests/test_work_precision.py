@@ -65,7 +65,7 @@ def test_the_front_is_what_no_other_beats():
 
 
 def test_a_lost_lane_counts_as_infinitely_far():
-    bench = work_precision.Bench(gfnn.scenes.make("standard-map-regular"), 3, quick=True)
+    bench = work_precision.Bench(gfnn.scenes.make("standard-map-regular"), 3, 50, quick=True)
     exact = bench.judged(bench.reference)
     assert exact["error_median"] == 0
     assert exact["num_lost"] == 0

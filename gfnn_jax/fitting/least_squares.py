@@ -148,8 +148,8 @@ def solve(reduced: Reduced, num_terms: int) -> LeastSquaresFit:
     errors = np.linalg.norm(held_a @ tried - held_b[:, None], axis=0)
     best = int(np.argmin(errors))
     c, error = tried[:, best], errors[best]
-    # What the rounding of the data alone would make of a coefficient is zero, unless held-out pairs
-    # object: a symmetry of S broken by 1e-17 biases the rounding of every step in one direction.
+    # A coefficient no larger than rounding of b would make it is zero, unless held-out pairs say no.
+    # A symmetry of S that is broken by 1e-17 biases the rounding of every step in one direction.
     rounding = 4 * np.finfo(np.float64).eps * np.linalg.norm(b)
     noise = rounding * np.linalg.norm(vt.T * filters[best], axis=1) / column
     told = np.where(np.abs(c) > noise, c, 0.0)
