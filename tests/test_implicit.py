@@ -200,6 +200,48 @@ def test_executed_derivative_of_an_unfinished_solve_is_wrong_and_the_implicit_on
     assert np.abs(jax.jacfwd(implicit)(THETA)[:, 0] - difference).max() > 1e-3
 
 
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize("bend", [0.0, 8.0])
+def test_executed_derivative_of_a_damped_solve_is_finite(bend, dtype):
+    """Also where a step is exactly straight (bend 0), or a part of it leads to a straight one."""
+
+    @equation
+    def bent(theta, x):
+        return x + bend * jnp.sin(x) - theta
+
+    def solve(theta):
+        x, _, info = iterate(bent, theta, 1.3 * theta + 0.1, most=40)
+        return x, info.status
+
+    theta = jnp.linspace(-4, 4, 2_001, dtype=dtype)[:, None]
+    slope, status = jax.jit(jax.vmap(jax.jacfwd(solve, has_aux=True)))(theta)
+    ok = np.asarray(status) == OK
+    assert ok.mean() > 0.9
+    assert np.isfinite(np.asarray(slope)[ok]).all()
+
+
+def test_a_large_component_at_its_floor_does_not_stop_the_others():
+    """The residual of the first is roundoff from the start on, and larger than the second's."""
+
+    def evaluate(theta, x):
+        large = 1e3 * (x[0] - 0.1) + 1e3 * 0.1 - 1e3 * 0.1
+        small = 1e-13 * (x[1] + 0.6 * jnp.sin(x[1]) - theta[0])
+        return jnp.stack([large, small]), jnp.array([1e3, 1e-13]), x[0]
+
+    theta = jnp.linspace(1, 4, 500)[:, None]
+    guess = jnp.stack([jnp.full(500, 0.1 + 1e-16), jnp.zeros(500)], axis=1)
+    x, _, info = solved(evaluate, theta, guess)
+    assert (info.status == OK).all()
+    np.testing.assert_allclose(x[:, 1] + 0.6 * jnp.sin(x[:, 1]), theta[:, 0], rtol=1e-11)
+
+
+def test_the_one_update_that_is_allowed_is_kept():
+    x, _, info = solved(square, jnp.array([[2.0]]), jnp.array([[1.5]]), 1)
+    np.testing.assert_allclose(x, [[1.5 - 0.25 / 3]], rtol=1e-15)
+    assert info.iterations[0] == 1
+    assert info.status[0] == NOT_CONVERGED
+
+
 # Rough generating functions: whatever S and the state are, "ok" means solved.
 
 

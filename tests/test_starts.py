@@ -12,7 +12,7 @@ from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.maps import Generated
 from gfnn_jax.scalars.inputs import box_inputs
 from gfnn_jax.scalars.products import Products
-from gfnn_jax.starts import CLOSE, affordable, fit_starts
+from gfnn_jax.starts import CLOSE, Starts, affordable, fit_starts
 
 DT = 0.4
 STATES = np.random.default_rng(0).uniform(-1, 1, (600, 2))
@@ -62,6 +62,22 @@ def test_rise_until_close_and_the_affordable_is_taken():
         assert error > CLOSE or dear.operations <= 5 * with_jacobian
         assert dear.family.degree >= there.family.degree
     assert there.family.degree == starts[-1].there.family.degree
+
+
+class Costing:
+    """A start, or a family, of which only the operations count."""
+
+    def __init__(self, operations):
+        self.operations = operations
+
+
+def test_the_closest_start_that_is_affordable_is_taken_though_a_dearer_one_is_closer():
+    known = ((1e-3, 40), (1e-6, 600), (4e-8, 1_800), (5e-9, 2_600))
+    starts = [Starts(Costing(cost), Costing(cost), error) for error, cost in known]
+    family = Costing((100, 400))
+    assert affordable(starts, family, spares=True).error == 4e-8
+    assert affordable(starts, family).error == 1e-3
+    assert affordable(starts, Costing((100, 600)), spares=True).error == 5e-9
 
 
 def test_noise_and_few_pairs_end_the_rise():

@@ -148,7 +148,7 @@ def solve(reduced: Reduced, num_terms: int) -> LeastSquaresFit:
     errors = np.linalg.norm(held_a @ tried - held_b[:, None], axis=0)
     best = int(np.argmin(errors))
     c, error = tried[:, best], errors[best]
-    # A coefficient no larger than rounding of b would make it is zero, unless held-out pairs say no.
+    # A coefficient no larger than rounding of b would make it is zero, if held-out pairs agree.
     # A symmetry of S that is broken by 1e-17 biases the rounding of every step in one direction.
     rounding = 4 * np.finfo(np.float64).eps * np.linalg.norm(b)
     noise = rounding * np.linalg.norm(vt.T * filters[best], axis=1) / column
