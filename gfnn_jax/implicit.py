@@ -4,7 +4,8 @@ The solve finds x with r(θ, x) = 0 for one lane; a batch is a ``vmap`` of it. T
 
 - Every iterate is judged by the residual that was evaluated *at it*, so "ok" is never a guess, and
   the gradient belonging to the returned x is at hand without another evaluation.
-- Finished lanes are frozen: a slow or bad lane costs the others the common loop, never a bit.
+- Finished lanes are frozen, and those of a batch that need more updates than most are taken out of
+  it for them: a slow or bad lane costs the others neither a bit nor its own time.
 - Status is data. Non-finite values are tested for, since ``while err > tol`` ends silently on NaN.
 
 Derivatives of ``root`` come from the implicit function theorem, in forward and reverse mode; those
@@ -20,6 +21,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Int
 
 OK, LEFT_DOMAIN, STOPPED_AT_EDGE, NOT_CONVERGED, NON_FINITE = range(5)
@@ -42,6 +44,9 @@ _BENT, _OFF_PATH = 0.35, 0.05
 _STRAIGHT, _BEGIN = 0.01, 0.125
 # A residual of this many eps of the size of its terms is the floor: a few roundings of that size.
 _FLOOR_EPS = 4.0
+# Where one update is not enough, so many lanes of a batch, or this part of it, are visited at a time
+# for so many updates: the fewer, the less waits for the hardest, the more often all are looked at.
+_FEWEST, _PART, _VISIT = 32, 32, 2
 
 
 class Info(NamedTuple):
@@ -99,14 +104,63 @@ class _Iterate(NamedTuple):
     merit: Any  # largest residual
     floor: Any  # largest of the residuals' roundoff floors
     error: Any  # largest residual relative to its roundoff floor
+    sign: Any  # of det ∂r/∂x at the guess
     step: Any  # the Newton step from x, and the part of it to be tried next
     factor: Any
     iterations: Any
     open: Any  # still to be improved
 
 
+def _each(newton: Callable, theta, state: _Iterate) -> _Iterate:
+    """Newton's method for one lane; a batch of it goes on as long as its slowest lane."""
+    return jax.lax.while_loop(lambda s: s.open, partial(newton, theta), state)
+
+
+def _some(newton: Callable, theta, state: _Iterate) -> _Iterate:
+    """As ``_each``, but for one visit."""
+
+    def goes_on(carry):
+        return carry[0].open & (carry[1] < _VISIT)
+
+    def again(carry):
+        return newton(theta, carry[0]), carry[1] + 1
+
+    return jax.lax.while_loop(goes_on, again, (state, 0))[0]
+
+
+def _few_together(newton: Callable, theta, state: _Iterate) -> _Iterate:
+    """As ``_each``; but of a batch only lanes that are open are visited, a few at a time: the
+    others need not wait for them."""
+    loop = custom_vmap(partial(_each, newton))
+
+    @loop.def_vmap
+    def _(size, batched, theta, state):
+        own = batched[0]  # which parts of θ a lane has for itself
+        axes = jax.tree.map(lambda its: 0 if its else None, own)
+        state = jax.tree.map(
+            lambda a, its: a if its else jnp.broadcast_to(a, (size, *jnp.shape(a))),
+            state, batched[1],
+        )  # fmt: skip
+        everywhere = jax.tree.map(lambda _: True, state)
+        few = max(_FEWEST, size // _PART)
+        if size <= few:
+            return jax.vmap(partial(_each, newton), (axes, 0))(theta, state), everywhere
+
+        def visit(state):
+            place = jnp.cumsum(state.open)  # of a lane among the open ones, from 1
+            lanes = jnp.searchsorted(place, jnp.arange(1, few + 1), method="scan_unrolled")
+            of_them = partial(jnp.take, indices=lanes, axis=0, mode="clip")
+            given = jax.tree.map(lambda a, its: of_them(a) if its else a, theta, own)
+            new = jax.vmap(partial(_some, newton), (axes, 0))(given, jax.tree.map(of_them, state))
+            return jax.tree.map(lambda a, its: a.at[lanes].set(its, mode="drop"), state, new)
+
+        return jax.lax.while_loop(lambda s: jnp.any(s.open), visit, state), everywhere
+
+    return loop(theta, state)
+
+
 def iterate(
-    evaluate: Callable, theta: Any, guess: Vector, *, most: int
+    evaluate: Callable, theta: Any, guess: Vector, *, most: int, loop: Callable = _each
 ) -> tuple[Vector, Any, Info]:
     """The iterations themselves: ``evaluate(theta, x) -> (residual (n,), size (n,), aux)``.
 
@@ -119,12 +173,12 @@ def iterate(
     there the sign of det ∂r/∂x would change, and the lane is given up, not led to another branch.
     A step over a pair of folds keeps the sign and may shrink the residual; it shows in the slopes.
     A lane closes when its residual is at the roundoff floor, or is close to it and no longer
-    halves, or cannot be made smaller. At most ``most`` updates, 1 or more.
+    halves, or cannot be made smaller. At most ``most`` updates, 1 or more; ``loop`` makes them.
     Returns x, aux at x, Info.
     """
     eps = float(jnp.finfo(guess.dtype).eps)
     settled = eps**-0.25  # in floors: 3e-12 of the size in float64, 1e-5 in float32
-    one = jnp.ones((), guess.dtype)
+    one = np.ones((), guess.dtype)
 
     def judged(x, residual, size, aux, iterations):
         merit = jnp.max(jnp.abs(residual))
@@ -137,13 +191,14 @@ def iterate(
             merit,
             floor,
             error,
+            one,
             jnp.zeros_like(x),
             one,
             iterations,
-            jnp.array(True),
+            np.array(True),
         )
 
-    def linearised(x):
+    def linearised(theta, x):
         """(residual, size, aux) and the Jacobian ∂r/∂x at x."""
 
         def with_aux(x):
@@ -158,17 +213,19 @@ def iterate(
 
     def frozen(x):
         """The guess with its step, the sign of the Jacobian there, and what the step leads to."""
-        matrix, (residual, size, aux) = linearised(x)
+        matrix, (residual, size, aux) = linearised(theta, x)
         step, sign = _solve_and_sign(matrix, residual)
-        first = judged(x, residual, size, aux, jnp.zeros((), jnp.int32))._replace(step=step)
+        first = judged(x, residual, size, aux, jnp.zeros((), jnp.int32))._replace(
+            step=step, sign=sign
+        )
         residual, size, aux = evaluate(theta, x - step)
         second = judged(x - step, residual, size, aux, jnp.ones((), jnp.int32))
-        return first, second, sign
+        return first, second._replace(sign=sign)
 
-    def newton(state):
+    def newton(theta, state):
         """Try a part of the step: take it where it stays by the path, else halve the part."""
         x = state.x - state.factor * state.step
-        matrix, (residual, size, aux) = linearised(x)
+        matrix, (residual, size, aux) = linearised(theta, x)
         new = judged(x, residual, size, aux, state.iterations + 1)
         step, sign_here = _solve_and_sign(matrix, residual)
         # The residual's slope along the step at its end; at its beginning it is -state.residual.
@@ -178,18 +235,20 @@ def iterate(
         told = state.residual + 0.5 * state.factor * (slope - state.residual)
         off = jnp.max(jnp.abs(residual - told))
         near = _OFF_PATH * state.factor * state.merit + 4 * new.floor
-        by_the_path = (bent <= _BENT) & (off <= near) & (sign_here == sign)
+        by_the_path = (bent <= _BENT) & (off <= near) & (sign_here == state.sign)
         better = by_the_path | (state.error <= settled) & (new.merit < state.merit)
         further = goes_on(new, state) & (new.iterations < most)
         # The next part is as long as the slope's change allows, if it goes on as it did.
         longer = 0.95 * _BENT / jnp.clip(bent, 0.25 * _BENT, 2 * _BENT) * state.factor
-        new = new._replace(step=step, factor=jnp.minimum(one, longer), open=further)
+        new = new._replace(
+            sign=state.sign, step=step, factor=jnp.minimum(one, longer), open=further
+        )
         # Close to the floor only the full step makes sense: what is left is roundoff.
         shortest = jnp.where(state.error < settled, 1.0, 0.5**_HALVINGS).astype(guess.dtype)
         halved = state._replace(factor=0.5 * state.factor, open=state.factor > shortest)
         return jax.tree.map(partial(jnp.where, better), new, halved)
 
-    first, second, sign = frozen(guess)
+    first, second = frozen(guess)
     smaller = second.merit < first.merit
     done = smaller & ~goes_on(second, first)
     begun = ~done & (smaller | (first.error > settled)) & (most > 1)
@@ -199,7 +258,7 @@ def iterate(
         iterations=jnp.where(begun, 0, 1).astype(jnp.int32),  # the loop makes the first one again
         open=begun,
     )
-    state = jax.lax.while_loop(lambda s: s.open, newton, state)
+    state = loop(newton, theta, state)
     finite = jnp.isfinite(state.error)
     status = jnp.where(state.error <= settled, OK, jnp.where(finite, NOT_CONVERGED, NON_FINITE))
     residual = state.error * (_FLOOR_EPS * eps)
@@ -213,7 +272,7 @@ def root(evaluate, theta, guess, most: int):
     dx = −(∂r/∂x)⁻¹ (∂r/∂θ) dθ; the guess has no influence. ``evaluate`` must not close over
     anything that is differentiated.
     """
-    return iterate(evaluate, theta, guess, most=most)
+    return iterate(evaluate, theta, guess, most=most, loop=_few_together)
 
 
 @root.defjvp
