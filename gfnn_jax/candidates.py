@@ -20,7 +20,7 @@ from gfnn_jax.charts import MIDPOINT, AnyChart
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI
 from gfnn_jax.fitting import least_squares
 from gfnn_jax.fitting.levenberg_marquardt import LMState, levenberg_marquardt
-from gfnn_jax.implicit import LEFT_DOMAIN, NOT_CONVERGED
+from gfnn_jax.implicit import LEFT_DOMAIN, NOT_CONVERGED, Info
 from gfnn_jax.maps import Generated, SymplecticMap
 from gfnn_jax.phase_space import Pairs, sizes
 from gfnn_jax.preparation import Prepared
@@ -41,6 +41,9 @@ _MOST_WORK = 1.2e11
 _ONE_UPDATE, _START_PAIRS = 1.1, 2_000
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
 _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
+# Of a refit: pairs at a time; a pair is wrong that is missed by so many deviations, which are no
+# smaller than roundoff. A million pairs with one at this limit have no worse a fit for it.
+_REFIT_PAIRS, _WRONG, _ROUNDING = 20_000, 100.0, 1e-14
 _CHECKPOINT_SECONDS = 10.0
 _NORMAL_95 = 1.645
 _TIMED_LANES, _TIMED_FRONT = 1_000, 3
@@ -282,42 +285,76 @@ def _weight(chart: AnyChart, scale, dt):
     return dt / (np.tile(scale[dim:], 2) if chart.name == "type1" else np.roll(scale, dim))
 
 
-def refitted(candidate: Candidate, chunks: Iterable[Pairs], held: Pairs) -> tuple[Candidate, int]:
-    """A candidate of a linear family fitted anew to all of these pairs, and their number.
+def refitted(
+    candidate: Candidate, chunks: Iterable[Pairs], held: Pairs
+) -> tuple[Candidate, int, int, float]:
+    """A candidate of a linear family fitted anew to all of these pairs: it, their number, how many
+    were left out as wrong, and the error of the old one on the pairs held out.
 
-    chunks: pairs that need never be in memory together. held: those that judge it, as before.
+    chunks: pairs that need never be in memory together. held: those that judge it, which are left
+    out of the fit. A pair is wrong that the old candidate misses by many of its deviations.
     """
     map_ = candidate.map
     index = next(i for i, piece in enumerate(map_.pieces) if isinstance(piece, Generated))
     generated = map_.pieces[index]
     weight = _weight(generated.chart, np.asarray(generated.scale), map_.dt)
     as_seen = jax.jit(jax.vmap(map_.generated_pair))
-    count = 0
+    most = _WRONG * np.maximum(candidate.deviations, _ROUNDING * np.asarray(map_.scale))
+    judges, count, wrong = _as_keys(held.z0), 0, 0
 
-    def rows(pairs: Pairs):
-        y0, y1 = as_seen(jnp.asarray(pairs.z0), jnp.asarray(pairs.z1))
+    def rows(z0, z1):
+        y0, y1 = as_seen(jnp.asarray(z0), jnp.asarray(z1))
         return generated.chart.point(y0, y1), generated.chart.wanted(y0, y1, map_.dt)
 
-    def counted():
-        nonlocal count
-        for pairs in chunks:
-            count += len(pairs)
-            yield rows(pairs)
+    def kept():
+        nonlocal count, wrong
+        for z0, z1 in _of_length(((p.z0, p.z1) for p in chunks), _REFIT_PAIRS):
+            new = ~np.isin(_as_keys(z0), judges)
+            right = np.all(np.abs(_state_error(map_, z0, z1)[0]) <= most, axis=1)
+            count, wrong = count + int(np.sum(right)), wrong + int(np.sum(~right))
+            yield tuple(np.asarray(a)[new & right] for a in rows(z0, z1))
 
-    reduced = least_squares.reduce_chunks(generated.scalar, counted(), [rows(held)], weight)
+    # Blocks of one length: each length is compiled for.
+    length = min(_REFIT_PAIRS, least_squares.chunk_size(candidate.num_parameters, map_.dim))
+    reduced = least_squares.reduce_chunks(
+        generated.scalar, _of_length(kept(), length), [rows(held.z0, held.z1)], weight
+    )
+    if reduced.rows == 0:
+        return dataclasses.replace(candidate, validation_rms=np.inf), count, wrong, 0.0
     solved = least_squares.solve(reduced, candidate.num_parameters)
     generated = dataclasses.replace(
         generated, params=generated.scalar.unflatten(solved.coefficients)
     )
     pieces = (*map_.pieces[:index], generated, *map_.pieces[index + 1 :])
+    all_held = np.arange(len(held))
+    before = validation_error(map_, held, all_held).rms
     map_ = dataclasses.replace(map_, pieces=pieces)
-    error = validation_error(map_, held, np.arange(len(held)))
+    error = validation_error(map_, held, all_held)
     refit = dataclasses.replace(
         candidate, map=map_, validation_rms=error.rms, validation_bound=error.bound,
         deviations=error.deviations,
         train_rms=solved.train_rms, fit_seconds=candidate.fit_seconds + reduced.seconds,
     )  # fmt: skip
-    return refit, count
+    return refit, count, wrong, before
+
+
+def _of_length(blocks: Iterable[tuple], length: int) -> Iterator[tuple]:
+    """Blocks of arrays cut and joined anew, each of so many rows, the last of what is left."""
+    rest: tuple = ()
+    for block in blocks:
+        joined = [np.concatenate(parts) for parts in zip(rest, block)] if rest else block  # noqa: B905
+        whole = len(joined[0]) - len(joined[0]) % length
+        for first in range(0, whole, length):
+            yield tuple(a[first : first + length] for a in joined)
+        rest = tuple(a[whole:] for a in joined)
+    if rest and len(rest[0]):
+        yield rest
+
+
+def _as_keys(z) -> np.ndarray:
+    """The rows of z (N, 2d) as N things that can be compared."""
+    z = np.ascontiguousarray(z)
+    return z.view([("", z.dtype)] * z.shape[1]).ravel()
 
 
 def _determined(stages: Iterable[Iterable[Any]], rows: int) -> Iterator[list[Any]]:
@@ -373,12 +410,7 @@ class ValidationError(NamedTuple):
 
 def validation_error(map_: SymplecticMap, pairs: Pairs, rows) -> ValidationError:
     """How far the map is from the images of these rows of the pairs."""
-    z0, z1 = np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows]
-    predicted, info = map_.step(z0)
-    error = np.asarray(predicted) - z1
-    if map_.coordinates.forward is CARTESIAN.forward:
-        angles = list(map_.coordinates.angles)
-        error[:, angles] -= TWO_PI * np.round(error[:, angles] / TWO_PI)
+    error, info = _state_error(map_, np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows])
     deviations, square = np.sqrt(np.mean(error**2, axis=0)), np.mean(error**2, axis=1)
     iterations = np.asarray(info.iterations)
     if not np.isfinite(square).all() or (np.asarray(info.status) > LEFT_DOMAIN).any():
@@ -386,6 +418,16 @@ def validation_error(map_: SymplecticMap, pairs: Pairs, rows) -> ValidationError
     bound = square.mean() + _NORMAL_95 * square.std() / np.sqrt(len(square))
     rms = float(np.sqrt(square.mean()))
     return ValidationError(rms, float(np.sqrt(bound)), deviations, iterations)
+
+
+def _state_error(map_: SymplecticMap, z0, z1) -> tuple[np.ndarray, Info]:
+    """Z_predicted − Z (N, 2d), angles modulo 2π, and how the solves ended."""
+    predicted, info = map_.step(z0)
+    error = np.asarray(predicted) - z1
+    if map_.coordinates.forward is CARTESIAN.forward:
+        angles = list(map_.coordinates.angles)
+        error[:, angles] -= TWO_PI * np.round(error[:, angles] / TWO_PI)
+    return error, info
 
 
 def counted_work(family, iterations) -> float:
@@ -410,6 +452,7 @@ def timed(candidates: list[Candidate], chosen: Candidate, states) -> list[Candid
         if candidate.validation_rms < best:
             front.append(candidate)
             best = candidate.validation_rms
+    front = front or [chosen]  # where no candidate has an image of every state
     few = {id(front[i]) for i in np.linspace(0, len(front) - 1, _TIMED_FRONT).round().astype(int)}
     few.add(id(chosen))
     return [_measured(c, states) if id(c) in few else c for c in candidates]

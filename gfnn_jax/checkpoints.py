@@ -98,10 +98,7 @@ class TrainingCheckpoints:
             except Damaged as error:
                 warnings.warn(f"{error}: the checkpoint before it is used", stacklevel=2)
                 continue
-            if record["identity"] != self.identity:
-                keys = {**record["identity"], **self.identity}
-                other = [k for k in keys if record["identity"].get(k) != self.identity.get(k)]
-                raise InputError(f"{path}: belongs to another training ({', '.join(other)} differ)")
+            self._check(path, record)
             kinds = [leaf["kind"] for leaf in record["leaves"]]
             leaves, structure = jax.tree.flatten(tree)
             for leaf, kind, entry in zip(leaves, kinds, record["leaves"], strict=True):
@@ -115,6 +112,23 @@ class TrainingCheckpoints:
             ]
             return step, jax.tree.unflatten(structure, leaves)
         return None
+
+    def check(self) -> None:
+        """Raise InputError where the newest readable checkpoint is of another training."""
+        for step in reversed(self._steps()):
+            path = self._path(step)
+            try:
+                record = json.loads((path / _JSON).read_bytes())
+            except (OSError, ValueError):
+                continue
+            return self._check(path, record)
+
+    def _check(self, path: Path, record: dict[str, Any]) -> None:
+        identity = record.get("identity", {})
+        if identity != self.identity:
+            keys = {**identity, **self.identity}
+            other = [k for k in keys if identity.get(k) != self.identity.get(k)]
+            raise InputError(f"{path}: belongs to another training ({', '.join(other)} differ)")
 
     def _path(self, step: int) -> Path:
         return self.folder / f"step_{step:012d}"

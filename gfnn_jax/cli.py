@@ -163,6 +163,8 @@ def _count(text: str) -> int:
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"expected an integer > 0, got {text}")
+    if value >= 2**53:
+        raise argparse.ArgumentTypeError(f"expected an integer below 2**53, got {text}")
     return value
 
 
@@ -188,11 +190,12 @@ def _names(text: str) -> tuple[str, ...]:
 
 def _indices(text: str) -> tuple[int, ...]:
     parts = text.split(",")
-    if not all(part.strip().isdecimal() for part in parts) or len(set(parts)) < len(parts):
+    found = tuple(int(part) for part in parts if part.strip().isdecimal())
+    if len(set(found)) < len(parts):
         raise argparse.ArgumentTypeError(
             f"expected different whole numbers separated by commas, as 0,2; got '{text}'"
         )
-    return tuple(map(int, parts))
+    return found
 
 
 # The commands. The heavy imports are here, after the checks that need none of them.

@@ -44,8 +44,8 @@ _BENT, _OFF_PATH = 0.35, 0.05
 _STRAIGHT, _BEGIN = 0.01, 0.125
 # A residual of this many eps of the size of its terms is the floor: a few roundings of that size.
 _FLOOR_EPS = 4.0
-# Where one update is not enough, so many lanes of a batch, or this part of it, are visited at a time
-# for so many updates: the fewer, the less waits for the hardest, the more often all are looked at.
+# Where one update is not enough, this many lanes of a batch, or this part of it, are visited at a
+# time for so many updates: the fewer, the less waits for the hardest, the more often all are seen.
 _FEWEST, _PART, _VISIT = 32, 32, 2
 
 

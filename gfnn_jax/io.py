@@ -34,8 +34,8 @@ from gfnn_jax.errors import InputError
 
 # Times in text files carry few digits: relative agreement asked of time steps.
 TIME_TOLERANCE = 1e-5
-# A larger number overflows when squared, which every norm does.
-LARGEST = float(np.sqrt(np.finfo(np.float64).max))
+# A larger number overflows in the squares, products and sums of squares that a fit makes.
+LARGEST = 1e100
 # Rows read at a time when no chunk is asked for; 16k rows of four numbers are 6 MB as text.
 BLOCK_ROWS = 16_384
 
@@ -216,10 +216,10 @@ class _Block:
         )
 
     def checked(self, path) -> _Block:
-        """Itself, if every number is finite and can be squared; else InputError."""
+        """Itself, if every number is finite and not too large; else InputError."""
         for bad, what in (
             (~np.isfinite(self.states), "not finite (NaN or infinity)"),
-            (np.abs(self.states) > LARGEST, f"too large to be squared (above {LARGEST:.1e})"),
+            (np.abs(self.states) > LARGEST, f"too large (above {LARGEST:.0e})"),
         ):
             if bad.any():
                 row, column = (int(i) for i in np.argwhere(bad)[0])
@@ -638,7 +638,8 @@ def _csv_tables(path, stream, names: list[str], line_number: int):
         if not filled.any():
             continue
         try:
-            table = np.loadtxt(text, delimiter=",", comments=None, ndmin=2)
+            rows = [line for line in text if line.strip()]
+            table = np.loadtxt(rows, delimiter=",", comments=None, ndmin=2)
             if table.shape[1] != len(names):
                 raise ValueError
         except ValueError:
@@ -676,10 +677,21 @@ def _csv_dt(path, names: list[str], table: np.ndarray, lines: np.ndarray) -> flo
     return float(np.mean(steps))
 
 
+def _printed_unit(time: np.ndarray, dt: float) -> float:
+    """The unit of the last decimal that the times were printed with, where that is less than a
+    hundredth of dt; 0 where they have all their digits."""
+    for decimals in range(max(0, int(np.ceil(2 - np.log10(dt)))), 13):
+        if np.all(np.abs(time - np.round(time, decimals)) <= 1e-3 * 10.0**-decimals):
+            return 10.0**-decimals
+    return 0.0
+
+
 def _check_times(path, time: np.ndarray, sequence: np.ndarray, lines: np.ndarray, dt: float):
-    """Every step within a sequence is dt. ``time`` and ``sequence`` start one row before."""
+    """Every step within a sequence is dt, but for the rounding of printed times. ``time`` and
+    ``sequence`` start one row before."""
     step = np.diff(time)
     slack = TIME_TOLERANCE * dt + 4 * np.finfo(np.float64).eps * np.abs(time[1:])
+    slack = slack + _printed_unit(time[np.isfinite(time)], dt)
     # "not (... <= ...)" so that NaN counts as wrong.
     bad = np.flatnonzero((sequence[1:] == sequence[:-1]) & ~(np.abs(step - dt) <= slack))
     if len(bad):

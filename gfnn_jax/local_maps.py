@@ -21,8 +21,13 @@ _NEIGHBOURS_PER_TERM = 3
 # From so many pairs on the neighbourhoods keep their size: more pairs then average the noise away
 # instead of shrinking them below it.
 _LOCAL_ENOUGH, _MOST_NEIGHBOURS = 4_000, 1_000
+_FILLED = 0.03
+_SPANNED = 1e-8  # a smaller singular value of a local fit is a direction without neighbours
 # Neighbourhoods grow until noise leaves no more than this error in the Jacobian's entries.
 _SLOPE_ERROR = 0.05
+# Pairs are held not to be symplectic whose Jacobians are known well enough, as a part of their
+# distance from the identity, and miss by so many errors and by more than this part of it.
+_KNOWN, _ERRORS, _MISSED = 0.06, 3.0, 0.1
 # A pair is odd that its neighbours' fit misses by so many standard deviations.
 _ODD, _ODD_ROUNDS = 30.0, 5
 # A determinant this far from zero is safe; below the lower figure the chart folds inside the data.
@@ -46,8 +51,9 @@ class ChartJudgement(NamedTuple):
         return self.low > SINGULAR
 
 
-def local_jacobians(y0, y1, scale, *, seed: int = 0) -> np.ndarray:
-    """Jacobians of y0 -> y1 at up to 400 of the states: (n, 2d, 2d).
+def local_jacobians(y0, y1, scale, *, seed: int = 0) -> tuple[np.ndarray, float]:
+    """Jacobians of y0 -> y1 at up to 400 of the states, (n, 2d, 2d), and the error of their entries
+    in coordinates of unit size, infinite where most are not known in all directions.
 
     y0, y1: (N, 2d) with angles lifted; scale (2d,) makes the coordinates comparable. A local
     quadratic fit where there are pairs enough, else a local linear one; over more neighbours where
@@ -71,7 +77,7 @@ def local_jacobians(y0, y1, scale, *, seed: int = 0) -> np.ndarray:
         design = np.concatenate(columns, axis=-1)
         # The pseudo-inverse takes the map for the identity in what the neighbours do not span: a
         # thin tube of data, the torus of a single orbit.
-        inverse = np.linalg.pinv(design, rcond=1e-8)
+        inverse = np.linalg.pinv(design, rcond=_SPANNED)
         solution = inverse @ move[near]
         rest = move[near] - design @ solution
         noise = np.sqrt(np.sum(rest**2, axis=1) / max(1, count - terms))
@@ -81,7 +87,12 @@ def local_jacobians(y0, y1, scale, *, seed: int = 0) -> np.ndarray:
             break
         count = min(n, _MOST_NEIGHBOURS, 2 * count)
     slope = np.eye(width) + np.swapaxes(solution[:, 1 : 1 + width], 1, 2)
-    return slope * scale[:, None] / scale[None, :]
+    # How far neighbours reach in the direction where they differ least, apart from what the other
+    # columns tell of it: along a curve or a torus the rest of the map is anybody's guess.
+    reach = 1 / (np.sqrt(count) * spread.max(axis=1) * np.sqrt(np.mean(offset**2, axis=(1, 2))))
+    filled = (np.linalg.matrix_rank(design, rtol=_SPANNED) == terms) & (reach > _FILLED)
+    known = float(error + 0.5 * count * error**2) if np.mean(filled) > 0.5 else np.inf
+    return slope * scale[:, None] / scale[None, :], known
 
 
 def odd_pairs(y0, y1, scale) -> np.ndarray:
@@ -118,7 +129,7 @@ def _studentised(x, move):
         design = np.concatenate([np.ones((*offset.shape[:2], 1)), offset], axis=-1)
         moves, kept = move[near], np.ones(near.shape)
         for _ in range(2):  # the second time without the neighbour that fits worst: it may be odd
-            inverse = np.linalg.pinv(design * kept[..., None], rcond=1e-8)
+            inverse = np.linalg.pinv(design * kept[..., None], rcond=_SPANNED)
             solution = inverse @ (moves * kept[..., None])
             rest = np.sum((moves - design @ solution) ** 2, axis=-1) * kept
             deviation[block] = np.sqrt(rest.sum(axis=1) / (kept.sum(axis=1) - terms))
@@ -144,10 +155,22 @@ def judge_chart(chart: AnyChart, jacobians, scale) -> ChartJudgement:
 def data_defect(jacobians, scale) -> float:
     """Median over the data of ‖Mᵀ J M − J‖ (largest entry, coordinates of unit size).
 
-    Far below 1 for pairs of a symplectic map, up to the local fits' error; of order 1 where q and p
-    are swapped in one snapshot, where velocities stand for momenta, or where there is friction.
+    For pairs of a symplectic map that of the local fits' error.
     """
     return float(np.median(symplecticity_defect(jnp.asarray(jacobians), jnp.asarray(scale))))
+
+
+def look_symplectic(jacobians, error: float, scale) -> bool:
+    """Whether the pairs may be those of a symplectic map, as far as their local Jacobians tell.
+
+    Every map of a short step is close to the identity and so to a symplectic one: the defect is
+    held against M − 1, and against the Jacobians' own error. Columns in another order, velocities
+    for momenta or friction miss by a third of M − 1 or more.
+    """
+    move = np.abs(jacobians * scale[None, None, :] / scale[None, :, None] - np.eye(len(scale)))
+    size = float(np.median(move.max(axis=(1, 2))))
+    defect = data_defect(jacobians, scale)
+    return error > _KNOWN * size or defect < max(_ERRORS * error, _MISSED * size)
 
 
 def volume_change(z, residual) -> tuple[float, float]:

@@ -14,15 +14,18 @@ from typing import Any
 
 from gfnn_jax.errors import InputError, WorkError
 
-# What marks a folder as written by this package, so that --overwrite never deletes another.
+# What marks a folder as written by this package, and what else is in such a folder: --overwrite
+# never deletes another, nor a file that a user keeps in one.
 FOLDER_MARKS = ("model.json", "report.json")
+_OURS = (*FOLDER_MARKS, "SHA256SUMS", "arrays", "model", "*.png")
 
 
 def ensure_new(path, overwrite: bool = False, *, folder: bool = False) -> Path:
     """Check, before any work, that the file or folder ``path`` can be written. Writes nothing.
 
     Raises InputError where it exists and ``overwrite`` is off, where it is of the other kind, where
-    it is a folder that this package did not write, or where its parent cannot be written.
+    it is a folder that this package did not write or that holds anything else, where it is the
+    current folder or one above it, or where its parent cannot be written.
     """
     path = Path(path)
     try:
@@ -30,12 +33,23 @@ def ensure_new(path, overwrite: bool = False, *, folder: bool = False) -> Path:
             raise InputError(f"{path}: is a folder, expected a file to write")
         if path.exists() and folder and not path.is_dir():
             raise InputError(f"{path}: is a file, expected a folder to write")
+        if folder and path.resolve() in (here := Path.cwd(), *here.parents):
+            raise InputError(
+                f"{path}: is the folder you are in, or one above it: expected another to write"
+            )
         if path.exists() and not (folder and not any(path.iterdir())):
             if not overwrite:
                 raise InputError(f"{path}: exists already (--overwrite replaces it)")
             if folder and not any((path / mark).is_file() for mark in FOLDER_MARKS):
                 raise InputError(
                     f"{path}: is a folder without {' or '.join(FOLDER_MARKS)}; not overwritten"
+                )
+            others = sorted(
+                file.name for file in path.iterdir() if not any(map(file.match, _OURS))
+            ) if folder else []  # fmt: skip
+            if others:
+                raise InputError(
+                    f"{path}: holds {others[0]}, which this package did not write; not overwritten"
                 )
         parent = path.absolute().parent
         while not parent.exists():

@@ -22,7 +22,7 @@ from gfnn_jax import figures, metrics, models, report, scenes
 from gfnn_jax.candidates import Candidate
 from gfnn_jax.checkpoints import TrainingCheckpoints
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.errors import InputError
+from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.io import iterate_pairs, read_initial_states, read_sample, read_trajectories
 from gfnn_jax.maps import Lanes, SymplecticMap
 from gfnn_jax.outputs import atomic_folder, ensure_new, failures_as_work_errors
@@ -216,10 +216,11 @@ def _figures(fit: Fit, scene: Scene, measured: Measured, reference) -> dict[str,
     if measured.energy_error is not None:
         drawn["energy"] = figures.energy_error({"GFNN": (steps, measured.energy_error)})
     shown = [c for c in fit.candidates if np.isfinite(c.validation_rms)]
-    drawn["candidates"] = figures.speed_against_error(
-        [c.work / 1e3 for c in shown], [c.validation_rms for c in shown],
-        [_labelled(c) for c in shown], shown.index(fit.chosen), fit.tolerance,
-    )  # fmt: skip
+    if fit.chosen in shown:
+        drawn["candidates"] = figures.speed_against_error(
+            [c.work / 1e3 for c in shown], [c.validation_rms for c in shown],
+            [_labelled(c) for c in shown], shown.index(fit.chosen), fit.tolerance,
+        )  # fmt: skip
     if scene.name == "two-body":
         errors = [
             metrics.absolute_error(element(predicted), element(reference))
@@ -293,7 +294,6 @@ def fit(
         )  # fmt: skip
         if large and scalar != "mlp":
             say("all pairs of the file, for the chosen candidate")
-            # Among millions of pairs those that judge a thousand terms need not be left out.
             held = trajectories.pairs().take(slice(_HELD))
             chosen = refit(chosen, iterate_pairs(data, _FIT_CHUNK, dt=dt), held)
         result = report.assemble(
@@ -325,6 +325,8 @@ def _fit(pairs: Pairs, scene, *, angles, iterations, say, **options) -> Fit:
         return select(pairs, scene, angles=angles, on_progress=say, **options)
     except FitError as error:
         raise InputError(str(error)) from error
+    except (np.linalg.LinAlgError, jax.errors.JaxRuntimeError) as error:  # out of memory too
+        raise WorkError(f"the fit failed: {str(error).splitlines()[0]}") from error
 
 
 def _record(result: dict[str, Any]) -> dict[str, Any]:
@@ -362,7 +364,9 @@ def _unfinished(
                 f"{folder}: an unfinished fit (--resume goes on with it, --overwrite discards it)"
             )
         _discard(folder)
-    yield TrainingCheckpoints(folder, job)
+    checkpoints = TrainingCheckpoints(folder, job)
+    checkpoints.check()
+    yield checkpoints
     _discard(folder)
 
 

@@ -89,6 +89,8 @@ class PredictionWriter:
             raise InputError(f"{out}: a prediction is written as .npz")
         self.finished = False
         if resume and self._journal.exists() and self._read_journal():
+            if not self._is_done():  # what stands there is another's
+                ensure_new(self.out, overwrite)
             return
         if resume and not overwrite and self._is_done():
             self.finished, self.saved = True, self.total

@@ -47,11 +47,14 @@ class Prepared:
 
 def prepare(pairs: Pairs, coordinates: Coordinates) -> Prepared:
     forward = jax.jit(jax.vmap(coordinates.forward))
-    y0, y1, centres, covered = lift(
-        forward(jnp.asarray(pairs.z0, jnp.float64)),
-        forward(jnp.asarray(pairs.z1, jnp.float64)),
-        coordinates,
-    )
+    inner = [forward(jnp.asarray(z, jnp.float64)) for z in (pairs.z0, pairs.z1)]
+    known = np.all([np.isfinite(np.asarray(y)).all(axis=1) for y in inner], axis=0)
+    if not known.all():
+        raise FitError(
+            f"expected states that have {coordinates.name} coordinates, got "
+            f"{int((~known).sum())} pairs without, the first is row {int(np.argmin(known))}"
+        )
+    y0, y1, centres, covered = lift(*inner, coordinates)
     whole = tuple(i for i, c in zip(coordinates.angles, covered, strict=True) if c)
     scale = sizes(y0)
     return Prepared(

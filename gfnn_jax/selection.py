@@ -27,6 +27,7 @@ from gfnn_jax.local_maps import (
     data_defect,
     judge_chart,
     local_jacobians,
+    look_symplectic,
     odd_pairs,
     volume_change,
 )
@@ -49,6 +50,7 @@ _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not n
 _WORTHWHILE, _STALLED = 0.8, 3
 # So often another ladder may be better before this one is left.
 _BEATEN = 3
+_NO_WORSE = 1.1  # a refit whose error is larger by this factor than that of its sample is not kept
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,6 +138,7 @@ def fit(
         messages.append(message)
         warnings.warn(message, FitWarning, stacklevel=3)
 
+    pairs = _distinct(pairs, warn)
     if scene is not None and scene.features is not None and scalar in ("auto", "features"):
         _compare_sizes(pairs, scene, warn)
     on_progress("looking at the map's local Jacobians")
@@ -152,12 +155,13 @@ def fit(
             pairs = pairs.take(np.setdiff1d(np.arange(len(pairs)), odd))
             prepared = prepare(pairs, coordinates)
     training, held_out = _split(pairs, seed)
-    jacobians = local_jacobians(prepared.y0, prepared.y1, prepared.scale, seed=seed)
+    jacobians, error = local_jacobians(prepared.y0, prepared.y1, prepared.scale, seed=seed)
     defect = data_defect(jacobians, prepared.scale)
-    if defect > 0.3:
+    if not look_symplectic(jacobians, error, prepared.scale):
         warn(
-            f"the pairs do not look symplectic: ‖MᵀJM − J‖ is about {defect:.2g} (0 for a "
-            "symplectic map): are q and p in order, p momenta and not velocities, and no friction?"
+            f"the pairs do not look symplectic: ‖MᵀJM − J‖ is about {defect:.2g}, known to within "
+            f"{error:.1g} (0 for a symplectic map): are q and p in order, p momenta and not "
+            "velocities, and no friction?"
         )
     judgements = {name: judge_chart(c, jacobians, prepared.scale) for name, c in CHARTS.items()}
     charts, half, judgements = choose_charts(
@@ -181,10 +185,7 @@ def fit(
         )
     chosen = _choose(candidates, tolerance)
     if chosen.validation_bound > tolerance:
-        warn(
-            f"no candidate meets the tolerance {tolerance:g}: the most accurate has a one-step "
-            f"error of {chosen.validation_rms:.2e} (95 % bound {chosen.validation_bound:.2e})"
-        )
+        warn(_not_met(chosen, tolerance))
     noise = None
     if (chosen.chart, chosen.scalar) in stalled and chosen.relative_rms > _ROUNDOFF:
         # Noise of both states enters the difference: σ √2 for a map near the identity. The fit
@@ -229,15 +230,45 @@ def fit(
     )
 
 
+def _not_met(chosen: Candidate, tolerance: float) -> str:
+    found = (
+        f"has a one-step error of {chosen.validation_rms:.2e} "
+        f"(95 % bound {chosen.validation_bound:.2e})"
+        if np.isfinite(chosen.validation_rms)
+        else "leaves held-out states without an image (its step does not converge there)"
+    )
+    return f"no candidate meets the tolerance {tolerance:g}: the most accurate {found}"
+
+
 def refit(fitted: Fit, chunks: Iterable[Pairs], held: Pairs) -> Fit:
     """The chosen map of a fit, fitted anew to more pairs than fit into memory.
 
-    fitted: of a sample of them, by a linear family. chunks: all of the pairs. held: pairs (of the
-    sample, held out or new) that choose the ridge and judge the result. Charts, domain, noise and
-    messages remain those that the sample gave.
+    fitted: of a sample of them, by a linear family. chunks: all of the pairs. held: pairs that
+    choose the ridge and judge the result; they are left out of the fit, as is what the sample's map
+    misses by far. Charts, domain and noise remain those that the sample gave, and so does the map
+    where all pairs give a worse one. Warns (FitWarning) of both, and where the tolerance is missed.
     """
     started = time.perf_counter()
-    chosen, num_pairs = refitted(fitted.chosen, chunks, held)
+    messages = [m for m in fitted.messages if m != _not_met(fitted.chosen, fitted.tolerance)]
+
+    def warn(message: str) -> None:
+        messages.append(message)
+        warnings.warn(message, FitWarning, stacklevel=3)
+
+    chosen, num_pairs, wrong, before = refitted(fitted.chosen, chunks, held)
+    if wrong:
+        warn(
+            f"{wrong} of {num_pairs + wrong} pairs are far from what the others tell: taken for "
+            "wrong, they are left out"
+        )
+    if not chosen.validation_rms <= _NO_WORSE * before:
+        warn(
+            f"all {num_pairs} pairs give a worse map ({chosen.validation_rms:.2e} on those held "
+            f"out) than the sample ({before:.2e}), whose map is kept"
+        )
+        chosen, num_pairs = fitted.chosen, fitted.num_pairs
+    if chosen.validation_bound > fitted.tolerance:
+        warn(_not_met(chosen, fitted.tolerance))
     candidates = tuple(chosen if c.chosen else c for c in fitted.candidates)
     test = np.asarray(held.z0)[:_JUDGED]
     return dataclasses.replace(
@@ -248,6 +279,7 @@ def refit(fitted: Fit, chunks: Iterable[Pairs], held: Pairs) -> Fit:
         symplecticity_defect=float(jnp.max(chosen.map.defect(test))),
         model_determinant_min=_smallest(chosen.map.determinant(test)),
         seconds=fitted.seconds + time.perf_counter() - started,
+        messages=tuple(messages),
     )
 
 
@@ -267,8 +299,12 @@ def _check_request(pairs, scene, tolerance, chart, scalar, angles) -> None:
     if scene is not None and angles:
         raise FitError("angles come with the scene: give a scene or angles, not both")
     bad = [a for a in angles if not 0 <= a < 2 * pairs.dim]
-    if bad:
-        raise FitError(f"expected angles among 0..{2 * pairs.dim - 1}, got {bad[0]}")
+    if bad or len(set(angles)) < len(angles):
+        raise FitError(
+            f"expected different angles among 0..{2 * pairs.dim - 1}, got {tuple(angles)}"
+        )
+    if not 0 < float(pairs.dt) < np.inf:
+        raise FitError(f"expected a time step that is finite and above 0, got {pairs.dt}")
     if scalar == "features" and (scene is None or scene.features is None):
         raise FitError("scalar 'features' needs a scene that declares features")
     for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):
@@ -278,9 +314,14 @@ def _check_request(pairs, scene, tolerance, chart, scalar, angles) -> None:
                 f"expected finite states, got {int((~finite).sum())} rows of {name} with NaN or "
                 f"infinity, the first is row {int(np.argmin(finite))}"
             )
+    _check_number(pairs)
+
+
+def _check_number(pairs: Pairs) -> None:
     if len(pairs) < 8 * pairs.dim:
         raise FitError(
-            f"expected at least {8 * pairs.dim} pairs for d = {pairs.dim}, got {len(pairs)}"
+            f"expected at least {8 * pairs.dim} different pairs for d = {pairs.dim}, "
+            f"got {len(pairs)}"
         )
 
 
@@ -301,6 +342,19 @@ def _compare_sizes(pairs: Pairs, scene: Scene, warn) -> None:
                 f"the {name} are {size / usual:.2g} times the size of those in the scene "
                 f"{scene.name}, whose features assume its own units: are the data in these?"
             )
+
+
+def _distinct(pairs: Pairs, warn) -> Pairs:
+    """Every pair once, in its place: held-out copies of training pairs would judge nothing."""
+    rows = np.concatenate([np.asarray(pairs.z0), np.asarray(pairs.z1)], axis=1)
+    first = np.sort(np.unique(rows, axis=0, return_index=True)[1])
+    copies = len(pairs) - len(first)
+    if copies == 0:
+        return pairs
+    warn(f"{copies} of {len(pairs)} pairs are copies of others: each is counted once")
+    pairs = pairs.take(first)
+    _check_number(pairs)
+    return pairs
 
 
 def _split(pairs: Pairs, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -396,7 +450,7 @@ def _choose(candidates: list[Candidate], tolerance: float) -> Candidate:
     meeting = [c for c in candidates if c.validation_bound <= tolerance]
     if meeting:
         return min(meeting, key=lambda c: c.work)
-    return min(candidates, key=lambda c: c.relative_rms)
+    return min(candidates, key=lambda c: (c.relative_rms, c.train_rms))
 
 
 def _generated(map_: SymplecticMap, y0) -> np.ndarray:

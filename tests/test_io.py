@@ -97,7 +97,7 @@ def test_sequences_of_any_length(tmp_path, lengths, dim, chunk, dtype, compresse
     assert np.array_equal(np.concatenate([c.z1 for c in chunks]), pairs.z1)
 
 
-FINITE = st.floats(-1e150, 1e150)
+FINITE = st.floats(-io.LARGEST, io.LARGEST)
 
 
 @QUICK
@@ -141,6 +141,17 @@ def test_csv_headers(tmp_path):
     path = csv(tmp_path / "e.csv", "q1,q2,p1,p2,energy", np.column_stack([Z, Z[:, 0]]))
     with pytest.warns(DataWarning, match="ignored: energy"):
         assert np.array_equal(io.read_trajectories(path, dt=0.5).states, Z)
+
+
+@pytest.mark.parametrize("digits", [4, 5, 9])
+def test_printed_times_are_rounded(tmp_path, digits):
+    """Steps of 1/3 differ by a unit of the last decimal, and a line of spaces is none."""
+    lines = [f"{i / 3:.{digits}f}," + ",".join(map(repr, row)) for i, row in enumerate(Z.tolist())]
+    path = tmp_path / "t.csv"
+    path.write_text("t,q1,q2,p1,p2\n" + "\n".join([*lines[:9], "   ", *lines[9:]]) + "\n")
+    data = io.read_trajectories(path)
+    assert abs(data.dt - 1 / 3) < 10.0**-digits
+    np.testing.assert_array_equal(data.pairs().z0, Z[:-1])
 
 
 def test_initial_states(tmp_path):
@@ -320,7 +331,7 @@ BAD_FILES = {
         npz(trajectories=bad(np.nan, 7)[None], dt=0.1),
         "trajectories[0, 7, 1]",
     ),
-    "huge value": (npz(z0=bad(1e200), z1=Z, dt=0.1), "too large to be squared"),
+    "huge value": (npz(z0=bad(1e200), z1=Z, dt=0.1), "too large (above 1e+100)"),
     "empty arrays": (npz(z0=Z[:0], z1=Z[:0], dt=0.1), "0 pairs"),
     "no sequences": (npz(trajectories=Z[None][:0], dt=0.1), "0 pairs"),
     "one pair": (npz(z0=Z[:1], z1=Z[1:2], dt=0.1), "1 pair of consecutive states"),

@@ -67,12 +67,61 @@ def test_all_pairs_fit_better_than_the_sample(file, tmp_path, monkeypatch):
     assert error(ran.fit.map) < 0.6 * error(sample.map)
 
 
+@pytest.fixture(scope="module")
+def sampled(file):
+    """Pairs of a file, those held out, and a fit of a sample of the others."""
+    pairs = read_trajectories(file).pairs()
+    scene = gfnn.scenes.make("standard-map-regular")
+    few = pairs.take(slice(200, 500))
+    return pairs, pairs.take(slice(200)), selection.fit(few, scene, tolerance=1e-3, chart="type2")
+
+
+def moved(fit, pairs):
+    return np.asarray(fit.map.step(pairs.z0)[0])
+
+
+def test_wrong_pairs_are_left_out_of_a_refit(sampled):
+    pairs, held, fit = sampled
+    z1 = np.array(pairs.z1)
+    z1[[700, 2_500]] += [[0.0, 1e3], [np.pi, 0.0]]
+    clean = pairs.take(np.delete(np.arange(3_000), [700, 2_500]))
+    with pytest.warns(gfnn.FitWarning, match="2 of 3000 pairs are far from what the others tell"):
+        refit = selection.refit(fit, [gfnn.Pairs(pairs.z0, z1, 1.0)], held)
+    assert refit.num_pairs == 2_998
+    np.testing.assert_allclose(
+        moved(refit, held), moved(selection.refit(fit, [clean], held), held), rtol=0, atol=1e-12
+    )
+
+
+def test_those_held_out_have_no_part_in_a_refit(sampled):
+    pairs, held, fit = sampled
+    others = pairs.take(slice(200, None))
+    np.testing.assert_array_equal(
+        moved(selection.refit(fit, [pairs], held), held),
+        moved(selection.refit(fit, [others], held), held),
+    )
+
+
+@pytest.mark.parametrize("kick", [5e-4, 1e3])
+def test_a_worse_refit_is_not_kept(sampled, kick):
+    """Pairs of another map: close enough to be believed, or so far that nothing is left."""
+    pairs, held, fit = sampled
+    others = pairs.take(slice(200, None))
+    other = gfnn.Pairs(others.z0, others.z1 + np.array([0.0, kick]), 1.0)
+    with pytest.warns(gfnn.FitWarning, match="whose map is kept"):
+        refit = selection.refit(fit, [other], held)
+    np.testing.assert_array_equal(moved(refit, held), moved(fit, held))
+    assert refit.num_pairs == fit.num_pairs
+    assert any("whose map is kept" in message for message in refit.messages)
+
+
 def test_refitting_to_the_same_pairs_in_chunks_changes_nothing(file):
     scene = gfnn.scenes.make("standard-map-regular")
     pairs = read_trajectories(file).pairs()
     fit = selection.fit(pairs, scene, tolerance=1e-3, chart="type2")
-    once = selection.refit(fit, [pairs], pairs)
-    chunked = selection.refit(fit, iterate_pairs(file, 700), pairs)
+    held = pairs.take(slice(200))
+    once = selection.refit(fit, [pairs], held)
+    chunked = selection.refit(fit, iterate_pairs(file, 700), held)
     assert chunked.num_pairs == once.num_pairs == 3_000
     np.testing.assert_allclose(
         chunked.map.step(pairs.z0)[0], once.map.step(pairs.z0)[0], rtol=0, atol=1e-12

@@ -12,6 +12,9 @@ def test_ensure_new(tmp_path):
     (tmp_path / "other" / "thesis.tex").write_text("kept")
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "model.json").write_text("{}")
+    (tmp_path / "mixed" / "model").mkdir(parents=True)
+    (tmp_path / "mixed" / "report.json").write_text("{}")
+    (tmp_path / "mixed" / "data.npz").write_text("kept")
     (tmp_path / "empty").mkdir()
     for name, overwrite, folder, message in [
         ("file", False, False, "exists already"),
@@ -19,6 +22,7 @@ def test_ensure_new(tmp_path):
         ("model", False, True, "exists already"),
         ("model", True, False, "expected a file"),
         ("other", True, True, "not overwritten"),
+        ("mixed", True, True, "holds data.npz"),
         ("file/below", False, False, "not a folder|Not a directory"),
     ]:
         with pytest.raises(InputError, match=message):
@@ -33,6 +37,14 @@ def test_ensure_new(tmp_path):
         assert outputs.ensure_new(tmp_path / name, overwrite, folder=folder) == tmp_path / name
     assert not (tmp_path / "deep").exists()
     assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_the_current_folder_cannot_be_exchanged(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for name in (".", "..", tmp_path, "../here"):
+        with pytest.raises(InputError, match="the folder you are in"):
+            outputs.ensure_new(name, True, folder=True)
 
 
 def test_ensure_new_without_permission(tmp_path, monkeypatch):

@@ -129,6 +129,16 @@ def test_damaged_journal(tmp_path, whole, cut):
         assert complete(out, resume=True, overwrite=True) == whole
 
 
+def test_resuming_replaces_no_other_file(tmp_path):
+    out = tmp_path / "p.npz"
+    append(writer(out), 6)
+    out.write_bytes(b"another's")
+    with pytest.raises(InputError, match="exists already"):
+        writer(out, resume=True)
+    assert out.read_bytes() == b"another's"
+    assert writer(out, resume=True, overwrite=True).saved == 6
+
+
 def test_killed_at_the_very_end(tmp_path, whole):
     """The output is there and its chunks are half removed: nothing is left to do but tidy up."""
     out = tmp_path / "whole.npz"

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax import selection
+from gfnn_jax import candidates, selection
+from gfnn_jax.local_maps import local_jacobians, look_symplectic
+from gfnn_jax.preparation import prepare
 from gfnn_jax.scenes import DrawnFrom, Scene, henon_heiles
 from gfnn_jax.scenes.two_body import angular_momentum
 
@@ -80,7 +82,7 @@ def long_steps():
         ({"angles": (2,)}, "angles among 0..1"),
         ({"scene": "two-body"}, "has dim 2, the pairs have 1"),
         ({"scene": "standard-map-regular", "angles": (0,)}, "a scene or angles"),
-        ({"rows": 5}, "at least 8 pairs"),
+        ({"rows": 5}, "at least 8 different pairs"),
         ({"nan": True}, "row 3"),
         ({"cut": True}, "of one shape"),
         ({"angles": (0,), "chart": "type1"}, "no meaning for angles"),
@@ -129,6 +131,72 @@ def test_friction_is_noticed():
     damped = gfnn.Pairs(z, pendulum(z) * np.array([[1.0, 0.5]]), 0.4)
     with pytest.warns(gfnn.FitWarning, match="do not look symplectic"):
         gfnn.fit(damped, tolerance=1.0)
+
+
+@pytest.mark.parametrize("wrong", ["columns", "friction"])
+def test_what_is_not_symplectic_is_noticed_at_short_steps(wrong):
+    """A short step is close to the identity whatever it does."""
+    scene = gfnn.scenes.make("henon-heiles-regular", 0.02)
+    pairs = gfnn.sample_pairs(scene, 1_000, jax.random.key(0))
+    if wrong == "columns":
+        z0, z1 = (np.asarray(z)[:, [0, 2, 1, 3]] for z in (pairs.z0, pairs.z1))
+    else:
+        z0, z1 = pairs.z0, pairs.z1 * np.exp([0, 0, -0.2 * 0.02, -0.2 * 0.02])[None, :]
+
+    def told(z0, z1):
+        prepared = prepare(gfnn.Pairs(z0, z1, 0.02), scene.coordinates)
+        jacobians, error = local_jacobians(prepared.y0, prepared.y1, prepared.scale)
+        return not look_symplectic(jacobians, error, prepared.scale)
+
+    assert told(z0, z1)
+    assert not told(pairs.z0, pairs.z1)
+
+
+def test_copies_of_a_pair_judge_nothing():
+    """Seven pairs, however often written down, are seven."""
+    few = pendulum_pairs(7)
+    many = gfnn.Pairs(np.tile(few.z0, (40, 1)), np.tile(few.z1, (40, 1)), 0.4)
+    with (
+        pytest.raises(gfnn.FitError, match="at least 8 different pairs"),
+        pytest.warns(gfnn.FitWarning, match="273 of 280 pairs are copies"),
+    ):
+        gfnn.fit(many)
+
+
+def test_a_map_without_all_images_is_still_given(monkeypatch):
+    """The most accurate there is, with a warning, even where no candidate could be judged."""
+
+    def failing(map_, pairs, rows):
+        return candidates.ValidationError(np.inf, np.inf, np.full(2, np.inf), np.ones(len(rows)))
+
+    monkeypatch.setattr(candidates, "validation_error", failing)
+    with pytest.warns(gfnn.FitWarning, match="leaves held-out states without an image"):
+        fit = gfnn.fit(pendulum_pairs(60), chart="midpoint", scalar="polynomial")
+    assert not fit.met
+    assert fit.chosen.train_rms == min(c.train_rms for c in fit.candidates)
+
+
+@pytest.mark.parametrize(
+    ("dt", "angles", "message"),
+    [
+        (0.0, (), "time step"), (np.nan, (), "time step"), (-0.4, (), "time step"),
+        (0.4, (0, 0), "different angles"), (0.4, (2,), "among 0..1, got .2,."),
+    ],
+)  # fmt: skip
+def test_bad_requests_are_refused(dt, angles, message):
+    z = disc(60)
+    with pytest.raises(gfnn.FitError, match=message):
+        gfnn.fit(gfnn.Pairs(z, pendulum(z), dt), angles=angles)
+
+
+def test_states_without_coordinates_are_refused():
+    """The body at the centre has no polar angle."""
+    scene = gfnn.scenes.two_body()
+    pairs = gfnn.sample_pairs(scene, 40, jax.random.key(0))
+    z0 = np.array(pairs.z0)
+    z0[7, :2] = 0.0
+    with pytest.raises(gfnn.FitError, match="1 pairs without, the first is row 7"):
+        gfnn.fit(gfnn.Pairs(z0, pairs.z1, pairs.dt), scene)
 
 
 @pytest.mark.parametrize(
