@@ -242,6 +242,60 @@ def test_the_one_update_that_is_allowed_is_kept():
     assert info.status[0] == NOT_CONVERGED
 
 
+@equation
+def folded(theta, x):
+    return x + 8.0 * jnp.sin(x) - theta
+
+
+def hard_and_easy(count, seed=0):
+    """A few lanes far from their roots or without any way to one, among many at theirs."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-20, 20, (count, 1))
+    guess = x + np.where(rng.uniform(size=(count, 1)) < 0.3, rng.uniform(-3, 3, (count, 1)), 1e-9)
+    theta = x + 8.0 * np.sin(x)
+    theta[::50] = np.nan
+    return jnp.asarray(theta), jnp.asarray(guess)
+
+
+@pytest.mark.parametrize("count", [1, 32, 33, 500, 3_000])
+def test_lanes_that_are_taken_out_of_a_batch_end_as_they_do_alone(count):
+    """Of a batch only those visit the loop that need to, some at a time: none is forgotten, mixed
+    up, or led elsewhere. The oracle is the loop in which all wait for the last."""
+    theta, guess = hard_and_easy(count)
+    waiting = jax.jit(jax.vmap(lambda t, x: iterate(folded, t, x, most=40)))(theta, guess)
+    found = solved(folded, theta, guess)
+    jax.tree.map(np.testing.assert_array_equal, found, waiting)
+    status = np.asarray(found[2].status)
+    assert status[0] == NON_FINITE
+    if count > 100:
+        assert {OK, NOT_CONVERGED, NON_FINITE} == set(status.tolist())
+
+
+def test_batches_of_batches_and_their_derivatives():
+    """Lanes with their own θ or a common one, in two axes, in reverse and in forward mode."""
+    theta, guess = hard_and_easy(300)
+    theta = jnp.where(jnp.isnan(theta), 0.0, theta)
+
+    def root_of(scale, t, x):
+        x, _, info = root(stretched, (scale, t), x, 40)
+        return jnp.where(info.status == OK, x[0], 0.0)
+
+    @equation
+    def stretched(theta, x):
+        scale, t = theta
+        return scale * x + 8.0 * jnp.sin(x) - t
+
+    scales = jnp.array([0.9, 1.0, 1.1])
+    both = jax.vmap(jax.vmap(root_of, (None, 0, 0)), (0, None, None))
+    single = jnp.stack([jax.vmap(root_of, (None, 0, 0))(s, theta, guess) for s in scales])
+    np.testing.assert_allclose(jax.jit(both)(scales, theta, guess), single, rtol=1e-14)
+    total = lambda s: jnp.sum(both(s, theta, guess))  # noqa: E731
+    slope = jax.jit(jax.grad(total))(scales)
+    expected = -single / (scales[:, None] + 8.0 * jnp.cos(single))
+    np.testing.assert_allclose(slope, expected.sum(axis=1), rtol=1e-9)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(total))(scales), slope, rtol=1e-12)
+
+
 # Rough generating functions: whatever S and the state are, "ok" means solved.
 
 
