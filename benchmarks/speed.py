@@ -272,7 +272,8 @@ def startup(quick: bool) -> Numbers:
 
 
 def scaling(quick: bool) -> Numbers:
-    """Seconds against pairs, terms, degrees of freedom and trajectories, with fitted slopes."""
+    """Seconds against pairs, terms, degrees of freedom, trajectories and steps, memory against
+    pairs, with fitted slopes."""
     rng = np.random.default_rng(SEED)
 
     def polynomial(dim, degree):
@@ -304,6 +305,16 @@ def scaling(quick: bool) -> Numbers:
         run = jax.jit(jax.vmap(lane))
         return best(lambda: run(z), 3) / num_steps
 
+    scene = gfnn.scenes.make("henon-heiles-regular")
+
+    def selection_seconds(num_pairs):
+        pairs = gfnn.sample_pairs(scene, num_pairs, jax.random.key(SEED))
+        gfnn.fit(pairs, scene, tolerance=1e-6)  # compiles
+        return gfnn.fit(pairs, scene, tolerance=1e-6)
+
+    def rollout_seconds(map_, z0, num_steps):
+        return best(lambda: map_.rollout(z0, num_steps, save_every=num_steps)[0], 2)
+
     sizes = (1_000, 10_000) if quick else (1_000, 10_000, 100_000, 1_000_000)
     degrees = (3, 5) if quick else (3, 4, 5, 6, 7, 8)
     lanes = (1, 100, 1_000) if quick else (1, 10, 100, 1_000, 10_000, 100_000)
@@ -312,18 +323,41 @@ def scaling(quick: bool) -> Numbers:
     terms_rows = [(terms, s) for s, terms in (timed_fit(4_000, d) for d in degrees)]
     lane_rows = [(n, step_seconds(2, n)) for n in lanes]
     dim_rows = [(d, step_seconds(d, 1_000)) for d in dims]
+    fits = [(n, selection_seconds(n)) for n in sizes[:3]]
+    z0 = gfnn.sample_test_states(scene, 100, jax.random.key(SEED))
+    lengths = (100, 1_000) if quick else (100, 1_000, 10_000, 100_000)
+    length_rows = [(n, rollout_seconds(fits[0][1].map, z0, n)) for n in lengths]
     return {
         "fit seconds against pairs": described(pairs_rows),
         "fit seconds against terms": described(terms_rows),
         "step seconds against trajectories": described(lane_rows),
         "step seconds of 1,000 trajectories against d": described(dim_rows),
+        "selection seconds against pairs": described([(n, f.seconds) for n, f in fits]),
+        "rollout seconds of 100 trajectories against steps": described(length_rows),
+        "peak GB of a fit of 69 terms against pairs": described([(n, peak(n)) for n in sizes]),
     }
 
 
+def peak(num_pairs: int) -> float:
+    """Peak memory of a process that fits a polynomial of degree 4 to so many pairs, in GB."""
+    script = f"""
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+from gfnn_jax.fitting import least_squares
+from gfnn_jax.scalars.inputs import box_inputs
+from gfnn_jax.scalars.products import Products
+w = np.random.default_rng(0).uniform(-1, 1, ({num_pairs}, 4))
+least_squares.fit(Products(box_inputs(w[:64]), 4), (w, w), (w[:100], w[:100]), np.ones(4))
+print(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1])
+"""
+    out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return int(out.stdout) / 2**20
+
+
 def described(rows: list[tuple[int, float]]) -> Numbers:
-    size, seconds = np.array(rows).T
-    slope = float(np.polyfit(np.log(size[-3:]), np.log(seconds[-3:]), 1)[0])
-    return {"size": size.tolist(), "seconds": seconds.tolist(), "slope_of_largest": slope}
+    size, measured = np.array(rows).T
+    slope = float(np.polyfit(np.log(size[-3:]), np.log(measured[-3:]), 1)[0])
+    return {"size": size.tolist(), "measured": measured.tolist(), "slope_of_largest": slope}
 
 
 PIECES = {"step": step, "training": training, "startup": startup, "scaling": scaling}
@@ -399,11 +433,11 @@ def tables() -> None:
         lines += [f"| `{name}` | {number(value)} |" for name, value in m.items()]
         parts.append("### The start\n\n" + "\n".join(lines))
     if "scaling" in found:
-        lines = ["| | sizes | seconds | slope of the largest three |", "|---|---|---|---|"]
+        lines = ["| | sizes | measured | slope of the largest three |", "|---|---|---|---|"]
         for name, m in found["scaling"]["measured"].items():
             lines.append(
                 f"| {name} | {', '.join(number(int(s)) for s in m['size'])} | "
-                f"{', '.join(number(s) for s in m['seconds'])} | {number(m['slope_of_largest'])} |"
+                f"{', '.join(number(s) for s in m['measured'])} | {number(m['slope_of_largest'])} |"
             )
         parts.append("### Growth with the size\n\n" + "\n".join(lines))
     if found:
