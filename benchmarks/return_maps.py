@@ -610,6 +610,10 @@ def section_text(measured: Numbers) -> str:
     )
 
 
+def counted(periods: int) -> str:
+    return f"{periods} period" + "s" * (periods > 1)
+
+
 def pendulum_text(found: dict[int, Numbers]) -> str:
     rows = [
         [str(n), *row(measured, ours, "error_1")] for n, measured in found.items()
@@ -617,7 +621,7 @@ def pendulum_text(found: dict[int, Numbers]) -> str:
     ]  # fmt: skip
     first = next(iter(found.values()))
     refused = [
-        f"{n} periods: {m['refused']}. There the maps of a part are taken several times.\n\n"
+        f"{counted(n)}: {m['refused']}. There the maps of a part are taken several times.\n\n"
         for n, m in found.items() if m["refused"]
     ]  # fmt: skip
     return (
@@ -628,7 +632,7 @@ def pendulum_text(found: dict[int, Numbers]) -> str:
         f"Where the ratio to the fastest integrator passes {WANTED:g}, one lane: "
         f"{passes(found, 'single')}. Lanes: {passes(found, 'batch')}.\n\n"
         + "\n".join(
-            f"![Error against time, {n} periods](figures/return_maps_pendulum_{n}.png)"
+            f"![Error against time, {counted(n)}](figures/return_maps_pendulum_{n}.png)"
             for n in found
         )
     )
@@ -662,7 +666,9 @@ def draw_curves(measured: Numbers, key: str, arrangement: str, name: str) -> Non
     }  # fmt: skip
     ours = measured["maps"]
     curves = {"learned maps": ([m[arrangement] for m in ours], [m[key] for m in ours]), **curves}
-    axes: Any = figures.work_precision(curves, "error after one iteration")
+    axes: Any = figures.work_precision(
+        curves, "error after one iteration", "time per iteration of one trajectory (µs)"
+    )
     figures.save(axes.figure, FIGURES / f"return_maps_{name}.png")
 
 
@@ -679,7 +685,12 @@ def tables() -> None:
         parts.append(pendulum_text(pendulums))
     if "iterations" in found:
         for name, m in found["iterations"].items():
-            points = {"reference": m["points"]["reference"], "learned map": m["points"]["map"]}
+            points = {}
+            for title, key, most in (("reference", "reference", "reference_iterations"),
+                                     ("learned map", "map", "iterations")):  # fmt: skip
+                shown = m["points"][key]
+                every = m[most] * m["reference_lanes"] // len(shown[0])
+                points[f"{title}, every {every:,}th of {m[most]:,}"] = shown
             labels = ("$y$", "$p_y$") if "section" in name else ("$q$", "$p$")
             panels = {n: (np.array(x), np.array(y)) for n, (x, y) in points.items()}
             axes: Any = figures.sections(panels, labels)

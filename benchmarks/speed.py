@@ -371,7 +371,8 @@ def met(value, limit, *, least: bool = False) -> str:
     if value is None or limit is None:
         return number(value)
     good, sign = (value >= limit, "≥") if least else (value <= limit, "≤")
-    return f"{number(value)} ({sign} {number(limit)}: {'met' if good else '**not met**'})"
+    shown = number(value) if good or number(value) != number(limit) else f"{value:.3g}"
+    return f"{shown} ({sign} {number(limit)}: {'met' if good else '**not met**'})"
 
 
 def step_table(measured: Numbers) -> str:

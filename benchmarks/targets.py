@@ -296,8 +296,8 @@ def three_tolerances(quick: bool) -> Numbers:
     return {
         "pairs": len(data),
         "chosen": chosen,
-        "label": ", ".join(c["label"] for c in chosen),
-        "chart": ", ".join(c["chart"] for c in chosen),
+        "label": "; ".join(f"{c['chart']} {c['label']}" for c in chosen),
+        "chart": "",
         "tolerances_missed": sum(c["one_step_rms"] > c["tolerance"] for c in chosen),
         "cost_not_rising": sum(b <= a for a, b in pairwise(cost)),
         "fit_seconds": max(c["fit_seconds"] for c in chosen),
@@ -353,6 +353,16 @@ ROWS: dict[str, Row] = {
 # Results and tables
 
 
+def processor_model() -> str:
+    """The processor's name where the system tells it, else its architecture."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as lines:
+            names = [line.partition(":")[2].strip() for line in lines if "model name" in line]
+    except OSError:
+        names = []
+    return names[0] if names else platform.machine()
+
+
 def circumstances() -> Numbers:
     """Where, when and with what a result was measured."""
     return {
@@ -361,6 +371,7 @@ def circumstances() -> Numbers:
         "device": report.device(),
         "machine": {
             "processor": platform.machine(),
+            "model": processor_model(),
             "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
             "load": os.getloadavg()[0],
         },
@@ -403,7 +414,7 @@ def number(value) -> str:
     """As the tables show it."""
     if value is None:
         return "–"
-    if isinstance(value, int) or (isinstance(value, float) and value >= 1000):
+    if isinstance(value, int) or (isinstance(value, float) and 99.5 <= value < 1e6):
         return f"{value:,.0f}"
     return f"{value:.2g}" if 0.01 <= abs(value) < 1000 or value == 0 else f"{value:.1e}"
 
@@ -462,10 +473,13 @@ def between_markers(path: Path, name: str, text: str) -> None:
 
 def provenance(found: dict[str, Numbers]) -> str:
     """One sentence on where and when the numbers were taken."""
-    machines = {
-        f"{r['machine']['processor']}, {r['machine']['cores']} cores, {r['device']}"
-        for r in found.values()
-    }
+    cores: dict[str, set[int]] = {}
+    for r in found.values():
+        machine = r["machine"]
+        where = r["device"].partition(": ")[2]
+        where = machine.get("model", machine["processor"]) if where in ("cpu", "") else where
+        cores.setdefault(where, set()).add(machine["cores"])
+    machines = [f"{name} ({' or '.join(map(str, sorted(n)))} cores)" for name, n in cores.items()]
     dates = sorted({r["date"] for r in found.values()})
     jaxes = sorted({r["versions"]["jax"] for r in found.values()})
     loads = [r["machine"]["load"] for r in found.values()]

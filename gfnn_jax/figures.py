@@ -86,8 +86,9 @@ def error_growth(errors: Mapping, ylabel="position error", ax=None) -> Axes:
 
     errors: name -> (steps (L,), error (B, L)). Above the mean the band is mean + std. Below it is
     mean / (1 + std/mean), the same factor down: mean − std to first order, and positive where
-    mean − std is not. A curve ends where a prediction is lost; the legend counts those. The dotted
-    line grows as the step, the paper's theorem for regular orbits.
+    mean − std is not. Where a prediction is lost the mean ends, and the median goes on, thin, until
+    half are lost; the legend counts those. The dotted line grows as the step, the paper's theorem
+    for regular orbits.
     """
     ax = _axes(ax)
     _error_curves(ax, errors, ylabel)
@@ -149,6 +150,10 @@ def _error_curves(ax, errors, ylabel):
             num = len(error) - statistics.num_excluded
             name = f"{name} ({statistics.num_lost} of {num} lost)"
         shown = _log_curve(ax, place, name, steps, mean)
+        if statistics.num_lost:
+            rest = (steps > 0) & ~shown & np.isfinite(statistics.median) & (statistics.median > 0)
+            look = _look(place) | {"marker": "", "linewidth": 0.8}
+            ax.plot(steps[rest], statistics.median[rest], label="_the median", **look)
         if len(error) > 1:
             factor = 1 + statistics.std[shown] / mean[shown]
             low, high = mean[shown] / factor, mean[shown] * factor
@@ -175,10 +180,12 @@ def _log_log(ax, ylabel):
 
 def _guide(ax, exponent, label):
     """A dotted power law below the lowest curve, touching it: only its slope means something."""
-    curves = [(x, y) for x, y in (line.get_data() for line in ax.get_lines()) if len(x) > 1]
+    data = (np.array(line.get_data(), float) for line in ax.get_lines())
+    known = (xy[:, np.isfinite(xy).all(axis=0)] for xy in data)
+    curves = [xy for xy in known if xy.shape[1] > 1]
     if not curves:
         return
-    x, y = min(curves, key=lambda curve: curve[1][-1])
+    x, y = min(curves, key=lambda xy: xy[1, -1])
     factor = np.min(y / x**exponent) / 2
     ax.plot(x, factor * x**exponent, color=REFERENCE, linestyle=":", linewidth=1, label=label)
 
@@ -436,13 +443,18 @@ def _number_points(ax, x, y, order):
 
 
 @style()
-def work_precision(curves: Mapping, ylabel="position error", ax=None) -> Axes:
-    """Error against time per step: name -> (microseconds (K,), errors (K,)), compile time apart."""
+def work_precision(
+    curves: Mapping,
+    ylabel="position error",
+    xlabel="time per step and trajectory (µs)",
+    ax=None,
+) -> Axes:
+    """Error against time: name -> (microseconds (K,), errors (K,)), compile time apart."""
     ax = _axes(ax)
     for place, (name, (cost, error)) in enumerate(curves.items()):
         ax.plot(cost, error, label=name, **_look(place))
-    ax.set(xscale="log", yscale="log", xlabel="time per step and trajectory (µs)", ylabel=ylabel)
-    ax.legend()
+    ax.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
+    _legend_above(ax)
     return ax
 
 
@@ -502,7 +514,7 @@ def _front(ax, curves):
     front = np.flatnonzero(np.append(True, best[1:] < best[:-1]))
     ax.step(
         cost[order][front], best[front], where="post", color=COLOURS[5], lw=4, alpha=0.45,
-        label="best of the learned maps", zorder=1.5,
+        label="best of our maps", zorder=1.5,
     )  # fmt: skip
 
 
@@ -566,5 +578,6 @@ def digits_against_step_size(sweeps: Mapping, axes=None) -> list[Axes]:
                     color=look["color"])  # fmt: skip
         ax.set(title=system, xlabel="time step $dt$")
     axes[0].set_ylabel("digits kept in one step")
+    axes[0].plot([], [], ls="none", marker="x", color=REFERENCE, label="fit refused")
     axes[0].legend(loc="lower left")
     return axes
