@@ -36,7 +36,7 @@ def assemble(
 ) -> dict[str, Any]:
     """The report of a fit, and of the rollouts with it where there were any (see `rollout_part`).
 
-    data: what is known of the pairs beside their number: source, digest, what was warned of.
+    data: what is known of the pairs beside their number: source, digest, precision, units.
     """
     chosen = fit.chosen
     return {
