@@ -47,14 +47,15 @@ class Prepared:
 
 def prepare(pairs: Pairs, coordinates: Coordinates) -> Prepared:
     forward = jax.jit(jax.vmap(coordinates.forward))
-    inner = [forward(jnp.asarray(z, jnp.float64)) for z in (pairs.z0, pairs.z1)]
-    known = np.all([np.isfinite(np.asarray(y)).all(axis=1) for y in inner], axis=0)
+    before = forward(jnp.asarray(pairs.z0, jnp.float64))
+    after = forward(jnp.asarray(pairs.z1, jnp.float64))
+    known = np.isfinite(np.asarray(before + after)).all(axis=1)
     if not known.all():
         raise FitError(
             f"expected states that have {coordinates.name} coordinates, got "
             f"{int((~known).sum())} pairs without, the first is row {int(np.argmin(known))}"
         )
-    y0, y1, centres, covered = lift(*inner, coordinates)
+    y0, y1, centres, covered = lift(before, after, coordinates)
     whole = tuple(i for i, c in zip(coordinates.angles, covered, strict=True) if c)
     scale = sizes(y0)
     return Prepared(
