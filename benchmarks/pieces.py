@@ -8,7 +8,11 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+# Sets float64, so it comes before all of JAX.
 from targets import RESULTS, Numbers, circumstances
+
+# isort: split
+import jax
 
 from gfnn_jax import report
 
@@ -59,5 +63,6 @@ def main(
                   "seconds": time.perf_counter() - started, **circumstances()}  # fmt: skip
         path.write_text(report.to_json(result), encoding="utf-8")
         print(f"{prefix} {name}: {result['seconds']:.0f} s")
+        jax.clear_caches()  # a process may map only so many compiled programs
     if folder == RESULTS:
         tables()

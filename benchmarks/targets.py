@@ -402,6 +402,7 @@ def run(name: str, folder: Path, quick: bool) -> None:
     (folder / f"{name}.json").write_text(text, encoding="utf-8")
     verdict = "met" if all(result["met"].values()) else f"NOT met: {result['met']}"
     print(f"{name}: {verdict}, {result['seconds']:.0f} s")
+    jax.clear_caches()  # a process may map only so many compiled programs
 
 
 def results(folder: Path) -> dict[str, Numbers]:
