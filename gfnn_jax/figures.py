@@ -469,11 +469,13 @@ def work_precision_panels(panels: Mapping, ylabel) -> Figure:
     """
     figure = Figure(figsize=(WIDTH * 0.85 * len(panels) + 1.6, HEIGHT * 1.25))
     axes = np.ravel(figure.subplots(1, len(panels), sharey=True))
+    # A name looks alike in all panels, also where one of them lacks another.
+    named = [n for group in ("ours", "known") for p in panels.values() for n in p[group]]
+    place = {name: i for i, name in enumerate(dict.fromkeys(named))}
     for ax, (title, groups) in zip(axes, panels.items(), strict=True):
         _front(ax, [*groups["ours"].values(), *groups["float32"].values()])
-        names = list(groups["ours"])
-        for place, (name, points) in enumerate(groups["ours"].items()):
-            look = _look(place) | {"linestyle": "none", "ms": 5.5}
+        for name, points in groups["ours"].items():
+            look = _look(place[name]) | {"linestyle": "none", "ms": 5.5}
             ax.plot(*points[:2], label=name, **look)
             for cost, error, size in zip(*points, strict=True):
                 ax.annotate(size, (cost, error), (5, 3), textcoords="offset points", fontsize=6,
@@ -482,8 +484,8 @@ def work_precision_panels(panels: Mapping, ylabel) -> Figure:
                 ax.plot(*groups["float32"][name][:2], mfc="white", **look)
         if groups["float32"]:
             ax.plot([], [], "o", mfc="white", color="#777777", label="hollow: in float32")
-        for place, (name, points) in enumerate(groups["known"].items()):
-            look = _look(place + len(names)) | {"color": "#777777", "linewidth": 0.8, "ms": 3.5}
+        for name, points in groups["known"].items():
+            look = _look(place[name]) | {"color": "#777777", "linewidth": 0.8, "ms": 3.5}
             ax.plot(*points[:2], label=f"{name} (told H)", **look)
         costs, errors = (
             np.array([np.ravel(v[i])[0] for v in groups["others"].values()]) for i in (0, 1)
