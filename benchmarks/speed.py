@@ -168,7 +168,7 @@ def waiting(batch: Callable[[], Any]) -> float:
     """Seconds of a rollout in which every lane of a batch waits for the one that takes longest."""
     with mock.patch.object(implicit, "_few_together", implicit._each):
         jax.clear_caches()
-        seconds = best(batch, 3)
+        seconds = best(batch)
     jax.clear_caches()
     return seconds
 
