@@ -287,12 +287,14 @@ def _weight(chart: AnyChart, scale, dt):
 
 def refitted(
     candidate: Candidate, chunks: Iterable[Pairs], held: Pairs
-) -> tuple[Candidate, int, int, float]:
-    """A candidate of a linear family fitted anew to all of these pairs: it, their number, how many
-    were left out as wrong, and the error of the old one on the pairs held out.
+) -> tuple[Candidate | None, int, int, float]:
+    """A candidate of a linear family fitted anew to all of these pairs: it (None where no pair is
+    left), their number, how many were left out as wrong, and the error of the old one on the pairs
+    held out.
 
     chunks: pairs that need never be in memory together. held: those that judge it, which are left
-    out of the fit. A pair is wrong that the old candidate misses by many of its deviations.
+    out of the fit. A pair is wrong, and no judge, that the old candidate misses by many of its
+    deviations.
     """
     map_ = candidate.map
     index = next(i for i, piece in enumerate(map_.pieces) if isinstance(piece, Generated))
@@ -300,6 +302,11 @@ def refitted(
     weight = _weight(generated.chart, np.asarray(generated.scale), map_.dt)
     as_seen = jax.jit(jax.vmap(map_.generated_pair))
     most = _WRONG * np.maximum(candidate.deviations, _ROUNDING * np.asarray(map_.scale))
+
+    def right(z0, z1):
+        return np.all(np.abs(_state_error(map_, z0, z1)[0]) <= most, axis=1)
+
+    held = held.take(np.flatnonzero(right(held.z0, held.z1)))
     judges, count, wrong = _as_keys(held.z0), 0, 0
 
     def rows(z0, z1):
@@ -310,17 +317,17 @@ def refitted(
         nonlocal count, wrong
         for z0, z1 in _of_length(((p.z0, p.z1) for p in chunks), _REFIT_PAIRS):
             new = ~np.isin(_as_keys(z0), judges)
-            right = np.all(np.abs(_state_error(map_, z0, z1)[0]) <= most, axis=1)
-            count, wrong = count + int(np.sum(right)), wrong + int(np.sum(~right))
-            yield tuple(np.asarray(a)[new & right] for a in rows(z0, z1))
+            good = right(z0, z1)
+            count, wrong = count + int(np.sum(good)), wrong + int(np.sum(~good))
+            yield tuple(np.asarray(a)[new & good] for a in rows(z0, z1))
 
     # Blocks of one length: each length is compiled for.
     length = min(_REFIT_PAIRS, least_squares.chunk_size(candidate.num_parameters, map_.dim))
     reduced = least_squares.reduce_chunks(
         generated.scalar, _of_length(kept(), length), [rows(held.z0, held.z1)], weight
     )
-    if reduced.rows == 0:
-        return dataclasses.replace(candidate, validation_rms=np.inf), count, wrong, 0.0
+    if reduced.rows == 0 or len(held) == 0:
+        return None, count, wrong, candidate.validation_rms
     solved = least_squares.solve(reduced, candidate.num_parameters)
     generated = dataclasses.replace(
         generated, params=generated.scalar.unflatten(solved.coefficients)

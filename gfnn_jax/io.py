@@ -677,13 +677,25 @@ def _csv_dt(path, names: list[str], table: np.ndarray, lines: np.ndarray) -> flo
     return float(np.mean(steps))
 
 
-def _printed_unit(time: np.ndarray, dt: float) -> float:
-    """The unit of the last decimal that the times were printed with, where that is less than a
-    hundredth of dt; 0 where they have all their digits."""
-    for decimals in range(max(0, int(np.ceil(2 - np.log10(dt)))), 13):
-        if np.all(np.abs(time - np.round(time, decimals)) <= 1e-3 * 10.0**-decimals):
-            return 10.0**-decimals
-    return 0.0
+def _only_rounded(time: np.ndarray, sequence: np.ndarray, dt: float) -> bool:
+    """Whether the steps differ because the times were printed with few decimals, the last of them
+    less than a thousandth of dt: every sequence is then within that unit of a straight line."""
+    if np.isnan(time[0]):  # nothing stands before the first row of a file
+        time, sequence = time[1:], sequence[1:]
+    for decimals in range(max(0, int(np.ceil(3 - np.log10(dt)))), 13):
+        unit = 10.0**-decimals
+        if np.all(np.abs(time - np.round(time, decimals)) <= 1e-3 * unit):
+            break
+    else:
+        return False
+    for rows in np.split(time, np.flatnonzero(sequence[1:] != sequence[:-1]) + 1):
+        count = np.arange(len(rows)) - 0.5 * (len(rows) - 1)
+        slope = count @ (rows - rows[0]) / max(count @ count, 1)
+        if np.ptp(rows - slope * count) > 1.5 * unit:
+            return False
+        if len(rows) > 1 and abs(slope - dt) > unit:
+            return False
+    return True
 
 
 def _check_times(path, time: np.ndarray, sequence: np.ndarray, lines: np.ndarray, dt: float):
@@ -691,10 +703,9 @@ def _check_times(path, time: np.ndarray, sequence: np.ndarray, lines: np.ndarray
     ``sequence`` start one row before."""
     step = np.diff(time)
     slack = TIME_TOLERANCE * dt + 4 * np.finfo(np.float64).eps * np.abs(time[1:])
-    slack = slack + _printed_unit(time[np.isfinite(time)], dt)
     # "not (... <= ...)" so that NaN counts as wrong.
     bad = np.flatnonzero((sequence[1:] == sequence[:-1]) & ~(np.abs(step - dt) <= slack))
-    if len(bad):
+    if len(bad) and not _only_rounded(time, sequence, dt):
         raise InputError(
             f"{path}: the time step is not uniform: {step[bad[0]]:.9g} in line {lines[bad[0]]} "
             f"where {dt:.9g} is usual ({len(bad)} such row{'s' * (len(bad) != 1)})"

@@ -164,13 +164,13 @@ def look_symplectic(jacobians, error: float, scale) -> bool:
     """Whether the pairs may be those of a symplectic map, as far as their local Jacobians tell.
 
     Every map of a short step is close to the identity and so to a symplectic one: the defect is
-    held against M − 1, and against the Jacobians' own error. Columns in another order, velocities
-    for momenta or friction miss by a third of M − 1 or more.
+    held against M − 1, and against the Jacobians' own error. Columns in another order miss by a
+    third of M − 1 or more, as does a rate of friction that is as large as the system's own.
     """
     move = np.abs(jacobians * scale[None, None, :] / scale[None, :, None] - np.eye(len(scale)))
     size = float(np.median(move.max(axis=(1, 2))))
     defect = data_defect(jacobians, scale)
-    return error > _KNOWN * size or defect < max(_ERRORS * error, _MISSED * size)
+    return error > _KNOWN * size or defect <= max(_ERRORS * error, _MISSED * size)
 
 
 def volume_change(z, residual) -> tuple[float, float]:

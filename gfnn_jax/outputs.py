@@ -15,7 +15,7 @@ from typing import Any
 from gfnn_jax.errors import InputError, WorkError
 
 # What marks a folder as written by this package, and what else is in such a folder: --overwrite
-# never deletes another, nor a file that a user keeps in one.
+# deletes no other folder, and none that holds something else, such as data.
 FOLDER_MARKS = ("model.json", "report.json")
 _OURS = (*FOLDER_MARKS, "SHA256SUMS", "arrays", "model", "*.png")
 
@@ -44,12 +44,12 @@ def ensure_new(path, overwrite: bool = False, *, folder: bool = False) -> Path:
                 raise InputError(
                     f"{path}: is a folder without {' or '.join(FOLDER_MARKS)}; not overwritten"
                 )
-            others = sorted(
-                file.name for file in path.iterdir() if not any(map(file.match, _OURS))
-            ) if folder else []  # fmt: skip
+            inside = [*path.iterdir(), *path.glob("model/*")] if folder else []
+            others = [file for file in inside if not any(map(file.match, _OURS))]
             if others:
                 raise InputError(
-                    f"{path}: holds {others[0]}, which this package did not write; not overwritten"
+                    f"{path}: holds {others[0].name}, which is no part of a model or a run; not "
+                    "overwritten"
                 )
         parent = path.absolute().parent
         while not parent.exists():

@@ -295,7 +295,8 @@ def fit(
         if large and scalar != "mlp":
             say("all pairs of the file, for the chosen candidate")
             held = trajectories.pairs().take(slice(_HELD))
-            chosen = refit(chosen, iterate_pairs(data, _FIT_CHUNK, dt=dt), held)
+            with _failures_of_arithmetic():
+                chosen = refit(chosen, iterate_pairs(data, _FIT_CHUNK, dt=dt), held)
         result = report.assemble(
             chosen, scene=scene_name, dt=trajectories.dt, seed=seed, rollout=None,
             data={
@@ -322,11 +323,20 @@ def _fit(pairs: Pairs, scene, *, angles, iterations, say, **options) -> Fit:
     if iterations is not None:
         options["max_iterations"] = iterations
     try:
-        return select(pairs, scene, angles=angles, on_progress=say, **options)
+        with _failures_of_arithmetic():
+            return select(pairs, scene, angles=angles, on_progress=say, **options)
     except FitError as error:
         raise InputError(str(error)) from error
-    except (np.linalg.LinAlgError, jax.errors.JaxRuntimeError) as error:  # out of memory too
-        raise WorkError(f"the fit failed: {str(error).splitlines()[0]}") from error
+
+
+@contextlib.contextmanager
+def _failures_of_arithmetic() -> Iterator[None]:
+    """A factorisation that does not converge, or JAX out of memory, as a WorkError of one line."""
+    try:
+        yield
+    except (np.linalg.LinAlgError, jax.errors.JaxRuntimeError) as error:
+        what = (str(error) or type(error).__name__).splitlines()[0]
+        raise WorkError(f"the fit failed: {what}") from error
 
 
 def _record(result: dict[str, Any]) -> dict[str, Any]:

@@ -88,9 +88,10 @@ class PredictionWriter:
         if self.out.suffix != ".npz":
             raise InputError(f"{out}: a prediction is written as .npz")
         self.finished = False
+        self._overwrite = overwrite
         if resume and self._journal.exists() and self._read_journal():
             if not self._is_done():  # what stands there is another's
-                ensure_new(self.out, overwrite)
+                ensure_new(self.out, self._overwrite)
             return
         if resume and not overwrite and self._is_done():
             self.finished, self.saved = True, self.total
@@ -218,17 +219,20 @@ class PredictionWriter:
         return self.partial / "journal.jsonl"
 
     def _write_journal(self) -> None:
-        lines = [{"job": self._job}, *self._chunks]
+        lines = [{"job": self._job, "overwrite": self._overwrite}, *self._chunks]
         atomic_write(self._journal, "".join(json.dumps(line) + "\n" for line in lines))
 
     def _read_journal(self) -> bool:
         """Take up the chunks that are whole; False if the job's first line was never written."""
         lines = self._journal.read_bytes().splitlines()
         try:
-            job = json.loads(lines[0])["job"]
+            began = json.loads(lines[0])
+            job = began["job"]
         except (IndexError, KeyError, TypeError, ValueError):
             warnings.warn(f"{self.partial}: no readable journal: starting again", stacklevel=3)
             return False
+        # Who began with --overwrite need not say it again.
+        self._overwrite = self._overwrite or began.get("overwrite") is True
         for key in {**job, **self._job}:
             if job.get(key) != self._job.get(key):
                 raise InputError(

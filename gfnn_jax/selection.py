@@ -138,15 +138,18 @@ def fit(
         messages.append(message)
         warnings.warn(message, FitWarning, stacklevel=3)
 
-    pairs = _distinct(pairs, warn)
     if scene is not None and scene.features is not None and scalar in ("auto", "features"):
         _compare_sizes(pairs, scene, warn)
     on_progress("looking at the map's local Jacobians")
     prepared = prepare(pairs, coordinates)
+    first = _distinct(pairs, warn)
+    if len(first) < len(pairs):
+        pairs = pairs.take(first)
+        prepared = prepare(pairs, coordinates)
     odd = odd_pairs(prepared.y0, prepared.y1, prepared.scale)
     if len(odd):
         few = len(odd) <= _MOST_ODD * len(pairs)
-        rows = ", ".join(map(str, odd[:5])) + (", …" if len(odd) > 5 else "")
+        rows = ", ".join(map(str, first[odd[:5]])) + (", …" if len(odd) > 5 else "")
         warn(
             f"{len(odd)} of {len(pairs)} pairs contradict the pairs around them (rows {rows}): "
             + ("taken for wrong, they are left out" if few else "too many to be left out")
@@ -261,11 +264,9 @@ def refit(fitted: Fit, chunks: Iterable[Pairs], held: Pairs) -> Fit:
             f"{wrong} of {num_pairs + wrong} pairs are far from what the others tell: taken for "
             "wrong, they are left out"
         )
-    if not chosen.validation_rms <= _NO_WORSE * before:
-        warn(
-            f"all {num_pairs} pairs give a worse map ({chosen.validation_rms:.2e} on those held "
-            f"out) than the sample ({before:.2e}), whose map is kept"
-        )
+    if chosen is None or not chosen.validation_rms <= _NO_WORSE * before:
+        found = "no map" if chosen is None else f"a worse map ({chosen.validation_rms:.2e})"
+        warn(f"all pairs give {found} than the sample ({before:.2e}), whose map is kept")
         chosen, num_pairs = fitted.chosen, fitted.num_pairs
     if chosen.validation_bound > fitted.tolerance:
         warn(_not_met(chosen, fitted.tolerance))
@@ -344,17 +345,16 @@ def _compare_sizes(pairs: Pairs, scene: Scene, warn) -> None:
             )
 
 
-def _distinct(pairs: Pairs, warn) -> Pairs:
-    """Every pair once, in its place: held-out copies of training pairs would judge nothing."""
+def _distinct(pairs: Pairs, warn) -> np.ndarray:
+    """The rows where a pair stands for the first time: held-out copies of training pairs would
+    judge nothing."""
     rows = np.concatenate([np.asarray(pairs.z0), np.asarray(pairs.z1)], axis=1)
     first = np.sort(np.unique(rows, axis=0, return_index=True)[1])
     copies = len(pairs) - len(first)
-    if copies == 0:
-        return pairs
-    warn(f"{copies} of {len(pairs)} pairs are copies of others: each is counted once")
-    pairs = pairs.take(first)
-    _check_number(pairs)
-    return pairs
+    if copies:
+        warn(f"{copies} of {len(pairs)} pairs are copies of others: each is counted once")
+        _check_number(pairs.take(first))
+    return first
 
 
 def _split(pairs: Pairs, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -380,7 +380,7 @@ def test_data_inside_the_output_are_not_deleted(fitted, tmp_path, capsys, monkey
     inside = pairs_file(model / "d.npz")
     before = files(tmp_path)
     assert gfnn("fit", inside, "--out", model, "--overwrite") == 2
-    assert "holds d.npz, which this package did not write" in capsys.readouterr().err
+    assert "holds d.npz, which is no part of a model or a run" in capsys.readouterr().err
     assert files(tmp_path) == before
 
 

@@ -271,6 +271,32 @@ def test_lanes_that_are_taken_out_of_a_batch_end_as_they_do_alone(count):
         assert {OK, NOT_CONVERGED, NON_FINITE} == set(status.tolist())
 
 
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_only_a_few_lanes_of_a_batch_are_in_the_loop(dtype):
+    """Seen in what is to be compiled: a sine of 32 lanes in a loop, and none of 500 in any."""
+    theta, guess = (a.astype(dtype) for a in hard_and_easy(500))
+
+    def widths(jaxpr, in_loop=False):
+        for equation in jaxpr.eqns:
+            if in_loop and equation.primitive.name == "sin":
+                yield equation.outvars[0].aval.shape[0]
+            inside = in_loop or equation.primitive.name == "while"
+            for part in equation.params.values():
+                inner = getattr(part, "jaxpr", part)
+                if hasattr(inner, "eqns"):
+                    yield from widths(inner, inside)
+
+    together = jax.vmap(lambda t, x: root(folded, t, x, 40))
+    waiting = jax.vmap(lambda t, x: iterate(folded, t, x, most=40))
+    assert set(widths(jax.make_jaxpr(together)(theta, guess).jaxpr)) == {32}
+    assert set(widths(jax.make_jaxpr(waiting)(theta, guess).jaxpr)) == {500}
+    x, _, info = solved(folded, theta, guess)
+    good = np.asarray(info.status) == OK
+    assert good.mean() > 0.7
+    residual = np.abs(x + 8 * jnp.sin(x) - theta)[good]
+    assert residual.max() < 200 * np.finfo(dtype).eps
+
+
 def test_batches_of_batches_and_their_derivatives():
     """Lanes with their own θ or a common one, in two axes, in reverse and in forward mode."""
     theta, guess = hard_and_easy(300)

@@ -154,6 +154,21 @@ def test_printed_times_are_rounded(tmp_path, digits):
     np.testing.assert_array_equal(data.pairs().z0, Z[:-1])
 
 
+@pytest.mark.parametrize(
+    ("dt", "odd", "digits"), [(0.1, 0.101, 3), (1 / 3, 0.3337, 4), (100, 101, 0)]
+)
+def test_rounding_explains_no_odd_step(tmp_path, dt, odd, digits):
+    """One step in thirty that is off by more than the last decimal that rounding can make."""
+    steps = np.full(29, dt)
+    steps[[12, 13, 14]] = odd
+    t = np.append(0, np.cumsum(steps))
+    lines = [f"{i:.{digits}f}," + ",".join(map(repr, row)) for i, row in zip(t, Z.tolist())]  # noqa: B905
+    path = tmp_path / "t.csv"
+    path.write_text("t,q1,q2,p1,p2\n" + "\n".join(lines) + "\n")
+    with pytest.raises(InputError, match="not uniform"):
+        io.read_trajectories(path)
+
+
 def test_initial_states(tmp_path):
     np.save(tmp_path / "z.npy", Z)
     np.save(tmp_path / "m.npy", Z.reshape(5, 6, 4))

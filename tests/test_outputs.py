@@ -15,6 +15,9 @@ def test_ensure_new(tmp_path):
     (tmp_path / "mixed" / "model").mkdir(parents=True)
     (tmp_path / "mixed" / "report.json").write_text("{}")
     (tmp_path / "mixed" / "data.npz").write_text("kept")
+    (tmp_path / "deep" / "model").mkdir(parents=True)
+    (tmp_path / "deep" / "report.json").write_text("{}")
+    (tmp_path / "deep" / "model" / "data.csv").write_text("kept")
     (tmp_path / "empty").mkdir()
     for name, overwrite, folder, message in [
         ("file", False, False, "exists already"),
@@ -23,19 +26,20 @@ def test_ensure_new(tmp_path):
         ("model", True, False, "expected a file"),
         ("other", True, True, "not overwritten"),
         ("mixed", True, True, "holds data.npz"),
+        ("deep", True, True, "holds data.csv"),
         ("file/below", False, False, "not a folder|Not a directory"),
     ]:
         with pytest.raises(InputError, match=message):
             outputs.ensure_new(tmp_path / name, overwrite, folder=folder)
     for name, overwrite, folder in [
         ("new", False, False),
-        ("deep/new", False, True),
+        ("far/new", False, True),
         ("file", True, False),
         ("model", True, True),
         ("empty", False, True),
     ]:
         assert outputs.ensure_new(tmp_path / name, overwrite, folder=folder) == tmp_path / name
-    assert not (tmp_path / "deep").exists()
+    assert not (tmp_path / "far").exists()
     assert (tmp_path / "file").read_text() == "kept"
 
 

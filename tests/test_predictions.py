@@ -137,6 +137,8 @@ def test_resuming_replaces_no_other_file(tmp_path):
         writer(out, resume=True)
     assert out.read_bytes() == b"another's"
     assert writer(out, resume=True, overwrite=True).saved == 6
+    # Once said, it holds for this job.
+    assert writer(out, resume=True).saved == 6
 
 
 def test_killed_at_the_very_end(tmp_path, whole):
