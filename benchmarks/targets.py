@@ -454,7 +454,7 @@ def table(found: dict[str, Numbers], *, full: bool) -> str:
         cells = [
             result["title"], number(m["pairs"]), against(result, "one_step_rms"), error,
             against(result, "fit_seconds"),
-            f"{m['chart']} {m['label']}" + (", base map" if m.get("base_map") else ""),
+            f"{m['chart']} {m['label']}".strip() + (", base map" if m.get("base_map") else ""),
         ]  # fmt: skip
         if full:
             keys = ("num_parameters", "microseconds_per_step", "symplecticity_defect",
