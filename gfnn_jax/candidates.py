@@ -289,8 +289,8 @@ def refitted(
     candidate: Candidate, chunks: Iterable[Pairs], held: Pairs
 ) -> tuple[Candidate | None, int, int, float]:
     """A candidate of a linear family fitted anew to all of these pairs: it (None where no pair is
-    left), their number, how many were left out as wrong, and the error of the old one on the pairs
-    held out.
+    or judge is left), their number, how many were left out as wrong, and the error of the old one
+    on the pairs held out.
 
     chunks: pairs that need never be in memory together. held: those that judge it, which are left
     out of the fit. A pair is wrong, and no judge, that the old candidate misses by many of its
@@ -307,6 +307,8 @@ def refitted(
         return np.all(np.abs(_state_error(map_, z0, z1)[0]) <= most, axis=1)
 
     held = held.take(np.flatnonzero(right(held.z0, held.z1)))
+    if len(held) == 0:
+        return None, 0, 0, candidate.validation_rms
     judges, count, wrong = _as_keys(held.z0), 0, 0
 
     def rows(z0, z1):
@@ -326,7 +328,7 @@ def refitted(
     reduced = least_squares.reduce_chunks(
         generated.scalar, _of_length(kept(), length), [rows(held.z0, held.z1)], weight
     )
-    if reduced.rows == 0 or len(held) == 0:
+    if reduced.rows == 0:
         return None, count, wrong, candidate.validation_rms
     solved = least_squares.solve(reduced, candidate.num_parameters)
     generated = dataclasses.replace(

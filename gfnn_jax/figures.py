@@ -18,7 +18,7 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import MaxNLocator, NullFormatter
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator, MaxNLocator, NullFormatter
 
 from gfnn_jax.metrics import error_statistics, kl_divergence
 
@@ -400,6 +400,8 @@ def speed_against_error(
         ylabel="one-step error (RMS)",
     )
     ax.margins(0.12)
+    ax.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))  # more labels would cover each other
+    ax.xaxis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(3, 3)))
     _number_points(ax, cost, error, order)
     ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
     names = [

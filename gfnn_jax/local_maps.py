@@ -21,7 +21,7 @@ _NEIGHBOURS_PER_TERM = 3
 # From so many pairs on the neighbourhoods keep their size: more pairs then average the noise away
 # instead of shrinking them below it.
 _LOCAL_ENOUGH, _MOST_NEIGHBOURS = 4_000, 1_000
-_FILLED = 0.03
+_FILLED = 0.03  # of a neighbourhood's size: a thinner one says nothing of the direction across
 _SPANNED = 1e-8  # a smaller singular value of a local fit is a direction without neighbours
 # Neighbourhoods grow until noise leaves no more than this error in the Jacobian's entries.
 _SLOPE_ERROR = 0.05
