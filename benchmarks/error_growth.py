@@ -42,13 +42,15 @@ from targets import (  # switches float64 on
 )
 
 import gfnn_jax as gfnn
-from gfnn_jax import figures, metrics, report
+from gfnn_jax.evaluate import figures
+from gfnn_jax.evaluate import metrics
+from gfnn_jax.evaluate import report
 from gfnn_jax.baselines import METHODS, Budget, Sequences
-from gfnn_jax.maps import Generated
-from gfnn_jax.models import versions
+from gfnn_jax.maps.symplectic_map import Generated
+from gfnn_jax.maps.symplectic_map.saved import versions
 from gfnn_jax.phase_space import hamiltonian_vector_field
-from gfnn_jax.rollout import rollout
-from gfnn_jax.trajectories import flow_step
+from gfnn_jax.maps.symplectic_map.rollout import rollout
+from gfnn_jax.scenes.trajectories import flow_step
 
 FIGURES = Path(__file__).resolve().parent / "figures"
 NUM_PAIRS, NUM_STEPS, LONGEST = 4_000, 1_000, 20_000

@@ -46,14 +46,15 @@ import jax.numpy as jnp
 import numpy as np
 
 import gfnn_jax as gfnn
-from gfnn_jax import figures, metrics
-from gfnn_jax.charts import MIDPOINT, TYPE2
+from gfnn_jax.evaluate import figures
+from gfnn_jax.evaluate import metrics
+from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
-from gfnn_jax.domain import covering
-from gfnn_jax.implicit import OK, STATUS_NAMES
-from gfnn_jax.maps import Generated, SymplecticMap
-from gfnn_jax.scalars.inputs import box_inputs
-from gfnn_jax.scalars.mlp import Mlp
+from gfnn_jax.maps.symplectic_map.domain import covering
+from gfnn_jax.solve.newton import OK, STATUS_NAMES
+from gfnn_jax.maps.symplectic_map import Generated, SymplecticMap
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.mlp import Mlp
 from gfnn_jax.scenes import DrawnFrom, Scene, henon_heiles, pcr3bp, standard_map, two_body
 from gfnn_jax.scenes.pcr3bp import MU
 

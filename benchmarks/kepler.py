@@ -32,9 +32,11 @@ from targets import (  # switches float64 on
 )
 
 import gfnn_jax as gfnn
-from gfnn_jax import figures, metrics, report
+from gfnn_jax.evaluate import figures
+from gfnn_jax.evaluate import metrics
+from gfnn_jax.evaluate import report
 from gfnn_jax.baselines import METHODS, Budget, Sequences
-from gfnn_jax.rollout import rollout
+from gfnn_jax.maps.symplectic_map.rollout import rollout
 
 FIGURE = Path(__file__).resolve().parent / "figures" / "kepler.png"
 NUM_PAIRS, NUM_NETWORK_PAIRS, TRAINING_SECONDS = 4_000, 100_000, 60.0

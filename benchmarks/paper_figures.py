@@ -26,8 +26,10 @@ from typing import Any
 import numpy as np
 from targets import RESULTS, TABLES, between_markers, number  # switches float64 on
 
-from gfnn_jax import comparison, figures, report
-from gfnn_jax.comparison import OURS, PAPER_GFNN, compare
+from gfnn_jax.jobs import compare as comparison
+from gfnn_jax.evaluate import figures
+from gfnn_jax.evaluate import report
+from gfnn_jax.jobs.compare import OURS, PAPER_GFNN, compare
 
 FIGURES = Path(__file__).resolve().parent / "figures" / "compare"
 WORK = Path("runs") / "paper-figures"

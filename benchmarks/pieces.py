@@ -14,7 +14,7 @@ from targets import RESULTS, Numbers, circumstances
 # isort: split
 import jax
 
-from gfnn_jax import report
+from gfnn_jax.evaluate import report
 
 Pieces = Mapping[str, Callable[[bool], Numbers]]
 

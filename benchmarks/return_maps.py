@@ -45,8 +45,10 @@ from scipy.integrate import solve_ivp
 from speed import best
 
 import gfnn_jax as gfnn
-from gfnn_jax import figures, metrics, report
-from gfnn_jax.candidates import Candidate
+from gfnn_jax.evaluate import figures
+from gfnn_jax.evaluate import metrics
+from gfnn_jax.evaluate import report
+from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.scenes import Scene, driven_pendulum, henon_heiles_section
 from gfnn_jax.scenes.henon_heiles_section import FIXED_POINT
 

@@ -42,16 +42,16 @@ import jax.numpy as jnp
 import numpy as np
 
 import gfnn_jax as gfnn
-from gfnn_jax import implicit
-from gfnn_jax.charts import MIDPOINT, TYPE2
+from gfnn_jax.solve import newton as implicit
+from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.fitting import least_squares
 from gfnn_jax.fitting.adam import PAPER, adam
-from gfnn_jax.implicit import small_solve
-from gfnn_jax.maps import Generated, SymplecticMap
-from gfnn_jax.rollout import rollout
-from gfnn_jax.scalars.inputs import box_inputs
-from gfnn_jax.scalars.mlp import PAPER_HIDDEN, Mlp
-from gfnn_jax.scalars.products import Products
+from gfnn_jax.solve.newton import small_solve
+from gfnn_jax.maps.symplectic_map import Generated, SymplecticMap
+from gfnn_jax.maps.symplectic_map.rollout import rollout
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.mlp import PAPER_HIDDEN, Mlp
+from gfnn_jax.families.products import Products
 from gfnn_jax.scenes import henon_heiles
 
 LANES = 1_000
@@ -359,8 +359,8 @@ def peak(num_pairs: int) -> float:
 import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 from gfnn_jax.fitting import least_squares
-from gfnn_jax.scalars.inputs import box_inputs
-from gfnn_jax.scalars.products import Products
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.products import Products
 w = np.random.default_rng(0).uniform(-1, 1, ({num_pairs}, 4))
 least_squares.fit(Products(box_inputs(w[:64]), 4), (w, w), (w[:100], w[:100]), np.ones(4))
 print(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1])

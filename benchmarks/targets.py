@@ -33,16 +33,18 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 import gfnn_jax as gfnn  # noqa: E402
-from gfnn_jax import figures, metrics, report  # noqa: E402
-from gfnn_jax.charts import TYPE2  # noqa: E402
+from gfnn_jax import report  # noqa: E402
+from gfnn_jax.evaluate import figures
+from gfnn_jax.evaluate import metrics
+from gfnn_jax.generating.charts import TYPE2  # noqa: E402
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI  # noqa: E402
-from gfnn_jax.domain import covering  # noqa: E402
+from gfnn_jax.maps.symplectic_map.domain import covering  # noqa: E402
 from gfnn_jax.fitting.adam import PAPER, adam  # noqa: E402
-from gfnn_jax.implicit import OK  # noqa: E402
-from gfnn_jax.maps import Generated, SymplecticMap  # noqa: E402
-from gfnn_jax.models import versions  # noqa: E402
-from gfnn_jax.scalars.inputs import box_inputs  # noqa: E402
-from gfnn_jax.scalars.mlp import PAPER_HIDDEN, Mlp, amplitude_of  # noqa: E402
+from gfnn_jax.solve.newton import OK  # noqa: E402
+from gfnn_jax.maps.symplectic_map import Generated, SymplecticMap  # noqa: E402
+from gfnn_jax.maps.symplectic_map.saved import versions  # noqa: E402
+from gfnn_jax.families.inputs import box_inputs  # noqa: E402
+from gfnn_jax.families.mlp import PAPER_HIDDEN, Mlp, amplitude_of  # noqa: E402
 from gfnn_jax.scenes import (  # noqa: E402
     DrawnFrom,
     Scene,

@@ -43,9 +43,10 @@ import numpy as np
 from integrators import runners
 
 import gfnn_jax as gfnn
-from gfnn_jax import figures, metrics
-from gfnn_jax.comparison import separable
-from gfnn_jax.implicit import LEFT_DOMAIN
+from gfnn_jax.evaluate import figures
+from gfnn_jax.evaluate import metrics
+from gfnn_jax.jobs.compare import separable
+from gfnn_jax.solve.newton import LEFT_DOMAIN
 from gfnn_jax.scenes import Scene
 
 # scene: pairs to learn from, the steps after which the error is taken, and states. In a batch all

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gfnn_jax import figures, metrics, scenes
-    from gfnn_jax.charts import CHARTS, Chart
+    from gfnn_jax.generating.charts import CHARTS, Chart
     from gfnn_jax.errors import InputError, WorkError
-    from gfnn_jax.maps import SymplecticMap
-    from gfnn_jax.models import load
+    from gfnn_jax.maps.symplectic_map import SymplecticMap
+    from gfnn_jax.maps.symplectic_map.saved import load
     from gfnn_jax.phase_space import Pairs
     from gfnn_jax.scenes import Scene
-    from gfnn_jax.selection import Fit, FitError, FitWarning, fit
-    from gfnn_jax.trajectories import (
+    from gfnn_jax.learn.fit import Fit, FitError, FitWarning, fit
+    from gfnn_jax.scenes.trajectories import (
         reference_trajectories,
         sample_pairs,
         sample_states,

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gfnn_jax.errors import InputError, WorkError
-from gfnn_jax.outputs import ensure_new
+from gfnn_jax.storage.outputs import ensure_new
 
 # Equal to those of `selection`, which would bring JAX; a test compares them.
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
@@ -293,7 +293,7 @@ def _summarise(ran: Any, out: Path) -> None:
         return
     from rich.console import Console
 
-    from gfnn_jax.selection import candidates_table
+    from gfnn_jax.learn.fit import candidates_table
 
     wide = Console() if sys.stdout.isatty() else Console(width=120)
     wide.print(candidates_table(ran.fit))
@@ -316,7 +316,7 @@ def _summarise(ran: Any, out: Path) -> None:
 
 def _print_status(status, left_at) -> None:
     """Lanes by status, and where those that left the domain did so."""
-    from gfnn_jax.report import status_counts
+    from gfnn_jax.evaluate.report import status_counts
 
     print(", ".join(f"{n} {name}" for name, n in status_counts(status).items() if n))
     left = [lane for lane in range(len(left_at)) if left_at[lane] >= 0]

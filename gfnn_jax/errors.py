@@ -1,4 +1,4 @@
-"""The two ways in which a job ends early, each told in one line."""
+"""How a job or a fit ends early, and what it warns of, each told in one line."""
 
 from __future__ import annotations
 
@@ -15,3 +15,14 @@ class WorkError(RuntimeError):
 
     def __init__(self, message: str):
         super().__init__(" ".join(message.split()))
+
+
+class FitError(ValueError):
+    """The data or the request cannot give a map: what was expected and what came."""
+
+    def __init__(self, message: str):
+        super().__init__(" ".join(message.split()))
+
+
+class FitWarning(UserWarning):
+    """The fit went on, but its user should know."""

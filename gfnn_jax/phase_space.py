@@ -12,9 +12,10 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+from gfnn_jax.arrays import namespace
 
 # The axis of length 2d is called phase: jaxtyping would read "2d" as an expression.
 Scalar = Float[Array, ""]
@@ -47,36 +48,34 @@ def sizes(z):
 
 
 def apply_j(g):
-    """J g for gradients g of shape (..., 2d): (g_q, g_p) -> (g_p, -g_q)."""
+    """J g for gradients g of shape (..., 2d), NumPy or JAX: (g_q, g_p) -> (g_p, -g_q)."""
     dim = g.shape[-1] // 2
-    return jnp.concatenate([g[..., dim:], -g[..., :dim]], axis=-1)
+    return namespace(g).concatenate([g[..., dim:], -g[..., :dim]], axis=-1)
 
 
-def symplectic_form(dim: int, dtype: Any = float) -> Float[Array, "phase phase"]:
-    """The matrix J of shape (2d, 2d)."""
-    zero, one = jnp.zeros((dim, dim), dtype), jnp.eye(dim, dtype=dtype)
-    return jnp.block([[zero, one], [-one, zero]])
+def symplectic_form(dim: int) -> Float[np.ndarray, "phase phase"]:
+    """The matrix J of shape (2d, 2d), float64 NumPy."""
+    zero, one = np.zeros((dim, dim)), np.eye(dim)
+    return np.block([[zero, one], [-one, zero]])
 
 
-def symplecticity_defect(
-    jacobian: Float[Array, "*batch phase phase"], scale: State | None = None
-) -> Float[Array, "*batch"]:
-    """Largest entry of Mᵀ J M − J in magnitude, for Jacobians M of shape (..., 2d, 2d).
+def symplecticity_defect(jacobian, scale=None):
+    """Largest entry of Mᵀ J M − J in magnitude, (...), for Jacobians M of shape (..., 2d, 2d).
 
     ``scale`` (2d,) makes the coordinates unit-sized first: z = scale * y. The form that M must
     preserve is then J with the entry (q_i, p_i) multiplied by scale_q,i * scale_p,i; the defect is
-    divided by the largest such product, so that it is a pure number.
+    divided by the largest such product, so that it is a pure number. NumPy or JAX.
     """
-    form = symplectic_form(jacobian.shape[-1] // 2, jacobian.dtype)
-    unit = jnp.ones((), jacobian.dtype)
+    xp = namespace(jacobian)
+    form = xp.asarray(symplectic_form(jacobian.shape[-1] // 2), dtype=jacobian.dtype)
     weighted = form
     if scale is not None:
-        jacobian = jacobian @ jnp.diag(scale)  # dZ/dy; the left factor of the form stays in z
-        weighted = form * jnp.outer(scale, scale)
-        unit = jnp.max(jnp.abs(weighted))
-    pulled_back = jnp.swapaxes(jacobian, -1, -2) @ form @ jacobian
-    defect = pulled_back - jnp.broadcast_to(weighted, pulled_back.shape)
-    return jnp.max(jnp.abs(defect), axis=(-2, -1)) / unit
+        scale = xp.asarray(scale, dtype=jacobian.dtype)
+        jacobian = jacobian * scale.reshape((1,) * (jacobian.ndim - 1) + scale.shape)  # dZ/dy
+        weighted = form * (scale[:, None] * scale[None, :])
+    pulled_back = xp.swapaxes(jacobian, -1, -2) @ (form @ jacobian)
+    defect = pulled_back - weighted.reshape((1,) * (jacobian.ndim - 2) + weighted.shape)
+    return xp.max(xp.abs(defect), axis=(-2, -1)) / xp.max(xp.abs(weighted))
 
 
 def hamiltonian_vector_field(hamiltonian: Callable) -> Callable:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax import candidates
-from gfnn_jax.scalars.inputs import box_inputs
-from gfnn_jax.scalars.products import Products
+from gfnn_jax.learn import candidates
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.products import Products
 
 
 def test_a_size_too_large_to_count_is_never_looked_at():

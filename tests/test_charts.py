@@ -10,8 +10,8 @@ import scipy.integrate
 import scipy.optimize
 from jax.flatten_util import ravel_pytree
 
-from gfnn_jax.charts import CHARTS, MIDPOINT, TYPE1, TYPE2, TYPE3, Chart
-from gfnn_jax.maps import Generated
+from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE1, TYPE2, TYPE3, Chart
+from gfnn_jax.maps.symplectic_map import Generated
 from gfnn_jax.phase_space import symplecticity_defect
 
 SKEW = Chart("skew 0.3", 0.3)

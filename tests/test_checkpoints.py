@@ -16,8 +16,8 @@ import numpy as np
 import optax
 import pytest
 
-from gfnn_jax import checkpoints
-from gfnn_jax.checkpoints import TrainingCheckpoints, load_model, save_model
+from gfnn_jax.storage import checkpoints
+from gfnn_jax.storage.checkpoints import TrainingCheckpoints, load_model, save_model
 from gfnn_jax.errors import InputError, WorkError
 
 RNG = np.random.default_rng(0)
@@ -260,7 +260,7 @@ WORKER = textwrap.dedent(
     """
     import sys
     import numpy as np
-    from gfnn_jax.checkpoints import TrainingCheckpoints
+    from gfnn_jax.storage.checkpoints import TrainingCheckpoints
 
     saved = TrainingCheckpoints(sys.argv[1], {})
     step, tree = saved.latest() or (0, {"w": np.ones((100, 50)), "b": np.zeros(3)})

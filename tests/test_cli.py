@@ -16,14 +16,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax import checkpoints, cli, models, pipeline, selection
-from gfnn_jax.charts import MIDPOINT
+from gfnn_jax import cli
+from gfnn_jax.storage import checkpoints
+from gfnn_jax.maps import saved as models
+from gfnn_jax.jobs import pipeline
+from gfnn_jax.learn import fit as selection
+from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.domain import covering
-from gfnn_jax.maps import Generated, SymplecticMap
+from gfnn_jax.maps.symplectic_map.domain import covering
+from gfnn_jax.maps.symplectic_map import Generated, SymplecticMap
 from gfnn_jax.phase_space import Pairs
-from gfnn_jax.scalars.inputs import box_inputs
-from gfnn_jax.scalars.products import Products
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.products import Products
 
 DT = 0.1
 
@@ -590,7 +594,8 @@ def test_killed_predictions_resume(model, tmp_path):
 # Every iteration of the training is saved and told.
 TRAINING = """
 import sys
-from gfnn_jax import candidates, cli
+from gfnn_jax import cli
+from gfnn_jax.learn import candidates
 
 candidates._CHECKPOINT_SECONDS = cli._SECONDS_BETWEEN_LINES = 0.0
 sys.exit(cli.main(sys.argv[1:]))

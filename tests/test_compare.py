@@ -6,7 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from gfnn_jax import cli, comparison, pipeline, scenes
+from gfnn_jax import cli, scenes
+from gfnn_jax.jobs import compare as comparison
+from gfnn_jax.jobs import pipeline
 from gfnn_jax.baselines.paper_gfnn import paper_gfnn
 from gfnn_jax.errors import InputError
 

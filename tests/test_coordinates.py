@@ -3,7 +3,7 @@
 import numpy as np
 
 from gfnn_jax.coordinates import Coordinates, lift
-from gfnn_jax.io import read_trajectories
+from gfnn_jax.data.files import read_trajectories
 
 
 def test_images_are_lifted_across_parts_that_lie_far_apart():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax.domain import covering
+from gfnn_jax.maps.symplectic_map.domain import covering
 
 
 def inside(domain, y):

@@ -9,7 +9,8 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.patches import StepPatch
 
-from gfnn_jax import figures, metrics
+from gfnn_jax.evaluate import figures
+from gfnn_jax.evaluate import metrics
 
 RNG = np.random.default_rng(0)
 STEPS = np.arange(101)

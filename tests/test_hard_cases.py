@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax import metrics
-from gfnn_jax.charts import TYPE2
+from gfnn_jax.evaluate import metrics
+from gfnn_jax.generating.charts import TYPE2
 from gfnn_jax.coordinates import Coordinates
-from gfnn_jax.domain import covering
-from gfnn_jax.implicit import NON_FINITE, OK
-from gfnn_jax.maps import Generated, SymplecticMap
+from gfnn_jax.maps.symplectic_map.domain import covering
+from gfnn_jax.solve.newton import NON_FINITE, OK
+from gfnn_jax.maps.symplectic_map import Generated, SymplecticMap
 from gfnn_jax.scenes import standard_map
 
 DT, K = 0.4, 0.6

@@ -10,9 +10,9 @@ import numpy as np
 import optimistix
 import pytest
 
-from gfnn_jax.charts import MIDPOINT, TYPE2
-from gfnn_jax.implicit import NON_FINITE, NOT_CONVERGED, OK, iterate, root, small_solve
-from gfnn_jax.maps import Generated
+from gfnn_jax.generating.charts import MIDPOINT, TYPE2
+from gfnn_jax.solve.newton import NON_FINITE, NOT_CONVERGED, OK, iterate, root, small_solve
+from gfnn_jax.maps.symplectic_map import Generated
 
 EPS = np.finfo(np.float64).eps
 

@@ -13,9 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from gfnn_jax import io
+from gfnn_jax.data import files as io
 from gfnn_jax.errors import InputError
-from gfnn_jax.io import DataWarning
+from gfnn_jax.data.files import DataWarning
 
 RNG = np.random.default_rng(0)
 Z = RNG.normal(size=(30, 4))
@@ -446,7 +446,7 @@ def test_damaged_bytes_never_escape(tmp_path_factory, data):
 
 
 def test_reading_needs_no_jax():
-    code = "import sys, gfnn_jax.io; sys.exit('jax' in sys.modules)"
+    code = "import sys, gfnn_jax.data.files; sys.exit('jax' in sys.modules)"
     package_needs_it = "import sys, gfnn_jax; sys.exit('jax' in sys.modules)"
     if subprocess.run([sys.executable, "-c", package_needs_it], check=False).returncode == 0:
         assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

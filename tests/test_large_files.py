@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax import pipeline, selection
-from gfnn_jax.io import iterate_pairs, read_sample, read_trajectories
+from gfnn_jax.jobs import pipeline
+from gfnn_jax.learn import fit as selection
+from gfnn_jax.data.files import iterate_pairs, read_sample, read_trajectories
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax.charts import MIDPOINT, TYPE2
+from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.fitting import least_squares
-from gfnn_jax.scalars.inputs import box_inputs
-from gfnn_jax.scalars.products import Products
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.products import Products
 
 RNG = np.random.default_rng(0)
 W = RNG.uniform(-1, 1, (900, 4)) * np.array([1.0, 2.0, 0.5, 1.0]) + 0.3

@@ -8,7 +8,7 @@ import scipy.optimize
 from jax.flatten_util import ravel_pytree
 
 from gfnn_jax.fitting.levenberg_marquardt import _compiled, levenberg_marquardt
-from gfnn_jax.scalars import as_pytree
+from gfnn_jax.families import as_pytree
 
 
 def network(params, w):

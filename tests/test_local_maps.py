@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from gfnn_jax.charts import CHARTS
-from gfnn_jax.local_maps import (
+from gfnn_jax.generating.charts import CHARTS
+from gfnn_jax.learn.local_maps import (
     data_defect,
     judge_chart,
     local_jacobians,

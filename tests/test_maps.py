@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from gfnn_jax import maps
-from gfnn_jax.charts import MIDPOINT, TYPE2
+from gfnn_jax.maps import symplectic_map as maps
+from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.coordinates import CARTESIAN, Coordinates, polar
-from gfnn_jax.domain import covering
-from gfnn_jax.implicit import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, OK
-from gfnn_jax.maps import Affine, Generated, SymplecticMap
+from gfnn_jax.maps.symplectic_map.domain import covering
+from gfnn_jax.solve.newton import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, OK
+from gfnn_jax.maps.symplectic_map import Affine, Generated, SymplecticMap
 from gfnn_jax.phase_space import symplectic_form, symplecticity_defect
 
 PENDULUM = Coordinates("pendulum", angles=(0,))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.special import jv
 
-from gfnn_jax import metrics
+from gfnn_jax.evaluate import metrics
 
 
 def test_position_and_momentum_errors_are_euclidean():

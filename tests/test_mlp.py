@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax.scalars.inputs import Inputs, box_inputs
-from gfnn_jax.scalars.mlp import (
+from gfnn_jax.families.inputs import Inputs, box_inputs
+from gfnn_jax.families.mlp import (
     ACTIVATIONS,
     PAPER_HIDDEN,
     PAPER_HIDDEN_STANDARD_MAP,

@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax import models
-from gfnn_jax.charts import CHARTS, MIDPOINT, TYPE2, AnyChart
+from gfnn_jax.maps import saved as models
+from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE2, AnyChart
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
-from gfnn_jax.domain import covering
+from gfnn_jax.maps.symplectic_map.domain import covering
 from gfnn_jax.errors import InputError
-from gfnn_jax.maps import Affine, Generated, SymplecticMap
-from gfnn_jax.scalars.inputs import box_inputs
-from gfnn_jax.scalars.mlp import Mlp
-from gfnn_jax.scalars.products import Products
-from gfnn_jax.scalars.sines import Sines
+from gfnn_jax.maps.symplectic_map import Affine, Generated, SymplecticMap
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.mlp import Mlp
+from gfnn_jax.families.products import Products
+from gfnn_jax.families.sines import Sines
 from gfnn_jax.scenes import DrawnFrom, Scene, pcr3bp, two_body
 
 RNG = np.random.default_rng(0)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gfnn_jax import outputs
+from gfnn_jax.storage import outputs
 from gfnn_jax.errors import InputError, WorkError
 
 

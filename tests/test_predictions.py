@@ -15,9 +15,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gfnn_jax import predictions
+from gfnn_jax.data import predictions
 from gfnn_jax.errors import InputError, WorkError
-from gfnn_jax.predictions import PredictionWriter
+from gfnn_jax.data.predictions import PredictionWriter
 
 LANES, SAVED, WIDTH = 3, 20, 4
 STEPS = np.arange(SAVED) * 5
@@ -222,7 +222,7 @@ WORKER = textwrap.dedent(
     """
     import sys, time
     import numpy as np
-    from gfnn_jax.predictions import PredictionWriter
+    from gfnn_jax.data.predictions import PredictionWriter
 
     job = PredictionWriter(
         sys.argv[1], shape=(50, 4), num_steps=399, dt=0.1, identity={"model": "m"}, resume=True

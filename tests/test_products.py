@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax.scalars.inputs import Inputs, box_inputs, variable_signs
-from gfnn_jax.scalars.products import Products, chebyshev, fourier
+from gfnn_jax.families.inputs import Inputs, box_inputs, variable_signs
+from gfnn_jax.families.products import Products, chebyshev, fourier
 
 
 @pytest.mark.parametrize("degree", range(9))

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax.charts import MIDPOINT, TYPE2
+from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
-from gfnn_jax.domain import covering
-from gfnn_jax.implicit import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, OK, STOPPED_AT_EDGE
-from gfnn_jax.maps import Generated, SymplecticMap
-from gfnn_jax.rollout import rollout
+from gfnn_jax.maps.symplectic_map.domain import covering
+from gfnn_jax.solve.newton import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, OK, STOPPED_AT_EDGE
+from gfnn_jax.maps.symplectic_map import Generated, SymplecticMap
+from gfnn_jax.maps.symplectic_map.rollout import rollout
 
 TORUS = Coordinates("torus", angles=(0, 1))
 CYLINDER = Coordinates("cylinder", angles=(0,))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from gfnn_jax import scenes
-from gfnn_jax import trajectories as tr
+from gfnn_jax.scenes import trajectories as tr
 from gfnn_jax.phase_space import hamiltonian_vector_field, symplectic_form, symplecticity_defect
 from gfnn_jax.scenes.two_body import angular_momentum, hamiltonian, kepler_flow
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax import candidates, selection
-from gfnn_jax.local_maps import local_jacobians, look_symplectic
-from gfnn_jax.preparation import prepare
+from gfnn_jax.learn import candidates
+from gfnn_jax.learn import fit as selection
+from gfnn_jax.learn.local_maps import local_jacobians, look_symplectic
+from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.scenes import DrawnFrom, Scene, henon_heiles
 from gfnn_jax.scenes.two_body import angular_momentum
 

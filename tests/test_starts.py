@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax.charts import CHARTS, MIDPOINT, TYPE2
+from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE2
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
-from gfnn_jax.maps import Generated
-from gfnn_jax.scalars.inputs import box_inputs
-from gfnn_jax.scalars.products import Products
-from gfnn_jax.starts import CLOSE, Starts, affordable, fit_starts
+from gfnn_jax.maps.symplectic_map import Generated
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.products import Products
+from gfnn_jax.generating.predictor import CLOSE, Starts, affordable, fit_starts
 
 DT = 0.4
 STATES = np.random.default_rng(0).uniform(-1, 1, (600, 2))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-import gfnn_jax.trajectories as tr
+import gfnn_jax.scenes.trajectories as tr
 from gfnn_jax import scenes
 from gfnn_jax.phase_space import hamiltonian_vector_field
 
@@ -221,7 +221,7 @@ def test_a_hundred_thousand_pairs_are_quick_and_finite():
 
 def test_float32_is_refused():
     code = (
-        "import jax, gfnn_jax.trajectories as t, gfnn_jax.scenes as s;"
+        "import jax, gfnn_jax.scenes.trajectories as t, gfnn_jax.scenes as s;"
         "t.sample_pairs(s.two_body(), 2, jax.random.key(0))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax import figures
+from gfnn_jax.evaluate import figures
 from gfnn_jax.phase_space import hamiltonian_vector_field
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))

@@ -21,9 +21,9 @@ import numpy as np
 from gfnn_jax.baselines.learned import Budget, Learned, Sequences, periodic, train
 from gfnn_jax.fitting.adam import Recipe
 from gfnn_jax.phase_space import apply_j, sizes
-from gfnn_jax.scalars.inputs import box_inputs
-from gfnn_jax.scalars.mlp import Mlp, amplitude_of, network
-from gfnn_jax.trajectories import flow_step
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.mlp import Mlp, amplitude_of, network
+from gfnn_jax.scenes.trajectories import flow_step
 
 HIDDEN, ACTIVATION = (200, 200), "tanh"
 RECIPE = Recipe(batch_size=200, epochs=40, epoch_length=250, rate=1e-3, schedule="cosine")

@@ -1,6 +1,6 @@
 """What every baseline shares: sequences to learn from, a training of a map, what comes out.
 
-A baseline ends in a step function z -> Z of one state (2d,), q first, which `gfnn_jax.rollout`
+A baseline ends in a step function z -> Z of one state (2d,), q first, which `gfnn_jax.maps.symplectic_map.rollout`
 rolls out. It learns in float32, as the public codes do, and predicts in the dtype of the state.
 """
 

@@ -16,14 +16,14 @@ import numpy as np
 
 from gfnn_jax.baselines.fields import q_angles
 from gfnn_jax.baselines.learned import HELD, Budget, Sequences
-from gfnn_jax.charts import TYPE2
+from gfnn_jax.generating.charts import TYPE2
 from gfnn_jax.coordinates import Coordinates
-from gfnn_jax.domain import covering
+from gfnn_jax.maps.symplectic_map.domain import covering
 from gfnn_jax.fitting.adam import PAPER, PAPER_STANDARD_MAP, AdamFit, adam
-from gfnn_jax.maps import Generated, SymplecticMap
+from gfnn_jax.maps.symplectic_map import Generated, SymplecticMap
 from gfnn_jax.phase_space import sizes
-from gfnn_jax.scalars.inputs import box_inputs
-from gfnn_jax.scalars.mlp import PAPER_HIDDEN, PAPER_HIDDEN_STANDARD_MAP, Mlp, amplitude_of
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.mlp import PAPER_HIDDEN, PAPER_HIDDEN_STANDARD_MAP, Mlp, amplitude_of
 
 _PART = 50  # iterations between looks at the clock
 _MOST_STATES = 20_000  # that describe the domain

@@ -26,8 +26,8 @@ from gfnn_jax.baselines.fields import network_field, q_angles
 from gfnn_jax.baselines.learned import Budget, Learned, Sequences, learn_map
 from gfnn_jax.fitting.adam import Recipe
 from gfnn_jax.phase_space import apply_j, split
-from gfnn_jax.scalars.inputs import box_inputs
-from gfnn_jax.scalars.mlp import Mlp, amplitude_of
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.mlp import Mlp, amplitude_of
 
 HIDDEN, ACTIVATION = (256, 256), "tanh"
 RECIPE = Recipe(batch_size=32, epochs=1_500, epoch_length=200, rate=5e-3, schedule="cosine")

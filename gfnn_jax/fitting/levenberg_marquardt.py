@@ -35,7 +35,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
-from gfnn_jax.scalars import as_pytree
+from gfnn_jax.families import as_pytree
 
 # δ₂ is a correction: where it is not small beside δ₁ the expansion has failed and δ₁ goes alone.
 LARGEST_ACCELERATION = 0.75

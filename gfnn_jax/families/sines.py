@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.scalars.inputs import Inputs
+from gfnn_jax.families.inputs import Inputs
 
 
 @partial(

@@ -19,10 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.candidates import Candidate, Ladder, Network, Rows, kinds, refitted, timed
-from gfnn_jax.charts import CHARTS
+from gfnn_jax.learn.candidates import Candidate, Ladder, Network, Rows, kinds, refitted, timed
+from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.coordinates import Coordinates
-from gfnn_jax.local_maps import (
+from gfnn_jax.learn.local_maps import (
     ChartJudgement,
     data_defect,
     judge_chart,
@@ -31,9 +31,9 @@ from gfnn_jax.local_maps import (
     odd_pairs,
     volume_change,
 )
-from gfnn_jax.maps import Generated, SymplecticMap
+from gfnn_jax.maps.symplectic_map import Generated, SymplecticMap
 from gfnn_jax.phase_space import Pairs, require_x64, split
-from gfnn_jax.preparation import FitError, FitWarning, choose_charts, factor_out, prepare
+from gfnn_jax.learn.prepare import FitError, FitWarning, choose_charts, factor_out, prepare
 from gfnn_jax.scenes.scene import AroundOrbit, Scene
 
 SCALARS = ("auto", "polynomial", "features", "sines", "mlp")

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogFormatterSciNotation, LogLocator, MaxNLocator, NullFormatter
 
-from gfnn_jax.metrics import error_statistics, kl_divergence
+from gfnn_jax.evaluate.metrics import error_statistics, kl_divergence
 
 # Okabe & Ito's palette without its yellow, which does not show on white, and with grey.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777")

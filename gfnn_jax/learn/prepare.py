@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.base_map import fit_half_map
-from gfnn_jax.charts import CHARTS, TYPE1
+from gfnn_jax.fitting.base_map import fit_half_map
+from gfnn_jax.generating.charts import CHARTS, TYPE1
 from gfnn_jax.coordinates import Coordinates, lift
-from gfnn_jax.domain import Domain, covering
-from gfnn_jax.local_maps import SAFE, ChartJudgement, judge_chart
-from gfnn_jax.maps import Affine
+from gfnn_jax.maps.symplectic_map.domain import Domain, covering
+from gfnn_jax.learn.local_maps import SAFE, ChartJudgement, judge_chart
+from gfnn_jax.maps.symplectic_map import Affine
 from gfnn_jax.phase_space import Pairs, sizes
 
 # Where the best chart's determinant falls below this, the map is far from the identity.

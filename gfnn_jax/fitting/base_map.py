@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from gfnn_jax.maps import Affine
+from gfnn_jax.maps.symplectic_map import Affine
 
 
 def fit_half_map(

@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.charts import AnyChart
+from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.phase_space import sizes
-from gfnn_jax.scalars.inputs import Inputs, box_inputs
-from gfnn_jax.scalars.products import Products, operations_of_values, values
+from gfnn_jax.families.inputs import Inputs, box_inputs
+from gfnn_jax.families.products import Products, operations_of_values, values
 
 # A start this close, in units of the data's spread, is the root of roundoff: one update is left.
 CLOSE = 5e-8

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
-from gfnn_jax.charts import AnyChart
+from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.phase_space import symplecticity_defect
 
 _CENTRES = 400

@@ -16,19 +16,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.charts import MIDPOINT, AnyChart
+from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI
 from gfnn_jax.fitting import least_squares
 from gfnn_jax.fitting.levenberg_marquardt import LMState, levenberg_marquardt
-from gfnn_jax.implicit import LEFT_DOMAIN, NOT_CONVERGED, Info
-from gfnn_jax.maps import Generated, SymplecticMap
+from gfnn_jax.solve.newton import LEFT_DOMAIN, NOT_CONVERGED, Info
+from gfnn_jax.maps.symplectic_map import Generated, SymplecticMap
 from gfnn_jax.phase_space import Pairs, sizes
-from gfnn_jax.preparation import Prepared
-from gfnn_jax.scalars.inputs import box_inputs, variable_signs
-from gfnn_jax.scalars.mlp import Mlp, amplitude_of
-from gfnn_jax.scalars.products import Products
-from gfnn_jax.scalars.sines import Sines
-from gfnn_jax.starts import CLOSE, Starts, affordable, fit_starts
+from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.families.inputs import box_inputs, variable_signs
+from gfnn_jax.families.mlp import Mlp, amplitude_of
+from gfnn_jax.families.products import Products
+from gfnn_jax.families.sines import Sines
+from gfnn_jax.generating.predictor import CLOSE, Starts, affordable, fit_starts
 
 # Degrees whose numbers of terms grow by about a half from one to the next; a stage is fitted by one
 # factorisation of the rows of its largest degree.

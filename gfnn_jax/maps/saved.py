@@ -18,20 +18,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.charts import Chart, TypeOne
-from gfnn_jax.checkpoints import load_model, save_model
+from gfnn_jax.generating.charts import Chart, TypeOne
+from gfnn_jax.storage.checkpoints import load_model, save_model
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
-from gfnn_jax.domain import Domain
+from gfnn_jax.maps.symplectic_map.domain import Domain
 from gfnn_jax.errors import InputError
-from gfnn_jax.maps import Affine, Generated, SymplecticMap
-from gfnn_jax.outputs import ensure_new
-from gfnn_jax.scalars.inputs import Inputs
-from gfnn_jax.scalars.mlp import Mlp
-from gfnn_jax.scalars.products import Products
-from gfnn_jax.scalars.sines import Sines
+from gfnn_jax.maps.symplectic_map import Affine, Generated, SymplecticMap
+from gfnn_jax.storage.outputs import ensure_new
+from gfnn_jax.families.inputs import Inputs
+from gfnn_jax.families.mlp import Mlp
+from gfnn_jax.families.products import Products
+from gfnn_jax.families.sines import Sines
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.scene import Scene
-from gfnn_jax.starts import Start
+from gfnn_jax.generating.predictor import Start
 
 _TYPES: dict[str, type] = {
     kind.__name__: kind

@@ -12,9 +12,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from gfnn_jax.implicit import STATUS_NAMES
-from gfnn_jax.models import versions
-from gfnn_jax.selection import Fit
+from gfnn_jax.solve.newton import STATUS_NAMES
+from gfnn_jax.maps.symplectic_map.saved import versions
+from gfnn_jax.learn.fit import Fit
 
 STEPS_REPORTED = (1, 10, 100, 1000)
 

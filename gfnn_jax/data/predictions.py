@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.errors import InputError
-from gfnn_jax.outputs import (
+from gfnn_jax.storage.outputs import (
     atomic_file,
     atomic_write,
     ensure_new,

@@ -19,14 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from gfnn_jax import implicit
-from gfnn_jax.charts import AnyChart, Chart
+from gfnn_jax.solve import newton as implicit
+from gfnn_jax.generating.charts import AnyChart, Chart
 from gfnn_jax.coordinates import TWO_PI, Coordinates
-from gfnn_jax.domain import Domain
-from gfnn_jax.implicit import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, Info
+from gfnn_jax.maps.symplectic_map.domain import Domain
+from gfnn_jax.solve.newton import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, Info
 from gfnn_jax.phase_space import apply_j, require_x64, symplecticity_defect
-from gfnn_jax.rollout import scan_steps
-from gfnn_jax.scalars import as_pytree
+from gfnn_jax.maps.symplectic_map.rollout import scan_steps
+from gfnn_jax.families import as_pytree
 
 _MOST_NEWTON = 40
 _TWO_PI_REST = 2.4492935982947064e-16  # what float64 leaves out of 2π

@@ -24,7 +24,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.errors import InputError
-from gfnn_jax.outputs import atomic_folder, failures_as_work_errors, restore_interrupted
+from gfnn_jax.storage.outputs import atomic_folder, failures_as_work_errors, restore_interrupted
 
 FORMAT = 2
 _SUMS = "SHA256SUMS"

@@ -21,20 +21,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax import figures, metrics, models, pipeline, report
+from gfnn_jax.evaluate import figures
+from gfnn_jax.evaluate import metrics
+from gfnn_jax.maps import saved as models
+from gfnn_jax.jobs import pipeline
+from gfnn_jax.evaluate import report
 from gfnn_jax.baselines import METHODS, Budget, Learned, Sequences
 from gfnn_jax.baselines.paper_gfnn import paper_gfnn
 from gfnn_jax.coordinates import TWO_PI
 from gfnn_jax.errors import InputError, WorkError
-from gfnn_jax.implicit import NON_FINITE, NOT_CONVERGED, OK
-from gfnn_jax.outputs import atomic_folder, atomic_write, ensure_new, failures_as_work_errors
+from gfnn_jax.solve.newton import NON_FINITE, NOT_CONVERGED, OK
+from gfnn_jax.storage.outputs import atomic_folder, atomic_write, ensure_new, failures_as_work_errors
 from gfnn_jax.phase_space import Pairs, sizes, symplecticity_defect
-from gfnn_jax.pipeline import NUM_STEPS, NUM_TRAJECTORIES, REPORT, Measured, Rollouts, Say
-from gfnn_jax.rollout import rollout
+from gfnn_jax.jobs.pipeline import NUM_STEPS, NUM_TRAJECTORIES, REPORT, Measured, Rollouts, Say
+from gfnn_jax.maps.symplectic_map.rollout import rollout
 from gfnn_jax.scenes import Scene
-from gfnn_jax.selection import FitWarning
-from gfnn_jax.selection import fit as select
-from gfnn_jax.trajectories import (
+from gfnn_jax.learn.fit import FitWarning
+from gfnn_jax.learn.fit import fit as select
+from gfnn_jax.scenes.trajectories import (
     reference_trajectories,
     sample_pairs,
     sample_sequences,

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.scalars.inputs import Inputs
+from gfnn_jax.families.inputs import Inputs
 
 # A GPU would multiply float32 in TF32: 7e-4 of relative error in ∇S.
 _dot = partial(jnp.matmul, precision="highest")

@@ -18,20 +18,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax import figures, metrics, models, report, scenes
-from gfnn_jax.candidates import Candidate
-from gfnn_jax.checkpoints import TrainingCheckpoints
+from gfnn_jax import scenes
+from gfnn_jax.evaluate import figures
+from gfnn_jax.evaluate import metrics
+from gfnn_jax.maps import saved as models
+from gfnn_jax.evaluate import report
+from gfnn_jax.learn.candidates import Candidate
+from gfnn_jax.storage.checkpoints import TrainingCheckpoints
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.errors import InputError, WorkError
-from gfnn_jax.io import iterate_pairs, read_initial_states, read_sample, read_trajectories
-from gfnn_jax.maps import Lanes, SymplecticMap
-from gfnn_jax.outputs import atomic_folder, ensure_new, failures_as_work_errors
+from gfnn_jax.data.files import iterate_pairs, read_initial_states, read_sample, read_trajectories
+from gfnn_jax.maps.symplectic_map import Lanes, SymplecticMap
+from gfnn_jax.storage.outputs import atomic_folder, ensure_new, failures_as_work_errors
 from gfnn_jax.phase_space import Pairs, sizes
-from gfnn_jax.predictions import PredictionWriter
+from gfnn_jax.data.predictions import PredictionWriter
 from gfnn_jax.scenes import Scene
-from gfnn_jax.selection import Fit, FitError, refit
-from gfnn_jax.selection import fit as select
-from gfnn_jax.trajectories import reference_trajectories, sample_pairs, sample_test_states
+from gfnn_jax.learn.fit import Fit, FitError, refit
+from gfnn_jax.learn.fit import fit as select
+from gfnn_jax.scenes.trajectories import reference_trajectories, sample_pairs, sample_test_states
 
 Say = Callable[[str], Any]
 

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.scalars.inputs import Inputs
+from gfnn_jax.families.inputs import Inputs
 
 # More accurate than the paper's shapes after a training of the same time, and three times smaller.
 DEFAULT_HIDDEN = (64, 64, 64)
