@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from gfnn_jax.arrays import namespace
 from gfnn_jax.phase_space import sizes, split
 
 TWO_PI = 2 * np.pi
 _NEAR = 8  # neighbours that are looked at first when states are joined to a tree
+# States that are transformed at once: batches are padded to a power of two, at most this one.
+_FEWEST, _MOST = 64, 2**16
 
 
 def _identity(z):
@@ -71,12 +73,57 @@ def polar(*, cyclic: bool) -> Coordinates:
     )
 
 
+def to_inner(coordinates: Coordinates, z) -> np.ndarray:
+    """y = forward(z) of states z (..., 2d): NumPy, float64. NaN where a state has no such y."""
+    return _batch(coordinates.forward, z)
+
+
+def to_user(coordinates: Coordinates, y) -> np.ndarray:
+    """z = inverse(y) of states y (..., 2d): NumPy, float64."""
+    return _batch(coordinates.inverse, y)
+
+
+def _batch(change: Callable, z) -> np.ndarray:
+    z = np.array(z, dtype=np.float64)
+    if change is _identity or z.size == 0:
+        return z
+    flat, done = z.reshape(-1, z.shape[-1]), []
+    size = min(_MOST, max(_FEWEST, 1 << (len(flat) - 1).bit_length()))
+    for first in range(0, len(flat), size):
+        part = flat[first : first + size]
+        padded = np.concatenate([part, np.repeat(part[:1], size - len(part), axis=0)])
+        done.append(np.asarray(_changed(padded, change=change))[: len(part)])
+    return np.concatenate(done).reshape(z.shape)
+
+
+@partial(jax.jit, static_argnames="change")
+def _changed(z, *, change):
+    return jax.vmap(change)(z)
+
+
+def whole_turns(angle):
+    """The multiple of 2π nearest to an angle of any shape. NumPy or JAX."""
+    return TWO_PI * namespace(angle).round(angle / TWO_PI)
+
+
+def nearest_image(difference, angles: tuple[int, ...]) -> np.ndarray:
+    """Differences of states (..., 2d), those of the ``angles`` brought to [−π, π]. A NumPy copy.
+
+    ``angles`` are the indices of what has period 2π. An infinite difference of an angle is NaN.
+    """
+    difference, index = np.array(difference, dtype=np.float64), list(angles)
+    if index:
+        with np.errstate(invalid="ignore"):
+            difference[..., index] -= whole_turns(difference[..., index])
+    return difference
+
+
 def circle_centre(angle) -> tuple[float, bool]:
     """Centre of the shortest arc that holds all values of an angle (N,); whether it is a circle.
 
-    The cut, where the angle jumps by 2π, lies opposite; data count as the whole circle where no gap
-    is wider than an eighth of it. Its centre is 0: there numbers are finest, and alike on both
-    sides, so that what rounding does to a kick averages out.
+    The angle jumps by 2π opposite to the centre. Data count as the whole circle where no gap is
+    wider than an eighth of it. Its centre is 0: there numbers are finest, and alike on both sides,
+    so that what rounding does to a kick averages out.
     """
     wrapped = np.sort(np.mod(angle, TWO_PI))
     gaps = np.diff(wrapped, append=wrapped[0] + TWO_PI)
@@ -100,7 +147,7 @@ def lift(y0, y1, coordinates: Coordinates):
     centres, covered = [], []
     for i in coordinates.angles:
         centre, whole = circle_centre(y0[:, i])
-        turns = TWO_PI * np.round((y0[:, i] - centre) / TWO_PI)
+        turns = whole_turns(y0[:, i] - centre)
         y0[:, i] -= turns
         y1[:, i] -= turns
         centres.append(centre)
@@ -109,11 +156,10 @@ def lift(y0, y1, coordinates: Coordinates):
         order, parent = _spanning_order(_embedded(y0, coordinates))
         for i in coordinates.angles:
             difference = y1[:, i] - y0[:, i]
-            difference -= TWO_PI * np.round(difference / TWO_PI)
+            difference -= whole_turns(difference)
             for node in order[1:]:
-                step = difference[node] - difference[parent[node]]
-                difference[node] -= TWO_PI * np.round(step / TWO_PI)
-            difference -= TWO_PI * np.round(np.median(difference) / TWO_PI)
+                difference[node] -= whole_turns(difference[node] - difference[parent[node]])
+            difference -= whole_turns(np.median(difference))
             y1[:, i] = y0[:, i] + difference
     return y0, y1, np.array(centres), np.array(covered, dtype=bool)
 
@@ -134,6 +180,14 @@ def _embedded(y, coordinates: Coordinates):
 
 def _spanning_order(points):
     """Nodes of a minimal spanning tree of neighbours in breadth-first order, and their parents."""
+    from scipy.sparse import csr_array  # loaded when first used
+    from scipy.sparse.csgraph import (
+        breadth_first_order,
+        connected_components,
+        minimum_spanning_tree,
+    )
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+
     count = len(points)
     distance, to = cKDTree(points).query(points, k=np.arange(1, min(_NEAR, count) + 1))
     edges = np.repeat(np.arange(count), distance.shape[1]), to.ravel(), distance.ravel()
@@ -153,6 +207,8 @@ def _bridges(points, part):
     Any two parts differ in some bit of their numbers: for each bit, one side is sought among the
     other. Memory is that of the points, however far apart the parts are.
     """
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+
     distance, to = np.full(len(points), np.inf), np.zeros(len(points), dtype=int)
     for bit in range(int(part.max()).bit_length()):
         for side in (0, 1):
