@@ -14,14 +14,17 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gfnn_jax import figures, metrics, scenes
+    from gfnn_jax import scenes
+    from gfnn_jax.compile_cache import enable_compile_cache
+    from gfnn_jax.errors import FitError, FitWarning, InputError, WorkError
+    from gfnn_jax.evaluate import figures, metrics
+    from gfnn_jax.families import from_function
     from gfnn_jax.generating.charts import CHARTS, Chart
-    from gfnn_jax.errors import InputError, WorkError
+    from gfnn_jax.learn.fit import Fit, fit
+    from gfnn_jax.maps.saved import load
     from gfnn_jax.maps.symplectic_map import SymplecticMap
-    from gfnn_jax.maps.symplectic_map.saved import load
     from gfnn_jax.phase_space import Pairs
     from gfnn_jax.scenes import Scene
-    from gfnn_jax.learn.fit import Fit, FitError, FitWarning, fit
     from gfnn_jax.scenes.trajectories import (
         reference_trajectories,
         sample_pairs,
@@ -31,24 +34,26 @@ if TYPE_CHECKING:
 
     __version__: str
 
-_MODULES = ("figures", "metrics", "scenes")
+_MODULES = {"figures": "evaluate.figures", "metrics": "evaluate.metrics", "scenes": "scenes"}
 _HOMES = {
-    "CHARTS": "charts",
-    "Chart": "charts",
-    "Fit": "selection",
-    "FitError": "selection",
-    "FitWarning": "selection",
+    "CHARTS": "generating.charts",
+    "Chart": "generating.charts",
+    "Fit": "learn.fit",
+    "FitError": "errors",
+    "FitWarning": "errors",
     "InputError": "errors",
     "Pairs": "phase_space",
     "Scene": "scenes",
-    "SymplecticMap": "maps",
+    "SymplecticMap": "maps.symplectic_map",
     "WorkError": "errors",
-    "fit": "selection",
-    "load": "models",
-    "reference_trajectories": "trajectories",
-    "sample_pairs": "trajectories",
-    "sample_states": "trajectories",
-    "sample_test_states": "trajectories",
+    "enable_compile_cache": "compile_cache",
+    "fit": "learn.fit",
+    "from_function": "families",
+    "load": "maps.saved",
+    "reference_trajectories": "scenes.trajectories",
+    "sample_pairs": "scenes.trajectories",
+    "sample_states": "scenes.trajectories",
+    "sample_test_states": "scenes.trajectories",
 }
 
 __all__ = [
@@ -62,8 +67,10 @@ __all__ = [
     "Scene",
     "SymplecticMap",
     "WorkError",
+    "enable_compile_cache",
     "figures",
     "fit",
+    "from_function",
     "load",
     "metrics",
     "reference_trajectories",
@@ -76,8 +83,8 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name in _MODULES:
-        return importlib.import_module(f"gfnn_jax.{name}")
-    if name in _HOMES:
+        value = importlib.import_module(f"gfnn_jax.{_MODULES[name]}")
+    elif name in _HOMES:
         value = getattr(importlib.import_module(f"gfnn_jax.{_HOMES[name]}"), name)
     elif name == "__version__":
         from importlib.metadata import version

@@ -1,8 +1,7 @@
 """The command line: ``gfnn scenes | run | fit | predict | compare``.
 
-Exit status 0 on success, 2 on bad usage or bad input, 1 on a failure during the work, 130 on
-Ctrl-C and 143 on SIGTERM, each but the first with one line that says why. Nothing heavy is
-imported before the usage has been found good.
+Each exit status but 0 comes with one line that says why (`EXIT_STATUS`). Nothing heavy is imported
+before the usage has been found good.
 """
 
 from __future__ import annotations
@@ -13,19 +12,35 @@ import math
 import os
 import signal
 import sys
-import time
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from gfnn_jax.compile_cache import enable_compile_cache
 from gfnn_jax.errors import InputError, WorkError
+from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new
 
-# Equal to those of `selection`, which would bring JAX; a test compares them.
+# Equal to those of `learn.fit`, which would bring JAX; a test compares them.
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
-SCALARS = ("auto", "polynomial", "features", "sines", "mlp")
-_SECONDS_BETWEEN_LINES = 2.0
+FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
+LEARN = ("auto", "map", "hamiltonian")
+
+EXIT_STATUS = """\
+exit status:
+  0    success
+  1    a failure during the work (a full disk); with --strict also a missed tolerance
+  2    bad usage or bad input, before any long work
+  130  stopped by Ctrl-C
+  143  stopped by SIGTERM"""
+WORDS = """\
+the table of candidates:
+  chart      where the generating function S is evaluated: type2 at (q, P), type3 at (Q, p),
+             midpoint at ((q + Q)/2, (p + P)/2), type1 at (q, Q); capitals are one step later
+  error      one-step error of held-out pairs; relative: RMS over coordinates of error divided by
+             that coordinate's spread
+  95 % bound the tolerance is met where this upper bound of the relative error is within it"""
 
 
 class _Terminated(KeyboardInterrupt):
@@ -53,8 +68,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt as stop:
         terminated = isinstance(stop, _Terminated)
-        hint = "; --resume goes on with what is unfinished"
-        return _fail(143 if terminated else 130, ("terminated" if terminated else "stopped") + hint)
+        kept = getattr(stop, "__notes__", ["nothing was kept"])  # notes of who keeps something
+        return _fail(
+            143 if terminated else 130,
+            "; ".join(["terminated" if terminated else "stopped", *kept]),
+        )
 
 
 def _fail(status: int, why: object) -> int:
@@ -63,8 +81,14 @@ def _fail(status: int, why: object) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="gfnn", description="Learn exactly symplectic maps, predict with them.")
+    plain: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
+    parser = _Parser(
+        prog="gfnn", description="Learn exactly symplectic maps, predict with them.",
+        epilog=EXIT_STATUS, **plain,
+    )  # fmt: skip
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    fitting: dict[str, Any] = {"epilog": f"{WORDS}\n\n{EXIT_STATUS}", **plain}
+    others: dict[str, Any] = {"epilog": EXIT_STATUS, **plain}
 
     command = commands.add_parser("scenes", help="list the scenes")
     command.set_defaults(command=_scenes)
@@ -72,6 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     command = commands.add_parser(
         "run", help="a scene from reference data to figures",
         description="Reference data of a scene, fit, rollouts, metrics, figures, report.json.",
+        **fitting,
     )  # fmt: skip
     command.set_defaults(command=_run)
     command.add_argument("scene", metavar="SCENE", help="a name that `gfnn scenes` lists")
@@ -83,6 +108,7 @@ def _parser() -> argparse.ArgumentParser:
     command = commands.add_parser(
         "fit", help="learn the map of your own trajectories",
         description="Learn the map of a .npz, .npy or .csv file; q first.",
+        **fitting,
     )  # fmt: skip
     command.set_defaults(command=_fit)
     command.add_argument("data", type=Path, metavar="DATA")
@@ -96,10 +122,22 @@ def _parser() -> argparse.ArgumentParser:
         "--angles", type=_indices, default=(), metavar="0,2", help="indices in z with period 2π"
     )
     _add_fit_options(command, "1e-6")
+    command.add_argument(
+        "--absolute-tolerance", type=_positive, metavar="E",
+        help="instead of --tolerance: bound on the RMS per component, in the data's units",
+    )  # fmt: skip
+    command.add_argument(
+        "--max-seconds", type=_positive, default=120.0, metavar="S",
+        help="the best map by then is kept (default 120)",
+    )  # fmt: skip
+    command.add_argument(
+        "--strict", action="store_true", help="exit status 1 where the tolerance is not met"
+    )
 
     command = commands.add_parser(
         "predict", help="predict with a learned map",
         description="Predict from initial states (.npy, .npz with z0, or a trajectory file).",
+        **others,
     )  # fmt: skip
     command.set_defaults(command=_predict)
     command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
@@ -116,6 +154,7 @@ def _parser() -> argparse.ArgumentParser:
     command = commands.add_parser(
         "compare", help="the same data through other methods",
         description="A scene learned by GFNN and by the methods that the paper compares with.",
+        **others,
     )  # fmt: skip
     command.set_defaults(command=_compare)
     command.add_argument("scene", metavar="SCENE", help="a name that `gfnn scenes` lists")
@@ -136,12 +175,20 @@ def _parser() -> argparse.ArgumentParser:
 def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
     command.add_argument(
         "--tolerance", type=_positive, metavar="E",
-        help=f"bound on the one-step error, RMS per component (default {tolerance})",
+        help="bound on the one-step error, RMS over coordinates of error divided by spread "
+        f"(default {tolerance})",
     )  # fmt: skip
+    command.add_argument(
+        "--learn", choices=LEARN, default="auto", help="what is learned (default %(default)s)"
+    )
     command.add_argument("--chart", choices=CHARTS, default="auto", help="default %(default)s")
     command.add_argument(
-        "--scalar", choices=SCALARS, default="auto",
+        "--family", choices=FAMILIES, default="auto",
         help="family of the generating function (default %(default)s)",
+    )  # fmt: skip
+    command.add_argument(
+        "--scalar", dest="family", choices=FAMILIES, default=argparse.SUPPRESS,
+        help="the old name of --family",
     )  # fmt: skip
     command.add_argument("--seed", type=_seed, default=0, metavar="N")
     _add_output_options(command)
@@ -153,26 +200,31 @@ def _add_output_options(command: argparse.ArgumentParser) -> None:
 
 
 def _positive(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
     if not (math.isfinite(value) and value > 0):
         raise argparse.ArgumentTypeError(f"expected a finite number > 0, got {text}")
     return value
 
 
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"expected an integer > 0, got {text}")
-    if value >= 2**53:
-        raise argparse.ArgumentTypeError(f"expected an integer below 2**53, got {text}")
+def _whole(text: str, low: int, high: int, what: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = low - 1
+    if not low <= value < high:
+        raise argparse.ArgumentTypeError(f"expected a whole number {what}, got {text}")
     return value
+
+
+def _count(text: str) -> int:
+    return _whole(text, 1, 2**53, "from 1 to 2**53 - 1")
 
 
 def _seed(text: str) -> int:
-    value = int(text)
-    if not 0 <= value < 2**32:
-        raise argparse.ArgumentTypeError(f"expected an integer from 0 to 2**32 - 1, got {text}")
-    return value
+    return _whole(text, 0, 2**32, "from 0 to 2**32 - 1")
 
 
 def _check_exists(path: Path) -> None:
@@ -211,36 +263,50 @@ def _scenes(arguments: argparse.Namespace) -> None:
 
 def _run(arguments: argparse.Namespace) -> None:
     out = arguments.out or Path("runs") / arguments.scene
+    _check_learn(arguments.learn)
     if not arguments.resume:
         ensure_new(out, arguments.overwrite, folder=True)
     _set_up_jax()
-    from gfnn_jax import pipeline
+    from gfnn_jax.jobs.run import run
 
-    with _progress() as say:
-        ran = pipeline.run(
+    with progress.on_stderr() as shown:
+        ran = run(
             arguments.scene, out=out, quick=arguments.quick, seed=arguments.seed, dt=arguments.dt,
-            tolerance=arguments.tolerance, chart=arguments.chart, scalar=arguments.scalar,
-            overwrite=arguments.overwrite, resume=arguments.resume, say=say,
+            tolerance=arguments.tolerance, chart=arguments.chart, learn=arguments.learn,
+            family=arguments.family, overwrite=arguments.overwrite, resume=arguments.resume,
+            progress=shown,
         )  # fmt: skip
     _summarise(ran, out)
 
 
 def _fit(arguments: argparse.Namespace) -> None:
+    _check_learn(arguments.learn)
+    if arguments.tolerance is not None and arguments.absolute_tolerance is not None:
+        raise InputError("expected --tolerance or --absolute-tolerance, not both")
     if not arguments.resume:
         ensure_new(arguments.out, arguments.overwrite, folder=True)
     _check_exists(arguments.data)
     _set_up_jax()
-    from gfnn_jax import pipeline
+    from gfnn_jax.jobs.fit import fit
 
-    with _progress() as say:
-        ran = pipeline.fit(
+    with progress.on_stderr() as shown:
+        ran = fit(
             arguments.data, out=arguments.out, dt=arguments.dt,
             tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
-            chart=arguments.chart, scalar=arguments.scalar, scene_name=arguments.scene,
-            angles=arguments.angles, seed=arguments.seed, overwrite=arguments.overwrite,
-            resume=arguments.resume, say=say,
+            absolute_tolerance=arguments.absolute_tolerance, max_seconds=arguments.max_seconds,
+            chart=arguments.chart, learn=arguments.learn, family=arguments.family,
+            scene_name=arguments.scene, angles=arguments.angles, seed=arguments.seed,
+            overwrite=arguments.overwrite, resume=arguments.resume, progress=shown,
         )  # fmt: skip
     _summarise(ran, arguments.out)
+    if arguments.strict and not _met(arguments.out):
+        raise WorkError(f"{arguments.out}: is written, but misses the tolerance (--strict)")
+
+
+def _met(model: Path) -> bool:
+    from gfnn_jax.maps.saved import record
+
+    return record(model)["fit"]["tolerance_met"]
 
 
 def _predict(arguments: argparse.Namespace) -> None:
@@ -249,14 +315,14 @@ def _predict(arguments: argparse.Namespace) -> None:
     for path in (arguments.model, arguments.initial):
         _check_exists(path)
     _set_up_jax()
-    from gfnn_jax import pipeline
+    from gfnn_jax.jobs.predict import predict
 
-    with _progress() as say:
-        predicted = pipeline.predict(
+    with progress.on_stderr() as shown:
+        predicted = predict(
             arguments.model, arguments.initial, num_steps=arguments.num_steps,
             save_every=arguments.save_every, out=arguments.out,
             stop_outside=arguments.outside == "stop", overwrite=arguments.overwrite,
-            resume=arguments.resume, say=say,
+            resume=arguments.resume, progress=shown,
         )  # fmt: skip
     num_lanes = len(predicted.status)
     print(f"{arguments.out}: {num_lanes} trajectories of {arguments.num_steps} steps, "
@@ -269,40 +335,42 @@ def _compare(arguments: argparse.Namespace) -> None:
     if not arguments.resume:
         ensure_new(out, arguments.overwrite, folder=True)
     _set_up_jax()
-    from gfnn_jax import comparison
+    from gfnn_jax.jobs.compare import compare
+    from gfnn_jax.jobs.comparison_table import table
 
-    with _progress() as say:
-        compared = comparison.compare(
+    with progress.on_stderr() as shown:
+        compared = compare(
             arguments.scene, methods=arguments.methods, out=out, quick=arguments.quick,
             seed=arguments.seed, cap=arguments.cap, overwrite=arguments.overwrite,
-            resume=arguments.resume, say=say,
+            resume=arguments.resume, progress=shown,
         )  # fmt: skip
     if compared is None:
         print(f"{out}: is there already, from this very job")
         return
-    from rich.console import Console
-
-    wide = Console() if sys.stdout.isatty() else Console(width=120)
-    wide.print(comparison.table(compared.report))
+    _print_table(table(compared.report))
     print(f"written to {out}")
+
+
+def _check_learn(learn: str) -> None:
+    if learn == "hamiltonian":
+        raise InputError("--learn hamiltonian: not available yet; --learn map learns the map")
 
 
 def _summarise(ran: Any, out: Path) -> None:
     if ran is None:
         print(f"{out}: is there already, from this very job")
         return
-    from rich.console import Console
-
     from gfnn_jax.learn.fit import candidates_table
 
-    wide = Console() if sys.stdout.isatty() else Console(width=120)
-    wide.print(candidates_table(ran.fit))
+    _print_table(candidates_table(ran.fit))
     report = ran.report
+    fit = report["fit"]
     print(
         f"{report['model']['chart']} {report['model']['label']}: one-step error "
-        f"{report['fit']['validation_rms']:.2e} (tolerance {report['fit']['tolerance']:g}), "
-        f"symplecticity defect {report['map']['symplecticity_defect']:.1e}"
+        f"{fit['validation_rms']:.2e}, {fit['validation_relative']:.2e} of the spread (tolerance "
+        f"{fit['tolerance']:g}), symplecticity defect {report['map']['symplecticity_defect']:.1e}"
     )
+    print(fit["ended"])
     rollout = report["rollout"]
     if rollout is not None:
         errors = ", ".join(f"{e:.1e} at step {n}" for n, e in rollout["error"].items())
@@ -312,6 +380,13 @@ def _summarise(ran: Any, out: Path) -> None:
         counts = rollout["status_counts"].items()
         print("rollouts: " + ", ".join(f"{n} {name}" for name, n in counts if n))
     print(f"written to {out}")
+
+
+def _print_table(table: Any) -> None:
+    from rich.console import Console
+
+    wide = Console() if sys.stdout.isatty() else Console(width=120)
+    wide.print(table)
 
 
 def _print_status(status, left_at) -> None:
@@ -334,33 +409,7 @@ def _set_up_jax() -> None:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
-        caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        jax.config.update("jax_compilation_cache_dir", str(Path(caches) / "gfnn_jax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-
-
-@contextlib.contextmanager
-def _progress() -> Iterator[Any]:
-    """``say(message)`` on standard error: a status line on a terminal, else a line now and then."""
-    started = time.perf_counter()
-    if not sys.stderr.isatty():
-        last = -math.inf
-
-        def say(message: str) -> None:
-            nonlocal last
-            now = time.perf_counter() - started
-            if now > last + _SECONDS_BETWEEN_LINES:
-                print(f"[{now:6.1f} s] {message}", file=sys.stderr)
-                last = now
-
-        yield say
-        return
-    from rich.console import Console
-    from rich.markup import escape
-
-    with Console(stderr=True).status("starting") as status:
-        yield lambda message: status.update(escape(message))
+    enable_compile_cache()
 
 
 @contextlib.contextmanager

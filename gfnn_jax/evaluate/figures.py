@@ -20,7 +20,8 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogFormatterSciNotation, LogLocator, MaxNLocator, NullFormatter
 
-from gfnn_jax.evaluate.metrics import error_statistics, kl_divergence
+from gfnn_jax.evaluate.chaos import kl_divergence
+from gfnn_jax.evaluate.errors import error_statistics
 
 # Okabe & Ito's palette without its yellow, which does not show on white, and with grey.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777")
@@ -358,16 +359,16 @@ def marginal_panels(panels: Mapping, bins: int) -> Figure:
 
 @style()
 def speed_against_error(
-    kiloflops, errors, labels: Sequence[str], chosen, tolerance=None, ax=None
+    kilo_operations, errors, labels: Sequence[str], chosen, tolerance=None, ax=None
 ) -> Axes:
-    """Candidates: one-step error against the counted work of a predicted step, both logarithmic.
+    """Candidates: one-step error against the counted operations of a predicted step, log–log.
 
-    kiloflops, errors: (K,). The points are numbered by rising cost and named on the right; the
-    chosen one is ringed, the staircase joins those that no other beats in both, and the dotted
+    kilo_operations, errors: (K,). The points are numbered by rising cost and named on the right;
+    the chosen one is ringed, the staircase joins those that no other beats in both, and the dotted
     line is the tolerance asked for.
     """
     ax = _axes(ax, WIDTH * 1.6, HEIGHT * 1.15)
-    cost, error = np.asarray(kiloflops, float), np.asarray(errors, float)
+    cost, error = np.asarray(kilo_operations, float), np.asarray(errors, float)
     order = np.argsort(cost, kind="stable")
     best = np.minimum.accumulate(error[order])
     front = np.flatnonzero(np.append(True, best[1:] < best[:-1]))
@@ -396,7 +397,7 @@ def speed_against_error(
     ax.set(
         xscale="log",
         yscale="log",
-        xlabel="work per step and trajectory (thousand operations)",
+        xlabel="operations per step and trajectory (thousands)",
         ylabel="one-step error (RMS)",
     )
     ax.margins(0.12)

@@ -12,9 +12,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from gfnn_jax.solve.newton import STATUS_NAMES
-from gfnn_jax.maps.symplectic_map.saved import versions
 from gfnn_jax.learn.fit import Fit
+from gfnn_jax.maps.saved import versions
+from gfnn_jax.solve.status import STATUS_NAMES
 
 STEPS_REPORTED = (1, 10, 100, 1000)
 
@@ -53,23 +53,28 @@ def assemble(
             **data,
         },
         "model": {
-            "scalar": chosen.scalar,
+            "learns": chosen.learns,
+            "family": chosen.family,
             "label": chosen.label,
             "chart": chosen.chart,
             "num_parameters": chosen.num_parameters,
-            "base_map": fit.based,
+            "base_map": fit.base_map,
         },
         "fit": {
             "seconds": chosen.fit_seconds,
-            "compile_seconds": chosen.compile_seconds,
+            "compile_seconds": fit.compile_seconds,
             "total_seconds": fit.seconds,
             "train_rms": chosen.train_rms,
             "validation_rms": chosen.validation_rms,
+            "validation_relative": chosen.validation_relative,
             "validation_bound": chosen.validation_bound,
+            "deviations": np.asarray(chosen.deviations).tolist(),
             "tolerance": fit.tolerance,
             "tolerance_met": fit.met,
+            "ended": fit.ended,
             "messages": list(fit.messages),
         },
+        "hamiltonian": None,
         "map": {
             "symplecticity_defect": fit.symplecticity_defect,
             "chart_determinant_min": fit.model_determinant_min,
@@ -79,13 +84,15 @@ def assemble(
         "rollout": rollout,
         "candidates": [
             {
-                "scalar": c.scalar,
+                "learns": c.learns,
+                "family": c.family,
                 "label": c.label,
                 "chart": c.chart,
                 "num_parameters": c.num_parameters,
                 "validation_rms": c.validation_rms,
+                "validation_relative": c.validation_relative,
                 "validation_bound": c.validation_bound,
-                "work": c.work,
+                "operations": c.operations,
                 "microseconds_per_step": c.microseconds_per_step,
                 "fit_seconds": c.fit_seconds,
                 "rank": c.rank,

@@ -1,0 +1,78 @@
+"""What ``gfnn fit`` does: a trajectory file in, a model folder with its report out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gfnn_jax.data.files import iterate_pairs, read_sample, read_trajectories
+from gfnn_jax.evaluate import report
+from gfnn_jax.jobs.progress import SILENT, Progress
+from gfnn_jax.jobs.search import failures_of_arithmetic, scene_named, search
+from gfnn_jax.jobs.written import Ran, already_done, write
+from gfnn_jax.learn.fit import refit
+from gfnn_jax.storage.outputs import atomic_folder
+from gfnn_jax.storage.partial import unfinished
+
+# A larger file is never in memory whole: candidates are chosen on a sample of its pairs, and the
+# chosen one is fitted to all of them chunk by chunk.
+_LARGE_BYTES, _FIT_CHUNK, _HELD = 2**29, 50_000, 2_000
+
+
+def fit(
+    data: Path,
+    *,
+    out: Path,
+    dt: float | None = None,
+    tolerance: float = 1e-6,
+    absolute_tolerance: float | None = None,
+    max_seconds: float = 120.0,
+    chart: str = "auto",
+    learn: str = "auto",
+    family: str = "auto",
+    scene_name: str | None = None,
+    angles: tuple[int, ...] = (),
+    seed: int = 0,
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: Progress = SILENT,
+) -> Ran | None:
+    """Learn the map of a trajectory file, and write it with its report into the model folder out.
+
+    scene_name: lends its coordinates and features. resume: None where ``out`` is this very job,
+    done. The other options are those of ``gfnn.fit``.
+    """
+    scene = scene_named(scene_name) if scene_name is not None else None
+    large = data.is_file() and data.stat().st_size > _LARGE_BYTES
+    trajectories = (read_sample if large else read_trajectories)(data, dt=dt)
+    options = {
+        "tolerance": tolerance, "absolute_tolerance": absolute_tolerance, "chart": chart,
+        "learn": learn, "family": family, "seed": seed,
+    }  # fmt: skip
+    job = {
+        "command": "fit", "data": trajectories.digest, "dt": trajectories.dt, "scene": scene_name,
+        "angles": list(angles), **options,
+    }  # fmt: skip
+    if already_done(out, job, resume):
+        return None
+    with unfinished(out, job, what="fit", overwrite=overwrite, resume=resume) as kept_in:
+        fitted = search(
+            trajectories.pairs(), scene, angles=angles, max_seconds=max_seconds,
+            progress=progress, kept_in=kept_in, job=job, **options,
+        )  # fmt: skip
+        if large and family != "mlp":
+            progress.say("all pairs of the file, for the chosen candidate")
+            held = trajectories.pairs().take(slice(_HELD))
+            with failures_of_arithmetic():
+                fitted = refit(fitted, iterate_pairs(data, _FIT_CHUNK, dt=dt), held)
+        result = report.assemble(
+            fitted, scene=scene_name, dt=trajectories.dt, seed=seed, rollout=None,
+            data={
+                "source": trajectories.source,
+                "digest": trajectories.digest,
+                "precision": trajectories.precision,
+                "units": trajectories.units,
+            },
+        )  # fmt: skip
+        with atomic_folder(out) as folder:
+            write(folder, folder, fitted, result, job)
+    return Ran(fitted, out, result)

@@ -1,0 +1,69 @@
+"""Rollouts measured against the reference: errors, energy, growth. The same for every method."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.evaluate import metrics, report
+from gfnn_jax.jobs.rollouts import Rollouts
+from gfnn_jax.phase_space import sizes
+from gfnn_jax.scenes import Scene
+
+# A first step this many roundings from the reference is roundoff.
+_ROUNDINGS = 64
+
+
+class Measured(NamedTuple):
+    """Rollouts of the test states (B, L, 2d), their errors (B, L), and the report's part."""
+
+    steps: np.ndarray
+    predicted: np.ndarray
+    error: np.ndarray
+    energy_error: np.ndarray | None
+    report: dict[str, Any]
+
+
+def measure(rollouts: Rollouts, scene: Scene, reference: np.ndarray) -> Measured:
+    """Errors against the reference (B, L, 2d), energy and growth."""
+    predicted, steps = rollouts.states, np.arange(reference.shape[1])
+    error = metrics.position_error(predicted, reference, angles_of_z(scene))
+    energy, drift = None, None
+    conserved = scene.hamiltonian if scene.period is None else None
+    hamiltonian = scene.invariants.get("energy", conserved)
+    if hamiltonian is not None:
+        values = _along(hamiltonian, jnp.asarray(predicted))
+        energy = metrics.energy_error(np.asarray(values))
+        drift = metrics.energy_drift(steps, energy)
+    # Roundoff grows by other laws than the error of a model: no exponent where it is all there is.
+    roundoff = _ROUNDINGS * np.finfo(float).eps * float(np.max(sizes(reference[:, 0])))
+    of_model = float(np.nanmean(error[:, 1])) > roundoff
+    growth = metrics.growth_exponent(steps, error) if scene.regular and of_model else None
+    part = report.rollout_part(
+        num_trajectories=len(predicted), num_steps=len(steps) - 1, seconds=rollouts.seconds,
+        status=rollouts.status, statistics=metrics.error_statistics(error), growth=growth,
+        drift=drift,
+    )  # fmt: skip
+    return Measured(steps, predicted, error, energy, part)
+
+
+@partial(jax.jit, static_argnums=0)
+def _along(invariant, states):
+    """Values (B, L) of an invariant along trajectories (B, L, 2d)."""
+    return jax.vmap(jax.vmap(invariant))(states)
+
+
+def angles_of_z(scene: Scene) -> tuple[int, ...]:
+    """Indices of the user's coordinates that are angles."""
+    coordinates = scene.coordinates
+    return coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
+
+
+def plane_of(scene: Scene) -> tuple[tuple[str, str], bool]:
+    """How one degree of freedom is drawn: names of its coordinates, whether modulo 2π."""
+    return ((r"$\theta$", "$p$"), True) if angles_of_z(scene) else (("$q$", "$p$"), False)

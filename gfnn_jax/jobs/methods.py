@@ -1,0 +1,173 @@
+"""A method of a comparison: learned from the shared data, rolled out, and what is reported."""
+
+from __future__ import annotations
+
+import warnings
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.baselines import METHODS, Budget
+from gfnn_jax.baselines.paper_gfnn import paper_gfnn
+from gfnn_jax.errors import FitWarning
+from gfnn_jax.evaluate.metrics import one_step_rms
+from gfnn_jax.jobs.measure import angles_of_z
+from gfnn_jax.jobs.progress import Progress
+from gfnn_jax.jobs.rollouts import Rollouts, map_rollouts, step_rollouts
+from gfnn_jax.jobs.run import QUICK_PAIRS, QUICK_TOLERANCE
+from gfnn_jax.jobs.search import search
+from gfnn_jax.jobs.shared_data import SharedData
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.phase_space import Pairs, sizes, symplecticity_defect
+from gfnn_jax.solve.status import NOT_CONVERGED
+
+PAPER_GFNN, OURS = "gfnn-paper", "gfnn"
+TITLES = {name: method.title for name, method in METHODS.items()} | {
+    PAPER_GFNN: "GFNN (paper)",
+    OURS: "GFNN (ours)",
+}
+_NUM_DEFECTS = 200
+
+
+def learn_and_roll(
+    method: str, data: SharedData, cap: float, progress: Progress
+) -> tuple[dict[str, Any], Rollouts]:
+    """The report's model, data, fit and map of a method, and its rollouts.
+
+    cap: most seconds of training, compilation apart.
+    """
+    told = Progress(
+        lambda line: progress.say(f"{TITLES[method]}: {line}"),
+        lambda line: progress.tell(f"{TITLES[method]}: {line}"),
+    )
+    if method == OURS:
+        return _ours(data, told)
+    budget = Budget(data.key(list(TITLES).index(method) + 100), cap, told.say)
+    if method == PAPER_GFNN:
+        return _papers(data, budget)
+    return _baseline(method, data, budget)
+
+
+def _baseline(method: str, data: SharedData, budget: Budget) -> tuple[dict[str, Any], Rollouts]:
+    chosen = METHODS[method]
+    sequences = data.sequences(chosen.length)
+    learned = chosen.learn(sequences, budget)
+    budget.say("rollouts")
+    fresh = data.fresh
+    defects = symplecticity_defect(
+        np.asarray(_jacobians(learned.step, jnp.asarray(fresh.z0[:_NUM_DEFECTS]))),
+        sizes(fresh.z0),
+    )
+    part = {
+        "model": {
+            "learns": "map", "family": method, "label": learned.label, "chart": None,
+            "num_parameters": learned.num_parameters,
+        },
+        "data": {"num_pairs": sequences.num_pairs, "sequence_length": chosen.length},
+        "fit": {
+            **_training(learned.training, budget.cap),
+            "validation_rms": _rms(data, _steps(learned.step, jnp.asarray(fresh.z0))),
+        },
+        "map": {
+            "symplecticity_defect": float(defects.max()),
+            "chart_determinant_min": None, "newton_iterations_max": None,
+        },
+    }  # fmt: skip
+    return part, step_rollouts(learned.step, data.z0, data.num_steps)
+
+
+@partial(jax.jit, static_argnums=0)
+def _jacobians(step, z):
+    """(B, 2d, 2d) of a plain step at z (B, 2d)."""
+    return jax.vmap(jax.jacfwd(step))(z)
+
+
+@partial(jax.jit, static_argnums=0)
+def _steps(step, z):
+    """Images (B, 2d) of z (B, 2d) under a plain step."""
+    return jax.vmap(step)(z)
+
+
+def _training(training: Any, cap: float | None) -> dict[str, Any]:
+    """The report's part on an Adam training. Its errors are those of the method's own loss."""
+    return {
+        "seconds": training.seconds,
+        "compile_seconds": training.compile_seconds,
+        "train_rms": training.train_rms,
+        "loss_rms": training.validation_rms,
+        "cap": cap,
+        "capped": "cap" in training.stopped_because,
+        "stopped_because": training.stopped_because,
+    }
+
+
+def _papers(data: SharedData, budget: Budget) -> tuple[dict[str, Any], Rollouts]:
+    pairs = data.sequences(2)
+    learned = paper_gfnn(pairs, budget)
+    part = {
+        "model": {
+            "learns": "map", "family": "mlp", "label": learned.family.label, "chart": "type2",
+            "num_parameters": learned.family.num_parameters,
+        },
+        "data": {"num_pairs": pairs.num_pairs, "sequence_length": 2},
+        "fit": {
+            **_training(learned.training, budget.cap),
+            "validation_rms": _rms(data, learned.map.step(data.fresh.z0)[0]),
+        },
+        "map": _map_part(learned.map, data),
+    }  # fmt: skip
+    return part, map_rollouts(learned.map, data.z0, data.num_steps)
+
+
+def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollouts]:
+    """The map that `gfnn.fit` chooses, from the first few of the same pairs."""
+    scene = data.scene
+    num_pairs, tolerance = scene.num_pairs, scene.tolerance
+    if data.quick:
+        num_pairs, tolerance = min(num_pairs, QUICK_PAIRS), max(tolerance, QUICK_TOLERANCE)
+    z = data.sequences(2).z[:num_pairs]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FitWarning)  # kept in fit.messages
+        fit = search(
+            Pairs(z[:, 0], z[:, 1], scene.dt), scene, tolerance=tolerance, seed=data.seed,
+            progress=progress,
+        )  # fmt: skip
+    chosen = fit.chosen
+    part = {
+        "model": {
+            "learns": chosen.learns, "family": chosen.family, "label": chosen.label,
+            "chart": chosen.chart, "num_parameters": chosen.num_parameters,
+        },
+        "data": {"num_pairs": fit.num_pairs, "sequence_length": 2},
+        "fit": {
+            "seconds": chosen.fit_seconds, "compile_seconds": fit.compile_seconds,
+            "total_seconds": fit.seconds, "train_rms": chosen.train_rms,
+            "validation_rms": _rms(data, fit.map.step(data.fresh.z0)[0]),
+            "tolerance": tolerance, "tolerance_met": fit.met, "ended": fit.ended,
+            "cap": None, "capped": False, "messages": list(fit.messages),
+        },
+        "map": _map_part(fit.map, data) | {"chart_determinant_min": fit.model_determinant_min},
+    }  # fmt: skip
+    return part, map_rollouts(fit.map, data.z0, data.num_steps)
+
+
+def _map_part(map_: SymplecticMap, data: SharedData) -> dict[str, Any]:
+    """Where a step is not solved there is none whose defect could be told: those are counted."""
+    z = data.fresh.z0[:_NUM_DEFECTS]
+    info = map_.step(z)[1]
+    solved = np.asarray(info.status) < NOT_CONVERGED
+    defects = np.asarray(map_.defect(z))[solved]
+    return {
+        "symplecticity_defect": float(defects.max()) if len(defects) else None,
+        "unsolved": float(np.mean(~solved)),
+        "chart_determinant_min": float(np.min(np.abs(np.asarray(map_.determinant(z))))),
+        "newton_iterations_max": int(np.max(np.asarray(info.iterations))),
+    }
+
+
+def _rms(data: SharedData, images) -> float:
+    """Per-component RMS of the one-step state error on fresh pairs, angles modulo 2π."""
+    return one_step_rms(np.asarray(images), data.fresh.z1, angles_of_z(data.scene))

@@ -1,0 +1,103 @@
+"""What ``gfnn predict`` does: a saved map, initial states, and a prediction written as it grows."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.data.files import read_initial_states
+from gfnn_jax.data.predictions import PredictionWriter
+from gfnn_jax.jobs.progress import SILENT, Progress
+from gfnn_jax.maps import saved
+from gfnn_jax.maps.symplectic_map import Lanes, SymplecticMap
+
+# A chunk of a prediction: what is held in memory at once, and how much work a kill may lose.
+_CHUNK_BYTES, _CHUNK_LANE_STEPS = 32 * 2**20, 400_000
+
+
+class Predicted(NamedTuple):
+    """How a prediction ended: status and left_at (B,), the map's dt, seconds of computing."""
+
+    status: np.ndarray
+    left_at: np.ndarray
+    dt: float
+    seconds: float
+
+
+def predict(
+    model: Path,
+    initial: Path,
+    *,
+    num_steps: int,
+    save_every: int = 1,
+    out: Path,
+    stop_outside: bool = False,
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: Progress = SILENT,
+) -> Predicted:
+    """Predict from the initial states in a file, in chunks along the steps, into ``out``.
+
+    Memory: one chunk of saved states, 32 MiB at most where a saved state of all lanes is no more
+    than that, whatever ``num_steps``. A job that was killed goes on with ``resume`` where its last
+    chunk ended, to the very bits that an uninterrupted one gives.
+    """
+    map_ = saved.load(model)
+    dt = float(map_.dt)
+    z0 = read_initial_states(initial, map_.dim)
+    identity = {
+        "model": saved.digest(model),
+        "initial": hashlib.sha256(np.ascontiguousarray(z0).data).hexdigest(),
+        "outside": "stop" if stop_outside else "continue",
+    }
+    writer = PredictionWriter(
+        out, shape=z0.shape, num_steps=num_steps, save_every=save_every, dt=dt,
+        identity=identity, overwrite=overwrite, resume=resume,
+    )  # fmt: skip
+    started = time.perf_counter()
+    if writer.finished:
+        with np.load(out, allow_pickle=False) as done:
+            return Predicted(done["status"], done["left_at"], dt, 0.0)
+    try:
+        lanes = _go_on(map_, z0, writer, num_steps, save_every, stop_outside, progress)
+        progress.say(f"writing {out}")
+        status, left_at = np.asarray(lanes.status), np.asarray(lanes.left_at)
+        writer.finish(status, left_at)
+    except KeyboardInterrupt as stop:
+        if not writer.finished:
+            done = max(0, writer.saved - 1) * save_every
+            stop.add_note(
+                f"{writer.partial} keeps {done} of {num_steps} steps: --resume goes on with it"
+            )
+        raise
+    return Predicted(status, left_at, dt, time.perf_counter() - started)
+
+
+def _go_on(
+    map_: SymplecticMap, z0, writer: PredictionWriter, num_steps, save_every, stop_outside, progress
+) -> Lanes:
+    """All chunks that are not yet written; returns the lanes after the last step."""
+    if writer.carry is None:
+        lanes = map_.start(z0, stop_outside=stop_outside)
+        writer.append(z0[:, None], lanes._asdict())
+    else:
+        lanes = Lanes(**{name: jnp.asarray(value) for name, value in writer.carry.items()})
+    chunk = _chunk_length(z0.shape[0], z0.shape[1], save_every)
+    while writer.saved < writer.total:
+        progress.say(f"step {(writer.saved - 1) * save_every} of {num_steps}")
+        count = min(chunk, writer.total - writer.saved)
+        lanes, states = map_.advance(lanes, count, save_every=save_every, stop_outside=stop_outside)
+        writer.append(states, lanes._asdict())
+    return lanes
+
+
+def _chunk_length(num_lanes: int, width: int, save_every: int) -> int:
+    """Saved states per chunk: a function of the job alone, so that a resumed one cuts alike."""
+    by_memory = _CHUNK_BYTES // (8 * num_lanes * width)
+    by_operations = _CHUNK_LANE_STEPS // (num_lanes * save_every)
+    return max(1, min(by_memory, by_operations))

@@ -1,0 +1,84 @@
+"""What a job says while it works, and how it is shown on standard error."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+# Seconds between lines where standard error is no terminal: at least, and at most.
+BETWEEN, LONGEST_SILENCE = 2.0, 5.0
+
+
+def _nothing(message: str) -> None:
+    del message
+
+
+class Progress(NamedTuple):
+    """say: what is being done now, shown now and then. tell: a line that is always shown."""
+
+    say: Callable[[str], Any] = _nothing
+    tell: Callable[[str], Any] = _nothing
+
+
+SILENT = Progress()
+
+
+@contextlib.contextmanager
+def on_stderr() -> Iterator[Progress]:
+    """A status line on a terminal; elsewhere a line now and then, at least every five seconds."""
+    if not sys.stderr.isatty():
+        lines = _Lines()
+        try:
+            yield Progress(lines.say, lines.tell)
+        finally:
+            lines.stop()
+        return
+    from rich.console import Console
+    from rich.markup import escape
+
+    console = Console(stderr=True)
+    with console.status("starting") as status:
+        yield Progress(
+            lambda message: status.update(escape(message)),
+            lambda message: console.print(escape(message), highlight=False),
+        )
+
+
+class _Lines:
+    """Lines with the seconds since the start; a thread repeats the last where nothing comes."""
+
+    def __init__(self):
+        self._started = time.perf_counter()
+        self._last = self._started - BETWEEN  # the first line comes at once
+        self._message = "starting"
+        self._lock, self._stopped = threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self._repeat, daemon=True)
+        self._thread.start()
+
+    def say(self, message: str) -> None:
+        with self._lock:
+            self._message = message
+            if time.perf_counter() >= self._last + BETWEEN:
+                self._print(message)
+
+    def tell(self, message: str) -> None:
+        with self._lock:
+            self._print(message)
+
+    def stop(self) -> None:
+        self._stopped.set()
+        self._thread.join()
+
+    def _repeat(self) -> None:
+        while not self._stopped.wait(LONGEST_SILENCE / 10):
+            with self._lock:
+                if time.perf_counter() >= self._last + 0.8 * LONGEST_SILENCE:
+                    self._print(f"{self._message} …")
+
+    def _print(self, message: str) -> None:
+        self._last = time.perf_counter()
+        print(f"[{self._last - self._started:6.1f} s] {message}", file=sys.stderr, flush=True)

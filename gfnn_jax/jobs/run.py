@@ -1,0 +1,153 @@
+"""What ``gfnn run`` does: reference data of a scene, fit, rollouts, metrics, figures, report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from gfnn_jax.errors import InputError
+from gfnn_jax.evaluate import figures, metrics, report
+from gfnn_jax.jobs.measure import Measured, measure, plane_of
+from gfnn_jax.jobs.progress import SILENT, Progress
+from gfnn_jax.jobs.rollouts import NUM_STEPS, NUM_TRAJECTORIES, map_rollouts
+from gfnn_jax.jobs.search import scene_named, search
+from gfnn_jax.jobs.written import MODEL, Ran, already_done, pairs_digest, write
+from gfnn_jax.learn.candidates import Candidate
+from gfnn_jax.learn.fit import Fit
+from gfnn_jax.phase_space import Pairs
+from gfnn_jax.scenes import Scene
+from gfnn_jax.scenes.trajectories import reference_trajectories, sample_pairs, sample_test_states
+from gfnn_jax.storage.outputs import atomic_folder
+from gfnn_jax.storage.partial import unfinished
+
+# Of a network: pairs, tolerance, iterations; and of a quick look.
+_NETWORK, _NETWORK_QUICK = (6_000, 1e-6, 250), (3_000, 1e-5, 60)
+QUICK_PAIRS, QUICK_TRAJECTORIES, QUICK_TOLERANCE = 4_000, 25, 1e-7
+
+
+def run(
+    name: str,
+    *,
+    out: Path,
+    quick: bool = False,
+    seed: int = 0,
+    dt: float | None = None,
+    tolerance: float | None = None,
+    chart: str = "auto",
+    learn: str = "auto",
+    family: str = "auto",
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: Progress = SILENT,
+) -> Ran | None:
+    """Reference data of a scene, fit, rollouts, metrics, figures and report, into the folder out.
+
+    tolerance: relative; None: the scene's own, close to the best that can be had. quick: fewer
+    pairs and rollouts, a tolerance of 1e-7 at best. resume: None where ``out`` is this very job,
+    done.
+    """
+    scene = scene_named(name, dt)
+    if family == "features" and scene.features is None:
+        raise InputError(f"family 'features': the scene {name} declares none")
+    num_pairs, default = scene.num_pairs, scene.tolerance
+    more = {}
+    if family == "mlp":
+        num_pairs, default, more["max_iterations"] = _NETWORK_QUICK if quick else _NETWORK
+    elif quick:
+        num_pairs, default = min(num_pairs, QUICK_PAIRS), max(default, QUICK_TOLERANCE)
+    options = {
+        "tolerance": default if tolerance is None else tolerance, "chart": chart, "learn": learn,
+        "family": family, "seed": seed,
+    }  # fmt: skip
+    num_trajectories = QUICK_TRAJECTORIES if quick else NUM_TRAJECTORIES
+    job = {
+        "command": "run", "scene": name, "dt": scene.dt, "num_pairs": num_pairs, "quick": quick,
+        **options,
+    }  # fmt: skip
+    if already_done(out / MODEL, job, resume):
+        return None
+
+    with unfinished(out, job, what="run", overwrite=overwrite, resume=resume) as kept_in:
+        progress.say(f"reference data: {num_pairs} pairs, {num_trajectories} trajectories")
+        key_pairs, key_test = _keys(seed)
+        pairs = _finite(sample_pairs(scene, num_pairs, key_pairs))
+        z0 = np.asarray(sample_test_states(scene, num_trajectories, key_test))
+        fitted = search(
+            pairs, scene, progress=progress, kept_in=kept_in, job=job, **options, **more
+        )
+        progress.say(f"reference trajectories of {NUM_STEPS} steps")
+        reference = np.asarray(reference_trajectories(scene, z0, NUM_STEPS))
+        progress.say(f"rollouts of {NUM_STEPS} steps")
+        measured = measure(map_rollouts(fitted.map, z0), scene, reference)
+        result = report.assemble(
+            fitted, scene=name, dt=scene.dt, seed=seed, rollout=measured.report,
+            data={"source": "reference data of the scene", "digest": pairs_digest(pairs)},
+        )  # fmt: skip
+        progress.say("figures")
+        with atomic_folder(out) as folder:
+            write(folder, folder / MODEL, fitted, result, job)
+            for file, figure in _figures(fitted, scene, measured, reference).items():
+                figures.save(figure, folder / f"{file}.png")
+    return Ran(fitted, out, result)
+
+
+@jax.jit
+def _keys(seed):
+    """Of the pairs and of the test states."""
+    of_pairs, of_test = jax.random.split(jax.random.key(seed))
+    return of_pairs, of_test
+
+
+def _finite(pairs: Pairs) -> Pairs:
+    """In NumPy, without those whose state collides: it has no image."""
+    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
+    known = np.isfinite(z1).all(axis=1)
+    return Pairs(z0[known], z1[known], pairs.dt)
+
+
+def _figures(fit: Fit, scene: Scene, measured: Measured, reference) -> dict[str, Any]:
+    """The scene's figures by file name."""
+    steps, predicted = measured.steps, measured.predicted
+    drawn = {"error": figures.error_growth({"GFNN": (steps, measured.error)})}
+    if measured.energy_error is not None:
+        drawn["energy"] = figures.energy_error({"GFNN": (steps, measured.energy_error)})
+    shown = [c for c in fit.candidates if np.isfinite(c.validation_relative)]
+    if fit.chosen in shown:
+        drawn["candidates"] = figures.speed_against_error(
+            [c.operations / 1e3 for c in shown], [c.validation_relative for c in shown],
+            [_labelled(c) for c in shown], shown.index(fit.chosen), fit.tolerance,
+        )  # fmt: skip
+    if scene.name == "two-body":
+        errors = [
+            metrics.absolute_error(element(predicted), element(reference))
+            for element in metrics.ELEMENTS.values()
+        ]
+        drawn["elements"] = figures.element_errors({"GFNN": (steps, *errors)})[0]
+    if scene.name.startswith("henon-heiles") and scene.dim == 2:
+        sections = {
+            name: np.concatenate([metrics.section_crossings(z, index=0) for z in trajectories])
+            for name, trajectories in (("reference", reference), ("GFNN", predicted))
+        }
+        drawn["section"] = figures.sections({n: (z[:, 1], z[:, 3]) for n, z in sections.items()})[0]
+    if scene.dim == 1:
+        both = {"reference": reference, "GFNN": predicted}
+        drawn["portrait"] = figures.sections(
+            {n: (z[..., 0], z[..., 1]) for n, z in both.items()}, *plane_of(scene)
+        )[0]
+    else:
+        lane = int(np.argmax(np.isfinite(reference).all(axis=(1, 2))))
+        drawn["portrait"] = figures.phase_portrait(
+            {n: (z[lane, :, 0], z[lane, :, 1]) for n, z in
+             (("reference", reference), ("GFNN", predicted))}, ("$q_1$", "$q_2$"),
+        )  # fmt: skip
+    return {name: ax.figure for name, ax in drawn.items()}
+
+
+def _labelled(candidate: Candidate) -> str:
+    """Chart, family and size, with the time of a step where it was measured."""
+    microseconds = candidate.microseconds_per_step
+    timed = f", {microseconds:.1f} µs" if microseconds is not None else ""
+    return f"{candidate.chart} {candidate.label}{timed}"

@@ -1,0 +1,72 @@
+"""``gfnn.fit`` as the jobs call it: its candidates are told, its failures are one line each."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from gfnn_jax import scenes
+from gfnn_jax.errors import FitError, InputError, WorkError
+from gfnn_jax.jobs.progress import Progress
+from gfnn_jax.learn.candidates import Candidate
+from gfnn_jax.learn.fit import Fit, fit
+from gfnn_jax.phase_space import Pairs
+from gfnn_jax.scenes import Scene
+from gfnn_jax.storage.checkpoints import TrainingCheckpoints
+
+
+def search(
+    pairs: Pairs,
+    scene: Scene | None,
+    *,
+    progress: Progress,
+    kept_in: Path | None = None,
+    job: dict[str, Any] | None = None,
+    **options: Any,
+) -> Fit:
+    """The fit of these pairs, with the options of ``gfnn.fit``.
+
+    kept_in, job: the folder of the training's checkpoints, and whose they are. Raises InputError
+    for data or a request that cannot give a map, WorkError where the arithmetic fails.
+    """
+    checkpoints = None if kept_in is None else TrainingCheckpoints(kept_in, job or {})
+    try:
+        with failures_of_arithmetic():
+            return fit(
+                pairs, scene, checkpoints=checkpoints, on_progress=progress.say,
+                on_candidate=lambda candidate: progress.tell(line(candidate)), **options,
+            )  # fmt: skip
+    except FitError as error:
+        raise InputError(str(error)) from error
+
+
+def line(candidate: Candidate) -> str:
+    """A finished candidate in one line: what it is, and its one-step error ÷ spread."""
+    return (
+        f"{candidate.chart} {candidate.label}: one-step error "
+        f"{candidate.validation_relative:.2e} of the spread, "
+        f"{candidate.num_parameters} parameters"
+    )
+
+
+@contextlib.contextmanager
+def failures_of_arithmetic() -> Iterator[None]:
+    """A factorisation that does not converge, or JAX out of memory, as a WorkError of one line."""
+    try:
+        yield
+    except (np.linalg.LinAlgError, jax.errors.JaxRuntimeError) as error:
+        what = (str(error) or type(error).__name__).splitlines()[0]
+        raise WorkError(f"the fit failed: {what}") from error
+
+
+def scene_named(name: str, dt: float | None = None) -> Scene:
+    """The scene of this name, with its own time step or another. Raises InputError."""
+    try:
+        return scenes.make(name, dt)
+    except ValueError as error:
+        raise InputError(str(error)) from error

@@ -1,0 +1,52 @@
+"""What ``gfnn run`` and ``gfnn fit`` write: a model with its record, and report.json."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.errors import InputError
+from gfnn_jax.evaluate import report
+from gfnn_jax.learn.fit import Fit
+from gfnn_jax.maps import saved
+from gfnn_jax.phase_space import Pairs
+
+REPORT, MODEL = "report.json", "model"
+
+
+class Ran(NamedTuple):
+    """A fit, where it was written, and its report."""
+
+    fit: Fit
+    out: Path
+    report: dict[str, Any]
+
+
+def write(folder: Path, model: Path, fit: Fit, result: dict[str, Any], job: dict[str, Any]) -> None:
+    """The chosen map into the folder ``model``, its report into ``folder``.
+
+    Of the report, the record in the model keeps where the map came from and how good it is.
+    """
+    origin = {key: result[key] for key in ("scene", "seed", "device", "data", "fit", "map")}
+    saved.save(fit.map, model, record={"job": job, **report.finite(origin)})
+    (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
+
+
+def already_done(model: Path, job: dict[str, Any], resume: bool) -> bool:
+    """Whether this is a resumed job that had come to its end."""
+    if not (resume and model.is_dir()):
+        return False
+    try:
+        return saved.record(model).get("job") == job
+    except InputError:
+        return False
+
+
+def pairs_digest(pairs: Pairs) -> str:
+    """SHA-256 of the pairs' states."""
+    digest = hashlib.sha256(np.ascontiguousarray(pairs.z0).data)
+    digest.update(np.ascontiguousarray(pairs.z1).data)
+    return digest.hexdigest()

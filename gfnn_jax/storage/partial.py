@@ -1,0 +1,88 @@
+"""``OUT.partial``: what an unfinished job has kept, until its output is there.
+
+The folder holds ``job.json``, what was asked for, and beside it whatever the job writes. Only the
+same job goes on with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from gfnn_jax.errors import InputError
+from gfnn_jax.storage.outputs import atomic_write, ensure_new, failures_as_work_errors
+
+JOB = "job.json"
+
+
+@contextlib.contextmanager
+def unfinished(
+    out: Path, job: dict[str, Any], *, what: str, overwrite: bool, resume: bool
+) -> Iterator[Path]:
+    """The folder ``OUT.partial`` of a job that writes the folder ``out``.
+
+    job: JSON-able, says which job it is. what: its name in messages, "fit" say. When the block ends
+    the folder is removed; when the block fails it is left if the job has kept anything in it, and
+    an interrupt (KeyboardInterrupt) is given a note that says what was kept.
+
+    Raises InputError where ``out`` is in the way, where an unfinished job is there and neither
+    ``resume`` nor ``overwrite`` is set, and where ``resume`` meets another job.
+    """
+    ensure_new(out, overwrite, folder=True)
+    folder = out.with_name(out.name + ".partial")
+    _make_way(folder, json.loads(json.dumps(job)), what, overwrite=overwrite, resume=resume)
+    atomic_write(folder / JOB, json.dumps(job))
+    try:
+        yield folder
+    except BaseException as error:
+        found = kept(folder)
+        if not found:
+            _discard(folder)
+        if isinstance(error, KeyboardInterrupt):
+            told = f"{folder} keeps {', '.join(found)}: --resume goes on with it"
+            error.add_note(told if found else f"nothing of the {what} was kept")
+        raise
+    _discard(folder)
+
+
+def kept(folder: Path) -> list[str]:
+    """Names, without suffix, of what a job has kept in its folder beside ``job.json``."""
+    if not folder.exists():
+        return []
+    names = (path.name for path in folder.iterdir())
+    return sorted({Path(n).stem for n in names if n != JOB and not n.startswith(".")})
+
+
+def _make_way(folder: Path, job, what: str, *, overwrite: bool, resume: bool) -> None:
+    if not folder.exists():
+        return
+    if not (folder / JOB).is_file():
+        raise InputError(f"{folder}: is in the way, and is no unfinished {what}")
+    if not kept(folder):  # killed before it had kept anything
+        return
+    if not resume:
+        if not overwrite:
+            raise InputError(
+                f"{folder}: an unfinished {what} (--resume goes on with it, --overwrite discards "
+                "it)"
+            )
+        return _discard(folder)
+    try:
+        found = json.loads((folder / JOB).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{folder}: {JOB} cannot be read ({error})") from error
+    other = [key for key in {**found, **job} if found.get(key) != job.get(key)]
+    if other:
+        raise InputError(
+            f"{folder}: of another {what}: {', '.join(other)} differ (--overwrite discards it)"
+        )
+
+
+def _discard(folder: Path) -> None:
+    with failures_as_work_errors(folder):
+        if (folder / JOB).is_file():  # else it is not ours
+            shutil.rmtree(folder)
