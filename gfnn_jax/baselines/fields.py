@@ -12,17 +12,17 @@ inputs and outputs of unit size, and the rate's decay.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from gfnn_jax.baselines.learned import Budget, Learned, Sequences, periodic, train
-from gfnn_jax.fitting.adam import Recipe
-from gfnn_jax.phase_space import apply_j, sizes
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of, network
+from gfnn_jax.fitting.adam import Recipe
+from gfnn_jax.phase_space import apply_j, sizes
 from gfnn_jax.scenes.trajectories import flow_step
 
 HIDDEN, ACTIVATION = (200, 200), "tanh"
@@ -39,9 +39,9 @@ def vfnn(sequences: Sequences, budget: Budget) -> Learned:
 def hnn(sequences: Sequences, budget: Budget) -> Learned:
     """ż = J ∇H(z), H a network."""
     z, velocity = sequences.derivatives()
-    wanted = -np.asarray(apply_j(jnp.asarray(velocity)))  # ∇H
+    target_gradient = -apply_j(velocity)  # ∇H
     inputs = box_inputs(z, angles=q_angles(sequences))
-    family = Mlp(inputs, HIDDEN, ACTIVATION, amplitude_of(z, wanted))
+    family = Mlp(inputs, HIDDEN, ACTIVATION, amplitude_of(z, target_gradient))
 
     def field(params, z):
         return apply_j(jax.grad(family, argnums=1)(params, z))
@@ -63,8 +63,13 @@ def network_field(sequences: Sequences, hidden: tuple[int, ...], key) -> tuple[C
         seen = inputs.seen(z).astype(dtype)
         return jnp.asarray(unit, dtype) * net(dtype).apply({"params": params}, seen)
 
-    start = jnp.zeros(inputs.num_inputs, jnp.float32)
-    return field, net(jnp.float32).init(key, start)["params"]
+    return field, _initial(net(jnp.float32), inputs.num_inputs, key)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _initial(network, num_inputs: int, key):
+    """Parameters of a Flax module, float32."""
+    return network.init(key, jnp.zeros(num_inputs, jnp.float32))["params"]
 
 
 def q_angles(sequences: Sequences) -> tuple[int, ...]:

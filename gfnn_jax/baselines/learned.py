@@ -1,7 +1,7 @@
 """What every baseline shares: sequences to learn from, a training of a map, what comes out.
 
-A baseline ends in a step function z -> Z of one state (2d,), q first, which `gfnn_jax.maps.symplectic_map.rollout`
-rolls out. It learns in float32, as the public codes do, and predicts in the dtype of the state.
+A baseline ends in a step function z -> Z of one state (2d,), q first, which `maps.rollout` rolls
+out. It learns in float32, as the public codes do, and predicts in the dtype of the state.
 """
 
 from __future__ import annotations
@@ -98,7 +98,12 @@ def train(
         components=components, recipe=recipe, key=budget.key, cap=budget.cap,
         on_epoch=lambda epoch, _, rms: budget.say(f"epoch {epoch}: error {rms:.1e}"),
     )  # fmt: skip
-    return jax.tree.map(lambda a: jnp.asarray(a, float), trained.params), trained
+    return in_float64(trained.params), trained
+
+
+def in_float64(params: Any) -> Any:
+    """The same parameters in NumPy's float64."""
+    return jax.tree.map(lambda a: np.asarray(a, np.float64), params)
 
 
 def learn_map(
@@ -111,9 +116,9 @@ def learn_map(
     step = periodic(step, sequences.angles)
 
     def loss(params, z):
-        def advance(now, wanted):
+        def advance(now, expected):
             now = jax.vmap(step, (None, 0))(params, now)
-            return now, jnp.mean(jnp.sum((now - wanted) ** 2, axis=-1))
+            return now, jnp.mean(jnp.sum((now - expected) ** 2, axis=-1))
 
         _, errors = jax.lax.scan(advance, z[:, 0], jnp.moveaxis(z[:, 1:], 1, 0))
         return jnp.mean(errors)

@@ -10,6 +10,8 @@ is the exact flow. Any linear symplectic map is such a row with quadratic f.
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +30,8 @@ def p_sympnet(sequences: Sequences, budget: Budget) -> Learned:
     largest = float(np.max(np.sqrt(np.mean(sequences.z**2, axis=(0, 1)))))
     params = p_init(budget.key, sequences.dim, LAYERS, DEGREE)
     # High powers of states much larger than 1 would overflow before the training begins.
-    params["direction"] = params["direction"] / max(1.0, largest)
+    direction = np.asarray(params["direction"])
+    params["direction"] = direction / np.float32(max(1.0, largest))
     label = f"{LAYERS} ridge polynomials of degree {DEGREE}"
 
     def step(params, z):
@@ -37,6 +40,7 @@ def p_sympnet(sequences: Sequences, budget: Budget) -> Learned:
     return learn_map(step, params, sequences, RECIPE, budget, label)
 
 
+@partial(jax.jit, static_argnums=(1, 2, 3))
 def p_init(key, dim: int, layers: int, degree: int):
     """Parameters, float32: directions of unit size, small coefficients of the degrees 2, 3, ..."""
     directions, coefficients = jax.random.split(key)

@@ -10,20 +10,20 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.baselines.fields import q_angles
-from gfnn_jax.baselines.learned import HELD, Budget, Sequences
-from gfnn_jax.generating.charts import TYPE2
+from gfnn_jax.baselines.learned import HELD, Budget, Sequences, in_float64
 from gfnn_jax.coordinates import Coordinates
-from gfnn_jax.maps.symplectic_map.domain import covering
-from gfnn_jax.fitting.adam import PAPER, PAPER_STANDARD_MAP, AdamFit, adam
-from gfnn_jax.maps.symplectic_map import Generated, SymplecticMap
-from gfnn_jax.phase_space import sizes
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import PAPER_HIDDEN, PAPER_HIDDEN_STANDARD_MAP, Mlp, amplitude_of
+from gfnn_jax.fitting.adam import PAPER, PAPER_STANDARD_MAP, AdamFit, adam
+from gfnn_jax.generating.charts import TYPE2
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.phase_space import sizes
 
 _PART = 50  # iterations between looks at the clock
 _MOST_STATES = 20_000  # that describe the domain
@@ -42,25 +42,23 @@ def paper_gfnn(pairs: Sequences, budget: Budget) -> PaperGfnn:
     hidden, recipe = PAPER_HIDDEN, PAPER
     if pairs.angles:
         hidden, recipe = PAPER_HIDDEN_STANDARD_MAP, PAPER_STANDARD_MAP
-    z0, z1 = jnp.asarray(pairs.z[:, 0]), jnp.asarray(pairs.z[:, 1])
-    w, wanted = TYPE2.point(z0, z1), TYPE2.wanted(z0, z1, pairs.dt)
-    family = Mlp(
-        box_inputs(w, angles=q_angles(pairs)), hidden, "tanh", amplitude_of(w, wanted)
-    )  # fmt: skip
+    z0, z1 = pairs.z[:, 0], pairs.z[:, 1]
+    w, target = TYPE2.evaluation_point(z0, z1), TYPE2.target_gradient(z0, z1, pairs.dt)
+    inputs = box_inputs(w, angles=q_angles(pairs))
+    family = Mlp(inputs, hidden, "tanh", amplitude_of(w, target))
     held = min(HELD, len(w) // 10)
     iterations = recipe.epochs * (len(w) // recipe.batch_size)
     recipe = dataclasses.replace(recipe, epochs=max(1, iterations // _PART), epoch_length=_PART)
     training = adam(
-        family, family.init(budget.key, jnp.float32), (w[held:], wanted[held:]),
-        (w[:held], wanted[:held]), pairs.dt * np.ones(2 * pairs.dim), recipe=recipe,
+        family, family.init(budget.key, jnp.float32), (w[held:], target[held:]),
+        (w[:held], target[:held]), pairs.dt * np.ones(2 * pairs.dim), recipe=recipe,
         key=budget.key, cap=budget.cap,
         on_epoch=lambda epoch, _, rms: budget.say(f"{epoch * _PART} iterations: error {rms:.1e}"),
     )  # fmt: skip
-    params = jax.tree.map(lambda a: jnp.asarray(a, float), training.params)
-    scale = jnp.asarray(sizes(z0))
-    generated = Generated(family, params, TYPE2, pairs.dt, scale)
+    scale = sizes(z0)
+    generated = Generated(family, in_float64(training.params), TYPE2, pairs.dt, scale)
     coordinates = Coordinates("cartesian", angles=pairs.angles)
-    cut = jnp.full(len(pairs.angles), np.pi)  # z0 is in [0, 2π)
+    centre = np.full(len(pairs.angles), np.pi)  # z0 is in [0, 2π)
     domain = covering(z0[:_MOST_STATES], ignore=pairs.angles)
-    map_ = SymplecticMap((generated,), coordinates, domain, scale, cut, pairs.dt)
+    map_ = SymplecticMap((generated,), coordinates, domain, scale, centre, pairs.dt)
     return PaperGfnn(map_, family, training)

@@ -24,10 +24,10 @@ import numpy as np
 
 from gfnn_jax.baselines.fields import network_field, q_angles
 from gfnn_jax.baselines.learned import Budget, Learned, Sequences, learn_map
-from gfnn_jax.fitting.adam import Recipe
-from gfnn_jax.phase_space import apply_j, split
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
+from gfnn_jax.fitting.adam import Recipe
+from gfnn_jax.phase_space import apply_j, split
 
 HIDDEN, ACTIVATION = (256, 256), "tanh"
 RECIPE = Recipe(batch_size=32, epochs=1_500, epoch_length=200, rate=5e-3, schedule="cosine")
@@ -37,7 +37,7 @@ BINDING = 10.0  # Tao's ω: how strongly the two copies of the state are held to
 def srnn(sequences: Sequences, budget: Budget) -> Learned:
     """Leapfrog of T(p) + V(q) where the system is separable, else Tao's integrator of H(q, p)."""
     z, velocity = sequences.derivatives()
-    gradient = -np.asarray(apply_j(jnp.asarray(velocity)))
+    gradient = -apply_j(velocity)
     dim, dt = sequences.dim, sequences.dt
     q, p = tuple(range(dim)), tuple(range(dim, 2 * dim))
 

@@ -33,6 +33,7 @@ def la_sympnet(sequences: Sequences, budget: Budget) -> Learned:
     return learn_map(la_step, params, sequences, RECIPE, budget, label)
 
 
+@partial(jax.jit, static_argnums=(1, 2, 3))
 def la_init(key, dim: int, layers: int, sublayers: int):
     """Parameters, float32: symmetric halves and shifts of the linear modules, activations."""
     linear, active = jax.random.split(key)
@@ -90,6 +91,7 @@ def g_sympnet(sequences: Sequences, budget: Budget) -> Learned:
     return learn_map(g_step, params, sequences, RECIPE, budget, label)
 
 
+@partial(jax.jit, static_argnums=(1, 2, 3))
 def g_init(key, dim: int, layers: int, width: int):
     """Parameters, float32: inner weights, biases, outer weights of each module."""
     inner, outer = jax.random.split(key)

@@ -29,7 +29,7 @@ from gfnn_jax.storage.outputs import (
     sync_folder,
 )
 
-_FORMAT = 1
+_FORMAT = 2
 # Memory for assembling the output.
 _ASSEMBLY_BYTES = 64 * 2**20
 

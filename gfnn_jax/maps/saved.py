@@ -15,31 +15,38 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.generating.charts import Chart, TypeOne
-from gfnn_jax.storage.checkpoints import load_model, save_model
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
-from gfnn_jax.maps.symplectic_map.domain import Domain
 from gfnn_jax.errors import InputError
-from gfnn_jax.maps.symplectic_map import Affine, Generated, SymplecticMap
-from gfnn_jax.storage.outputs import ensure_new
 from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.mlp import Mlp
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
+from gfnn_jax.generating.charts import Chart, TypeOne
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.generating.predictor import PolynomialModel, Predictor
+from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.domain import Domain
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.scene import Scene
-from gfnn_jax.generating.predictor import Start
+from gfnn_jax.storage.checkpoints import load_model, save_model
+from gfnn_jax.storage.outputs import ensure_new
 
 _TYPES: dict[str, type] = {
     kind.__name__: kind
     for kind in (
-        SymplecticMap, Generated, Start, Affine, Chart, TypeOne, Domain,
+        SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
         Products, Sines, Mlp, Inputs,
     )
 }  # fmt: skip
+# Names that were used before, in models that may still be about.
+_FORMER_TYPES = {"Start": "PolynomialModel"}
+_FORMER_FIELDS = {
+    ("Generated", "scalar"): "family",
+    ("SymplecticMap", "cut"): "angle_centre",
+}
 # Stands in the description where a function of the scene belongs.
 _OF_SCENE = "of the scene"
 _PACKAGES = ("gfnn_jax", "jax", "jaxlib", "flax", "optax", "diffrax", "numpy", "scipy")
@@ -91,7 +98,7 @@ def load(folder, scene: Scene | None = None) -> SymplecticMap:
     if scene is not None and name is not None and scene.name != name:
         raise InputError(f"{folder}: was learned in the scene '{name}', not in '{scene.name}'")
     try:
-        return _decode(description["map"], arrays, scene)
+        return _decode(*_renamed(description["map"], arrays), scene)
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -120,7 +127,7 @@ def versions() -> dict[str, str | None]:
 
 
 def _features(map_: SymplecticMap) -> list:
-    """The functions that stand in for w in the map's scalars."""
+    """The functions that stand in for w in the map's families."""
     inputs = jax.tree.leaves(map_, is_leaf=lambda node: isinstance(node, Inputs))
     return [i.features for i in inputs if isinstance(i, Inputs) and i.features is not None]
 
@@ -200,10 +207,36 @@ def _decode(text: Any, arrays: Any, scene: Scene | None) -> Any:
         elif name in text:
             items[name] = _decode(text[name], numbers, scene)
         else:
-            items[name] = jax.tree.map(jnp.asarray, numbers)
+            items[name] = numbers
     if kind == "tuple":
         return tuple(items[str(i)] for i in range(len(items)))
     return _TYPES[kind](**items)
+
+
+def _renamed(text: Any, arrays: Any) -> tuple[Any, Any]:
+    """The same tree with today's names for types and fields."""
+    if not isinstance(text, dict) or "type" not in text:
+        return text, arrays
+    kind = _FORMER_TYPES.get(text["type"], text["type"])
+    words, numbers = {"type": kind}, {}
+    for name in {**text, **(arrays or {})}:
+        if name == "type":
+            continue
+        inside = _renamed(text.get(name), (arrays or {}).get(name))
+        name_now = _FORMER_FIELDS.get((kind, name), name)
+        if name in text:
+            words[name_now] = inside[0]
+        if arrays and name in arrays:
+            numbers[name_now] = inside[1]
+    if kind == "Generated" and "there" in words:
+        sides = {"forward": "there", "backward": "back"}
+        predictor = {now: words.pop(former) for now, former in sides.items()}
+        found = {n: numbers.pop(f) for n, f in sides.items() if f in numbers}
+        given = predictor["forward"] is not None
+        words["predictor"] = {"type": "Predictor", **predictor} if given else None
+        if given:
+            numbers["predictor"] = found
+    return words, numbers or None
 
 
 def _decode_coordinates(text: dict[str, Any], scene: Scene | None) -> Coordinates:
