@@ -9,11 +9,11 @@ keeps reversibility.
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from gfnn_jax.maps.symplectic_map import Affine
+from gfnn_jax.maps.affine import Affine
+from gfnn_jax.phase_space import symplectic_form
 
 
 def fit_half_map(
@@ -46,7 +46,7 @@ def fit_half_map(
     matrix = matrix * scale[:, None] / scale[None, :]
     shift = solution[0] * scale
 
-    form = np.block([[np.zeros((dim, dim)), np.eye(dim)], [-np.eye(dim), np.zeros((dim, dim))]])
+    form = symplectic_form(dim)
     logarithm = scipy.linalg.logm(matrix)
     if np.abs(np.imag(logarithm)).max(initial=0.0) > 1e-6 * (1 + np.abs(logarithm).max()):
         return None  # inversion with stretching: not the flow of any linear field
@@ -61,7 +61,7 @@ def fit_half_map(
         generator = 0.5 * (generator - signs[:, None] * generator * signs[None, :])
         field = 0.5 * (field - signs * field)
     half, half_shift = _flow(generator, field, 0.5)
-    return Affine(jnp.asarray(half), jnp.asarray(centre), jnp.asarray(half_shift))
+    return Affine(half, centre, half_shift)
 
 
 def _flow(generator, field, time):

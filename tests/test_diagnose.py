@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from gfnn_jax.generating.charts import CHARTS
-from gfnn_jax.learn.local_maps import (
+from gfnn_jax.learn.diagnose import (
     data_defect,
     judge_chart,
     local_jacobians,
-    odd_pairs,
+    look_symplectic,
+    outliers,
     volume_change,
 )
 
@@ -58,25 +59,25 @@ def bent(z):
 
 
 @pytest.mark.parametrize("sigma", [0.0, 1e-6, 3e-3])
-def test_wrong_pairs_are_found_and_right_ones_are_not(sigma):
+def test_outliers_are_found_and_right_pairs_are_not(sigma):
     rng = np.random.default_rng(2)
     z = np.concatenate([rng.uniform(-1, 1, (1_500, 2)), 0.3 * rng.standard_normal((500, 2))])
     z1 = bent(z)
     scale = z.std(axis=0)
     noise = sigma * rng.standard_normal((2, *z.shape))
-    assert len(odd_pairs(z + noise[0], z1 + noise[1], scale)) == 0
+    assert len(outliers(z + noise[0], z1 + noise[1], scale)) == 0
     wrong = np.sort(rng.permutation(len(z))[:20])
     # Off by something like the data's size, never by nothing.
     angle = rng.uniform(0, 2 * np.pi, 20)
     z1[wrong] += np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    np.testing.assert_array_equal(odd_pairs(z + noise[0], z1 + noise[1], scale), wrong)
+    np.testing.assert_array_equal(outliers(z + noise[0], z1 + noise[1], scale), wrong)
 
 
-def test_few_or_coinciding_pairs_are_not_odd():
+def test_few_or_coinciding_pairs_are_no_outliers():
     z = np.random.default_rng(3).uniform(-1, 1, (5, 2))
-    assert len(odd_pairs(z, turned(z), z.std(axis=0))) == 0
+    assert len(outliers(z, turned(z), z.std(axis=0))) == 0
     many = np.tile(z, (20, 1))
-    assert len(odd_pairs(many, turned(many), many.std(axis=0))) == 0
+    assert len(outliers(many, turned(many), many.std(axis=0))) == 0
 
 
 def test_volume_change_tells_friction_from_noise_and_from_a_hamiltonian_residual():
@@ -91,3 +92,18 @@ def test_volume_change_tells_friction_from_noise_and_from_a_hamiltonian_residual
     squeeze = 1e-2 * z * [1, 1, -1, -1]  # linear and Hamiltonian: no volume is lost
     change, error = volume_change(z, squeeze + noise)
     assert abs(change) < 5 * error
+
+
+def test_many_degrees_of_freedom_are_diagnosed_in_seconds():
+    """22 oscillators that turn by 0.5 each: linear, so that the local fits are exact."""
+    dim = 22
+    exact = np.kron([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]], np.eye(dim))
+    z = np.random.default_rng(5).uniform(-1, 1, (300, 2 * dim))
+    z1, scale = z @ exact.T, z.std(axis=0)
+    jacobians, error = local_jacobians(z, z1, scale)
+    assert error < 1e-9
+    np.testing.assert_allclose(jacobians[:5], np.broadcast_to(exact, (5, 44, 44)), atol=1e-9)
+    assert look_symplectic(jacobians, error, scale)
+    assert len(outliers(z, z1, scale)) == 0
+    z1[7, 3] += 1.0
+    np.testing.assert_array_equal(outliers(z, z1, scale), [7])
