@@ -11,8 +11,8 @@ import pytest
 from gfnn_jax.baselines import METHODS, Budget, Sequences
 from gfnn_jax.baselines.learned import learn_map, periodic
 from gfnn_jax.fitting.adam import Recipe
+from gfnn_jax.maps.rollout import rollout
 from gfnn_jax.phase_space import hamiltonian_vector_field
-from gfnn_jax.maps.symplectic_map.rollout import rollout
 from gfnn_jax.scenes import henon_heiles, standard_map
 from gfnn_jax.scenes.trajectories import flow_step, reference_trajectories, sample_sequences
 

@@ -16,9 +16,9 @@ import numpy as np
 import optax
 import pytest
 
+from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.storage import checkpoints
 from gfnn_jax.storage.checkpoints import TrainingCheckpoints, load_model, save_model
-from gfnn_jax.errors import InputError, WorkError
 
 RNG = np.random.default_rng(0)
 ARRAYS = {

@@ -1,6 +1,7 @@
 """The command line: exit statuses, one line per refusal, nothing harmed, reports, resuming."""
 
 import contextlib
+import dataclasses
 import errno
 import json
 import math
@@ -12,22 +13,24 @@ import time
 import warnings
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from gfnn_jax import cli
-from gfnn_jax.storage import checkpoints
-from gfnn_jax.maps import saved as models
-from gfnn_jax.jobs import pipeline
-from gfnn_jax.learn import fit as selection
-from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.maps.symplectic_map.domain import covering
-from gfnn_jax.maps.symplectic_map import Generated, SymplecticMap
-from gfnn_jax.phase_space import Pairs
+from gfnn_jax.errors import FitWarning
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
+from gfnn_jax.generating.charts import MIDPOINT
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.jobs import predict as predict_job
+from gfnn_jax.jobs import progress, search
+from gfnn_jax.learn import fit as learn_fit
+from gfnn_jax.maps import saved as models
+from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.phase_space import Pairs
+from gfnn_jax.storage import checkpoints
 
 DT = 0.1
 
@@ -72,9 +75,9 @@ def model(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models") / "m"
     z = np.random.default_rng(0).uniform(-1, 1, (100, 2))
     family = Products(box_inputs(z), 2)
-    params = family.unflatten(jnp.linspace(0.1, 0.3, family.num_parameters))
-    generated = Generated(family, params, MIDPOINT, DT, jnp.ones(2))
-    map_ = SymplecticMap((generated,), CARTESIAN, covering(z), jnp.ones(2), jnp.zeros(0), DT)
+    params = family.unflatten(np.linspace(0.1, 0.3, family.num_parameters))
+    generated = Generated(family, params, MIDPOINT, DT, np.ones(2))
+    map_ = SymplecticMap((generated,), CARTESIAN, covering(z), np.ones(2), np.zeros(0), DT)
     models.save(map_, folder)
     np.save(folder.parent / "z0.npy", np.array([[0.1, 0.2], [0.3, -0.4], [30.0, 0.0]]))
     return folder
@@ -84,7 +87,7 @@ def model(tmp_path_factory):
 def fitted():
     """A fit, for tests of what is done with one."""
     z = oscillator(200, [0, DT])
-    return selection.fit(Pairs(z[:, 0], z[:, 1], DT), chart="type2", tolerance=1e-2)
+    return learn_fit.fit(Pairs(z[:, 0], z[:, 1], DT), chart="type2", tolerance=1e-2)
 
 
 def gfnn(*arguments):
@@ -103,9 +106,9 @@ def files(folder):
 # Usage
 
 
-def test_constants_are_those_of_selection():
-    assert cli.CHARTS == selection.CHART_NAMES
-    assert cli.SCALARS == selection.SCALARS
+def test_choices_are_those_of_the_fit():
+    assert cli.CHARTS == learn_fit.CHART_NAMES
+    assert cli.FAMILIES == learn_fit.FAMILIES
 
 
 def test_scenes(capsys):
@@ -120,9 +123,13 @@ def test_help(command, capsys):
     with pytest.raises(SystemExit) as stop:
         gfnn(*command, "--help")
     assert stop.value.code == 0
-    assert "usage: gfnn" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "usage: gfnn" in out
+    assert ("exit status:" in out) == (command != ("scenes",))
+    assert ("95 % bound" in out) == (command in (("run",), ("fit",)))
 
 
+WHOLE = "expected a whole number from 1 to 2**53 - 1, got "
 BAD_USAGE = [
     ((), "required: COMMAND"),
     (("rum",), "invalid choice: 'rum'"),
@@ -130,14 +137,16 @@ BAD_USAGE = [
     (("run", "two-bdy"), "unknown scene 'two-bdy', did you mean 'two-body'?"),
     (("run", "two-body", "--dt", "0"), "expected a finite number > 0, got 0"),
     (("run", "two-body", "--dt", "nan"), "expected a finite number > 0, got nan"),
-    (("run", "two-body", "--dt", "one"), "invalid _positive value: 'one'"),
+    (("run", "two-body", "--dt", "one"), "expected a finite number > 0, got one"),
     (("run", "standard-map-regular", "--dt", "0.5"), "is a map without time"),
     (("run", "two-body", "--tolerance", "-1"), "expected a finite number > 0, got -1"),
     (("run", "two-body", "--chart", "type5"), "invalid choice: 'type5'"),
+    (("run", "two-body", "--family", "spline"), "invalid choice: 'spline'"),
     (("run", "two-body", "--scalar", "spline"), "invalid choice: 'spline'"),
-    (("run", "two-body", "--scalar", "features"), "the scene two-body declares none"),
-    (("run", "two-body", "--seed", "-1"), "expected an integer from 0"),
-    (("run", "two-body", "--seed", "1.5"), "invalid _seed value: '1.5'"),
+    (("run", "two-body", "--family", "features"), "the scene two-body declares none"),
+    (("run", "two-body", "--learn", "hamiltonian"), "not available yet"),
+    (("run", "two-body", "--seed", "-1"), "expected a whole number from 0 to 2**32 - 1, got -1"),
+    (("run", "two-body", "--seed", "1.5"), "expected a whole number from 0 to 2**32 - 1, got 1.5"),
     (("run", "two-body", "--quik"), "unrecognized arguments: --quik"),
     (("run", "two-body", "--out", "{file}"), "is a file, expected a folder"),
     (("run", "two-body", "--out", "{file}/x"), "is not a folder"),
@@ -164,16 +173,20 @@ BAD_USAGE = [
     (("fit", "{data}", "--out", "{new}", "--angles", "0, 00"), "different whole numbers"),
     (("fit", "{data}", "--out", "{new}", "--angles", "0,"), "different whole numbers"),
     (("fit", "{data}", "--out", "{new}", "--tolerance", "0"), "expected a finite number > 0"),
-    (("fit", "{data}", "--out", "{new}", "--scalar", "features"), "needs a scene that declares"),
+    (("fit", "{data}", "--out", "{new}", "--family", "features"), "needs a scene that declares"),
+    (("fit", "{data}", "--out", "{new}", "--learn", "hamiltonian"), "not available yet"),
+    (("fit", "{data}", "--out", "{new}", "--max-seconds", "0"), "expected a finite number > 0"),
+    (("fit", "{data}", "--out", "{new}", "--tolerance", "1", "--absolute-tolerance", "1"),
+     "expected --tolerance or --absolute-tolerance, not both"),
     (("predict", "{model}"), "required: --initial, --num-steps, --out"),
     (("predict", "{tmp}/none", "{to}"), "no such file or folder"),
     (("predict", "{folder}", "{to}"), "holds no model.json"),
     (("predict", "{model}", "{to}", "--initial", "{tmp}/none.npy"), "no such file"),
     (("predict", "{model}", "{to}", "--initial", "{wide}"), "expected states of 2 columns"),
-    (("predict", "{model}", "{to}", "--num-steps", "0"), "expected an integer > 0, got 0"),
-    (("predict", "{model}", "{to}", "--num-steps", "1e3"), "invalid _count value: '1e3'"),
-    (("predict", "{model}", "{to}", "--num-steps", "1" + 20 * "0"), "integer below 2**53"),
-    (("predict", "{model}", "{to}", "--save-every", "-1"), "expected an integer > 0, got -1"),
+    (("predict", "{model}", "{to}", "--num-steps", "0"), WHOLE + "0"),
+    (("predict", "{model}", "{to}", "--num-steps", "1e3"), WHOLE + "1e3"),
+    (("predict", "{model}", "{to}", "--num-steps", "1" + 20 * "0"), WHOLE + "1000"),
+    (("predict", "{model}", "{to}", "--save-every", "-1"), WHOLE + "-1"),
     (("predict", "{model}", "{to}", "--outside", "maybe"), "invalid choice: 'maybe'"),
     (("predict", "{model}", "{to}", "--out", "{data}"), "exists already"),
     (("predict", "{model}", "{to}", "--out", "{new}.csv"), "is written as .npz"),
@@ -233,17 +246,19 @@ def test_usage_is_refused_in_a_moment():
 
 REPORT_KEYS = {
     "": {"scene", "dt", "seed", "dtype", "device", "versions", "data", "model", "fit", "map",
-         "rollout", "candidates"},
+         "hamiltonian", "rollout", "candidates"},
     "data": {"num_pairs"},
-    "model": {"scalar", "chart", "num_parameters"},
-    "fit": {"seconds", "compile_seconds", "train_rms", "validation_rms"},
+    "model": {"learns", "family", "chart", "num_parameters", "label"},
+    "fit": {"seconds", "total_seconds", "compile_seconds", "train_rms", "validation_rms",
+            "validation_relative", "tolerance", "tolerance_met", "ended"},
     "map": {"symplecticity_defect", "chart_determinant_min", "newton_iterations_max"},
     "rollout": {"num_trajectories", "num_excluded", "num_steps", "seconds",
                 "microseconds_per_step", "status_counts", "error", "error_median",
                 "growth_exponent", "energy_drift"},
 }  # fmt: skip
-CANDIDATE_KEYS = {"scalar", "chart", "num_parameters", "validation_rms", "microseconds_per_step",
-                  "fit_seconds", "chosen"}  # fmt: skip
+CANDIDATE_KEYS = {"learns", "family", "chart", "num_parameters", "validation_rms",
+                  "validation_relative", "microseconds_per_step", "fit_seconds",
+                  "chosen"}  # fmt: skip
 
 
 def read_report(folder):
@@ -256,6 +271,8 @@ def read_report(folder):
         assert (part == "rollout" and found is None) or keys <= set(found)
     assert all(set(candidate) >= CANDIDATE_KEYS for candidate in report["candidates"])
     assert [c["chosen"] for c in report["candidates"]].count(True) == 1
+    assert report["hamiltonian"] is None
+    assert report["fit"]["ended"]
     return report
 
 
@@ -286,12 +303,16 @@ def test_pairs_from_plain_numpy(suffix, num_pairs, tolerance, num_steps, tmp_pat
     else:
         csv_file(data, orbits, "sequence,t,q1,q2,p1,p2")
     assert gfnn("fit", data, "--out", tmp_path / "m", "--tolerance", tolerance) == 0
-    assert f"candidates for tolerance {tolerance:g}" in capsys.readouterr().out
+    told = capsys.readouterr()
+    assert "midpoint" in told.out
     report = read_report(tmp_path / "m")
+    lines = [line for line in told.err.splitlines() if "error" in line]
+    assert len(lines) >= len(report["candidates"])
     assert report["rollout"] is None
     assert report["scene"] is None
     assert report["data"]["num_pairs"] == num_pairs
-    assert report["fit"]["validation_rms"] <= tolerance
+    assert report["fit"]["validation_relative"] <= tolerance
+    assert report["fit"]["tolerance_met"]
     assert report["map"]["symplecticity_defect"] <= 1e-12
 
     orbits = kepler_orbits(20, DT * np.arange(num_steps + 1), seed=1)
@@ -321,7 +342,7 @@ def test_fit_of_csv(tmp_path):
 
 def test_a_model_is_kept_and_known_again(fitted, tmp_path, capsys, monkeypatch):
     """An existing model is refused, replaced on demand, and the very job known again."""
-    monkeypatch.setattr(pipeline, "select", lambda *args, **kwargs: fitted)
+    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
     fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
     assert gfnn(*fit) == 0
     before = files(tmp_path)
@@ -347,13 +368,15 @@ def test_a_training_that_was_stopped(fitted, tmp_path, capsys, monkeypatch):
             raise KeyboardInterrupt
         return fitted
 
-    monkeypatch.setattr(pipeline, "select", training)
+    monkeypatch.setattr(search, "fit", training)
     fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
     assert gfnn(*fit) == 130
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.endswith("m.partial keeps step_000000000007: --resume goes on with it")
     assert gfnn(*fit) == 2
     assert "m.partial: an unfinished fit" in capsys.readouterr().err
     assert gfnn(*fit, "--resume", "--seed", 1) == 2
-    assert "belongs to another training (seed differ)" in capsys.readouterr().err
+    assert "m.partial: of another fit: seed differ" in capsys.readouterr().err
     assert gfnn(*fit, "--overwrite") == 130
     assert gfnn(*fit, "--resume") == 0
     assert started_from == [None, None, 7]
@@ -368,17 +391,17 @@ def test_resuming_another_job_discards_no_training(fitted, tmp_path, capsys, mon
         raise KeyboardInterrupt
 
     fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
-    monkeypatch.setattr(pipeline, "select", training)
-    assert gfnn(*fit, "--scalar", "mlp") == 130
+    monkeypatch.setattr(search, "fit", training)
+    assert gfnn(*fit, "--family", "mlp") == 130
     before = files(tmp_path)
-    monkeypatch.setattr(pipeline, "select", lambda *args, **kwargs: fitted)
+    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
     assert gfnn(*fit, "--resume") == 2
-    assert "belongs to another training (scalar differ)" in capsys.readouterr().err
+    assert "m.partial: of another fit: family differ" in capsys.readouterr().err
     assert files(tmp_path) == before
 
 
 def test_data_inside_the_output_are_not_deleted(fitted, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(pipeline, "select", lambda *args, **kwargs: fitted)
+    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
     model = tmp_path / "m"
     assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", model) == 0
     inside = pairs_file(model / "d.npz")
@@ -388,21 +411,78 @@ def test_data_inside_the_output_are_not_deleted(fitted, tmp_path, capsys, monkey
     assert files(tmp_path) == before
 
 
+def test_nothing_is_left_where_nothing_was_kept(tmp_path, capsys, monkeypatch):
+    def stop(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(search, "fit", stop)
+    assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m") == 130
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == "gfnn: stopped; nothing of the fit was kept"
+    assert [p.name for p in tmp_path.iterdir()] == ["d.npz"]
+
+
+def test_a_killed_fit_that_kept_nothing_is_in_nobodys_way(fitted, tmp_path, monkeypatch):
+    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
+    (tmp_path / "m.partial").mkdir()
+    (tmp_path / "m.partial" / "job.json").write_text("{}")
+    assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m") == 0
+    assert not (tmp_path / "m.partial").exists()
+
+
+def test_strict(fitted, tmp_path, capsys, monkeypatch):
+    """A missed tolerance: the map is written, and the exit status says so where asked for."""
+    missed = dataclasses.replace(fitted, tolerance=1e-300)
+    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: missed)
+    fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
+    assert gfnn(*fit, "--strict") == 1
+    assert "misses the tolerance" in capsys.readouterr().err.splitlines()[-1]
+    assert not read_report(tmp_path / "m")["fit"]["tolerance_met"]
+    assert gfnn(*fit, "--overwrite") == 0
+
+
+def test_the_former_name_of_an_option(fitted, tmp_path, monkeypatch):
+    asked = []
+
+    def remember(*args, family, **kwargs):
+        asked.append(family)
+        return fitted
+
+    monkeypatch.setattr(search, "fit", remember)
+    fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m", "--overwrite")
+    for more in ((), ("--scalar", "sines"), ("--family", "polynomial")):
+        assert gfnn(*fit, *more) == 0
+    assert asked == ["auto", "sines", "polynomial"]
+
+
+def test_silence_is_never_long(capsys, monkeypatch):
+    """Where standard error is no terminal the last line is repeated."""
+    monkeypatch.setattr(progress, "LONGEST_SILENCE", 0.2)
+    with progress.on_stderr() as shown:
+        shown.say("factorising")
+        shown.say("not shown: too soon")
+        shown.tell("a candidate, error 1e-3")
+        time.sleep(0.5)
+    lines = [line.split("] ")[1] for line in capsys.readouterr().err.splitlines()]
+    assert lines[:2] == ["factorising", "a candidate, error 1e-3"]
+    assert lines[2] == "not shown: too soon …"
+
+
 def test_failing_arithmetic_is_one_line(tmp_path, capsys, monkeypatch):
     def fail(*args, **kwargs):
         raise np.linalg.LinAlgError("SVD did not converge")
 
-    monkeypatch.setattr(pipeline, "select", fail)
+    monkeypatch.setattr(search, "fit", fail)
     assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m") == 1
     assert capsys.readouterr().err.strip().endswith("the fit failed: SVD did not converge")
 
 
 def test_warnings_are_one_line(fitted, tmp_path, capsys, monkeypatch):
     def warn(*args, **kwargs):
-        warnings.warn("nothing meets the tolerance", selection.FitWarning, stacklevel=2)
+        warnings.warn("nothing meets the tolerance", FitWarning, stacklevel=2)
         return fitted
 
-    monkeypatch.setattr(pipeline, "select", warn)
+    monkeypatch.setattr(search, "fit", warn)
     assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m") == 0
     assert "gfnn: warning: nothing meets the tolerance" in capsys.readouterr().err.splitlines()
 
@@ -434,7 +514,7 @@ def test_leaving_the_domain_is_told(outside, model, tmp_path, capsys):
 @contextlib.contextmanager
 def stopped_after(num_chunks, stop):
     """The prediction is stopped after so many chunks."""
-    append = pipeline.PredictionWriter.append
+    append = predict_job.PredictionWriter.append
     count = 0
 
     def counting(writer, states, carry):
@@ -445,8 +525,8 @@ def stopped_after(num_chunks, stop):
             stop()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "_CHUNK_LANE_STEPS", 30)
-        patch.setattr(pipeline.PredictionWriter, "append", counting)
+        patch.setattr(predict_job, "_CHUNK_LANE_STEPS", 30)
+        patch.setattr(predict_job.PredictionWriter, "append", counting)
         yield
 
 
@@ -464,7 +544,9 @@ def test_a_prediction_resumes_to_the_same_bits(stop, status, model, tmp_path, ca
     with stopped_after(3, stop):
         assert predict(model, tmp_path / "p.npz") == status
         assert not (tmp_path / "p.npz").exists()
-        assert "--resume" in capsys.readouterr().err.splitlines()[-1]
+        last = capsys.readouterr().err.splitlines()[-1]
+        assert last.startswith("gfnn: terminated" if status == 143 else "gfnn: stopped")
+        assert last.endswith("p.npz.partial keeps 20 of 50 steps: --resume goes on with it")
         assert predict(model, tmp_path / "p.npz") == 2
         assert predict(model, tmp_path / "p.npz", "--resume", num_steps=60) == 2
     with stopped_after(math.inf, stop):
@@ -475,7 +557,7 @@ def test_a_prediction_resumes_to_the_same_bits(stop, status, model, tmp_path, ca
 
 
 def test_a_full_disk(model, fitted, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(pipeline, "select", lambda *args, **kwargs: fitted)
+    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
     assert predict(model, tmp_path / "p.npz") == 0
     before = files(tmp_path)
     with monkeypatch.context() as patch:
@@ -565,9 +647,9 @@ def test_run_of_every_scene(scene, error, tmp_path):
 
 @pytest.mark.slow
 def test_run_of_a_network(tmp_path):
-    assert gfnn("run", "two-body", "--quick", "--scalar", "mlp", "--out", tmp_path / "r") == 0
+    assert gfnn("run", "two-body", "--quick", "--family", "mlp", "--out", tmp_path / "r") == 0
     report = check_run(tmp_path / "r", "two-body")
-    assert report["model"]["scalar"] == "mlp"
+    assert report["model"]["family"] == "mlp"
     assert report["rollout"]["error"]["1000"] <= 0.15
 
 
@@ -595,9 +677,10 @@ def test_killed_predictions_resume(model, tmp_path):
 TRAINING = """
 import sys
 from gfnn_jax import cli
+from gfnn_jax.jobs import progress
 from gfnn_jax.learn import candidates
 
-candidates._CHECKPOINT_SECONDS = cli._SECONDS_BETWEEN_LINES = 0.0
+candidates._CHECKPOINT_SECONDS = progress.BETWEEN = 0.0
 sys.exit(cli.main(sys.argv[1:]))
 """
 
@@ -624,7 +707,7 @@ def killed_training(arguments, seconds):
 def test_killed_trainings_resume(kills, tolerance, tmp_path):
     """SIGKILLs at random moments of a training: the same map in the end, to the last bit."""
     data = pairs_file(tmp_path / "d.npz", oscillator(100, [0, 1.0]), dt=1.0)
-    fit = ("fit", data, "--scalar", "mlp", "--chart", "type2", "--tolerance", tolerance, "--out")
+    fit = ("fit", data, "--family", "mlp", "--chart", "type2", "--tolerance", tolerance, "--out")
     assert gfnn(*fit, tmp_path / "whole") == 0
     whole, described = checkpoints.load_model(tmp_path / "whole")
     rng, killed = np.random.default_rng(0), 0

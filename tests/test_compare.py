@@ -7,10 +7,15 @@ import numpy as np
 import pytest
 
 from gfnn_jax import cli, scenes
-from gfnn_jax.jobs import compare as comparison
-from gfnn_jax.jobs import pipeline
+from gfnn_jax.baselines import Budget
 from gfnn_jax.baselines.paper_gfnn import paper_gfnn
 from gfnn_jax.errors import InputError
+from gfnn_jax.jobs import compare as comparison
+from gfnn_jax.jobs import shared_data
+from gfnn_jax.jobs.chaos import divergences
+from gfnn_jax.jobs.progress import Progress
+from gfnn_jax.jobs.rollouts import Rollouts, without_runaways
+from gfnn_jax.jobs.shared_data import SharedData, separable
 
 CHEAP = ("p-sympnet", "hnn")
 
@@ -18,11 +23,10 @@ CHEAP = ("p-sympnet", "hnn")
 @pytest.fixture
 def small(monkeypatch):
     """Little data, short rollouts."""
-    monkeypatch.setattr(comparison, "_QUICK_PAIRS", 500)
-    monkeypatch.setattr(comparison, "_QUICK_TRAJECTORIES", 3)
-    monkeypatch.setattr(comparison, "_NUM_FRESH", 50)
-    monkeypatch.setattr(pipeline, "NUM_STEPS", 100)
-    monkeypatch.setattr(comparison, "NUM_STEPS", 100)
+    monkeypatch.setattr(shared_data, "_QUICK_PAIRS", 500)
+    monkeypatch.setattr(shared_data, "_QUICK_TRAJECTORIES", 3)
+    monkeypatch.setattr(shared_data, "_NUM_FRESH", 50)
+    monkeypatch.setattr(shared_data, "NUM_STEPS", 100)
 
 
 def compare(out, methods=CHEAP, scene="two-body", **options):
@@ -58,15 +62,15 @@ def test_an_interrupted_comparison_keeps_what_is_finished(small, tmp_path, monke
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        compare(out, say=stop)
+        compare(out, progress=Progress(stop))
     assert not out.exists()
     kept = (tmp_path / "out.partial" / "hnn.json").read_text()
     with pytest.raises(InputError, match="an unfinished comparison"):
         compare(out)
-    with pytest.raises(InputError, match="of another comparison"):
+    with pytest.raises(InputError, match="of another comparison: seed differ"):
         compare(out, resume=True, seed=1)
     learned = []
-    assert compare(out, resume=True, say=learned.append) is not None
+    assert compare(out, resume=True, progress=Progress(learned.append)) is not None
     assert not any(line.startswith("HNN") for line in learned)
     report = json.loads((out / "report.json").read_text())
     assert report["methods"]["hnn"]["fit"] == json.loads(kept)["fit"]
@@ -89,38 +93,38 @@ def test_bad_usage_is_one_line(tmp_path, capsys):
 
 
 def test_which_scenes_are_separable():
-    assert comparison.separable(scenes.make("two-body"))
-    assert comparison.separable(scenes.make("henon-heiles-regular"))
-    assert comparison.separable(scenes.make("standard-map-regular"))
-    assert not comparison.separable(scenes.make("pcr3bp"))
+    assert separable(scenes.make("two-body"))
+    assert separable(scenes.make("henon-heiles-regular"))
+    assert separable(scenes.make("standard-map-regular"))
+    assert not separable(scenes.make("pcr3bp"))
 
 
 def test_methods_that_apply():
-    everywhere = comparison._chosen((), scenes.make("two-body"))
+    everywhere = comparison.chosen_methods((), scenes.make("two-body"))
     assert set(comparison.TITLES) - set(everywhere) == {"onet-2", "onet-5"}
-    assert set(comparison._chosen((), scenes.make("pcr3bp"))) == set(comparison.TITLES)
+    assert set(comparison.chosen_methods((), scenes.make("pcr3bp"))) == set(comparison.TITLES)
 
 
 def test_the_same_data_for_every_method(small):
-    data = comparison._Data(scenes.make("two-body"), 3, True)
-    again = comparison._Data(scenes.make("two-body"), 3, True)
+    data = SharedData(scenes.make("two-body"), 3, True)
+    again = SharedData(scenes.make("two-body"), 3, True)
     np.testing.assert_array_equal(data.sequences(2).z, again.sequences(2).z)
     assert data.sequences(2) is data.sequences(2)
     assert data.sequences(5).z.shape == (500, 5, 4)  # on two bodies as many as pairs
-    other = comparison._Data(scenes.make("standard-map-regular"), 3, True)
+    other = SharedData(scenes.make("standard-map-regular"), 3, True)
     assert other.sequences(5).num_pairs == other.sequences(2).num_pairs
 
 
 def test_divergences_of_a_chaotic_scene(small):
     scene = scenes.make("standard-map-chaotic")
-    data = comparison._Data(scene, 0, True)
-    same = comparison._divergences(scene, data.reference, data.reference)
+    data = SharedData(scene, 0, True)
+    same = divergences(scene, data.reference, data.reference)
     assert same == {"θ": 0.0, "p": 0.0}
-    shifted = comparison._divergences(scene, data.reference + 2 * np.pi, data.reference)
+    shifted = divergences(scene, data.reference + 2 * np.pi, data.reference)
     assert max(shifted.values()) < 1e-9  # modulo 2π
     still = np.broadcast_to(data.reference[:, :1], data.reference.shape)
-    assert min(comparison._divergences(scene, still, data.reference).values()) > 1
-    assert comparison._divergences(scenes.make("two-body"), None, None) is None
+    assert min(divergences(scene, still, data.reference).values()) > 1
+    assert divergences(scenes.make("two-body"), None, None) is None
 
 
 def test_a_runaway_is_lost_from_there_on():
@@ -128,7 +132,7 @@ def test_a_runaway_is_lost_from_there_on():
     states = reference.copy()
     states[1, 2, 0] = 101.0
     status = np.zeros(2, int)
-    kept = comparison.without_runaways(pipeline.Rollouts(states, status, 1.0), reference)
+    kept = without_runaways(Rollouts(states, status, 1.0), reference)
     np.testing.assert_array_equal(kept.states[0], 1.0)
     assert np.isnan(kept.states[1, 2:]).all()
     np.testing.assert_array_equal(kept.states[1, :2], 1.0)
@@ -137,8 +141,8 @@ def test_a_runaway_is_lost_from_there_on():
 
 def test_the_papers_recipe_on_the_standard_map(small):
     """Its map commutes with the shifts by 2π, and S sees no more of θ than cos and sin."""
-    data = comparison._Data(scenes.make("standard-map-regular"), 0, True)
-    budget = comparison.Budget(jax.random.key(0), cap=0.1)
+    data = SharedData(scenes.make("standard-map-regular"), 0, True)
+    budget = Budget(jax.random.key(0), cap=0.1)
     learned = paper_gfnn(data.sequences(2), budget)
     z = np.array([[1.0, 2.0], [1.0 + 2 * np.pi, 2.0 - 4 * np.pi]])
     image = np.asarray(learned.map.step(z)[0])

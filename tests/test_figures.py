@@ -9,8 +9,7 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.patches import StepPatch
 
-from gfnn_jax.evaluate import figures
-from gfnn_jax.evaluate import metrics
+from gfnn_jax.evaluate import figures, metrics
 
 RNG = np.random.default_rng(0)
 STEPS = np.arange(101)

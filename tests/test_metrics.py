@@ -49,6 +49,16 @@ def test_lost_predictions_count_and_missing_references_do_not():
     np.testing.assert_array_equal(metrics.absolute_error([1.0, np.nan], [3.0, 1.0]), [2, np.inf])
 
 
+def test_one_step_rms_is_per_component_and_modulo_two_pi():
+    reference = np.zeros((2, 2))
+    predicted = np.array([[2 * np.pi + 0.3, 0.1], [-0.3, -0.1]])
+    rms = np.sqrt((0.09 + 0.01) / 2)
+    assert metrics.one_step_rms(predicted, reference, angles=(0,)) == pytest.approx(rms)
+    assert metrics.one_step_rms(predicted, reference) > 3
+    predicted[0, 1] = np.nan
+    assert metrics.one_step_rms(predicted, reference) == np.inf
+
+
 def test_statistics_of_nothing_and_of_lost_majorities():
     nothing = metrics.error_statistics(np.full((2, 3), np.nan))
     assert np.isnan(nothing.mean).all()

@@ -12,7 +12,6 @@ inputs and outputs of unit size, and the rate's decay.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -20,7 +19,7 @@ import jax.numpy as jnp
 
 from gfnn_jax.baselines.learned import Budget, Learned, Sequences, periodic, train
 from gfnn_jax.families.inputs import box_inputs
-from gfnn_jax.families.mlp import Mlp, amplitude_of, network
+from gfnn_jax.families.mlp import Mlp, amplitude_of, initial, network
 from gfnn_jax.fitting.adam import Recipe
 from gfnn_jax.phase_space import apply_j, sizes
 from gfnn_jax.scenes.trajectories import flow_step
@@ -63,13 +62,8 @@ def network_field(sequences: Sequences, hidden: tuple[int, ...], key) -> tuple[C
         seen = inputs.seen(z).astype(dtype)
         return jnp.asarray(unit, dtype) * net(dtype).apply({"params": params}, seen)
 
-    return field, _initial(net(jnp.float32), inputs.num_inputs, key)
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def _initial(network, num_inputs: int, key):
-    """Parameters of a Flax module, float32."""
-    return network.init(key, jnp.zeros(num_inputs, jnp.float32))["params"]
+    params = initial(inputs.num_inputs, hidden, z.shape[1], ACTIVATION, jnp.float32, key)
+    return field, params
 
 
 def q_angles(sequences: Sequences) -> tuple[int, ...]:

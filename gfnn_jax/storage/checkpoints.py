@@ -113,16 +113,6 @@ class TrainingCheckpoints:
             return step, jax.tree.unflatten(structure, leaves)
         return None
 
-    def check(self) -> None:
-        """Raise InputError where the newest readable checkpoint is of another training."""
-        for step in reversed(self._steps()):
-            path = self._path(step)
-            try:
-                record = json.loads((path / _JSON).read_bytes())
-            except (OSError, ValueError):
-                continue
-            return self._check(path, record)
-
     def _check(self, path: Path, record: dict[str, Any]) -> None:
         identity = record.get("identity", {})
         if identity != self.identity:

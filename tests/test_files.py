@@ -13,9 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from gfnn_jax.data import files as io
-from gfnn_jax.errors import InputError
+from gfnn_jax.data import files
 from gfnn_jax.data.files import DataWarning
+from gfnn_jax.errors import InputError
 
 RNG = np.random.default_rng(0)
 Z = RNG.normal(size=(30, 4))
@@ -49,7 +49,7 @@ HEADER = "t,q1,q2,p1,p2"
 
 def test_pairs_file(tmp_path):
     path = save(tmp_path / "d.npz", z0=Z[:-1], z1=Z[1:], dt=0.1)
-    data = io.read_trajectories(path)
+    data = files.read_trajectories(path)
     pairs = data.pairs()
     assert np.array_equal(pairs.z0, Z[:-1])
     assert np.array_equal(pairs.z1, Z[1:])
@@ -81,23 +81,23 @@ def test_sequences_of_any_length(tmp_path, lengths, dim, chunk, dtype, compresse
     (np.savez_compressed if compressed else np.savez)(
         path, trajectories=padded, lengths=lengths, dt=2
     )
-    data = io.read_trajectories(path)
+    data = files.read_trajectories(path)
     assert data.states.dtype == np.float64
     assert data.precision == str(np.dtype(dtype))
     for read, written in zip(data.sequences, sequences, strict=True):
         assert np.array_equal(read, written)
     assert np.array_equal(data.last_states(), [s[-1] for s in sequences])
-    assert np.array_equal(io.read_initial_states(path, dim), data.last_states())
+    assert np.array_equal(files.read_initial_states(path, dim), data.last_states())
     pairs = data.pairs()
     assert np.array_equal(pairs.z0, np.concatenate([s[:-1] for s in sequences]))
     assert np.array_equal(pairs.z1, np.concatenate([s[1:] for s in sequences]))
-    chunks = list(io.iterate_pairs(path, chunk))
+    chunks = list(files.iterate_pairs(path, chunk))
     assert max(map(len, chunks)) <= chunk
     assert np.array_equal(np.concatenate([c.z0 for c in chunks]), pairs.z0)
     assert np.array_equal(np.concatenate([c.z1 for c in chunks]), pairs.z1)
 
 
-FINITE = st.floats(-io.LARGEST, io.LARGEST)
+FINITE = st.floats(-files.LARGEST, files.LARGEST)
 
 
 @QUICK
@@ -116,14 +116,14 @@ def test_csv_round_trip(tmp_path, z, order, chunk):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)
         try:
-            data = io.read_trajectories(path)
+            data = files.read_trajectories(path)
         except InputError as error:
             assert "pairs of consecutive" in str(error)  # noqa: PT017
             return
     assert data.dt == 0.25
     assert list(data.lengths) == [2, len(z) - 2]
     assert np.array_equal(data.states, z)
-    chunks = list(io.iterate_pairs(path, chunk))
+    chunks = list(files.iterate_pairs(path, chunk))
     assert np.array_equal(np.concatenate([c.z1 for c in chunks]), data.pairs().z1)
 
 
@@ -134,13 +134,13 @@ def test_csv_headers(tmp_path):
         path, table(Z), delimiter=",", header="made by hand\nt [s],Q1 [km],q2 (km),p1,p2 [km/s]"
     )
     path.write_text(path.read_text() + "\n\n")
-    data = io.read_trajectories(path)
+    data = files.read_trajectories(path)
     assert data.units == {"t": "s", "q1": "km", "q2": "km", "p2": "km/s"}
     assert np.allclose(data.states, Z, rtol=1e-15)
     assert data.dt == pytest.approx(0.1, rel=1e-13)
     path = csv(tmp_path / "e.csv", "q1,q2,p1,p2,energy", np.column_stack([Z, Z[:, 0]]))
     with pytest.warns(DataWarning, match="ignored: energy"):
-        assert np.array_equal(io.read_trajectories(path, dt=0.5).states, Z)
+        assert np.array_equal(files.read_trajectories(path, dt=0.5).states, Z)
 
 
 @pytest.mark.parametrize("digits", [4, 5, 9])
@@ -149,7 +149,7 @@ def test_printed_times_are_rounded(tmp_path, digits):
     lines = [f"{i / 3:.{digits}f}," + ",".join(map(repr, row)) for i, row in enumerate(Z.tolist())]
     path = tmp_path / "t.csv"
     path.write_text("t,q1,q2,p1,p2\n" + "\n".join([*lines[:9], "   ", *lines[9:]]) + "\n")
-    data = io.read_trajectories(path)
+    data = files.read_trajectories(path)
     assert abs(data.dt - 1 / 3) < 10.0**-digits
     np.testing.assert_array_equal(data.pairs().z0, Z[:-1])
 
@@ -166,7 +166,7 @@ def test_rounding_explains_no_odd_step(tmp_path, dt, odd, digits):
     path = tmp_path / "t.csv"
     path.write_text("t,q1,q2,p1,p2\n" + "\n".join(lines) + "\n")
     with pytest.raises(InputError, match="not uniform"):
-        io.read_trajectories(path)
+        files.read_trajectories(path)
 
 
 def test_initial_states(tmp_path):
@@ -176,24 +176,24 @@ def test_initial_states(tmp_path):
     rows = csv(tmp_path / "rows.csv", "q1,q2,p1,p2", Z)
     orbit = csv(tmp_path / "orbit.csv", HEADER, table(Z))
     for path in (tmp_path / "z.npy", tmp_path / "z.npz", rows):
-        assert np.array_equal(io.read_initial_states(path, 2), Z)
-    assert np.array_equal(io.read_initial_states(tmp_path / "m.npy", 2), Z[5::6])
-    assert np.array_equal(io.read_initial_states(orbit, 2), Z[-1:])
+        assert np.array_equal(files.read_initial_states(path, 2), Z)
+    assert np.array_equal(files.read_initial_states(tmp_path / "m.npy", 2), Z[5::6])
+    assert np.array_equal(files.read_initial_states(orbit, 2), Z[-1:])
     with pytest.raises(InputError, match=r"d = 3\), found 4 columns"):
-        io.read_initial_states(orbit, 3)
+        files.read_initial_states(orbit, 3)
 
 
 def test_prediction_file_as_data(tmp_path):
     """A prediction that kept every tenth step holds states ten time steps apart."""
     arrays = {"trajectories": Z.reshape(3, 10, 4), "steps": np.arange(10) * 10}
-    assert io.read_trajectories(save(tmp_path / "p.npz", **arrays, dt=0.1)).dt == 1.0
+    assert files.read_trajectories(save(tmp_path / "p.npz", **arrays, dt=0.1)).dt == 1.0
 
 
 def test_given_dt(tmp_path):
     np.save(tmp_path / "d.npy", Z)
-    assert io.read_trajectories(tmp_path / "d.npy", dt=0.1).dt == 0.1
+    assert files.read_trajectories(tmp_path / "d.npy", dt=0.1).dt == 0.1
     path = save(tmp_path / "d.npz", z0=Z, z1=Z + 1, dt=np.float32(0.1))
-    assert io.read_trajectories(path, dt=0.1).dt == 0.1
+    assert files.read_trajectories(path, dt=0.1).dt == 0.1
 
 
 @pytest.mark.parametrize(
@@ -206,7 +206,7 @@ def test_given_dt(tmp_path):
 )
 def test_odd_columns_warn(tmp_path, z0, z1, message):
     with pytest.warns(DataWarning, match=message):
-        io.read_trajectories(save(tmp_path / "d.npz", z0=z0, z1=z1, dt=1.0))
+        files.read_trajectories(save(tmp_path / "d.npz", z0=z0, z1=z1, dt=1.0))
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".npz", ".csv"])
@@ -217,12 +217,12 @@ def test_streaming_memory_is_bounded(tmp_path, suffix):
     if suffix == ".csv":
         np.savetxt(path, z, delimiter=",", header="q1,q2,p1,p2", comments="")
         # A block of lines as text and as numbers; the whole file so would take 57 MB.
-        limit = io.BLOCK_ROWS * 600
+        limit = files.BLOCK_ROWS * 600
     else:
         limit = z.nbytes // 4
         np.save(path, z) if suffix == ".npy" else np.savez_compressed(path, trajectories=z)
     tracemalloc.start()
-    count = sum(len(pairs) for pairs in io.iterate_pairs(path, 10_000, dt=0.1))
+    count = sum(len(pairs) for pairs in files.iterate_pairs(path, 10_000, dt=0.1))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert count == rows - 1
@@ -389,8 +389,8 @@ def test_bad_file(tmp_path, name):
     make, message = BAD_FILES[name]
     path = make(tmp_path)
     dt = 0.1 if path.suffix == ".npy" or name == "csv sequences mixed" else None
-    for read in (io.read_trajectories, lambda p, dt: list(io.iterate_pairs(p, 10, dt=dt))):
-        if "pair" in message and "stand" not in message and read is not io.read_trajectories:
+    for read in (files.read_trajectories, lambda p, dt: list(files.iterate_pairs(p, 10, dt=dt))):
+        if "pair" in message and "stand" not in message and read is not files.read_trajectories:
             continue  # a stream may be as short as it likes
         with pytest.raises(InputError) as caught:
             read(path, dt=dt)
@@ -403,7 +403,7 @@ def test_bad_file(tmp_path, name):
 @pytest.mark.parametrize("dt", [0.0, -1.0, np.nan, np.inf, 0.2])
 def test_bad_given_dt(tmp_path, dt):
     with pytest.raises(InputError, match="dt"):
-        io.read_trajectories(save(tmp_path / "d.npz", z0=Z, z1=Z + 1, dt=0.1), dt=dt)
+        files.read_trajectories(save(tmp_path / "d.npz", z0=Z, z1=Z + 1, dt=0.1), dt=dt)
 
 
 def test_no_permission(tmp_path, monkeypatch):
@@ -414,7 +414,7 @@ def test_no_permission(tmp_path, monkeypatch):
 
     monkeypatch.setattr(builtins, "open", refuse)
     with pytest.raises(InputError, match="Permission denied"):
-        io.read_trajectories(path)
+        files.read_trajectories(path)
 
 
 @settings(max_examples=150, deadline=None)
@@ -437,7 +437,7 @@ def test_damaged_bytes_never_escape(tmp_path_factory, data):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)
         try:
-            read = io.read_trajectories(path, dt=None if kind in ("npz", "zip", "csv") else 0.1)
+            read = files.read_trajectories(path, dt=None if kind in ("npz", "zip", "csv") else 0.1)
         except InputError as error:
             assert "\n" not in str(error)  # noqa: PT017
         else:
@@ -459,4 +459,4 @@ def test_zip_members_are_not_trusted(tmp_path):
         archive.writestr("z0.npy", b"\x93NUMPY\x01\x00")
         archive.writestr("z1.npy", b"")
     with pytest.raises(InputError, match="damaged"):
-        io.read_trajectories(path, dt=1.0)
+        files.read_trajectories(path, dt=1.0)

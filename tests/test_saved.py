@@ -8,43 +8,58 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax.maps import saved as models
-from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE2, AnyChart
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
-from gfnn_jax.maps.symplectic_map.domain import covering
 from gfnn_jax.errors import InputError
-from gfnn_jax.maps.symplectic_map import Affine, Generated, SymplecticMap
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
+from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE2, AnyChart
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.generating.predictor import PolynomialModel, Predictor
+from gfnn_jax.maps import saved as models
+from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.scenes import DrawnFrom, Scene, pcr3bp, two_body
+from gfnn_jax.storage.checkpoints import load_model, save_model
 
 RNG = np.random.default_rng(0)
 STATES = 1.0 + 0.1 * RNG.standard_normal((40, 4))
 
 
+def inner(coordinates):
+    return np.asarray(jax.vmap(coordinates.forward)(jnp.asarray(STATES)))
+
+
 def a_map(
-    family, params, chart: AnyChart = MIDPOINT, coordinates=CARTESIAN, half=None
+    family, params, chart: AnyChart = MIDPOINT, coordinates=CARTESIAN, half=None, predictor=None
 ) -> SymplecticMap:
-    width = STATES.shape[1]
-    y = np.asarray(jax.vmap(coordinates.forward)(jnp.asarray(STATES)))
-    generated = Generated(family, params, chart, 0.1, jnp.ones(width))
+    y = inner(coordinates)
+    generated = Generated(family, params, chart, 0.1, np.ones(4), predictor)
     return SymplecticMap(
         (generated,) if half is None else (half, generated, half),
         coordinates,
         covering(y, ignore=coordinates.cyclic),
-        jnp.asarray(STATES.std(axis=0)),
-        jnp.zeros(len(coordinates.angles)),
+        STATES.std(axis=0),
+        np.zeros(len(coordinates.angles)),
         0.1,
     )
 
 
 def polynomial(coordinates=CARTESIAN, features=None, degree=2, angles=()):
-    y = jax.vmap(coordinates.forward)(jnp.asarray(STATES))
-    inputs = box_inputs(y, angles=angles, cyclic=coordinates.cyclic, features=features)
+    inputs = box_inputs(
+        inner(coordinates), angles=angles, cyclic=coordinates.cyclic, features=features
+    )
     family = Products(inputs, degree)
-    return family, family.unflatten(jnp.asarray(0.01 * RNG.standard_normal(family.num_parameters)))
+    return family, family.unflatten(0.01 * RNG.standard_normal(family.num_parameters))
+
+
+def predictor():
+    family = Products(box_inputs(STATES), 2)
+    coefficients = 1e-4 * RNG.standard_normal((2, 4, family.num_parameters))
+    sides = (PolynomialModel(family, family.basis.placed(c)) for c in coefficients)
+    return Predictor(*sides)
 
 
 def network(dtype):
@@ -56,7 +71,7 @@ def some_maps():
     for name, chart in CHARTS.items():
         yield name, a_map(*polynomial(), chart=chart)
     sines = Sines(box_inputs(STATES), 20)
-    yield "sines", a_map(sines, jnp.asarray(0.01 * RNG.standard_normal(20)), chart=TYPE2)
+    yield "sines", a_map(sines, 0.01 * RNG.standard_normal(20), chart=TYPE2)
     yield "mlp", a_map(*network(jnp.float64))
     yield "mlp float32", a_map(*network(jnp.float32))
     yield "angles", a_map(*polynomial(angles=(0,)), coordinates=Coordinates("plain", (0, 2)))
@@ -64,8 +79,9 @@ def some_maps():
     yield "features", a_map(*polynomial(features=pcr3bp().features))
     c, s = np.cos(0.4), np.sin(0.4)
     turn = np.kron(np.array([[c, s], [-s, c]]), np.eye(2))
-    half = Affine(jnp.asarray(turn), jnp.ones(4), jnp.full(4, 0.01))
+    half = Affine(turn, np.ones(4), np.full(4, 0.01))
     yield "base map", a_map(*polynomial(), half=half)
+    yield "predictor", a_map(*polynomial(), predictor=predictor())
 
 
 @pytest.mark.parametrize(
@@ -78,7 +94,7 @@ def test_loads_the_same_bits(name, saved, tmp_path):
     for a, b in zip(jax.tree.leaves(saved), jax.tree.leaves(loaded), strict=True):
         assert jnp.result_type(a) == jnp.result_type(b)
         assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
-    if name in ("type2", "polar", "mlp", "base map"):  # the others run the same program too
+    if name in ("type2", "polar", "mlp", "base map", "predictor"):  # others run the same program
         before, after = saved.rollout(STATES, 3)[0], loaded.rollout(STATES, 3)[0]
         assert np.isfinite(np.asarray(before)).all()
         assert np.asarray(before).tobytes() == np.asarray(after).tobytes()
@@ -90,8 +106,8 @@ def test_the_description_is_for_humans(tmp_path):
     text = (tmp_path / "m" / "model.json").read_text()
     description = json.loads(text)["description"]
     piece = description["map"]["pieces"]["0"]
-    assert piece["scalar"]["type"] == "Products"
-    assert piece["scalar"]["degree"] == 2
+    assert piece["family"]["type"] == "Products"
+    assert piece["family"]["degree"] == 2
     assert piece["chart"]["name"] == "midpoint"
     assert description["map"]["dt"] == 0.1
     assert description["versions"]["jax"] == jax.__version__
@@ -150,8 +166,28 @@ def test_a_function_of_ones_own_is_refused(tmp_path):
 )
 def test_a_foreign_description(change, message, tmp_path):
     models.save(a_map(*polynomial()), tmp_path / "m")
-    arrays, description = models.load_model(tmp_path / "m")
+    arrays, description = load_model(tmp_path / "m")
     change(description)
-    models.save_model(tmp_path / "m", arrays, description)
+    save_model(tmp_path / "m", arrays, description)
     with pytest.raises(InputError, match=message):
         models.load(tmp_path / "m")
+
+
+def test_a_model_with_the_former_names_loads(tmp_path):
+    """Fields and types that were renamed since it was saved."""
+    map_ = a_map(*polynomial(), predictor=predictor())
+    models.save(map_, tmp_path / "m")
+    arrays, description = load_model(tmp_path / "m")
+    for tree in (description["map"], arrays):
+        if "angle_centre" in tree:
+            tree["cut"] = tree.pop("angle_centre")
+        piece = tree["pieces"]["0"]
+        piece["scalar"] = piece.pop("family")
+        sides = piece.pop("predictor")
+        piece["there"], piece["back"] = sides["forward"], sides["backward"]
+    for side in ("there", "back"):
+        description["map"]["pieces"]["0"][side]["type"] = "Start"
+    save_model(tmp_path / "m", arrays, description)
+    loaded = models.load(tmp_path / "m")
+    assert jax.tree.structure(loaded) == jax.tree.structure(map_)
+    jax.tree.map(np.testing.assert_array_equal, loaded, map_)
