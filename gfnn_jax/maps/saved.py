@@ -217,8 +217,10 @@ def _renamed(text: Any, arrays: Any) -> tuple[Any, Any]:
     """The same tree with today's names for types and fields."""
     if not isinstance(text, dict) or "type" not in text:
         return text, arrays
-    kind = _FORMER_TYPES.get(text["type"], text["type"])
-    words, numbers = {"type": kind}, {}
+    kind: str = text["type"]
+    kind = _FORMER_TYPES.get(kind, kind)
+    words: dict[str, Any] = {"type": kind}
+    numbers: dict[str, Any] = {}
     for name in {**text, **(arrays or {})}:
         if name == "type":
             continue
