@@ -1,6 +1,8 @@
 """Strict numerics for every test: float64, no silent rank or dtype promotion, shapes checked."""
 
+import contextlib
 import os
+import types
 
 import jax
 import pytest
@@ -41,3 +43,28 @@ def as_a_user():
     yield
     for name, value in before.items():
         jax.config.update(name, value)
+
+
+_compiled = []
+
+
+def _count_compilations(event, duration, **_):
+    if event == "/jax/core/compile/backend_compile_duration":
+        _compiled.append(duration)
+
+
+jax.monitoring.register_event_duration_secs_listener(_count_compilations)
+
+
+@pytest.fixture
+def compilations():
+    """``with compilations() as found``: ``found.count`` is then the number of XLA programs that
+    were compiled inside, or fetched from the cache of compiled ones."""
+
+    @contextlib.contextmanager
+    def counted():
+        before, found = len(_compiled), types.SimpleNamespace(count=0)
+        yield found
+        found.count = len(_compiled) - before
+
+    return counted

@@ -244,7 +244,9 @@ def test_what_the_data_cannot_tell_from_zero_is_zero():
     target = np.stack([w[:, 0] ** 2, w[:, 1]], axis=1)
     family = Monomials(2, 5)
     fit = least_squares.fit(family, *parts(w, target), np.ones(2))
-    found = {tuple(e) for e, c in zip(family.exponents.tolist(), fit.coefficients, strict=True) if c}
+    found = {
+        tuple(e) for e, c in zip(family.exponents.tolist(), fit.coefficients, strict=True) if c
+    }
     assert found == {(0, 2), (3, 0)}
     assert fit.validation_rms < 1e-15
 

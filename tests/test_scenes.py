@@ -2,6 +2,10 @@
 
 import dataclasses
 import math
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
+import gfnn_jax
 from gfnn_jax import scenes
-from gfnn_jax.scenes import trajectories as tr
+from gfnn_jax.coordinates import to_inner, to_user
 from gfnn_jax.phase_space import hamiltonian_vector_field, symplectic_form, symplecticity_defect
+from gfnn_jax.scenes import trajectories as tr
 from gfnn_jax.scenes.two_body import angular_momentum, hamiltonian, kepler_flow
 
 FLOW = jax.jit(jax.vmap(kepler_flow))
@@ -63,10 +69,22 @@ def test_kepler_flow_on_circles_whole_periods_and_long_times():
     for invariant in (hamiltonian, angular_momentum):
         np.testing.assert_allclose(invariant(z[0]), invariant(z0[0]), rtol=3e-14)
     # Circular orbits are an ordinary point of the derivatives too.
-    jacobian = jax.jacfwd(kepler_flow)(circle[0], 0.7)
+    jacobian = np.asarray(jax.jit(jax.jacfwd(kepler_flow))(circle[0], 0.7))
     assert symplecticity_defect(jacobian) < 1e-14
-    np.testing.assert_allclose(jax.jacrev(kepler_flow)(circle[0], 0.7), jacobian, atol=1e-14)
-    assert np.isnan(kepler_flow(jnp.array([1.0, 0.0, 0.0, 1.5]), 0.1)).all()  # unbound
+    backwards = jax.jit(jax.jacrev(kepler_flow))(circle[0], 0.7)
+    np.testing.assert_allclose(backwards, jacobian, atol=1e-14)
+    unbound = jnp.array([[1.0, 0.0, 0.0, 1.5]])
+    assert np.isnan(FLOW(unbound, jnp.array([0.1]))).all()
+
+
+def test_the_ellipse_is_filled_uniformly():
+    z = scenes.UniformInEllipse((1.0, -2.0), (0.5, 3.0))(jax.random.key(0), 4_000)
+    x, y = ((np.asarray(z) - [1.0, -2.0]) / [0.5, 3.0]).T
+    area = x**2 + y**2
+    assert area.max() < 1
+    np.testing.assert_allclose(np.quantile(area, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.03)
+    turn = np.arctan2(y, x) / (2 * np.pi) % 1
+    np.testing.assert_allclose(np.quantile(turn, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.03)
 
 
 def test_two_body_law():
@@ -102,25 +120,27 @@ def test_two_body_law():
 def test_reversor(name):
     """ρᵀJρ = −J, and H∘ρ = H in the inner coordinates, so that φ∘ρ∘φ = ρ; features keep or flip."""
     scene = scenes.make(name)
-    rho = jnp.array(scene.reversor, jnp.float64)
+    rho = np.array(scene.reversor, float)
     form = symplectic_form(scene.dim)
-    np.testing.assert_array_equal(form * jnp.outer(rho, rho), -form)
-    y = jax.vmap(scene.coordinates.forward)(tr.sample_states(scene, 20, jax.random.key(1)))
-    energy = jax.vmap(lambda y: scene.hamiltonian(scene.coordinates.inverse(y)))
-    np.testing.assert_allclose(energy(y * rho[None]), energy(y), atol=1e-14, rtol=0)
+    np.testing.assert_array_equal(form * np.outer(rho, rho), -form)
+    y = to_inner(scene.coordinates, tr.sample_states(scene, 20, jax.random.key(1)))
+    energy = jax.jit(jax.vmap(lambda y: scene.hamiltonian(scene.coordinates.inverse(y))))
+    np.testing.assert_allclose(energy(y * rho), energy(y), atol=1e-14, rtol=0)
     if scene.features is not None:
-        there, back = (jax.vmap(scene.features)(v) for v in (y, y * rho[None]))
-        np.testing.assert_allclose(jnp.abs(there), jnp.abs(back), atol=1e-14, rtol=0)
+        features = jax.jit(jax.vmap(scene.features))
+        np.testing.assert_allclose(
+            np.abs(features(y)), np.abs(features(y * rho)), atol=1e-14, rtol=0
+        )
 
 
 def test_polar_coordinates_are_canonical():
     scene = scenes.two_body()
     z = tr.sample_states(scene, 50, jax.random.key(2))
-    jacobian = jax.vmap(jax.jacfwd(scene.coordinates.forward))(z)
-    assert symplecticity_defect(jacobian).max() < 1e-14
-    y = jax.vmap(scene.coordinates.forward)(z)
-    np.testing.assert_allclose(jax.vmap(scene.coordinates.inverse)(y), z, atol=1e-15, rtol=0)
-    np.testing.assert_allclose(y[:, 3], jax.vmap(angular_momentum)(z), atol=1e-15, rtol=0)
+    jacobian = jax.jit(jax.vmap(jax.jacfwd(scene.coordinates.forward)))(z)
+    assert symplecticity_defect(np.asarray(jacobian)).max() < 1e-14
+    y = to_inner(scene.coordinates, z)
+    np.testing.assert_allclose(to_user(scene.coordinates, y), z, atol=1e-15, rtol=0)
+    np.testing.assert_allclose(y[:, 3], z[:, 0] * z[:, 3] - z[:, 1] * z[:, 2], atol=1e-15, rtol=0)
 
 
 def test_standard_map_is_the_papers_and_preserves_area():
@@ -128,14 +148,14 @@ def test_standard_map_is_the_papers_and_preserves_area():
     z = jnp.array([0.7, 2.0])
     p = 2.0 + 1.2 * math.sin(0.7)
     np.testing.assert_array_equal(step(z), [0.7 + p, p])
-    states = jax.random.uniform(jax.random.key(3), (100, 2), jnp.float64, 0, 7)
-    assert symplecticity_defect(jax.vmap(jax.jacfwd(step))(states)).max() < 1e-15
+    states = np.random.default_rng(3).uniform(0, 7, (100, 2))
+    jacobian = np.asarray(jax.jit(jax.vmap(jax.jacfwd(step)))(states))
+    assert symplecticity_defect(jacobian).max() < 1e-15
 
 
 def test_the_regular_standard_map_orbit_jumps_between_two_islands():
     scene = scenes.standard_map()
-    orbit = tr.reference_trajectories(scene, jnp.array([scene.sampling.start]), 10_000)[0]
-    theta, p = np.asarray(orbit).T
+    theta, p = tr.reference_trajectories(scene, np.array([scene.sampling.start]), 10_000)[0].T
     np.testing.assert_array_less(np.abs(p - np.pi), 0.6)
     assert (np.cos(theta[::2]) > 0.4).all()
     assert (np.cos(theta[1::2]) < -0.4).all()
@@ -222,8 +242,8 @@ def test_orbits_are_regular_or_chaotic_as_they_should_be(name):
 def test_orbits_of_the_section_stay_in_the_island_and_of_the_pendulum_near_the_disc():
     section, pendulum = scenes.henon_heiles_section(), scenes.driven_pendulum()
     law = jax.random.key(5)
-    z = tr.reference_trajectories(section, tr.sample_states(section, 40, law), 200)
-    y, p_y = np.moveaxis(np.asarray(z), -1, 0)
+    z = tr.reference_trajectories(section, tr.sample_states(section, 20, law), 100)
+    y, p_y = np.moveaxis(z, -1, 0)
     assert (((y - 0.25) / 0.32) ** 2 + (p_y / 0.2) ** 2 < 1).all()
     z = tr.reference_trajectories(pendulum, tr.sample_test_states(pendulum, 40, law), 200)
     assert np.linalg.norm(z, axis=-1).max() < 0.8
@@ -232,8 +252,45 @@ def test_orbits_of_the_section_stay_in_the_island_and_of_the_pendulum_near_the_d
 def test_chaotic_henon_heiles_stays_in_the_well():
     scene = scenes.henon_heiles(energy=1 / 6)
     for law in (scene.sampling, scene.test_states):
-        orbit = tr.reference_trajectories(scene, jnp.array([law.start]), 10_000)
+        orbit = tr.reference_trajectories(scene, np.array([law.start]), 10_000)
         assert np.abs(orbit[..., :2]).max() < 1.01
+
+
+NEW_SCENE = """
+from gfnn_jax.scenes.scene import DrawnFrom, Scene
+
+
+def free_rotor():
+    return Scene("free-rotor", "turns", dim=1, dt=0.1, sampling=DrawnFrom(None))
+
+
+SCENES = {"free-rotor": free_rotor}
+"""
+
+
+def test_a_new_scene_needs_its_own_file_only(tmp_path):
+    """A copy of the folder with one more module in it, as another process finds it."""
+    package = tmp_path / "gfnn_jax"
+    shutil.copytree(Path(gfnn_jax.__file__).parent, package)
+    (package / "scenes" / "free_rotor.py").write_text(NEW_SCENE)
+    code = (
+        "from gfnn_jax import scenes;"
+        "s = scenes.make('free-rotor');"
+        "print(scenes.free_rotor() == s, s.num_pairs, s.tolerance, len(scenes.names()))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True
+    )
+    assert done.stdout.split() == ["True", "4000", "1e-08", "10"]
+
+
+def test_the_same_scene_made_twice_has_the_same_functions():
+    """What is compiled for the one serves the other."""
+    for name in scenes.names():
+        one, other = scenes.make(name), scenes.make(name)
+        assert one == other
+        for function in ("flow", "step", "section", "hamiltonian", "sampling", "test_states"):
+            assert hash(getattr(one, function)) == hash(getattr(other, function))
 
 
 def test_names_and_mistakes():
@@ -245,7 +302,7 @@ def test_names_and_mistakes():
     assert scenes.make("standard-map-regular", dt=1.0).dt == 1.0
     with pytest.raises(ValueError, match=r"unknown scene 'twobody', did you mean 'two-body'\?"):
         scenes.make("twobody")
-    with pytest.raises(ValueError, match="unknown scene 'xyz'; scenes: two-body, henon"):
+    with pytest.raises(ValueError, match="unknown scene 'xyz'; scenes: driven-pendulum, henon"):
         scenes.make("xyz")
     with pytest.raises(ValueError, match=r"dt = 1 only, not 0\.5"):
         scenes.make("standard-map-chaotic", dt=0.5)
@@ -258,6 +315,8 @@ def test_names_and_mistakes():
     for dt in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="finite and > 0"):
             scenes.make("pcr3bp", dt=dt)
+    with pytest.raises(ValueError, match="tolerance must be finite and > 0, not 0"):
+        dataclasses.replace(scenes.two_body(), tolerance=0.0)
     for energy in (0.0, 0.2, math.nan):
         with pytest.raises(ValueError, match="energy must be"):
             scenes.henon_heiles(energy=energy)

@@ -14,6 +14,7 @@ import gfnn_jax.scenes.trajectories as tr
 from gfnn_jax import scenes
 from gfnn_jax.phase_space import hamiltonian_vector_field
 
+KEY = jax.random.key(0)  # made once: that compiles as well
 INTEGRATED = ("henon-heiles-regular", "henon-heiles-printed", "pcr3bp")
 
 
@@ -22,15 +23,20 @@ def integrated(name, **changes):
     return dataclasses.replace(scenes.make(name), flow=None, **changes)
 
 
+def neighbours(scene):
+    """Three states beside the start of the scene's orbit."""
+    return np.array([scene.sampling.start]) + 0.01 * np.arange(3.0)[:, None]
+
+
 @pytest.mark.parametrize("name", INTEGRATED)
 def test_flow_agrees_with_another_solver(name):
     scene = scenes.make(name)
-    z0 = jnp.array([scene.sampling.start]) + 0.01 * jnp.arange(3.0)[:, None]
+    z0 = neighbours(scene)
     z = tr.reference_trajectories(scene, z0, 10)
     field = jax.jit(hamiltonian_vector_field(scene.hamiltonian))
     for lane in range(3):
         other = solve_ivp(
-            lambda t, y: np.asarray(field(y)), (0, 10 * scene.dt), np.asarray(z0[lane]),
+            lambda t, y: np.asarray(field(y)), (0, 10 * scene.dt), z0[lane],
             method="DOP853", rtol=3e-14, atol=1e-14,
         )  # fmt: skip
         np.testing.assert_allclose(z[lane, -1], other.y[:, -1], atol=3e-13, rtol=0)
@@ -40,14 +46,14 @@ def test_the_stroboscopic_map_agrees_with_another_solver_and_starts_at_time_0_ev
     scene = scenes.driven_pendulum(periods=3)
     z0 = tr.sample_states(scene, 3, jax.random.key(9))
     z = tr.reference_trajectories(scene, z0, 2)
-    for start, path in zip(np.asarray(z0), np.asarray(z), strict=True):
+    for start, path in zip(z0, z, strict=True):
         other = solve_ivp(
             lambda t, y: [y[1], -np.sin(y[0]) * (1 + 0.15 * np.cos(t))], (0, 2 * scene.dt), start,
             t_eval=[scene.dt, 2 * scene.dt], method="DOP853", rtol=3e-14, atol=1e-15,
         )  # fmt: skip
         np.testing.assert_allclose(path[1:], other.y.T, atol=1e-12, rtol=0)
-    np.testing.assert_array_equal(tr.reference_trajectories(scene, z[:, 1], 1)[:, 1], z[:, 2])
-    assert 0 < tr.reference_error(scene, z0, 10) < 1e-12
+    np.testing.assert_array_equal(tr.reference_trajectories(scene, z[:, 1], 2)[:, 1], z[:, 2])
+    assert 0 < tr.reference_error(scene, z0, 2) < 1e-12
 
 
 def returned(z):
@@ -73,9 +79,10 @@ def test_the_return_map():
     scene = scenes.henon_heiles_section()
 
     def step(z):
-        return np.asarray(tr.reference_trajectories(scene, jnp.asarray(z), 1)[:, 1])
+        """Of at most ten states: one compilation."""
+        return tr.reference_trajectories(scene, np.resize(z, (10, 2)), 1)[: len(z), 1]
 
-    z0 = np.asarray(tr.sample_states(scene, 8, jax.random.key(9)))
+    z0 = tr.sample_states(scene, 8, jax.random.key(9))
     z1 = step(z0)
     np.testing.assert_allclose(z1, [returned(z) for z in z0], atol=3e-13, rtol=0)
     assert np.linalg.norm(z1 - z0, axis=1).min() > 1e-2
@@ -96,7 +103,7 @@ def test_the_return_map():
     mixed = step(np.concatenate([z0, [[0.9, 0.0], [np.nan, 0.0]]]))
     assert np.isnan(mixed[8:]).all()
     np.testing.assert_array_equal(mixed[:8], step(np.concatenate([z0, z0[:2]]))[:8])
-    assert 0 < tr.reference_error(scene, jnp.asarray(z0), 100) < 1e-11
+    assert 0 < tr.reference_error(scene, np.resize(z0, (10, 2)), 1) < 1e-13
 
 
 def test_integration_against_the_exact_kepler_solution():
@@ -113,45 +120,43 @@ def test_integration_against_the_exact_kepler_solution():
 def test_forward_and_back(name):
     """The reversor turns time round: ρ φ_t ρ φ_t = 1."""
     scene = scenes.make(name)
-    rho = jnp.array(scene.reversor, jnp.float64)
-    z0 = jnp.array([scene.sampling.start])
-    there = tr.reference_trajectories(scene, z0, 100)[:, -1]
-    back = tr.reference_trajectories(scene, there * rho[None], 100)[:, -1] * rho[None]
+    rho, z0 = np.array(scene.reversor), neighbours(scene)
+    there = tr.reference_trajectories(scene, z0, 100, save_every=10)[:, -1]
+    back = tr.reference_trajectories(scene, there * rho, 100, save_every=10)[:, -1] * rho
     np.testing.assert_allclose(back, z0, atol=2e-12, rtol=0)
 
 
 def test_measured_error_of_the_reference():
-    z0 = jnp.array([scenes.henon_heiles().sampling.start])
+    z0 = np.array([scenes.henon_heiles().sampling.start])
     assert 0 < tr.reference_error(scenes.henon_heiles(), z0, 1) < 2e-15
     assert 1e-15 < tr.reference_error(scenes.henon_heiles(), z0, 1000) < 1e-11
     # It sees a bad reference: the solver out of steps in one dt, and a chaotic orbit's growth.
     assert np.isnan(tr.reference_error(scenes.henon_heiles(dt=5_000.0), z0, 1))
     chaotic = scenes.henon_heiles(energy=1 / 6)
-    assert tr.reference_error(chaotic, jnp.array([chaotic.sampling.start]), 400) > 1e-6
-    start = jnp.array([scenes.standard_map().sampling.start])
+    assert tr.reference_error(chaotic, np.array([chaotic.sampling.start]), 1_000) > 1e-6
+    start = np.array([scenes.standard_map().sampling.start])
     assert 0 < tr.reference_error(scenes.standard_map(), start, 100) < 1e-11
 
 
 def test_saving_less_changes_no_state():
     scene = scenes.henon_heiles()
-    z0 = jnp.array([scene.sampling.start])
-    every = tr.reference_trajectories(scene, z0, 12)
-    fourth = tr.reference_trajectories(scene, z0, 12, save_every=4)
-    assert every.shape == (1, 13, 4)
-    np.testing.assert_array_equal(every[:, ::4], fourth)
+    every = tr.reference_trajectories(scene, neighbours(scene), 10)
+    fourth = tr.reference_trajectories(scene, neighbours(scene), 40, save_every=4)
+    assert every.shape == fourth.shape == (3, 11, 4)
+    np.testing.assert_array_equal(every[:, ::4], fourth[:, :3])
 
 
 def test_a_collision_is_nan_and_leaves_the_others_alone():
     """A body released at rest falls into the centre at t = π/√8 ≈ 1.11; NaN stays NaN."""
     scene = integrated("two-body", dt=0.3)
-    good = jnp.array([[1.0, 0.0, 0.0, 1.0], [0.0, 1.1, -0.9, 0.1]])
-    falling = jnp.array([[1.0, 0.0, 0.0, 0.0]])
-    broken = jnp.full((1, 4), jnp.nan)
-    z = tr.reference_trajectories(scene, jnp.concatenate([good, falling, broken]), 8)
+    good = np.array([[1.0, 0.0, 0.0, 1.0], [0.0, 1.1, -0.9, 0.1]])
+    falling = np.array([[1.0, 0.0, 0.0, 0.0]])
+    broken = np.full((1, 4), np.nan)
+    z = tr.reference_trajectories(scene, np.concatenate([good, falling, broken]), 8)
     assert np.isfinite(z[2, :4]).all()
     assert np.isnan(z[2, 4:]).all()
     assert np.isnan(z[3]).all()
-    alone = tr.reference_trajectories(scene, jnp.concatenate([good, good]), 8)
+    alone = tr.reference_trajectories(scene, np.concatenate([good, good]), 8)
     np.testing.assert_array_equal(z[:2], alone[:2])
 
 
@@ -163,7 +168,7 @@ def test_time_dependent_hamiltonian():
 
     law = scenes.DrawnFrom(lambda key, num: jnp.zeros((num, 2)))
     scene = scenes.Scene("forced", "test", 1, 0.7, law, hamiltonian=hamiltonian)
-    z = tr.reference_trajectories(scene, jnp.zeros((1, 2)), 20, save_every=2)
+    z = tr.reference_trajectories(scene, np.zeros((1, 2)), 20, save_every=2)
     t = 1.4 * np.arange(11)
     np.testing.assert_allclose(z[0, :, 0], (np.cos(t) - np.cos(2 * t)) / 3, atol=1e-13, rtol=0)
 
@@ -173,6 +178,7 @@ def test_pairs_are_the_same_bits_for_the_same_seed_and_conserve_the_invariants(n
     scene = scenes.make(name)
     pairs, again, other = (tr.sample_pairs(scene, 16, jax.random.key(s)) for s in (3, 3, 4))
     assert pairs.z0.shape == pairs.z1.shape == (16, 2 * scene.dim)
+    assert isinstance(pairs.z0, np.ndarray)
     assert pairs.z0.dtype == pairs.z1.dtype == np.float64
     assert pairs.dt == scene.dt
     np.testing.assert_array_equal(pairs.z0, again.z0)
@@ -180,7 +186,7 @@ def test_pairs_are_the_same_bits_for_the_same_seed_and_conserve_the_invariants(n
     assert not (pairs.z0 == other.z0).any()
     np.testing.assert_array_equal(pairs.z1, tr.reference_trajectories(scene, pairs.z0, 1)[:, 1])
     for invariant in scene.invariants.values():
-        start, end = (jax.vmap(invariant)(z) for z in (pairs.z0, pairs.z1))
+        start, end = (jax.jit(jax.vmap(invariant))(z) for z in (pairs.z0, pairs.z1))
         np.testing.assert_allclose(end, start, atol=1e-14, rtol=0)
         assert np.ptp(start) > 1e-4
 
@@ -191,7 +197,7 @@ def test_spread_around_the_orbit(name):
     scene = scenes.make(name)
     law = dataclasses.replace(scene.sampling, num_steps=0)  # one state, so that σ is seen alone
     z = tr.sample_states(dataclasses.replace(scene, sampling=law), 4_000, jax.random.key(6))
-    offset = z - jnp.array([law.start])
+    offset = z - np.array(law.start)
     if scene.coordinates.angles:
         offset = (offset + np.pi) % (2 * np.pi) - np.pi
         assert ((z >= 0) & (z < 2 * np.pi)).all()
@@ -204,14 +210,29 @@ def test_spread_around_the_orbit(name):
 def test_draws_run_all_along_the_orbit():
     scene = scenes.henon_heiles(energy=1 / 6)
     z = tr.sample_test_states(scene, 400, jax.random.key(7))
-    energy = jax.vmap(scene.hamiltonian)(z)
+    energy = jax.jit(jax.vmap(scene.hamiltonian))(z)
     np.testing.assert_allclose(energy, 1 / 6 - 1e-3, atol=1e-12, rtol=0)
-    orbit = tr.reference_trajectories(scene, jnp.array([scene.test_states.start]), 10_000)[0]
-    index = np.array(
-        [np.flatnonzero((np.asarray(orbit) == row).all(axis=1))[0] for row in np.asarray(z)]
-    )
+    orbit = tr.reference_trajectories(scene, np.array([scene.test_states.start]), 10_000)[0]
+    index = np.array([np.flatnonzero((orbit == row).all(axis=1))[0] for row in z])
     assert abs(index.mean() / 5_000 - 1) < 0.1
     assert index.max() > 9_800
+
+
+def test_data_of_a_scene_take_one_compilation_per_program_and_shape(compilations):
+    """Draw and step of the pairs, draw of the test states, trajectories; nothing of it eagerly."""
+    with compilations() as of_pairs:
+        tr.sample_pairs(scenes.two_body(), 37, KEY)
+    with compilations() as of_tests:
+        z0 = tr.sample_test_states(scenes.two_body(), 11, KEY)
+        tr.reference_trajectories(scenes.two_body(), z0, 13)
+    with compilations() as again:
+        tr.sample_pairs(scenes.two_body(dt=0.2), 37, KEY)
+        tr.reference_trajectories(scenes.two_body(), z0, 13)
+    assert (of_pairs.count, of_tests.count, again.count) == (2, 2, 0)
+    with compilations() as of_an_orbit:
+        tr.sample_pairs(scenes.standard_map(), 37, KEY)
+        tr.sample_test_states(scenes.standard_map(), 37, KEY)
+    assert of_an_orbit.count <= 3
 
 
 def test_a_hundred_thousand_pairs_are_quick_and_finite():

@@ -1,30 +1,41 @@
-"""The scenes that come with the package, each a `Scene`, by function and by name."""
+"""The scenes that come with the package, each a `Scene`, by function and by name.
+
+A scene is one module here. Its ``SCENES`` are the names on the command line with the functions that
+make them; its function of the module's own name becomes one of this package.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import importlib
+import pkgutil
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from gfnn_jax.scenes.driven_pendulum import driven_pendulum
-from gfnn_jax.scenes.henon_heiles import henon_heiles
-from gfnn_jax.scenes.henon_heiles_section import henon_heiles_section
-from gfnn_jax.scenes.pcr3bp import pcr3bp
-from gfnn_jax.scenes.scene import AroundOrbit, DrawnFrom, Scene, Section
-from gfnn_jax.scenes.standard_map import standard_map
-from gfnn_jax.scenes.two_body import two_body
+from gfnn_jax.scenes.scene import AroundOrbit, DrawnFrom, Scene, Section, UniformInEllipse
 
-SCENES: dict[str, Callable[[], Scene]] = {
-    "two-body": two_body,
-    "henon-heiles-regular": lambda: henon_heiles(energy=1 / 12),
-    "henon-heiles-chaotic": lambda: henon_heiles(energy=1 / 6),
-    "henon-heiles-printed": lambda: henon_heiles(energy=1 / 12, printed=True),
-    "pcr3bp": pcr3bp,
-    "standard-map-regular": lambda: standard_map(k=0.6),
-    "standard-map-chaotic": lambda: standard_map(k=1.2),
-    "driven-pendulum": driven_pendulum,
-    "henon-heiles-section": henon_heiles_section,
-}
+if TYPE_CHECKING:  # what is collected below
+    from gfnn_jax.scenes.driven_pendulum import driven_pendulum
+    from gfnn_jax.scenes.henon_heiles import henon_heiles
+    from gfnn_jax.scenes.henon_heiles_section import henon_heiles_section
+    from gfnn_jax.scenes.pcr3bp import pcr3bp
+    from gfnn_jax.scenes.standard_map import standard_map
+    from gfnn_jax.scenes.two_body import two_body
+
+_OTHER_MODULES = ("scene", "trajectories")
+SCENES: dict[str, Callable[[], Scene]] = {}
+
+
+def _collect() -> None:
+    for found in pkgutil.iter_modules(__path__):
+        if found.name not in _OTHER_MODULES:
+            module = importlib.import_module(f"{__name__}.{found.name}")
+            SCENES.update(module.SCENES)
+            globals()[found.name] = getattr(module, found.name)
+
+
+_collect()
 
 
 def names() -> tuple[str, ...]:
@@ -57,6 +68,7 @@ __all__ = [
     "DrawnFrom",
     "Scene",
     "Section",
+    "UniformInEllipse",
     "driven_pendulum",
     "henon_heiles",
     "henon_heiles_section",

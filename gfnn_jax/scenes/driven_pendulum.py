@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import jax.numpy as jnp
 
 from gfnn_jax.phase_space import Scalar, State
-from gfnn_jax.scenes.scene import Scene, uniform_in_ellipse
+from gfnn_jax.scenes.scene import DrawnFrom, Scene, UniformInEllipse
+
+
+@dataclasses.dataclass(frozen=True)
+class DrivenPendulum:
+    """``hamiltonian(z, t)``: p²/2 − cos q (1 + a cos νt), a the amplitude and ν the frequency."""
+
+    amplitude: float
+    frequency: float
+
+    def __call__(self, z: State, t=0.0) -> Scalar:
+        q, p = z
+        return p**2 / 2 - jnp.cos(q) * (1 + self.amplitude * jnp.cos(self.frequency * t))
 
 
 def driven_pendulum(periods: int = 1, amplitude: float = 0.15, frequency: float = 1.0) -> Scene:
@@ -18,11 +31,6 @@ def driven_pendulum(periods: int = 1, amplitude: float = 0.15, frequency: float 
     second tongue, a weak saddle (multipliers 0.987 and 1.013 per period) between two centres at
     p = ±0.128; orbits turn by up to 0.31 per period at the disc's rim, so that many periods twist.
     """
-
-    def hamiltonian(z: State, t=0.0) -> Scalar:
-        q, p = z
-        return p**2 / 2 - jnp.cos(q) * (1 + amplitude * jnp.cos(frequency * t))
-
     period = 2 * math.pi / frequency
     return Scene(
         name="driven-pendulum",
@@ -30,8 +38,13 @@ def driven_pendulum(periods: int = 1, amplitude: float = 0.15, frequency: float 
         dim=1,
         dt=periods * period,
         period=period,
-        sampling=uniform_in_ellipse((0.0, 0.0), (0.8, 0.8)),
-        test_states=uniform_in_ellipse((0.0, 0.0), (0.6, 0.6)),
-        hamiltonian=hamiltonian,
+        sampling=DrawnFrom(UniformInEllipse((0.0, 0.0), (0.8, 0.8))),
+        test_states=DrawnFrom(UniformInEllipse((0.0, 0.0), (0.6, 0.6))),
+        hamiltonian=DrivenPendulum(amplitude, frequency),
         reversor=(1, -1),
+        num_pairs=3_000,
+        tolerance=2.5e-10,
     )
+
+
+SCENES = {"driven-pendulum": driven_pendulum}

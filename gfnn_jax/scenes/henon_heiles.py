@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 from gfnn_jax.phase_space import Scalar, State, split
 from gfnn_jax.scenes.scene import AroundOrbit, Scene
@@ -79,4 +80,13 @@ def henon_heiles(energy: float = 1 / 12, dt: float = 0.5, *, printed: bool = Fal
         ),
         reversor=(1, 1, -1, -1),
         regular=not chaotic,
+        num_pairs=8_000 if chaotic else 4_000,
+        tolerance=3e-10 if chaotic else 5e-12,
     )
+
+
+SCENES = {
+    "henon-heiles-regular": henon_heiles,
+    "henon-heiles-chaotic": partial(henon_heiles, energy=ESCAPE_ENERGY),
+    "henon-heiles-printed": partial(henon_heiles, printed=True),
+}

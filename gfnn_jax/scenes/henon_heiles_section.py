@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from gfnn_jax.phase_space import State
 from gfnn_jax.scenes.henon_heiles import hamiltonian
-from gfnn_jax.scenes.scene import Scene, Section, uniform_in_ellipse
+from gfnn_jax.scenes.scene import DrawnFrom, Scene, Section, UniformInEllipse
 
 ENERGY = 0.1
 FIXED_POINT = (0.2755, 0.0)  # to four digits
@@ -34,8 +34,13 @@ def henon_heiles_section() -> Scene:
         purpose="Poincaré return map of Hénon–Heiles, the large island of regular orbits",
         dim=1,
         dt=1.0,
-        sampling=uniform_in_ellipse(centre, axes),
-        test_states=uniform_in_ellipse(centre, (0.8 * axes[0], 0.8 * axes[1])),
+        sampling=DrawnFrom(UniformInEllipse(centre, axes)),
+        test_states=DrawnFrom(UniformInEllipse(centre, (0.8 * axes[0], 0.8 * axes[1]))),
         section=Section(hamiltonian, index=0, lift=lift),
         reversor=(1, -1),
+        num_pairs=1_000,
+        tolerance=1.5e-9,
     )
+
+
+SCENES = {"henon-heiles-section": henon_heiles_section}

@@ -45,4 +45,9 @@ def pcr3bp(dt: float = 0.1) -> Scene:
         invariants={"Jacobi energy": hamiltonian},
         features=features,
         reversor=(1, -1, -1, 1),
+        num_pairs=10_000,
+        tolerance=7e-7,
     )
+
+
+SCENES = {"pcr3bp": pcr3bp}

@@ -17,21 +17,23 @@ from gfnn_jax.phase_space import State
 
 @dataclasses.dataclass(frozen=True)
 class DrawnFrom:
-    """States drawn directly: ``draw(key, num)`` -> (num, 2d) float64."""
+    """States drawn directly: ``draw(key, num)`` -> (num, 2d) float64, traced by ``jax.jit``."""
 
     draw: Callable
 
 
-def uniform_in_ellipse(centre: tuple[float, float], semi_axes: tuple[float, float]) -> DrawnFrom:
-    """States (q, p) of one degree of freedom, uniform inside an ellipse."""
+@dataclasses.dataclass(frozen=True)
+class UniformInEllipse:
+    """``draw(key, num)``: (q, p) of one degree of freedom, uniform inside an ellipse."""
 
-    def draw(key, num):
+    centre: tuple[float, float]
+    semi_axes: tuple[float, float]
+
+    def __call__(self, key, num):
         area, turn = jax.random.uniform(key, (2, num), jnp.float64)
         radius, angle = jnp.sqrt(area), 2 * jnp.pi * turn
         unit = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle)], axis=-1)
-        return jnp.array([centre]) + jnp.array([semi_axes]) * unit
-
-    return DrawnFrom(draw)
+        return jnp.array([self.centre]) + jnp.array([self.semi_axes]) * unit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,6 +77,8 @@ class Scene:
 
     They are taken in that order: an exact flow before an exact map before a numerical integration
     (a Hamiltonian may be given beside an exact flow; it is then an invariant, not the reference).
+    What is compiled for one scene serves another with the same functions: functions with
+    parameters of their own are best frozen dataclasses with ``__call__``, which compare by value.
 
     name, purpose: as `gfnn scenes` prints them, one line.
     dim:           degrees of freedom d.
@@ -94,6 +98,9 @@ class Scene:
     reversor:      signs (2d,) of a linear reversor ρ in the inner coordinates (ρᵀJρ = −J and
                    φ∘ρ∘φ = ρ, φ the map), where there is one; it halves a midpoint basis.
     regular:       True where the orbits are regular, so that error growth has an exponent.
+    num_pairs:     pairs that `gfnn run` draws.
+    tolerance:     relative one-step error that `gfnn run` asks for: RMS over coordinates of the
+                   error divided by the coordinate's spread.
     """
 
     name: str
@@ -112,10 +119,14 @@ class Scene:
     features: Callable | None = None
     reversor: tuple[int, ...] | None = None
     regular: bool = True
+    num_pairs: int = 4_000
+    tolerance: float = 1e-8
 
     def __post_init__(self):
-        if not (math.isfinite(self.dt) and self.dt > 0):
-            raise ValueError(f"dt must be finite and > 0, not {self.dt}")
+        for name in ("dt", "tolerance"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be finite and > 0, not {value}")
         if self.period is not None:
             periods = self.dt / self.period
             if round(periods) < 1 or abs(periods - round(periods)) > 1e-9 * periods:

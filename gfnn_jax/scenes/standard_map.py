@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import partial
 
 import jax.numpy as jnp
 
@@ -12,6 +13,18 @@ from gfnn_jax.phase_space import State
 from gfnn_jax.scenes.scene import AroundOrbit, Scene
 
 GOLDEN_CURVE_BREAKS = 0.971635  # Greene (1979): above this K the chaos is connected in p
+
+
+@dataclasses.dataclass(frozen=True)
+class Kick:
+    """``step(z)``: p += k sin θ, then θ += p (paper, eq. (standardMap))."""
+
+    k: float
+
+    def __call__(self, z: State) -> State:
+        theta, p = z
+        p = p + self.k * jnp.sin(theta)
+        return jnp.stack([theta + p, p])
 
 
 def standard_map(k: float = 0.6) -> Scene:
@@ -24,12 +37,6 @@ def standard_map(k: float = 0.6) -> Scene:
 
     Drawn states have θ and p in [0, 2π). Their images are not reduced, so that both are continuous.
     """
-
-    def step(z: State) -> State:
-        theta, p = z
-        p = p + k * jnp.sin(theta)  # paper, eq. (standardMap)
-        theta = theta + p
-        return jnp.stack([theta, p])
 
     regular = k < GOLDEN_CURVE_BREAKS
     orbit = AroundOrbit((0.3, math.pi) if regular else (0.1, 0.1), num_steps=10_000, sigma=0.5)
@@ -44,7 +51,15 @@ def standard_map(k: float = 0.6) -> Scene:
         dt=1.0,
         sampling=orbit,
         test_states=None if regular else dataclasses.replace(orbit, sigma=0.0),
-        step=step,
+        step=Kick(k),
         coordinates=Coordinates("angles", angles=(0, 1)),
         regular=regular,
+        num_pairs=1_000,
+        tolerance=6e-13,
     )
+
+
+SCENES = {
+    "standard-map-regular": standard_map,
+    "standard-map-chaotic": partial(standard_map, k=1.2),
+}

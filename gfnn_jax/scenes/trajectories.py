@@ -1,24 +1,31 @@
 """Reference trajectories of a scene, and the states, pairs and sequences that are drawn from them.
 
-Every key is a ``jax.random.key``; everything is float64 and needs x64 to be on.
+Every key is a ``jax.random.key``; everything is float64 and needs x64 to be on. States come out as
+NumPy arrays: each function here compiles one program per scene and shape, and nothing beside it.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from gfnn_jax.phase_space import Pairs, States, hamiltonian_vector_field, require_x64
-from gfnn_jax.scenes.scene import DrawnFrom, Scene
+from gfnn_jax.coordinates import TWO_PI, to_inner, to_user
+from gfnn_jax.phase_space import Pairs, hamiltonian_vector_field, require_x64
+from gfnn_jax.scenes.scene import AroundOrbit, DrawnFrom, Scene
+
+States = Float[Array | np.ndarray, "batch phase"]
+Drawn = Float[np.ndarray, "num phase"]
 
 TOLERANCE = 1e-15  # 1e-14 costs 15 % less and drifts ten times more in energy
 MAX_SOLVER_STEPS = 1024  # for one dt; a state that needs more is about to collide
+KEPT_ORBITS = 8  # orbits that states are drawn around, so that the next draw has them
 LONGEST_RETURN = 1e6  # to a section: what does not come back uses up its steps before
 
 
@@ -88,7 +95,7 @@ def _return_map(section):
 
 
 @partial(jax.jit, static_argnames=("num_saved", "flow", "step", "section", "hamiltonian", "period"))
-def _trajectories(z0, dt, save_every, num_saved, flow, step, section, hamiltonian, period):
+def _trajectories(z0, save_every, num_saved, dt, flow, step, section, hamiltonian, period):
     """States after save_every, 2 save_every, ... steps: (num_saved, B, 2d)."""
     if flow is not None:
         times = dt * (save_every * jnp.arange(1, num_saved + 1)).astype(float)
@@ -113,9 +120,14 @@ def _trajectories(z0, dt, save_every, num_saved, flow, step, section, hamiltonia
     return jax.lax.scan(save, z0, save_every * jnp.arange(num_saved))[1]
 
 
+def _reference(scene: Scene) -> tuple:
+    """What a trajectory of the scene depends on."""
+    return scene.dt, scene.flow, scene.step, scene.section, scene.hamiltonian, scene.period
+
+
 def reference_trajectories(
     scene: Scene, z0: States, num_steps: int, *, save_every: int = 1
-) -> Float[Array, "batch saved phase"]:
+) -> Float[np.ndarray, "batch saved phase"]:
     """Reference trajectories from ``z0`` (B, 2d): (B, 1 + num_steps // save_every, 2d), z0 first.
 
     The scene's exact flow or exact map where it has one, else Dopri8, to its section where it has
@@ -123,19 +135,9 @@ def reference_trajectories(
     not reduced. From where a state escapes or collides its own row is NaN, and no other lane's.
     """
     require_x64("a reference trajectory")
-    z0 = jnp.asarray(z0, jnp.float64)
-    saved = _trajectories(
-        z0,
-        scene.dt,
-        save_every,
-        num_steps // save_every,
-        scene.flow,
-        scene.step,
-        scene.section,
-        scene.hamiltonian,
-        scene.period,
-    )
-    return jnp.concatenate([z0[:, None], jnp.moveaxis(saved, 0, 1)], axis=1)
+    z0 = np.asarray(z0, np.float64)
+    saved = _trajectories(z0, save_every, num_steps // save_every, *_reference(scene))
+    return np.concatenate([z0[:, None], np.moveaxis(np.asarray(saved), 0, 1)], axis=1)
 
 
 def flow_step(field: Callable, dt: float, tolerance: float) -> Callable:
@@ -183,42 +185,66 @@ def reference_error(scene: Scene, z0: States, num_steps: int) -> float:
         halved = dataclasses.replace(scene, dt=scene.dt / halves, period=None)
         second = reference_trajectories(halved, z0, halves * num_steps, save_every=halves)
     else:
-        moved = jnp.asarray(z0, jnp.float64) * (1 + jnp.finfo(jnp.float64).eps)
+        moved = np.asarray(z0, np.float64) * (1 + np.finfo(np.float64).eps)
         second = reference_trajectories(scene, moved, num_steps)
-    error = jnp.max(jnp.linalg.norm(second - first, axis=-1), axis=-1)
-    return float(jnp.nanmax(error))
+    error = np.max(np.linalg.norm(second - first, axis=-1), axis=-1)
+    return float(np.nanmax(error)) if not np.isnan(error).all() else float("nan")
+
+
+@partial(jax.jit, static_argnames=("draw", "num"))
+def _drawn(key, *, draw, num):
+    return draw(key, num)
+
+
+@partial(jax.jit, static_argnames=("length", "shape"))
+def _perturbations(key, *, length, shape):
+    """Which states of an orbit of this length (num,), and standard normal noise (num, 2d)."""
+    key_time, key_noise = jax.random.split(key)
+    time = jax.random.randint(key_time, shape[:1], 0, length)
+    return time, jax.random.normal(key_noise, shape, jnp.float64)
+
+
+@lru_cache(maxsize=KEPT_ORBITS)
+def _orbit(law: AroundOrbit, *reference):
+    """The states (num_steps + 1, 2d) of the law's orbit."""
+    start = np.array([law.start])
+    states = np.asarray(_trajectories(start, 1, law.num_steps, *reference))
+    return np.concatenate([start, states[:, 0]])
 
 
 def _reduce_angles(coordinates, z):
-    """Angles of z (2d,) brought to [0, 2π)."""
+    """Angles of z (num, 2d) brought to [0, 2π)."""
     if not coordinates.angles:
         return z
-    y, angles = coordinates.forward(z), jnp.array(coordinates.angles)
-    return coordinates.inverse(y.at[angles].set(y[angles] % (2 * jnp.pi)))
+    y, angles = to_inner(coordinates, z), list(coordinates.angles)
+    y[:, angles] = np.mod(y[:, angles], TWO_PI)
+    return to_user(coordinates, y)
 
 
 def _draw(scene, law, num, key):
     require_x64("drawing states")
     if isinstance(law, DrawnFrom):
-        return law.draw(key, num)
-    orbit = reference_trajectories(scene, jnp.array([law.start]), law.num_steps)[0]
-    key_time, key_noise = jax.random.split(key)
-    time = jax.random.randint(key_time, (num,), 0, len(orbit))
-    noise = jax.random.normal(key_noise, (num, 2 * scene.dim), jnp.float64)
-    return jax.vmap(partial(_reduce_angles, scene.coordinates))(orbit[time] + law.sigma * noise)
+        return np.asarray(_drawn(key, draw=law.draw, num=num), np.float64)
+    orbit = _orbit(law, *_reference(scene))
+    time, noise = _perturbations(key, length=len(orbit), shape=(num, 2 * scene.dim))
+    return _reduce_angles(
+        scene.coordinates, orbit[np.asarray(time)] + law.sigma * np.asarray(noise)
+    )
 
 
-def sample_states(scene: Scene, num: int, key) -> States:
+def sample_states(scene: Scene, num: int, key) -> Drawn:
     """``num`` states of the scene's training law, (num, 2d)."""
     return _draw(scene, scene.sampling, num, key)
 
 
-def sample_test_states(scene: Scene, num: int, key) -> States:
+def sample_test_states(scene: Scene, num: int, key) -> Drawn:
     """``num`` states for rollouts to start from, (num, 2d): the training law unless declared."""
     return _draw(scene, scene.test_states or scene.sampling, num, key)
 
 
-def sample_sequences(scene: Scene, num: int, length: int, key) -> Float[Array, "num length phase"]:
+def sample_sequences(
+    scene: Scene, num: int, length: int, key
+) -> Float[np.ndarray, "num length phase"]:
     """``num`` reference sequences of ``length`` states each, from states of the training law."""
     return reference_trajectories(scene, sample_states(scene, num, key), length - 1)
 

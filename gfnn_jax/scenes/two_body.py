@@ -63,15 +63,13 @@ def kepler_flow(z: State, t) -> State:
 
 def _draw(key, num):
     """Paper, Experimental Details: uniform in a and e; uniform mean anomaly and orientation."""
-    keys = jax.random.split(key, 4)
+    ranges = jnp.array([SEMI_MAJOR_AXIS, ECCENTRICITY, (0.0, 2 * jnp.pi), (0.0, 2 * jnp.pi)])
 
-    def uniform(key, low, high):
-        return jax.random.uniform(key, (num,), jnp.float64, low, high)
+    def uniform(key, range_):
+        return jax.random.uniform(key, (num,), jnp.float64, range_[0], range_[1])
 
-    a = uniform(keys[0], *SEMI_MAJOR_AXIS)
-    e = uniform(keys[1], *ECCENTRICITY)
-    mean_anomaly = uniform(keys[2], 0.0, 2 * jnp.pi)
-    turn = uniform(keys[3], 0.0, 2 * jnp.pi)
+    # One program for the four of them, which takes most of the time to compile.
+    a, e, mean_anomaly, turn = jax.vmap(uniform)(jax.random.split(key, 4), ranges)
 
     zero = jnp.zeros_like(a)
     periapsis = jnp.stack([a * (1 - e), zero, zero, jnp.sqrt((1 + e) / (a * (1 - e)))], axis=-1)
@@ -101,4 +99,8 @@ def two_body(dt: float = 0.1) -> Scene:
         invariants={"energy": hamiltonian, "angular momentum": angular_momentum},
         coordinates=polar(cyclic=True),
         reversor=(1, -1, -1, 1),
+        tolerance=1.4e-10,
     )
+
+
+SCENES = {"two-body": two_body}
