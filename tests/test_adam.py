@@ -3,12 +3,14 @@
 import dataclasses
 import functools
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gfnn_jax.families.family import DifferentiatedByJax
 from gfnn_jax.fitting.adam import DEFAULT, PAPER, PAPER_STANDARD_MAP, QUICK, Recipe, adam, minimise
 
 WEIGHT = np.array([0.5, 0.1])
@@ -18,9 +20,31 @@ def pendulum(w):
     return 0.5 * w[1] ** 2 - jnp.cos(2 * w[0])
 
 
-def network(params, w):
-    hidden = jnp.tanh(w.astype(params["inner"].dtype) @ params["inner"] + params["bias"])
-    return hidden @ params["outer"]
+@partial(jax.tree_util.register_dataclass, data_fields=("amplitude",), meta_fields=())
+@dataclasses.dataclass(frozen=True)
+class Network(DifferentiatedByJax):
+    """One hidden layer of tanh, its gradient in closed form."""
+
+    amplitude: float = 1.0
+    operations = (0, 0)
+
+    def value(self, params, w, args=None):
+        hidden = jnp.tanh(self._cast(params, w) @ params["inner"] + self._row(params["bias"], w))
+        return self.amplitude * (hidden @ params["outer"])
+
+    def gradient(self, params, w, args=None):
+        hidden = jnp.tanh(self._cast(params, w) @ params["inner"] + self._row(params["bias"], w))
+        slope = (1 - hidden**2) * self._row(params["outer"], w)
+        return self.amplitude * (slope @ params["inner"].T)
+
+    def _row(self, vector, w):
+        return vector.reshape((1,) * (w.ndim - 1) + vector.shape)
+
+    def _cast(self, params, w):
+        return w.astype(params["inner"].dtype)
+
+
+NETWORK = Network()
 
 
 def start(seed=0):
@@ -34,7 +58,7 @@ def start(seed=0):
 
 def gradient_data(num, seed):
     w = np.random.default_rng(seed).uniform(-1, 1, (num, 2))
-    return w, np.asarray(jax.vmap(jax.grad(pendulum))(jnp.asarray(w)))
+    return w, np.asarray(jax.jit(jax.vmap(jax.grad(pendulum)))(w))
 
 
 TRAIN, VALIDATION = gradient_data(330, 1), gradient_data(40, 2)
@@ -43,7 +67,7 @@ SHORT = Recipe(batch_size=50, epochs=6, rate=0.02, schedule="cosine", dtype="flo
 
 def fit(recipe=SHORT, *, params=None, train=TRAIN, seed=7, **options):
     return adam(
-        network,
+        NETWORK,
         start() if params is None else params,
         train,
         VALIDATION,
@@ -65,11 +89,11 @@ def numpy_gradient(params, w):
     return ((1 - np.tanh(w @ inner + bias) ** 2) * outer) @ inner.T
 
 
-def numpy_rms(params, w, wanted):
+def numpy_rms(params, w, target):
     """Root of the loss per component, written out."""
     total = 0.0
-    for row, target in zip(numpy_gradient(params, w), wanted, strict=True):
-        total += sum((WEIGHT[i] * (row[i] - target[i])) ** 2 for i in range(2))
+    for row, asked in zip(numpy_gradient(params, w), target, strict=True):
+        total += sum((WEIGHT[i] * (row[i] - asked[i])) ** 2 for i in range(2))
     return math.sqrt(total / len(w) / 2)
 
 
@@ -90,10 +114,10 @@ def test_the_loss_is_the_papers():
 def test_one_iteration_is_adams():
     """The first update of Adam is the rate times the sign of the slope (but for its epsilon)."""
     recipe = Recipe(330, epochs=1, rate=1e-3, schedule="staircase", dtype="float64")
-    w, wanted = TRAIN
+    w, target = TRAIN
 
     def loss(outer):
-        return numpy_rms({**start(), "outer": outer}, w, wanted)
+        return numpy_rms({**start(), "outer": outer}, w, target)
 
     outer, step = np.asarray(start()["outer"]), 1e-6
     slope = [
@@ -210,18 +234,18 @@ def test_stops_where_numbers_cease_to_be_finite():
 
 
 def test_refuses_what_is_not_finite_at_the_start():
-    w, wanted = (a.copy() for a in TRAIN)
-    wanted[3, 1] = np.nan
+    w, target = (a.copy() for a in TRAIN)
+    target[3, 1] = np.nan
     with pytest.raises(ValueError, match="NaN"):
-        fit(train=(w, wanted))
+        fit(train=(w, target))
     with pytest.raises(ValueError, match="not finite"):
         fit(params={**start(), "outer": jnp.full(11, jnp.inf)})
 
 
 def test_refuses_shapes_that_do_not_agree():
-    w, wanted = TRAIN
-    with pytest.raises(ValueError, match="train: expected w and wanted of shape"):
-        fit(train=(w, wanted[:-1]))
+    w, target = TRAIN
+    with pytest.raises(ValueError, match="train: expected w and target_gradient of shape"):
+        fit(train=(w, target[:-1]))
 
 
 def test_refuses_unknown_schedules_and_sizes():
@@ -243,6 +267,20 @@ def test_any_loss_of_a_batch():
     np.testing.assert_allclose(result.params, rows.mean(axis=0), atol=1e-4)
     expected = np.sqrt(np.mean(rows.var(axis=0)))
     assert result.validation_rms == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_second_fit_of_the_same_shapes_compiles_nothing(compilations):
+    """Other data, another start, other leaves of the family, another key."""
+    fit()
+    key, other, data = jax.random.key(11), start(seed=4), gradient_data(330, 5)
+    with compilations() as found:
+        result = adam(
+            Network(amplitude=2.0), other, data, VALIDATION, WEIGHT,
+            recipe=SHORT, key=key,
+        )  # fmt: skip
+    assert result.epochs == 6
+    assert found.count == 0
+    assert result.compile_seconds < 0.1
 
 
 def test_a_cap_ends_the_training_and_its_rate():

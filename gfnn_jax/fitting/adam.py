@@ -1,9 +1,9 @@
 """Minimise a loss by Adam, among them the paper's for S(params, w). The one home of optax.
 
-`adam` fits S to wanted gradients. Its loss is the paper's (3), a mean over pairs, with a weight for
+`adam` fits S to target gradients. Its loss is the paper's (3), a mean over pairs, with a weight for
 the size of each coordinate:
 
-    L(θ) = mean of ‖weight · (∇S(θ, w) − wanted)‖²
+    L(θ) = mean of ‖weight · (∇S(θ, w) − target_gradient)‖²
 
 ``weight = h`` in all entries is the paper's; ``h / scale`` of the conjugate coordinate makes L
 independent of the units of q and p. `minimise` takes any loss of a batch.
@@ -19,6 +19,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -26,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gfnn_jax.families import Family
 from gfnn_jax.phase_space import require_x64
 
 Rows = Float[Array | np.ndarray, "_ _"]
@@ -94,8 +96,8 @@ QUICK = dataclasses.replace(DEFAULT, epochs=30)
 class AdamFit(NamedTuple):
     """params: those of the epoch with the lowest validation error, of the recipe's dtype.
 
-    train_rms, validation_rms: of that epoch, per component of weight · (∇S − wanted); the first is
-    a mean over its batches, while parameters moved. history: both of every epoch, (epochs,) each.
+    train_rms, validation_rms: of that epoch, per component of the loss; the first is a mean over
+    its batches, while parameters moved. history: both of every epoch, (epochs,) each.
     seconds: without compilation; with those of the run that was resumed. stopped_because: "epochs",
     or words that say that the cap was reached, or where numbers ceased to be finite.
     """
@@ -111,7 +113,7 @@ class AdamFit(NamedTuple):
 
 
 def adam(
-    family: Callable,
+    family: Family,
     params: Any,
     train: tuple[Rows, Rows],
     validation: tuple[Rows, Rows],
@@ -124,29 +126,86 @@ def adam(
     resume: dict[str, Any] | None = None,
     cap: float | None = None,
 ) -> AdamFit:
-    """Minimise L over train = (w, wanted), each (N, 2d).
+    """Minimise L over train = (w, target_gradient), each (N, 2d).
 
-    family:     ``S(params, w)`` -> scalar, for one w of shape (2d,).
+    family:     what is compiled for it serves every set of data of the same shapes.
     params:     any pytree of floating-point arrays: the start.
-    validation: (w, wanted) of pairs kept apart.
+    validation: (w, target_gradient) of pairs kept apart.
     weight:     (2d,).
     The other arguments, and what is raised later, are those of `minimise`. Raises ValueError where
     shapes do not agree or data are not finite.
     """
-    weight = jnp.asarray(weight, recipe.dtype)
-    train, validation = ((jnp.asarray(w), jnp.asarray(wanted)) for w, wanted in (train, validation))
+    weight = np.asarray(weight, recipe.dtype)
+    train, validation = ((np.asarray(w), np.asarray(target)) for w, target in (train, validation))
     _check(train, validation, weight)
-    gradient = jax.vmap(jax.grad(family, argnums=1), (None, 0))
-
-    def loss(params, w, wanted):
-        """The paper's (3), for weight = h."""
-        error = weight[None, :] * (gradient(params, w) - wanted)
-        return jnp.mean(jnp.sum(error**2, axis=-1))
-
-    return minimise(
-        loss, params, train, validation, components=weight.size, recipe=recipe, key=key,
-        on_epoch=on_epoch, checkpoint=checkpoint, resume=resume, cap=cap,
+    return _minimise(
+        _gradient_loss, (family, weight), params, train, validation, components=weight.size,
+        recipe=recipe, key=key, on_epoch=on_epoch, checkpoint=checkpoint, resume=resume, cap=cap,
     )  # fmt: skip
+
+
+def _gradient_loss(given, params, w, target_gradient):
+    """The paper's (3), for weight = h."""
+    family, weight = given
+    error = weight[None, :] * (family.gradient(params, w) - target_gradient)
+    return jnp.mean(jnp.sum(error**2, axis=-1))
+
+
+@dataclasses.dataclass(frozen=True)
+class _LossOfRows:
+    """A loss that is given nothing but the parameters and the rows."""
+
+    loss: Callable
+
+    def __call__(self, given, params, *rows):
+        del given
+        return self.loss(params, *rows)
+
+
+@partial(jax.jit, static_argnames="loss", donate_argnames="carry")
+def _run_epoch(carry, given, batches, rates, rows, *, loss):
+    """(carry, mean loss) after an iteration with each of the batches (length, batch_size)."""
+    import optax
+
+    optimizer = optax.scale_by_adam()
+
+    def iterate(carry, chosen):
+        (params, state), (batch, rate) = carry, chosen
+        value, slope = jax.value_and_grad(loss, argnums=1)(
+            given, params, *(array[batch] for array in rows)
+        )
+        with jax.numpy_dtype_promotion("standard"):  # optax counts in int32
+            direction, state = optimizer.update(slope, state, params)
+        updates = jax.tree.map(lambda a: -rate * a, direction)
+        return (optax.apply_updates(params, updates), state), value
+
+    carry, values = jax.lax.scan(iterate, carry, (batches, rates))
+    return carry, jnp.mean(values)
+
+
+@partial(jax.jit, static_argnames="loss")
+def _validate(params, given, rows, *, loss):
+    return loss(given, params, *rows)
+
+
+@jax.jit
+def _first_carry(params):
+    import optax
+
+    return jax.tree.map(jnp.copy, params), optax.scale_by_adam().init(params)
+
+
+@partial(jax.jit, static_argnames=("recipe", "length"))
+def _rates(first, *, recipe, length):
+    """The rate of ``length`` iterations from ``first`` on: (length,)."""
+    with jax.numpy_dtype_promotion("standard"):
+        rates = recipe.rate_at(first + jnp.arange(length), recipe.epochs * length)
+        return rates.astype(recipe.dtype)
+
+
+@jax.jit
+def _seed(key, epoch):
+    return jax.random.key_data(jax.random.fold_in(key, epoch))
 
 
 def minimise(
@@ -181,34 +240,39 @@ def minimise(
     An interrupt (Ctrl-C) passes through; the last state given to ``checkpoint`` is whole.
     Raises ValueError where the loss is not finite at the start, RuntimeError where float64 is asked
     for and JAX's x64 mode is off. Where numbers cease to be finite later, the fit stops and says
-    so.
+    so. What is compiled serves the next call with this very ``loss`` and shapes.
     """
-    import optax
+    return _minimise(
+        _LossOfRows(loss), None, params, train, validation, components=components, recipe=recipe,
+        key=key, on_epoch=on_epoch, checkpoint=checkpoint, resume=resume, cap=cap,
+    )  # fmt: skip
 
-    dtype = jnp.dtype(recipe.dtype)
-    if dtype == jnp.float64:
+
+def _minimise(
+    loss, given, params, train, validation, *, components, recipe, key, on_epoch, checkpoint,
+    resume, cap,
+) -> AdamFit:  # fmt: skip
+    """`minimise` of ``loss(given, params, *batch)``: what is given, a pytree, may change without
+    another compilation."""
+    if recipe.dtype == "float64":
         require_x64("training in float64")
     params, train, validation = jax.tree.map(
-        lambda a: jnp.array(a, dtype), (params, train, validation)
+        lambda a: jnp.asarray(np.asarray(a, recipe.dtype)), (params, train, validation)
     )
     num_rows, batch_size = len(train[0]), min(recipe.batch_size, len(train[0]))
     length = recipe.epoch_length or num_rows // batch_size
-    optimizer = optax.scale_by_adam()
 
     def rates(epoch, seconds):
         """The rate of each iteration of an epoch: (length,)."""
         passed = max(epoch / recipe.epochs, seconds / cap if cap else 0.0)
-        first = round(passed * recipe.epochs * length)
-        with jax.numpy_dtype_promotion("standard"):
-            return recipe.rate_at(first + jnp.arange(length), recipe.epochs * length).astype(dtype)
+        return _rates(round(passed * recipe.epochs * length), recipe=recipe, length=length)
 
     def order(epoch):
         """The rows of each batch (length, batch_size): permutations in a row that fill the epoch.
 
         By NumPy: XLA permutes by sorting, which on a CPU takes as long as a small network's epoch.
         """
-        seed = jax.random.key_data(jax.random.fold_in(key, epoch))
-        random = np.random.default_rng(np.asarray(seed))
+        random = np.random.default_rng(np.asarray(_seed(key, epoch)))
         in_pass = num_rows // batch_size
         passes = [
             random.permutation(num_rows)[: in_pass * batch_size].reshape(in_pass, batch_size)
@@ -216,30 +280,17 @@ def minimise(
         ]
         return np.concatenate(passes)[:length].astype(np.int32)
 
-    def run_epoch(carry, batches, rates, *rows):
-        def iterate(carry, chosen):
-            (params, state), (batch, rate) = carry, chosen
-            value, slope = jax.value_and_grad(loss)(params, *(array[batch] for array in rows))
-            with jax.numpy_dtype_promotion("standard"):  # optax counts in int32
-                direction, state = optimizer.update(slope, state, params)
-            updates = jax.tree.map(lambda a: -rate * a, direction)
-            return (optax.apply_updates(params, updates), state), value
-
-        carry, values = jax.lax.scan(iterate, carry, (batches, rates))
-        return carry, jnp.mean(values)
-
     started = time.perf_counter()
-    carry = (params, optimizer.init(params))
-    run_epoch = jax.jit(run_epoch, donate_argnums=0)
-    run_epoch = run_epoch.lower(carry, order(0), rates(0, 0.0), *train).compile()
-    validate = jax.jit(loss).lower(params, *validation).compile()
+    carry = _first_carry(params)
+    _run_epoch.lower(carry, given, order(0), rates(0, 0.0), train, loss=loss).compile()
+    _validate.lower(params, given, validation, loss=loss).compile()
     compile_seconds = time.perf_counter() - started
 
     def rms(value):
         return math.sqrt(float(value) / components)
 
     if resume is None:
-        start = rms(validate(params, *validation))
+        start = rms(_validate(params, given, validation, loss=loss))
         if not math.isfinite(start):
             raise ValueError("the loss is not finite on the validation rows at the start")
         epoch, seconds = 0, 0.0
@@ -257,9 +308,11 @@ def minimise(
             stopped_because = f"the cap of {cap:g} s"
             break
         started = time.perf_counter()
-        carry, value = run_epoch(carry, order(epoch), rates(epoch, seconds), *train)
+        batches, now_rates = order(epoch), rates(epoch, seconds)
+        carry, value = _run_epoch(carry, given, batches, now_rates, train, loss=loss)
         epoch += 1
-        now = {"train_rms": rms(value), "validation_rms": rms(validate(carry[0], *validation))}
+        held = _validate(carry[0], given, validation, loss=loss)
+        now = {"train_rms": rms(value), "validation_rms": rms(held)}
         seconds += time.perf_counter() - started
         for name, column in history.items():
             column.append(now[name])
@@ -294,11 +347,11 @@ def _copied(tree):
 
 
 def _check(train, validation, weight):
-    for name, (w, wanted) in (("train", train), ("validation", validation)):
-        if w.shape != wanted.shape or w.ndim != 2 or w.shape[1:] != weight.shape or len(w) == 0:
+    for name, (w, target) in (("train", train), ("validation", validation)):
+        if w.shape != target.shape or w.ndim != 2 or w.shape[1:] != weight.shape or len(w) == 0:
             raise ValueError(
-                f"{name}: expected w and wanted of shape (N, {weight.size}), N > 0, "
-                f"got {w.shape} and {wanted.shape}"
+                f"{name}: expected w and target_gradient of shape (N, {weight.size}), N > 0, "
+                f"got {w.shape} and {target.shape}"
             )
-        if not bool(jnp.all(jnp.isfinite(w)) & jnp.all(jnp.isfinite(wanted))):
-            raise ValueError(f"{name}: w or wanted has entries that are NaN or infinite")
+        if not (np.isfinite(w).all() and np.isfinite(target).all()):
+            raise ValueError(f"{name}: w or target_gradient has entries that are NaN or infinite")

@@ -1,4 +1,4 @@
-"""Fit any S(params, w) to wanted gradients by Levenberg–Marquardt with geodesic acceleration.
+"""Fit any family S(params, w) to target gradients by Levenberg–Marquardt, with acceleration.
 
 The loss is a sum of squares, F(θ) = Σ ‖∇S(θ, w) − g‖², so that the Jacobian A of the residual r
 gives nearly all of its curvature. A network of a thousand parameters then gains an order of
@@ -16,7 +16,7 @@ evaluations, no second Jacobian, and saves most of the iterations.
 Normal equations square the condition number of A. Damping makes that harmless here, where a step
 needs only to lead downhill, but it does take float64: anything less is refused.
 
-Memory: A is never held whole. The peak is 2 P² + 2 · 2d · chunk · P numbers in linearising and 3 P²
+Memory: A is never held whole. The peak is 2 P² + 4 · 2d · chunk · P numbers in linearising and 3 P²
 in a trial, whatever N; each also keeps a few activations of S for every pair of a chunk.
 """
 
@@ -31,11 +31,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
-from gfnn_jax.families import as_pytree
+from gfnn_jax.families import Family
+from gfnn_jax.phase_space import require_x64
 
 # δ₂ is a correction: where it is not small beside δ₁ the expansion has failed and δ₁ goes alone.
 LARGEST_ACCELERATION = 0.75
@@ -51,7 +51,8 @@ class LMState(NamedTuple):
     theta, best_theta: flattened parameters (P,), of now and of the best validation error so far.
     damping:           μ; NaN before the first iteration, which takes it from AᵀA.
     iteration:         iterations done.
-    train_rms, validation_rms, best_validation_rms: of ∇S − wanted, per component.
+    train_rms, validation_rms, best_validation_rms: of ∇S − target_gradient, per
+                       component.
     landmark_rms, landmark_iteration: the train_rms that progress is measured from, and its time.
     seconds:           time spent so far, without compilation.
     """
@@ -86,10 +87,10 @@ class LMResult(NamedTuple):
 
 
 def levenberg_marquardt(
-    scalar: Callable,
+    family: Family,
     params: Any,
     w: Rows,
-    wanted: Rows,
+    target_gradient: Rows,
     *,
     validation: tuple[Rows, Rows],
     weight: Any = 1.0,
@@ -102,13 +103,13 @@ def levenberg_marquardt(
     checkpoint: Callable[[LMState], Any] | None = None,
     resume: LMState | None = None,
 ) -> LMResult:
-    """Minimise the mean of ‖weight · (∇S(params, w) − wanted)‖² over the pairs.
+    """Minimise the mean of ‖weight · (∇S(params, w) − target_gradient)‖² over the pairs.
 
-    scalar:      ``S(params, w)`` -> scalar, for one w of shape (2d,). What a pytree holds is passed
-                 to the compiled code, so that it serves every set of data of the same shape.
+    family:      what is compiled for it serves every set of data of the same shape.
     params:      any pytree of float64 arrays: the start.
-    w, wanted:   (N, 2d) each, as a chart makes them from pairs of states.
-    validation:  (w, wanted) of pairs kept apart; the parameters that fit them best are returned.
+    w, target_gradient: (N, 2d) each, as a chart makes them from pairs of states.
+    validation:  (w, target_gradient) of pairs kept apart; the parameters that fit them best are
+                 returned.
     weight:      (2d,), or one for all: what makes a row of ∇S unit-free.
     max_iterations, max_seconds: when to stop; seconds exclude compilation. Runs that stop by
                  iterations repeat to the last bit on one machine with the same number of threads;
@@ -120,15 +121,23 @@ def levenberg_marquardt(
     checkpoint:  likewise, to save the state. Given back as ``resume`` the fit goes on as though it
                  had never stopped, bit for bit (``params`` then only lends its structure).
     """
-    theta, unravel = ravel_pytree(params)
-    train, held = ([jnp.asarray(a) for a in rows] for rows in ((w, wanted), validation))
-    weight = jnp.broadcast_to(jnp.asarray(weight, theta.dtype), train[0].shape[-1:])
-    _check(theta, *train, *held)
+    theta, layout = _flattened(params)
+    rows = (np.asarray(a) for a in (w, target_gradient, *validation))
+    w, target_gradient, held_w, held_target = rows
+    _check(theta, w, target_gradient, held_w, held_target)
+    weight = np.broadcast_to(np.asarray(weight, theta.dtype), w.shape[-1:])
+    # On the device once, not in every iteration.
+    chunks = jax.device_put(_chunked(w, target_gradient, weight, chunk))
+    held = jax.device_put((held_w, held_target, weight[None, :]))
+
+    linearize = partial(_linearize, family, chunks, layout=layout)
+    attempt = partial(_attempt, family, chunks, layout=layout)
+
+    def validation_rms(theta):
+        return math.sqrt(float(_loss(family, held, theta, layout=layout)))
 
     started = time.perf_counter()
-    linearize, attempt, validation_rms = _compiled(
-        as_pytree(scalar), unravel, theta, train, held, weight, chunk
-    )
+    _compile(family, chunks, held, theta, layout)
     compile_seconds = time.perf_counter() - started
 
     started = time.perf_counter()
@@ -147,12 +156,12 @@ def levenberg_marquardt(
         return None
 
     while (stopped_because := reason_to_stop(state)) is None:
-        step = _descend(jnp.asarray(state.theta), state.damping, linearize, attempt)
+        step = _descend(state.theta, state.damping, linearize, attempt)
         if step is None:
             stopped_because = "no progress"
             break
         theta, loss, damping = step
-        train_rms = math.sqrt(loss / train[0].size)
+        train_rms = math.sqrt(loss / w.size)
         seconds = seconds_before + time.perf_counter() - started
         state = _next_state(state, theta, damping, train_rms, validation_rms(theta), seconds)
         for report in (on_progress, checkpoint):
@@ -160,7 +169,7 @@ def levenberg_marquardt(
                 report(state)
 
     return LMResult(
-        params=unravel(jnp.asarray(state.best_theta)),
+        params=jax.tree.map(jnp.asarray, _unflattened(np.asarray(state.best_theta), layout)),
         train_rms=state.train_rms,
         validation_rms=state.best_validation_rms,
         iterations=state.iteration,
@@ -176,12 +185,10 @@ def _descend(theta, damping, linearize, attempt):
     if not math.isfinite(float(loss)):
         raise ValueError("∇S(params, w) is not finite on the training pairs at the start")
     if math.isnan(damping):
-        damping = 1e-3 * float(jnp.max(jnp.diagonal(matrix)))
+        damping = 1e-3 * float(np.max(np.diagonal(np.asarray(matrix))))
     growth = 2.0
     for _ in range(MAX_TRIALS):
-        trial, trial_loss, promised = attempt(
-            theta, matrix, slope, jnp.asarray(damping, theta.dtype)
-        )
+        trial, trial_loss, promised = attempt(theta, matrix, slope, np.float64(damping))
         decrease = float(loss - trial_loss)
         # False for NaN as well: a failed factorisation or an overflow is a step too long.
         if decrease > 0:
@@ -191,105 +198,112 @@ def _descend(theta, damping, linearize, attempt):
     return None
 
 
-def _compiled(scalar, unravel, theta, train, validation, weight, chunk):
-    """An iteration's three computations, compiled ahead so that their time is known apart.
+def _flattened(params):
+    """Parameters (P,) of a pytree, and its layout: hashable, for `_unflattened`."""
+    leaves, structure = jax.tree.flatten(params)
+    theta = np.concatenate([np.ravel(leaf) for leaf in leaves])
+    return theta, (structure, tuple(np.shape(leaf) for leaf in leaves))
 
-    linearize(theta)                       -> AᵀA (P, P), Aᵀr (P,), F
-    attempt(theta, matrix, slope, damping) -> trial theta (P,), its F, the decrease δ₁ promises
-    validation_rms(theta)                  -> float
-    """
-    train = (scalar, _chunked(*train, weight, chunk))
-    validation = (scalar, *validation, weight[None, :])
-    units = jnp.eye(weight.size, dtype=weight.dtype)
 
-    def value(scalar, theta, w):
-        """S of flattened parameters (P,)."""
-        return scalar(unravel(theta), w)
+def _unflattened(theta, layout):
+    structure, shapes = layout
+    ends = np.cumsum([math.prod(shape) for shape in shapes]).tolist()
+    starts = [0, *ends[:-1]]
+    leaves = [theta[i:j].reshape(s) for i, j, s in zip(starts, ends, shapes, strict=True)]
+    return structure.unflatten(leaves)
 
-    gradient = jax.vmap(jax.grad(value, argnums=2), (None, None, 0))
 
-    def residual(scalar, theta, w, wanted, weight):
-        return weight * (gradient(scalar, theta, w) - wanted)
-
-    def jacobian(scalar, theta, w, weight):
-        """A of one chunk, (rows · 2d, P): a reverse sweep through each directional derivative of S,
-        which costs less than reversing the reverse sweep of ∇S."""
-
-        def directional(theta, w, unit):
-            return jax.jvp(lambda w: value(scalar, theta, w), (w,), (unit,))[1]
-
-        over_units = jax.vmap(jax.grad(directional), (None, None, 0))
-        rows = jax.vmap(over_units, (None, 0, None))(theta, w, units)
-        return (weight[:, :, None] * rows).reshape(-1, theta.size)
-
-    def total(term, chunks):
-        """The sum of term(w, wanted, weight) over the chunks, one at a time."""
-
-        def add(sums, part):
-            return jax.tree.map(jnp.add, sums, term(*part)), None
-
-        shapes = jax.eval_shape(lambda parts: term(*(a[0] for a in parts)), chunks)
-        return jax.lax.scan(
-            add, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), chunks
-        )[0]
-
-    def linearize(train, theta):
-        scalar, chunks = train
-
-        def term(w, wanted, weight):
-            r = residual(scalar, theta, w, wanted, weight).ravel()
-            a = jacobian(scalar, theta, w, weight)
-            return a.T @ a, a.T @ r, r @ r
-
-        return total(term, chunks)
-
-    def attempt(train, theta, matrix, slope, damping):
-        scalar, chunks = train
-        factor = jnp.linalg.cholesky(matrix + damping * jnp.eye(theta.size, dtype=theta.dtype))
-        step = -cho_solve((factor, True), slope)
-
-        def bend(*part):
-            """Aᵀ r″(δ₁, δ₁) of one chunk: two nested directional derivatives, one reverse sweep."""
-
-            def residual_at(theta):
-                return residual(scalar, theta, *part)
-
-            _, pull_back = jax.vjp(residual_at, theta)
-
-            def along(theta):
-                return jax.jvp(residual_at, (theta,), (step,))[1]
-
-            return pull_back(jax.jvp(along, (theta,), (step,))[1])[0]
-
-        correction = -0.5 * cho_solve((factor, True), total(bend, chunks))
-        ratio = 2 * jnp.linalg.norm(correction) / jnp.linalg.norm(step)
-        trial = theta + step + jnp.where(ratio <= LARGEST_ACCELERATION, correction, 0)
-        loss = total(lambda *part: jnp.sum(residual(scalar, trial, *part) ** 2), chunks)
-        return trial, loss, step @ (damping * step - slope)
-
-    def validation_loss(validation, theta):
-        scalar, *rows = validation
-        return jnp.mean(residual(scalar, theta, *rows) ** 2)
-
+def _compile(family, chunks, held, theta, layout) -> None:
+    """Have an iteration's three programs compiled, where they are not yet."""
     matrix = jax.ShapeDtypeStruct((theta.size, theta.size), theta.dtype)
     damping = jax.ShapeDtypeStruct((), theta.dtype)
-    validate = jax.jit(validation_loss).lower(validation, theta).compile()
-    return (
-        partial(jax.jit(linearize).lower(train, theta).compile(), train),
-        partial(jax.jit(attempt).lower(train, theta, matrix, theta, damping).compile(), train),
-        lambda theta: math.sqrt(float(validate(validation, theta))),
-    )
+    _linearize.lower(family, chunks, theta, layout=layout).compile()
+    _attempt.lower(family, chunks, theta, matrix, theta, damping, layout=layout).compile()
+    _loss.lower(family, held, theta, layout=layout).compile()
 
 
-def _chunked(w, wanted, weight, chunk):
-    """w, wanted and weights as equal chunks (num_chunks, rows, 2d); weight 0 marks padding."""
+def _residual(family, layout, theta, w, target_gradient, weight):
+    return weight * (family.gradient(_unflattened(theta, layout), w) - target_gradient)
+
+
+def _jacobian(family, layout, theta, w, weight):
+    """A of one chunk, (rows · 2d, P): a reverse sweep through each directional derivative of S,
+    which costs less than reversing the reverse sweep of ∇S."""
+
+    def directional(theta, w, unit):
+        params = _unflattened(theta, layout)
+        return jax.jvp(lambda w: family.value(params, w), (w,), (unit,))[1]
+
+    units = jnp.eye(w.shape[-1], dtype=w.dtype)
+    over_units = jax.vmap(jax.grad(directional), (None, None, 0))
+    rows = jax.vmap(over_units, (None, 0, None))(theta, w, units)
+    return (weight[:, :, None] * rows).reshape(-1, theta.size)
+
+
+def _total(term, chunks):
+    """The sum of term(w, target_gradient, weight) over the chunks, one at a time."""
+
+    def add(sums, part):
+        return jax.tree.map(jnp.add, sums, term(*part)), None
+
+    shapes = jax.eval_shape(lambda parts: term(*(a[0] for a in parts)), chunks)
+    zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    return jax.lax.scan(add, zeros, chunks)[0]
+
+
+@partial(jax.jit, static_argnames="layout")
+def _linearize(family, chunks, theta, *, layout):
+    """AᵀA (P, P), Aᵀr (P,) and F."""
+
+    def term(w, target_gradient, weight):
+        r = _residual(family, layout, theta, w, target_gradient, weight).ravel()
+        a = _jacobian(family, layout, theta, w, weight)
+        return a.T @ a, a.T @ r, r @ r
+
+    return _total(term, chunks)
+
+
+@partial(jax.jit, static_argnames="layout")
+def _attempt(family, chunks, theta, matrix, slope, damping, *, layout):
+    """Trial θ (P,), its F, and the decrease that δ₁ promises."""
+    factor = jnp.linalg.cholesky(matrix + damping * jnp.eye(theta.size, dtype=theta.dtype))
+    step = -cho_solve((factor, True), slope)
+
+    def bend(*part):
+        """Aᵀ r″(δ₁, δ₁) of one chunk: two nested directional derivatives, one reverse sweep."""
+
+        def residual_at(theta):
+            return _residual(family, layout, theta, *part)
+
+        _, pull_back = jax.vjp(residual_at, theta)
+
+        def along(theta):
+            return jax.jvp(residual_at, (theta,), (step,))[1]
+
+        return pull_back(jax.jvp(along, (theta,), (step,))[1])[0]
+
+    correction = -0.5 * cho_solve((factor, True), _total(bend, chunks))
+    ratio = 2 * jnp.linalg.norm(correction) / jnp.linalg.norm(step)
+    trial = theta + step + jnp.where(ratio <= LARGEST_ACCELERATION, correction, 0)
+    loss = _total(lambda *part: jnp.sum(_residual(family, layout, trial, *part) ** 2), chunks)
+    return trial, loss, step @ (damping * step - slope)
+
+
+@partial(jax.jit, static_argnames="layout")
+def _loss(family, rows, theta, *, layout):
+    """The mean square of a component of the residual."""
+    return jnp.mean(_residual(family, layout, theta, *rows) ** 2)
+
+
+def _chunked(w, target_gradient, weight, chunk):
+    """All three as equal chunks (num_chunks, rows, 2d); weight 0 marks padding. NumPy."""
     num_chunks = -(-len(w) // chunk)
     rows = -(-len(w) // num_chunks)
     padding = num_chunks * rows - len(w)
     # Padding repeats a state, where S is as finite as on the data.
     take = np.concatenate([np.arange(len(w)), np.zeros(padding, int)])
-    weights = jnp.asarray(np.arange(take.size) < len(w), w.dtype)[:, None] * weight[None, :]
-    return tuple(a.reshape(num_chunks, rows, -1) for a in (w[take], wanted[take], weights))
+    weights = (np.arange(take.size) < len(w))[:, None] * weight[None, :]
+    return tuple(a.reshape(num_chunks, rows, -1) for a in (w[take], target_gradient[take], weights))
 
 
 def _first_state(theta, validation_rms):
@@ -326,18 +340,19 @@ def _next_state(state, theta, damping, train_rms, validation_rms, seconds):
 
 
 def _check(theta, *data):
-    names = ("w", "wanted", "the validation's w", "the validation's wanted")
+    names = ("w", "target_gradient", "the validation's w", "the validation's target_gradient")
     for name, array in zip(("params", *names), (theta, *data), strict=True):
-        if array.dtype != jnp.float64:
+        if array.dtype != np.float64:
             raise TypeError(
                 f"{name} must be float64, not {array.dtype}: normal equations need it; "
                 'switch it on with jax.config.update("jax_enable_x64", True)'
             )
-        if not bool(jnp.all(jnp.isfinite(array))):
+        if not np.isfinite(array).all():
             raise ValueError(f"{name} has entries that are NaN or infinite")
-    w, wanted, w_validation, wanted_validation = data
-    for a, b in ((w, wanted), (w_validation, wanted_validation), (w[:1], w_validation[:1])):
+    w, target, held_w, held_target = data
+    for a, b in ((w, target), (held_w, held_target), (w[:1], held_w[:1])):
         if a.shape != b.shape or len(a) == 0:
             raise ValueError(
-                f"w and wanted must be (N, 2d) with N > 0: got {[x.shape for x in data]}"
+                f"w and target_gradient must be (N, 2d) with N > 0: got {[x.shape for x in data]}"
             )
+    require_x64("Levenberg–Marquardt")
