@@ -1,13 +1,5 @@
-"""Families of the generating function S(params, w)."""
+"""Families of scalar functions f(params, w, args): what S and H are made of."""
 
-from __future__ import annotations
+from gfnn_jax.families.family import Family, LinearFamily, as_family, from_function
 
-from collections.abc import Callable
-from typing import Any
-
-from jax.tree_util import Partial, all_leaves
-
-
-def as_pytree(scalar: Callable) -> Any:
-    """A scalar that can be passed to compiled code: a family as it is, a function wrapped."""
-    return Partial(scalar) if callable(scalar) and all_leaves((scalar,)) else scalar
+__all__ = ["Family", "LinearFamily", "as_family", "from_function"]

@@ -1,4 +1,4 @@
-"""What a generating function sees of w: the variables a scene leaves it, scaled from the data."""
+"""What a family sees of w: the variables a scene leaves it, scaled from the data."""
 
 from __future__ import annotations
 
@@ -11,45 +11,138 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gfnn_jax.arrays import as_row, namespace
+
 _MARGIN = 1.0 + 1e-9  # the data's extremes lie just inside the box
+_PARITY_STATES = 64  # on so many states the parity of a feature is judged
+_CHUNK = 4_096  # states for which features are compiled, whatever the number of data
 
 
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=("centre", "scale"),
-    meta_fields=("keep", "angles", "features"),
+    meta_fields=("keep", "angles", "width", "features"),
 )
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Inputs:
-    """The variables x of S: w without its cyclic entries, or the scene's features, scaled.
+    """The variables x of a family: w without its cyclic entries, or the scene's features, scaled.
 
-    keep:     indices of w that S sees (all but the cyclic ones).
+    keep:     indices of w that the family sees (all but the cyclic ones).
     angles:   positions within the variables that are angles; they are neither shifted nor scaled.
-    features: ``features(w)`` -> (k,), where S is a function of features of w instead of w itself.
-    centre, scale: of the variables, so that the data fill [-1, 1]; any scaling inside S leaves the
-              map symplectic. They are leaves of the pytree that a family is: what is compiled for
-              one set of data serves the next.
+    width:    2d, the length of w.
+    features: ``features(w)`` -> (k,) for one w (2d,), by JAX, where the family is a function of
+              features of w instead of w itself.
+    centre, scale: (k,) of the variables, so that the data fill [-1, 1]; any scaling inside S leaves
+              the map symplectic. They are leaves of the pytree that a family is: what is compiled
+              for one set of data serves the next.
+
+    Every method takes w of shape (..., 2d), NumPy or JAX.
     """
 
     keep: tuple[int, ...]
     angles: tuple[int, ...]
-    centre: tuple[Any, ...]
-    scale: tuple[Any, ...]
+    width: int
+    centre: Any
+    scale: Any
     features: Callable | None = None
 
     @property
     def num_variables(self) -> int:
-        return len(self.centre)
+        return self.centre.shape[0]
+
+    @property
+    def is_angle(self) -> tuple[bool, ...]:
+        """Of each variable, whether it is an angle."""
+        return tuple(j in self.angles for j in range(self.num_variables))
 
     def raw(self, w):
-        """The unscaled variables (k,) at w (2d,)."""
-        return self.features(w) if self.features is not None else w[np.array(self.keep)]
+        """The unscaled variables (..., k)."""
+        if self.features is not None:
+            return feature_tables(self.features, w, order=0)[0]
+        return w if len(self.keep) == w.shape[-1] else w[..., np.array(self.keep, dtype=int)]
 
     def __call__(self, w):
-        """The scaled variables (k,) at w (2d,)."""
-        centre, scale = (jnp.stack([jnp.asarray(c, w.dtype) for c in side])
-                         for side in (self.centre, self.scale))  # fmt: skip
-        return (self.raw(w) - centre) / scale
+        """The scaled variables (..., k)."""
+        return self._scaled(self.raw(w), w)
+
+    def tables(self, w, order: int):
+        """The scaled variables (..., k), and for features their slopes (..., k, 2d) and, with
+        ``order`` 2, curvatures (..., k, 2d, 2d), else None for both."""
+        if self.features is None:
+            return self(w), None, None
+        raw, *derivatives = feature_tables(self.features, w, order=order)
+        unit = as_row(namespace(w).asarray(self.scale, dtype=w.dtype), raw)
+        slope = derivatives[0] / unit[..., None] if order > 0 else None
+        curvature = derivatives[1] / unit[..., None, None] if order > 1 else None
+        return self._scaled(raw, w), slope, curvature
+
+    def pull_back_gradient(self, gradient, slope):
+        """∇ with respect to w (..., 2d) from that with respect to x (..., k)."""
+        if slope is not None:
+            return (gradient[..., None, :] @ slope)[..., 0, :]
+        xp = namespace(gradient)
+        return self._spread(gradient / as_row(xp.asarray(self.scale, dtype=gradient.dtype), gradient))
+
+    def pull_back_hessian(self, hessian, gradient, slope, curvature):
+        """The Hessian with respect to w (..., 2d, 2d) from that with respect to x (..., k, k)."""
+        xp = namespace(hessian)
+        if slope is not None:
+            bent = xp.sum(gradient[..., None, None] * curvature, axis=-3)
+            return xp.swapaxes(slope, -1, -2) @ hessian @ slope + bent
+        unit = xp.asarray(self.scale, dtype=hessian.dtype)
+        hessian = hessian / as_row(unit[:, None] * unit[None, :], hessian)
+        return self._spread(xp.swapaxes(self._spread(hessian), -1, -2))
+
+    def pull_back_terms(self, gradients, slope):
+        """∇ of many functions with respect to w (..., 2d, m) from (..., k, m)."""
+        xp = namespace(gradients)
+        if slope is not None:
+            return xp.swapaxes(slope, -1, -2) @ gradients
+        unit = xp.asarray(self.scale, dtype=gradients.dtype)[:, None]
+        moved = xp.swapaxes(gradients / as_row(unit, gradients), -1, -2)
+        return xp.swapaxes(self._spread(moved), -1, -2)
+
+    def _scaled(self, raw, w):
+        xp = namespace(w)
+        centre, scale = (
+            as_row(xp.asarray(side, dtype=w.dtype), raw) for side in (self.centre, self.scale)
+        )
+        return (raw - centre) / scale
+
+    def _spread(self, values):
+        """(..., k) placed at ``keep`` in (..., 2d), zeros elsewhere."""
+        if len(self.keep) == self.width:
+            return values
+        xp = namespace(values)
+        place = np.full(self.width, len(self.keep))
+        place[list(self.keep)] = np.arange(len(self.keep))
+        return xp.concatenate([values, xp.zeros_like(values[..., :1])], axis=-1)[..., place]
+
+
+def feature_tables(features: Callable, w, *, order: int) -> tuple:
+    """Features (..., k) at w (..., 2d), with their slopes and curvatures up to ``order``.
+
+    NumPy arrays are answered by one compiled function of fixed size, JAX arrays are traced.
+    """
+    if namespace(w) is jnp:
+        return _feature_tables(features, order, w)
+    flat = w.reshape(-1, w.shape[-1])
+    size = min(_CHUNK, 2 ** max(6, (len(flat) - 1).bit_length()))
+    padded = np.concatenate([flat, np.broadcast_to(flat[-1:], (-len(flat) % size, w.shape[-1]))])
+    blocks = [_compiled_tables(features, order, block) for block in padded.reshape(-1, size, w.shape[-1])]
+    joined = (np.concatenate([np.asarray(b) for b in column]) for column in zip(*blocks, strict=True))
+    return tuple(a[: len(flat)].reshape(*w.shape[:-1], *a.shape[1:]) for a in joined)
+
+
+def _feature_tables(features, order, w):
+    slope = jax.jacfwd(features)
+    functions = (features, slope, jax.jacfwd(slope))[: order + 1]
+    flat = w.reshape(-1, w.shape[-1])
+    tables = jax.vmap(lambda y: tuple(f(y) for f in functions))(flat)
+    return tuple(a.reshape(*w.shape[:-1], *a.shape[1:]) for a in tables)
+
+
+_compiled_tables = partial(jax.jit, static_argnums=(0, 1))(_feature_tables)
 
 
 def box_inputs(
@@ -60,14 +153,15 @@ def box_inputs(
     features: Callable | None = None,
     reversor: tuple[int, ...] | None = None,
 ) -> Inputs:
-    """Inputs whose box is that of the data w (N, 2d).
+    """Inputs whose box is that of the data w (N, 2d), NumPy.
 
     ``reversor`` (signs of the entries of w): the box is made symmetric about 0 in the coordinates
     that it flips, because an even or odd polynomial is so about 0 and nowhere else.
     """
+    w = np.asarray(w)
     keep = tuple(i for i in range(w.shape[-1]) if i not in cyclic)
-    plain = Inputs(keep, (), (0.0,) * len(keep), (1.0,) * len(keep), features)
-    x = np.asarray(jax.vmap(plain.raw)(jnp.asarray(w)))
+    plain = Inputs(keep, (), w.shape[-1], np.zeros(0), np.ones(0), features)
+    x = plain.raw(w)
     low, high = x.min(axis=0), x.max(axis=0)
     if reversor is not None:
         signs = np.asarray(variable_signs(plain, reversor, w))
@@ -76,9 +170,8 @@ def box_inputs(
     centre, scale = 0.5 * (low + high), 0.5 * (high - low) * _MARGIN
     scale = np.where(scale > 0, scale, np.where(centre != 0, np.abs(centre), 1.0))
     positions = tuple(keep.index(i) for i in angles if i in keep) if features is None else ()
-    for i in positions:
-        centre[i], scale[i] = 0.0, 1.0
-    return Inputs(keep, positions, tuple(map(float, centre)), tuple(map(float, scale)), features)
+    centre[list(positions)], scale[list(positions)] = 0.0, 1.0
+    return Inputs(keep, positions, w.shape[-1], centre, scale, features)
 
 
 def variable_signs(inputs: Inputs, reversor: tuple[int, ...], w) -> tuple[int, ...]:
@@ -86,9 +179,8 @@ def variable_signs(inputs: Inputs, reversor: tuple[int, ...], w) -> tuple[int, .
 
     Raises ValueError for a feature that is neither even nor odd.
     """
-    w = jnp.asarray(w)[:64]
-    x = np.asarray(jax.vmap(inputs.raw)(w))
-    flipped = np.asarray(jax.vmap(inputs.raw)(w * jnp.asarray(reversor, w.dtype)[None, :]))
+    w = np.asarray(w)[:_PARITY_STATES]
+    x, flipped = inputs.raw(w), inputs.raw(w * np.asarray(reversor, w.dtype))
     size = np.abs(x).max(axis=0) + 1e-300
     even = np.abs(flipped - x).max(axis=0) / size
     odd = np.abs(flipped + x).max(axis=0) / size

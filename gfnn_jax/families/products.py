@@ -1,15 +1,12 @@
-"""S linear in its parameters: products of Chebyshev polynomials and Fourier harmonics.
+"""Linear in the parameters: products of Chebyshev polynomials and Fourier harmonics.
 
     S(C, w) = Σ C_ab u_a(x_A) v_b(x_B)
 
 x are the scaled variables of ``Inputs``, cut into two halves A and B; u and v are the products of
 one-dimensional functions over a half, up to a total degree, and C holds a coefficient for each
 allowed term (total degree of the product, parity) and zero elsewhere. Values, gradients and second
-derivatives come from recurrences and from matrix products with C, which a batch turns into two
-dense products of about (√terms)² each: many times faster than differentiating a thousand features.
-
-Because S is linear in C, the derivative rules below are complete: ``jax.grad``, ``jvp`` and
-``hessian`` of ``S`` use the recurrences, also with respect to C.
+derivatives come from recurrences and from matrix products with C, which for a batch are two dense
+products of about (√terms)² each: many times faster than differentiating a thousand terms.
 """
 
 from __future__ import annotations
@@ -19,50 +16,50 @@ import math
 from functools import cache, cached_property, partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from gfnn_jax.arrays import as_row, matmul, namespace
 from gfnn_jax.families.inputs import Inputs
-
-# A GPU would multiply float32 in TF32: 7e-4 of relative error in ∇S.
-_dot = partial(jnp.matmul, precision="highest")
 
 
 def chebyshev(x, degree: int):
-    """T_0..T_degree of each x (n,), their first and second derivatives: each (degree + 1, n).
-
-    By doubling, T_{k+j} = 2 T_k T_j − T_{k−j} for j = 1..k, differentiated twice: a handful of
-    vector operations whatever the degree.
-    """
-    one, zero = jnp.ones_like(x), jnp.zeros_like(x)
-    t, d, dd = jnp.stack([one, x]), jnp.stack([zero, one]), jnp.stack([zero, zero])
-    while (k := t.shape[0] - 1) < degree:
+    """T_0..T_degree of x (...), by doubling: T_{k+j} = 2 T_k T_j − T_{k−j}: (..., degree + 1)."""
+    xp = namespace(x)
+    t = xp.stack([xp.ones_like(x), x], axis=-1)
+    while (k := t.shape[-1] - 1) < degree:
         j = slice(1, min(k, degree - k) + 1)
         mirror = slice(k - 1, None if k - j.stop < 0 else k - j.stop, -1)
-        more_dd = 2 * (dd[k:] * t[j] + 2 * d[k:] * d[j] + t[k:] * dd[j]) - dd[mirror]
-        more_d = 2 * (d[k:] * t[j] + t[k:] * d[j]) - d[mirror]
-        more_t = 2 * t[k:] * t[j] - t[mirror]
-        t, d, dd = (jnp.concatenate(f) for f in ((t, more_t), (d, more_d), (dd, more_dd)))
-    return t[: degree + 1], d[: degree + 1], dd[: degree + 1]
+        t = xp.concatenate([t, 2 * t[..., k : k + 1] * t[..., j] - t[..., mirror]], axis=-1)
+    return t[..., : degree + 1]
 
 
 def fourier(x, degree: int):
-    """1, cos x, .., cos Dx, sin x, .., sin Dx of each x (n,), two derivatives: each (2D + 1, n).
+    """1, cos x, .., cos Dx, sin x, .., sin Dx of x (...), by doubling: e^{i(k+j)x} = e^{ikx} e^{ijx}:
+    (..., 2D + 1)."""
+    xp = namespace(x)
+    c = xp.stack([xp.ones_like(x), xp.cos(x)], axis=-1)
+    s = xp.stack([xp.zeros_like(x), xp.sin(x)], axis=-1)
+    while (k := c.shape[-1] - 1) < degree:
+        top, j = slice(k, k + 1), slice(1, min(k, degree - k) + 1)
+        more_c = c[..., top] * c[..., j] - s[..., top] * s[..., j]
+        more_s = s[..., top] * c[..., j] + c[..., top] * s[..., j]
+        c, s = xp.concatenate([c, more_c], axis=-1), xp.concatenate([s, more_s], axis=-1)
+    return xp.concatenate([c[..., : degree + 1], s[..., 1 : degree + 1]], axis=-1)
 
-    By doubling, e^{i(k+j)x} = e^{ikx} e^{ijx}.
-    """
-    c, s = jnp.stack([jnp.ones_like(x), jnp.cos(x)]), jnp.stack([jnp.zeros_like(x), jnp.sin(x)])
-    while (k := c.shape[0] - 1) < degree:
-        j = slice(1, min(k, degree - k) + 1)
-        more_c, more_s = c[k:] * c[j] - s[k:] * s[j], s[k:] * c[j] + c[k:] * s[j]
-        c, s = jnp.concatenate([c, more_c]), jnp.concatenate([s, more_s])
-    c, s = c[: degree + 1], s[: degree + 1]
-    n = jnp.arange(degree + 1, dtype=x.dtype)[:, None]
-    return (
-        jnp.concatenate([c, s[1:]]),
-        jnp.concatenate([-n * s, (n * c)[1:]]),
-        jnp.concatenate([-n * n * c, -(n * n * s)[1:]]),
-    )
+
+@cache
+def _differentiation(angle: bool, degree: int) -> np.ndarray:
+    """The matrix D with f' = f D, f the row of the functions above: differentiation is linear in
+    them and exact."""
+    if not angle:
+        d = np.zeros((degree + 1, degree + 1))
+        for k in range(1, degree + 1):
+            derivative = np.polynomial.chebyshev.chebder(np.eye(degree + 1)[k])
+            d[: len(derivative), k] = derivative
+        return d
+    d, k = np.zeros((2 * degree + 1, 2 * degree + 1)), np.arange(1, degree + 1)
+    d[degree + k, k], d[k, degree + k] = -k, k
+    return d
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,41 +110,45 @@ class _Half:
         """Sign of each product under the reversor (terms,)."""
         return np.array([self._parity(t) for t in self.indices.tolist()], dtype=int)
 
-    def tables(self, x):
-        """Products u (terms,), their gradients (k, terms) and Hessians (k, k, terms)."""
-        angle = np.array(self.is_angle, dtype=bool)
-        plain, circle = np.flatnonzero(~angle), np.flatnonzero(angle)
-        polynomials = chebyshev(x[plain], self.degree) if plain.size else None
-        harmonics = fourier(x[circle], self.degree) if circle.size else None
-        picked = []
-        for j, k in enumerate(self.indices.T):
-            functions, among = (harmonics, circle) if angle[j] else (polynomials, plain)
-            column = int(np.flatnonzero(among == j)[0])
-            picked.append([f[k, column] for f in functions])  # pyright: ignore[reportOptionalIterable]
-        n, terms = len(picked), len(self.indices)
-        unit = jnp.ones(terms, x.dtype)
+    @cache  # noqa: B019, there are as many halves as kinds of bases
+    def picks(self, variable: int, order: int) -> np.ndarray:
+        """What turns a variable's functions (..., K) into its factor of every product, and that
+        factor's derivatives up to ``order``, side by side: (K, (1 + order) terms)."""
+        derivative = _differentiation(self.is_angle[variable], self.degree)
+        powers = [np.linalg.matrix_power(derivative, r) for r in range(order + 1)]
+        return np.concatenate([d[:, self.indices[:, variable]] for d in powers], axis=1)
 
-        def product(orders):
-            factors = [picked[j][k] for j, k in enumerate(orders)]
-            out = factors[0] if factors else unit
-            for f in factors[1:]:
-                out = out * f
-            return out
-
-        def raised(*which):
-            orders = [0] * n
-            for j in which:
-                orders[j] += 1
-            return product(orders)
-
-        value = product([0] * n)
-        gradient = [raised(j) for j in range(n)]
-        upper = {(i, j): raised(i, j) for i in range(n) for j in range(i, n)}
-        hessian = [[upper[min(i, j), max(i, j)] for j in range(n)] for i in range(n)]
-        shape = (n, terms)
+    def tables(self, functions: list, order: int, like) -> list:
+        """Products u (..., terms), gradients (..., n, terms) and, with ``order`` 2, Hessians
+        (..., n, n, terms), from the functions (..., K) of each of the n variables."""
+        xp, n, terms = namespace(like), len(self.is_angle), len(self.indices)
         if n == 0:  # a single variable leaves the other half empty
-            return value, jnp.zeros(shape, x.dtype), jnp.zeros((n, *shape), x.dtype)
-        return value, jnp.stack(gradient), jnp.stack([jnp.stack(row) for row in hessian])
+            one = xp.ones_like(like[..., :1])
+            return [one, one[..., None, :][..., :0, :], one[..., None, None, :][..., :0, :0, :]]
+        factors = []  # of each variable: the factor of every product, and its derivatives
+        for j, f in enumerate(functions):
+            side_by_side = matmul(f, xp.asarray(self.picks(j, order), dtype=f.dtype))
+            factors.append(
+                [side_by_side[..., r * terms : (r + 1) * terms] for r in range(order + 1)]
+            )
+
+        def product(*raised):
+            return math.prod(
+                (f[raised.count(j)] for j, f in enumerate(factors[1:], 1)),
+                start=factors[0][raised.count(0)],
+            )
+
+        tables = [product()]
+        if order > 0:
+            tables.append(xp.stack([product(j) for j in range(n)], axis=-2))
+        if order > 1:
+            upper = {(i, j): product(i, j) for i in range(n) for j in range(i, n)}
+            rows = [
+                xp.stack([upper[min(i, j), max(i, j)] for j in range(n)], axis=-2)
+                for i in range(n)
+            ]  # fmt: skip
+            tables.append(xp.stack(rows, axis=-3))
+        return tables
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,52 +187,51 @@ class Basis:
     @cached_property
     def terms(self) -> np.ndarray:
         """Rows (a, b) of the coefficients that exist, by rising degree: (num_parameters, 2)."""
+        return self._sorted_terms[0]
+
+    @cached_property
+    def term_orders(self) -> np.ndarray:
+        """Total degree of each term (num_parameters,), rising."""
+        return self._sorted_terms[1]
+
+    @cached_property
+    def _sorted_terms(self) -> tuple[np.ndarray, np.ndarray]:
         a, b = self.halves
         order = a.orders[:, None] + b.orders[None, :]
         exists = (order <= self.degree) & (order > 0)  # a constant generates nothing
         if self.signs is not None:
             exists &= a.parities[:, None] * b.parities[None, :] > 0
-        rows = np.argwhere(exists)
-        return rows[np.argsort(order[exists], kind="stable")]
+        rising = np.argsort(order[exists], kind="stable")
+        return np.argwhere(exists)[rising], order[exists][rising]
 
-    def design(self, x) -> np.ndarray:
-        """The products at N variables x (N, k), the constant first: (N, 1 + terms), by NumPy."""
-        columns = []
-        for angle, values in zip(self.is_angle, np.asarray(x).T, strict=True):
-            phases = values[:, None] * np.arange(self.degree + 1)
-            columns.append(
-                np.hstack([np.cos(phases), np.sin(phases[:, 1:])])
-                if angle
-                else np.polynomial.chebyshev.chebvander(values, self.degree)
-            )
+    def tables(self, x, order: int) -> tuple[list, list]:
+        """The tables of both halves at the variables x (..., k)."""
+        angle, functions = np.array(self.is_angle, dtype=bool), [None] * len(self.is_angle)
+        for of, family in ((np.flatnonzero(~angle), chebyshev), (np.flatnonzero(angle), fourier)):
+            if of.size:
+                chosen = x if of.size == angle.size else x[..., of]
+                together = family(chosen, self.degree)
+                for place, j in enumerate(of):
+                    functions[j] = together[..., place, :]
         a, b = self.halves
-        (row, column), ones = self.terms.T, np.ones((len(x), 1))
-        u = math.prod((f[:, k] for f, k in zip(columns, a.indices.T, strict=False)), start=ones)
-        v = math.prod(
-            (f[:, k] for f, k in zip(columns[self.cut :], b.indices.T, strict=True)), start=ones
-        )
-        return np.hstack(
-            [
-                ones,
-                np.broadcast_to(u, (len(x), len(a.indices)))[:, row]
-                * np.broadcast_to(v, (len(x), len(b.indices)))[:, column],
-            ]
+        return (
+            a.tables(functions[: self.cut], order, x),
+            b.tables(functions[self.cut :], order, x),
         )
 
     def placed(self, coefficients) -> np.ndarray:
-        """Coefficients (1 + terms, k) of the columns of ``design`` as k matrices (k, m, n)."""
+        """Coefficients (..., terms) as matrices (..., m, n), NumPy."""
         a, b = self.halves
-        c = np.zeros((coefficients.shape[1], len(a.indices), len(b.indices)))
-        c[:, 0, 0] = coefficients[0]
-        c[:, self.terms[:, 0], self.terms[:, 1]] = coefficients[1:].T
+        c = np.zeros((*coefficients.shape[:-1], len(a.indices), len(b.indices)), coefficients.dtype)
+        c[..., self.terms[:, 0], self.terms[:, 1]] = coefficients
         return c
 
 
-_basis = cache(Basis)
+basis_of = cache(Basis)
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("inputs",), meta_fields=("degree", "signs"))
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Products:
     """Chebyshev × Fourier products of total degree at most ``degree`` in the inputs' variables.
 
@@ -244,6 +244,8 @@ class Products:
 
     @property
     def name(self) -> str:
+        if self.inputs.features is not None:
+            return "features"
         return "fourier-chebyshev" if self.inputs.angles else "polynomial"
 
     @property
@@ -253,8 +255,7 @@ class Products:
 
     @property
     def basis(self) -> Basis:
-        is_angle = tuple(j in self.inputs.angles for j in range(self.inputs.num_variables))
-        return _basis(is_angle, self.degree, self.signs)
+        return basis_of(self.inputs.is_angle, self.degree, self.signs)
 
     @property
     def num_parameters(self) -> int:
@@ -262,7 +263,7 @@ class Products:
 
     @property
     def operations(self) -> tuple[int, int]:
-        """Floating-point operations of ∇S and of its Jacobian: the products with C, the tables."""
+        """Floating-point operations of ∇S, and of ∇S with its Hessian: products with C, tables."""
         (m, i), (n, j) = (h.indices.shape for h in self.basis.halves)
         tables = sum(t * k * (k - 1) + 10 * self.degree * k for t, k in ((m, i), (n, j)))
         gradient = 4 * m * n + 2 * (m * i + n * j) + tables
@@ -270,85 +271,58 @@ class Products:
         return gradient, gradient + mixed + 2 * (m * i * i + n * j * j)
 
     def unflatten(self, coefficients):
-        """Coefficients (num_parameters,) -> the matrix C, the parameters of ``S``."""
-        a, b = self.basis.halves
-        row, col = self.basis.terms.T
-        c = jnp.zeros((len(a.indices), len(b.indices)), coefficients.dtype)
-        return c.at[row, col].set(coefficients)
+        """Coefficients (num_parameters,), NumPy -> the matrix C (m, n), the parameters of S."""
+        return self.basis.placed(np.asarray(coefficients))
 
-    def __call__(self, params, w):
-        """S(params, w): params the matrix C, w (2d,) -> scalar."""
-        return _polynomial(self.basis, params, self.inputs(w))
+    def __call__(self, params, w, args=None):
+        return self.value(params, w, args)
 
-    def gradient_features(self, w):
-        """∇ of every term at w: (2d, num_parameters), the rows of the least-squares problem."""
-        x, slope = self.inputs(w), jax.jacfwd(self.inputs)(w)
-        u, du, _, v, dv, _ = _tables(self.basis, x)
-        row, col = self.basis.terms.T
-        by_variable = jnp.concatenate([du[:, row] * v[None, col], u[None, row] * dv[:, col]])
-        return slope.T @ by_variable
+    def value(self, params, w, args=None):
+        """S(C, w), shape (...): params the matrix C, w (..., 2d)."""
+        (u,), (v,) = self.basis.tables(self.inputs(w), 0)
+        return namespace(w).sum(matmul(u, params) * v, axis=-1)
 
+    def gradient(self, params, w, args=None):
+        """∇S(C, w), shape (..., 2d)."""
+        x, slope, _ = self.inputs.tables(w, order=1)
+        tables = self.basis.tables(x, 1)
+        return self.inputs.pull_back_gradient(_gradient(tables, params)[0], slope)
 
-def values(family: Products, matrices, x):
-    """Σ C_ab u_a v_b of each matrix in (k, m, n) at the scaled variables x: (k,)."""
-    u, _, _, v, _, _ = _tables(family.basis, x)
-    row, column = family.basis.corner
-    low = _dot(_dot(matrices[:, :row], v), u[:row])
-    return low + _dot(_dot(matrices[:, row:, :column], v[:column]), u[row:])
+    def gradient_and_hessian(self, params, w, args=None):
+        """∇S (..., 2d) and S'' (..., 2d, 2d)."""
+        xp = namespace(w)
+        x, slope, curvature = self.inputs.tables(w, order=2)
+        tables = self.basis.tables(x, 2)
+        gradient, to_a, to_b = _gradient(tables, params)
+        (_, du, ddu), (_, dv, ddv) = tables
+        aa = xp.sum(ddu * to_a[..., None, None, :], axis=-1)
+        bb = xp.sum(ddv * to_b[..., None, None, :], axis=-1)
+        ab = xp.sum(matmul(du, params)[..., :, None, :] * dv[..., None, :, :], axis=-1)
+        upper = xp.concatenate([aa, ab], axis=-1)
+        lower = xp.concatenate([xp.swapaxes(ab, -1, -2), bb], axis=-1)
+        hessian = xp.concatenate([upper, lower], axis=-2)
+        return (
+            self.inputs.pull_back_gradient(gradient, slope),
+            self.inputs.pull_back_hessian(hessian, gradient, slope, curvature),
+        )
 
-
-def operations_of_values(family: Products, count: int) -> int:
-    """Floating-point operations of ``values`` for so many matrices."""
-    (m, i), (n, j) = (h.indices.shape for h in family.basis.halves)
-    row, column = family.basis.corner
-    tables = m * (i - 1) + n * max(j - 1, 0) + 4 * family.degree * (i + j)
-    return 2 * count * (row * n + (m - row) * column + m) + tables
-
-
-def _tables(basis, x):
-    """u, ∇u, ∇²u of the first half and v, ∇v, ∇²v of the second at the variables x (k,)."""
-    a, b = basis.halves
-    return (*a.tables(x[: basis.cut]), *b.tables(x[basis.cut :]))
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _polynomial(basis, matrix, x):
-    u, _, _, v, _, _ = _tables(basis, x)
-    return _dot(u, _dot(matrix, v))
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _gradient(basis, matrix, x):
-    u, du, _, v, dv, _ = _tables(basis, x)
-    return jnp.concatenate([_dot(du, _dot(matrix, v)), _dot(dv, _dot(u, matrix))])
+    def term_gradients(self, w, args=None):
+        """∇ of every term at w (..., 2d): (..., 2d, num_parameters)."""
+        xp = namespace(w)
+        x, slope, _ = self.inputs.tables(w, order=1)
+        (u, du), (v, dv) = self.basis.tables(x, 1)
+        row, column = self.basis.terms.T
+        by_variable = xp.concatenate(
+            [du[..., row] * v[..., None, column], u[..., None, row] * dv[..., column]], axis=-2
+        )
+        return self.inputs.pull_back_terms(by_variable, slope)
 
 
-def _hessian(basis, matrix, x):
-    u, du, ddu, v, dv, ddv = _tables(basis, x)
-    aa, bb = _dot(ddu, _dot(matrix, v)), _dot(ddv, _dot(u, matrix))
-    ab = _dot(_dot(du, matrix), dv.T)
-    return jnp.block([[aa, ab], [ab.T, bb]])
-
-
-def _is_zero(tangent) -> bool:
-    return isinstance(tangent, jax.custom_derivatives.SymbolicZero)
-
-
-def _linear_rule(value, derivative):
-    """d f(C, x) = f(dC, x) + f'(C, x) dx for f linear in C; a symbolic zero costs nothing."""
-
-    def rule(basis, primals, tangents):
-        (matrix, x), (matrix_dot, x_dot) = primals, tangents
-        out = value(basis, matrix, x)
-        out_dot = jnp.zeros_like(out)
-        if not _is_zero(matrix_dot):
-            out_dot = out_dot + value(basis, matrix_dot, x)
-        if not _is_zero(x_dot):
-            out_dot = out_dot + _dot(derivative(basis, matrix, x), x_dot)
-        return out, out_dot
-
-    return rule
-
-
-_polynomial.defjvp(_linear_rule(_polynomial, _gradient), symbolic_zeros=True)
-_gradient.defjvp(_linear_rule(_gradient, _hessian), symbolic_zeros=True)
+def _gradient(tables, params):
+    """∇S with respect to the variables (..., k), and the halves C v (..., m) and uᵀC (..., n)."""
+    (u, du, *_), (v, dv, *_) = tables
+    xp = namespace(u)
+    to_a, to_b = matmul(v, params.T), matmul(u, params)
+    in_a = xp.sum(du * to_a[..., None, :], axis=-1)
+    in_b = xp.sum(dv * to_b[..., None, :], axis=-1)
+    return xp.concatenate([in_a, in_b], axis=-1), to_a, to_b

@@ -1,4 +1,4 @@
-"""Random sine features: S linear in its parameters where polynomials have too many terms.
+"""Random sine features: linear in the parameters where polynomials have too many terms.
 
     S(c, w) = Σ c_j sin(k_j·x + b_j),   k_j normal of deviation ``bandwidth``, b_j uniform
 
@@ -12,9 +12,9 @@ import dataclasses
 from functools import cached_property, partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from gfnn_jax.arrays import as_row, matmul, namespace
 from gfnn_jax.families.inputs import Inputs
 
 
@@ -23,7 +23,7 @@ from gfnn_jax.families.inputs import Inputs
     data_fields=("inputs",),
     meta_fields=("num_parameters", "bandwidth", "seed"),
 )
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Sines:
     """``num_parameters`` random sines of the variables; whole wave numbers for angles."""
 
@@ -40,9 +40,10 @@ class Sines:
 
     @property
     def operations(self) -> tuple[int, int]:
-        """Floating-point operations of ∇S and of its Jacobian."""
+        """Floating-point operations of ∇S, and of ∇S with its Hessian."""
         n = self.inputs.num_variables
-        return 4 * self.num_parameters * n, 2 * self.num_parameters * n * (n + 1)
+        gradient = 4 * self.num_parameters * n
+        return gradient, gradient + 2 * self.num_parameters * n * n
 
     @cached_property
     def _frequencies(self) -> tuple[np.ndarray, np.ndarray]:
@@ -53,20 +54,48 @@ class Sines:
         k[:, angles] = np.round(k[:, angles])
         return k, rng.uniform(0, 2 * np.pi, self.num_parameters)
 
-    def _phase(self, w):
-        k, b = (jnp.asarray(a, w.dtype) for a in self._frequencies)
-        return jnp.dot(k, self.inputs(w), precision="highest") + b
+    def _phase(self, x):
+        """(k (m, n), the phases k·x + b (..., m))."""
+        xp = namespace(x)
+        k, b = (xp.asarray(a, dtype=x.dtype) for a in self._frequencies)
+        phase = matmul(x, k.T)
+        return k, phase + as_row(b, phase)
 
     def unflatten(self, coefficients):
-        """The parameters of ``S`` are the coefficients (num_parameters,) themselves."""
+        """The parameters of S are the coefficients (num_parameters,) themselves."""
         return coefficients
 
-    def __call__(self, params, w):
-        """S(params, w): params (num_parameters,), w (2d,) -> scalar."""
-        return jnp.dot(params, jnp.sin(self._phase(w)), precision="highest")
+    def __call__(self, params, w, args=None):
+        return self.value(params, w, args)
 
-    def gradient_features(self, w):
-        """∇ of every sine at w: (2d, num_parameters)."""
-        k, _ = self._frequencies
-        slope = jax.jacfwd(self.inputs)(w)
-        return slope.T @ (jnp.asarray(k.T, w.dtype) * jnp.cos(self._phase(w))[None, :])
+    def value(self, params, w, args=None):
+        """S(params, w), shape (...): params (num_parameters,), w (..., 2d)."""
+        _, phase = self._phase(self.inputs(w))
+        return matmul(namespace(w).sin(phase), params[:, None])[..., 0]
+
+    def gradient(self, params, w, args=None):
+        """∇S(params, w), shape (..., 2d)."""
+        x, slope, _ = self.inputs.tables(w, order=1)
+        k, phase = self._phase(x)
+        weighted = namespace(w).cos(phase) * as_row(params, phase)
+        return self.inputs.pull_back_gradient(matmul(weighted, k), slope)
+
+    def gradient_and_hessian(self, params, w, args=None):
+        """∇S (..., 2d) and S'' (..., 2d, 2d)."""
+        x, slope, curvature = self.inputs.tables(w, order=2)
+        (k, phase), xp = self._phase(x), namespace(w)
+        gradient = matmul(xp.cos(phase) * as_row(params, phase), k)
+        squares = (k[:, :, None] * k[:, None, :]).reshape(len(k), -1)
+        hessian = -matmul(xp.sin(phase) * as_row(params, phase), squares)
+        hessian = hessian.reshape(*x.shape, x.shape[-1])
+        return (
+            self.inputs.pull_back_gradient(gradient, slope),
+            self.inputs.pull_back_hessian(hessian, gradient, slope, curvature),
+        )
+
+    def term_gradients(self, w, args=None):
+        """∇ of every sine at w (..., 2d): (..., 2d, num_parameters)."""
+        x, slope, _ = self.inputs.tables(w, order=1)
+        k, phase = self._phase(x)
+        cos = namespace(w).cos(phase)[..., None, :]
+        return self.inputs.pull_back_terms(as_row(k.T, cos) * cos, slope)

@@ -10,87 +10,104 @@ function, which is time-symmetric. Why: with δ = Z − z and m = ½(z + Z),
 dZ∧J dZ − dz∧J dz = 2 dδ∧J dm and dm = dw − C dδ; the dw part vanishes because S'' is symmetric,
 the other because J C is.
 
-For training, ``point`` and ``wanted`` are explicit in the data. For prediction the unknowns are the
-entries of w that the state z does not give; ``residual`` vanishes at the solution.
+For training, ``evaluation_point`` and ``target_gradient`` are explicit in the data. For prediction
+the unknowns are the entries of w that the state z does not give; ``residual`` vanishes at the
+solution. States, points and gradients have shape (..., 2d), NumPy or JAX; dt is a number.
 """
 
 from __future__ import annotations
 
 import dataclasses
 
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
 
-from gfnn_jax.phase_space import State, apply_j, split
-
-Jacobians = Float[Array, "*batch phase phase"]
+from gfnn_jax.arrays import as_row, namespace
+from gfnn_jax.phase_space import apply_j, split
 
 
 @dataclasses.dataclass(frozen=True)
 class Chart:
-    """The near-identity chart with C = diag(skew I, −skew I).
-
-    States, points and gradients have shape (2d,) or (..., 2d); nothing here is specific to a
-    batch. ``skew`` = −½, ½, 0 are types 2 and 3 and the midpoint.
-    """
+    """The near-identity chart with C = diag(skew I, −skew I): −½, ½, 0 are types 2 and 3 and the
+    midpoint."""
 
     name: str
     skew: float
 
-    def point(self, z0, z1):
+    def evaluation_point(self, z0, z1):
         """w, where S is evaluated: ½(z + Z) + C(Z − z)."""
         (q, p), (q1, p1) = split(z0), split(z1)
         to, back = 0.5 + self.skew, 0.5 - self.skew
-        return jnp.concatenate([to * q1 + back * q, to * p + back * p1], axis=-1)
+        return namespace(z0, z1).concatenate([to * q1 + back * q, to * p + back * p1], axis=-1)
 
-    def wanted(self, z0, z1, dt):
+    def target_gradient(self, z0, z1, dt):
         """∇S(w) that the pair asks for: −J (Z − z)/h = ((p − P)/h, (Q − q)/h)."""
         return -apply_j(z1 - z0) / dt
 
-    def free(self, dim: int) -> tuple[int, ...]:
+    def free(self, dim: int) -> slice:
         """The entries of w that z does not give: d of them for types 2 and 3, else 2d."""
-        q_free = range(dim) if self.skew != -0.5 else ()
-        p_free = range(dim, 2 * dim) if self.skew != 0.5 else ()
-        return (*q_free, *p_free)
+        first = 0 if self.skew != -0.5 else dim
+        return slice(first, 2 * dim if self.skew != 0.5 else dim)
 
-    def start(self, z: State) -> State:
+    def complete(self, known, x):
+        """w with the free entries x, the others from ``known`` (..., 2d)."""
+        return _completed(self.free(known.shape[-1] // 2), known, x)
+
+    def first_guess(self, z):
         """The first guess of w without any other knowledge: the map is near the identity."""
         return z
 
     def residual(self, z, w, gradient, dt):
         """w − z − (½I + C) h J∇S(w), its free entries; zero at the solution."""
         dim = z.shape[-1] // 2
-        delta_q, delta_p = split(dt * apply_j(gradient))
-        move = jnp.concatenate([(0.5 + self.skew) * delta_q, (0.5 - self.skew) * delta_p])
-        return (w - z - move)[jnp.array(self.free(dim))]
+        move = as_row(self._half(dim, z), z) * (dt * apply_j(gradient))
+        return (w - z - move)[..., self.free(dim)]
+
+    def residual_jacobian(self, hessian, dt):
+        """Its derivative in the free entries: I − (½I + C) h J S''(w), (..., n, n)."""
+        dim = hessian.shape[-1] // 2
+        free = self.free(dim)
+        return self._linear_part(hessian, dt)[..., free, free]
 
     def sizes(self, scale, z, gradient, dt):
         """The unit of the residual's entries, scale + abs(z), and the size of their terms."""
-        free = jnp.array(self.free(z.shape[-1] // 2))
-        unit = scale + jnp.abs(z)
-        return unit[free], (unit + jnp.abs(dt * apply_j(gradient)))[free]
+        free = self.free(z.shape[-1] // 2)
+        xp = namespace(z)
+        unit = as_row(scale, z) + xp.abs(z)
+        return unit[..., free], (unit + xp.abs(dt * apply_j(gradient)))[..., free]
 
     def image(self, z, w, gradient, dt):
         """Z = z + h J∇S(w)."""
         return z + dt * apply_j(gradient)
 
-    def reverse(self, dt) -> tuple[Chart, float]:
+    def reverse(self, dt):
         """Chart and time step of the inverse map, which the same S generates: (−c, −h)."""
         named = {chart.skew: chart for chart in (TYPE2, TYPE3, MIDPOINT)}
         return named.get(-self.skew, Chart(self.name, -self.skew)), -dt
 
-    def determinant(self, jacobian: Jacobians) -> Float[Array, "*batch"]:
-        """det ∂w/∂z = det(½(I + M) + C(M − I)) for Jacobians M of the map.
+    def determinant(self, jacobian):
+        """det ∂w/∂z = det(½(I + M) + C(M − I)) for Jacobians M (..., 2d, 2d) of the map.
 
         The chart is valid where this keeps one sign and stays away from 0: there w determines z.
         """
-        dim = jacobian.shape[-1] // 2
-        eye = jnp.eye(2 * dim, dtype=jacobian.dtype)
-        signs = jnp.concatenate([jnp.ones(dim), -jnp.ones(dim)]).astype(jacobian.dtype)
-        c = (self.skew * signs)[:, None]
-        shape = (1,) * (jacobian.ndim - 2)
-        eye, c = eye.reshape(*shape, *eye.shape), c.reshape(*shape, *c.shape)
-        return jnp.linalg.det(0.5 * (eye + jacobian) + c * (jacobian - eye))
+        xp, dim = namespace(jacobian), jacobian.shape[-1] // 2
+        eye = as_row(xp.eye(2 * dim, dtype=jacobian.dtype), jacobian)
+        c = as_row(self._half(dim, jacobian)[:, None] - 0.5, jacobian)
+        return xp.linalg.det(0.5 * (eye + jacobian) + c * (jacobian - eye))
+
+    def determinant_of(self, hessian, dt):
+        """The same of the map that S generates: 1/det(I − (½I + C) h J S''(w))."""
+        return 1.0 / namespace(hessian).linalg.det(self._linear_part(hessian, dt))
+
+    def _half(self, dim: int, like):
+        """The diagonal of ½I + C: (2d,)."""
+        half = np.repeat([0.5 + self.skew, 0.5 - self.skew], dim)
+        return namespace(like).asarray(half, dtype=like.dtype)
+
+    def _linear_part(self, hessian, dt):
+        xp, width = namespace(hessian), hessian.shape[-1]
+        form = xp.swapaxes(apply_j(xp.swapaxes(hessian, -1, -2)), -1, -2)  # J S''
+        half = as_row(self._half(width // 2, hessian)[:, None], hessian)
+        return as_row(xp.eye(width, dtype=hessian.dtype), hessian) - half * (dt * form)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,51 +122,73 @@ class TypeOne:
     name: str = "type1"
     side: int = 0
 
-    def point(self, z0, z1):
+    def evaluation_point(self, z0, z1):
         """w = (q, Q), whichever of the two states is the given one."""
         first, second = (z0, z1) if self.side == 0 else (z1, z0)
-        return jnp.concatenate([split(first)[0], split(second)[0]], axis=-1)
+        return namespace(z0, z1).concatenate([split(first)[0], split(second)[0]], axis=-1)
 
-    def wanted(self, z0, z1, dt):
+    def target_gradient(self, z0, z1, dt):
         """∇S(w) = (−p, P)/h."""
         first, second = (z0, z1) if self.side == 0 else (z1, z0)
-        return jnp.concatenate([-split(first)[1], split(second)[1]], axis=-1) / dt
+        momenta = [-split(first)[1], split(second)[1]]
+        return namespace(z0, z1).concatenate(momenta, axis=-1) / dt
 
-    def free(self, dim: int) -> tuple[int, ...]:
+    def free(self, dim: int) -> slice:
         """The half of w that the given state is not."""
-        return tuple(range(dim, 2 * dim)) if self.side == 0 else tuple(range(dim))
+        return slice(dim, 2 * dim) if self.side == 0 else slice(0, dim)
 
-    def start(self, z):
+    def complete(self, known, x):
+        """w with the free entries x, the others from ``known`` (..., 2d)."""
+        return _completed(self.free(known.shape[-1] // 2), known, x)
+
+    def first_guess(self, z):
         """Q = q, for want of anything better; a fit supplies a better guess."""
         q = split(z)[0]
-        return jnp.concatenate([q, q])
+        return namespace(z).concatenate([q, q], axis=-1)
 
     def residual(self, z, w, gradient, dt):
         """p + h ∂S/∂q for the map, P − h ∂S/∂Q for its inverse."""
-        g_q, g_q1 = split(gradient)
+        in_q, in_q1 = split(gradient)
         p = split(z)[1]
-        return p + dt * g_q if self.side == 0 else p - dt * g_q1
+        return p + dt * in_q if self.side == 0 else p - dt * in_q1
+
+    def residual_jacobian(self, hessian, dt):
+        """Its derivative in the free entries: h S_qQ, or −h S_Qq for the inverse, (..., d, d)."""
+        dim = hessian.shape[-1] // 2
+        if self.side == 0:
+            return dt * hessian[..., :dim, dim:]
+        return -dt * hessian[..., dim:, :dim]
 
     def sizes(self, scale, z, gradient, dt):
         """As for the other charts; the residual's entries are momenta."""
-        unit = split(scale + jnp.abs(z))[1]
-        return unit, unit + jnp.abs(dt * split(gradient)[self.side])
+        xp = namespace(z)
+        unit = split(as_row(scale, z) + xp.abs(z))[1]
+        return unit, unit + xp.abs(dt * split(gradient)[self.side])
 
     def image(self, z, w, gradient, dt):
         """(Q, P) from (q, p), or (q, p) from (Q, P)."""
-        (q, q1), (g_q, g_q1) = split(w), split(gradient)
-        if self.side == 0:
-            return jnp.concatenate([q1, dt * g_q1])
-        return jnp.concatenate([q, -dt * g_q])
+        (q, q1), (in_q, in_q1) = split(w), split(gradient)
+        image = [q1, dt * in_q1] if self.side == 0 else [q, -dt * in_q]
+        return namespace(z).concatenate(image, axis=-1)
 
-    def reverse(self, dt) -> tuple[TypeOne, float]:
+    def reverse(self, dt):
         """The same S read from its other side."""
         return TypeOne(self.name, 1 - self.side), dt
 
-    def determinant(self, jacobian: Jacobians) -> Float[Array, "*batch"]:
+    def determinant(self, jacobian):
         """det ∂(q, Q)/∂(q, p) = det ∂Q/∂p; up to sign the same from the other side."""
         dim = jacobian.shape[-1] // 2
-        return jnp.linalg.det(jacobian[..., :dim, dim:])
+        return namespace(jacobian).linalg.det(jacobian[..., :dim, dim:])
+
+    def determinant_of(self, hessian, dt):
+        """The same of the map that S generates: 1/det(−h S_qQ(w))."""
+        dim = hessian.shape[-1] // 2
+        return 1.0 / namespace(hessian).linalg.det(-dt * hessian[..., :dim, dim:])
+
+
+def _completed(free: slice, known, x):
+    parts = [known[..., : free.start], x, known[..., free.stop :]]
+    return namespace(x).concatenate([p for p in parts if p.shape[-1]], axis=-1)
 
 
 AnyChart = Chart | TypeOne

@@ -1,8 +1,8 @@
-"""Where the implicit solve starts: an explicit polynomial model of a chart's unknowns.
+"""The predictor: an explicit polynomial model of a chart's unknowns, where the solve starts.
 
 The model is fitted to pairs, where the unknowns are explicit: those that S is fitted to, or states
-and their images by the map itself, to which a start of a coarse map can be closer. It need not be
-symplectic: the solve corrects it and forgets it, but for two things. A start that is as close as
+and their images by the map itself, to which it can be closer where S is coarse. It need not be
+symplectic: the solve corrects it and forgets it, but for two things. A guess that is as close as
 the root of roundoff leaves one Newton update to do, and beside a fold of S it decides which of the
 branches is found: that of the data.
 """
@@ -11,40 +11,41 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 
+from gfnn_jax.arrays import matmul, namespace
+from gfnn_jax.families.inputs import Inputs, box_inputs
+from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.phase_space import sizes
-from gfnn_jax.families.inputs import Inputs, box_inputs
-from gfnn_jax.families.products import Products, operations_of_values, values
 
-# A start this close, in units of the data's spread, is the root of roundoff: one update is left.
+# A guess this close, in units of the data's spread, is the root of roundoff: one update is left.
 CLOSE = 5e-8
 # What that update leaves is the square of it, the same at every step: below the floor, but more
-# than roundoff makes of a million steps. Starts so close leave less (Hénon–Heiles, S of degree 8:
+# than roundoff makes of a million steps. Guesses so close leave less (Hénon–Heiles, S of degree 8:
 # the energy error grows with the 0.55th power of the steps instead of the 0.86th).
 _STEADY = 1e-8
 # The model goes on a little outside the box, where rollouts of states at its edge do, but not
 # where T_n of its own degree is larger than 250.
 _REACH, _LARGEST = 1.2, 250.0
-_DEGREES = range(1, 21)
-_MOST_TERMS = 250
-_ROWS = 4_000
+_MOST_DEGREE, _MOST_TERMS, _ROWS = 20, 250, 4_000
+_RIDGE = 1e-13  # of a column's size: data on a surface leave some products undetermined
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("family", "matrices"), meta_fields=())
 @dataclasses.dataclass(frozen=True, eq=False)
-class Start:
+class PolynomialModel:
     """What the unknowns differ from the chart's own first guess by, as polynomials of the state.
 
     family: the products and their box; far outside the model is that of the nearest point of a
-    slightly larger box, so that it stays as small as it is near the data. matrices: coefficients
-    (k, m, n) of the k unknowns.
+    slightly larger box, so that it stays as small as it is near the data. matrices: (k, m, n) the
+    coefficients of the k unknowns, the constant included.
     """
 
     family: Products
@@ -53,91 +54,141 @@ class Start:
     @property
     def operations(self) -> int:
         """Floating-point operations of an evaluation."""
-        return operations_of_values(self.family, len(self.matrices))
+        basis, count = self.family.basis, len(self.matrices)
+        (m, i), (n, j) = (h.indices.shape for h in basis.halves)
+        row, column = basis.corner
+        tables = m * (i - 1) + n * max(j - 1, 0) + 4 * self.family.degree * (i + j)
+        return 2 * count * (row * n + (m - row) * column + m) + tables
 
     def __call__(self, z):
-        """The difference (k,) at the state z (2d,)."""
-        x = self.family.inputs(z)
-        angle = np.isin(np.arange(x.shape[0]), self.family.inputs.angles)
+        """The difference (..., k) at the states z (..., 2d), NumPy or JAX."""
+        xp, inputs = namespace(z), self.family.inputs
         reach = min(_REACH, math.cosh(math.acosh(_LARGEST) / self.family.degree))
-        return values(self.family, self.matrices, jnp.where(angle, x, jnp.clip(x, -reach, reach)))
+        reaches = np.where(inputs.is_angle, np.inf, reach)
+        x = inputs(z)
+        bound = xp.broadcast_to(xp.asarray(reaches, dtype=x.dtype), x.shape)
+        (u,), (v,) = self.family.basis.tables(xp.clip(x, -bound, bound), 0)
+        row, column = self.family.basis.corner
+        low = self._product(self.matrices[:, :row], u[..., :row], v)
+        return low + self._product(self.matrices[:, row:, :column], u[..., row:], v[..., :column])
+
+    @staticmethod
+    def _product(matrices, u, v):
+        """Σ C_ab u_a v_b of each matrix (k, m, n): one product of the batch with all of them."""
+        count, m, n = matrices.shape
+        by_row = matmul(v, matrices.reshape(count * m, n).T).reshape(*u.shape[:-1], count, m)
+        return namespace(u).sum(by_row * u[..., None, :], axis=-1)
 
 
-class Starts(NamedTuple):
-    """Starts of a map and of its inverse, and the RMS error of the worse, in units of the data."""
+@partial(
+    jax.tree_util.register_dataclass, data_fields=("forward", "backward"), meta_fields=()
+)  # fmt: skip
+@dataclasses.dataclass(frozen=True, eq=False)
+class Predictor:
+    """Where the solves of a map (forward) and of its inverse (backward) start."""
 
-    there: Start
-    back: Start
+    forward: PolynomialModel
+    backward: PolynomialModel
+
+    def reverse(self) -> Predictor:
+        """The predictor of the inverse map."""
+        return Predictor(self.backward, self.forward)
+
+
+class Fitted(NamedTuple):
+    """A predictor and its RMS error, in units of the data's spread, of the worse direction."""
+
+    predictor: Predictor
     error: float
 
 
-def fit_starts(chart: AnyChart, prepared, features=None) -> list[Starts]:
-    """The starts of a chart's map and of its inverse, by rising degree.
+def fit_predictors(
+    chart: AnyChart, y0, y1, dt: float, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
+    features=None,
+) -> list[Fitted]:  # fmt: skip
+    """Predictors of a chart's map and of its inverse, by rising degree.
 
-    prepared: of the pairs, y0 and y1 (N, 2d) with their coordinates and dt. The degree rises until
-    the start is as close as it need be, or no longer gains: then noise, or the number of pairs, is
-    the limit.
+    y0, y1: (N, 2d) states and images, NumPy, angles lifted. angles, cyclic, features: as those of
+    ``box_inputs``. The degree rises until the model is as close as it need be, or no longer gains:
+    then noise, or the number of pairs, is the limit.
     """
-    coordinates = prepared.coordinates
-    rows = np.linspace(0, len(prepared.y0) - 1, min(_ROWS, len(prepared.y0))).astype(int)
-    y0, y1 = prepared.y0[rows], prepared.y1[rows]
+    rows = np.linspace(0, len(y0) - 1, min(_ROWS, len(y0))).astype(int)
+    y0, y1 = y0[rows], y1[rows]
 
-    def fitted(chart: AnyChart, given, other) -> list[tuple[Start, float]]:
+    def fitted(chart: AnyChart, given, other) -> list[tuple[PolynomialModel, float]]:
         dim = given.shape[1] // 2
-        free = np.array(chart.free(dim))
-        known = np.asarray(jax.vmap(chart.start)(jnp.asarray(given)))
-        point = np.asarray(chart.point(given, other))
+        free = chart.free(dim)
+        unknown = chart.evaluation_point(given, other)[:, free]
+        known = chart.first_guess(given)[:, free]
         inputs = box_inputs(
-            given, angles=tuple(a for a in coordinates.angles if a < dim),
-            cyclic=coordinates.cyclic, features=features,
+            given, angles=tuple(a for a in angles if a < dim), cyclic=tuple(cyclic),
+            features=features,
         )  # fmt: skip
-        return _by_degree(inputs, given, (point - known)[:, free], sizes(point)[free])
+        return _by_degree(inputs, given, unknown - known, sizes(unknown))
 
-    there, back = fitted(chart, y0, y1), fitted(chart.reverse(prepared.dt)[0], y1, y0)
-    # The one that is close first waits for the other.
-    rising = range(max(len(there), len(back)))
-    sides = ([side[min(i, len(side) - 1)] for i in rising] for side in (there, back))
+    forward, backward = fitted(chart, y0, y1), fitted(chart.reverse(dt)[0], y1, y0)
+    # The direction that is close first waits for the other.
+    rising = range(max(len(forward), len(backward)))
+    sides = ([side[min(i, len(side) - 1)] for i in rising] for side in (forward, backward))
     return [
-        Starts(one, other, max(error, its_error))
+        Fitted(Predictor(one, other), max(error, its_error))
         for (one, error), (other, its_error) in zip(*sides, strict=True)
     ]
 
 
-def affordable(starts: list[Starts], family, *, spares: bool = False) -> Starts:
-    """The closest starts that cost at most half of what the family's own gradient does.
+def affordable(fitted: list[Fitted], family, *, spares: bool = False) -> Fitted:
+    """The closest predictor that costs at most half of what the family's own gradient does.
 
-    spares: whether they leave more than one update to do; then such as do not may cost what they
-    spare, two or three evaluations with a Jacobian, whose operations take about twice as long as
-    those of a start.
+    spares: whether it leaves more than one update to do; then one that does not may cost what it
+    spares, two or three evaluations with a Jacobian, whose operations take about twice as long as
+    those of a polynomial model.
     """
-    gradient, with_jacobian = family.operations
+    gradient, with_hessian = family.operations
     close = [
-        s for s in starts if s.error <= CLOSE and s.there.operations <= 5 * with_jacobian
+        f for f in fitted
+        if f.error <= CLOSE and f.predictor.forward.operations <= 5 * with_hessian
     ]  # fmt: skip
     if spares and close:
         return close[-1]
-    cheap = [s for s in starts if s.there.operations <= 0.5 * gradient]
-    return cheap[-1] if cheap else starts[0]
+    cheap = [f for f in fitted if f.predictor.forward.operations <= 0.5 * gradient]
+    return cheap[-1] if cheap else fitted[0]
 
 
-def _by_degree(inputs: Inputs, y, wanted, unit) -> list[tuple[Start, float]]:
+def _by_degree(inputs: Inputs, y, target, unit) -> list[tuple[PolynomialModel, float]]:
+    """Least-squares models of the target (N, k), one factorisation for all degrees."""
     held = np.arange(len(y)) % 5 == 0
-    x = np.asarray(jax.vmap(inputs)(jnp.asarray(y)))
+    most = min(_MOST_TERMS, len(y) // 3)
+    top = 1
+    while top < _MOST_DEGREE and Products(inputs, top + 1).num_parameters <= most:
+        top += 1
+    largest = Products(inputs, top).basis
+    design = _design(largest, inputs(y))
+    width = design.shape[1]
+    ridge = _RIDGE * np.linalg.norm(design[~held], axis=0)
+    rows = np.vstack([design[~held], np.diag(ridge)])
+    q, r = scipy.linalg.qr(rows, mode="economic", check_finite=False)
+    along = q.T @ np.vstack([target[~held], np.zeros((width, target.shape[1]))])
     found, closest = [], np.inf
-    for degree in _DEGREES:
-        family = Products(inputs, degree)
-        most = min(_MOST_TERMS, len(y) // 3)
-        if found and family.num_parameters > most:
-            break
-        design = family.basis.design(x)
-        solution = np.linalg.lstsq(design[~held], wanted[~held], rcond=1e-13)[0]
-        error = np.sqrt(np.mean((design[held] @ solution - wanted[held]) ** 2 / unit**2))
+    for degree in range(1, top + 1):
+        m = 1 + int(np.sum(largest.term_orders <= degree))
+        solution = scipy.linalg.solve_triangular(r[:m, :m], along[:m], check_finite=False)
+        error = np.sqrt(np.mean((design[held, :m] @ solution - target[held]) ** 2 / unit**2))
         if found and not error < 0.5 * closest:
-            if family.degree > found[-1][0].family.degree + 1:
+            if degree > found[-1][0].family.degree + 1:
                 break
             continue  # an odd map gains nothing by an even degree
         closest = error
-        found.append((Start(family, jnp.asarray(family.basis.placed(solution))), float(error)))
+        family = Products(inputs, degree)
+        matrices = family.basis.placed(solution[1:].T)
+        matrices[:, 0, 0] = solution[0]
+        found.append((PolynomialModel(family, matrices), float(error)))
         if error < _STEADY:
             break
     return found
+
+
+def _design(basis, x) -> np.ndarray:
+    """The constant and the products at x (N, k): (N, 1 + terms)."""
+    (u,), (v,) = basis.tables(x, 0)
+    row, column = basis.terms.T
+    return np.concatenate([np.ones((len(x), 1)), u[:, row] * v[:, column]], axis=1)

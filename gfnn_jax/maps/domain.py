@@ -14,9 +14,9 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from gfnn_jax.arrays import as_row, matmul, namespace
 from gfnn_jax.phase_space import sizes
 
 # κ is of degree 4 in y: a factor 2 is a margin of about a fifth of the region's size.
@@ -28,7 +28,7 @@ _MARGIN = 2.0
     data_fields=("centre", "scale", "factor", "limit"),
     meta_fields=("keep",),
 )
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Domain:
     """{y : κ(y) <= limit}, in the coordinates ``keep`` of y; everything where ``keep`` is empty.
 
@@ -42,19 +42,22 @@ class Domain:
     limit: Any
 
     def contains(self, y):
-        """Whether the state y (2d,) lies where data were; False for non-finite y."""
-        finite = jnp.all(jnp.isfinite(y))
+        """Whether the states y (..., 2d) lie where data were; False for non-finite ones. NumPy or
+        JAX."""
+        xp = namespace(y)
+        finite = xp.all(xp.isfinite(y), axis=-1)
         return finite & (self._christoffel(y) <= self.limit) if self.keep else finite
 
     def _christoffel(self, y):
-        x = (y[np.array(self.keep)] - self.centre) / self.scale
-        return jnp.sum((self.factor @ _monomials(x)) ** 2)
+        x = y[..., np.array(self.keep)]
+        x = (x - as_row(self.centre, x)) / as_row(self.scale, x)
+        return namespace(y).sum(matmul(_monomials(x), self.factor.T) ** 2, axis=-1)
 
 
 def _monomials(x):
-    """1, x_i, x_i x_j of x (k,): (1 + k + k(k+1)/2,)."""
-    i, j = np.triu_indices(x.shape[0])
-    return jnp.concatenate([jnp.ones(1, x.dtype), x, x[i] * x[j]])
+    """1, x_i, x_i x_j of x (..., k): (..., 1 + k + k(k+1)/2)."""
+    xp, (i, j) = namespace(x), np.triu_indices(x.shape[-1])
+    return xp.concatenate([xp.ones_like(x[..., :1]), x, x[..., i] * x[..., j]], axis=-1)
 
 
 def covering(y, *, ignore: tuple[int, ...] = ()) -> Domain:
@@ -65,14 +68,14 @@ def covering(y, *, ignore: tuple[int, ...] = ()) -> Domain:
     y = np.asarray(y, dtype=np.float64)
     keep = tuple(i for i in range(y.shape[1]) if i not in ignore)
     if not keep:
-        empty = jnp.zeros((0,))
-        return Domain((), empty, empty, jnp.zeros((0, 0)), jnp.zeros(()))
+        empty = np.zeros(0)
+        return Domain((), empty, empty, np.zeros((0, 0)), np.zeros(()))
     x = y[:, keep]
     centre, scale = x.mean(axis=0), sizes(x)
-    v = np.asarray(jax.vmap(_monomials)(jnp.asarray((x - centre) / scale)))
+    v = _monomials((x - centre) / scale)
     # Data on a surface (one energy, say) leave G singular; the floor gives the surface a thickness.
     values, vectors = np.linalg.eigh(v.T @ v / len(v))
     values = np.maximum(values, 1e-6 * values[-1])
     factor = vectors.T / np.sqrt(values)[:, None]
     limit = _MARGIN * np.max(np.sum((v @ factor.T) ** 2, axis=1))
-    return Domain(keep, *(jnp.asarray(a) for a in (centre, scale, factor, limit)))
+    return Domain(keep, centre, scale, factor, np.asarray(limit))

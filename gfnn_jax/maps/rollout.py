@@ -1,4 +1,4 @@
-"""Apply a step many times: scan over steps, vmap over initial states, save every K-th.
+"""Apply a step many times: scan over steps, save every K-th.
 
 Knows nothing of generating functions: any ``step(carry) -> carry`` will do, so every method that
 ends in a step function is rolled out, timed and judged by the same code.
@@ -12,12 +12,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 
 def scan_steps(
     step: Callable, carry: Any, num_saved: int, *, save_every: int = 1, observe: Callable
 ) -> tuple[Any, Any]:
-    """One lane: ``num_saved`` blocks of ``save_every`` steps, ``observe(carry)`` after each block.
+    """``num_saved`` blocks of ``save_every`` steps, ``observe(carry)`` after each block.
 
     Returns the last carry and the stacked observations (num_saved, ...). Memory is that of what is
     saved, whatever the number of steps.
@@ -34,12 +35,12 @@ def scan_steps(
 
 
 def rollout(step: Callable, z0, num_steps: int, *, save_every: int = 1):
-    """Roll out a plain step function z -> z from a batch of initial states.
+    """Roll out a plain step function z -> z of one state (2d,) from a batch of initial states.
 
-    z0: (B, 2d). Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first.
+    z0: (B, 2d), NumPy or JAX. Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first.
     Compiled once for each ``step``: pass the same function again, not a new lambda.
     """
-    return _rollout(step, jnp.asarray(z0), num_steps // save_every, save_every)
+    return _rollout(step, np.asarray(z0), num_steps // save_every, save_every)
 
 
 @partial(jax.jit, static_argnums=(0, 2, 3))

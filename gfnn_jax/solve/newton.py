@@ -1,11 +1,11 @@
-"""The implicit step: a Newton solve down to roundoff, with implicit-function derivatives.
+"""Newton's method for a batch of small systems, down to roundoff, with implicit derivatives.
 
-The solve finds x with r(θ, x) = 0 for one lane; a batch is a ``vmap`` of it. Three rules:
+The solve finds x (B, n) with r(shared, lanes, x) = 0, a system for each lane. Three rules:
 
 - Every iterate is judged by the residual that was evaluated *at it*, so "ok" is never a guess, and
-  the gradient belonging to the returned x is at hand without another evaluation.
-- Finished lanes are frozen, and those of a batch that need more updates than most are taken out of
-  it for them: a slow or bad lane costs the others neither a bit nor its own time.
+  what belongs to the returned x (the gradient of S) is at hand without another evaluation.
+- Finished lanes are frozen, and those that need more updates than most are gathered from the batch
+  for them: a slow or bad lane costs the others neither a bit nor its own time.
 - Status is data. Non-finite values are tested for, since ``while err > tol`` ends silently on NaN.
 
 Derivatives of ``root`` come from the implicit function theorem, in forward and reverse mode; those
@@ -14,27 +14,17 @@ of ``iterate`` from the iterations that ran, which is what an honest symplectici
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Float, Int
 
-OK, LEFT_DOMAIN, STOPPED_AT_EDGE, NOT_CONVERGED, NON_FINITE = range(5)
-STATUS_NAMES = (
-    "ok",
-    "left the domain",
-    "stopped at the domain's edge",
-    "not converged",
-    "non-finite",
-)
+from gfnn_jax.arrays import namespace
+from gfnn_jax.solve.linear import small_solve, solve_and_sign
+from gfnn_jax.solve.status import NON_FINITE, NOT_CONVERGED, OK, Info
 
-# Elimination is unrolled up to this size; beyond it LAPACK's call overhead no longer matters.
-_UNROLL_UP_TO = 8
 _HALVINGS = 30
 # How much the residual's slope along a step may change, as a part of the steeper slope; how far the
 # residual's change may be from what these slopes tell (the trapezoidal rule), as a part of it.
@@ -44,66 +34,41 @@ _BENT, _OFF_PATH = 0.35, 0.05
 _STRAIGHT, _BEGIN = 0.01, 0.125
 # A residual of this many eps of the size of its terms is the floor: a few roundings of that size.
 _FLOOR_EPS = 4.0
-# Where one update is not enough, this many lanes of a batch, or this part of it, are visited at a
+# Where one update is not enough, this many lanes of a batch, or this part of it, are gathered at a
 # time for so many updates: the fewer, the less waits for the hardest, the more often all are seen.
-# Tuned on CPUs; where all lanes of a batch are hard, it costs up to a fifth more than to wait.
+# Tuned on CPUs (benchmarks/speed.py); where all lanes of a batch are hard, it costs up to a fifth
+# more than to wait.
 _FEWEST, _PART, _VISIT = 32, 32, 2
 
 
-class Info(NamedTuple):
-    """How a solve ended, per lane: status, Newton updates made, and the residual relative to
-    the size of the terms that it is made of."""
+class Evaluation(NamedTuple):
+    """residual (B, n); size (B, n) of the terms whose difference it is: a few eps of it is
+    roundoff; aux: a pytree of (B, ...) that belongs to x."""
 
-    status: Int[Array, "*batch"]
-    iterations: Int[Array, "*batch"]
-    residual: Float[Array, "*batch"]
-
-
-def small_solve(matrix: Matrix, rhs: Vector) -> Vector:
-    """Solve matrix @ x = rhs by Gaussian elimination with partial pivoting, unrolled for n <= 8.
-
-    Under vmap it compiles to a few fused loops over the batch, 10-25 times faster than a batched
-    LAPACK call at these sizes. Linear in ``rhs``, so it can be transposed.
-    """
-    if rhs.shape[0] > _UNROLL_UP_TO:
-        return jnp.linalg.solve(matrix, rhs)
-    return _eliminate(matrix, rhs)[0]
+    residual: Any
+    size: Any
+    aux: Any
 
 
-def _solve_and_sign(matrix, rhs):
-    """The solution, and the sign of the matrix' determinant."""
-    if rhs.shape[0] > _UNROLL_UP_TO:
-        return jnp.linalg.solve(matrix, rhs), jnp.linalg.slogdet(matrix)[0]
-    return _eliminate(matrix, rhs)
+class Equation(Protocol):
+    """r(shared, lanes, x) = 0 for each lane: a hashable constant, everything else is in its
+    arguments. shared: a pytree common to all lanes. lanes: a pytree of (B, ...). x: (B, n)."""
 
+    def evaluate(self, shared: Any, lanes: Any, x: Any) -> Evaluation:
+        """The residual at x."""
+        ...
 
-def _eliminate(matrix, rhs):
-    n, sign = rhs.shape[0], jnp.ones((), matrix.dtype)
-    # The right-hand side apart from the rows: only so is all this linear in it.
-    rows, x = [matrix[i] for i in range(n)], [rhs[i] for i in range(n)]
-    for k in range(n):
-        for i in range(k + 1, n):  # bubble the largest pivot up
-            swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
-            rows[k], rows[i] = jnp.where(swap, rows[i], rows[k]), jnp.where(swap, rows[k], rows[i])
-            x[k], x[i] = jnp.where(swap, x[i], x[k]), jnp.where(swap, x[k], x[i])
-            sign = jnp.where(swap, -sign, sign)
-        sign = sign * jnp.sign(rows[k][k])
-        rows[k], x[k] = rows[k] / rows[k][k], x[k] / rows[k][k]
-        for i in range(k + 1, n):
-            factor = rows[i][k]
-            rows[i], x[i] = rows[i] - factor * rows[k], x[i] - factor * x[k]
-    for k in reversed(range(n)):
-        for j in range(k + 1, n):
-            x[k] = x[k] - rows[k][j] * x[j]
-    return jnp.stack(x), sign
+    def linearise(self, shared: Any, lanes: Any, x: Any) -> tuple[Evaluation, Any]:
+        """The residual at x and its Jacobian ∂r/∂x (B, n, n)."""
+        ...
 
 
 class _Iterate(NamedTuple):
+    """Where each lane stands; every leaf is (B, ...)."""
+
     x: Any
     residual: Any
     aux: Any
-    merit: Any  # largest residual
-    floor: Any  # largest of the residuals' roundoff floors
     error: Any  # largest residual relative to its roundoff floor
     sign: Any  # of det ∂r/∂x at the guess
     step: Any  # the Newton step from x, and the part of it to be tried next
@@ -111,61 +76,17 @@ class _Iterate(NamedTuple):
     iterations: Any
     open: Any  # still to be improved
 
-
-def _each(newton: Callable, theta, state: _Iterate) -> _Iterate:
-    """Newton's method for one lane; a batch of it goes on as long as its slowest lane."""
-    return jax.lax.while_loop(lambda s: s.open, partial(newton, theta), state)
-
-
-def _some(newton: Callable, theta, state: _Iterate) -> _Iterate:
-    """As ``_each``, but for one visit."""
-
-    def goes_on(carry):
-        return carry[0].open & (carry[1] < _VISIT)
-
-    def again(carry):
-        return newton(theta, carry[0]), carry[1] + 1
-
-    return jax.lax.while_loop(goes_on, again, (state, 0))[0]
-
-
-def _few_together(newton: Callable, theta, state: _Iterate) -> _Iterate:
-    """As ``_each``; but of a batch only lanes that are open are visited, a few at a time: the
-    others need not wait for them."""
-    loop = custom_vmap(partial(_each, newton))
-
-    @loop.def_vmap
-    def _(size, batched, theta, state):
-        own = batched[0]  # which parts of θ a lane has for itself
-        axes = jax.tree.map(lambda its: 0 if its else None, own)
-        state = jax.tree.map(
-            lambda a, its: a if its else jnp.broadcast_to(a, (size, *jnp.shape(a))),
-            state, batched[1],
-        )  # fmt: skip
-        everywhere = jax.tree.map(lambda _: True, state)
-        few = max(_FEWEST, size // _PART)
-        if size <= few:
-            return jax.vmap(partial(_each, newton), (axes, 0))(theta, state), everywhere
-
-        def visit(state):
-            place = jnp.cumsum(state.open)  # of a lane among the open ones, from 1
-            lanes = jnp.searchsorted(place, jnp.arange(1, few + 1), method="scan_unrolled")
-            of_them = partial(jnp.take, indices=lanes, axis=0, mode="clip")
-            given = jax.tree.map(lambda a, its: of_them(a) if its else a, theta, own)
-            new = jax.vmap(partial(_some, newton), (axes, 0))(given, jax.tree.map(of_them, state))
-            return jax.tree.map(lambda a, its: a.at[lanes].set(its, mode="drop"), state, new)
-
-        return jax.lax.while_loop(lambda s: jnp.any(s.open), visit, state), everywhere
-
-    return loop(theta, state)
+    @property
+    def merit(self):
+        """The largest residual."""
+        return _largest(self.residual)
 
 
 def iterate(
-    evaluate: Callable, theta: Any, guess: Vector, *, most: int, loop: Callable = _each
-) -> tuple[Vector, Any, Info]:
-    """The iterations themselves: ``evaluate(theta, x) -> (residual (n,), size (n,), aux)``.
+    equation: Equation, shared: Any, lanes: Any, guess: Any, *, most: int, gather: bool = True
+) -> tuple[Any, Any, Info]:
+    """The iterations themselves, from guess (B, n): (x, aux at x, Info).
 
-    ``size`` is that of the terms whose difference the residual is: a few eps of it is roundoff.
     One update with the Jacobian at the guess, where it is evaluated together with the residual,
     with which it shares most of its work: from a guess as close as the root of roundoff that is
     all. For the lanes that are left, Newton's method with a fresh Jacobian, a step halved until it
@@ -174,116 +95,182 @@ def iterate(
     there the sign of det ∂r/∂x would change, and the lane is given up, not led to another branch.
     A step over a pair of folds keeps the sign and may shrink the residual; it shows in the slopes.
     A lane closes when its residual is at the roundoff floor, or is close to it and no longer
-    halves, or cannot be made smaller. At most ``most`` updates, 1 or more; ``loop`` makes them.
-    Returns x, aux at x, Info.
+    halves, or cannot be made smaller.
+
+    most: updates, 1 or more. gather: whether open lanes are taken out of the batch; else all wait
+    for the slowest.
     """
     eps = float(jnp.finfo(guess.dtype).eps)
     settled = eps**-0.25  # in floors: 3e-12 of the size in float64, 1e-5 in float32
-    one = np.ones((), guess.dtype)
+    size = guess.shape[0]
+    ones, zeros = jnp.ones(size, guess.dtype), jnp.zeros(size, jnp.int32)
+    newton = partial(_newton, equation, most=most, settled=settled)
 
-    def judged(x, residual, size, aux, iterations):
-        merit = jnp.max(jnp.abs(residual))
-        floor = _FLOOR_EPS * eps * jnp.max(size)
-        error = jnp.max(jnp.abs(residual) / size) / (_FLOOR_EPS * eps)
-        return _Iterate(
-            x,
-            residual,
-            aux,
-            merit,
-            floor,
-            error,
-            one,
-            jnp.zeros_like(x),
-            one,
-            iterations,
-            np.array(True),
-        )
+    evaluation, matrix = equation.linearise(shared, lanes, guess)
+    step, sign = solve_and_sign(matrix, evaluation.residual)
+    first = _Iterate(
+        guess, evaluation.residual, evaluation.aux, _error(evaluation), sign, step, ones, zeros,
+        open=zeros < 1,
+    )  # fmt: skip
+    x = guess - step
+    evaluation = equation.evaluate(shared, lanes, x)
+    second = first._replace(
+        x=x, residual=evaluation.residual, aux=evaluation.aux, error=_error(evaluation)
+    )  # fmt: skip
 
-    def linearised(theta, x):
-        """(residual, size, aux) and the Jacobian ∂r/∂x at x."""
-
-        def with_aux(x):
-            residual, size, aux = evaluate(theta, x)
-            return residual, (residual, size, aux)
-
-        return jax.jacfwd(with_aux, has_aux=True)(x)
-
-    def goes_on(new, old):
-        halved = new.merit < 0.5 * old.merit
-        return (new.error > settled) | (new.error > 1.0) & halved
-
-    def frozen(x):
-        """The guess with its step, the sign of the Jacobian there, and what the step leads to."""
-        matrix, (residual, size, aux) = linearised(theta, x)
-        step, sign = _solve_and_sign(matrix, residual)
-        first = judged(x, residual, size, aux, jnp.zeros((), jnp.int32))._replace(
-            step=step, sign=sign
-        )
-        residual, size, aux = evaluate(theta, x - step)
-        second = judged(x - step, residual, size, aux, jnp.ones((), jnp.int32))
-        return first, second._replace(sign=sign)
-
-    def newton(theta, state):
-        """Try a part of the step: take it where it stays by the path, else halve the part."""
-        x = state.x - state.factor * state.step
-        matrix, (residual, size, aux) = linearised(theta, x)
-        new = judged(x, residual, size, aux, state.iterations + 1)
-        step, sign_here = _solve_and_sign(matrix, residual)
-        # The residual's slope along the step at its end; at its beginning it is -state.residual.
-        slope = -matrix @ state.step
-        steeper = jnp.maximum(jnp.max(jnp.abs(slope)), state.merit)
-        bent = jnp.max(jnp.abs(slope + state.residual)) / steeper
-        told = state.residual + 0.5 * state.factor * (slope - state.residual)
-        off = jnp.max(jnp.abs(residual - told))
-        near = _OFF_PATH * state.factor * state.merit + 4 * new.floor
-        by_the_path = (bent <= _BENT) & (off <= near) & (sign_here == state.sign)
-        better = by_the_path | (state.error <= settled) & (new.merit < state.merit)
-        further = goes_on(new, state) & (new.iterations < most)
-        # The next part is as long as the slope's change allows, if it goes on as it did.
-        longer = 0.95 * _BENT / jnp.clip(bent, 0.25 * _BENT, 2 * _BENT) * state.factor
-        new = new._replace(
-            sign=state.sign, step=step, factor=jnp.minimum(one, longer), open=further
-        )
-        # Close to the floor only the full step makes sense: what is left is roundoff.
-        shortest = jnp.where(state.error < settled, 1.0, 0.5**_HALVINGS).astype(guess.dtype)
-        halved = state._replace(factor=0.5 * state.factor, open=state.factor > shortest)
-        return jax.tree.map(partial(jnp.where, better), new, halved)
-
-    first, second = frozen(guess)
-    smaller = second.merit < first.merit
-    done = smaller & ~goes_on(second, first)
+    before, after = first.merit, second.merit
+    smaller = after < before
+    done = smaller & ~_goes_on(second.error, after, before, settled)
     begun = ~done & (smaller | (first.error > settled)) & (most > 1)
-    straight = (second.error <= settled) | (second.merit <= _STRAIGHT * first.merit)
-    state = jax.tree.map(partial(jnp.where, smaller & ~begun), second, first)._replace(
-        factor=jnp.where(straight, one, _BEGIN),
+    straight = (second.error <= settled) | (after <= _STRAIGHT * before)
+    state = _where(smaller & ~begun, second, first)._replace(
+        factor=jnp.where(straight, ones, _BEGIN * ones),
         iterations=jnp.where(begun, 0, 1).astype(jnp.int32),  # the loop makes the first one again
         open=begun,
     )
-    state = loop(newton, theta, state)
+    few = max(_FEWEST, size // _PART)
+    if gather and size > few:
+        state = _gathered(newton, shared, lanes, state, few)
+    else:
+        state = jax.lax.while_loop(
+            lambda s: jnp.any(s.open), lambda s: newton(shared, lanes, s), state
+        )
     finite = jnp.isfinite(state.error)
     status = jnp.where(state.error <= settled, OK, jnp.where(finite, NOT_CONVERGED, NON_FINITE))
     residual = state.error * (_FLOOR_EPS * eps)
     return state.x, state.aux, Info(status.astype(jnp.int32), state.iterations, residual)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 3))
-def root(evaluate, theta, guess, most: int):
-    """As ``iterate``, with derivatives in θ by the implicit function theorem.
+def _error(evaluation: Evaluation):
+    """The largest residual of each lane, in units of its roundoff floor."""
+    eps = float(jnp.finfo(evaluation.residual.dtype).eps)
+    return _largest(evaluation.residual / evaluation.size) / (_FLOOR_EPS * eps)
 
-    dx = −(∂r/∂x)⁻¹ (∂r/∂θ) dθ; the guess has no influence. ``evaluate`` must not close over
-    anything that is differentiated.
+
+def _goes_on(error, merit, merit_before, settled: float):
+    """Whether a lane that came to this error is still to be improved."""
+    return (error > settled) | ((error > 1.0) & (merit < 0.5 * merit_before))
+
+
+def _newton(equation, shared, lanes, state: _Iterate, *, most, settled) -> _Iterate:
+    """Try a part of each open lane's step: take it where it stays by the path, else halve it."""
+    part, merit = state.factor[:, None], state.merit
+    x = state.x - part * state.step
+    evaluation, matrix = equation.linearise(shared, lanes, x)
+    residual = evaluation.residual
+    step, sign_here = solve_and_sign(matrix, residual)
+    error, new_merit = _error(evaluation), _largest(residual)
+    # The residual's slope along the step at its end; at its beginning it is -state.residual.
+    slope = -jnp.sum(matrix * state.step[:, None, :], axis=-1)
+    bent = _largest(slope + state.residual) / jnp.maximum(_largest(slope), merit)
+    told = state.residual + 0.5 * part * (slope - state.residual)
+    floor = _FLOOR_EPS * float(jnp.finfo(x.dtype).eps) * jnp.max(evaluation.size, axis=-1)
+    near = _largest(residual - told) <= _OFF_PATH * state.factor * merit + 4 * floor
+    by_the_path = (bent <= _BENT) & near & (sign_here == state.sign)
+    settled_here = state.error <= settled
+    better = state.open & (by_the_path | (settled_here & (new_merit < merit)))
+    iterations = state.iterations + 1
+    further = _goes_on(error, new_merit, merit, settled) & (iterations < most)
+    # The next part is as long as the slope's change allows, if it goes on as it did.
+    longer = 0.95 * _BENT / jnp.clip(bent, 0.25 * _BENT, 2 * _BENT) * state.factor
+    new = _Iterate(
+        x, residual, evaluation.aux, error, state.sign, step, jnp.minimum(longer, 1.0),
+        iterations, further,
+    )  # fmt: skip
+    # Close to the floor only the full step makes sense: what is left is roundoff.
+    shortest = jnp.where(settled_here, 1.0, 0.5**_HALVINGS).astype(x.dtype)
+    halved = state._replace(
+        factor=jnp.where(state.open, 0.5 * state.factor, state.factor),
+        open=state.open & (state.factor > shortest),
+    )
+    return _where(better, new, halved)
+
+
+def _largest(rows):
+    return jnp.max(jnp.abs(rows), axis=-1)
+
+
+def _where(chosen, one, other):
+    """Of each lane, the leaves of one where ``chosen`` (B,), else of the other."""
+
+    xp = namespace(chosen)
+    return jax.tree.map(
+        lambda a, b: xp.where(chosen.reshape(chosen.shape + (1,) * (a.ndim - 1)), a, b), one, other
+    )
+
+
+def _gathered(newton, shared, lanes, state: _Iterate, few: int) -> _Iterate:
+    """Newton's method on the open lanes alone, ``few`` at a time: the others need not wait."""
+
+    count = state.open.shape[0]
+    lane = jnp.arange(count)
+
+    def visit(state):
+        # The first open lanes, by a partial sort of their numbers: compiled in no time.
+        first = jnp.where(state.open, count - lane, 0).astype(jnp.float32)
+        _, chosen = jax.lax.top_k(first, few)
+
+        def gather(a):
+            return a.at[chosen].get(mode="promise_in_bounds", unique_indices=True)
+
+        own, part = jax.tree.map(gather, (lanes, state))
+
+        def goes_on(carry):
+            return jnp.any(carry[0].open) & (carry[1] < _VISIT)
+
+        part, _ = jax.lax.while_loop(
+            goes_on, lambda c: (newton(shared, own, c[0]), c[1] + 1), (part, 0)
+        )
+        # Where fewer than ``few`` are open, lanes that are closed come along unchanged.
+        return jax.tree.map(
+            lambda a, b: a.at[chosen].set(b, mode="promise_in_bounds", unique_indices=True),
+            state, part,
+        )  # fmt: skip
+
+    return jax.lax.while_loop(lambda s: jnp.any(s.open), visit, state)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 4))
+def root(equation: Equation, shared: Any, lanes: Any, guess: Any, most: int):
+    """As ``iterate``, with derivatives in shared and lanes by the implicit function theorem.
+
+    dx = −(∂r/∂x)⁻¹ (∂r/∂θ) dθ, θ = (shared, lanes); the guess has no influence.
     """
-    return iterate(evaluate, theta, guess, most=most, loop=_few_together)
+    return iterate(equation, shared, lanes, guess, most=most)
 
 
 @root.defjvp
-def _root_jvp(evaluate, most, primals, tangents):
-    theta, guess = primals
-    x, aux, info = root(evaluate, theta, guess, most)
-    _, residual_dot = jax.jvp(lambda t: evaluate(t, x)[0], (theta,), (tangents[0],))
-    matrix = jax.jacfwd(lambda y: evaluate(theta, y)[0])(x)
+def _root_jvp(equation, most, primals, tangents):
+    shared, lanes, guess = primals
+    x, aux, info = root(equation, shared, lanes, guess, most)
+    theta, theta_dot = (shared, lanes), tangents[:2]
+    _, residual_dot = jax.jvp(lambda s, c: equation.evaluate(s, c, x).residual, theta, theta_dot)
+    _, matrix = equation.linearise(shared, lanes, x)
     x_dot = -small_solve(matrix, residual_dot)
-    _, aux_dot = jax.jvp(lambda t, y: evaluate(t, y)[2], (theta, x), (tangents[0], x_dot))
-    integer_dot: Any = np.zeros((), jax.dtypes.float0)
+    _, aux_dot = jax.jvp(
+        lambda s, c, y: equation.evaluate(s, c, y).aux, (*theta, x), (*theta_dot, x_dot)
+    )
+    integer_dot: Any = np.zeros(info.status.shape, jax.dtypes.float0)
     info_dot = Info(integer_dot, integer_dot, jnp.zeros_like(info.residual))
     return (x, aux, info), (x_dot, aux_dot, info_dot)
+
+
+def refine(equation: Equation, shared: Any, lanes: Any, guess: Any, updates: int = 6):
+    """Newton updates in NumPy from a guess (B, n) known to be close: (x, aux, error (B,)).
+
+    For fits, where the data give the evaluation points: no predictor and no branches, and nothing
+    is compiled. A lane keeps what it has where an update does not make its residual smaller. error:
+    the largest residual relative to the size of its terms.
+    """
+    with np.errstate(all="ignore"):
+        state = (guess, *equation.linearise(shared, lanes, guess))
+        for _ in range(updates):
+            x, evaluation, matrix = state
+            tried = x - small_solve(matrix, evaluation.residual)
+            new = (tried, *equation.linearise(shared, lanes, tried))
+            before, after = (np.abs(s[1].residual).max(axis=-1) for s in (state, new))
+            if not (after < before).any():
+                break
+            state = _where(after < before, new, state)
+        x, evaluation, _ = state
+        return x, evaluation.aux, np.abs(evaluation.residual / evaluation.size).max(axis=-1)

@@ -1,0 +1,139 @@
+"""The protocol of a family: a pure scalar function f(params, w, args) and its derivatives in w.
+
+S of a chart and H of a flow are families. Batch first: w has shape (..., 2d). A family is a frozen
+dataclass registered as a pytree; what it knows of the data are its leaves, all else is static. The
+same lines compute in NumPy for NumPy arrays (a fit) and are traced once for JAX arrays (a step).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.arrays import namespace
+
+
+@runtime_checkable
+class Family(Protocol):
+    """What maps, fits and solvers need of a scalar function.
+
+    args: what the function depends on beside the state (parameters of a system, the time of a
+    drive), or None. ``family(params, w, args)`` is ``value``, so that ``jax.grad(family, argnums=1)``
+    is the gradient at one w (2d,).
+    """
+
+    @property
+    def operations(self) -> tuple[int, int]:
+        """Floating-point operations of a gradient, and of a gradient with its Hessian."""
+        ...
+
+    def value(self, params: Any, w: Any, args: Any = None) -> Any:
+        """f, shape (...)."""
+        ...
+
+    def gradient(self, params: Any, w: Any, args: Any = None) -> Any:
+        """∂f/∂w, shape (..., 2d)."""
+        ...
+
+    def gradient_and_hessian(self, params: Any, w: Any, args: Any = None) -> tuple[Any, Any]:
+        """∂f/∂w and ∂²f/∂w², shapes (..., 2d) and (..., 2d, 2d)."""
+        ...
+
+
+@runtime_checkable
+class LinearFamily(Family, Protocol):
+    """A family f = Σ c_j φ_j(w) that is linear in its parameters."""
+
+    @property
+    def num_parameters(self) -> int:
+        """The number of terms."""
+        ...
+
+    def term_gradients(self, w: Any, args: Any = None) -> Any:
+        """∂φ_j/∂w of every term, shape (..., 2d, num_parameters)."""
+        ...
+
+    def unflatten(self, coefficients: Any) -> Any:
+        """The params of the family whose coefficients are (num_parameters,)."""
+        ...
+
+
+class DifferentiatedByJax:
+    """Derivatives of a family that has no closed form: ``value`` is differentiated by ``jax.grad``.
+
+    ``value`` must treat the rows of w independently. NumPy arrays are answered by one compiled
+    function.
+    """
+
+    def __call__(self, params, w, args=None):
+        return self.value(params, w, args)
+
+    def value(self, params, w, args=None):
+        raise NotImplementedError
+
+    def gradient(self, params, w, args=None):
+        """∂f/∂w (..., 2d): one reverse sweep of the batch."""
+        if namespace(w) is np:
+            return np.asarray(_compiled_gradient(self, params, w, args))
+        return jax.grad(lambda v: jnp.sum(self.value(params, v, args)))(w)
+
+    def gradient_and_hessian(self, params, w, args=None):
+        """∂f/∂w and ∂²f/∂w²: a tangent of the reverse sweep for each entry of w."""
+        if namespace(w) is np:
+            return tuple(map(np.asarray, _compiled_hessian(self, params, w, args)))
+        gradient, tangent = jax.linearize(lambda v: self.gradient(params, v, args), w)
+        units = jnp.eye(w.shape[-1], dtype=w.dtype)
+        along = jax.vmap(lambda e: tangent(jnp.broadcast_to(e, w.shape)), out_axes=-1)
+        return gradient, along(units)
+
+
+@jax.jit
+def _compiled_gradient(family, params, w, args):
+    return family.gradient(params, w, args)
+
+
+@jax.jit
+def _compiled_hessian(family, params, w, args):
+    return family.gradient_and_hessian(params, w, args)
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=("function",), meta_fields=())
+@dataclasses.dataclass(frozen=True, eq=False)
+class FromFunction(DifferentiatedByJax):
+    """A user's own S(params, w) of one state w (2d,) as a family."""
+
+    function: Any
+
+    name, label = "function", "a function"
+    # Unknown; the sizes of neither S nor its parameters tell.
+    operations = (0, 0)
+
+    def value(self, params, w, args=None):
+        """S at each w of (..., 2d)."""
+        one = self.function if args is None else lambda p, v: self.function(p, v, args)
+        flat = w.reshape(-1, w.shape[-1])
+        return jax.vmap(one, in_axes=(None, 0))(params, flat).reshape(w.shape[:-1])
+
+
+def from_function(function: Callable) -> Family:
+    """A family from a plain ``S(params, w)`` -> scalar, w (2d,): all derivatives by JAX.
+
+    What a callable pytree holds are leaves of the family; a plain function is static.
+    """
+    if jax.tree_util.all_leaves((function,)):
+        function = jax.tree_util.Partial(function)
+    return FromFunction(function)
+
+
+def as_family(function: Any) -> Any:
+    """A family as it is, any other callable by ``from_function``; what is neither stays: JAX puts
+    placeholders into pytrees."""
+    if not callable(function) or hasattr(type(function), "gradient_and_hessian"):
+        return function
+    return from_function(function)

@@ -1,0 +1,151 @@
+"""The piece that a generating function makes: Z − z = h J ∇S(w) (paper, eq. (4)).
+
+The implicit equation for w is solved by Newton's method to roundoff; derivatives in the state, the
+parameters and dt come from the implicit function theorem.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.arrays import namespace
+from gfnn_jax.families import as_family
+from gfnn_jax.generating.charts import AnyChart, Chart
+from gfnn_jax.phase_space import apply_j
+from gfnn_jax.solve import newton
+from gfnn_jax.solve.newton import Evaluation
+
+_MOST_NEWTON = 40
+
+
+@dataclasses.dataclass(frozen=True)
+class ImplicitStep:
+    """The implicit equation of a chart as the solver wants it: x is the free part of w.
+
+    shared = (family, params, dt, scale); lanes = (z, w where it is known, args). A residual is in
+    units of the coordinates' sizes, so that its floor is one number.
+    """
+
+    chart: AnyChart
+
+    def evaluate(self, shared, lanes, x) -> Evaluation:
+        """The residual; aux is (w, ∇S(w)), each (B, 2d)."""
+        (family, params, dt, scale), (z, known, args) = shared, lanes
+        w = self.chart.complete(known, x)
+        gradient = family.gradient(params, w, args)
+        return self._evaluation(z, w, gradient, dt, scale)[0]
+
+    def linearise(self, shared, lanes, x) -> tuple[Evaluation, Any]:
+        """The residual and its Jacobian ∂r/∂x (B, n, n)."""
+        (family, params, dt, scale), (z, known, args) = shared, lanes
+        w = self.chart.complete(known, x)
+        gradient, hessian = family.gradient_and_hessian(params, w, args)
+        evaluation, unit = self._evaluation(z, w, gradient, dt, scale)
+        return evaluation, self.chart.residual_jacobian(hessian, dt) / unit[..., None]
+
+    def _evaluation(self, z, w, gradient, dt, scale):
+        unit, size = self.chart.sizes(scale, z, gradient, dt)
+        if namespace(z) is jnp:
+            unit, size = jax.lax.stop_gradient((unit, size))
+        residual = self.chart.residual(z, w, gradient, dt)
+        return Evaluation(residual / unit, size / unit, (w, gradient)), unit
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("family", "params", "dt", "scale", "predictor"),
+    meta_fields=("chart",),
+)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Generated:
+    """The map that S(params, ·) generates in a chart. A piece: see `maps.symplectic_map`.
+
+    family: S, a family or a plain ``S(params, w)``; what it holds of the data are leaves.
+    dt:     the time step h, a number or a leaf of the map.
+    scale:  (2d,) sizes of the coordinates, for the roundoff floor.
+    predictor: where the solves start; None: at the chart's own first guess.
+    """
+
+    family: Any
+    params: Any
+    chart: AnyChart
+    dt: Any
+    scale: Any
+    predictor: Any = None
+
+    def __post_init__(self):
+        object.__setattr__(self, "family", as_family(self.family))
+        if isinstance(self.dt, (int, float)):
+            object.__setattr__(self, "dt", np.asarray(self.dt, self.scale.dtype))
+
+    def solve(self, z, args=None, *, unrolled: bool = False):
+        """(w, ∇S(w), Info) for the states z (B, 2d).
+
+        unrolled: derivatives are those of the iterations that ran, not of the implicit function.
+        """
+        known = self.chart.first_guess(z)
+        guess = known[:, self.chart.free(z.shape[1] // 2)]
+        if self.predictor is not None:
+            guess = guess + self.predictor.forward(z)
+        shared = (self.family, self.params, self.dt, self.scale)
+        equation, lanes = ImplicitStep(self.chart), (z, known, args)
+        if unrolled:
+            _, (w, gradient), info = newton.iterate(
+                equation, shared, lanes, guess, most=_MOST_NEWTON, gather=False
+            )
+        else:
+            _, (w, gradient), info = newton.root(
+                equation, shared, lanes, jax.lax.stop_gradient(guess), _MOST_NEWTON
+            )
+        return w, gradient, info
+
+    def step(self, z, args=None, *, unrolled: bool = False):
+        """(Z, Info) of the states z (B, 2d), by JAX."""
+        w, gradient, info = self.solve(z, args, unrolled=unrolled)
+        return self.chart.image(z, w, gradient, self.dt), info
+
+    def compensated_step(self, z, compensation, args=None):
+        """(Z, compensation, Info) of z + compensation, which is what rounding has lost so far
+        (compensated summation: Hairer, Lubich & Wanner, "Geometric Numerical Integration",
+        section VIII.5)."""
+        w, gradient, info = self.solve(z, args)
+        if not isinstance(self.chart, Chart):  # Z is no sum
+            return self.chart.image(z, w, gradient, self.dt), jnp.zeros_like(z), info
+        return *two_sum(z, self.dt * apply_j(gradient) + compensation), info
+
+    def refined_step(self, z, guess, args=None):
+        """(Z, error (B,)) of the states z (B, 2d) in NumPy, from evaluation points w (B, 2d) that
+        are known to be close: see `solve.newton.refine`. Nothing is compiled."""
+        dim = z.shape[1] // 2
+        shared = (self.family, self.params, self.dt, self.scale)
+        x = guess[:, self.chart.free(dim)]
+        _, (w, gradient), error = newton.refine(
+            ImplicitStep(self.chart), shared, (z, self.chart.first_guess(z), args), x
+        )
+        return self.chart.image(z, w, gradient, self.dt), error
+
+    def inverse(self) -> Generated:
+        """The inverse map: the same S, the chart read from its other side."""
+        chart, dt = self.chart.reverse(self.dt)
+        predictor = self.predictor.reverse() if self.predictor is not None else None
+        return dataclasses.replace(self, chart=chart, dt=dt, predictor=predictor)
+
+    def determinant(self, z0, z1, args=None):
+        """det ∂w/∂z (B,) at states z0 (B, 2d) with images z1, NumPy or JAX: it vanishes where the
+        chart is singular."""
+        w = self.chart.evaluation_point(z0, z1)
+        _, hessian = self.family.gradient_and_hessian(self.params, w, args)
+        return self.chart.determinant_of(hessian, self.dt)
+
+
+def two_sum(a, b):
+    """a + b as rounded, and what the rounding lost, exactly (Knuth, TAOCP 2, section 4.2.2)."""
+    total = a + b
+    part = total - a
+    return total, (a - (total - part)) + (b - part)

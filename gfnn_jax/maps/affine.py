@@ -1,0 +1,49 @@
+"""Affine symplectic maps, as base maps are made of."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from gfnn_jax.arrays import as_row, matmul
+from gfnn_jax.phase_space import apply_j
+from gfnn_jax.solve.status import OK, Info
+
+
+@partial(
+    jax.tree_util.register_dataclass, data_fields=("matrix", "centre", "shift"), meta_fields=()
+)  # fmt: skip
+@dataclasses.dataclass(frozen=True, eq=False)
+class Affine:
+    """z -> centre + shift + E (z − centre), E a symplectic matrix: half a base map (R^½). A piece.
+
+    matrix: (2d, 2d). centre, shift: (2d,).
+    """
+
+    matrix: Any
+    centre: Any
+    shift: Any
+
+    def image(self, z):
+        """The images of states z (..., 2d), NumPy or JAX."""
+        moved = matmul(z - as_row(self.centre, z), self.matrix.T)
+        return as_row(self.centre + self.shift, z) + moved
+
+    def step(self, z, args=None, *, unrolled: bool = False):
+        """(Z, Info) of the states z (B, 2d), by JAX."""
+        lanes = jnp.zeros(z.shape[0], jnp.int32)
+        return self.image(z), Info(lanes + OK, lanes, jnp.zeros(z.shape[0], z.dtype))
+
+    def compensated_step(self, z, compensation, args=None):
+        """(Z, compensation, Info) of z + compensation; a product's rounding is lost."""
+        image, info = self.step(z)
+        return image + matmul(compensation, self.matrix.T), jnp.zeros_like(z), info
+
+    def inverse(self) -> Affine:
+        """E⁻¹, which of a symplectic E is −J Eᵀ J."""
+        inverse = apply_j(apply_j(self.matrix).T)
+        return Affine(inverse, self.centre + self.shift, -self.shift)

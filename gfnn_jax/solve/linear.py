@@ -1,0 +1,96 @@
+"""Small dense linear systems, one for each lane of a batch."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from gfnn_jax.arrays import namespace
+
+# Up to the first size by cofactors, up to the second by unrolled elimination, beyond by LAPACK.
+# A batch of 1,000 systems of size 4: 0.08, 0.14, 0.8 µs each; seconds to compile 0.3, 1.2, 0.7.
+_COFACTORS_UP_TO, _UNROLL_UP_TO = 4, 8
+
+
+def small_solve(matrix, rhs):
+    """Solve matrix @ x = rhs for matrix (..., n, n) and rhs (..., n), NumPy or JAX.
+
+    By cofactors, or by elimination with partial pivoting, unrolled: a few fused loops over the
+    batch, many times faster than a batched LAPACK call at these sizes. Cofactors lose a factor of
+    the condition number in the residual, which an iteration that judges its own residual makes
+    good. Linear in ``rhs``, so it can be transposed. A singular system gives non-finite numbers.
+    """
+    return solve_and_sign(matrix, rhs)[0]
+
+
+def solve_and_sign(matrix, rhs):
+    """The solution (..., n), and the sign (...) of the matrix' determinant."""
+    n = rhs.shape[-1]
+    if n <= _COFACTORS_UP_TO:
+        return _by_cofactors(matrix, rhs)
+    if n <= _UNROLL_UP_TO:
+        return _by_elimination(matrix, rhs)
+    return _by_lapack(matrix, rhs), namespace(matrix).linalg.slogdet(matrix)[0]
+
+
+def _by_cofactors(matrix, rhs):
+    xp, n = namespace(matrix, rhs), rhs.shape[-1]
+
+    @cache
+    def minor(rows, columns):
+        """The determinant of these rows and columns, expanded along the first row."""
+        if not rows:
+            return 1.0
+        total = 0.0
+        for sign, j in zip((1.0, -1.0) * n, columns):  # noqa: B905
+            others = tuple(k for k in columns if k != j)
+            total = total + sign * matrix[..., rows[0], j] * minor(rows[1:], others)
+        return total
+
+    everything = tuple(range(n))
+    without = [tuple(k for k in everything if k != i) for i in everything]
+    determinant = minor(everything, everything)
+    x = [
+        sum((-1.0) ** (i + j) * minor(without[i], without[j]) * rhs[..., i] for i in everything)
+        / determinant
+        for j in everything
+    ]
+    return xp.stack(x, axis=-1), xp.sign(determinant)
+
+
+def _by_elimination(matrix, rhs):
+    xp, n = namespace(matrix, rhs), rhs.shape[-1]
+    rows = [[matrix[..., i, j] for j in range(n)] for i in range(n)]
+    x = [rhs[..., i] for i in range(n)]  # apart from the rows: only so is all this linear in it
+    sign = 1.0
+    for k in range(n):
+        for i in range(k + 1, n):  # bubble the largest pivot up
+            swap = xp.abs(rows[i][k]) > xp.abs(rows[k][k])
+            for pair in ((rows[k], rows[i], j) for j in range(k, n)):
+                _exchange(xp, swap, *pair)
+            x[k], x[i] = xp.where(swap, x[i], x[k]), xp.where(swap, x[k], x[i])
+            sign = xp.where(swap, -1.0, 1.0) * sign
+        pivot = rows[k][k]
+        sign = xp.sign(pivot) * sign
+        for i in range(k + 1, n):
+            factor = rows[i][k] / pivot
+            for j in range(k + 1, n):
+                rows[i][j] = rows[i][j] - factor * rows[k][j]
+            x[i] = x[i] - factor * x[k]
+    for k in reversed(range(n)):
+        for j in range(k + 1, n):
+            x[k] = x[k] - rows[k][j] * x[j]
+        x[k] = x[k] / rows[k][k]
+    return xp.stack(x, axis=-1), sign
+
+
+def _exchange(xp, swap, one, other, j):
+    one[j], other[j] = xp.where(swap, other[j], one[j]), xp.where(swap, one[j], other[j])
+
+
+def _by_lapack(matrix, rhs):
+    try:
+        return namespace(matrix, rhs).linalg.solve(matrix, rhs[..., None])[..., 0]
+    except np.linalg.LinAlgError:  # one singular lane: NumPy would answer none
+        return (np.linalg.pinv(matrix) @ rhs[..., None])[..., 0]
