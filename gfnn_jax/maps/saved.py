@@ -217,13 +217,11 @@ def _renamed(text: Any, arrays: Any) -> tuple[Any, Any]:
     """The same tree with today's names for types and fields."""
     if not isinstance(text, dict) or "type" not in text:
         return text, arrays
-    kind: str = text["type"]
-    kind = _FORMER_TYPES.get(kind, kind)
+    kind = _FORMER_TYPES.get(text["type"], text["type"])
     words: dict[str, Any] = {"type": kind}
     numbers: dict[str, Any] = {}
-    for name in {**text, **(arrays or {})}:
-        if name == "type":
-            continue
+    names: list[str] = [n for n in {**text, **(arrays or {})} if n != "type"]
+    for name in names:
         inside = _renamed(text.get(name), (arrays or {}).get(name))
         name_now = _FORMER_FIELDS.get((kind, name), name)
         if name in text:
