@@ -217,7 +217,7 @@ def _renamed(text: Any, arrays: Any) -> tuple[Any, Any]:
     """The same tree with today's names for types and fields."""
     if not isinstance(text, dict) or "type" not in text:
         return text, arrays
-    kind = _FORMER_TYPES.get(text["type"], text["type"])
+    kind: str = _FORMER_TYPES.get(str(text["type"])) or text["type"]
     words: dict[str, Any] = {"type": kind}
     numbers: dict[str, Any] = {}
     names: list[str] = [n for n in {**text, **(arrays or {})} if n != "type"]

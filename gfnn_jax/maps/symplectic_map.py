@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial, wraps
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,7 @@ from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, 
 _TWO_PI_REST = 2.4492935982947064e-16  # what float64 leaves out of 2π
 
 
+@runtime_checkable
 class Piece(Protocol):
     """One symplectic map of a row, batch first: z (B, 2d), by JAX.
 

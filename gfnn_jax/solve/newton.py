@@ -15,7 +15,7 @@ of ``iterate`` from the iterations that ran, which is what an honest symplectici
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +50,7 @@ class Evaluation(NamedTuple):
     aux: Any
 
 
+@runtime_checkable
 class Equation(Protocol):
     """r(shared, lanes, x) = 0 for each lane: a hashable constant, everything else is in its
     arguments. shared: a pytree common to all lanes. lanes: a pytree of (B, ...). x: (B, n)."""
