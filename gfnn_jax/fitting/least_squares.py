@@ -14,12 +14,13 @@ Memory for m parameters: one block of rows and R, whatever the number of pairs.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
-from scipy.linalg import lapack
+from scipy.linalg.lapack import dtpqrt  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.errors import FitError
 
@@ -104,7 +105,7 @@ def _blocks(rows, num_parameters: int) -> Iterator[tuple[np.ndarray, np.ndarray]
 def _folded(factor, block):
     """R of the stacked [R; block]; both are overwritten. Costs 2 rows · m² operations."""
     panel = min(_PANEL, len(factor))
-    upper, _, _, status = lapack.dtpqrt(0, panel, factor, block, overwrite_a=1, overwrite_b=1)
+    upper, _, _, status = dtpqrt(0, panel, factor, block, overwrite_a=1, overwrite_b=1)
     assert status == 0  # an argument of the wrong shape, which it is not
     return upper
 
@@ -137,8 +138,8 @@ def _missed(reduced: Reduced, coefficients) -> float:
     return float(np.hypot(np.linalg.norm(top), np.linalg.norm(reduced.factor[size:, -1])))
 
 
-def _rms(norm: float, rows: int) -> float:
-    return float(norm) / np.sqrt(rows)
+def _rms(norm: Any, rows: int) -> float:
+    return float(norm) / math.sqrt(rows)
 
 
 def solve(train: Reduced, held: Reduced, num_terms: int) -> LeastSquaresFit:
@@ -194,5 +195,5 @@ def fit(
     weight: np.ndarray,
 ) -> LeastSquaresFit:
     """Fit one linear family to (w, target_gradient): ``reduce`` and ``solve`` in one go."""
-    reduced = (reduce(family, [rows], weight) for rows in (train, held))
-    return solve(*reduced, family.num_parameters)
+    factors = [reduce(family, [rows], weight) for rows in (train, held)]
+    return solve(factors[0], factors[1], family.num_parameters)

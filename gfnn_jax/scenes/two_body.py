@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from gfnn_jax.coordinates import polar
+from gfnn_jax.coordinates import polar, whole_turns
 from gfnn_jax.phase_space import Scalar, State, split
 from gfnn_jax.scenes.scene import DrawnFrom, Scene
 
@@ -44,7 +44,7 @@ def kepler_flow(z: State, t) -> State:
     e_cos, e_sin = 1 - r / a, radial / root_a
 
     mean = t / (a * root_a)
-    mean = mean - 2 * jnp.pi * jnp.round(mean / (2 * jnp.pi))
+    mean = mean - whole_turns(mean)
 
     def laguerre(_, x):
         sin, cos = jnp.sin(x), jnp.cos(x)
