@@ -136,22 +136,20 @@ def fit_predictors(
     ]
 
 
-def affordable(fitted: list[Fitted], family, *, spares: bool = False) -> Fitted:
-    """The closest predictor that costs at most half of what the family's own gradient does.
+def affordable(fitted: list[Fitted], family) -> Fitted:
+    """The closest predictor that costs at most half of what the family's own gradient does, or, if
+    none such leaves a single update to do, one that does.
 
-    spares: whether it leaves more than one update to do; then one that does not may cost what it
-    spares, two or three evaluations with a Jacobian, whose operations take about twice as long as
-    those of a polynomial model.
+    That one may cost what it spares: two or three evaluations with a Hessian, whose operations take
+    about twice as long as those of a polynomial model.
     """
     gradient, with_hessian = family.operations
+    cheap = [f for f in fitted if f.predictor.forward.operations <= 0.5 * gradient] or fitted[:1]
     close = [
         f for f in fitted
         if f.error <= CLOSE and f.predictor.forward.operations <= 5 * with_hessian
     ]  # fmt: skip
-    if spares and close:
-        return close[-1]
-    cheap = [f for f in fitted if f.predictor.forward.operations <= 0.5 * gradient]
-    return cheap[-1] if cheap else fitted[0]
+    return close[-1] if close and cheap[-1].error > CLOSE else cheap[-1]
 
 
 def _by_degree(inputs: Inputs, y, target, unit) -> list[tuple[PolynomialModel, float]]:

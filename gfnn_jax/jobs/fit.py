@@ -9,7 +9,7 @@ from gfnn_jax.evaluate import report
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.search import failures_of_arithmetic, scene_named, search
 from gfnn_jax.jobs.written import Ran, already_done, write
-from gfnn_jax.learn.fit import refit
+from gfnn_jax.learn.refit import refit
 from gfnn_jax.storage.outputs import atomic_folder
 from gfnn_jax.storage.partial import unfinished
 

@@ -1,0 +1,119 @@
+"""The chosen candidate made a map: predictors for its solves, and a last look at its own steps."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.generating.charts import AnyChart
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.generating.predictor import affordable, fit_predictors
+from gfnn_jax.learn.candidates import Candidate, Judges, refined_images, with_error
+from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.phase_space import sizes
+from gfnn_jax.solve.status import LEFT_DOMAIN
+
+_PREDICTOR_PAIRS = 4_000
+# States are stepped in blocks of one shape, whatever their number: compiled once for a kind of map.
+_BLOCK = 512
+_REPEATS = 5  # of a timed block; the best counts
+
+
+class Assembled(NamedTuple):
+    """The candidate as its own steps show it, with its map, and the seconds that compiling took."""
+
+    candidate: Candidate
+    compile_seconds: float
+
+
+def assemble(
+    candidate: Candidate, prepared: Prepared, chart: AnyChart, family, params, features,
+    judges: Judges,
+) -> Assembled:  # fmt: skip
+    """The candidate's map, its error and its time per step measured by the steps that users run."""
+    generated = with_predictor(
+        Generated(family, params, chart, prepared.dt, prepared.scale), prepared, judges.training,
+        features,
+    )  # fmt: skip
+    map_ = composed(generated, prepared, judges)
+    steps = stepped(map_, np.asarray(judges.pairs.z0)[judges.held_out])
+    error = judges.error_of(np.where(steps.failed[:, None], np.nan, steps.images), prepared.coordinates)
+    gradient, with_hessian = family.operations
+    more = np.where(steps.iterations > 1, steps.iterations, 0).mean()
+    predictor = generated.predictor.forward.operations
+    candidate = dataclasses.replace(
+        with_error(candidate, error), map=map_,
+        operations=float(with_hessian + gradient + more * with_hessian + predictor),
+        newton_iterations_max=int(steps.iterations.max()),
+        microseconds_per_step=steps.microseconds_per_step,
+    )  # fmt: skip
+    return Assembled(candidate, steps.compile_seconds)
+
+
+def with_predictor(generated: Generated, prepared: Prepared, rows, features=None) -> Generated:
+    """The piece with predictors fitted to its own images of the data's states: where S is coarse,
+    the data are no closer to its roots than S is to the data."""
+    rows = rows[:_PREDICTOR_PAIRS]
+    images, solved = refined_images(
+        prepared, generated.chart, generated.family, generated.params, rows
+    )
+    if solved.sum() < 2:  # nothing to learn from: the data's own images
+        images, solved = prepared.y1[rows], np.ones(len(rows), bool)
+    coordinates = prepared.coordinates
+    fitted = fit_predictors(
+        generated.chart, prepared.y0[rows][solved], images[solved], prepared.dt,
+        angles=coordinates.angles, cyclic=coordinates.cyclic, features=features,
+    )  # fmt: skip
+    chosen = affordable(fitted, generated.family)
+    return dataclasses.replace(generated, predictor=chosen.predictor)
+
+
+def composed(generated: Generated, prepared: Prepared, judges: Judges) -> SymplecticMap:
+    """The piece between the halves of the base map, in the scene's coordinates: leaves of JAX."""
+    half = prepared.half
+    map_ = SymplecticMap(
+        pieces=(generated,) if half is None else (half, generated, half),
+        coordinates=prepared.coordinates,
+        domain=prepared.domain,
+        scale=sizes(judges.pairs.z0),
+        angle_centre=prepared.angle_centre,
+        dt=prepared.dt,
+    )
+    return jax.tree.map(jnp.asarray, map_)
+
+
+class Steps(NamedTuple):
+    """Images (N, 2d) of states, Newton's iterations and whether a step failed (N,), the time of a
+    step in a block, and the seconds that compiling took."""
+
+    images: np.ndarray
+    iterations: np.ndarray
+    failed: np.ndarray
+    microseconds_per_step: float
+    compile_seconds: float
+
+
+def stepped(map_: SymplecticMap, z: np.ndarray, *, timed: bool = True) -> Steps:
+    """One step of the states z (N, 2d), in blocks of one shape; the times are 0 unless ``timed``."""
+    rows = np.resize(np.arange(len(z)), -(-len(z) // _BLOCK) * _BLOCK).reshape(-1, _BLOCK)
+
+    def run(block) -> tuple[Any, float]:
+        started = time.perf_counter()
+        out = jax.block_until_ready(map_.step(z[block]))
+        return jax.tree.map(np.asarray, out), time.perf_counter() - started
+
+    (images, infos), first = run(rows[0])
+    seconds = min(run(rows[0])[1] for _ in range(_REPEATS)) if timed else 0.0
+    blocks = [(images, infos), *(run(block)[0] for block in rows[1:])]
+    images, status, iterations = (
+        np.concatenate(parts)[: len(z)]
+        for parts in zip(*((i, f.status, f.iterations) for i, f in blocks), strict=True)
+    )
+    compiling = first - seconds if timed else 0.0
+    return Steps(images, iterations, status > LEFT_DOMAIN, 1e6 * seconds / _BLOCK, compiling)

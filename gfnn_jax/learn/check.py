@@ -1,0 +1,89 @@
+"""What a fit refuses before any work, each in one line: what was expected and what came."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gfnn_jax.errors import FitError
+from gfnn_jax.generating.charts import CHARTS
+from gfnn_jax.phase_space import Pairs, split
+from gfnn_jax.scenes.scene import AroundOrbit, Scene
+from gfnn_jax.scenes.trajectories import sample_states
+
+FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
+LEARNS = ("auto", "map")
+CHART_NAMES = ("auto", *CHARTS)
+
+_OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; those in other units do
+_COMPARED = 100
+
+
+def check_request(
+    pairs: Pairs, scene: Scene | None, *, tolerance, chart, learn, family, angles
+) -> None:
+    """Raises FitError where the request or the pairs cannot give a map."""
+    for name, value, known in (
+        ("chart", chart, CHART_NAMES), ("family", family, FAMILIES), ("learn", learn, LEARNS)
+    ):  # fmt: skip
+        if value not in known:
+            raise FitError(f"expected a {name} among {', '.join(known)}; got '{value}'")
+    if not tolerance > 0:
+        raise FitError(f"expected a tolerance > 0, got {tolerance}")
+    if not isinstance(pairs, Pairs):
+        raise FitError(f"expected gfnn.Pairs(z0, z1, dt), got {type(pairs).__name__}")
+    if pairs.z0.shape != pairs.z1.shape or pairs.z0.ndim != 2 or pairs.z0.shape[1] % 2:
+        raise FitError(
+            f"expected z0 and z1 of one shape (N, 2d), got {pairs.z0.shape} and {pairs.z1.shape}"
+        )
+    if scene is not None and scene.dim != pairs.dim:
+        raise FitError(f"scene {scene.name} has dim {scene.dim}, the pairs have {pairs.dim}")
+    if scene is not None and angles:
+        raise FitError("angles come with the scene: give a scene or angles, not both")
+    bad = [a for a in angles if not 0 <= a < 2 * pairs.dim]
+    if bad or len(set(angles)) < len(angles):
+        raise FitError(
+            f"expected different angles among 0..{2 * pairs.dim - 1}, got {tuple(angles)}"
+        )
+    if not 0 < float(pairs.dt) < np.inf:
+        raise FitError(f"expected a time step that is finite and above 0, got {pairs.dt}")
+    if family == "features" and (scene is None or scene.features is None):
+        raise FitError("family 'features' needs a scene that declares features")
+    for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):
+        finite = np.isfinite(np.asarray(z)).all(axis=1)
+        if not finite.all():
+            raise FitError(
+                f"expected finite states, got {int((~finite).sum())} rows of {name} with NaN or "
+                f"infinity, the first is row {int(np.argmin(finite))}"
+            )
+    check_number(pairs)
+
+
+def check_number(pairs: Pairs) -> None:
+    """Raises FitError where there are fewer pairs than a local Jacobian needs."""
+    if len(pairs) < 8 * pairs.dim:
+        raise FitError(
+            f"expected at least {8 * pairs.dim} different pairs for d = {pairs.dim}, "
+            f"got {len(pairs)}"
+        )
+
+
+def unlike_the_scene(pairs: Pairs, scene: Scene) -> list[str]:
+    """Warnings where the pairs are of another size than the scene's states: 1/r₁ and the like know
+    where the scene's bodies are, in its units."""
+    import jax  # loaded when first used
+
+    if isinstance(scene.sampling, AroundOrbit):
+        states = np.asarray(scene.sampling.start)[None, :]
+    else:
+        states = np.asarray(sample_states(scene, _COMPARED, jax.random.key(0)))
+    messages = []
+    for name, ours, theirs in zip(
+        ("positions", "momenta"), split(np.asarray(pairs.z0)), split(states), strict=True
+    ):
+        size, usual = (float(np.median(np.linalg.norm(x, axis=1))) for x in (ours, theirs))
+        if usual > 0 and not 1 / _OTHER_SIZE < size / usual < _OTHER_SIZE:
+            messages.append(
+                f"the {name} are {size / usual:.2g} times the size of those in the scene "
+                f"{scene.name}, whose features assume its own units: are the data in these?"
+            )
+    return messages

@@ -1,0 +1,55 @@
+"""Which pairs a fit is trained on, and which are held out to judge it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+_FRACTION, _FEWEST, _MOST = 0.1, 4, 2_000
+
+
+def first_occurrences(pairs) -> np.ndarray:
+    """The rows where a pair stands for the first time: held-out copies of training pairs would
+    judge nothing."""
+    rows = np.concatenate([np.asarray(pairs.z0), np.asarray(pairs.z1)], axis=1)
+    return np.sort(np.unique(rows, axis=0, return_index=True)[1])
+
+
+def split_rows(pairs, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows for training and rows held out, shuffled by the seed.
+
+    Where the image of one pair is the state of the next, both are of one sequence. They share the
+    noise of that state and lie on one orbit, so that a random half would judge the other too
+    kindly: whole sequences are held out then. A sequence longer than all that is to be held out is
+    cut into blocks in time first.
+    """
+    rng, count = np.random.default_rng(seed), len(pairs)
+    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
+    target = max(_FEWEST, int(_FRACTION * count))
+    goes_on = np.all(z1[:-1] == z0[1:], axis=1)  # from each row to the next
+    if not goes_on.any():
+        order, target = rng.permutation(count), min(target, _MOST)
+        return order[target:], order[:target]
+    block = _blocks(goes_on, target)
+    lengths = np.bincount(block)
+    order = rng.permutation(len(lengths))
+    # Blocks in random order until there are rows enough: the last one may bring more.
+    chosen = order[np.cumsum(lengths[order]) - lengths[order] < target]
+    held = np.isin(block, chosen)
+    # Beside a block that was cut out, a training pair would share its outermost state.
+    border = goes_on & (held[1:] != held[:-1])
+    apart = ~held
+    apart[:-1] &= ~border
+    apart[1:] &= ~border
+    held_out = rng.permutation(np.flatnonzero(held))[:_MOST]
+    return rng.permutation(np.flatnonzero(apart)), held_out
+
+
+def _blocks(goes_on: np.ndarray, target: int) -> np.ndarray:
+    """The number of the block that each row is in: a sequence, or, of one longer than ``target``,
+    a quarter of ``target`` consecutive rows."""
+    starts = np.concatenate([[True], ~goes_on])
+    sequence = np.cumsum(starts) - 1
+    place = np.arange(len(starts)) - np.flatnonzero(starts)[sequence]
+    length = np.bincount(sequence)[sequence]
+    cut = (length > target) & (place % max(_FEWEST, target // 4) == 0)
+    return np.cumsum(starts | cut) - 1

@@ -1,0 +1,158 @@
+"""The search: which sizes of which sweeps are tried, in what order, and which one is chosen.
+
+All sweeps are climbed together by rising operations per step, until the next size costs more than
+one that is accurate enough. A sweep is left that no longer gains, or that another keeps beating.
+Only sizes that may be accurate enough, and the few best where none is, are validated by steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.learn.candidates import Candidate
+from gfnn_jax.learn.clock import Clock, OutOfTime
+
+# A size that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
+# the odd degrees), and larger families only fit noise.
+_WORTHWHILE, _STALLED = 0.8, 3
+# So often another sweep may be better before this one is left.
+_BEATEN = 3
+_FINALISTS = 3  # that are validated where none meets the tolerance
+
+
+class Entry(NamedTuple):
+    """A judged or validated candidate and where it came from."""
+
+    candidate: Candidate
+    sweep: Any
+    size: Any
+
+
+class Found(NamedTuple):
+    """entries: every size that was judged. ranking: what may be chosen, the best first: those that
+    meet the tolerance by rising operations, then the others by rising error. stalled: (chart,
+    family) of sweeps in which larger sizes stopped helping. ended: why the search ended."""
+
+    entries: list[Entry]
+    ranking: list[Entry]
+    stalled: set[tuple[str, str]]
+    ended: str
+
+
+def search(
+    sweeps: Sequence[Any],
+    bound: float,
+    clock: Clock,
+    say: Callable[[str], Any],
+    tell: Callable[[Candidate], Any],
+) -> Found:
+    """Climb the sweeps. A sweep has ``sizes`` with ``operations`` by rising order, and
+    ``judge(size, clock, say)`` and ``validate(size, judged, clock, say)``, which give candidates.
+
+    bound: the tolerance on a candidate's ``validation_bound``. tell: called with every candidate.
+    """
+    queue = sorted(
+        ((size.operations, i, n) for i, s in enumerate(sweeps) for n, size in enumerate(s.sizes))
+    )
+    entries: list[Entry] = []
+    best = [np.inf] * len(sweeps)
+    amplification = [1.0] * len(sweeps)  # of the gradient's error in a step, as validated
+    beaten, stalled = [0] * len(sweeps), [0] * len(sweeps)
+    left: set[int] = set()
+    cheapest, ended = np.inf, ""
+    try:
+        for operations, i, n in queue:
+            if i in left or operations >= cheapest:
+                continue
+            clock.check()
+            sweep, size = sweeps[i], sweeps[i].sizes[n]
+            judged = sweep.judge(size, clock, say)
+            candidate = judged
+            if amplification[i] * judged.validation_bound <= bound:
+                candidate = sweep.validate(size, judged, clock, say)
+                if np.isfinite(candidate.validation_relative):
+                    ratio = candidate.validation_relative / judged.validation_relative
+                    amplification[i] = max(1.0, ratio)
+            entries.append(Entry(candidate, sweep, size))
+            tell(candidate)
+            if candidate.validated and candidate.validation_bound <= bound:
+                cheapest = min(cheapest, operations)
+                left.add(i)
+            relative = judged.validation_relative
+            stalled[i] = stalled[i] + 1 if relative > _WORTHWHILE * best[i] else 0
+            best[i] = min(best[i], relative)
+            beaten[i] += any(_beats(e.candidate, judged) for e in entries)
+            if stalled[i] == _STALLED or beaten[i] == _BEATEN:
+                left.add(i)
+    except OutOfTime:
+        ended = f"the budget of {clock.max_seconds:g} s is spent"
+    if not np.isfinite(cheapest):
+        entries = _finalists(entries, clock, say)
+    if np.isfinite(cheapest):
+        ended = "the tolerance is met"
+    elif not ended:
+        ended = _why(sweeps, left, stalled)
+    return Found(entries, _ranking(entries, bound), _stalled_sweeps(entries), ended)
+
+
+def _finalists(entries: list[Entry], clock: Clock, say) -> list[Entry]:
+    """The entries with the few best of them validated: one at least, whatever the time."""
+    best = sorted(
+        (e for e in entries if not e.candidate.validated),
+        key=lambda e: (e.candidate.validation_relative, e.candidate.train_rms),
+    )
+    done: dict[int, Entry] = {}
+    for entry in best[:_FINALISTS]:
+        if done and clock.left <= 0:
+            break
+        free = Clock()  # a step of the held-out pairs is short
+        candidate = entry.sweep.validate(entry.size, entry.candidate, free, say)
+        done[id(entry)] = entry._replace(candidate=candidate)
+    return [done.get(id(e), e) for e in entries]
+
+
+def _ranking(entries: list[Entry], bound: float) -> list[Entry]:
+    validated = [e for e in entries if e.candidate.validated]
+    meeting = [e for e in validated if e.candidate.validation_bound <= bound]
+    others = [e for e in validated if e.candidate.validation_bound > bound]
+    return [
+        *sorted(meeting, key=lambda e: e.candidate.operations),
+        *sorted(others, key=lambda e: (e.candidate.validation_relative, e.candidate.train_rms)),
+    ]
+
+
+def _beats(rival: Candidate, candidate: Candidate) -> bool:
+    """Whether a size of another sweep is better for no more operations: at all for the same
+    functions in another chart, by far for other functions, which may gain faster later."""
+    if (rival.chart, rival.family) == (candidate.chart, candidate.family):
+        return False
+    margin = 1.0 if rival.family == candidate.family else 10.0
+    return (
+        rival.operations <= 1.1 * candidate.operations
+        and margin * rival.validation_relative < candidate.validation_relative
+    )
+
+
+def _stalled_sweeps(entries: list[Entry]) -> set[tuple[str, str]]:
+    """(chart, family) of the sweeps whose last two sizes gained nothing worth while."""
+    found, of_sweep = set(), {}
+    for e in entries:
+        of_sweep.setdefault((e.candidate.chart, e.candidate.family), []).append(
+            e.candidate.validation_relative
+        )
+    for sweep, errors in of_sweep.items():
+        if len(errors) > 2 and min(errors[-2:]) > _WORTHWHILE * min(errors[:-2]):
+            found.add(sweep)
+    return found
+
+
+def _why(sweeps: Sequence[Any], left: set[int], stalled: list[int]) -> str:
+    """Why a search that met nothing ended before its time."""
+    if any(stalled[i] == _STALLED for i in left):
+        return "larger models are no more accurate: noise, or a structure they cannot represent"
+    if any(sweep.sizes for sweep in sweeps):
+        return "the pairs determine no larger model: more pairs would help"
+    return "the pairs determine no model at all"

@@ -1,0 +1,256 @@
+"""Size sweeps: the sizes of one family in one chart, judged from a factor that they share."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from gfnn_jax.families.inputs import box_inputs, variable_signs
+from gfnn_jax.families.mlp import Mlp, amplitude_of
+from gfnn_jax.families.products import Products
+from gfnn_jax.families.sines import Sines
+from gfnn_jax.fitting import least_squares
+from gfnn_jax.fitting.levenberg_marquardt import LMState, levenberg_marquardt
+from gfnn_jax.generating.charts import MIDPOINT, AnyChart
+from gfnn_jax.learn.candidates import Candidate, Judges, validated
+from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.prepare import Prepared
+
+# Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
+# judged from one factor of the rows of its largest.
+_DEGREES = ((2, 3, 4, 5, 6), (7, 8, 9, 10), (12, 14, 16), (18, 20))
+_SINES = (100, 200, 400, 800, 1_600)
+_MOST_TERMS = 1_500
+_ROWS_PER_TERM = 3
+# Rows × terms² of one factor: about ten seconds on two cores.
+_MOST_OPERATIONS = 1.2e11
+# The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
+_MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
+_CHECKPOINT_SECONDS = 10.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Size:
+    """One size of a sweep: what a search needs to know before it is judged."""
+
+    family: Any
+    group: Any  # the largest family that is judged from the same factor
+
+    @property
+    def operations(self) -> float:
+        """Floating-point operations per predicted step: one update, which takes ∇S with its
+        Hessian, and ∇S where it leads."""
+        gradient, with_hessian = self.family.operations
+        return float(gradient + with_hessian)
+
+
+def sweeps_for(request: str, charts: Sequence[AnyChart], prepared, scene, judges) -> Iterator:
+    """The sweeps of the families that apply, chart by chart.
+
+    request: "auto", "polynomial", "features" (the scene's) or "sines"; with "auto" random sines
+    are tried where polynomials have too many terms.
+    """
+    features = scene.features if scene is not None else None
+    for chart in charts:
+        # Only the midpoint S inherits the parity.
+        reversor = scene.reversor if scene is not None and chart == MIDPOINT else None
+        if request in ("auto", "polynomial"):
+            yield LinearSweep(prepared, chart, judges, "polynomial", None, reversor)
+        if request in ("auto", "features") and features is not None:
+            yield LinearSweep(prepared, chart, judges, "features", features, reversor)
+        if request == "sines" or (request == "auto" and prepared.dim > 2):
+            yield LinearSweep(prepared, chart, judges, "sines", None, None)
+
+
+class LinearSweep:
+    """The sizes of one linear family in one chart."""
+
+    def __init__(
+        self, prepared: Prepared, chart: AnyChart, judges: Judges, kind: str, features, reversor
+    ):
+        self.prepared, self.chart, self.judges, self.kind = prepared, chart, judges, kind
+        self._train, self._weight = _rows(prepared, chart, judges.training)
+        self._held, _ = _rows(prepared, chart, judges.held_out)
+        coordinates = prepared.coordinates
+        w = self._train[0]
+        inputs = box_inputs(
+            w, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+            cyclic=coordinates.cyclic, features=features, reversor=reversor,
+        )  # fmt: skip
+        if kind == "sines":
+            groups: Iterable[Iterable[Any]] = ([Sines(inputs, count)] for count in _SINES)
+        else:
+            signs = variable_signs(inputs, reversor, w) if reversor is not None else None
+            groups = ((Products(inputs, degree, signs) for degree in g) for g in _DEGREES)
+        self.sizes = [
+            Size(family, group[-1]) for group in _determined(groups, w.size) for family in group
+        ]
+        self._factors: dict[Any, tuple] = {}
+
+    def judge(self, size: Size, clock: Clock, say: Callable[[str], Any]) -> Candidate:
+        """The size with its error estimated from the held-out residual of the gradient."""
+        started = time.perf_counter()
+        train, held = self._factor(size.group, clock, say)
+        count = size.family.num_parameters
+        (train_rms, held_rms), = least_squares.residuals(train, held, [count])
+        return self._candidate(size, train_rms, held_rms, time.perf_counter() - started)
+
+    def validate(self, size: Size, judged: Candidate, clock: Clock, say) -> Candidate:
+        """The judged size solved, and its error measured by steps."""
+        clock.check()
+        say(f"{judged.chart} {judged.label}: steps of the held-out pairs")
+        started = time.perf_counter()
+        solved, params = self.solve(size, clock, say)
+        candidate = dataclasses.replace(
+            judged, train_rms=solved.train_rms, condition=solved.condition, rank=solved.rank
+        )
+        candidate = validated(
+            candidate, self.prepared, self.chart, size.family, params, self.judges
+        )
+        seconds = judged.fit_seconds + time.perf_counter() - started
+        return dataclasses.replace(candidate, fit_seconds=seconds)
+
+    def solve(self, size: Size, clock: Clock, say) -> tuple[least_squares.LeastSquaresFit, Any]:
+        """The coefficients of this size, and the params of its family."""
+        train, held = self._factor(size.group, clock, say)
+        solved = least_squares.solve(train, held, size.family.num_parameters)
+        return solved, size.family.unflatten(solved.coefficients)
+
+    def _factor(self, group, clock: Clock, say) -> tuple:
+        if group not in self._factors:
+            say(f"{self.chart.name}: {group.num_parameters} terms of {group.label}")
+            # Shuffled rows: the first of them are a sample, where all would take too long.
+            width = self._train[0].shape[1]
+            most = int(_MOST_OPERATIONS / (group.num_parameters**2 * width))
+            train = [tuple(a[: max(most, 1)] for a in self._train)]
+            self._factors[group] = tuple(
+                least_squares.reduce(group, rows, self._weight, on_block=clock.check)
+                for rows in (train, [self._held])
+            )
+        return self._factors[group]
+
+    def _candidate(self, size: Size, train_rms, held_rms, seconds) -> Candidate:
+        error = self.judges.estimate(held_rms)
+        return Candidate(
+            label=size.family.label, family=self.kind, chart=self.chart.name,
+            num_parameters=size.family.num_parameters, operations=size.operations,
+            validation_rms=error.rms, validation_relative=error.relative,
+            validation_bound=error.bound, deviations=error.deviations, train_rms=train_rms,
+            fit_seconds=seconds,
+        )  # fmt: skip
+
+
+class NetworkSweep:
+    """The one size of a network, trained by Levenberg–Marquardt."""
+
+    kind = "mlp"
+
+    def __init__(self, prepared, chart, judges: Judges, max_iterations, seed, checkpoints):
+        self.prepared, self.chart, self.judges = prepared, chart, judges
+        self._max_iterations, self._seed, self._checkpoints = max_iterations, seed, checkpoints
+        (w, target), self._weight = _rows(prepared, chart, judges.training[:_MLP_PAIRS])
+        coordinates = prepared.coordinates
+        inputs = box_inputs(
+            w, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+            cyclic=coordinates.cyclic,
+        )  # fmt: skip
+        family = Mlp(inputs, _MLP_HIDDEN, _MLP_ACTIVATION, amplitude_of(w, target))
+        self._train, self.sizes = (w, target), [Size(family, family)]
+        self._params: Any = None
+
+    def judge(self, size: Size, clock: Clock, say: Callable[[str], Any]) -> Candidate:
+        """Train the network."""
+        family = size.family
+        held, _ = _rows(self.prepared, self.chart, self.judges.held_out)
+
+        def report(state: LMState) -> None:
+            say(
+                f"{self.chart.name} {family.label}: iteration {state.iteration}, "
+                f"validation {state.validation_rms:.2e} of the data's spread"
+            )
+
+        theta = np.zeros(family.num_parameters)
+        like = LMState(theta, theta, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0, 0.0)  # its structure counts
+        resume = self._checkpoints.latest(like) if self._checkpoints else None
+        result = levenberg_marquardt(
+            family, family.init(jax.random.key(self._seed), np.float64), *self._train,
+            validation=held, weight=self._weight, max_iterations=self._max_iterations,
+            max_seconds=clock.left if np.isfinite(clock.left) else None,
+            target_rms=0.5 * self.judges.tolerance.bound,
+            on_progress=report, checkpoint=_every_few_seconds(self._checkpoints),
+            resume=resume[1] if resume else None,
+        )  # fmt: skip
+        self._params = jax.tree.map(np.asarray, result.params)
+        error = self.judges.estimate(result.validation_rms)
+        return Candidate(
+            label=family.label, family=self.kind, chart=self.chart.name,
+            num_parameters=family.num_parameters, operations=size.operations,
+            validation_rms=error.rms, validation_relative=error.relative,
+            validation_bound=error.bound, deviations=error.deviations,
+            train_rms=result.train_rms, fit_seconds=result.seconds,
+        )  # fmt: skip
+
+    def validate(self, size: Size, judged: Candidate, clock: Clock, say) -> Candidate:
+        """The trained network with its error measured by steps."""
+        return validated(
+            judged, self.prepared, self.chart, size.family, self._params, self.judges
+        )
+
+    def solve(self, size: Size, clock: Clock, say) -> tuple[Any, Any]:
+        """The params of the trained network."""
+        return None, self._params
+
+
+def _every_few_seconds(checkpoints) -> Callable | None:
+    """A checkpoint callback that saves when ten seconds have passed since it last did."""
+    if checkpoints is None:
+        return None
+    last = time.monotonic()
+
+    def save(state: LMState) -> None:
+        nonlocal last
+        if time.monotonic() - last > _CHECKPOINT_SECONDS:
+            checkpoints.save(state.iteration, state)
+            last = time.monotonic()
+
+    return save
+
+
+def _rows(prepared: Prepared, chart: AnyChart, rows):
+    """(w, target_gradient) of these rows, and the weight that makes a row of ∇S unit-free."""
+    y0, y1 = prepared.y0[rows], prepared.y1[rows]
+    data = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, prepared.dt)
+    return data, residual_weight(chart, prepared.scale, prepared.dt)
+
+
+def residual_weight(chart: AnyChart, scale, dt: float) -> np.ndarray:
+    """h over the scale of what each entry of ∇S changes, (2d,): ∂S/∂q changes p and conversely; in
+    type 1 both entries are momenta."""
+    dim = len(scale) // 2
+    return dt / (np.tile(scale[dim:], 2) if chart.name == "type1" else np.roll(scale, dim))
+
+
+def _determined(groups: Iterable[Iterable[Any]], rows: int) -> Iterator[list[Any]]:
+    """The families, group by group, whose terms so many rows determine.
+
+    Sizes rise, so the first that is too large is the last that is looked at: in many dimensions the
+    terms of a high degree could not even be counted.
+    """
+    most = min(_MOST_TERMS, rows // _ROWS_PER_TERM)
+    for group in groups:
+        kept = []
+        for family in group:
+            if family.num_parameters > most:
+                break
+            kept.append(family)
+        else:
+            yield kept
+            continue
+        if kept:
+            yield kept
+        return
