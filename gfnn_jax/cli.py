@@ -22,7 +22,7 @@ from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new
 
-# Equal to those of `learn.fit`, which would bring JAX; a test compares them.
+# Those of `learn.check`, which would bring JAX; a test compares them.
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
 FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
 LEARN = ("auto", "map", "hamiltonian")

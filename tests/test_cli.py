@@ -25,7 +25,9 @@ from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.jobs import predict as predict_job
 from gfnn_jax.jobs import progress, search
+from gfnn_jax.learn import check
 from gfnn_jax.learn import fit as learn_fit
+from gfnn_jax.learn.candidates import Tolerance
 from gfnn_jax.maps import saved as models
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -107,8 +109,9 @@ def files(folder):
 
 
 def test_choices_are_those_of_the_fit():
-    assert cli.CHARTS == learn_fit.CHART_NAMES
-    assert cli.FAMILIES == learn_fit.FAMILIES
+    assert cli.CHARTS == check.CHART_NAMES
+    assert cli.FAMILIES == check.FAMILIES
+    assert set(cli.LEARN) == {*check.LEARNS, "hamiltonian"}
 
 
 def test_scenes(capsys):
@@ -432,7 +435,7 @@ def test_a_killed_fit_that_kept_nothing_is_in_nobodys_way(fitted, tmp_path, monk
 
 def test_strict(fitted, tmp_path, capsys, monkeypatch):
     """A missed tolerance: the map is written, and the exit status says so where asked for."""
-    missed = dataclasses.replace(fitted, tolerance=1e-300)
+    missed = dataclasses.replace(fitted, asked=Tolerance(1e-300))
     monkeypatch.setattr(search, "fit", lambda *args, **kwargs: missed)
     fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
     assert gfnn(*fit, "--strict") == 1
@@ -678,9 +681,9 @@ TRAINING = """
 import sys
 from gfnn_jax import cli
 from gfnn_jax.jobs import progress
-from gfnn_jax.learn import candidates
+from gfnn_jax.learn import sweeps
 
-candidates._CHECKPOINT_SECONDS = progress.BETWEEN = 0.0
+sweeps._CHECKPOINT_SECONDS = progress.BETWEEN = 0.0
 sys.exit(cli.main(sys.argv[1:]))
 """
 

@@ -70,6 +70,7 @@ def assemble(
             "validation_bound": chosen.validation_bound,
             "deviations": np.asarray(chosen.deviations).tolist(),
             "tolerance": fit.tolerance,
+            "tolerance_is_relative": fit.asked.relative,
             "tolerance_met": fit.met,
             "ended": fit.ended,
             "messages": list(fit.messages),

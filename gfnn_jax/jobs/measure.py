@@ -6,7 +6,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN
@@ -37,7 +36,7 @@ def measure(rollouts: Rollouts, scene: Scene, reference: np.ndarray) -> Measured
     conserved = scene.hamiltonian if scene.period is None else None
     hamiltonian = scene.invariants.get("energy", conserved)
     if hamiltonian is not None:
-        values = _along(hamiltonian, jnp.asarray(predicted))
+        values = _along(hamiltonian, predicted)
         energy = metrics.energy_error(np.asarray(values))
         drift = metrics.energy_drift(steps, energy)
     # Roundoff grows by other laws than the error of a model: no exponent where it is all there is.

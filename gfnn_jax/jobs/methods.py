@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.baselines import METHODS, Budget
@@ -58,7 +57,7 @@ def _baseline(method: str, data: SharedData, budget: Budget) -> tuple[dict[str, 
     budget.say("rollouts")
     fresh = data.fresh
     defects = symplecticity_defect(
-        np.asarray(_jacobians(learned.step, jnp.asarray(fresh.z0[:_NUM_DEFECTS]))),
+        np.asarray(_jacobians(learned.step, fresh.z0[:_NUM_DEFECTS])),
         sizes(fresh.z0),
     )
     part = {
@@ -69,7 +68,7 @@ def _baseline(method: str, data: SharedData, budget: Budget) -> tuple[dict[str, 
         "data": {"num_pairs": sequences.num_pairs, "sequence_length": chosen.length},
         "fit": {
             **_training(learned.training, budget.cap),
-            "validation_rms": _rms(data, _steps(learned.step, jnp.asarray(fresh.z0))),
+            "validation_rms": _rms(data, _steps(learned.step, fresh.z0)),
         },
         "map": {
             "symplecticity_defect": float(defects.max()),

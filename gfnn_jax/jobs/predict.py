@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from gfnn_jax.data.files import read_initial_states
@@ -86,7 +86,7 @@ def _go_on(
         lanes = map_.start(z0, stop_outside=stop_outside)
         writer.append(z0[:, None], lanes._asdict())
     else:
-        lanes = Lanes(**{name: jnp.asarray(value) for name, value in writer.carry.items()})
+        lanes = Lanes(**{name: jax.device_put(value) for name, value in writer.carry.items()})
     chunk = _chunk_length(z0.shape[0], z0.shape[1], save_every)
     while writer.saved < writer.total:
         progress.say(f"step {(writer.saved - 1) * save_every} of {num_steps}")

@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.maps.rollout import rollout
@@ -36,7 +35,7 @@ def map_rollouts(map_: SymplecticMap, z0, num_steps: int = NUM_STEPS) -> Rollout
 
 def step_rollouts(step: Callable, z0, num_steps: int = NUM_STEPS) -> Rollouts:
     """Rollouts of a plain ``step(z)`` -> Z of one state (2d,) from z0 (B, 2d)."""
-    z0 = jnp.asarray(z0)
+    z0 = np.asarray(z0)
     program = _rolled_out.lower(step, z0, num_steps).compile()
     states, seconds = _timed(program, z0)
     states = np.asarray(states)

@@ -46,9 +46,11 @@ def search(
 
 
 def line(candidate: Candidate) -> str:
-    """A finished candidate in one line: what it is, and its one-step error ÷ spread."""
+    """A finished candidate in one line: what it is, and its one-step error ÷ spread, which is an
+    estimate until steps have validated it."""
+    about = "" if candidate.validated else "about "
     return (
-        f"{candidate.chart} {candidate.label}: one-step error "
+        f"{candidate.chart} {candidate.label}: one-step error {about}"
         f"{candidate.validation_relative:.2e} of the spread, "
         f"{candidate.num_parameters} parameters"
     )

@@ -42,7 +42,7 @@ def separable(scene: Scene) -> bool:
     if scene.hamiltonian is None:
         return True
     z = sample_test_states(scene, 5, jax.random.key(0))
-    return float(_largest_mixed(scene.hamiltonian, jnp.asarray(z))) == 0
+    return float(_largest_mixed(scene.hamiltonian, z)) == 0
 
 
 @jax.jit
