@@ -23,6 +23,7 @@ import scipy.linalg
 from scipy.linalg.lapack import dtpqrt  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.errors import FitError
+from gfnn_jax.threads import one_thread
 
 # Rows that are folded at once stay in the cache: 16 MiB take a quarter longer per row. A block of
 # 1,500 terms takes 50 ms on two cores.
@@ -85,7 +86,8 @@ def reduce(
         gradients = family.term_gradients(w) * weight[:, None]
         block[:, :m] = gradients.reshape(-1, m)
         block[:, m] = (target * weight).ravel()
-        factor = _folded(factor, block)
+        with one_thread():
+            factor = _folded(factor, block)
         seen += len(block)
     if not np.isfinite(factor).all():
         raise FitError("expected finite gradients of all terms and finite targets on the pairs")

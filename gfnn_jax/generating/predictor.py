@@ -24,6 +24,7 @@ from gfnn_jax.families.inputs import Inputs, box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.phase_space import sizes
+from gfnn_jax.threads import one_thread
 
 # A guess this close, in units of the data's spread, is the root of roundoff: one update is left.
 CLOSE = 5e-8
@@ -164,7 +165,8 @@ def _by_degree(inputs: Inputs, y, target, unit) -> list[tuple[PolynomialModel, f
     width = design.shape[1]
     ridge = _RIDGE * np.linalg.norm(design[~held], axis=0)
     rows = np.vstack([design[~held], np.diag(ridge)])
-    q, r = scipy.linalg.qr(rows, mode="economic", check_finite=False)
+    with one_thread():
+        q, r = scipy.linalg.qr(rows, mode="economic", check_finite=False)
     along = q.T @ np.vstack([target[~held], np.zeros((width, target.shape[1]))])
     found, closest = [], np.inf
     for degree in range(1, top + 1):

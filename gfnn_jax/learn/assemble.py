@@ -19,7 +19,7 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.solve.status import LEFT_DOMAIN
 
-_PREDICTOR_PAIRS = 4_000
+_PREDICTOR_PAIRS = 2_000
 # States are stepped in blocks of one shape, whatever their number: compiled once for a kind of map.
 _BLOCK = 512
 _REPEATS = 5  # of a timed block; the best counts

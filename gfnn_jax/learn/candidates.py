@@ -64,7 +64,7 @@ class Candidate:
     newton_iterations_max: int | None = None
     condition: float | None = None
     rank: int | None = None
-    map: Any = None
+    map: Any = dataclasses.field(default=None, repr=False)
     chosen: bool = False
     learns: str = "map"
 

@@ -21,6 +21,10 @@ _WORTHWHILE, _STALLED = 0.8, 3
 # So often another sweep may be better before this one is left.
 _BEATEN = 3
 _FINALISTS = 3  # that are validated where none meets the tolerance
+# The ratio of a step's error to its estimate hardly changes along a sweep: it is measured once an
+# estimate is within the first factor of the tolerance, and from then on sizes are validated whose
+# estimate times the ratio is within the second.
+_CALIBRATED, _HOPEFUL = 1e3, 1.3
 
 
 class Entry(NamedTuple):
@@ -59,7 +63,7 @@ def search(
     )
     entries: list[Entry] = []
     best = [np.inf] * len(sweeps)
-    amplification = [1.0] * len(sweeps)  # of the gradient's error in a step, as validated
+    ratio = [1.0 / _CALIBRATED] * len(sweeps)  # of a step's error to its estimate
     beaten, stalled = [0] * len(sweeps), [0] * len(sweeps)
     left: set[int] = set()
     cheapest, ended = np.inf, ""
@@ -71,11 +75,10 @@ def search(
             sweep, size = sweeps[i], sweeps[i].sizes[n]
             judged = sweep.judge(size, clock, say)
             candidate = judged
-            if amplification[i] * judged.validation_bound <= bound:
+            if ratio[i] * judged.validation_bound <= _HOPEFUL * bound:
                 candidate = sweep.validate(size, judged, clock, say)
-                if np.isfinite(candidate.validation_relative):
-                    ratio = candidate.validation_relative / judged.validation_relative
-                    amplification[i] = max(1.0, ratio)
+                if np.isfinite(candidate.validation_relative) and judged.validation_relative > 0:
+                    ratio[i] = candidate.validation_relative / judged.validation_relative
             entries.append(Entry(candidate, sweep, size))
             tell(candidate)
             if candidate.validated and candidate.validation_bound <= bound:

@@ -23,7 +23,7 @@ from gfnn_jax.learn.prepare import Prepared
 
 # Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
 # judged from one factor of the rows of its largest.
-_DEGREES = ((2, 3, 4, 5, 6), (7, 8, 9, 10), (12, 14, 16), (18, 20))
+_DEGREES = ((2, 3), (4, 5, 6), (7, 8), (9, 10), (12, 14), (16, 18, 20))
 _SINES = (100, 200, 400, 800, 1_600)
 _MOST_TERMS = 1_500
 _ROWS_PER_TERM = 3

@@ -39,6 +39,7 @@ _FLOOR_EPS = 4.0
 # Tuned on CPUs (benchmarks/speed.py); where all lanes of a batch are hard, it costs up to a fifth
 # more than to wait.
 _FEWEST, _PART, _VISIT = 32, 32, 2
+_QUADRATIC = 1e-9  # a residual so small is at roundoff after another update
 
 
 class Evaluation(NamedTuple):
@@ -270,8 +271,10 @@ def refine(equation: Equation, shared: Any, lanes: Any, guess: Any, updates: int
             tried = x - small_solve(matrix, evaluation.residual)
             new = (tried, *equation.linearise(shared, lanes, tried))
             before, after = (np.abs(s[1].residual).max(axis=-1) for s in (state, new))
-            if not (after < before).any():
-                break
-            state = _where(after < before, new, state)
+            better = after < before
+            if better.any():
+                state = _where(better, new, state)
+            if not (better & (before > _QUADRATIC)).any():
+                break  # what was so small is roundoff now
         x, evaluation, _ = state
         return x, evaluation.aux, np.abs(evaluation.residual / evaluation.size).max(axis=-1)
