@@ -1,0 +1,391 @@
+"""Linear in the parameters: products of powers of named variables, as a formula is written.
+
+    f(c, w) = Σ_j c_j Π_k x_k(w)^a_jk
+
+A variable x_k is an expression: a coordinate, cos q1, 1/r of a scene, a term that a user gives. The
+coefficients are those of the formula, in the user's units; a fit scales the columns itself. A
+family of this kind is data alone, text and whole numbers, and is saved as such.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import cache, cached_property, partial
+from itertools import combinations_with_replacement
+from typing import Any
+
+import jax
+import numpy as np
+
+from gfnn_jax.arrays import matmul, namespace
+from gfnn_jax.errors import InputError
+from gfnn_jax.families.expressions import (
+    Expression,
+    call,
+    coordinate,
+    coordinate_names,
+    count_operations,
+    depends_on,
+    jets,
+    parse,
+    to_text,
+    traced,
+)
+
+# So many products with coefficients are written one by one, where XLA fuses them; beyond, a matrix.
+_MOST_WRITTEN_OUT = 400
+
+
+class _Plan:
+    """How the products of powers (N, k) and their derivatives are computed: from a set of products
+    that is closed under division, each one earlier product times a variable."""
+
+    def __init__(self, powers: np.ndarray):
+        self.powers = powers
+        count, variables = powers.shape
+        closed: set[tuple[int, ...]] = {(0,) * variables}
+        ahead = [tuple(row) for row in powers.tolist()]
+        while ahead:
+            row = ahead.pop()
+            if row not in closed:
+                closed.add(row)
+                ahead += [_less(row, k) for k in range(variables) if row[k]]
+        rows = sorted(closed, key=lambda r: (sum(r), r))
+        place = {row: i for i, row in enumerate(rows)}
+        self.size = len(rows)
+        # Of every product but 1: the earlier one, and the variable it is multiplied by.
+        self.parents = [
+            (place[_less(row, k)], k)
+            for row in rows[1:]
+            for k in [next(k for k in range(variables) if row[k])]
+        ]
+        self.places = np.array([place[tuple(row)] for row in powers.tolist()], dtype=int)
+        # Of ∂/∂x_k: (term, product, factor) with ∂_k term = factor · product; ∂²/∂x_k∂x_l likewise.
+        self.slopes = [
+            _columns([(j, place[_less(a, k)], a[k]) for j, a in self._terms() if a[k]])
+            for k in range(variables)
+        ]
+        self.curvatures = {
+            (k, m): _columns(
+                [
+                    (j, place[_less(_less(a, k), m)], a[k] * _less(a, k)[m])
+                    for j, a in self._terms()
+                    if a[k] and _less(a, k)[m]
+                ]
+            )
+            for k in range(variables)
+            for m in range(k, variables)
+        }
+        self.curvatures = {pair: c for pair, c in self.curvatures.items() if len(c[0])}
+
+    def _terms(self):
+        return enumerate(tuple(row) for row in self.powers.tolist())
+
+    def products(self, variables: list, xp) -> list:
+        """Every product, from the variables' values."""
+        found: list[Any] = [xp.ones_like(variables[0])]
+        for parent, k in self.parents:
+            found.append(variables[k] if parent == 0 else found[parent] * variables[k])
+        return found
+
+    def combined(self, params, products: list, columns: list) -> list:
+        """Σ_j c_j · factor_j · product_j for each of the columns (term, product, factor)."""
+        xp = namespace(params, products[-1])
+        sizes = [len(c[0]) for c in columns]
+        if xp is not np and sum(sizes) <= _MOST_WRITTEN_OUT:
+            return [
+                sum((params[j] * f) * products[i] for j, i, f in zip(*c, strict=True))
+                for c in columns
+            ]
+        matrix = xp.zeros((self.size, len(columns)), dtype=params.dtype)
+        for n, (j, i, f) in enumerate(columns):
+            if xp is np:
+                np.add.at(matrix[:, n], i, params[j] * f)
+            else:
+                matrix = matrix.at[i, n].add(params[j] * f.astype(params.dtype))
+        if xp is np:
+            shape = products[0].shape
+            out = matrix.T @ np.stack(products).reshape(self.size, -1)
+            return list(out.reshape(len(columns), *shape))
+        out = matmul(xp.stack(products, axis=-1), matrix)
+        return [out[..., n] for n in range(len(columns))]
+
+
+def _less(row: tuple[int, ...], k: int) -> tuple[int, ...]:
+    return (*row[:k], row[k] - 1, *row[k + 1 :])
+
+
+def _columns(entries: list) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    j, i, f = zip(*entries, strict=True) if entries else ((), (), ())
+    return np.array(j, dtype=int), np.array(i, dtype=int), np.array(f, dtype=float)
+
+
+@cache
+def _plan_of(powers: tuple[tuple[int, ...], ...]) -> _Plan:
+    return _Plan(np.array(powers, dtype=int))
+
+
+@partial(
+    jax.tree_util.register_dataclass, data_fields=(), meta_fields=("dim", "variables", "powers")
+)  # fmt: skip
+@dataclasses.dataclass(frozen=True)
+class Terms:
+    """Products of powers of ``variables``, expressions as text, one row of ``powers`` (N, k) each.
+
+    params: the coefficients (N,).
+    """
+
+    dim: int
+    variables: tuple[str, ...]
+    powers: tuple[tuple[int, ...], ...]
+
+    name = "terms"
+
+    @property
+    def label(self) -> str:
+        return f"{self.name} {self.num_parameters}"
+
+    @property
+    def num_parameters(self) -> int:
+        return len(self.powers)
+
+    @cached_property
+    def _trees(self) -> list[Expression]:
+        return [parse(text, self.dim) for text in self.variables]
+
+    @property
+    def _plan(self) -> _Plan:
+        return _plan_of(self.powers)
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """Each term as it stands in a formula: "q1² q2"."""
+        named = [
+            text if tree.operation not in ("+", "*", "/", "power", "number") else f"({text})"
+            for text, tree in zip(self.variables, self._trees, strict=True)
+        ]
+        names = []
+        for row in self.powers:
+            factors = [
+                (text if alone else name) if a == 1 else f"{name}{_superscript(a)}"
+                for text, name, a in zip(self.variables, named, row, strict=True)
+                if a
+                for alone in [sum(row) == 1]
+            ]
+            names.append(" ".join(factors))
+        return tuple(names)
+
+    @property
+    def operations(self) -> tuple[int, int]:
+        """Floating-point operations of a gradient, and of a gradient with its Hessian."""
+        plan = self._plan
+        variables = sum(count_operations(t) * (1 + 2 * len(depends_on(t))) for t in self._trees)
+        gradient = plan.size + sum(2 * len(c[0]) for c in plan.slopes) + variables
+        more = sum(2 * len(c[0]) for c in plan.curvatures.values()) + 2 * variables
+        return gradient, gradient + more + 4 * self.dim * self.dim
+
+    def take(self, rows: Sequence[int]) -> Terms:
+        """The family of these terms alone, without the variables that are no longer used."""
+        kept = np.array(self.powers, dtype=int).reshape(-1, len(self.variables))[list(rows)]
+        used = np.flatnonzero(kept.any(axis=0)) if len(kept) else np.arange(0)
+        return Terms(
+            self.dim,
+            tuple(self.variables[k] for k in used),
+            tuple(tuple(row) for row in kept[:, used].tolist()),
+        )
+
+    def unflatten(self, coefficients):
+        """The parameters are the coefficients (N,) themselves."""
+        return coefficients
+
+    def __call__(self, params, w, args=None):
+        return self.value(params, w, args)
+
+    def value(self, params, w, args=None):
+        """f, shape (...): params (N,), w (..., 2d)."""
+        variables = self._variables(w, 0)
+        products = self._products(variables, w)
+        places = self._plan.places
+        columns = [(np.arange(len(places)), places, np.ones(len(places)))]
+        return self._plan.combined(params, products, columns)[0]
+
+    def gradient(self, params, w, args=None):
+        """∂f/∂w (..., 2d)."""
+        variables = self._variables(w, 1)
+        products = self._products(variables, w)
+        slopes = self._plan.combined(params, products, self._plan.slopes)
+        return self._stacked(_pulled_back(variables, slopes), w)
+
+    def gradient_and_hessian(self, params, w, args=None):
+        """∂f/∂w (..., 2d) and ∂²f/∂w² (..., 2d, 2d)."""
+        xp, width = namespace(w), w.shape[-1]
+        variables, plan = self._variables(w, 2), self._plan
+        products = self._products(variables, w)
+        pairs = list(plan.curvatures)
+        found = plan.combined(params, products, [*plan.slopes, *(plan.curvatures[p] for p in pairs)])
+        slopes, bends = found[: len(plan.slopes)], found[len(plan.slopes) :]
+        entries: dict[tuple[int, int], Any] = {}
+
+        def add(i, j, term):
+            key = (min(i, j), max(i, j))
+            entries[key] = entries[key] + term if key in entries else term
+
+        for (k, m), bend in zip(pairs, bends, strict=True):
+            for i, a in variables[k].slope.items():
+                for j, b in variables[m].slope.items():
+                    if k != m:
+                        add(i, j, bend * a * b * (2.0 if i == j else 1.0))
+                    elif i <= j:
+                        add(i, j, bend * a * b)
+        for variable, slope in zip(variables, slopes, strict=True):
+            for (i, j), curvature in variable.curvature.items():
+                add(i, j, slope * curvature)
+        zero = xp.zeros_like(w[..., 0])
+        full = [
+            _like(entries.get((min(i, j), max(i, j)), zero), zero, xp)
+            for i in range(width) for j in range(width)
+        ]  # fmt: skip
+        hessian = xp.stack(full, axis=-1).reshape(*w.shape, width)
+        return self._stacked(_pulled_back(variables, slopes), w), hessian
+
+    def term_gradients(self, w, args=None):
+        """∇ of every term at w (..., 2d): (..., 2d, N). NumPy."""
+        variables, plan = self._variables(w, 1), self._plan
+        products = np.stack(self._products(variables, w), axis=-1)
+        out = np.zeros((*w.shape, self.num_parameters))
+        for variable, (j, i, factor) in zip(variables, plan.slopes, strict=True):
+            along = products[..., i] * factor
+            for index, slope in variable.slope.items():
+                unit = isinstance(slope, float)
+                out[..., index, j] += along * (slope if unit else slope[..., None])
+        return out
+
+    def _variables(self, w, order: int) -> list:
+        return jets(self._trees, w, order)
+
+    def _products(self, variables, w) -> list:
+        xp, zero = namespace(w), namespace(w).zeros_like(w[..., 0])
+        return self._plan.products([_like(v.value, zero, xp) for v in variables], xp)
+
+    def _stacked(self, gradient: dict, w):
+        xp, zero = namespace(w), namespace(w).zeros_like(w[..., 0])
+        return xp.stack([_like(gradient.get(i, zero), zero, xp) for i in range(w.shape[-1])], axis=-1)
+
+
+def _like(value, zero, xp):
+    """The value as an array of the lanes' shape."""
+    return value if getattr(value, "shape", None) == zero.shape else zero + value
+
+
+def _pulled_back(variables, slopes) -> dict[int, Any]:
+    """{i: ∂f/∂w_i} from ∂f/∂x_k."""
+    gradient: dict[int, Any] = {}
+    for variable, slope in zip(variables, slopes, strict=True):
+        for i, s in variable.slope.items():
+            term = slope if isinstance(s, float) and s == 1.0 else slope * s
+            gradient[i] = gradient[i] + term if i in gradient else term
+    return gradient
+
+
+_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def _superscript(exponent: int) -> str:
+    return str(exponent).translate(_DIGITS)
+
+
+# Which terms a family has.
+
+
+def given_terms(dim: int, given: Sequence[str | Callable]) -> Terms:
+    """A user's own terms as they are: text, or functions of z (2d,), each of which may be several.
+
+    Raises InputError for a term that is not understood, or that does not depend on the state.
+    """
+    texts: list[str] = []
+    for term in given:
+        trees = [parse(term, dim)] if isinstance(term, str) else traced(term, dim)
+        for tree in trees:
+            text = to_text(tree, dim)
+            if not depends_on(tree):
+                raise InputError(f"the term '{text}' is the same at every state: leave it out")
+            texts.append(text)
+    unique = tuple(dict.fromkeys(texts))
+    count = range(len(unique))
+    return Terms(dim, unique, tuple(tuple(int(k == j) for k in count) for j in count))
+
+
+def polynomial_terms(
+    dim: int,
+    degree: int,
+    *,
+    angles: Sequence[int] = (),
+    cyclic: Sequence[int] = (),
+    features: Callable | None = None,
+    reversor: Sequence[int] | None = None,
+) -> Terms:
+    """Every product of total degree 1 to ``degree`` of the coordinates, or of a scene's features.
+
+    angles: indices of z with period 2π, which enter by their cosines and sines; of sin² there is
+    none, it is 1 − cos². cyclic: indices that do not enter. features: ``features(z)`` -> (k,).
+    reversor: signs (2d,) under which H is even; terms that are odd are left out.
+    """
+    if features is not None:
+        trees = traced(features, dim)
+        sines: set[int] = set()
+    else:
+        trees, sines = [], set()
+        for i in range(2 * dim):
+            if i in cyclic:
+                continue
+            if i in angles and i < dim:
+                sines.add(len(trees) + 1)
+                trees += [call("cos", coordinate(i)), call("sin", coordinate(i))]
+            else:
+                trees.append(coordinate(i))
+    odd = _odd(trees, dim, reversor)
+    rows = tuple(
+        row
+        for row in _rows(len(trees), degree)
+        if all(row[k] < 2 for k in sines) and sum(row[k] for k in odd) % 2 == 0
+    )
+    return Terms(dim, tuple(to_text(tree, dim) for tree in trees), rows)
+
+
+def joined(first: Terms, second: Terms) -> Terms:
+    """The terms of both, those that are written alike once."""
+    variables = tuple(dict.fromkeys((*first.variables, *second.variables)))
+    rows = dict.fromkeys(
+        tuple(
+            row[family.variables.index(v)] if v in family.variables else 0 for v in variables
+        )
+        for family in (first, second)
+        for row in family.powers
+    )  # fmt: skip
+    return Terms(first.dim, variables, tuple(rows))
+
+
+def _rows(variables: int, degree: int) -> list[tuple[int, ...]]:
+    """Exponents of all products of total degree 1 to ``degree``, by rising degree."""
+    rows = []
+    for total in range(1, degree + 1):
+        for chosen in combinations_with_replacement(range(variables), total):
+            rows.append(tuple(chosen.count(k) for k in range(variables)))
+    return rows
+
+
+def _odd(trees: list[Expression], dim: int, reversor) -> list[int]:
+    """The variables that change sign under the reversor; one that is neither even nor odd counts as
+    even, as if there were none."""
+    if reversor is None:
+        return []
+    z = np.random.default_rng(0).uniform(0.2, 1.0, (8, 2 * dim))
+    flipped = z * np.array(reversor, dtype=float)
+    return [
+        k
+        for k, (here, there) in enumerate(
+            zip(jets(trees, z, 0), jets(trees, flipped, 0), strict=True)
+        )
+        if np.allclose(here.value, -there.value, rtol=1e-9, atol=1e-12)
+    ]

@@ -1,0 +1,321 @@
+"""Fit of a Hamiltonian through its flow: minimise ‖Φ_h(z₀; c) − z₁‖² over H = Σ c_j φ_j.
+
+Φ_h is Gauss collocation in NumPy, its derivative in c exact, so that a fit needs neither derivative
+data nor small steps. Gauss–Newton steps with a trust region (Levenberg–Marquardt) from the better
+of two linear starts; pairs that the present H already explains come first, the others follow.
+
+The rows of a Gauss–Newton problem are folded, block by block, into one triangular factor: of its
+singular values come every damping at once, the condition number and the standard errors.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from gfnn_jax.flows.collocation import Steps, images
+from gfnn_jax.phase_space import apply_j, symplectic_form
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Tuned on Hénon–Heiles at dt 0.5 to 3 and on three bodies at dt 0.1 and 0.5.
+
+    fractions: of the pairs, those that the present H explains best, in the rounds of a fit.
+    early, most: Gauss–Newton steps of the early rounds and of the last.
+    rows_per_term: rows that a round has for each term, at least.
+    dampings: tried in turn, in units of the largest singular value.
+    gained: a step that lowers the residual by less has converged.
+    null: of a term's size; one that is closer to the span of those before it is not known apart.
+    block_bytes: of the arrays that a block of pairs takes.
+    reach: h‖H''‖ of one substep.
+    """
+
+    fractions: tuple[float, ...] = (0.1, 0.3, 0.6, 0.9, 1.0)
+    early: int = 3
+    most: int = 40
+    rows_per_term: float = 1.5
+    dampings: tuple[float, ...] = (0.0, 1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+    gained: float = 1e-3
+    null: float = 1e-10
+    block_bytes: int = 32 * 2**20
+    reach: float = 1.0
+
+
+OPTIONS = Options()
+_ROUNDOFF = 2e-16  # of the coordinates' sizes: the residual's floor
+
+
+class FlowFit(NamedTuple):
+    """Coefficients (terms,) and how well the pairs determine them.
+
+    rms: per component of (Φ(z₀) − z₁) ÷ scale on the pairs that were used. standard_errors:
+    (terms,), from the Gauss–Newton factor. factor: R of [∂r/∂c, r] (m + 1, m + 1), and ``rows``, for
+    which it stands. condition: of the scaled columns. used: (N,) the pairs in the loss.
+    iterations: Gauss–Newton steps taken.
+    """
+
+    coefficients: np.ndarray
+    rms: float
+    standard_errors: np.ndarray
+    factor: np.ndarray
+    rows: int
+    condition: float
+    used: np.ndarray
+    iterations: int
+
+
+# Where a fit starts.
+
+
+def null_terms(family, z, tolerance: float = OPTIONS.null) -> tuple[list[int], list[int]]:
+    """(kept, null): the terms that states z (N, 2d) tell apart, and those whose gradient is a
+    combination of those before them."""
+    gradients = family.term_gradients(z)
+    columns = gradients.reshape(-1, gradients.shape[-1])
+    size = np.linalg.norm(columns, axis=0)
+    scaled = columns / np.where(size > 0, size, 1.0)
+    kept: list[int] = []
+    basis = np.zeros((len(scaled), 0))
+    for j in range(scaled.shape[1]):
+        rest = scaled[:, j]
+        for _ in range(2):  # the second time makes it orthogonal to roundoff
+            rest = rest - basis @ (basis.T @ rest)
+        distance = np.linalg.norm(rest)
+        if np.isfinite(distance) and distance > tolerance and basis.shape[1] < len(scaled):
+            kept.append(j)
+            basis = np.column_stack([basis, rest / distance])
+    return kept, sorted(set(range(scaled.shape[1])) - set(kept))
+
+
+def midpoint_start(family, z0, z1, dt: float, scale) -> np.ndarray:
+    """The linear problem (z₁ − z₀)/h = J∇H(½(z₀ + z₁)): exact to O(h²)."""
+    return fitted_gradients(family, 0.5 * (z0 + z1), -apply_j(z1 - z0) / dt, scale)
+
+
+def log_start(family, z0, z1, dt: float, scale) -> np.ndarray | None:
+    """The quadratic H whose flow is the pairs' affine regression: its logarithm over h. None where
+    it has no real one."""
+    width = z0.shape[1]
+    centre = z0.mean(axis=0)
+    design = np.column_stack([np.ones(len(z0)), (z0 - centre) / scale])
+    solution = np.linalg.lstsq(design, (z1 - z0) / scale, rcond=None)[0]
+    augmented = np.eye(width + 1)
+    augmented[:width, :width] += solution[1:].T
+    augmented[:width, width] = solution[0]
+    logarithm = scipy.linalg.logm(augmented)
+    if not np.abs(np.imag(logarithm)).max() <= 1e-6 * (1 + np.abs(logarithm).max()):
+        return None
+    generator = np.real(logarithm) / dt
+    unit = scale[:, None] / scale[None, :]
+    field = scale * generator[:width, width] + (z0 - centre) @ (generator[:width, :width] * unit).T
+    matrix = -symplectic_form(width // 2) @ (generator[:width, :width] * unit)
+    offset = -apply_j(scale * generator[:width, width])
+    gradient = (z0 - centre) @ (0.5 * (matrix + matrix.T)) + offset
+    del field
+    return fitted_gradients(family, z0, gradient, scale)
+
+
+def fitted_gradients(family, z, gradient, scale) -> np.ndarray:
+    """Coefficients whose ∇H is closest to gradients (N, 2d) at states z, each in the unit of what
+    it changes."""
+    dim = z.shape[1] // 2
+    weight = 1.0 / np.roll(scale, dim)
+    terms = family.term_gradients(z) * weight[:, None]
+    rows = terms.reshape(-1, terms.shape[-1])
+    size = np.linalg.norm(rows, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    return np.linalg.lstsq(rows / size, (gradient * weight).ravel(), rcond=1e-12)[0] / size
+
+
+def substeps_for(family, coefficients, z, dt: float, reach: float = OPTIONS.reach) -> int:
+    """Substeps so that h‖H''‖ is within reach for nearly all of the states z (N, 2d)."""
+    _, hessian = family.gradient_and_hessian(coefficients, z)
+    finite = np.isfinite(hessian).all(axis=(1, 2))
+    if not finite.any():
+        return 1
+    rates = frequencies(hessian[finite])
+    return int(np.clip(np.ceil(dt * np.quantile(rates, 0.95) / reach), 1, 64))
+
+
+def frequencies(hessian) -> np.ndarray:
+    """The largest |eigenvalue| of JH'' (N,): the fastest rate of the linearised flow."""
+    turned = symplectic_form(hessian.shape[-1] // 2) @ hessian
+    return np.abs(np.linalg.eigvals(turned)).max(axis=-1)
+
+
+# The fit.
+
+
+class Problem:
+    """Pairs z0 -> z1 (N, 2d) a time dt apart, and how the flow between them is computed.
+
+    scale: (2d,) sizes of the coordinates, by which residuals are divided.
+    check: called between blocks; it may raise to stop.
+    """
+
+    def __init__(
+        self, z0, z1, dt: float, scale, *, options: Options = OPTIONS,
+        check: Callable[[], Any] = lambda: None,
+    ):  # fmt: skip
+        self.z0, self.z1, self.dt, self.scale = z0, z1, dt, scale
+        self.options, self.check = options, check
+
+    def residuals(self, family, coefficients, steps: Steps, rows) -> np.ndarray:
+        """(Φ(z₀) − z₁) ÷ scale of these rows (n, 2d); not finite where the flow fails."""
+        parts = [
+            (images(family, coefficients, self.z0[b], self.dt, steps).states - self.z1[b])
+            / self.scale
+            for b in self._blocks(rows, 0)
+        ]
+        return np.concatenate(parts) if parts else np.zeros((0, self.z0.shape[1]))
+
+    def factor(self, family, coefficients, steps: Steps, rows) -> tuple[np.ndarray, int]:
+        """R (m + 1, m + 1) of [∂r/∂c, r] over these rows, and the number of rows of the matrix."""
+        count = family.num_parameters
+        factor, seen = np.zeros((0, count + 1)), 0
+        for block in self._blocks(rows, count * steps.stages):
+            found = images(
+                family, coefficients, self.z0[block], self.dt, steps, derivatives=True
+            )
+            residual = (found.states - self.z1[block]) / self.scale
+            slope = found.by_coefficient / self.scale[:, None]
+            good = np.isfinite(residual).all(axis=1) & np.isfinite(slope).all(axis=(1, 2))
+            matrix = np.concatenate([slope[good], residual[good][..., None]], axis=-1)
+            stacked = np.concatenate([factor, matrix.reshape(-1, count + 1)])
+            factor = np.linalg.qr(stacked, mode="r")
+            seen += matrix.shape[0] * matrix.shape[1]
+        short = count + 1 - len(factor)
+        return np.concatenate([factor, np.zeros((max(short, 0), count + 1))]), seen
+
+    def _blocks(self, rows, columns: int):
+        width = self.z0.shape[1]
+        pair = 8 * width * (columns + 40 * width)
+        size = max(16, self.options.block_bytes // pair)
+        for first in range(0, len(rows), size):
+            self.check()
+            yield rows[first : first + size]
+
+    def fit(
+        self, family, start, steps: Steps, rows=None, *, rounds: bool = True,
+        say: Callable[[str], Any] = lambda message: None,
+    ) -> FlowFit:  # fmt: skip
+        """Levenberg–Marquardt from ``start`` (terms,) over these rows.
+
+        rounds: quiet pairs first; else all at once, from a start that is known to be close.
+        """
+        options = self.options
+        rows = np.arange(len(self.z0)) if rows is None else np.asarray(rows)
+        c, iterations = np.array(start, dtype=float), 0
+        least = int(np.ceil(options.rows_per_term * family.num_parameters / self.z0.shape[1]))
+        fractions = options.fractions if rounds else (1.0,)
+        used = rows
+        for fraction in fractions:
+            count = int(np.ceil(fraction * len(rows)))
+            if fraction < 1 and count < least:
+                continue
+            size = np.linalg.norm(self.residuals(family, c, steps, rows), axis=1)
+            size = np.where(np.isfinite(size), size, np.inf)
+            order = np.argsort(size, kind="stable")
+            used = rows[order[:count]]
+            used = used[np.isfinite(size[order[:count]])]
+            if len(used) < min(least, len(rows)):
+                break
+            most = options.most if fraction == 1.0 else options.early
+            c, made = self._descend(family, c, steps, used, most)
+            iterations += made
+            say(f"H: {family.num_parameters} terms, {len(used)} of {len(rows)} pairs")
+        factor, seen = self.factor(family, c, steps, used)
+        return _summary(c, factor, seen, used, iterations)
+
+    def _descend(self, family, c, steps: Steps, rows, most: int):
+        """Gauss–Newton steps until nothing is gained: (coefficients, steps taken)."""
+        cost = self._cost(family, c, steps, rows)
+        floor = _ROUNDOFF * np.sqrt(rows.size * self.z0.shape[1])
+        first_damping, made = 0, 0
+        while made < most and cost > floor:
+            factor, _ = self.factor(family, c, steps, rows)
+            found = None
+            for n in range(first_damping, len(self.options.dampings)):
+                step = _damped_step(factor, self.options.dampings[n])
+                tried = self._cost(family, c - step, steps, rows)
+                if tried < cost:
+                    found = n
+                    break
+            if found is None:
+                break
+            made += 1
+            gained = 1 - tried / cost
+            c, cost = c - step, tried
+            first_damping = max(0, found - 2)
+            if gained < self.options.gained:
+                break
+        return c, made
+
+    def _cost(self, family, c, steps, rows) -> float:
+        """‖r‖, infinite where a flow fails."""
+        if not np.isfinite(c).all():
+            return np.inf
+        norm = float(np.linalg.norm(self.residuals(family, c, steps, rows)))
+        return norm if np.isfinite(norm) else np.inf
+
+
+def _scaled(factor):
+    count = factor.shape[1] - 1
+    a, b = factor[:, :count], factor[:, count]
+    size = np.linalg.norm(a, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    u, s, vt = np.linalg.svd(a / size, full_matrices=False)
+    return size, s, vt, u.T @ b
+
+
+def _damped_step(factor, damping: float) -> np.ndarray:
+    """δ that minimises ‖R δ − r‖² + (damping s₀)² ‖size δ‖²; c − δ is the next iterate."""
+    size, s, vt, along = _scaled(factor)
+    cutoff = np.finfo(float).eps * max(factor.shape) * s[0]
+    known = s > cutoff
+    filters = np.where(known, s, 0.0) / np.where(known, s**2 + (damping * s[0]) ** 2, 1.0)
+    return vt.T @ (filters * along) / size
+
+
+def _summary(c, factor, seen: int, used, iterations: int) -> FlowFit:
+    count = len(c)
+    size, s, vt, _ = _scaled(factor)
+    rms = float(np.linalg.norm(factor[:, count])) / np.sqrt(max(seen, 1))
+    left = float(np.linalg.norm(factor[:, count])) / np.sqrt(max(seen - count, 1))
+    inverse = np.where(s > 0, 1.0 / np.where(s > 0, s, 1.0), 0.0)
+    errors = max(left, _ROUNDOFF) * np.linalg.norm(vt.T * inverse, axis=1) / size
+    condition = float(s[0] / s[-1]) if s[-1] > 0 else float("inf")
+    return FlowFit(c, rms, errors, factor, seen, condition, used, iterations)
+
+
+# Fewer terms.
+
+
+def significant_terms(fit: FlowFit, threshold: float) -> np.ndarray:
+    """The terms that are left when those below ``threshold`` standard errors go, the others solved
+    for again (in the linearised problem), until none is below."""
+    count = len(fit.coefficients)
+    kept = np.arange(count)
+    a, r = fit.factor[:, :count], fit.factor[:, count]
+    target = a @ fit.coefficients - r  # the linearised problem: min ‖a c − target‖
+    noise = max(fit.rms, _ROUNDOFF) * np.sqrt(fit.rows / max(fit.rows - count, 1))
+    while kept.size:
+        part = np.concatenate([a[:, kept], target[:, None]], axis=1)
+        size, s, vt, along = _scaled(part)
+        inverse = np.where(s > np.finfo(float).eps * s[0], 1 / np.where(s > 0, s, 1.0), 0.0)
+        c = vt.T @ (inverse * along) / size
+        errors = noise * np.linalg.norm(vt.T * inverse, axis=1) / size
+        ratio = np.abs(c) / errors
+        weak = ratio < threshold
+        if not weak.any():
+            break
+        # Half of the weak ones at a time, the weakest first: they lend each other their weight.
+        order = np.argsort(ratio)
+        gone = order[: max(1, (weak.sum() + 1) // 2)]
+        kept = np.delete(kept, gone)
+    return kept

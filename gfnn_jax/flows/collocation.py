@@ -1,0 +1,191 @@
+"""One step of Gauss collocation for a batch of states in NumPy: what fits through a flow run.
+
+Stage by stage, K_i = J∇H(z + h Σ_j a_ij K_j), then Z = z + h Σ_i b_i K_i. Arrays of stages have
+shape (s, B, 2d): a sum over stages is then one matrix product.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.flows.gauss import gauss
+from gfnn_jax.phase_space import apply_j, symplectic_form
+
+_EPS = float(np.finfo(np.float64).eps)
+_FLOOR = 4 * _EPS  # of a state's size: a change of the stages that small is roundoff
+_SETTLED = 1e-12  # of it: what no longer shrinks below this is roundoff too
+_MOST, _SLOW = 40, 0.6  # iterations; a lane that contracts by less is given to Newton's method
+_MOST_NEWTON = 12
+
+
+@dataclasses.dataclass(frozen=True)
+class Steps:
+    """How a flow over dt is computed: ``substeps`` of collocation with ``stages`` stages each."""
+
+    stages: int
+    substeps: int
+
+    @property
+    def order(self) -> int:
+        return 2 * self.stages
+
+
+class Images(NamedTuple):
+    """Z (B, 2d); whether the stages were solved (B,); and, where asked for, ∂Z/∂z (B, 2d, 2d) and
+    ∂Z/∂c (B, 2d, terms)."""
+
+    states: np.ndarray
+    solved: np.ndarray
+    by_state: Any = None
+    by_coefficient: Any = None
+
+
+def images(family, params, z, dt: float, steps: Steps, *, args=None, derivatives: bool = False):
+    """Images of the states z (B, 2d) after dt, in NumPy. Lanes that fail are not finite.
+
+    derivatives: the exact ones of the collocation, in the state and in the coefficients of a
+    linear family.
+    """
+    rule, h = gauss(steps.stages), dt / steps.substeps
+    width = z.shape[1]
+    solved = np.ones(len(z), bool)
+    by_state: Any = np.broadcast_to(np.eye(width), (len(z), width, width))
+    by_coefficient: Any = 0.0
+    with np.errstate(all="ignore"):
+        for _ in range(steps.substeps):
+            slopes, done = solve_stages(family, params, z, h, rule, args)
+            solved = solved & done
+            if derivatives:
+                inside = z + h * _summed(rule.matrix, slopes)
+                by_z, by_c = _derivatives(family, params, inside, h, rule, args)
+                by_state = by_z @ by_state
+                by_coefficient = by_z @ by_coefficient + by_c if np.ndim(by_coefficient) else by_c
+            z = z + h * _summed(rule.weights[None, :], slopes)[0]
+    z = np.where(solved[:, None], z, np.nan)
+    return Images(z, solved, *((by_state, by_coefficient) if derivatives else ()))
+
+
+def _summed(matrix, slopes):
+    """Σ_j matrix_ij slopes_j for slopes (s, B, 2d)."""
+    return (matrix @ slopes.reshape(len(slopes), -1)).reshape(-1, *slopes.shape[1:])
+
+
+def solve_stages(family, params, z, h: float, rule, args=None):
+    """The slopes K (s, B, 2d) at states z (B, 2d), and which lanes were solved to roundoff (B,).
+
+    By fixed point; lanes in which that hardly contracts by Newton's method.
+    """
+    size = np.abs(z) + np.abs(z).mean(axis=1, keepdims=True)  # of each coordinate's lane
+    slopes = np.repeat(apply_j(family.gradient(params, z, args))[None], len(rule.weights), axis=0)
+    change = np.full(len(z), np.inf)
+    open_, slow = np.ones(len(z), bool), np.zeros(len(z), bool)
+    for _ in range(_MOST):
+        lanes = np.flatnonzero(open_)
+        inside = z[lanes] + h * _summed(rule.matrix, slopes[:, lanes])
+        new = apply_j(family.gradient(params, inside, args))
+        moved = h * np.abs(new - slopes[:, lanes])
+        slopes[:, lanes] = new
+        relative = np.max(moved / (size[lanes] + h * np.abs(new)), axis=(0, 2))
+        ratio = relative / change[lanes]
+        closed = (relative <= _FLOOR) | ((relative <= _SETTLED) & (ratio > 0.5))
+        given_up = ~closed & ~(ratio < _SLOW) & np.isfinite(change[lanes])
+        change[lanes] = relative
+        slow[lanes[given_up]] = True
+        open_[lanes[closed | given_up]] = False
+        if not open_.any():
+            break
+    left = np.flatnonzero(open_ | slow)
+    solved = ~(open_ | slow)
+    if left.size:
+        slopes[:, left], solved[left] = _newton(family, params, z[left], h, rule, args)
+    return slopes, solved
+
+
+def _newton(family, params, z, h, rule, args):
+    """Newton's method on the stages from constant slopes, each step halved until the residual is
+    smaller."""
+    count, (lanes, width) = len(rule.weights), z.shape
+    slopes = np.repeat(apply_j(family.gradient(params, z, args))[None], count, axis=0)
+
+    def residual(slopes):
+        inside = z + h * _summed(rule.matrix, slopes)
+        gradient, hessian = family.gradient_and_hessian(params, inside, args)
+        return slopes - apply_j(gradient), hessian
+
+    error, hessian = residual(slopes)
+    norm = _largest(error)
+    factor, step = np.ones(lanes), np.zeros_like(slopes)
+    fresh = np.ones(lanes, bool)
+    for _ in range(3 * _MOST_NEWTON):
+        if fresh.any():
+            matrix = stage_matrix(hessian[:, fresh], h, rule)
+            flat = error[:, fresh].transpose(1, 0, 2).reshape(fresh.sum(), -1)
+            step[:, fresh] = (
+                solve(matrix, flat[..., None])[..., 0].reshape(-1, count, width).transpose(1, 0, 2)
+            )
+        tried = slopes - factor[:, None] * step
+        new_error, new_hessian = residual(tried)
+        new_norm = _largest(new_error)
+        better = new_norm < norm
+        slopes = np.where(better[:, None], tried, slopes)
+        error = np.where(better[:, None], new_error, error)
+        hessian = np.where(better[:, None, None], new_hessian, hessian)
+        fresh = better & (new_norm > 0)
+        floor = _SETTLED * _largest(slopes)
+        at_floor = np.where(better, new_norm, norm) <= floor
+        factor = np.where(better, 1.0, 0.5 * factor)
+        done = (at_floor & ~(better & (new_norm < 0.5 * norm))) | (factor < 1e-3)
+        norm = np.where(better, new_norm, norm)
+        if (done | (norm == 0)).all():
+            break
+    return slopes, norm <= _SETTLED * np.maximum(_largest(slopes), 1e-300)
+
+
+def _largest(slopes):
+    largest = np.abs(slopes).max(axis=(0, 2))
+    return np.where(np.isfinite(largest), largest, np.inf)
+
+
+def stage_matrix(hessian, h: float, rule):
+    """I − h A ⊗ JH'' (B, s·2d, s·2d) from the stages' Hessians (s, B, 2d, 2d): what a change of the
+    slopes K is multiplied by in their equation."""
+    count, lanes, width = hessian.shape[:3]
+    turned = symplectic_form(width // 2) @ hessian
+    coupled = np.einsum("ij,ibkl->bikjl", -h * rule.matrix, turned, optimize=False)
+    coupled = coupled.reshape(lanes, count * width, count * width)
+    coupled[:, np.arange(count * width), np.arange(count * width)] += 1.0
+    return coupled
+
+
+def solve(matrix, rhs):
+    """Batched solve; lanes that are not finite or singular give NaN."""
+    good = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(rhs).all(axis=(1, 2))
+    out = np.full_like(rhs, np.nan)
+    try:
+        out[good] = np.linalg.solve(matrix[good], rhs[good])
+    except np.linalg.LinAlgError:
+        out[good] = np.linalg.pinv(matrix[good]) @ rhs[good]
+    return out
+
+
+def _derivatives(family, params, inside, h, rule, args):
+    """∂Z/∂z (B, 2d, 2d) and ∂Z/∂c (B, 2d, terms) of one step, its stage states (s, B, 2d).
+
+    N dK = JH'' dz + J∇φ dc with N the stage matrix, and dZ = dz + h Σ b_i dK_i: the rows h bᵀ N⁻¹
+    are solved for once, whatever the number of terms.
+    """
+    count, lanes, width = inside.shape
+    form = symplectic_form(width // 2)
+    _, hessian = family.gradient_and_hessian(params, inside, args)
+    transposed = stage_matrix(hessian, h, rule).swapaxes(1, 2)
+    weights = np.kron(h * rule.weights[:, None], np.eye(width))
+    adjoint = solve(transposed, np.broadcast_to(weights, (lanes, *weights.shape)))
+    rows = adjoint.reshape(lanes, count, width, width).transpose(0, 3, 1, 2) @ form  # (B, 2d, s, 2d)
+    rows = rows.reshape(lanes, width, count * width)
+    bent = hessian.transpose(1, 0, 2, 3).reshape(lanes, count * width, width)
+    by_state = np.eye(width) + rows @ bent
+    terms = family.term_gradients(inside, args).transpose(1, 0, 2, 3)
+    return by_state, rows @ terms.reshape(lanes, count * width, -1)
