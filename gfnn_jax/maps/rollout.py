@@ -40,7 +40,8 @@ def rollout(step: Callable, z0, num_steps: int, *, save_every: int = 1):
     z0: (B, 2d), NumPy or JAX. Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first.
     Compiled once for each ``step``: pass the same function again, not a new lambda.
     """
-    return _rollout(step, np.asarray(z0), num_steps // save_every, save_every)
+    z0 = z0 if isinstance(z0, jax.Array) else np.asarray(z0)
+    return _rollout(step, z0, num_steps // save_every, save_every)
 
 
 @partial(jax.jit, static_argnums=(0, 2, 3))
