@@ -35,7 +35,7 @@ class ImplicitStep:
     chart: AnyChart
 
     def evaluate(self, shared, lanes, x) -> Evaluation:
-        """The residual; aux is (w, ∇S(w)), each (B, 2d)."""
+        """The residual; aux is ∇S(w), (B, 2d)."""
         (family, params, dt, scale), (z, known, args) = shared, lanes
         w = self.chart.complete(known, x)
         gradient = family.gradient(params, w, args)
@@ -54,7 +54,7 @@ class ImplicitStep:
         if namespace(z) is jnp:
             unit, size = jax.lax.stop_gradient((unit, size))
         residual = self.chart.residual(z, w, gradient, dt)
-        return Evaluation(residual / unit, size / unit, (w, gradient)), unit
+        return Evaluation(residual / unit, size / unit, gradient), unit
 
 
 @partial(
@@ -96,14 +96,14 @@ class Generated:
         shared = (self.family, self.params, self.dt, self.scale)
         equation, lanes = ImplicitStep(self.chart), (z, known, args)
         if unrolled:
-            _, (w, gradient), info = newton.iterate(
+            x, gradient, info = newton.iterate(
                 equation, shared, lanes, guess, most=_MOST_NEWTON, gather=False
             )
         else:
-            _, (w, gradient), info = newton.root(
+            x, gradient, info = newton.root(
                 equation, shared, lanes, jax.lax.stop_gradient(guess), _MOST_NEWTON
             )
-        return w, gradient, info
+        return self.chart.complete(known, x), gradient, info
 
     def step(self, z, args=None, *, unrolled: bool = False):
         """(Z, Info) of the states z (B, 2d), by JAX."""
@@ -125,10 +125,11 @@ class Generated:
         dim = z.shape[1] // 2
         shared = (self.family, self.params, self.dt, self.scale)
         x = guess[:, self.chart.free(dim)]
-        _, (w, gradient), error = newton.refine(
-            ImplicitStep(self.chart), shared, (z, self.chart.first_guess(z), args), x
+        known = self.chart.first_guess(z)
+        x, gradient, error = newton.refine(
+            ImplicitStep(self.chart), shared, (z, known, args), x
         )
-        return self.chart.image(z, w, gradient, self.dt), error
+        return self.chart.image(z, self.chart.complete(known, x), gradient, self.dt), error
 
     def inverse(self) -> Generated:
         """The inverse map: the same S, the chart read from its other side."""

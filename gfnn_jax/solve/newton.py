@@ -14,6 +14,7 @@ of ``iterate`` from the iterations that ran, which is what an honest symplectici
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -203,33 +204,51 @@ def _where(chosen, one, other):
 
 def _gathered(newton, shared, lanes, state: _Iterate, few: int) -> _Iterate:
     """Newton's method on the open lanes alone, ``few`` at a time: the others need not wait."""
-
     count = state.open.shape[0]
     lane = jnp.arange(count)
+    given, lanes_of = _packed(lanes, state.x.dtype)
+    packed, state_of = _packed(state, state.x.dtype)
 
-    def visit(state):
+    def goes_on(carry):
+        return jnp.any(carry[0].open) & (carry[1] < _VISIT)
+
+    def visit(packed):
         # The first open lanes, by a partial sort of their numbers: compiled in no time.
-        first = jnp.where(state.open, count - lane, 0).astype(jnp.float32)
+        first = jnp.where(state_of(packed).open, count - lane, 0).astype(jnp.float32)
         _, chosen = jax.lax.top_k(first, few)
 
-        def gather(a):
-            return a.at[chosen].get(mode="promise_in_bounds", unique_indices=True)
+        def gather(rows):
+            return rows.at[chosen].get(mode="promise_in_bounds", unique_indices=True)
 
-        own, part = jax.tree.map(gather, (lanes, state))
-
-        def goes_on(carry):
-            return jnp.any(carry[0].open) & (carry[1] < _VISIT)
-
+        own = lanes_of(gather(given))
         part, _ = jax.lax.while_loop(
-            goes_on, lambda c: (newton(shared, own, c[0]), c[1] + 1), (part, 0)
+            goes_on,
+            lambda carry: (newton(shared, own, carry[0]), carry[1] + 1),
+            (state_of(gather(packed)), 0),
         )
         # Where fewer than ``few`` are open, lanes that are closed come along unchanged.
-        return jax.tree.map(
-            lambda a, b: a.at[chosen].set(b, mode="promise_in_bounds", unique_indices=True),
-            state, part,
-        )  # fmt: skip
+        rows, _ = _packed(part, packed.dtype)
+        return packed.at[chosen].set(rows, mode="promise_in_bounds", unique_indices=True)
 
-    return jax.lax.while_loop(lambda s: jnp.any(s.open), visit, state)
+    packed = jax.lax.while_loop(lambda p: jnp.any(state_of(p).open), visit, packed)
+    return state_of(packed)
+
+
+def _packed(tree: Any, dtype) -> tuple[Any, Callable]:
+    """The leaves (B, ...) of a tree as columns of one array (B, k), and what takes such an array
+    apart again: one gather and one scatter serve all of them."""
+    leaves, structure = jax.tree.flatten(tree)
+    columns = [leaf.reshape(leaf.shape[0], -1).astype(dtype) for leaf in leaves]
+    ends = np.cumsum([column.shape[1] for column in columns])[:-1]
+
+    def unpacked(rows):
+        parts = jnp.split(rows, ends, axis=1)
+        return structure.unflatten(
+            part.reshape(rows.shape[0], *leaf.shape[1:]).astype(leaf.dtype)
+            for part, leaf in zip(parts, leaves, strict=True)
+        )
+
+    return jnp.concatenate(columns, axis=1), unpacked
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 4))
