@@ -7,7 +7,6 @@ import time
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.generating.charts import AnyChart
@@ -85,7 +84,8 @@ def composed(generated: Generated, prepared: Prepared, judges: Judges) -> Symple
         angle_centre=prepared.angle_centre,
         dt=prepared.dt,
     )
-    return jax.tree.map(jnp.asarray, map_)
+    # Not jnp.asarray, which compiles a copy for every new shape.
+    return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_)
 
 
 class Steps(NamedTuple):

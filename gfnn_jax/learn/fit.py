@@ -97,7 +97,7 @@ class Fit:
     def symplecticity_defect(self) -> float:
         """The largest defect of the chosen map's unrolled step at the test states. Compiled when it
         is first asked for."""
-        return float(np.max(self.map.defect(self.test_states)))
+        return float(np.max(np.asarray(self.map.defect(self.test_states))))
 
     @property
     def table(self) -> str:

@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Iterable, Iterator
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_inner, whole_turns
@@ -132,7 +131,7 @@ class _Refit:
     def solved(self, train, held_factor, held: Pairs) -> Candidate:
         """The candidate with these coefficients, judged by the pairs held out."""
         solved = least_squares.solve(train, held_factor, self.candidate.num_parameters)
-        params = jnp.asarray(self.generated.family.unflatten(solved.coefficients))
+        params = jax.device_put(self.generated.family.unflatten(solved.coefficients))
         pieces = list(self.map.pieces)
         pieces[self.index] = dataclasses.replace(pieces[self.index], params=params)
         map_ = dataclasses.replace(self.map, pieces=tuple(pieces))
