@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from gfnn_jax.arrays import namespace
+from gfnn_jax.arrays import matmul, namespace
 
 # The axis of length 2d is called phase: jaxtyping would read "2d" as an expression.
 Scalar = Float[Array, ""]
@@ -73,7 +73,7 @@ def symplecticity_defect(jacobian, scale=None):
         scale = xp.asarray(scale, dtype=jacobian.dtype)
         jacobian = jacobian * scale.reshape((1,) * (jacobian.ndim - 1) + scale.shape)  # dZ/dy
         weighted = form * (scale[:, None] * scale[None, :])
-    pulled_back = xp.swapaxes(jacobian, -1, -2) @ (form @ jacobian)
+    pulled_back = matmul(xp.swapaxes(jacobian, -1, -2), matmul(form, jacobian))
     defect = pulled_back - weighted.reshape((1,) * (jacobian.ndim - 2) + weighted.shape)
     return xp.max(xp.abs(defect), axis=(-2, -1)) / xp.max(xp.abs(weighted))
 

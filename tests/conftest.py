@@ -1,4 +1,4 @@
-"""Strict numerics for every test: float64, no silent rank or dtype promotion, shapes checked."""
+"""Strict numerics for every test: float64, no silent rank or dtype promotion."""
 
 import contextlib
 import os
@@ -6,17 +6,26 @@ import types
 
 import jax
 import pytest
-from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-install_import_hook("gfnn_jax", "beartype.beartype")
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--typecheck", action="store_true",
+        help="check the types and shapes of the package's annotations at run time: slow to trace",
+    )  # fmt: skip
 
 
 def pytest_configure(config):
     """Compiling is most of the suite: its workers, the processes that tests start and the next run
     share what was compiled once, in pytest's own cache."""
+    if config.getoption("typecheck"):
+        from jaxtyping import install_import_hook
+
+        install_import_hook("gfnn_jax", "beartype.beartype")
     shared = {
         "jax_compilation_cache_dir": str(config.cache.mkdir("compiled")),
         "jax_persistent_cache_min_compile_time_secs": 0.02,

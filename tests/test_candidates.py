@@ -1,14 +1,63 @@
-"""Candidates: which sizes exist, and on how many pairs they are fitted."""
+"""Candidates: the error of one step, and which sizes exist."""
 
 import itertools
 
 import numpy as np
 import pytest
 
-import gfnn_jax as gfnn
-from gfnn_jax.learn import candidates
+from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
+from gfnn_jax.generating.charts import TYPE2
+from gfnn_jax.learn import sweeps
+from gfnn_jax.learn.candidates import Judges, Tolerance, one_step_error
+from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.held_out import split_rows
+from gfnn_jax.learn.prepare import prepare
+from gfnn_jax.learn.search import search
+from gfnn_jax.phase_space import Pairs
+
+
+def test_a_relative_error_is_that_of_each_coordinate_in_its_own_spread():
+    rng = np.random.default_rng(0)
+    spread = np.array([1e3, 1e-5])
+    error = 1e-4 * spread * rng.standard_normal((10_000, 2))
+    found = one_step_error(error, spread, Tolerance(1.0))
+    assert found.relative == pytest.approx(1e-4, rel=0.05)
+    np.testing.assert_allclose(found.deviations, 1e-4 * spread, rtol=0.05)
+    assert found.rms == pytest.approx(0.1 / np.sqrt(2), rel=0.05)
+    assert found.relative < found.bound < 1.05 * found.relative
+    absolute = one_step_error(error, spread, Tolerance(1.0, relative=False))
+    assert absolute.rms < absolute.bound < 1.05 * absolute.rms
+    assert (absolute.rms, absolute.relative) == (found.rms, found.relative)
+
+
+def test_the_bound_holds_for_95_of_a_hundred_samples():
+    rng = np.random.default_rng(1)
+    held = 0
+    for _ in range(400):
+        error = rng.standard_normal((50, 2))
+        held += one_step_error(error, np.ones(2), Tolerance(1.0)).bound >= 1.0
+    assert 0.88 < held / 400 < 0.99  # of a skewed mean, from 50 pairs
+
+
+def test_a_step_without_an_image_makes_the_error_infinite():
+    error = np.zeros((5, 2))
+    error[3, 1] = np.nan
+    found = one_step_error(error, np.ones(2), Tolerance(1.0))
+    assert np.isinf([found.rms, found.relative, found.bound, *found.deviations]).all()
+
+
+def test_errors_of_angles_are_to_the_nearest_image():
+    z0 = np.random.default_rng(2).uniform(-3, 3, (20, 2))
+    pairs = Pairs(z0, z0 + [2 * np.pi, 0.0], 1.0)
+    rows = np.arange(20)
+    judges = Judges(pairs, rows, rows, Tolerance(1.0))
+    assert judges.error_of(z0, Coordinates("angle", angles=(0,))).rms < 1e-15
+    assert judges.error_of(z0, Coordinates("plain")).rms > 4
+
+
+# Sizes.
 
 
 def test_a_size_too_large_to_count_is_never_looked_at():
@@ -20,35 +69,65 @@ def test_a_size_too_large_to_count_is_never_looked_at():
         looked_at.append(degree)
         return Products(inputs, degree)
 
-    stages = (map(family, stage) for stage in candidates._STAGES)
-    kept = list(itertools.chain(*candidates._determined(stages, 10**6)))
+    groups = (map(family, group) for group in sweeps._DEGREES)
+    kept = list(itertools.chain(*sweeps._determined(groups, 10**6)))
     assert [f.degree for f in kept] == [2, 3]
     assert looked_at == [2, 3, 4]
 
 
-@pytest.mark.slow
+def kicked(num=2_000):
+    """A kick by a quartic potential, whose S is a polynomial of degree 4 in type 2."""
+    z = np.random.default_rng(0).uniform(-1, 1, (num, 2))
+    q, p = z.T
+    p = p - 0.3 * (q + q**3)
+    return Pairs(z, np.stack([q + 0.3 * p, p], axis=1), 0.3)
+
+
+def of_kicks(num=2_000):
+    """The sweep of polynomials in type 2, without any compilation."""
+    pairs = kicked(num)
+    prepared = prepare(pairs, Coordinates("plain"))
+    judges = Judges(pairs, *split_rows(pairs, 0), Tolerance(1e-11))
+    return sweeps.LinearSweep(prepared, TYPE2, judges, "polynomial", None, None)
+
+
+def quiet(_):
+    pass
+
+
+def test_the_right_degree_is_found_without_compiling(compilations):
+    with compilations() as found:
+        sweep = of_kicks()
+        result = search([sweep], 1e-11, Clock(), quiet, quiet)
+    assert found.count == 0
+    best = result.ranking[0]
+    assert best.candidate.label == "polynomial 4"
+    assert best.candidate.validated
+    assert best.candidate.validation_bound < 1e-12
+    assert best.candidate.rank == best.candidate.num_parameters == 14
+    worse = [e.candidate for e in result.entries if e is not best]
+    assert all(c.validation_relative > 1e-4 for c in worse)
+
+
+def test_the_estimate_is_of_the_size_of_the_error():
+    """The held-out residual of the gradient is the step's error to first order."""
+    sweep = of_kicks()
+    for size in sweep.sizes[:2]:
+        judged = sweep.judge(size, Clock(), quiet)
+        measured = sweep.validate(size, judged, Clock(), quiet)
+        assert 0.5 < measured.validation_relative / judged.validation_relative < 2
+        assert 0.5 < judged.train_rms / judged.validation_relative < 2
+
+
 def test_more_pairs_never_take_a_candidate_away(monkeypatch):
     """Where a factorisation of all rows would take too long, it is of a sample of them."""
-    monkeypatch.setattr(candidates, "_MOST_WORK", 500 * 27**2)
-    z = np.random.default_rng(0).uniform(-1, 1, (2_000, 2))
-    q, p = z.T
-    kicked = p - 0.3 * (q + q**3)
-    pairs = gfnn.Pairs(z, np.stack([q + 0.3 * kicked, kicked], axis=1), 0.3)
-    fit = gfnn.fit(pairs, chart="type2", tolerance=1e-12)
-    assert fit.met
-    assert fit.chosen.label == "polynomial 4"
+    monkeypatch.setattr(sweeps, "_MOST_OPERATIONS", 300 * 27**2)
+    found = search([of_kicks()], 1e-11, Clock(), quiet, quiet)
+    assert found.ranking[0].candidate.label == "polynomial 4"
+    assert found.ranking[0].candidate.validation_bound < 1e-11
 
 
-@pytest.mark.slow
-def test_a_degree_of_freedom_at_rest_does_no_harm():
-    z = np.random.default_rng(0).uniform(-1, 1, (200, 2))
-    q, p = z.T
-    kicked = p - 0.3 * q
-    rest = np.zeros_like(q)
-    z0 = np.stack([q, rest, p, rest + 0.1], axis=1)
-    z1 = np.stack([q + 0.3 * kicked, rest, kicked, rest + 0.1], axis=1)
-    fit = gfnn.fit(gfnn.Pairs(z0, z1, 0.3), tolerance=1e-10)
-    assert fit.met
-    states, info = fit.map.rollout(z0[:5], 100)
-    assert not np.any(info.status)
-    np.testing.assert_allclose(states[:, -1, [1, 3]], z0[:5][:, [1, 3]], atol=1e-10)
+def test_a_factorisation_stops_when_the_time_is_spent():
+    sweep = of_kicks()
+    with pytest.raises(OutOfTime):
+        sweep.judge(sweep.sizes[0], Clock(max_seconds=0.0), quiet)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.arrays import as_row, namespace
+from gfnn_jax.arrays import as_row, matmul, namespace
 
 _MARGIN = 1.0 + 1e-9  # the data's extremes lie just inside the box
 _PARITY_STATES = 64  # on so many states the parity of a feature is judged
@@ -79,7 +79,7 @@ class Inputs:
     def pull_back_gradient(self, gradient, slope):
         """∇ with respect to w (..., 2d) from that with respect to x (..., k)."""
         if slope is not None:
-            return (gradient[..., None, :] @ slope)[..., 0, :]
+            return matmul(gradient[..., None, :], slope)[..., 0, :]
         xp = namespace(gradient)
         return self._spread(gradient / as_row(xp.asarray(self.scale, dtype=gradient.dtype), gradient))
 
@@ -88,7 +88,7 @@ class Inputs:
         xp = namespace(hessian)
         if slope is not None:
             bent = xp.sum(gradient[..., None, None] * curvature, axis=-3)
-            return xp.swapaxes(slope, -1, -2) @ hessian @ slope + bent
+            return matmul(matmul(xp.swapaxes(slope, -1, -2), hessian), slope) + bent
         unit = xp.asarray(self.scale, dtype=hessian.dtype)
         hessian = hessian / as_row(unit[:, None] * unit[None, :], hessian)
         return self._spread(xp.swapaxes(self._spread(hessian), -1, -2))
@@ -97,7 +97,7 @@ class Inputs:
         """∇ of many functions with respect to w (..., 2d, m) from (..., k, m)."""
         xp = namespace(gradients)
         if slope is not None:
-            return xp.swapaxes(slope, -1, -2) @ gradients
+            return matmul(xp.swapaxes(slope, -1, -2), gradients)
         unit = xp.asarray(self.scale, dtype=gradients.dtype)[:, None]
         moved = xp.swapaxes(gradients / as_row(unit, gradients), -1, -2)
         return xp.swapaxes(self._spread(moved), -1, -2)

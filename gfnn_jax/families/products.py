@@ -124,7 +124,8 @@ class _Half:
         xp, n, terms = namespace(like), len(self.is_angle), len(self.indices)
         if n == 0:  # a single variable leaves the other half empty
             one = xp.ones_like(like[..., :1])
-            return [one, one[..., None, :][..., :0, :], one[..., None, None, :][..., :0, :0, :]]
+            tables = [one, one[..., None, :][..., :0, :], one[..., None, None, :][..., :0, :0, :]]
+            return tables[: order + 1]
         factors = []  # of each variable: the factor of every product, and its derivatives
         for j, f in enumerate(functions):
             side_by_side = matmul(f, xp.asarray(self.picks(j, order), dtype=f.dtype))

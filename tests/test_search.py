@@ -1,0 +1,171 @@
+"""The search's policy, on sweeps that are made up: what is tried, in what order, what is chosen."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from gfnn_jax.learn.candidates import Candidate
+from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.search import search
+
+
+class Size(NamedTuple):
+    operations: float
+    estimate: float
+    error: float
+
+
+class Sweep:
+    """Sizes with an estimate and an error each; it notes what it is asked."""
+
+    def __init__(self, sizes, family="polynomial", chart="midpoint", most=np.inf):
+        self.sizes = [Size(*s) if len(s) == 3 else Size(*s, s[1]) for s in sizes]
+        self.family, self.chart, self.most = family, chart, most
+        self.judged, self.validated = [], []
+
+    def judge(self, size, clock, say):
+        if len(self.judged) >= self.most:
+            raise OutOfTime
+        self.judged.append(size.operations)
+        return Candidate(
+            f"{self.family} {size.operations:g}", self.family, self.chart, 3, size.operations,
+            size.estimate, size.estimate, size.estimate, np.ones(2), size.estimate, 0.0,
+        )  # fmt: skip
+
+    def validate(self, size, judged, clock, say):
+        self.validated.append(size.operations)
+        return dataclasses.replace(
+            judged, validation_rms=size.error, validation_relative=size.error,
+            validation_bound=size.error, validated=True,
+        )  # fmt: skip
+
+
+def found_in(*sweeps, bound=1e-6, clock=None, told=None):
+    tell = (lambda c: None) if told is None else told.append
+    return search(sweeps, bound, clock or Clock(), lambda message: None, tell)
+
+
+def order(found):
+    return [e.candidate.operations for e in found.ranking]
+
+
+FALLING = [(10.0**k, 10.0 ** (-2 * k)) for k in range(1, 7)]  # 1e-2 at 10, 1e-4 at 100, ...
+
+
+def test_the_cheapest_that_is_accurate_enough_is_chosen_and_nothing_dearer_is_tried():
+    sweep, told = Sweep(FALLING), []
+    found = found_in(sweep, bound=1e-6, told=told)
+    assert order(found)[0] == 1e3
+    assert sweep.judged == [10, 100, 1000]
+    assert found.ended == "the tolerance is met"
+    assert [c.operations for c in told] == sweep.judged
+    assert [e.candidate.operations for e in found.entries] == sweep.judged
+
+
+def test_only_hopeful_sizes_are_validated():
+    """One to learn how estimates relate to errors, then those that may be accurate enough."""
+    sweep = Sweep(FALLING)
+    found_in(sweep, bound=1e-10)
+    assert sweep.judged == [10, 100, 1e3, 1e4, 1e5]
+    assert sweep.validated == [1e4, 1e5]
+
+
+@pytest.mark.parametrize("ratio", [0.02, 50.0])
+def test_how_far_estimates_are_off_is_learned(ratio):
+    """Estimates need only rise and fall with the errors."""
+    sweep = Sweep([(o, ratio * e, e) for o, e in FALLING])
+    found = found_in(sweep, bound=1e-6)
+    assert order(found)[0] == 1e3
+    assert found.ranking[0].candidate.validation_bound == pytest.approx(1e-6)
+
+
+def test_sweeps_are_climbed_together_by_rising_operations():
+    one = Sweep([(10, 1e-2), (30, 1e-3), (90, 1e-4)])
+    other = Sweep([(20, 1e-3), (60, 1e-7), (200, 1e-9)], chart="type2")
+    told = []
+    found = found_in(one, other, told=told)
+    assert [c.operations for c in told] == [10, 20, 30, 60]
+    assert order(found)[0] == 60
+    assert found.ranking[0].sweep is other
+
+
+def test_a_sweep_that_no_longer_gains_is_left():
+    sweep = Sweep([(10, 1e-2), *((20 + n, 0.99e-2) for n in range(8))])
+    found = found_in(sweep)
+    assert len(sweep.judged) == 4
+    assert "no more accurate" in found.ended
+    assert found.stalled == {("midpoint", "polynomial")}
+
+
+def test_odd_degrees_of_a_symmetric_map_do_not_look_like_a_stall():
+    sizes = [(10.0 + n, 10.0 ** -(2 * (n // 2) + 2)) for n in range(12)]
+    found = found_in(Sweep(sizes), bound=1e-9)
+    assert found.ended == "the tolerance is met"
+    assert found.stalled == set()
+
+
+def test_a_sweep_that_another_keeps_beating_is_left():
+    worse = Sweep([(10.0 + n, 10.0 ** -(2 + 0.2 * n)) for n in range(12)], chart="type2")
+    better = Sweep([(10.0 + n, 10.0 ** -(3 + 0.5 * n)) for n in range(12)])
+    found = found_in(better, worse, bound=1e-8)
+    assert len(worse.judged) <= 4
+    assert found.ranking[0].sweep is better
+    # Of other functions, which may gain faster later, only where far better ones are as cheap.
+    later = Sweep(
+        [(10.0 + n, 10.0 ** -(2.5 + 0.5 * n)) for n in range(12)], family="sines"
+    )  # fmt: skip
+    better = Sweep([(10.0 + n, 10.0 ** -(3 + 0.5 * n)) for n in range(12)])
+    found_in(better, later, bound=1e-8)
+    assert len(later.judged) > 8
+
+
+def test_where_nothing_meets_the_tolerance_the_few_best_are_validated():
+    sizes = [(10.0 * 2**n, 10.0**-n, 2 * 10.0**-n) for n in range(1, 7)]
+    sweep = Sweep(sizes)
+    found = found_in(sweep, bound=1e-20)
+    assert sorted(sweep.validated) == [160, 320, 640]
+    assert order(found) == [640, 320, 160]
+    assert "more pairs would help" in found.ended
+    assert len(found.entries) == 6
+
+
+def test_a_finalist_whose_steps_fail_is_ranked_last():
+    sweep = Sweep([(10, 1e-1), (20, 1e-2), (40, 1e-3, np.inf)])
+    found = found_in(sweep, bound=1e-20)
+    assert order(found) == [20, 10, 40]
+
+
+def test_steps_that_belie_the_estimate_let_the_search_go_on():
+    """A size whose steps fail is no reason to stop, whatever its estimate says."""
+    sweep = Sweep([(10, 1e-3), (20, 1e-7, np.inf), (40, 1e-8)])
+    found = found_in(sweep, bound=1e-6)
+    assert order(found)[0] == 40
+    assert sweep.judged == [10, 20, 40]
+
+
+def test_what_was_found_before_the_time_was_spent_stands():
+    sweep = Sweep(FALLING, most=2)
+    found = found_in(sweep, bound=1e-9, clock=Clock(max_seconds=1_000.0))
+    assert order(found) == [100, 10]
+    assert found.ended == "the budget of 1000 s is spent"
+
+
+def test_one_is_validated_however_little_time_there_is():
+    sweep, clock = Sweep(FALLING), Clock(max_seconds=1_000.0)
+    judge = sweep.judge
+
+    def slow(size, clock, say):
+        clock.max_seconds = 0.0
+        return judge(size, clock, say)
+
+    sweep.judge = slow
+    found = found_in(sweep, bound=1e-20, clock=clock)
+    assert order(found) == [10]
+
+
+def test_no_sizes_at_all():
+    found = found_in(Sweep([]))
+    assert found.ranking == found.entries == []
+    assert found.ended == "the pairs determine no model at all"
