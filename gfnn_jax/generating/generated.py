@@ -21,7 +21,7 @@ from gfnn_jax.phase_space import apply_j
 from gfnn_jax.solve import newton
 from gfnn_jax.solve.newton import Evaluation
 
-_MOST_NEWTON = 40
+MOST_UPDATES = 40
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,10 +84,11 @@ class Generated:
         if isinstance(self.dt, (int, float)):
             object.__setattr__(self, "dt", np.asarray(self.dt, self.scale.dtype))
 
-    def solve(self, z, args=None, *, unrolled: bool = False):
+    def solve(self, z, args=None, *, unrolled: bool | int = False):
         """(w, ∇S(w), Info) for the states z (B, 2d).
 
-        unrolled: derivatives are those of the iterations that ran, not of the implicit function.
+        unrolled: whether derivatives are those of the iterations that ran, not of the implicit
+        function; a number says that at most so many updates ran.
         """
         known = self.chart.first_guess(z)
         guess = known[:, self.chart.free(z.shape[1] // 2)]
@@ -96,16 +97,17 @@ class Generated:
         shared = (self.family, self.params, self.dt, self.scale)
         equation, lanes = ImplicitStep(self.chart), (z, known, args)
         if unrolled:
+            most = MOST_UPDATES if unrolled is True else unrolled
             x, gradient, info = newton.iterate(
-                equation, shared, lanes, guess, most=_MOST_NEWTON, gather=False
+                equation, shared, lanes, guess, most=most, gather=False
             )
         else:
             x, gradient, info = newton.root(
-                equation, shared, lanes, jax.lax.stop_gradient(guess), _MOST_NEWTON
+                equation, shared, lanes, jax.lax.stop_gradient(guess), MOST_UPDATES
             )
         return self.chart.complete(known, x), gradient, info
 
-    def step(self, z, args=None, *, unrolled: bool = False):
+    def step(self, z, args=None, *, unrolled: bool | int = False):
         """(Z, Info) of the states z (B, 2d), by JAX."""
         w, gradient, info = self.solve(z, args, unrolled=unrolled)
         return self.chart.image(z, w, gradient, self.dt), info

@@ -88,6 +88,12 @@ def composed(generated: Generated, prepared: Prepared, judges: Judges) -> Symple
     return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_)
 
 
+def in_block(z: np.ndarray) -> np.ndarray:
+    """States z (N, 2d), N no more than a block holds, repeated so that they fill it: for them the
+    step is compiled."""
+    return np.resize(z, (_BLOCK, z.shape[1]))
+
+
 class Steps(NamedTuple):
     """Images (N, 2d) of states, Newton's iterations and whether a step failed (N,), the time of a
     step in a block, and the seconds that compiling took."""

@@ -19,7 +19,7 @@ import numpy as np
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.errors import FitError, FitWarning
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.assemble import assemble
+from gfnn_jax.learn.assemble import assemble, in_block
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance, refined_images
 from gfnn_jax.learn.check import check_number, check_request, unlike_the_scene
 from gfnn_jax.learn.choose_charts import Charts, choose_charts

@@ -33,7 +33,7 @@ class Affine:
         moved = matmul(z - as_row(self.centre, z), self.matrix.T)
         return as_row(self.centre + self.shift, z) + moved
 
-    def step(self, z, args=None, *, unrolled: bool = False):
+    def step(self, z, args=None, *, unrolled: bool | int = False):
         """(Z, Info) of the states z (B, 2d), by JAX."""
         lanes = jnp.zeros(z.shape[0], jnp.int32)
         return self.image(z), Info(lanes + OK, lanes, jnp.zeros(z.shape[0], z.dtype))

@@ -132,9 +132,9 @@ def iterate(
         open=begun,
     )
     few = max(_FEWEST, size // _PART)
-    if gather and size > few:
+    if most > 1 and gather and size > few:
         state = _gathered(newton, shared, lanes, state, few)
-    else:
+    elif most > 1:
         state = jax.lax.while_loop(
             lambda s: jnp.any(s.open), lambda s: newton(shared, lanes, s), state
         )
