@@ -17,67 +17,65 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
-import json
-import os
-import platform
 import time
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-from targets import (  # switches float64 on
+# Sets float64, so it comes before all of JAX.
+from harness import (
+    FIGURES,
     RESULTS,
     SEED,
     TABLES,
+    Numbers,
     angles_of,
     between_markers,
     drawn,
     number,
     one_step_rms,
     provenance,
+    read,
+    write,
 )
 
+# isort: split
+import jax
+import jax.numpy as jnp
+import numpy as np
+
 import gfnn_jax as gfnn
-from gfnn_jax.evaluate import figures
-from gfnn_jax.evaluate import metrics
-from gfnn_jax.evaluate import report
 from gfnn_jax.baselines import METHODS, Budget, Sequences
-from gfnn_jax.maps.symplectic_map import Generated
-from gfnn_jax.maps.symplectic_map.saved import versions
+from gfnn_jax.evaluate import figures, metrics
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.maps.rollout import rollout
 from gfnn_jax.phase_space import hamiltonian_vector_field
-from gfnn_jax.maps.symplectic_map.rollout import rollout
 from gfnn_jax.scenes.trajectories import flow_step
 
-FIGURES = Path(__file__).resolve().parent / "figures"
 NUM_PAIRS, NUM_STEPS, LONGEST = 4_000, 1_000, 20_000
 SIZES, LOW_DEGREE = tuple(10.0**-k for k in range(2, 10)), 4
 SMALL = 1e-6
 SATURATED = 0.1  # a position error of this size is no longer small against the orbit
 
-Numbers = dict[str, Any]
-
 
 @functools.cache
-def ladder(name: str, quick: bool):
+def perturbed(name: str, quick: bool):
     """The scene, and (ε, label, map) for each size of the perturbation of S."""
     scene = gfnn.scenes.make(name)
     pairs, fresh = drawn(scene, 1_000 if quick else NUM_PAIRS, quick)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
         fit = gfnn.fit(
-            pairs, scene, tolerance=1e-7 if quick else 1e-10, chart="midpoint",
-            scalar="polynomial", seed=SEED, on_progress=lambda line: print(f"  {line}"),
+            pairs, scene, absolute_tolerance=1e-7 if quick else 1e-10, chart="midpoint",
+            family="polynomial", seed=SEED, on_progress=lambda line: print(f"  {line}"),
         )  # fmt: skip
     index = next(i for i, piece in enumerate(fit.map.pieces) if isinstance(piece, Generated))
     whole: Any = fit.map.pieces[index]
-    first, second = whole.scalar.basis.halves
+    first, second = whole.family.basis.halves
     low = first.orders[:, None] + second.orders[None, :] <= LOW_DEGREE
     exists = np.zeros(low.shape, bool)
-    exists[tuple(whole.scalar.basis.terms.T)] = True
+    exists[tuple(whole.family.basis.terms.T)] = True
     g = np.random.default_rng(SEED).standard_normal(low.shape) * (low & exists)
     found = []
     for size in SIZES[::3] if quick else SIZES:
@@ -93,7 +91,7 @@ def growth(name: str) -> Callable[[bool], Numbers]:
     """Position error against the step number at many ε, with the exponent of each."""
 
     def measure(quick: bool) -> Numbers:
-        scene, maps = ladder(name, quick)
+        scene, maps = perturbed(name, quick)
         key = jax.random.fold_in(jax.random.key(SEED), 1)
         z0 = gfnn.sample_test_states(scene, 8 if quick else 50, key)
         reference = np.asarray(gfnn.reference_trajectories(scene, z0, NUM_STEPS))
@@ -140,7 +138,7 @@ def slope(rows: list[Numbers], key: str) -> Numbers:
 
 def actions(quick: bool) -> Numbers:
     """Two bodies: the action √a (Delaunay's L) over 1/(ε dt) steps, at most LONGEST."""
-    scene, maps = ladder("two-body", quick)
+    scene, maps = perturbed("two-body", quick)
     z0 = gfnn.sample_test_states(scene, 8, jax.random.fold_in(jax.random.key(SEED), 2))
     start = np.sqrt(np.asarray(metrics.semi_major_axis(z0)))
     rows = []
@@ -176,7 +174,7 @@ def vfnn(quick: bool) -> Numbers:
     step_error = np.asarray(rollout(learned.step, jnp.asarray(fresh.z0), 1))[:, 1] - fresh.z1
     states = np.asarray(rollout(learned.step, z0, NUM_STEPS))
     vfnn_rms = float(np.sqrt(np.mean(np.asarray(step_error) ** 2)))
-    _, maps = ladder("two-body", quick)
+    _, maps = perturbed("two-body", quick)
     error, label, map_ = min(maps, key=lambda m: abs(np.log(m[0] / vfnn_rms)))
     label = f"generated, s = {label}"
     # What the two kinds of error do while they are small: a true field that is slightly off, as no
@@ -260,19 +258,10 @@ def run(name: str, folder: Path, quick: bool) -> None:
     print(name, flush=True)
     started = time.perf_counter()
     measured = PIECES[name](quick)
-    result = {
-        "piece": name, "quick": quick, "measured": measured,
-        "seconds": time.perf_counter() - started, "seed": SEED, "dtype": "float64",
-        "device": report.device(),
-        "machine": {
-            "processor": platform.machine(), "cores": len(os.sched_getaffinity(0)),
-            "load": os.getloadavg()[0],
-        },
-        "versions": versions(), "date": time.strftime("%Y-%m-%d", time.gmtime()),
-    }  # fmt: skip
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{name}.json").write_text(report.to_json(result), encoding="utf-8")
-    print(f"{name}: {result['seconds']:.0f} s", flush=True)
+    seconds = time.perf_counter() - started
+    write(folder / f"{name}.json", {"piece": name, "quick": quick, "measured": measured,
+                                    "seconds": seconds})  # fmt: skip
+    print(f"{name}: {seconds:.0f} s", flush=True)
 
 
 def interval(row: Numbers, key: str = "exponent") -> str:
@@ -448,8 +437,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         if arguments.overwrite or not (folder / f"{name}.json").exists():
             run(name, folder, arguments.quick)
     if folder == RESULTS:
-        paths = {name: folder / f"{name}.json" for name in PIECES}
-        found = {n: json.loads(p.read_text("utf-8")) for n, p in paths.items() if p.exists()}
+        found = read({name: folder / f"{name}.json" for name in PIECES})
         if found:
             draw(found)
             between_markers(TABLES, "growth", f"{section(found)}\n\n{provenance(found)}")

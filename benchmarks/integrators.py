@@ -1,7 +1,7 @@
 """What integrates a scene whose H is known: the limit that learned maps are compared with.
 
-Each kind gives a `Runner`, whose precision is a number handed to it when it runs, so that a sweep
-over precisions compiles once.
+Each integrator is a `Runner`, whose precision is a number handed to it when it runs, so that a
+sweep over precisions compiles once.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ COMPOSITIONS = {
 ORDERS = {"leapfrog": 2, "Yoshida 4": 4, "Kahan–Li 8": 8}
 DIFFRAX = {"Tsit5": diffrax.Tsit5, "Dopri5": diffrax.Dopri5, "Dopri8": diffrax.Dopri8}
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
-# Of the compositions: a leapfrog costs a force.
+# Sizes of the compositions: a leapfrog costs a force.
 FORCES_PER_DT = (1, 2, 4, 8, 16, 32, 64, 128)
 MOST_STEPS = 1_000_000
 

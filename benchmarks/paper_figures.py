@@ -15,23 +15,22 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
-import platform
 import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+# Sets float64, so it comes before all of JAX.
+import harness
 import numpy as np
-from targets import RESULTS, TABLES, between_markers, number  # switches float64 on
+from harness import RESULTS, TABLES, Numbers, between_markers, markdown, number, read, write
 
-from gfnn_jax.jobs import compare as comparison
 from gfnn_jax.evaluate import figures
-from gfnn_jax.evaluate import report
-from gfnn_jax.jobs.compare import OURS, PAPER_GFNN, compare
+from gfnn_jax.jobs.compare import CAP, OURS, PAPER_GFNN, compare
+from gfnn_jax.jobs.progress import Progress
 
-FIGURES = Path(__file__).resolve().parent / "figures" / "compare"
+FIGURES = harness.FIGURES / "compare"
 WORK = Path("runs") / "paper-figures"
 # The seeds of a scene, and the paper's figure.
 SCENES: dict[str, tuple[tuple[int, ...], str]] = {
@@ -42,8 +41,6 @@ SCENES: dict[str, tuple[tuple[int, ...], str]] = {
     "standard-map-chaotic": ((0,), "Fig. 6"),
     "standard-map-regular": ((0,), "Fig. 7"),
 }
-
-Numbers = dict[str, Any]
 
 
 def pieces() -> list[tuple[str, int]]:
@@ -64,20 +61,12 @@ def run(name: str, seed: int, folder: Path, work: Path, **options) -> None:
     print(f"{name}, seed {seed}", flush=True)
     started = time.perf_counter()
     out = work / f"{name}-{seed}"
-    compare(
-        name, seed=seed, out=out, resume=True,
-        say=lambda line: print(f"  [{time.perf_counter() - started:6.1f} s] {line}", flush=True),
-        **options,
-    )  # fmt: skip
-    result = json.loads((out / "report.json").read_text(encoding="utf-8")) | {
-        "machine": {
-            "processor": platform.machine(), "cores": len(os.sched_getaffinity(0)),
-            "load": os.getloadavg()[0],
-        },
-        "date": time.strftime("%Y-%m-%d", time.gmtime()),
-    }  # fmt: skip
-    folder.mkdir(parents=True, exist_ok=True)
-    result_path(folder, name, seed).write_text(report.to_json(result), encoding="utf-8")
+
+    def say(line: str) -> None:
+        print(f"  [{time.perf_counter() - started:6.1f} s] {line}", flush=True)
+
+    compare(name, seed=seed, out=out, resume=True, progress=Progress(say, say), **options)
+    write(result_path(folder, name, seed), json.loads((out / "report.json").read_text("utf-8")))
     if folder == RESULTS and seed == SCENES[name][0][0]:
         FIGURES.mkdir(parents=True, exist_ok=True)
         for figure in out.glob("*.png"):
@@ -110,7 +99,7 @@ def scene_table(name: str, reports: list[Numbers]) -> str:
     heads += ["energy drift", "defect"]
     labels = list(next(iter(first["methods"].values()))["kl"] or ())
     heads += [f"KL of {label}" for label in labels]
-    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    rows = []
     for method, m in first["methods"].items():
 
         def mean(*path, method=method):
@@ -133,8 +122,8 @@ def scene_table(name: str, reports: list[Numbers]) -> str:
         cells += [mean("rollout", "energy_drift"), mean("map", "symplecticity_defect")
                   + (f" ({100 * unsolved:.0f} % unsolved)" if unsolved else "")]  # fmt: skip
         cells += [mean("kl", label) for label in labels]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        rows.append(cells)
+    return markdown(heads, rows)
 
 
 def ranking(reports: list[Numbers], *path: str) -> list[str]:
@@ -262,7 +251,7 @@ def tables() -> None:
     found: dict[str, list[Numbers]] = {}
     for name, (seeds, _) in SCENES.items():
         paths = [result_path(RESULTS, name, seed) for seed in seeds]
-        reports = [json.loads(p.read_text(encoding="utf-8")) for p in paths if p.exists()]
+        reports = list(read({p.name: p for p in paths}).values())
         if reports:
             found[name] = reports
             draw(name, reports[0]["methods"])
@@ -275,7 +264,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("scenes", nargs="*", choices=[[], *SCENES], metavar="SCENE",
                         help=", ".join(SCENES))  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="two bodies only, small sizes")
-    parser.add_argument("--cap", type=float, metavar="SECONDS", default=comparison.CAP,
+    parser.add_argument("--cap", type=float, metavar="SECONDS", default=CAP,
                         help="most training time of a method (default %(default)g)")  # fmt: skip
     parser.add_argument("--work", type=Path, default=WORK, metavar="DIR",
                         help="where comparisons are made (default %(default)s)")  # fmt: skip
@@ -287,9 +276,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         run("two-body", 0, work, work, quick=True)
         return
     for name, seed in [] if arguments.tables else pieces():
-        wanted = not arguments.scenes or name in arguments.scenes
+        asked = not arguments.scenes or name in arguments.scenes
         path = result_path(RESULTS, name, seed)
-        if wanted and (arguments.overwrite or not path.exists()):
+        if asked and (arguments.overwrite or not path.exists()):
             if arguments.overwrite:
                 shutil.rmtree(arguments.work / f"{name}-{seed}", ignore_errors=True)
             run(name, seed, RESULTS, arguments.work, cap=arguments.cap)

@@ -1,40 +1,48 @@
-"""How fast: predicted steps, a training step, the start of the program, growth with the size.
+"""How fast: the first answer, predicted steps, a training step, growth with the size.
 
     python benchmarks/speed.py                    pieces that have no result yet, then the tables
     python benchmarks/speed.py --only step --overwrite
     python benchmarks/speed.py --quick            small sizes, into runs/speed, no tables
 
 A piece's result is one JSON file, speed-*.json in benchmarks/results; the section of
-benchmarks/RESULTS.md is made from these files alone. Times are the best of several and without
-compilation; ratios are of times taken in one run.
+benchmarks/RESULTS.md is made from these files alone. Times of steps are the best of several and
+without compilation; those of whole processes the median of a few; ratios are of times taken in one
+run.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import json
+import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 from unittest import mock
 
 # Sets float64, so it comes before all of JAX.
-from pieces import main as run_pieces
-from pieces import results
-from targets import (
+from harness import (
+    HERE,
     SEED,
     TABLES,
     Numbers,
     between_markers,
-    circumstances,
+    cores,
     drawn,
     fitted,
+    markdown,
     number,
     provenance,
+    results,
+    timed,
 )
+from harness import main as run_pieces
 
 # isort: split
 import jax
@@ -42,20 +50,21 @@ import jax.numpy as jnp
 import numpy as np
 
 import gfnn_jax as gfnn
-from gfnn_jax.solve import newton as implicit
-from gfnn_jax.generating.charts import MIDPOINT, TYPE2
-from gfnn_jax.fitting import least_squares
-from gfnn_jax.fitting.adam import PAPER, adam
-from gfnn_jax.solve.newton import small_solve
-from gfnn_jax.maps.symplectic_map import Generated, SymplecticMap
-from gfnn_jax.maps.symplectic_map.rollout import rollout
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import PAPER_HIDDEN, Mlp
 from gfnn_jax.families.products import Products
+from gfnn_jax.fitting import least_squares
+from gfnn_jax.fitting.adam import PAPER, adam
+from gfnn_jax.generating.charts import MIDPOINT, TYPE2
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.maps.rollout import rollout
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.scenes import henon_heiles
+from gfnn_jax.solve import newton
+from gfnn_jax.solve.linear import small_solve
 
 LANES = 1_000
-# scene, tolerance, pairs, and how many microseconds a step may take: of a batch, of one trajectory.
+# scene, absolute tolerance, pairs, and how many microseconds a step may take: of a batch, alone.
 STEPS = {
     "henon-heiles-regular": (1e-10, 4_000, 2.0, 12.0),
     "two-body": (1e-9, 4_000, None, None),
@@ -67,17 +76,6 @@ TARGETS = {"evaluations": 3.5, "defect": 1e-12, "against_newton": 4.0, "training
            "torch": {"original": 4.0, "careful": 2.0}}  # fmt: skip
 
 
-def best(function: Callable[[], Any], repeats: int = 7) -> float:
-    """Seconds of the fastest of some calls, after one that compiles."""
-    jax.block_until_ready(function())
-    times = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        jax.block_until_ready(function())
-        times.append(time.perf_counter() - started)
-    return min(times)
-
-
 # Predicted steps
 
 
@@ -86,17 +84,17 @@ def textbook(map_: SymplecticMap) -> Callable:
     the residual is at roundoff; for a map without coordinates of its own."""
     (piece,) = map_.pieces
     assert isinstance(piece, Generated)
-    gradient = jax.grad(functools.partial(piece.scalar, piece.params))
+    gradient = functools.partial(piece.family.gradient, piece.params)
 
     def step(z):
-        free = np.array(piece.chart.free(z.shape[0] // 2))
-        known = piece.chart.start(z)
+        free = piece.chart.free(z.shape[0] // 2)
+        known = piece.chart.first_guess(z)
 
         def residual(x):
             w = known.at[free].set(x)
             return piece.chart.residual(z, w, gradient(w), piece.dt)
 
-        def newton(state):
+        def update(state):
             x, r, count = state
             x = x - small_solve(jax.jacfwd(residual)(x), r)
             return x, residual(x), count + 1
@@ -105,7 +103,7 @@ def textbook(map_: SymplecticMap) -> Callable:
             return (jnp.max(jnp.abs(state[1])) > 1e-15) & (state[2] < 8)
 
         x = known[free]
-        x, _, _ = jax.lax.while_loop(is_open, newton, (x, residual(x), 0))
+        x, _, _ = jax.lax.while_loop(is_open, update, (x, residual(x), 0))
         w = known.at[free].set(x)
         return piece.chart.image(z, w, gradient(w), piece.dt)
 
@@ -115,9 +113,9 @@ def textbook(map_: SymplecticMap) -> Callable:
 def evaluations(map_: SymplecticMap, states) -> Numbers:
     """Evaluations of ∇S per step, what else is done counted as parts of one by its operations."""
     piece = next(p for p in map_.pieces if isinstance(p, Generated))
-    gradient, with_jacobian = piece.scalar.operations
+    gradient, with_jacobian = piece.family.operations
     updates = np.asarray(map_.step(states)[1].iterations)
-    start = 0 if piece.there is None else piece.there.operations
+    start = 0 if piece.predictor is None else piece.predictor.forward.operations
     return {
         "updates_mean": float(updates.mean()),
         "updates_max": int(updates.max()),
@@ -134,41 +132,47 @@ def step(quick: bool) -> Numbers:
         tolerance, num_pairs, _, _ = STEPS[name]
         scene = gfnn.scenes.make(name)
         pairs, fresh = drawn(scene, num_pairs, quick)
-        fit, about = fitted(pairs, scene, fresh, tolerance=tolerance)
-        z = jnp.asarray(gfnn.sample_test_states(scene, LANES, jax.random.key(SEED)))
+        fit, about = fitted(pairs, scene, fresh, absolute_tolerance=tolerance)
+        z = gfnn.sample_test_states(scene, LANES, jax.random.key(SEED))
         states, info = fit.map.rollout(z, num_steps, save_every=num_steps // 10)
         inside = np.asarray(info.status) == 0
         visited = np.asarray(states)[inside].reshape(-1, z.shape[1])[::10]
         lanes = fit.map.start(z)
-        batch = best(lambda: fit.map.advance(lanes, 1, save_every=num_steps)[1])  # noqa: B023
+
+        def together(map_=fit.map, lanes=lanes, num_steps=num_steps):
+            return map_.advance(lanes, 1, save_every=num_steps)[1]
+
         one = fit.map.start(z[:1])
-        single = best(lambda: fit.map.advance(one, 1, save_every=10 * num_steps)[1])  # noqa: B023
+
+        def alone(map_=fit.map, one=one, num_steps=num_steps):
+            return map_.advance(one, 1, save_every=10 * num_steps)[1]
+
+        batch, single = timed(together, 7).seconds, timed(alone, 7).seconds
         row = {
             **evaluations(fit.map, visited),
             "one_step_rms": about["one_step_rms"],
             "label": about["label"],
             "chart": about["chart"],
-            "defect": float(jnp.max(fit.map.defect(visited[:500]))),
+            "defect": float(np.max(fit.map.defect(visited[:500]))),
             "microseconds_batch": 1e6 * batch / num_steps / LANES,
             "microseconds_single": 1e6 * single / (10 * num_steps),
             "bytes_saved_per_lane": 8 * z.shape[1],
             "against_newton": None,
-            "against_waiting": waiting(lambda: fit.map.advance(lanes, 1, save_every=num_steps)[1])  # noqa: B023
-            / batch,
+            "against_waiting": waiting(together) / batch,
         }
         if len(fit.map.pieces) == 1 and not fit.map.coordinates.angles:
             plain = textbook(fit.map)
-            newton = best(lambda: rollout(plain, z, num_steps, save_every=num_steps))  # noqa: B023
-            row["against_newton"] = newton / batch
+            fresh_newton = timed(lambda: rollout(plain, z, num_steps, save_every=num_steps), 7)  # noqa: B023
+            row["against_newton"] = fresh_newton.seconds / batch
         measured[name] = row
     return measured
 
 
 def waiting(batch: Callable[[], Any]) -> float:
     """Seconds of a rollout in which every lane of a batch waits for the one that takes longest."""
-    with mock.patch.object(implicit, "_few_together", implicit._each):
+    with mock.patch.object(newton, "_FEWEST", LANES):
         jax.clear_caches()
-        seconds = best(batch)
+        seconds = timed(batch, 7).seconds
     jax.clear_caches()
     return seconds
 
@@ -180,14 +184,14 @@ def training(quick: bool) -> Numbers:
     """The paper's network, batches of 200, float32: its rate against that of its own products."""
     scene = henon_heiles()
     pairs, _ = drawn(scene, 2_000 if quick else 20_000, quick=True)
-    z0, z1 = jnp.asarray(pairs.z0), jnp.asarray(pairs.z1)
-    w, wanted = TYPE2.point(z0, z1), TYPE2.wanted(z0, z1, scene.dt)
+    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
+    w, target = TYPE2.evaluation_point(z0, z1), TYPE2.target_gradient(z0, z1, scene.dt)
     family = Mlp(box_inputs(w), PAPER_HIDDEN, "tanh")
     runs, length = (3, 20) if quick else (10, 100)
     recipe = dataclasses.replace(PAPER, epochs=runs + 1, epoch_length=length)
     ends = []
     adam(
-        family, family.init(jax.random.key(SEED), jnp.float32), (w, wanted), (w[:10], wanted[:10]),
+        family, family.init(jax.random.key(SEED), jnp.float32), (w, target), (w[:10], target[:10]),
         scene.dt * np.ones(4), recipe=recipe, key=jax.random.key(SEED),
         on_epoch=lambda *_: ends.append(time.perf_counter()),
     )  # fmt: skip
@@ -210,7 +214,7 @@ def training(quick: bool) -> Numbers:
 
     repeats = 20 if quick else 200
     loop = jax.jit(lambda c: jax.lax.fori_loop(0, repeats, products, c))
-    plain = best(lambda: loop(jnp.float32(0.0))) / repeats
+    plain = timed(lambda: loop(jnp.float32(0.0)), 7).seconds / repeats
     product_flop = 6 * 200 * sum(m.size for m in weights)
     return {
         "microseconds": 1e6 * seconds,
@@ -218,32 +222,32 @@ def training(quick: bool) -> Numbers:
         "gflops": flop / seconds / 1e9,
         "gflops_of_products": product_flop / plain / 1e9,
         "training_rate": (flop / seconds) / (product_flop / plain),
-        "torch": in_torch(np.asarray(w), np.asarray(wanted), scene.dt, runs, length),
-        "models_per_second": models_per_second(family, w, wanted, scene.dt, quick),
+        "torch": in_torch(w, target, scene.dt, runs, length),
+        "models_per_second": models_per_second(family, w, target, scene.dt, quick),
     }
 
 
-def in_torch(w, wanted, dt: float, runs: int, length: int) -> Numbers | None:
+def in_torch(w, target, dt: float, runs: int, length: int) -> Numbers | None:
     """The same step in PyTorch, on as many threads; None where it is not installed."""
     try:
         import torch_loops
     except ImportError:
         return None
-    threads = circumstances()["machine"]["cores"] or 1
+    threads = cores() or 1
     widths = (w.shape[1], *PAPER_HIDDEN, 1)
-    return torch_loops.measure(w, wanted, widths, dt, PAPER.batch_size, runs, length, threads)
+    return torch_loops.measure(w, target, widths, dt, PAPER.batch_size, runs, length, threads)
 
 
-def models_per_second(family, w, wanted, dt: float, quick: bool) -> Numbers:
+def models_per_second(family, w, target, dt: float, quick: bool) -> Numbers:
     """Steps of several networks trained at once, by vmap: number -> steps of one model a second.
 
     Plain descent instead of Adam, whose own work is small beside that of the network.
     """
-    w, wanted = (jnp.asarray(a[: PAPER.batch_size], jnp.float32) for a in (w, wanted))
-    gradient = jax.vmap(jax.grad(family, argnums=1), (None, 0))
+    w, target = (np.asarray(a[: PAPER.batch_size], np.float32) for a in (w, target))
 
     def loss(params):
-        return jnp.mean(jnp.sum((dt * (gradient(params, w) - wanted)) ** 2, axis=-1))
+        error = dt * (family.gradient(params, jnp.asarray(w)) - target)
+        return jnp.mean(jnp.sum(error**2, axis=-1))
 
     def descend(_, params):
         return jax.tree.map(lambda a, slope: a - 1e-3 * slope, params, jax.grad(loss)(params))
@@ -253,12 +257,149 @@ def models_per_second(family, w, wanted, dt: float, quick: bool) -> Numbers:
         keys = jax.random.split(jax.random.key(SEED), models)
         params = jax.vmap(lambda key: family.init(key, jnp.float32))(keys)
         train = jax.jit(jax.vmap(lambda p: jax.lax.fori_loop(0, steps, descend, p)))
-        seconds = best(lambda: train(params), 3)  # noqa: B023
+        seconds = timed(lambda: train(params), 3).seconds  # noqa: B023
         found[str(models)] = models * steps / seconds
     return found
 
 
-# The start
+# The first answer
+
+
+# row -> (title, the release before, as its issue was filed, the most it may be)
+START: dict[str, tuple[str, str, float]] = {
+    "run_warm": ("`gfnn run two-body --quick`, compile cache warm: time ÷ time of importing its "
+                 "libraries", "16–20", 5),
+    "run_cold": ("the same, compile cache empty", "60", 10),
+    "run_compilations": ("XLA compilations in it", "392", 60),
+    "run_calls": ("Python calls in it (cProfile), millions", "47", 12),
+    "fit_command": ("`gfnn fit` of 4,000 pairs, d = 2, tolerance 1e-7, warm, seconds", "30–100", 8),
+    "first_fit": ("first `gfnn.fit` of 2,000 pairs, d = 2, in Python without a compile cache, "
+                  "seconds", "76–170", 12),
+    "second_fit": ("second `gfnn.fit` of the same shapes in one process, seconds", "2", 1),
+    "second_compilations": ("compilations in it", "3", 3),
+    "first_rollout": ("first `map.rollout` of 1,000 steps after a fit, seconds", "11–19", 3),
+}  # fmt: skip
+# What the command imports, and nothing of its own work.
+LIBRARIES = """
+import diffrax, flax.nnx, jax, matplotlib.pyplot, optax, orbax.checkpoint, scipy.linalg, scipy.stats
+import rich.console, rich.progress, rich.table
+"""
+COUNTED_RUN = """
+import cProfile, json, pstats, sys
+import jax
+compilations = 0
+def listen(event, seconds, **_):
+    global compilations
+    compilations += event == "/jax/core/compile/backend_compile_duration"
+jax.monitoring.register_event_duration_secs_listener(listen)
+profile = cProfile.Profile()
+profile.enable()
+try:
+    from gfnn_jax.cli import main
+    main(["run", "two-body", "--quick", "--out", sys.argv[1]])
+except SystemExit as ended:
+    assert not ended.code, ended.code
+profile.disable()
+print(json.dumps({"run_compilations": compilations,
+                  "run_calls": pstats.Stats(profile).total_calls / 1e6}))
+"""
+FITS_IN_PYTHON = """
+import json, time
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+import gfnn_jax as gfnn
+compilations = 0
+def listen(event, seconds, **_):
+    global compilations
+    compilations += event == "/jax/core/compile/backend_compile_duration"
+jax.monitoring.register_event_duration_secs_listener(listen)
+scene = gfnn.scenes.make("henon-heiles-regular")
+found = {}
+def take(name, call):
+    global compilations
+    compilations, started, cpu = 0, time.perf_counter(), time.process_time()
+    out = jax.block_until_ready(call())
+    found[name] = time.perf_counter() - started
+    found[name + "_cpu"] = time.process_time() - cpu
+    found[name.replace("_fit", "") + "_compilations"] = compilations
+    return out
+one, other = (gfnn.sample_pairs(scene, 2_000, jax.random.key(seed)) for seed in (0, 1))
+z0 = gfnn.sample_test_states(scene, 25, jax.random.key(2))
+fit = take("first_fit", lambda: gfnn.fit(one, scene, tolerance=1e-7))
+take("second_fit", lambda: gfnn.fit(other, scene, tolerance=1e-7))
+take("first_rollout", lambda: fit.map.rollout(z0, 1_000))
+print(json.dumps(found))
+"""
+
+
+class Process(NamedTuple):
+    """Seconds, processor seconds and standard output of a finished process."""
+
+    seconds: float
+    cpu: float
+    out: str
+
+
+def process(arguments: Sequence[str], cache: Path | None) -> Process:
+    """A fresh Python process with this compile cache, or none."""
+    env = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    env |= {"PYTHONPATH": str(HERE.parent), "MPLBACKEND": "agg"}
+    if cache is not None:
+        env["JAX_COMPILATION_CACHE_DIR"] = str(cache)
+        env["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    started, before = time.perf_counter(), os.times()
+    done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=env,
+                          check=False)  # fmt: skip
+    seconds, after = time.perf_counter() - started, os.times()
+    if done.returncode:
+        raise RuntimeError(f"{arguments[:4]} failed: {done.stderr.strip().splitlines()[-1:]}")
+    used = after.children_user - before.children_user
+    used += after.children_system - before.children_system
+    return Process(seconds, used, done.stdout)
+
+
+def start(quick: bool) -> Numbers:
+    """The first answer of fresh processes: medians of three, counts of one.
+
+    Processor seconds stand beside the seconds: on a machine that others use too they say more.
+    """
+    repeats = 1 if quick else 3
+    with tempfile.TemporaryDirectory() as name:
+        folder, count = Path(name), iter(range(100))
+        warm, data = folder / "warm", folder / "pairs.npz"
+        scene = gfnn.scenes.make("henon-heiles-regular")
+        pairs = gfnn.sample_pairs(scene, 4_000, jax.random.key(SEED))
+        np.savez(data, z0=pairs.z0, z1=pairs.z1, dt=pairs.dt)
+
+        def command(*arguments: str, cache: Path) -> Process:
+            out = folder / f"out{next(count)}"
+            return process(["-m", "gfnn_jax", *arguments, "--out", str(out)], cache)
+
+        def run(cache: Path) -> Process:
+            return command("run", "two-body", "--quick", cache=cache)
+
+        def fit() -> Process:
+            return command("fit", str(data), "--tolerance", "1e-7", cache=warm)
+
+        process(["-c", LIBRARIES], None)
+        run(warm)
+        fit()
+        taken = {
+            "libraries": [process(["-c", LIBRARIES], None) for _ in range(repeats)],
+            "run_warm": [run(warm) for _ in range(repeats)],
+            "run_cold": [run(folder / f"cold{i}") for i in range(repeats)],
+            "fit_command": [fit() for _ in range(repeats)],
+        }
+        counted = process(["-c", COUNTED_RUN, str(folder / "counted")], warm).out
+        in_python = [process(["-c", FITS_IN_PYTHON], None).out for _ in range(repeats)]
+    measured = json.loads(counted.splitlines()[-1])
+    python = [json.loads(out.splitlines()[-1]) for out in in_python]
+    measured |= {key: float(np.median([p[key] for p in python])) for key in python[0]}
+    for key, processes in taken.items():
+        measured[key] = float(np.median([p.seconds for p in processes]))
+        measured[f"{key}_cpu"] = float(np.median([p.cpu for p in processes]))
+        measured[f"{key}_all"] = [p.seconds for p in processes]
+    return measured
 
 
 def startup(quick: bool) -> Numbers:
@@ -294,41 +435,34 @@ def scaling(quick: bool) -> Numbers:
     def polynomial(dim, degree):
         w = rng.uniform(-1, 1, (64, 2 * dim))
         family = Products(box_inputs(w), degree)
-        return family, family.unflatten(
-            jnp.asarray(1e-3 * rng.standard_normal(family.num_parameters))
-        )
-
-    def fit_seconds(num_pairs, degree):
-        family, _ = polynomial(2, degree)
-        w = jnp.asarray(rng.uniform(-1, 1, (num_pairs, 4)))
-        return least_squares.fit(family, (w, w), (w[:100], w[:100]), np.ones(4)), family
+        return family, family.unflatten(1e-3 * rng.standard_normal(family.num_parameters))
 
     def timed_fit(num_pairs, degree):
-        fit_seconds(num_pairs, degree)  # compiles
-        started = time.perf_counter()
-        _, family = fit_seconds(num_pairs, degree)
-        return time.perf_counter() - started, family.num_parameters
+        family, _ = polynomial(2, degree)
+        w = rng.uniform(-1, 1, (num_pairs, 4))
+        taken = timed(lambda: least_squares.fit(family, (w, w), (w[:100], w[:100]), np.ones(4)), 1)
+        return taken.seconds, family.num_parameters
 
     def step_seconds(dim, lanes, num_steps=100):
         family, params = polynomial(dim, 4)
-        piece = Generated(family, params, MIDPOINT, 0.1, jnp.ones(2 * dim))
+        piece = Generated(family, params, MIDPOINT, 0.1, np.ones(2 * dim))
         z = jnp.asarray(rng.uniform(-0.5, 0.5, (lanes, 2 * dim)))
 
-        def lane(z):
-            return jax.lax.fori_loop(0, num_steps, lambda _, y: piece(y)[0], z)
+        @jax.jit
+        def run(piece, z):
+            return jax.lax.fori_loop(0, num_steps, lambda _, y: piece.step(y)[0], z)
 
-        run = jax.jit(jax.vmap(lane))
-        return best(lambda: run(z), 3) / num_steps
+        return timed(lambda: run(piece, z), 3).seconds / num_steps
 
     scene = gfnn.scenes.make("henon-heiles-regular")
 
     def selection_seconds(num_pairs):
         pairs = gfnn.sample_pairs(scene, num_pairs, jax.random.key(SEED))
-        gfnn.fit(pairs, scene, tolerance=1e-6)  # compiles
-        return gfnn.fit(pairs, scene, tolerance=1e-6)
+        gfnn.fit(pairs, scene, absolute_tolerance=1e-6)  # compiles
+        return gfnn.fit(pairs, scene, absolute_tolerance=1e-6)
 
     def rollout_seconds(map_, z0, num_steps):
-        return best(lambda: map_.rollout(z0, num_steps, save_every=num_steps)[0], 2)
+        return timed(lambda: map_.rollout(z0, num_steps, save_every=num_steps)[0], 2).seconds
 
     sizes = (1_000, 10_000) if quick else (1_000, 10_000, 100_000, 1_000_000)
     degrees = (3, 5) if quick else (3, 4, 5, 6, 7, 8)
@@ -375,7 +509,9 @@ def described(rows: list[tuple[int, float]]) -> Numbers:
     return {"size": size.tolist(), "measured": measured.tolist(), "slope_of_largest": slope}
 
 
-PIECES = {"step": step, "training": training, "startup": startup, "scaling": scaling}
+PIECES = {
+    "start": start, "step": step, "training": training, "startup": startup, "scaling": scaling,
+}  # fmt: skip
 
 
 # Tables
@@ -395,7 +531,7 @@ def step_table(measured: Numbers) -> str:
              "µs per step, 1,000 lanes", "µs per step, one lane",
              "times as fast as Newton with fresh Jacobians",
              "times as fast as with all lanes waiting for the last"]  # fmt: skip
-    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    rows = []
     for name, m in measured.items():
         _, _, batch, single = STEPS[name]
         cells = [name, f"{m['chart']} {m['label']}", number(m["one_step_rms"]),
@@ -404,8 +540,27 @@ def step_table(measured: Numbers) -> str:
                  met(m["microseconds_single"], single),
                  met(m["against_newton"], TARGETS["against_newton"], least=True),
                  number(m["against_waiting"])]  # fmt: skip
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        rows.append(cells)
+    return markdown(heads, rows)
+
+
+def start_table(m: Numbers) -> str:
+    """The first answer, beside the release before and the targets."""
+    rows = []
+    for key, (title, before, most) in START.items():
+        value, cpu = m[key], m.get(f"{key}_cpu")
+        if key in ("run_warm", "run_cold"):  # in times of importing the libraries
+            value, cpu = value / m["libraries"], m[f"{key}_cpu"] / m["libraries_cpu"]
+        rows.append([title, before, met(value, most), number(cpu)])
+    seconds = ", ".join(
+        f"{name} {number(m[key])} ({number(m[f'{key}_cpu'])})" for name, key in (
+            ("libraries", "libraries"), ("the command warm", "run_warm"), ("cold", "run_cold"),
+        )
+    )  # fmt: skip
+    return (
+        markdown(["", "release before", "now", "the same in processor time"], rows)
+        + f"\n\nSeconds, and processor seconds of all threads: {seconds}."
+    )
 
 
 def beside_torch(m: Numbers) -> str:
@@ -434,6 +589,8 @@ def several_models(m: Numbers) -> str:
 def tables() -> None:
     found = results(PIECES, "speed")
     parts = []
+    if "start" in found:
+        parts.append("### The first answer\n\n" + start_table(found["start"]["measured"]))
     if "step" in found:
         parts.append("### A predicted step\n\n" + step_table(found["step"]["measured"]))
     if "training" in found:
@@ -447,17 +604,16 @@ def tables() -> None:
         )  # fmt: skip
     if "startup" in found:
         m = found["startup"]["measured"]
-        lines = ["| a fresh process | seconds |", "|---|---|"]
-        lines += [f"| `{name}` | {number(value)} |" for name, value in m.items()]
-        parts.append("### The start\n\n" + "\n".join(lines))
+        rows = [[f"`{name}`", number(value)] for name, value in m.items()]
+        parts.append("### The start\n\n" + markdown(["a fresh process", "seconds"], rows))
     if "scaling" in found:
-        lines = ["| | sizes | measured | slope of the largest three |", "|---|---|---|---|"]
-        for name, m in found["scaling"]["measured"].items():
-            lines.append(
-                f"| {name} | {', '.join(number(int(s)) for s in m['size'])} | "
-                f"{', '.join(number(s) for s in m['measured'])} | {number(m['slope_of_largest'])} |"
-            )
-        parts.append("### Growth with the size\n\n" + "\n".join(lines))
+        rows = [
+            [name, ", ".join(number(int(size)) for size in m["size"]),
+             ", ".join(map(number, m["measured"])), number(m["slope_of_largest"])]
+            for name, m in found["scaling"]["measured"].items()
+        ]  # fmt: skip
+        heads = ["", "sizes", "measured", "slope of the largest three"]
+        parts.append("### Growth with the size\n\n" + markdown(heads, rows))
     if found:
         parts.append(provenance(found))
         between_markers(TABLES, "speed", "\n\n".join(parts))

@@ -13,54 +13,50 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import datetime
-import json
-import os
-import platform
 import textwrap
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import jax
-
-jax.config.update("jax_enable_x64", True)
-
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-
-import gfnn_jax as gfnn  # noqa: E402
-from gfnn_jax import report  # noqa: E402
-from gfnn_jax.evaluate import figures
-from gfnn_jax.evaluate import metrics
-from gfnn_jax.generating.charts import TYPE2  # noqa: E402
-from gfnn_jax.coordinates import CARTESIAN, TWO_PI  # noqa: E402
-from gfnn_jax.maps.symplectic_map.domain import covering  # noqa: E402
-from gfnn_jax.fitting.adam import PAPER, adam  # noqa: E402
-from gfnn_jax.solve.newton import OK  # noqa: E402
-from gfnn_jax.maps.symplectic_map import Generated, SymplecticMap  # noqa: E402
-from gfnn_jax.maps.symplectic_map.saved import versions  # noqa: E402
-from gfnn_jax.families.inputs import box_inputs  # noqa: E402
-from gfnn_jax.families.mlp import PAPER_HIDDEN, Mlp, amplitude_of  # noqa: E402
-from gfnn_jax.scenes import (  # noqa: E402
-    DrawnFrom,
-    Scene,
-    driven_pendulum,
-    henon_heiles,
-    henon_heiles_section,
+# Sets float64, so it comes before all of JAX.
+from harness import (
+    FIGURES,
+    README,
+    RESULTS,
+    SEED,
+    TABLES,
+    Numbers,
+    angles_of,
+    between_markers,
+    bounded_states,
+    drawn,
+    fitted,
+    markdown,
+    number,
+    one_step_rms,
+    provenance,
+    read,
+    write,
 )
-from gfnn_jax.scenes.henon_heiles_section import FIXED_POINT  # noqa: E402
 
-HERE = Path(__file__).resolve().parent
-RESULTS, TABLES, README = HERE / "results", HERE / "RESULTS.md", HERE.parent / "README.md"
-FIGURE = HERE / "figures" / "two_body_error.png"
-SEED = 0
+# isort: split
+import jax
+import numpy as np
+
+import gfnn_jax as gfnn
+from gfnn_jax.baselines import Budget, Sequences
+from gfnn_jax.baselines.paper_gfnn import paper_gfnn
+from gfnn_jax.coordinates import TWO_PI
+from gfnn_jax.evaluate import figures, metrics, report
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.scenes import DrawnFrom, Scene, driven_pendulum, henon_heiles, henon_heiles_section
+from gfnn_jax.scenes.henon_heiles_section import FIXED_POINT
+from gfnn_jax.solve.status import OK
+
+FIGURE = FIGURES / "two_body_error.png"
 NUM_STEPS = 1_000
-
-Numbers = dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,33 +74,6 @@ class Row:
 
 
 # Measuring
-
-
-def angles_of(scene: Scene | None) -> tuple[int, ...]:
-    """Indices of the user's coordinates that are angles."""
-    if scene is None or scene.coordinates.forward is not CARTESIAN.forward:
-        return ()
-    return scene.coordinates.angles
-
-
-def finite(pairs: gfnn.Pairs) -> gfnn.Pairs:
-    """Without the states that collide or escape within the step."""
-    return pairs.take(np.flatnonzero(np.isfinite(np.asarray(pairs.z1)).all(axis=1)))
-
-
-def drawn(scene: Scene, num_pairs: int, quick: bool) -> tuple[gfnn.Pairs, gfnn.Pairs]:
-    """Pairs to learn from, and fresh ones of another key to judge by."""
-    key, fresh = jax.random.split(jax.random.key(SEED))
-    pairs = gfnn.sample_pairs(scene, num_pairs, key)
-    return finite(pairs), finite(gfnn.sample_pairs(scene, 200 if quick else 2_000, fresh))
-
-
-def one_step_rms(map_: SymplecticMap, fresh: gfnn.Pairs, angles=()) -> float:
-    """Per-component RMS of the one-step state error."""
-    error = np.asarray(map_.step(fresh.z0)[0]) - np.asarray(fresh.z1)
-    turned = list(angles)
-    error[:, turned] -= TWO_PI * np.round(error[:, turned] / TWO_PI)
-    return float(np.sqrt(np.mean(error**2)))
 
 
 def rolled_out(map_: SymplecticMap, scene: Scene, quick: bool) -> Numbers:
@@ -130,59 +99,16 @@ def rolled_out(map_: SymplecticMap, scene: Scene, quick: bool) -> Numbers:
     }
 
 
-def in_float32(map_: SymplecticMap) -> SymplecticMap:
-    """The same map, all of its arrays rounded to float32."""
-
-    def rounded(leaf):
-        is_double = getattr(leaf, "dtype", None) == jnp.float64
-        return leaf.astype(jnp.float32) if is_double else leaf
-
-    return jax.tree.map(rounded, map_)
-
-
-def fitted(pairs: gfnn.Pairs, scene: Scene | None, fresh: gfnn.Pairs, **options):
-    """(fit, what was measured of it)."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", gfnn.FitWarning)  # kept in fit.messages
-        fit = gfnn.fit(pairs, scene, seed=SEED, on_progress=lambda m: print(f"  {m}"), **options)
-    return fit, {
-        "one_step_rms": one_step_rms(fit.map, fresh, angles_of(scene)),
-        "pairs": len(pairs),
-        "fit_seconds": fit.chosen.fit_seconds,
-        "compile_seconds": fit.chosen.compile_seconds,
-        "total_seconds": fit.seconds,
-        **described(fit),
-    }
-
-
-def described(fit: gfnn.Fit) -> Numbers:
-    """The chosen candidate."""
-    return {
-        "chart": fit.chosen.chart,
-        "label": fit.chosen.label,
-        "base_map": fit.based,
-        "num_parameters": fit.chosen.num_parameters,
-        "kflop_per_step": fit.chosen.work / 1e3,
-        "microseconds_per_step": fit.chosen.microseconds_per_step,
-        "validation_rms": fit.chosen.validation_rms,
-        "validation_bound": fit.chosen.validation_bound,
-        "tolerance": fit.tolerance,
-        "symplecticity_defect": fit.symplecticity_defect,
-        "determinants": {name: j.low for name, j in fit.judgements.items()},
-        "messages": list(fit.messages),
-    }
-
-
 # The scenes
 
 
 def scene_row(name: str, title: str, pairs: int, seconds: float, rms: float, **targets) -> Row:
-    """A scene by its name, at a tolerance equal to the target."""
+    """A scene by its name, at an absolute tolerance equal to the target."""
 
     def measure(quick: bool) -> Numbers:
         scene = gfnn.scenes.make(name)
         data, fresh = drawn(scene, pairs, quick)
-        fit, measured = fitted(data, scene, fresh, tolerance=rms)
+        fit, measured = fitted(data, scene, fresh, absolute_tolerance=rms)
         if targets:
             measured |= rolled_out(fit.map, scene, quick)
         return measured
@@ -193,44 +119,31 @@ def scene_row(name: str, title: str, pairs: int, seconds: float, rms: float, **t
 
 def cartesian_two_body(quick: bool) -> Numbers:
     data, fresh = drawn(gfnn.scenes.two_body(), 10_000, quick)
-    return fitted(data, None, fresh, tolerance=1e-6)[1]
+    return fitted(data, None, fresh, absolute_tolerance=1e-6)[1]
 
 
 def network_on_two_body(quick: bool) -> Numbers:
     data, fresh = drawn(gfnn.scenes.two_body(), 3_000 if quick else 6_000, quick)
     options = {"max_iterations": 40} if quick else {}
-    return fitted(data, None, fresh, scalar="mlp", tolerance=2e-6, **options)[1]
+    return fitted(data, None, fresh, family="mlp", absolute_tolerance=2e-6, **options)[1]
 
 
 def paper_recipe(quick: bool) -> Numbers:
     """The paper's network and training on two bodies: what the figure compares with."""
     scene = gfnn.scenes.two_body()
     data, fresh = drawn(scene, 10_000 if quick else 100_000, quick)
-    z0, z1 = jnp.asarray(data.z0), jnp.asarray(data.z1)
-    w, wanted = TYPE2.point(z0, z1), TYPE2.wanted(z0, z1, scene.dt)
-    family = Mlp(box_inputs(w), PAPER_HIDDEN, "tanh", amplitude_of(w, wanted))
-    cut = len(data) // 10
-    trained = adam(
-        family, family.init(jax.random.key(SEED), jnp.float32), (w[cut:], wanted[cut:]),
-        (w[:cut], wanted[:cut]), scene.dt * np.ones(4), recipe=PAPER, key=jax.random.key(SEED),
-        on_epoch=lambda epoch, _, rms: print(f"  epoch {epoch}: {rms:.2e}"),
-    )  # fmt: skip
-    params = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), trained.params)
-    scale = jnp.asarray(z0.std(axis=0))
-    generated = Generated(
-        family, params, TYPE2, scene.dt, scale
-    )  # fmt: skip
-    map_ = SymplecticMap((generated,), CARTESIAN, covering(z0), scale, jnp.zeros(0), scene.dt)
+    sequences = Sequences(np.stack([data.z0, data.z1], axis=1), scene.dt)
+    learned = paper_gfnn(sequences, Budget(jax.random.key(SEED), say=lambda m: print(f"  {m}")))
     return {
-        "one_step_rms": one_step_rms(map_, fresh),
+        "one_step_rms": one_step_rms(learned.map, fresh),
         "pairs": len(data),
-        "fit_seconds": trained.seconds,
-        "compile_seconds": trained.compile_seconds,
+        "fit_seconds": learned.training.seconds,
+        "compile_seconds": learned.training.compile_seconds,
         "chart": "type2",
-        "label": f"{family.label}, Adam",
-        "num_parameters": family.num_parameters,
-        "symplecticity_defect": float(jnp.max(map_.defect(fresh.z0[:200]))),
-        **rolled_out(map_, scene, quick),
+        "label": f"{learned.family.label}, Adam",
+        "num_parameters": learned.family.num_parameters,
+        "symplecticity_defect": float(np.max(learned.map.defect(fresh.z0[:200]))),
+        **rolled_out(learned.map, scene, quick),
     }
 
 
@@ -242,7 +155,7 @@ def pendulum(nu: float) -> Row:
 
     def measure(quick: bool) -> Numbers:
         data, fresh = drawn(driven_pendulum(frequency=nu), 3_000, quick)
-        return fitted(data, None, fresh, tolerance=1e-10)[1]
+        return fitted(data, None, fresh, absolute_tolerance=1e-10)[1]
 
     title = f"driven pendulum, ν = {nu:g}, one period per step, told nothing"
     return Row(title, {"pairs": 3_000, "one_step_rms": 1e-10}, measure)
@@ -258,22 +171,14 @@ def return_map(quick: bool) -> Numbers:
     )
     y, p_y = FIXED_POINT
     z0 = np.stack([y + radius * np.cos(angle), p_y + radius * np.sin(angle)], axis=1)
-    z1 = np.asarray(gfnn.reference_trajectories(henon_heiles_section(), jnp.asarray(z0), 1)[:, 1])
+    z1 = np.asarray(gfnn.reference_trajectories(henon_heiles_section(), z0, 1)[:, 1])
     pairs, fresh = gfnn.Pairs(z0[:400], z1[:400], 1.0), gfnn.Pairs(z0[400:], z1[400:], 1.0)
     # The disc's rim, where the map bends most, is rare among 400 states: asking for more than is
     # there takes the most accurate map instead of the first that looks good enough inside.
-    return fitted(pairs, None, fresh, tolerance=1e-7)[1]
+    return fitted(pairs, None, fresh, absolute_tolerance=1e-7)[1]
 
 
 # What the choice does
-
-
-def bounded_states(key, num):
-    """Uniform over the well of Hénon and Heiles below E = 1/8."""
-    energy = gfnn.scenes.henon_heiles().invariants["energy"]
-    box = np.array([0.7, 0.7, 0.5, 0.5])
-    z = box * jax.random.uniform(key, (100 * num, 4), jnp.float64, -1, 1)
-    return z[np.flatnonzero(np.asarray(jax.vmap(energy)(z)) < 1 / 8)[:num]]
 
 
 def long_step(quick: bool) -> Numbers:
@@ -285,7 +190,7 @@ def long_step(quick: bool) -> Numbers:
         refusal = ""
     except gfnn.FitError as error:
         refusal = str(error)
-    _, measured = fitted(data, scene, fresh, tolerance=1e-6)
+    _, measured = fitted(data, scene, fresh, absolute_tolerance=1e-6)
     return measured | {"refusal": refusal, "advice_missing": int("midpoint" not in refusal)}
 
 
@@ -293,7 +198,7 @@ def three_tolerances(quick: bool) -> Numbers:
     """Hénon–Heiles: three tolerances choose three maps of rising cost."""
     scene = gfnn.scenes.make("henon-heiles-regular")
     data, fresh = drawn(scene, 2_000 if quick else 4_000, quick)
-    chosen = [fitted(data, scene, fresh, tolerance=t)[1] for t in (1e-4, 1e-7, 1e-10)]
+    chosen = [fitted(data, scene, fresh, absolute_tolerance=t)[1] for t in (1e-4, 1e-7, 1e-10)]
     cost = [c["kflop_per_step"] for c in chosen]
     return {
         "pairs": len(data),
@@ -355,71 +260,26 @@ ROWS: dict[str, Row] = {
 # Results and tables
 
 
-def processor_model() -> str:
-    """The processor's name where the system tells it, else its architecture."""
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as lines:
-            names = [line.partition(":")[2].strip() for line in lines if "model name" in line]
-    except OSError:
-        names = []
-    return names[0] if names else platform.machine()
-
-
-def circumstances() -> Numbers:
-    """Where, when and with what a result was measured."""
-    return {
-        "seed": SEED,
-        "dtype": "float64",
-        "device": report.device(),
-        "machine": {
-            "processor": platform.machine(),
-            "model": processor_model(),
-            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
-            "load": os.getloadavg()[0],
-        },
-        "python": platform.python_version(),
-        "versions": versions(),
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-    }
-
-
 def run(name: str, folder: Path, quick: bool) -> None:
     """Measure a row and write its result."""
     row = ROWS[name]
     print(f"{name}: {row.title}")
     started = time.perf_counter()
     measured = row.measure(quick)
-    result = {
-        "row": name,
-        "title": row.title,
-        "quick": quick,
-        "targets": row.targets,
-        "met": {key: bool(measured[key] <= most) for key, most in row.targets.items()},
-        "measured": measured,
-        "seconds": time.perf_counter() - started,
-        **circumstances(),
-    }
-    folder.mkdir(parents=True, exist_ok=True)
-    text = report.to_json(result)
-    (folder / f"{name}.json").write_text(text, encoding="utf-8")
-    verdict = "met" if all(result["met"].values()) else f"NOT met: {result['met']}"
-    print(f"{name}: {verdict}, {result['seconds']:.0f} s")
+    seconds = time.perf_counter() - started
+    met = {key: bool(measured[key] <= most) for key, most in row.targets.items()}
+    write(folder / f"{name}.json", {
+        "row": name, "title": row.title, "quick": quick, "targets": row.targets, "met": met,
+        "measured": measured, "seconds": seconds,
+    })  # fmt: skip
+    said = "met" if all(met.values()) else f"NOT met: {met}"
+    print(f"{name}: {said}, {seconds:.0f} s", flush=True)
     jax.clear_caches()  # a process may map only so many compiled programs
 
 
 def results(folder: Path) -> dict[str, Numbers]:
     """Results so far, in the order of the rows."""
-    paths = {name: folder / f"{name}.json" for name in ROWS}
-    return {n: json.loads(p.read_text(encoding="utf-8")) for n, p in paths.items() if p.exists()}
-
-
-def number(value) -> str:
-    """As the tables show it."""
-    if value is None:
-        return "–"
-    if isinstance(value, int) or (isinstance(value, float) and 99.5 <= value < 1e6):
-        return f"{value:,.0f}"
-    return f"{value:.2g}" if 0.01 <= abs(value) < 1000 or value == 0 else f"{value:.1e}"
+    return read({name: folder / f"{name}.json" for name in ROWS})
 
 
 def against(result: Numbers, key: str) -> str:
@@ -445,7 +305,7 @@ def table(found: dict[str, Numbers], *, full: bool) -> str:
     heads = ["what is learned", "pairs", "one-step RMS", "error at step 1,000", "fit, s", "map"]
     heads += ["parameters", "µs/step", "defect", "compile, s", "all of it, s"] if full else []
     heads += ["targets met"]
-    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    rows = []
     for result in found.values():
         m = result["measured"]
         at_end = "error_median" if "error_median" in result["targets"] else "error_mean"
@@ -462,36 +322,8 @@ def table(found: dict[str, Numbers], *, full: bool) -> str:
             keys = ("num_parameters", "microseconds_per_step", "symplecticity_defect",
                     "compile_seconds", "total_seconds")  # fmt: skip
             cells += [number(m.get(key)) for key in keys]
-        lines.append("| " + " | ".join([*cells, verdict(result)]) + " |")
-    return "\n".join(lines)
-
-
-def between_markers(path: Path, name: str, text: str) -> None:
-    """Put ``text`` between <!-- name --> and <!-- /name --> of a file."""
-    before, after = f"<!-- {name} -->\n", f"<!-- /{name} -->"
-    whole = path.read_text(encoding="utf-8")
-    start, end = whole.index(before) + len(before), whole.index(after)
-    path.write_text(whole[:start] + text + "\n" + whole[end:], encoding="utf-8")
-
-
-def provenance(found: dict[str, Numbers]) -> str:
-    """One sentence on where and when the numbers were taken."""
-    cores: dict[str, set[int]] = {}
-    for r in found.values():
-        machine = r["machine"]
-        where = r["device"].partition(": ")[2]
-        where = machine.get("model", machine["processor"]) if where in ("cpu", "") else where
-        cores.setdefault(where, set()).add(machine["cores"])
-    machines = [f"{name} ({' or '.join(map(str, sorted(n)))} cores)" for name, n in cores.items()]
-    dates = sorted({r["date"] for r in found.values()})
-    jaxes = sorted({r["versions"]["jax"] for r in found.values()})
-    loads = [r["machine"]["load"] for r in found.values()]
-    span = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
-    return (
-        f"Measured {span} on {' and '.join(sorted(machines))}, jax {', '.join(jaxes)}, float64, "
-        f"seed {SEED}; other work on the machine at the time: load average {min(loads):.1f} to "
-        f"{max(loads):.1f}."
-    )
+        rows.append([*cells, verdict(result)])
+    return markdown(heads, rows)
 
 
 def tables() -> None:

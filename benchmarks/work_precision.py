@@ -15,16 +15,13 @@ from __future__ import annotations
 import functools
 import importlib.metadata
 import json
-import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 # Sets float64, so it comes before all of JAX.
-from pieces import main as run_pieces
-from pieces import results
-from targets import (
-    HERE,
+from harness import (
+    FIGURES,
     RESULTS,
     SEED,
     TABLES,
@@ -33,9 +30,13 @@ from targets import (
     between_markers,
     drawn,
     in_float32,
+    markdown,
     number,
     provenance,
+    results,
+    timed,
 )
+from harness import main as run_pieces
 
 # isort: split
 import jax
@@ -43,11 +44,10 @@ import numpy as np
 from integrators import runners
 
 import gfnn_jax as gfnn
-from gfnn_jax.evaluate import figures
-from gfnn_jax.evaluate import metrics
-from gfnn_jax.jobs.compare import separable
-from gfnn_jax.solve.newton import LEFT_DOMAIN
+from gfnn_jax.evaluate import figures, metrics
+from gfnn_jax.jobs.shared_data import separable
 from gfnn_jax.scenes import Scene
+from gfnn_jax.solve.status import LEFT_DOMAIN
 
 # scene: pairs to learn from, the steps after which the error is taken, and states. In a batch all
 # states wait for the one that comes closest to a body: of a thousand that takes half an hour.
@@ -63,29 +63,16 @@ QUICK = ("standard-map-regular", "henon-heiles-regular")
 SINGLE_STEPS, STRIDE, MOST_SIZES = 1_000, 10, 5
 FLOAT32_FLOOR = 1e-7  # of the data's spread: a larger map is no more accurate in float32
 CHARTS = ("midpoint", "type2")
-UNREACHABLE = 1e-300  # a tolerance for which a fit climbs its ladder to the end
+UNREACHABLE = 1e-300  # a tolerance for which a fit sweeps all sizes
+# A size is fitted by asking for its own error, a little more because that may be an estimate.
+_MARGIN = 1.1
 MLP_ITERATIONS = 100
 DRAWN = 10.0  # a larger error is that of a prediction far outside the scene
 ASKED = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
-FIGURES = HERE / "figures"
 OURS, KNOWN, OTHERS = "ours", "H known", "baseline"
 
 
 # Measuring
-
-
-def timed(function: Callable[[], Any], most_seconds: float = 0.6) -> tuple[Any, float, float]:
-    """What the function returns, seconds of its fastest call, and what the first took longer."""
-
-    def once() -> tuple[Any, float]:
-        started = time.perf_counter()
-        out = jax.block_until_ready(function())
-        return out, time.perf_counter() - started
-
-    (out, first), (_, second) = once(), once()
-    repeats = int(np.clip(most_seconds / second, 1, 40))
-    fastest = min(second, *(once()[1] for _ in range(repeats)))
-    return out, fastest, max(0.0, first - fastest)
 
 
 class Bench:
@@ -169,7 +156,7 @@ def thinned(items: list, most: int) -> list:
 
 
 def kinds_of(scene: Scene, quick: bool) -> Iterator[tuple[str, str]]:
-    """(chart, scalar) of each ladder."""
+    """(chart, family) of each size sweep."""
     for chart in CHARTS[:1] if quick else CHARTS:
         if scene.features is None or chart == CHARTS[0]:  # one row shows what features are worth
             yield chart, "polynomial"
@@ -183,37 +170,48 @@ def our_maps(bench: Bench, num_pairs: int, quick: bool, omit) -> Iterator[Number
     """Every chart and family, a few sizes along the front of each, in both precisions."""
     scene = bench.scene
     pairs, _ = drawn(scene, num_pairs, quick=True)
-    for chart, scalar in kinds_of(scene, quick):
-        name = f"{chart} {scalar}"
-        try:
+    for chart, family in kinds_of(scene, quick):
+        name = f"{chart} {family}"
+
+        def fitted(tolerance, chart=chart, family=family):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", gfnn.FitWarning)
-                fit = gfnn.fit(
-                    pairs, scene, chart=chart, scalar=scalar, seed=SEED,
-                    tolerance=1e-3 if quick else UNREACHABLE, max_iterations=MLP_ITERATIONS,
+                return gfnn.fit(
+                    pairs, scene, chart=chart, family=family, seed=SEED, tolerance=tolerance,
+                    max_iterations=MLP_ITERATIONS,
                 )  # fmt: skip
+
+        try:
+            sweep = fitted(1e-3 if quick else UNREACHABLE)
         except gfnn.FitError as error:
             omit(name, str(error))
             continue
-        print(f"  {name}: {len(fit.candidates)} sizes, {fit.seconds:.0f} s")
-        sizes = [c for c in fit.candidates if np.isfinite(c.validation_rms)]
-        if len(sizes) < len(fit.candidates):
-            lost = sorted({c.label for c in fit.candidates} - {c.label for c in sizes})
+        print(f"  {name}: {len(sweep.candidates)} sizes, {sweep.seconds:.0f} s", flush=True)
+        sizes = [c for c in sweep.candidates if np.isfinite(c.validation_relative)]
+        if len(sizes) < len(sweep.candidates):
+            lost = sorted({c.label for c in sweep.candidates} - {c.label for c in sizes})
             omit(name, f"lanes of the held-out pairs fail: {', '.join(lost)}")
-        front = front_of([c.work for c in sizes], [c.validation_rms for c in sizes])
+        front = front_of([c.operations for c in sizes], [c.validation_relative for c in sizes])
+        shown: set[str] = set()
         at_floor = False
-        for candidate in thinned([sizes[i] for i in front], 1 if quick else MOST_SIZES):
+        for size in thinned([sizes[i] for i in front], 1 if quick else MOST_SIZES):
+            alone = size.chosen or len(front) == 1
+            fit = sweep if alone else fitted(_MARGIN * size.validation_bound)
+            candidate = fit.chosen
+            if candidate.label in shown:
+                continue
+            shown.add(candidate.label)
             about = {
                 "group": OURS, "method": f"{chart} {candidate.label.rsplit(maxsplit=1)[0]}",
                 "label": candidate.label, "chart": chart,
-                "num_parameters": candidate.num_parameters, "base_map": fit.based,
+                "num_parameters": candidate.num_parameters, "base_map": fit.base_map,
                 "one_step_rms": candidate.validation_rms, "fit_seconds": candidate.fit_seconds,
             }  # fmt: skip
-            yield {**about, "dtype": "float64", **map_point(bench, candidate.map, alone=True)}
+            yield {**about, "dtype": "float64", **map_point(bench, fit.map, alone=True)}
             if not at_floor:
-                single = in_float32(candidate.map)
+                single = in_float32(fit.map)
                 yield {**about, "dtype": "float32", **map_point(bench, single, alone=False)}
-            at_floor = candidate.relative_rms < FLOAT32_FLOOR
+            at_floor = candidate.validation_relative < FLOAT32_FLOOR
 
 
 def integrated(bench: Bench, quick: bool, omit) -> Iterator[Numbers]:
@@ -366,8 +364,7 @@ def advice(name: str, result: Numbers) -> str:
             f"{other['method']}, {number(other['microseconds_batch'])}" if other else "none"
         )
         rows.append(row)
-    lines = ["| " + " | ".join(rows[0]) + " |", "|---" * len(rows[0]) + "|"]
-    return "\n".join([*lines, *("| " + " | ".join(row.values()) + " |" for row in rows)])
+    return markdown(list(rows[0]), [list(row.values()) for row in rows])
 
 
 def pair_of(together: Numbers | None, alone: Numbers | None, of: Numbers | None = None) -> str:
