@@ -32,7 +32,9 @@ class Options:
     gained: a step that lowers the residual by less has converged.
     null: of a term's size; one that is closer to the span of those before it is not known apart.
     block_bytes: of the arrays that a block of pairs takes.
-    reach: h‖H''‖ of one substep.
+    reach: h‖H''‖ of one substep. coarse_stages: of the early rounds.
+    early_rows: rows per term that the early rounds look at; fewest: pairs at least.
+    judged: pairs at which a step's own error is measured.
     """
 
     fractions: tuple[float, ...] = (0.1, 0.3, 0.6, 0.9, 1.0)
@@ -44,10 +46,15 @@ class Options:
     null: float = 1e-10
     block_bytes: int = 32 * 2**20
     reach: float = 1.0
+    coarse_stages: int = 4
+    early_rows: float = 6.0
+    fewest: int = 60
+    judged: int = 48
 
 
 OPTIONS = Options()
 _ROUNDOFF = 2e-16  # of the coordinates' sizes: the residual's floor
+_FINE, _ROUNDED = 5e-16, 1e-13  # of them: a step's own error that is roundoff, at dt of long arcs too
 
 
 class FlowFit(NamedTuple):
@@ -56,7 +63,7 @@ class FlowFit(NamedTuple):
     rms: per component of (Φ(z₀) − z₁) ÷ scale on the pairs that were used. standard_errors:
     (terms,), from the Gauss–Newton factor. factor: R of [∂r/∂c, r] (m + 1, m + 1), and ``rows``, for
     which it stands. condition: of the scaled columns. used: (N,) the pairs in the loss.
-    iterations: Gauss–Newton steps taken.
+    iterations: Gauss–Newton steps taken. steps: how the flow was computed in the end.
     """
 
     coefficients: np.ndarray
@@ -67,6 +74,15 @@ class FlowFit(NamedTuple):
     condition: float
     used: np.ndarray
     iterations: int
+    steps: Steps
+
+
+class Factor(NamedTuple):
+    """R (m + 1, m + 1) of [∂r/∂c, r], the rows for which it stands, and the cost ‖r‖."""
+
+    matrix: np.ndarray
+    rows: int
+    cost: float
 
 
 # Where a fit starts.
@@ -174,23 +190,27 @@ class Problem:
         ]
         return np.concatenate(parts) if parts else np.zeros((0, self.z0.shape[1]))
 
-    def factor(self, family, coefficients, steps: Steps, rows) -> tuple[np.ndarray, int]:
-        """R (m + 1, m + 1) of [∂r/∂c, r] over these rows, and the number of rows of the matrix."""
+    def factor(self, family, coefficients, steps: Steps, rows) -> Factor:
+        """The Gauss–Newton problem of these rows; its cost is infinite where a flow fails."""
         count = family.num_parameters
-        factor, seen = np.zeros((0, count + 1)), 0
+        matrix, seen, failed = np.zeros((0, count + 1)), 0, not np.isfinite(coefficients).all()
         for block in self._blocks(rows, count * steps.stages):
+            if failed:
+                break
             found = images(
                 family, coefficients, self.z0[block], self.dt, steps, derivatives=True
             )
             residual = (found.states - self.z1[block]) / self.scale
             slope = found.by_coefficient / self.scale[:, None]
-            good = np.isfinite(residual).all(axis=1) & np.isfinite(slope).all(axis=(1, 2))
-            matrix = np.concatenate([slope[good], residual[good][..., None]], axis=-1)
-            stacked = np.concatenate([factor, matrix.reshape(-1, count + 1)])
-            factor = np.linalg.qr(stacked, mode="r")
-            seen += matrix.shape[0] * matrix.shape[1]
-        short = count + 1 - len(factor)
-        return np.concatenate([factor, np.zeros((max(short, 0), count + 1))]), seen
+            part = np.concatenate([slope, residual[..., None]], axis=-1).reshape(-1, count + 1)
+            failed = not np.isfinite(part).all()
+            if not failed:
+                matrix = np.linalg.qr(np.concatenate([matrix, part]), mode="r")
+                seen += len(part)
+        short = max(count + 1 - len(matrix), 0)
+        matrix = np.concatenate([matrix, np.zeros((short, count + 1))])
+        cost = np.inf if failed else float(np.linalg.norm(matrix[:, -1]))
+        return Factor(matrix, seen, cost)
 
     def _blocks(self, rows, columns: int):
         width = self.z0.shape[1]
@@ -201,67 +221,100 @@ class Problem:
             yield rows[first : first + size]
 
     def fit(
-        self, family, start, steps: Steps, rows=None, *, rounds: bool = True,
+        self, family, start, rows=None, *, rounds: bool = True,
         say: Callable[[str], Any] = lambda message: None,
     ) -> FlowFit:  # fmt: skip
         """Levenberg–Marquardt from ``start`` (terms,) over these rows.
 
-        rounds: quiet pairs first; else all at once, from a start that is known to be close.
+        rounds: quiet pairs first, with coarse steps; else all at once, from a start that is known
+        to be close.
         """
         options = self.options
         rows = np.arange(len(self.z0)) if rows is None else np.asarray(rows)
         c, iterations = np.array(start, dtype=float), 0
         least = int(np.ceil(options.rows_per_term * family.num_parameters / self.z0.shape[1]))
-        fractions = options.fractions if rounds else (1.0,)
-        used = rows
-        for fraction in fractions:
-            count = int(np.ceil(fraction * len(rows)))
+        most = max(options.fewest, int(options.early_rows * least / options.rows_per_term))
+        sample = rows[:: -(-len(rows) // most)] if len(rows) > most else rows
+        for fraction in options.fractions if rounds else ():
+            count = int(np.ceil(fraction * len(sample)))
             if fraction < 1 and count < least:
                 continue
-            size = np.linalg.norm(self.residuals(family, c, steps, rows), axis=1)
-            size = np.where(np.isfinite(size), size, np.inf)
-            order = np.argsort(size, kind="stable")
-            used = rows[order[:count]]
-            used = used[np.isfinite(size[order[:count]])]
-            if len(used) < min(least, len(rows)):
+            steps = self._coarse(family, c, sample)
+            quiet = self._quietest(family, c, steps, sample, count)
+            if len(quiet) < min(least, len(sample)):
                 break
-            most = options.most if fraction == 1.0 else options.early
-            c, made = self._descend(family, c, steps, used, most)
+            c, _, made = self._descend(family, c, steps, quiet, options.early)
             iterations += made
-            say(f"H: {family.num_parameters} terms, {len(used)} of {len(rows)} pairs")
-        factor, seen = self.factor(family, c, steps, used)
-        return _summary(c, factor, seen, used, iterations)
+            say(f"H of {family.num_parameters} terms: {len(quiet)} of {len(rows)} pairs")
+        if rounds:
+            steps = self._coarse(family, c, sample)
+            quiet = self._quietest(family, c, steps, sample, len(sample))
+            c, _, made = self._descend(family, c, steps, quiet, options.most)
+            iterations += made
+        steps = self.fine_steps(family, c, rows)
+        used = self._quietest(family, c, steps, rows, len(rows))
+        c, factor, made = self._descend(family, c, steps, used, options.most)
+        return _summary(c, factor, used, iterations + made, steps)
+
+    def _quietest(self, family, c, steps: Steps, rows, count: int):
+        """The ``count`` of these rows that c explains best, without those whose flow fails."""
+        size = np.linalg.norm(self.residuals(family, c, steps, rows), axis=1)
+        order = np.argsort(np.where(np.isfinite(size), size, np.inf), kind="stable")[:count]
+        return rows[order[np.isfinite(size[order])]]
+
+    def _coarse(self, family, c, rows) -> Steps:
+        substeps = substeps_for(family, c, self.z0[rows], self.dt, self.options.reach)
+        return Steps(self.options.coarse_stages, substeps)
+
+    def fine_steps(self, family, c, rows, tolerance: float | None = None) -> Steps:
+        """The cheapest steps whose own error, ÷ scale, is within the tolerance at nearly all of
+        these rows; None: at roundoff."""
+        tolerance = _FINE if tolerance is None else tolerance
+        sample = rows[:: -(-len(rows) // self.options.judged)]
+        z = self.z0[sample]
+        substeps = substeps_for(family, c, z, self.dt, self.options.reach)
+        reference = images(family, c, z, self.dt, Steps(12, 4 * substeps)).states
+
+        def error(steps: Steps) -> float:
+            states = images(family, c, z, self.dt, steps).states
+            off = np.abs((states - reference) / self.scale).max(axis=1)
+            return float(np.quantile(np.where(np.isfinite(off), off, np.inf), 0.95))
+
+        counts = (3, 4, 5, 6, 8, 10, 12)
+        errors: dict[Steps, float] = {}
+        for more in (1, 2, 4):
+            for stages in counts:
+                steps = Steps(stages, more * substeps)
+                errors[steps] = error(steps)
+                if errors[steps] <= tolerance:
+                    return steps
+            best = min(errors.values())
+            if best <= _ROUNDED:  # all that rounding leaves
+                break
+        return next(s for s, e in errors.items() if e <= 3 * best)
 
     def _descend(self, family, c, steps: Steps, rows, most: int):
-        """Gauss–Newton steps until nothing is gained: (coefficients, steps taken)."""
-        cost = self._cost(family, c, steps, rows)
+        """Gauss–Newton steps until nothing is gained: (coefficients, their factor, steps taken)."""
+        here = self.factor(family, c, steps, rows)
         floor = _ROUNDOFF * np.sqrt(rows.size * self.z0.shape[1])
         first_damping, made = 0, 0
-        while made < most and cost > floor:
-            factor, _ = self.factor(family, c, steps, rows)
+        while made < most and floor < here.cost < np.inf:
             found = None
             for n in range(first_damping, len(self.options.dampings)):
-                step = _damped_step(factor, self.options.dampings[n])
-                tried = self._cost(family, c - step, steps, rows)
-                if tried < cost:
+                tried = c - _damped_step(here.matrix, self.options.dampings[n])
+                there = self.factor(family, tried, steps, rows)
+                if there.cost < here.cost:
                     found = n
                     break
             if found is None:
                 break
             made += 1
-            gained = 1 - tried / cost
-            c, cost = c - step, tried
+            gained = 1 - there.cost / here.cost
+            c, here = tried, there
             first_damping = max(0, found - 2)
             if gained < self.options.gained:
                 break
-        return c, made
-
-    def _cost(self, family, c, steps, rows) -> float:
-        """‖r‖, infinite where a flow fails."""
-        if not np.isfinite(c).all():
-            return np.inf
-        norm = float(np.linalg.norm(self.residuals(family, c, steps, rows)))
-        return norm if np.isfinite(norm) else np.inf
+        return c, here, made
 
 
 def _scaled(factor):
@@ -282,15 +335,15 @@ def _damped_step(factor, damping: float) -> np.ndarray:
     return vt.T @ (filters * along) / size
 
 
-def _summary(c, factor, seen: int, used, iterations: int) -> FlowFit:
-    count = len(c)
+def _summary(c, found: Factor, used, iterations: int, steps: Steps) -> FlowFit:
+    count, factor, seen = len(c), found.matrix, found.rows
     size, s, vt, _ = _scaled(factor)
     rms = float(np.linalg.norm(factor[:, count])) / np.sqrt(max(seen, 1))
     left = float(np.linalg.norm(factor[:, count])) / np.sqrt(max(seen - count, 1))
     inverse = np.where(s > 0, 1.0 / np.where(s > 0, s, 1.0), 0.0)
     errors = max(left, _ROUNDOFF) * np.linalg.norm(vt.T * inverse, axis=1) / size
     condition = float(s[0] / s[-1]) if s[-1] > 0 else float("inf")
-    return FlowFit(c, rms, errors, factor, seen, condition, used, iterations)
+    return FlowFit(c, rms, errors, factor, seen, condition, used, iterations, steps)
 
 
 # Fewer terms.

@@ -1,0 +1,242 @@
+"""The piece that a Hamiltonian makes: its flow over dt by Gauss collocation.
+
+    K_i = J∇H(z + h Σ_j a_ij K_j),      Z = z + h Σ_i b_i K_i
+
+Symplectic for every H, separable or not, and symmetric in time: the inverse is the same method
+with −dt. The stages are solved to roundoff, by fixed point or, where h‖H''‖ is too large for that to
+contract, by Newton's method. Their number and the substeps are fixed for a piece: a count that
+depended on the state would make the map discontinuous.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.arrays import as_row, matmul
+from gfnn_jax.families import as_family
+from gfnn_jax.flows.gauss import gauss
+from gfnn_jax.generating.generated import two_sum
+from gfnn_jax.phase_space import apply_j, symplectic_form
+from gfnn_jax.solve import newton
+from gfnn_jax.solve.linear import small_solve
+from gfnn_jax.solve.newton import Evaluation
+from gfnn_jax.solve.status import NON_FINITE, NOT_CONVERGED, OK, Info
+
+_MOST, _MOST_NEWTON = 100, 40
+# A change of the stages of so many eps of the state is roundoff; so is one of eps^¾ that no longer
+# halves.
+_FLOOR_EPS, _SETTLED = 2.0, 0.75
+
+
+@dataclasses.dataclass(frozen=True)
+class StageEquation:
+    """The stages' equation as Newton's method wants it: x is h K, (B, s·2d).
+
+    shared = (family, params, h, scale); lanes = (z, args). Residuals are in units of ``scale``.
+    """
+
+    stages: int
+
+    def evaluate(self, shared, lanes, x) -> Evaluation:
+        """The residual; aux is nothing."""
+        (family, params, h, scale), (z, args) = shared, lanes
+        slopes, inside = self._inside(z, x)
+        field = h * apply_j(family.gradient(params, inside, args))
+        return self._evaluation(z, slopes, field, scale)
+
+    def linearise(self, shared, lanes, x) -> tuple[Evaluation, Any]:
+        """The residual and its Jacobian ∂r/∂x (B, s·2d, s·2d)."""
+        (family, params, h, scale), (z, args) = shared, lanes
+        slopes, inside = self._inside(z, x)
+        gradient, hessian = family.gradient_and_hessian(params, inside, args)
+        evaluation = self._evaluation(z, slopes, h * apply_j(gradient), scale)
+        unit = jnp.tile(scale, self.stages)
+        return evaluation, stage_matrix(hessian, h, self.stages) / unit[None, :, None]
+
+    def _inside(self, z, x):
+        """The slopes h K (s, B, 2d), and the states of the stages."""
+        slopes = jnp.swapaxes(x.reshape(len(z), self.stages, -1), 0, 1)
+        return slopes, z[None] + _summed(gauss(self.stages).matrix, slopes)
+
+    def _evaluation(self, z, slopes, field, scale):
+        unit = jax.lax.stop_gradient(as_row(scale, slopes))
+        size = jax.lax.stop_gradient((jnp.abs(z)[None] + jnp.abs(field)) / unit + 1.0)
+        flat = (_flat((slopes - field) / unit), _flat(size))
+        return Evaluation(*flat, jnp.zeros((len(z), 0), z.dtype))
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("family", "params", "dt", "scale"),
+    meta_fields=("stages", "substeps", "newton"),
+)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Flow:
+    """The flow of H(params, ·) over dt. A piece: see `maps.symplectic_map`.
+
+    family:   H, a family or a plain ``H(params, z)``; what it holds of the data are leaves.
+    dt:       the time of a step, of either sign; a number or a leaf.
+    scale:    (2d,) sizes of the coordinates, for the roundoff floor.
+    stages:   s of each substep; the order is 2s.
+    substeps: of dt, equal.
+    newton:   whether the stages are solved by Newton's method instead of by fixed point.
+    """
+
+    family: Any
+    params: Any
+    dt: Any
+    scale: Any
+    stages: int = 6
+    substeps: int = 1
+    newton: bool = False
+
+    def __post_init__(self):
+        object.__setattr__(self, "family", as_family(self.family))
+        if isinstance(self.dt, (int, float)):
+            object.__setattr__(self, "dt", np.asarray(self.dt, self.scale.dtype))
+
+    def value(self, z, args=None):
+        """H at states z (..., 2d), NumPy or JAX."""
+        return self.family.value(self.params, z, args)
+
+    def step(self, z, args=None, *, unrolled: bool = False):
+        """(Z, Info) of the states z (B, 2d), by JAX."""
+
+        def substep(z):
+            moved, info = self._increment(z, args, unrolled)
+            return z + moved, info
+
+        return self._repeated(substep, z)
+
+    def compensated_step(self, z, compensation, args=None):
+        """(Z, compensation, Info) of z + compensation, which is what rounding has lost so far."""
+
+        def substep(both):
+            z, lost = both
+            moved, info = self._increment(z, args, False)
+            return two_sum(z, moved + lost), info
+
+        (z, compensation), info = self._repeated(substep, (z, compensation))
+        return z, compensation, info
+
+    def inverse(self) -> Flow:
+        """The inverse map: the same flow backwards."""
+        return dataclasses.replace(self, dt=-self.dt)
+
+    def _repeated(self, substep, carry):
+        if self.substeps == 1:
+            return substep(carry)
+        carry, infos = jax.lax.scan(lambda c, _: substep(c), carry, length=self.substeps)
+        return carry, jax.tree.map(lambda a: jnp.max(a, axis=0), infos)
+
+    def _increment(self, z, args, unrolled: bool):
+        """(Z − z, Info) of one substep."""
+        shared = (self.family, self.params, self.dt / self.substeps, self.scale)
+        if self.newton:
+            equation = StageEquation(self.stages)
+            first = shared[2] * apply_j(self.family.gradient(self.params, z, args))
+            guess = jnp.tile(first, self.stages)
+            if unrolled:
+                x, _, info = newton.iterate(
+                    equation, shared, (z, args), guess, most=_MOST_NEWTON, gather=False
+                )
+            else:
+                guess = jax.lax.stop_gradient(guess)
+                x, _, info = newton.root(equation, shared, (z, args), guess, _MOST_NEWTON)
+            slopes = jnp.swapaxes(x.reshape(len(z), self.stages, -1), 0, 1)
+        else:
+            solve = _fixed_point if unrolled else _stages
+            slopes, info = solve(self.stages, shared, z, args)
+        return _summed(gauss(self.stages).weights[None, :], slopes)[0], info
+
+
+def _fixed_point(stages: int, shared, z, args):
+    """h K (s, B, 2d) and Info, by iterating K_i = J∇H(z + h Σ_j a_ij K_j) from K_i = J∇H(z).
+
+    A lane that is at roundoff keeps its stages: a slow or bad lane changes no other.
+    """
+    family, params, h, scale = shared
+    eps = float(jnp.finfo(z.dtype).eps)
+    matrix = gauss(stages).matrix
+    size = jax.lax.stop_gradient(jnp.abs(z) + as_row(scale, z))[None]
+    first = h * apply_j(family.gradient(params, z, args))
+    slopes = jnp.broadcast_to(first[None], (stages, *z.shape))
+    lanes = jnp.zeros(z.shape[0], jnp.int32)
+
+    def improve(carry):
+        slopes, change, open_, iterations = carry
+        new = h * apply_j(family.gradient(params, z[None] + _summed(matrix, slopes), args))
+        moved = jax.lax.stop_gradient(jnp.max(jnp.abs(new - slopes) / size, axis=(0, 2)))
+        settled = (moved <= eps**_SETTLED) & (moved > 0.5 * change)
+        goes_on = ~((moved <= _FLOOR_EPS * eps) | settled) & jnp.isfinite(moved)
+        iterations = iterations + open_.astype(jnp.int32)
+        return (
+            jnp.where(open_[None, :, None], new, slopes),
+            jnp.where(open_, moved, change),
+            open_ & goes_on & (iterations < _MOST),
+            iterations,
+        )
+
+    begun = (slopes, jnp.full(z.shape[0], jnp.inf, z.dtype), lanes < 1, lanes)
+    slopes, change, _, iterations = jax.lax.while_loop(
+        lambda carry: jnp.any(carry[2]), improve, begun
+    )
+    failed = jnp.where(jnp.isfinite(change), NOT_CONVERGED, NON_FINITE)
+    status = jnp.where(change <= eps**_SETTLED, OK, failed).astype(jnp.int32)
+    return slopes, Info(status, iterations, change)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _stages(stages: int, shared, z, args):
+    """As ``_fixed_point``, with derivatives in everything by the implicit function theorem."""
+    return _fixed_point(stages, shared, z, args)
+
+
+@_stages.defjvp
+def _stages_jvp(stages, primals, tangents):
+    shared, z, args = primals
+    slopes, info = _stages(stages, shared, z, args)
+    family, params, h, _ = shared
+
+    def field(shared, z, args):
+        family, params, h, _ = shared
+        inside = z[None] + _summed(gauss(stages).matrix, slopes)
+        return h * apply_j(family.gradient(params, inside, args))
+
+    _, field_dot = jax.jvp(field, primals, tangents)
+    inside = z[None] + _summed(gauss(stages).matrix, slopes)
+    _, hessian = family.gradient_and_hessian(params, inside, args)
+    solved = small_solve(stage_matrix(hessian, h, stages), _flat(field_dot))
+    slopes_dot = jnp.swapaxes(solved.reshape(len(z), stages, -1), 0, 1)
+    integer_dot: Any = np.zeros(info.status.shape, jax.dtypes.float0)
+    info_dot = Info(integer_dot, integer_dot, jnp.zeros_like(info.residual))
+    return (slopes, info), (slopes_dot, info_dot)
+
+
+def _summed(matrix, slopes):
+    """Σ_j matrix_ij slopes_j for slopes (s, B, 2d)."""
+    matrix = jnp.asarray(matrix, slopes.dtype)
+    return matmul(matrix, slopes.reshape(len(slopes), -1)).reshape(-1, *slopes.shape[1:])
+
+
+def _flat(slopes):
+    """(s, B, 2d) as (B, s·2d)."""
+    return jnp.swapaxes(slopes, 0, 1).reshape(slopes.shape[1], -1)
+
+
+def stage_matrix(hessian, h, stages: int):
+    """I − h A ⊗ JH'' (B, s·2d, s·2d), from the stages' Hessians (s, B, 2d, 2d)."""
+    _, lanes, width, _ = hessian.shape
+    form = jnp.asarray(symplectic_form(width // 2), hessian.dtype)
+    matrix = jnp.asarray(gauss(stages).matrix, hessian.dtype)
+    # Row (i, a), column (j, b): what a change of the slope j adds to stage i, seen by its field.
+    turned = jnp.einsum("ac,ilcb->liab", form, hessian, precision="highest")
+    coupled = jnp.einsum("ij,liab->liajb", matrix, turned, precision="highest")
+    size = stages * width
+    return jnp.eye(size, dtype=hessian.dtype)[None] - h * coupled.reshape(lanes, size, size)
