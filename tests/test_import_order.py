@@ -13,9 +13,9 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 
 # A module imports only from rooms before its own; the modules of a room share its place.
 ORDER = (
-    "arrays", "errors", "phase_space", "coordinates", "compile_cache", "storage", "scenes",
-    "families", "solve", "generating", "flows", "maps", "fitting", "learn", "data", "baselines",
-    "evaluate", "jobs", "cli", "__main__",
+    "arrays", "errors", "phase_space", "coordinates", "compile_cache", "threads", "storage",
+    "scenes", "families", "solve", "generating", "flows", "maps", "fitting", "learn", "data",
+    "baselines", "evaluate", "jobs", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {("maps.symplectic_map", "maps.saved")}

@@ -16,8 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gfnn_jax.data import predictions
-from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.data.predictions import PredictionWriter
+from gfnn_jax.errors import InputError, WorkError
 
 LANES, SAVED, WIDTH = 3, 20, 4
 STEPS = np.arange(SAVED) * 5
