@@ -8,160 +8,177 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.optimize
+from analytic import generated, rotated
 from jax.flatten_util import ravel_pytree
 
+from gfnn_jax.families import from_function
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE1, TYPE2, TYPE3, Chart
-from gfnn_jax.maps.symplectic_map import Generated
+from gfnn_jax.generating.generated import Generated
 from gfnn_jax.phase_space import symplecticity_defect
 
 SKEW = Chart("skew 0.3", 0.3)
 EVERY = pytest.mark.parametrize("chart", [*CHARTS.values(), SKEW], ids=lambda chart: chart.name)
-NEAR_IDENTITY = pytest.mark.parametrize("chart", [TYPE2, TYPE3, MIDPOINT, SKEW], ids=str)
-DT, DIM, BATCH = 0.3, 2, 16
+NEAR_IDENTITY = [TYPE2, TYPE3, MIDPOINT, SKEW]
+DT, BATCH = 0.3, 16
 
 
+@from_function
 def network(params, w):
-    inner, bias, outer = params
-    return outer @ jnp.tanh(inner @ w + bias)
-
-
-def network_type1(params, w):
-    """The network about free motion, whose type-1 function is |Q − q|²/2h."""
+    """A network; for type 1 about free motion, whose type-1 function is |Q − q|²/2h."""
+    inner, bias, outer, free = params
     q, q1 = jnp.split(w, 2)
-    return 0.5 * jnp.sum((q1 - q) ** 2) / DT**2 + network(params, w)
+    return outer @ jnp.tanh(inner @ w + bias) + free * 0.5 * jnp.sum((q1 - q) ** 2)
 
 
-def random_params(dim=DIM, width=12):
+def random_params(chart, dim=1, width=12):
     rng = np.random.default_rng(0)
     shapes = (width, 2 * dim), (width,), (width,)
-    inner, bias, outer = (jnp.asarray(rng.standard_normal(shape)) for shape in shapes)
-    return inner, bias, outer / np.sqrt(width)
-
-
-def generated(scalar, params, chart, dt, dim):
-    """A map that starts its solve at the state itself."""
-    size = 2 * dim
-    return Generated(scalar, params, chart, dt, jnp.ones(size))
+    inner, bias, outer = (rng.standard_normal(shape) for shape in shapes)
+    return inner, bias, outer / np.sqrt(width), np.float64(chart is TYPE1) / DT**2
 
 
 def random_piece(params, chart):
-    return generated(
-        network_type1 if chart is TYPE1 else network, params, chart, DT, params[0].shape[1] // 2
-    )
+    return Generated(network, params, chart, DT, np.ones(params[0].shape[1]))
 
 
-STATES = jnp.asarray(0.7 * np.random.default_rng(1).standard_normal((BATCH, 2 * DIM)))
+STATES = 0.7 * np.random.default_rng(1).standard_normal((BATCH, 4))
+
+
+def states_of(chart):
+    """Of two degrees of freedom for types 1 and 2, where two entries of w are free, else of one."""
+    return STATES if chart in (TYPE1, TYPE2) else STATES[:, :2]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def all_about(chart, params, z):
+    piece = random_piece(params, chart)
+
+    def step(z):
+        w, gradient, info = piece.solve(z, unrolled=True)
+        image = chart.image(z, w, gradient, DT)
+        return image, {"w": w, "gradient": gradient, "status": info.status, "image": image}
+
+    def along(unit):
+        return jax.jvp(step, (z,), (jnp.broadcast_to(unit, z.shape),), has_aux=True)[1:]
+
+    jacobian, found = jax.vmap(along, out_axes=(-1, None))(jnp.eye(z.shape[1]))
+    back = piece.inverse().step(found["image"])[0]
+    determinant = piece.determinant(z, found["image"])
+    return {"jacobian": jacobian, "back": back, "determinant": determinant, **found}
 
 
 @functools.cache
 def facts(chart):
     """Everything about one step at random weights, in one compilation."""
-
-    def lane(z):
-        piece = random_piece(random_params(), chart)
-        w, gradient, info = piece.solve(z)
-        image = chart.image(z, w, gradient, DT)
-        return {
-            "image": image,
-            "status": info.status,
-            "residual": info.residual,
-            "back": piece.inverse()(image)[0],
-            "executed": jax.jacfwd(lambda x: piece(x, executed=True)[0])(z),
-            "implicit": jax.jacrev(lambda x: piece(x)[0])(z),
-            "w": w,
-            "gradient": gradient,
-        }
-
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(lane))(STATES))
+    z = states_of(chart)
+    return jax.tree.map(np.asarray, all_about(chart, random_params(chart, z.shape[1] // 2), z))
 
 
 @EVERY
-def test_executed_step_is_symplectic_at_random_weights(chart):
+def test_unrolled_step_is_symplectic_at_random_weights(chart):
     found = facts(chart)
     assert (found["status"] == 0).all()
-    assert found["residual"].max() < 4e-15
-    assert np.abs(found["image"] - STATES).max() > 0.1  # it is not the identity
-    assert symplecticity_defect(jnp.asarray(found["executed"])).max() < 1e-12
+    assert np.abs(found["image"] - states_of(chart)).max() > 0.1  # it is not the identity
+    assert symplecticity_defect(found["jacobian"]).max() < 1e-12
 
 
 @EVERY
 def test_inverse_after_step_is_the_identity(chart):
-    np.testing.assert_allclose(facts(chart)["back"], STATES, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(facts(chart)["back"], states_of(chart), rtol=0, atol=1e-12)
 
 
 @EVERY
-def test_implicit_jacobian_is_that_of_the_iterations(chart):
+def test_determinant_of_s_is_that_of_the_jacobian(chart):
     found = facts(chart)
-    np.testing.assert_allclose(found["implicit"], found["executed"], rtol=0, atol=1e-11)
+    expected = chart.determinant(found["jacobian"])
+    np.testing.assert_allclose(found["determinant"], expected, rtol=1e-10)
 
 
 @EVERY
-def test_pair_of_the_map_asks_for_its_own_gradient(chart):
-    found = facts(chart)
-    np.testing.assert_allclose(chart.point(STATES, found["image"]), found["w"], atol=1e-14)
-    np.testing.assert_allclose(
-        chart.wanted(STATES, found["image"], DT), found["gradient"], rtol=0, atol=1e-13
-    )
-
-
-@EVERY
-def test_pair_read_from_the_inverse_asks_for_the_same_gradient(chart):
-    found = facts(chart)
+def test_pair_asks_for_its_own_gradient_from_either_side(chart):
+    image, w, gradient = (facts(chart)[name] for name in ("image", "w", "gradient"))
+    z = states_of(chart)
     back, dt = chart.reverse(DT)
-    np.testing.assert_allclose(back.point(found["image"], STATES), found["w"], atol=1e-14)
-    np.testing.assert_allclose(
-        back.wanted(found["image"], STATES, dt), found["gradient"], rtol=0, atol=1e-13
-    )
+    for one, step, pair in ((chart, DT, (z, image)), (back, dt, (image, z))):
+        np.testing.assert_allclose(one.evaluation_point(*pair), w, atol=1e-14)
+        np.testing.assert_allclose(
+            one.target_gradient(*pair, step), gradient, rtol=0, atol=1e-13
+        )
 
 
 @EVERY
+def test_jacobian_of_the_residual_and_determinant_are_those_of_the_formulas(chart):
+    """For two degrees of freedom, in NumPy, against finite differences."""
+    family = Products(box_inputs(STATES), 3)
+    c = np.random.default_rng(8).standard_normal(family.num_parameters)
+    params, free = family.unflatten(c), chart.free(2)
+    z, w = STATES[:3], STATES[3:6]
+    w = chart.complete(chart.first_guess(z), w[:, free])
+
+    def residual(w):
+        return chart.residual(z, w, family.gradient(params, w), DT)
+
+    moves = 1e-6 * np.eye(4)[free]
+    columns = [(residual(w + move) - residual(w - move)) / 2e-6 for move in moves]
+    _, hessian = family.gradient_and_hessian(params, w)
+    found = chart.residual_jacobian(hessian, DT)
+    np.testing.assert_allclose(found, np.stack(columns, axis=-1), rtol=0, atol=1e-6)
+    product = chart.determinant_of(hessian, DT) * np.linalg.det(found)
+    np.testing.assert_allclose(np.abs(product), 1.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize("chart", [TYPE1, MIDPOINT], ids=lambda chart: chart.name)
 def test_derivatives_of_step_and_rollout_in_state_and_parameters(chart):
     """Forward = reverse = through the iterations = finite difference, along a random direction."""
-    flat, unravel = ravel_pytree((random_params(dim=1), STATES[0, :2]))
-    direction = jnp.asarray(np.random.default_rng(2).standard_normal(flat.size))
-    weights = jnp.asarray([1.0, -2.0])
+    flat, unravel = ravel_pytree((random_params(chart), STATES[0, :2]))
+    direction = np.random.default_rng(2).standard_normal(flat.size)
 
-    def rollout(theta, *, executed=False):
+    def rollout(theta, *, unrolled=False):
         """A number after each of three steps."""
         params, start = unravel(theta)
         piece = random_piece(params, chart)
 
         def step(z, _):
-            image = piece(z, executed=executed)[0]
-            return image, weights @ image
+            image = piece.step(z, unrolled=unrolled)[0]
+            return image, image[0, 0] - 2 * image[0, 1]
 
-        return jax.lax.scan(step, start, None, length=3)[1]
+        return jax.lax.scan(step, start[None], None, length=3)[1]
 
     @jax.jit
     def derivatives(theta):
-        forward = jax.jvp(rollout, (theta,), (direction,))[1]
-        through = jax.jvp(functools.partial(rollout, executed=True), (theta,), (direction,))[1]
-        return forward, through, jax.jacrev(rollout)(theta) @ direction
+        value, forward = jax.jvp(rollout, (theta,), (direction,))
+        through = jax.jvp(functools.partial(rollout, unrolled=True), (theta,), (direction,))[1]
+        return value, forward, through, jax.jacrev(rollout)(theta) @ direction
 
-    forward, through, backward = derivatives(flat)
-    step, compiled = 1e-5, jax.jit(rollout)
-    difference = compiled(flat + step * direction) - compiled(flat - step * direction)
-    assert np.abs(forward).min() > 0.1
-    np.testing.assert_allclose(through, forward, rtol=1e-11)
-    np.testing.assert_allclose(backward, forward, rtol=1e-11)
-    np.testing.assert_allclose(difference / (2 * step), forward, rtol=1e-7)
+    _, forward, through, backward = derivatives(flat)
+    step = 1e-5
+    above, below = (derivatives(flat + sign * step * direction)[0] for sign in (1, -1))
+    assert np.abs(forward).min() > 0.05
+    np.testing.assert_allclose(through, forward, rtol=1e-10)
+    np.testing.assert_allclose(backward, forward, rtol=1e-10)
+    np.testing.assert_allclose((above - below) / (2 * step), forward, rtol=1e-6)
 
 
 def test_second_derivative_through_the_step():
-    piece = random_piece(random_params(dim=1), MIDPOINT)
+    piece = random_piece(random_params(MIDPOINT), MIDPOINT)
 
-    def position(z):
-        return piece(z)[0][0]
+    @jax.jit
+    def derivatives(z):
+        def position(z):
+            return piece.step(z[None])[0][0, 0]
+
+        return jax.grad(position)(z), jax.hessian(position)(z)
 
     z, step = STATES[0, :2], 1e-5
-    hessian = jax.jit(jax.hessian(position))(z)
-    gradient = jax.jit(jax.vmap(jax.grad(position)))
-    ends = gradient(z[None] + step * jnp.concatenate([jnp.eye(2), -jnp.eye(2)]))
+    hessian = derivatives(z)[1]
+    ends = np.stack([derivatives(z + move)[0] for move in step * np.vstack([np.eye(2), -np.eye(2)])])
     np.testing.assert_allclose(hessian, (ends[:2] - ends[2:]) / (2 * step), rtol=0, atol=1e-8)
     np.testing.assert_allclose(hessian, hessian.T, rtol=0, atol=1e-12)
 
 
-@NEAR_IDENTITY
+@pytest.mark.parametrize("chart", NEAR_IDENTITY, ids=lambda chart: chart.name)
 def test_reverse_is_minus_skew_and_minus_dt(chart):
     back, dt = chart.reverse(DT)
     assert (back.skew, dt) == (-chart.skew, -DT)
@@ -171,14 +188,15 @@ def test_reverse_is_minus_skew_and_minus_dt(chart):
 # Oracles: S := H.
 
 
-def pendulum(params, w):
+@from_function
+def separable(strength, w):
     q, p = w
-    return 0.5 * p**2 - params * jnp.cos(q)
+    return 0.5 * p**2 - strength * jnp.cos(q)
 
 
-def henon_heiles(params, w):
+@from_function
+def henon_heiles(_, w):
     x, y, px, py = w
-    del params
     return 0.5 * (px**2 + py**2 + x**2 + y**2) + x**2 * y - y**3 / 3
 
 
@@ -187,8 +205,13 @@ def henon_heiles_field(z):
     return np.array([px, py, -x - 2 * x * y, -y - x**2 + y**2])
 
 
+@jax.jit
+def stepped(piece, z):
+    return piece.step(z)
+
+
 def images(piece, z):
-    out, info = jax.jit(jax.vmap(piece))(jnp.asarray(z))
+    out, info = stepped(piece, z)
     assert (info.status == 0).all()
     return np.asarray(out)
 
@@ -207,118 +230,105 @@ def test_midpoint_chart_of_the_hamiltonian_is_the_implicit_midpoint_rule():
 
 def test_types_2_and_3_of_a_separable_hamiltonian_are_symplectic_euler():
     q, p = z = np.random.default_rng(4).uniform(-2, 2, (2, 50))
-    second = images(generated(pendulum, jnp.float64(1.0), TYPE2, 0.4, 1), z.T)
+    second = images(generated(separable, 1.0, TYPE2, 0.4), z.T)
     kicked = p - 0.4 * np.sin(q)
     np.testing.assert_allclose(second, np.stack([q + 0.4 * kicked, kicked], 1), atol=1e-15)
-    third = images(generated(pendulum, jnp.float64(1.0), TYPE3, 0.4, 1), z.T)
+    third = images(generated(separable, 1.0, TYPE3, 0.4), z.T)
     moved = q + 0.4 * p
     np.testing.assert_allclose(third, np.stack([moved, p - 0.4 * np.sin(moved)], 1), atol=1e-15)
 
 
-@pytest.mark.parametrize(("chart", "order"), [(TYPE2, 1), (TYPE3, 1), (MIDPOINT, 2)], ids=str)
-def test_order_of_convergence_when_s_is_the_hamiltonian(chart, order):
+def test_midpoint_rule_is_of_second_order():
     start, time = np.array([0.1, -0.2, 0.3, 0.25]), 1.6
     reference = scipy.integrate.solve_ivp(
-        lambda t, z: henon_heiles_field(z),
-        (0, time),
-        start,
-        method="DOP853",
-        rtol=1e-13,
-        atol=1e-14,
+        lambda t, z: henon_heiles_field(z), (0, time), start, method="DOP853", rtol=1e-13, atol=1e-14
     ).y[:, -1]
-    counts = np.array([16, 32, 64])
-    errors = []
+    counts, errors = np.array([8, 16, 32]), []
     for count in counts:
-        piece = generated(henon_heiles, None, chart, time / float(count), 2)
-        end = jax.jit(lambda z, n=count, f=piece: jax.lax.fori_loop(0, n, lambda _, y: f(y)[0], z))
-        errors.append(np.linalg.norm(end(jnp.asarray(start)) - reference))
+        piece, z = generated(henon_heiles, None, MIDPOINT, time / count, 2), np.tile(start, (5, 1))
+        for _ in range(count):
+            z = stepped(piece, z)[0]
+        errors.append(np.linalg.norm(np.asarray(z)[0] - reference))
     assert min(errors) > 1e-6  # far above roundoff
     slope = -np.polyfit(np.log(counts), np.log(errors), 1)[0]
-    assert abs(slope - order) < 0.1
+    assert abs(slope - 2) < 0.1
 
 
-def test_standard_map_in_type_2():
-    kick = 1.2
-
-    def scalar(params, w):
-        return 0.5 * w[1] ** 2 + params * jnp.cos(w[0])
-
-    theta, p = z = np.random.default_rng(5).uniform(-np.pi, np.pi, (2, 200))
-    found = images(generated(scalar, jnp.float64(kick), TYPE2, 1.0, 1), z.T)
-    after = p + kick * np.sin(theta)
-    expected = np.stack([theta + after, after], axis=1)
-    np.testing.assert_allclose(found, expected, rtol=1e-15, atol=1e-15)
+@from_function
+def exact_type_2(time, w):
+    """Of the oscillator, without q P, which the chart has; h = 1."""
+    q, p = w
+    return q * p * (1 / jnp.cos(time) - 1) + 0.5 * (q**2 + p**2) * jnp.tan(time)
 
 
-def rotated(z, angle):
-    q, p = z.T
-    return np.stack(
-        [q * np.cos(angle) + p * np.sin(angle), p * np.cos(angle) - q * np.sin(angle)], axis=1
-    )
+@from_function
+def exact_type_1(time, w):
+    q, q1 = w
+    return ((q**2 + q1**2) * jnp.cos(time) - 2 * q * q1) / (2 * jnp.sin(time))
 
 
-def oscillator(chart, full, times, z):
-    """Images, those of the inverse, and determinant of what F(t, w) generates; h = 1."""
-
-    def near_identity(time, w):
-        return full(time, w) - (0.0 if chart is TYPE1 else w[0] * w[1])
-
-    def lane(time, z):
-        piece = generated(near_identity, time, chart, 1.0, 1)
-        return piece(z)[0], piece.inverse()(z)[0], piece.determinant(z)
-
-    each = jax.vmap(jax.vmap(lane, (None, 0)), (0, None))
-    found = jax.jit(each)(jnp.asarray(times), jnp.asarray(z))
-    return zip(times, *map(np.asarray, found), strict=True)
+@jax.jit
+def there_and_back(piece, z):
+    image = piece.step(z)[0]
+    return image, piece.inverse().step(z)[0], piece.determinant(z, image)
 
 
-def test_exact_type_2_function_of_the_oscillator():
-    def full(time, w):
-        q, p = w
-        return q * p / jnp.cos(time) + 0.5 * (q**2 + p**2) * jnp.tan(time)
-
+@pytest.mark.parametrize(
+    ("chart", "family", "times", "expected"),
+    [
+        (TYPE2, exact_type_2, (0.1, 0.8, 1.3, 2.6), np.cos),  # ∂P/∂p
+        (TYPE1, exact_type_1, (0.3, np.pi / 2, 2.5), np.sin),  # ∂Q/∂p
+    ],
+    ids=["type 2", "type 1"],
+)
+def test_exact_functions_of_the_oscillator(chart, family, times, expected):
+    """Also far beyond the fold at a quarter turn."""
     z = np.random.default_rng(6).standard_normal((20, 2))
-    for time, image, back, determinant in oscillator(TYPE2, full, [0.1, 0.8, 1.3, 2.6], z):
+    for time in times:
+        image, back, determinant = there_and_back(generated(family, time, chart, 1.0), z)
         np.testing.assert_allclose(image, rotated(z, time), rtol=0, atol=1e-14)
         np.testing.assert_allclose(back, rotated(z, -time), rtol=0, atol=1e-14)
-        np.testing.assert_allclose(determinant, np.cos(time), rtol=1e-12)  # ∂P/∂p
-
-
-def test_exact_type_1_function_of_the_oscillator():
-    def full(time, w):
-        q, q1 = w
-        return ((q**2 + q1**2) * jnp.cos(time) - 2 * q * q1) / (2 * jnp.sin(time))
-
-    z = np.random.default_rng(7).standard_normal((20, 2))
-    for time, image, back, determinant in oscillator(TYPE1, full, [0.3, np.pi / 2, 2.5], z):
-        np.testing.assert_allclose(image, rotated(z, time), rtol=0, atol=1e-14)
-        np.testing.assert_allclose(back, rotated(z, -time), rtol=0, atol=1e-14)
-        np.testing.assert_allclose(determinant, np.sin(time), rtol=1e-12)  # ∂Q/∂p
+        np.testing.assert_allclose(determinant, expected(time), rtol=1e-12)
 
 
 @EVERY
-def test_linear_map_has_its_own_determinant(chart):
+def test_linear_map_is_generated_from_three_pairs(chart):
     turn = np.array([[np.cos(0.4), np.sin(0.4)], [-np.sin(0.4), np.cos(0.4)]])
     offset = np.array([0.2, -0.1])
-    # ∇S is affine in w; three pairs determine it.
     z0 = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     z1 = z0 @ turn.T + offset
-    points = np.asarray(chart.point(jnp.asarray(z0), jnp.asarray(z1)))
-    wanted = np.asarray(chart.wanted(jnp.asarray(z0), jnp.asarray(z1), 0.4))
-    constant, *linear = np.linalg.solve(np.column_stack([np.ones(3), points]), wanted)
-    linear, constant = jnp.asarray(np.array(linear)), jnp.asarray(constant)
-
-    def scalar(_, w):
-        return constant @ w + 0.5 * w @ linear @ w
-
-    piece = Generated(scalar, None, chart, 0.4, jnp.ones(2))
-    z = jnp.asarray([0.3, -0.8])
-    image = jnp.asarray(turn) @ z + jnp.asarray(offset)
-    for one, start, end in ((piece, z, image), (piece.inverse(), image, z)):
-        w, gradient, info = jax.jit(one.solve)(start)
-        np.testing.assert_allclose(one.chart.image(start, w, gradient, one.dt), end, atol=1e-14)
-        assert info.residual < 1e-14
-    expected = chart.determinant(jnp.asarray(turn))
-    np.testing.assert_allclose(jax.jit(piece.determinant)(z), expected, rtol=1e-12)
-    batch = chart.determinant(jnp.asarray(np.stack([turn, np.eye(2)])))
+    points, target = chart.evaluation_point(z0, z1), chart.target_gradient(z0, z1, 0.4)
+    family = Products(box_inputs(points), 2)  # ∇S is affine in w
+    terms = family.term_gradients(points).reshape(6, -1)
+    params = family.unflatten(np.linalg.lstsq(terms, target.ravel(), rcond=None)[0])
+    piece = Generated(family, params, chart, 0.4, np.ones(2))
+    z = np.array([[0.3, -0.8]])
+    image = z @ turn.T + offset
+    w = chart.evaluation_point(z, image)
+    np.testing.assert_allclose(piece.refined_step(z, w + 0.1)[0], image, atol=1e-14)
+    np.testing.assert_allclose(piece.inverse().refined_step(image, w + 0.1)[0], z, atol=1e-14)
+    expected = chart.determinant(turn)
+    np.testing.assert_allclose(piece.determinant(z, image), [expected], rtol=1e-12)
+    batch = chart.determinant(np.stack([turn, np.eye(2)]))
     np.testing.assert_allclose(batch, [expected, 0.0 if chart is TYPE1 else 1.0], rtol=1e-12)
+
+
+# In NumPy, for fits.
+
+
+def test_refined_step_is_the_step_without_compilation(compilations):
+    z = STATES[:, :2]
+    family = Products(box_inputs(z), 3)
+    c = 0.05 * np.random.default_rng(7).standard_normal(family.num_parameters)
+    piece = Generated(family, family.unflatten(c), MIDPOINT, DT, np.ones(2))
+    expected = images(piece, z)
+    guess = MIDPOINT.evaluation_point(z, expected) + 1e-4
+    guess[3] = np.nan
+    with compilations() as found:
+        image, error = piece.refined_step(z, guess)
+    assert found.count == 0
+    assert isinstance(image, np.ndarray)
+    others = np.arange(BATCH) != 3
+    np.testing.assert_allclose(image[others], expected[others], rtol=0, atol=1e-14)
+    assert (error[others] < 1e-14).all()
+    assert not np.isfinite(error[3])
