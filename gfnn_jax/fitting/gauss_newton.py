@@ -128,11 +128,9 @@ def log_start(family, z0, z1, dt: float, scale) -> np.ndarray | None:
         return None
     generator = np.real(logarithm) / dt
     unit = scale[:, None] / scale[None, :]
-    field = scale * generator[:width, width] + (z0 - centre) @ (generator[:width, :width] * unit).T
     matrix = -symplectic_form(width // 2) @ (generator[:width, :width] * unit)
     offset = -apply_j(scale * generator[:width, width])
     gradient = (z0 - centre) @ (0.5 * (matrix + matrix.T)) + offset
-    del field
     return fitted_gradients(family, z0, gradient, scale)
 
 
@@ -261,6 +259,11 @@ class Problem:
         size = np.linalg.norm(self.residuals(family, c, steps, rows), axis=1)
         order = np.argsort(np.where(np.isfinite(size), size, np.inf), kind="stable")[:count]
         return rows[order[np.isfinite(size[order])]]
+
+    def distance(self, family, c, rows) -> float:
+        """Median of ‖r‖ over these rows, by coarse steps: what starts are compared by."""
+        size = np.linalg.norm(self.residuals(family, c, self._coarse(family, c, rows), rows), axis=1)
+        return float(np.median(np.where(np.isfinite(size), size, np.inf)))
 
     def _coarse(self, family, c, rows) -> Steps:
         substeps = substeps_for(family, c, self.z0[rows], self.dt, self.options.reach)

@@ -1,0 +1,393 @@
+"""Learn H: the Hamiltonian whose flow over dt maps z₀ to z₁, as a formula of few terms.
+
+Libraries of terms are tried by rising size, each from the one before, until one meets the
+tolerance; its terms that are nothing but noise go while the held-out error does not rise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.coordinates import to_user
+from gfnn_jax.errors import FitError
+from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
+from gfnn_jax.fitting.gauss_newton import (
+    FlowFit,
+    Problem,
+    frequencies,
+    log_start,
+    midpoint_start,
+    null_terms,
+    significant_terms,
+)
+from gfnn_jax.flows.collocation import Steps, images, truncation
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.gauss import gauss
+from gfnn_jax.learn.assemble import Assembled, composed, stepped
+from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
+from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.prepare import Prepared
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Tuned on Hénon–Heiles at dt 0.5 to 3 and on three bodies.
+
+    degrees: of the products of coordinates; feature_degrees: of a scene's features; given_degrees:
+    of the products that stand beside a user's own terms (0: his alone).
+    most_terms: of a library. rows_per_term: that a library needs.
+    judged_rows: per term, from which a library is judged; all pairs only count in the last fit.
+    thresholds: standard errors below which terms go, tried in turn.
+    rise: of the held-out error that dropping terms may cost; rounding: below which it is roundoff.
+    gained: a library that lowers the error by less has not helped; twice in a row ends the search.
+    truncation: a flow's own error, as a part of the tolerance. contracting: a fixed point's factor
+    up to which it is preferred to Newton's method.
+    """
+
+    degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 8)
+    feature_degrees: tuple[int, ...] = (2, 3)
+    given_degrees: tuple[int, ...] = (0, 2, 3, 4)
+    most_terms: int = 350
+    rows_per_term: float = 2.0
+    judged_rows: float = 12.0
+    thresholds: tuple[float, ...] = (1e4, 1e3, 100.0, 30.0, 10.0, 5.0, 3.0)
+    rise: float = 1.1
+    rounding: float = 1e-15
+    gained: float = 0.5
+    truncation: float = 0.1
+    contracting: float = 0.8
+
+
+OPTIONS = Options()
+_ROUNDOFF = 1e-12  # of the spread: above it the pairs carry noise, and every one of them counts
+_FREQUENCY_STATES = 500
+
+
+class Term(NamedTuple):
+    """One term of the formula, its coefficient and that one's standard error."""
+
+    term: str
+    coefficient: float
+    std: float
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnedHamiltonian:
+    """H as learned, in the inner coordinates.
+
+    candidate: as the others of a fit, its error measured by steps in NumPy. flow: the piece.
+    terms, formula: what H is. truncation: largest error of the flow's own steps on the held-out
+    states, ÷ scale. omega_h: the fastest oscillation over the data, times dt; beyond π one dt does
+    not tell H. contraction: the fixed point's factor where it is largest. condition: of the terms'
+    columns. null_terms: that the data do not tell from the others. left_out: pairs that the flow
+    does not resolve.
+    """
+
+    candidate: Candidate
+    flow: Flow
+    terms: tuple[Term, ...]
+    formula: str
+    truncation: float
+    omega_h: float
+    contraction: float
+    condition: float
+    null_terms: tuple[str, ...]
+    left_out: int
+    messages: tuple[str, ...]
+
+
+class _Fitted(NamedTuple):
+    family: Terms
+    fit: FlowFit
+    error: OneStepError
+    null: tuple[str, ...]
+
+
+def learn_hamiltonian(
+    prepared: Prepared,
+    judges: Judges,
+    scene: Any = None,
+    *,
+    terms: Sequence[str | Callable] = (),
+    clock: Clock | None = None,
+    say: Callable[[str], Any] = lambda message: None,
+    options: Options = OPTIONS,
+) -> LearnedHamiltonian:
+    """The Hamiltonian of these pairs: the smallest library that meets the tolerance, else the best.
+
+    prepared: without a base map. scene: lends its features and reversor. terms: a user's own.
+
+    Raises FitError where no library can be tried, OutOfTime where the budget ends before the first.
+    """
+    clock = Clock() if clock is None else clock
+    if prepared.half is not None:
+        raise FitError("expected pairs without a base map: it is no part of a flow")
+    started = time.perf_counter()
+    problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, check=clock.check)
+    bound = judges.tolerance.bound
+    best: _Fitted | None = None
+    last, poor = None, 0
+    try:
+        for family in _libraries(prepared, judges, scene, terms, options):
+            say(f"H: {family.num_parameters} terms")
+            found = _fitted(problem, family, prepared, judges, last, options, say)
+            better = best is None or found.error.relative < options.gained * best.error.relative
+            poor = 0 if better else poor + 1
+            if best is None or found.error.relative < best.error.relative:
+                best = found
+            last = found
+            if best.error.bound <= bound or poor == 2:
+                break
+    except OutOfTime:
+        if best is None:
+            raise
+    if best is None:
+        raise FitError(
+            f"expected more pairs: {len(prepared.y0)} are too few for any library of terms"
+        )
+    try:
+        best = _sparse(problem, best, prepared, judges, options, say)
+        if best.error.relative > _ROUNDOFF and len(best.fit.used) < len(judges.training):
+            best = _refitted(problem, best, judges.training, prepared, judges)
+    except OutOfTime:
+        pass  # what was found stands
+    return _learned(best, problem, prepared, judges, time.perf_counter() - started, options)
+
+
+def _libraries(prepared, judges, scene, terms, options: Options) -> Iterator[Terms]:
+    """Families by rising size, of as many terms as the training rows tell apart."""
+    dim, coordinates = prepared.dim, prepared.coordinates
+    reversor = scene.reversor if scene is not None else None
+    features = scene.features if scene is not None else None
+    most = len(judges.training) * 2 * dim / options.rows_per_term
+    most = min(most, options.most_terms)
+    own = given_terms(dim, terms) if terms else None
+    if own is not None:
+        degrees = options.given_degrees
+    else:
+        degrees = options.degrees if features is None else options.feature_degrees
+    for degree in degrees:
+        if degree == 0:
+            assert own is not None
+            yield own
+            continue
+        family = polynomial_terms(
+            dim, degree, angles=coordinates.angles, cyclic=coordinates.cyclic, features=features,
+            reversor=reversor,
+        )  # fmt: skip
+        family = family if own is None else joined(own, family)
+        if family.num_parameters > most:
+            return
+        yield family
+
+
+def _fitted(problem, family, prepared, judges, last: _Fitted | None, options, say) -> _Fitted:
+    """The library fitted to as many training pairs as tell its terms, from the best start."""
+    names = family.term_names
+    z = prepared.y0[judges.training]
+    enough = z[: max(200, 4 * family.num_parameters // z.shape[1])]
+    kept, null = null_terms(family, enough)
+    family = family.take(kept)
+    count = int(np.ceil(options.judged_rows * family.num_parameters / z.shape[1]))
+    rows = judges.training[: max(count, 100)]
+    fit = problem.fit(family, _start(problem, family, rows, last), rows, say=say)
+    fit = _resolved(problem, family, fit, rows)
+    error = _held_out_error(problem, family, fit, prepared, judges)
+    return _Fitted(family, fit, error, tuple(names[j] for j in null))
+
+
+def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
+    """The start whose flow is nearest to the pairs: midpoint, logarithm, or the last library's."""
+    z0, z1 = problem.z0[rows], problem.z1[rows]
+    starts = [midpoint_start(family, z0, z1, problem.dt, problem.scale)]
+    logarithm = log_start(family, z0, z1, problem.dt, problem.scale)
+    if logarithm is not None:
+        starts.append(logarithm)
+    if last is not None:
+        known = dict(zip(last.family.term_names, last.fit.coefficients, strict=True))
+        starts.append(np.array([known.get(name, 0.0) for name in family.term_names]))
+    some = rows[:100]
+    return min(starts, key=lambda c: problem.distance(family, c, some))
+
+
+def _resolved(problem, family, fit: FlowFit, rows) -> FlowFit:
+    """The fit without the pairs that the flow's own steps do not resolve."""
+    off = truncation(family, fit.coefficients, problem.z0[fit.used], problem.dt, fit.steps)
+    off = np.abs(off / problem.scale).max(axis=1)
+    limit = max(10 * fit.rms, 100 * float(np.median(off)), 1e-13)
+    good = off <= limit
+    if good.all() or good.sum() < 0.5 * len(rows):
+        return fit
+    return problem.fit(family, fit.coefficients, fit.used[good], rounds=False)
+
+
+def _held_out_error(problem, family, fit: FlowFit, prepared, judges: Judges) -> OneStepError:
+    return _error_of(family, fit.coefficients, fit.steps, prepared, judges)
+
+
+def _error_of(family, coefficients, steps: Steps, prepared, judges: Judges) -> OneStepError:
+    states = prepared.y0[judges.held_out]
+    found = images(family, coefficients, states, prepared.dt, steps).states
+    return judges.error_of(to_user(prepared.coordinates, found), prepared.coordinates)
+
+
+def _sparse(problem, full: _Fitted, prepared, judges, options: Options, say) -> _Fitted:
+    """Without the terms that the pairs do not ask for, as far as the held-out error allows."""
+    seen: set[tuple[int, ...]] = set()
+    for threshold in options.thresholds:
+        kept = tuple(significant_terms(full.fit, threshold).tolist())
+        if len(kept) == full.family.num_parameters:
+            break
+        if not kept or kept in seen:
+            continue
+        seen.add(kept)
+        family = full.family.take(kept)
+        say(f"H: {len(kept)} of {full.family.num_parameters} terms")
+        start = full.fit.coefficients[list(kept)]
+        fit = problem.fit(family, start, full.fit.used, rounds=False)
+        error = _held_out_error(problem, family, fit, prepared, judges)
+        if error.relative <= max(options.rise * full.error.relative, options.rounding):
+            return _Fitted(family, fit, error, full.null)
+    return full
+
+
+def _refitted(problem, found: _Fitted, rows, prepared, judges) -> _Fitted:
+    """Fitted to all training pairs: each of them averages the noise."""
+    unresolved = np.setdiff1d(rows[: len(found.fit.used)], found.fit.used)
+    rows = np.setdiff1d(rows, unresolved)
+    fit = problem.fit(found.family, found.fit.coefficients, rows, rounds=False)
+    error = _held_out_error(problem, found.family, fit, prepared, judges)
+    return found._replace(fit=fit, error=error)
+
+
+def _learned(
+    found: _Fitted, problem, prepared: Prepared, judges: Judges, seconds: float, options: Options
+) -> LearnedHamiltonian:
+    family, fit = found.family, found.fit
+    rows = judges.held_out
+    z = prepared.y0[rows]
+    _, hessian = family.gradient_and_hessian(fit.coefficients, prepared.y0[:_FREQUENCY_STATES])
+    rates = frequencies(hessian)
+    steps = _cheapest(problem, family, fit, rates, judges, options)
+    contraction = _contraction(rates, prepared.dt, steps)
+    by_newton = contraction > options.contracting
+    off = truncation(family, fit.coefficients, z, prepared.dt, steps) / prepared.scale
+    error = _error_of(family, fit.coefficients, steps, prepared, judges)
+    flow = Flow(
+        family, fit.coefficients, prepared.dt, prepared.scale, steps.stages, steps.substeps,
+        by_newton,
+    )  # fmt: skip
+    candidate = Candidate(
+        label=f"H, {family.num_parameters} terms", family=family.name, chart="flow",
+        num_parameters=family.num_parameters, operations=_operations(family, rates, prepared.dt, steps),
+        validation_rms=error.rms, validation_relative=error.relative,
+        validation_bound=error.bound, deviations=error.deviations, train_rms=fit.rms,
+        fit_seconds=seconds, condition=fit.condition, rank=family.num_parameters,
+        learns="hamiltonian",
+    )  # fmt: skip
+    terms = tuple(
+        Term(*entry)
+        for entry in zip(
+            family.term_names, fit.coefficients.tolist(), fit.standard_errors.tolist(), strict=True
+        )
+    )
+    omega_h = _omega_h(hessian, prepared.dt)
+    left_out = sum(
+        r not in set(fit.used.tolist()) for r in judges.training[: len(fit.used)].tolist()
+    )
+    return LearnedHamiltonian(
+        with_error(candidate, error), flow, terms, formula(terms), float(np.abs(off).max()), omega_h,
+        contraction, fit.condition, found.null, left_out,
+        tuple(_messages(found, omega_h, left_out, prepared, judges)),
+    )  # fmt: skip
+
+
+def _cheapest(problem, family, fit: FlowFit, rates, judges: Judges, options: Options) -> Steps:
+    """Steps whose own error is a tenth of the tolerance; at roundoff where that is not twice as
+    dear."""
+
+    def cost(steps: Steps) -> float:
+        return _operations(family, rates, problem.dt, steps)
+
+    bound = options.truncation * judges.tolerance.bound
+    if not judges.tolerance.relative:
+        bound = bound / float(problem.scale.max())
+    bound = max(bound, 0.3 * fit.rms)
+    rows = judges.training
+    coarse = problem.fine_steps(family, fit.coefficients, rows, bound)
+    fine = problem.fine_steps(family, fit.coefficients, rows)
+    return fine if cost(fine) < 2 * cost(coarse) else coarse
+
+
+def _contraction(rates, dt: float, steps: Steps) -> float:
+    """The factor by which the stages' fixed point contracts in the end, where it is largest."""
+    radius = np.abs(np.linalg.eigvals(gauss(steps.stages).matrix)).max()
+    return float(dt / steps.substeps * rates.max() * radius)
+
+
+def _operations(family: Terms, rates, dt: float, steps: Steps) -> float:
+    """Floating-point operations per step: as many iterations as roundoff takes at this factor."""
+    gradient, with_hessian = family.operations
+    width, s = 2 * family.dim, steps.stages
+    factor = _contraction(rates, dt, steps)
+    if factor > OPTIONS.contracting:
+        one = s * with_hessian + (s * width) ** 3 * 2 / 3
+        return float(steps.substeps * 4 * one)
+    iterations = 2 + np.log(1e-16) / np.log(max(factor, 1e-3))
+    return float(steps.substeps * iterations * s * (gradient + 2 * width * s))
+
+
+def _omega_h(hessian, dt: float) -> float:
+    """The fastest oscillation of the linearised flow, in radians per step."""
+    from gfnn_jax.phase_space import symplectic_form
+
+    turned = symplectic_form(hessian.shape[-1] // 2) @ hessian
+    return float(dt * np.abs(np.linalg.eigvals(turned).imag).max())
+
+
+def _messages(found: _Fitted, omega_h: float, left_out: int, prepared, judges) -> Iterator[str]:
+    if omega_h > np.pi:
+        yield (
+            f"the fastest oscillation of the learned H turns by {omega_h:.2g} > π in a step: pairs of "
+            f"one dt do not tell H there; pairs with a shorter dt than {prepared.dt:g} would"
+        )
+    if found.error.bound > judges.tolerance.bound:
+        yield (
+            f"no H of the terms tried meets the tolerance (best {found.error.relative:.2e} of the "
+            "spread): other terms are needed, the map has no flow, or an oscillation turns by more "
+            f"than π in dt = {prepared.dt:g} (ωh > π)"
+        )
+    if left_out:
+        yield f"{left_out} pairs are not resolved by the flow's own steps: they are left out"
+
+
+def formula(terms: Sequence[Term]) -> str:
+    """H as text: "0.5 p1² + 0.5 p2² - 0.333333333333 q2³"."""
+    text = ""
+    for term, coefficient, std in terms:
+        sign = " - " if coefficient < 0 else " + "
+        size = abs(coefficient)
+        digits = 12 if std <= 0 else int(np.clip(np.ceil(np.log10(size / std)) + 1, 2, 12))
+        number = f"{size:.{digits}g}"
+        factor = "" if number == "1" else f"{number} "
+        text += (sign if text else sign.strip().removeprefix("+")) + factor + term
+    return text or "0"
+
+
+def assembled(learned: LearnedHamiltonian, prepared: Prepared, judges: Judges) -> Assembled:
+    """The candidate's map, its error and its time per step measured by the steps that users run."""
+    map_ = composed(learned.flow, prepared, judges)  # pyright: ignore[reportArgumentType]
+    steps = stepped(map_, np.asarray(judges.pairs.z0)[judges.held_out])
+    states = np.where(steps.failed[:, None], np.nan, steps.images)
+    error = judges.error_of(states, prepared.coordinates)
+    candidate = dataclasses.replace(
+        with_error(learned.candidate, error), map=map_,
+        newton_iterations_max=int(steps.iterations.max()),
+        microseconds_per_step=steps.microseconds_per_step,
+    )  # fmt: skip
+    return Assembled(candidate, steps.compile_seconds)
