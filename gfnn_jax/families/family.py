@@ -24,8 +24,8 @@ class Family(Protocol):
     """What maps, fits and solvers need of a scalar function.
 
     args: what the function depends on beside the state (parameters of a system, the time of a
-    drive), or None. ``family(params, w, args)`` is ``value``, so that ``jax.grad(family, argnums=1)``
-    is the gradient at one w (2d,).
+    drive), or None. ``family(params, w, args)`` is ``value``, so that
+    ``jax.grad(family, argnums=1)`` is the gradient at one w (2d,).
     """
 
     @property
@@ -83,10 +83,11 @@ class DifferentiatedByJax:
             return np.asarray(_compiled_gradient(self, params, w, args))
         return jax.grad(lambda v: jnp.sum(self.value(params, v, args)))(w)
 
-    def gradient_and_hessian(self, params, w, args=None):
+    def gradient_and_hessian(self, params, w, args=None) -> tuple[Any, Any]:
         """∂f/∂w and ∂²f/∂w²: a tangent of the reverse sweep for each entry of w."""
         if namespace(w) is np:
-            return tuple(map(np.asarray, _compiled_hessian(self, params, w, args)))
+            gradient, hessian = _compiled_hessian(self, params, w, args)
+            return np.asarray(gradient), np.asarray(hessian)
         gradient, tangent = jax.linearize(lambda v: self.gradient(params, v, args), w)
         units = jnp.eye(w.shape[-1], dtype=w.dtype)
         along = jax.vmap(lambda e: tangent(jnp.broadcast_to(e, w.shape)), out_axes=-1)

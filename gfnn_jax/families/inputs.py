@@ -81,7 +81,9 @@ class Inputs:
         if slope is not None:
             return matmul(gradient[..., None, :], slope)[..., 0, :]
         xp = namespace(gradient)
-        return self._spread(gradient / as_row(xp.asarray(self.scale, dtype=gradient.dtype), gradient))
+        return self._spread(
+            gradient / as_row(xp.asarray(self.scale, dtype=gradient.dtype), gradient)
+        )
 
     def pull_back_hessian(self, hessian, gradient, slope, curvature):
         """The Hessian with respect to w (..., 2d, 2d) from that with respect to x (..., k, k)."""
@@ -129,8 +131,12 @@ def feature_tables(features: Callable, w, *, order: int) -> tuple:
     flat = w.reshape(-1, w.shape[-1])
     size = min(_CHUNK, 2 ** max(6, (len(flat) - 1).bit_length()))
     padded = np.concatenate([flat, np.broadcast_to(flat[-1:], (-len(flat) % size, w.shape[-1]))])
-    blocks = [_compiled_tables(features, order, block) for block in padded.reshape(-1, size, w.shape[-1])]
-    joined = (np.concatenate([np.asarray(b) for b in column]) for column in zip(*blocks, strict=True))
+    blocks = [
+        _compiled_tables(features, order, block) for block in padded.reshape(-1, size, w.shape[-1])
+    ]
+    joined = (
+        np.concatenate([np.asarray(b) for b in column]) for column in zip(*blocks, strict=True)
+    )
     return tuple(a[: len(flat)].reshape(*w.shape[:-1], *a.shape[1:]) for a in joined)
 
 

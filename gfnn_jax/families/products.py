@@ -34,7 +34,7 @@ def chebyshev(x, degree: int):
 
 
 def fourier(x, degree: int):
-    """1, cos x, .., cos Dx, sin x, .., sin Dx of x (...), by doubling: e^{i(k+j)x} = e^{ikx} e^{ijx}:
+    """1, cos x, .., cos Dx, sin x, .., sin Dx of x (...), by doubling e^{i(k+j)x} = e^{ikx} e^{ijx}:
     (..., 2D + 1)."""
     xp = namespace(x)
     c = xp.stack([xp.ones_like(x), xp.cos(x)], axis=-1)

@@ -24,7 +24,6 @@ from gfnn_jax.families.expressions import (
     Expression,
     call,
     coordinate,
-    coordinate_names,
     count_operations,
     depends_on,
     jets,
@@ -223,7 +222,9 @@ class Terms:
         variables, plan = self._variables(w, 2), self._plan
         products = self._products(variables, w)
         pairs = list(plan.curvatures)
-        found = plan.combined(params, products, [*plan.slopes, *(plan.curvatures[p] for p in pairs)])
+        found = plan.combined(
+            params, products, [*plan.slopes, *(plan.curvatures[p] for p in pairs)]
+        )
         slopes, bends = found[: len(plan.slopes)], found[len(plan.slopes) :]
         entries: dict[tuple[int, int], Any] = {}
 
@@ -270,7 +271,9 @@ class Terms:
 
     def _stacked(self, gradient: dict, w):
         xp, zero = namespace(w), namespace(w).zeros_like(w[..., 0])
-        return xp.stack([_like(gradient.get(i, zero), zero, xp) for i in range(w.shape[-1])], axis=-1)
+        return xp.stack(
+            [_like(gradient.get(i, zero), zero, xp) for i in range(w.shape[-1])], axis=-1
+        )
 
 
 def _like(value, zero, xp):

@@ -42,7 +42,7 @@ class Options:
     most: int = 40
     rows_per_term: float = 1.5
     dampings: tuple[float, ...] = (0.0, 1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
-    gained: float = 1e-3
+    gained: float = 1e-2
     null: float = 1e-10
     block_bytes: int = 32 * 2**20
     reach: float = 1.0
@@ -54,7 +54,10 @@ class Options:
 
 OPTIONS = Options()
 _ROUNDOFF = 2e-16  # of the coordinates' sizes: the residual's floor
-_FINE, _ROUNDED = 5e-16, 1e-13  # of them: a step's own error that is roundoff, at dt of long arcs too
+_FINE, _ROUNDED = (
+    5e-16,
+    1e-13,
+)  # of them: a step's own error that is roundoff, at dt of long arcs too
 
 
 class FlowFit(NamedTuple):
@@ -195,9 +198,7 @@ class Problem:
         for block in self._blocks(rows, count * steps.stages):
             if failed:
                 break
-            found = images(
-                family, coefficients, self.z0[block], self.dt, steps, derivatives=True
-            )
+            found = images(family, coefficients, self.z0[block], self.dt, steps, derivatives=True)
             residual = (found.states - self.z1[block]) / self.scale
             slope = found.by_coefficient / self.scale[:, None]
             part = np.concatenate([slope, residual[..., None]], axis=-1).reshape(-1, count + 1)
@@ -262,12 +263,14 @@ class Problem:
 
     def distance(self, family, c, rows) -> float:
         """Median of ‖r‖ over these rows, by coarse steps: what starts are compared by."""
-        size = np.linalg.norm(self.residuals(family, c, self._coarse(family, c, rows), rows), axis=1)
+        size = np.linalg.norm(
+            self.residuals(family, c, self._coarse(family, c, rows), rows), axis=1
+        )
         return float(np.median(np.where(np.isfinite(size), size, np.inf)))
 
     def _coarse(self, family, c, rows) -> Steps:
         substeps = substeps_for(family, c, self.z0[rows], self.dt, self.options.reach)
-        return Steps(self.options.coarse_stages, substeps)
+        return Steps(self.options.coarse_stages, substeps, newton=False)
 
     def fine_steps(self, family, c, rows, tolerance: float | None = None) -> Steps:
         """The cheapest steps whose own error, ÷ scale, is within the tolerance at nearly all of

@@ -25,10 +25,12 @@ _MOST_NEWTON = 12
 
 @dataclasses.dataclass(frozen=True)
 class Steps:
-    """How a flow over dt is computed: ``substeps`` of collocation with ``stages`` stages each."""
+    """How a flow over dt is computed: ``substeps`` of collocation with ``stages`` stages each, and
+    whether lanes in which the fixed point does not contract are given to Newton's method."""
 
     stages: int
     substeps: int
+    newton: bool = True
 
 
 class Images(NamedTuple):
@@ -54,7 +56,7 @@ def images(family, params, z, dt: float, steps: Steps, *, args=None, derivatives
     by_coefficient: Any = 0.0
     with np.errstate(all="ignore"):
         for _ in range(steps.substeps):
-            slopes, done = solve_stages(family, params, z, h, rule, args)
+            slopes, done = solve_stages(family, params, z, h, rule, args, newton=steps.newton)
             solved = solved & done
             if derivatives:
                 inside = z + h * _summed(rule.matrix, slopes)
@@ -71,10 +73,10 @@ def _summed(matrix, slopes):
     return (matrix @ slopes.reshape(len(slopes), -1)).reshape(-1, *slopes.shape[1:])
 
 
-def solve_stages(family, params, z, h: float, rule, args=None):
+def solve_stages(family, params, z, h: float, rule, args=None, *, newton: bool = True):
     """The slopes K (s, B, 2d) at states z (B, 2d), and which lanes were solved to roundoff (B,).
 
-    By fixed point; lanes in which that hardly contracts by Newton's method.
+    By fixed point; with ``newton``, lanes in which that hardly contracts by Newton's method.
     """
     size = np.abs(z) + np.abs(z).mean(axis=1, keepdims=True)  # of each coordinate's lane
     slopes = np.repeat(apply_j(family.gradient(params, z, args))[None], len(rule.weights), axis=0)
@@ -97,7 +99,7 @@ def solve_stages(family, params, z, h: float, rule, args=None):
             break
     left = np.flatnonzero(open_ | slow)
     solved = ~(open_ | slow)
-    if left.size:
+    if left.size and newton:
         slopes[:, left], solved[left] = _newton(family, params, z[left], h, rule, args)
     return slopes, solved
 
@@ -189,7 +191,9 @@ def _derivatives(family, params, inside, h, rule, args):
     transposed = stage_matrix(hessian, h, rule).swapaxes(1, 2)
     weights = np.kron(h * rule.weights[:, None], np.eye(width))
     adjoint = solve(transposed, np.broadcast_to(weights, (lanes, *weights.shape)))
-    rows = adjoint.reshape(lanes, count, width, width).transpose(0, 3, 1, 2) @ form  # (B, 2d, s, 2d)
+    rows = (
+        adjoint.reshape(lanes, count, width, width).transpose(0, 3, 1, 2) @ form
+    )  # (B, 2d, s, 2d)
     rows = rows.reshape(lanes, width, count * width)
     bent = hessian.transpose(1, 0, 2, 3).reshape(lanes, count * width, width)
     by_state = np.eye(width) + rows @ bent

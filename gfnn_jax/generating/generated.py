@@ -128,9 +128,7 @@ class Generated:
         shared = (self.family, self.params, self.dt, self.scale)
         x = guess[:, self.chart.free(dim)]
         known = self.chart.first_guess(z)
-        x, gradient, error = newton.refine(
-            ImplicitStep(self.chart), shared, (z, known, args), x
-        )
+        x, gradient, error = newton.refine(ImplicitStep(self.chart), shared, (z, known, args), x)
         return self.chart.image(z, self.chart.complete(known, x), gradient, self.dt), error
 
     def inverse(self) -> Generated:

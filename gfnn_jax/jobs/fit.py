@@ -7,8 +7,8 @@ from pathlib import Path
 from gfnn_jax.data.files import iterate_pairs, read_sample, read_trajectories
 from gfnn_jax.evaluate import report
 from gfnn_jax.jobs.progress import SILENT, Progress
-from gfnn_jax.jobs.search import failures_of_arithmetic, scene_named, search
-from gfnn_jax.jobs.written import Ran, already_done, write
+from gfnn_jax.jobs.search import BEST, failures_of_arithmetic, scene_named, search
+from gfnn_jax.jobs.written import Ran, already_done, publish, write
 from gfnn_jax.learn.refit import refit
 from gfnn_jax.storage.outputs import atomic_folder
 from gfnn_jax.storage.partial import unfinished
@@ -55,10 +55,15 @@ def fit(
     if already_done(out, job, resume):
         return None
     with unfinished(out, job, what="fit", overwrite=overwrite, resume=resume) as kept_in:
-        fitted = search(
-            trajectories.pairs(), scene, angles=angles, max_seconds=max_seconds,
-            progress=progress, kept_in=kept_in, job=job, **options,
-        )  # fmt: skip
+        try:
+            fitted = search(
+                trajectories.pairs(), scene, angles=angles, max_seconds=max_seconds,
+                progress=progress, kept_in=kept_in, job=job, **options,
+            )  # fmt: skip
+        except KeyboardInterrupt as stop:
+            if told := publish(kept_in / BEST, out):
+                stop.add_note(told)
+            raise
         if large and family != "mlp":
             progress.say("all pairs of the file, for the chosen candidate")
             held = trajectories.pairs().take(slice(_HELD))

@@ -15,9 +15,13 @@ from gfnn_jax.errors import FitError, InputError, WorkError
 from gfnn_jax.jobs.progress import Progress
 from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.fit import Fit, fit
+from gfnn_jax.maps import saved
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene
 from gfnn_jax.storage.checkpoints import TrainingCheckpoints
+
+BEST = "best"
 
 
 def search(
@@ -31,15 +35,25 @@ def search(
 ) -> Fit:
     """The fit of these pairs, with the options of ``gfnn.fit``.
 
-    kept_in, job: the folder of the training's checkpoints, and whose they are. Raises InputError
+    kept_in, job: the folder where a training's checkpoints and the best map so far are kept, and
+    whose they are. Raises InputError
     for data or a request that cannot give a map, WorkError where the arithmetic fails.
     """
-    checkpoints = None if kept_in is None else TrainingCheckpoints(kept_in, job or {})
+    checkpoints = on_better = None
+    if kept_in is not None:
+        checkpoints = TrainingCheckpoints(kept_in, job or {})
+        record = {"unfinished": job}
+
+        def on_better(map_: SymplecticMap, candidate: Candidate) -> None:
+            found = record | {"validation_relative": candidate.validation_relative}
+            saved.save(map_, kept_in / BEST, scene=scene, record=found, overwrite=True)
+
     try:
         with failures_of_arithmetic():
             return fit(
                 pairs, scene, checkpoints=checkpoints, on_progress=progress.say,
-                on_candidate=lambda candidate: progress.tell(line(candidate)), **options,
+                on_candidate=lambda candidate: progress.tell(line(candidate)),
+                on_better=on_better, **options,
             )  # fmt: skip
     except FitError as error:
         raise InputError(str(error)) from error

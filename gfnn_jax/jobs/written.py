@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from gfnn_jax.evaluate import report
 from gfnn_jax.learn.fit import Fit
 from gfnn_jax.maps import saved
 from gfnn_jax.phase_space import Pairs
+from gfnn_jax.storage.outputs import atomic_folder
 
 REPORT, MODEL = "report.json", "model"
 
@@ -33,6 +35,16 @@ def write(folder: Path, model: Path, fit: Fit, result: dict[str, Any], job: dict
     origin = {key: result[key] for key in ("scene", "seed", "device", "data", "fit", "map")}
     saved.save(fit.map, model, record={"job": job, **report.finite(origin)})
     (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
+
+
+def publish(best: Path, model: Path) -> str:
+    """The best map of an interrupted fit into the folder ``model``, where nothing stands there yet;
+    what is to be said of it, or nothing."""
+    if not best.is_dir() or model.exists():
+        return ""
+    with atomic_folder(model) as folder:
+        shutil.copytree(best, folder, dirs_exist_ok=True)
+    return f"the best map so far is in {model} and can be used"
 
 
 def already_done(model: Path, job: dict[str, Any], resume: bool) -> bool:

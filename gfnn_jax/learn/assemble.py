@@ -42,7 +42,9 @@ def assemble(
     )  # fmt: skip
     map_ = composed(generated, prepared, judges)
     steps = stepped(map_, np.asarray(judges.pairs.z0)[judges.held_out])
-    error = judges.error_of(np.where(steps.failed[:, None], np.nan, steps.images), prepared.coordinates)
+    error = judges.error_of(
+        np.where(steps.failed[:, None], np.nan, steps.images), prepared.coordinates
+    )
     gradient, with_hessian = family.operations
     more = np.where(steps.iterations > 1, steps.iterations, 0).mean()
     predictor = generated.predictor.forward.operations
@@ -106,7 +108,7 @@ class Steps(NamedTuple):
 
 
 def stepped(map_: SymplecticMap, z: np.ndarray, *, timed: bool = True) -> Steps:
-    """One step of the states z (N, 2d), in blocks of one shape; the times are 0 unless ``timed``."""
+    """One step of the states z (N, 2d), in blocks of one shape; times are 0 unless ``timed``."""
     rows = np.resize(np.arange(len(z)), -(-len(z) // _BLOCK) * _BLOCK).reshape(-1, _BLOCK)
 
     def run(block) -> tuple[Any, float]:

@@ -6,7 +6,8 @@ import numpy as np
 
 from gfnn_jax.errors import FitError
 from gfnn_jax.generating.charts import CHARTS
-from gfnn_jax.phase_space import Pairs, split
+from gfnn_jax.learn.candidates import Tolerance
+from gfnn_jax.phase_space import Pairs, sizes, split
 from gfnn_jax.scenes.scene import AroundOrbit, Scene
 from gfnn_jax.scenes.trajectories import sample_states
 
@@ -16,6 +17,7 @@ CHART_NAMES = ("auto", *CHARTS)
 
 _OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; those in other units do
 _COMPARED = 100
+_COARSE = 0.01  # of what a step moves
 
 
 def check_request(
@@ -87,3 +89,18 @@ def unlike_the_scene(pairs: Pairs, scene: Scene) -> list[str]:
                 f"{scene.name}, whose features assume its own units: are the data in these?"
             )
     return messages
+
+
+def coarse_tolerance(pairs: Pairs, tolerance: Tolerance) -> list[str]:
+    """A warning where the tolerance exceeds a hundredth of what a step moves."""
+    z0, move = np.asarray(pairs.z0), np.asarray(pairs.z1) - np.asarray(pairs.z0)
+    # An angle that turned over moves little, whatever the difference of its numbers: the median.
+    moved = np.median(np.abs(move / sizes(z0)) if tolerance.relative else np.abs(move), axis=0)
+    size = float(np.sqrt(np.mean(moved**2)))
+    if not tolerance.bound > _COARSE * size > 0:
+        return []
+    unit = " of the coordinates' spread" if tolerance.relative else ""
+    return [
+        f"a step moves the states by {size:.1e}{unit}: a tolerance of {tolerance.bound:g} is more "
+        "than a hundredth of that, and met by maps that know little of the motion"
+    ]

@@ -32,6 +32,11 @@ _SLOPE_ERROR = 0.05
 _KNOWN, _ERRORS, _MISSED = 0.06, 3.0, 0.1
 # A pair is an outlier that its neighbours' fit misses by so many standard deviations.
 _OUTLYING, _OUTLIER_ROUNDS = 30.0, 5
+# Neighbours that spread less than this part of their largest spread do not fill a direction.
+_THIN = 0.05
+# What an affine fit within sequences may leave of a residual that agrees within them; neighbours
+# among which the nearest one of another sequence is sought.
+_EXPLAINED, _SEQUENCE_NEIGHBOURS = 0.25, 50
 # A determinant this far from zero is safe; below the lower figure the chart folds inside the data.
 SAFE, SINGULAR = 0.2, 0.03
 
@@ -209,3 +214,58 @@ def volume_change(z, residual) -> tuple[float, float]:
         return 0.0, np.inf
     variance = np.linalg.pinv(design.T @ design).diagonal()[1:] * rest.var(axis=0)
     return float(np.trace(solution[1:])), float(np.sqrt(variance.sum()))
+
+
+def sampled_dimension(y, scale) -> int:
+    """Dimension of the set that the states y (N, 2d) were sampled from: 1 along a curve, 2d where
+    they fill a region.
+
+    Local principal components: in how many directions, in units of scale (2d,), the neighbours of a
+    state spread by more than a twentieth of their largest spread, in the median over the states.
+    """
+    x, width = np.asarray(y) / scale, np.shape(y)[1]
+    count = min(len(x), _NEIGHBOURS_PER_TERM * (1 + width))
+    centres = np.linspace(0, len(x) - 1, min(_CENTRES, len(x))).astype(int)
+    _, near = cKDTree(x).query(x[centres], k=count)
+    offset = x[near] - x[near].mean(axis=1, keepdims=True)
+    spread = np.linalg.svd(offset, compute_uv=False)
+    return int(np.median(np.sum(spread > _THIN * spread[:, :1], axis=1)))
+
+
+def sequences_of(z0, z1) -> np.ndarray:
+    """The number (N,) of the sequence that each pair is of: a pair goes on with the next one where
+    its image is the next one's state."""
+    goes_on = np.all(np.asarray(z1)[:-1] == np.asarray(z0)[1:], axis=1)
+    return np.concatenate([[0], np.cumsum(~goes_on)])
+
+
+def differs_between_sequences(z, residual, sequence) -> bool:
+    """Whether what a fit left over agrees within a sequence and differs between sequences: then
+    something that the states do not hold, a parameter, differs between them.
+
+    z, residual: (N, 2d), in units of the coordinates' sizes; sequence: (N,). Within, every other
+    pair of a sequence is predicted by an affine fit to the rest of it; between, a pair by its
+    nearest neighbours in other sequences. Noise is predicted by neither, a misfit by both.
+    """
+    z, residual = np.asarray(z), np.asarray(residual)
+    total, within, rows = 0.0, 0.0, []
+    for number in np.unique(sequence):
+        own = np.flatnonzero(sequence == number)
+        if len(own) < 4 * (1 + z.shape[1]):
+            continue
+        design = np.column_stack([np.ones(len(own)), z[own]])
+        fitted = np.linalg.lstsq(design[::2], residual[own[::2]], rcond=None)[0]
+        total += np.sum(residual[own[1::2]] ** 2)
+        within += np.sum((residual[own[1::2]] - design[1::2] @ fitted) ** 2)
+        rows.append(own)
+    if len(rows) < 2 or not within < _EXPLAINED * total:
+        return False
+    rows = np.concatenate(rows)
+    count = min(len(rows), _SEQUENCE_NEIGHBOURS)
+    _, near = cKDTree(z[rows]).query(z[rows], k=count)
+    other = sequence[rows][near] != sequence[rows][:, None]
+    known = other.any(axis=1)
+    first = np.argmax(other, axis=1)  # the nearest of another sequence
+    guess = residual[rows][near[np.arange(len(rows)), first]]
+    error = np.sum((residual[rows] - guess)[known] ** 2)
+    return bool(error > 0.5 * np.sum(residual[rows][known] ** 2))

@@ -19,17 +19,25 @@ import numpy as np
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.errors import FitError, FitWarning
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.assemble import assemble, in_block
+from gfnn_jax.learn.assemble import assemble, composed, with_predictor
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance, refined_images
-from gfnn_jax.learn.check import check_number, check_request, unlike_the_scene
+from gfnn_jax.learn.check import (
+    check_number,
+    check_request,
+    coarse_tolerance,
+    unlike_the_scene,
+)
 from gfnn_jax.learn.choose_charts import Charts, choose_charts
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.diagnose import (
     ChartJudgement,
     data_defect,
+    differs_between_sequences,
     local_jacobians,
     look_symplectic,
     outliers,
+    sampled_dimension,
+    sequences_of,
     volume_change,
 )
 from gfnn_jax.learn.held_out import first_occurrences, split_rows
@@ -46,7 +54,7 @@ _MOST_OUTLIERS = 0.05  # of the pairs may be left out
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
-_VOLUME_PAIRS = 2_000
+_RESIDUAL_PAIRS = 2_000  # whose residuals are looked at
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,6 +135,7 @@ def fit(
     checkpoints: Any = None,
     on_progress: Callable[[str], Any] = lambda message: None,
     on_candidate: Callable[[Candidate], Any] = lambda candidate: None,
+    on_better: Callable[[SymplecticMap, Candidate], Any] | None = None,
 ) -> Fit:
     """Learn the map of these pairs: the cheapest candidate within the tolerance, else the best.
 
@@ -143,6 +152,8 @@ def fit(
     max_iterations: of the training of "mlp".
     checkpoints: a ``TrainingCheckpoints``, which a training saves to and goes on from.
     on_progress, on_candidate: called with what is being done, and with every candidate.
+    on_better: called with a map and its candidate whenever steps have shown one that is more
+               accurate than those before, so that it can be kept should the fit be interrupted.
 
     Raises FitError, in one line, where the data are too few or not finite or a chart that was asked
     for is singular over them (naming the chart to use instead). Warns (FitWarning) where nothing
@@ -151,7 +162,9 @@ def fit(
     """
     clock = Clock(max_seconds)
     require_x64("a fit")
-    bound = Tolerance(tolerance) if absolute_tolerance is None else Tolerance(absolute_tolerance, False)  # fmt: skip
+    bound = Tolerance(tolerance)
+    if absolute_tolerance is not None:
+        bound = Tolerance(absolute_tolerance, relative=False)
     check_request(
         pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, angles=angles
     )
@@ -164,6 +177,7 @@ def fit(
 
     if scene is not None and scene.features is not None and family in ("auto", "features"):
         warn(unlike_the_scene(pairs, scene))
+    warn(coarse_tolerance(pairs, bound))
     coordinates = scene.coordinates if scene else Coordinates("cartesian", angles=tuple(angles))
     on_progress("looking at the map's local Jacobians")
     pairs, prepared, new = _prepared(pairs, coordinates)
@@ -178,15 +192,17 @@ def fit(
         ]
     else:
         sweeps = list(sweeps_for(family, charts.charts, prepared, scene, judges))
-    found = search(sweeps, bound.bound, clock, on_progress, on_candidate)
+    better = _Better(prepared, judges, on_better) if on_better is not None else None
+    found = search(sweeps, bound.bound, clock, on_progress, on_candidate, better)
     if not found.ranking:
         raise FitError(_nothing_found(found, pairs, clock))
     chosen, entry, compile_seconds = _assembled(found, prepared, judges, clock, on_progress)
     noise = None
     if chosen.validation_bound > bound.bound:
         warn([not_met(chosen, bound, found.ended)])
-    if (chosen.chart, chosen.family) in found.stalled and chosen.validation_relative > _ROUNDOFF:
-        noise, new = _noise(chosen, entry, prepared, judges)
+    if chosen.validation_bound > bound.bound and chosen.validation_relative > _ROUNDOFF:
+        stalled = (chosen.chart, chosen.family) in found.stalled
+        noise, new = _what_is_left(chosen, entry, prepared, judges, stalled)
         warn(new)
     entries = [e for e in found.entries if e.size is not entry.size]
     candidates = [*(e.candidate for e in entries), dataclasses.replace(chosen, chosen=True)]
@@ -207,6 +223,29 @@ def fit(
         test_states=test,
         model_determinant_min=smallest_determinant(chosen.map, prepared, judges),
     )
+
+
+class _Better:
+    """Hands on the map of every entry that is more accurate than those before. Nothing is compiled:
+    the map is judged by the steps that the search made."""
+
+    def __init__(self, prepared: Prepared, judges: Judges, on_better: Callable):
+        self._prepared, self._judges, self._on_better = prepared, judges, on_better
+        self._best = np.inf
+
+    def __call__(self, entry: Entry) -> None:
+        candidate = entry.candidate
+        if not candidate.validation_bound < self._best:
+            return
+        self._best = candidate.validation_bound
+        _, params = entry.sweep.solve(entry.size, Clock(), lambda message: None)
+        family = entry.size.family
+        generated = Generated(
+            family, params, entry.sweep.chart, self._prepared.dt, self._prepared.scale
+        )
+        features = getattr(getattr(family, "inputs", None), "features", None)
+        generated = with_predictor(generated, self._prepared, self._judges.training, features)
+        self._on_better(composed(generated, self._prepared, self._judges), candidate)
 
 
 def _prepared(pairs: Pairs, coordinates: Coordinates) -> tuple[Pairs, Prepared, list[str]]:
@@ -243,7 +282,7 @@ def _diagnosed(prepared: Prepared, chart: str, reversor, seed: int) -> _Diagnosi
     """What the local Jacobians say: whether the pairs look symplectic, and which charts cover
     them; the base map is factored out where one is needed."""
     jacobians, error = local_jacobians(prepared.y0, prepared.y1, prepared.scale, seed=seed)
-    defect, messages = data_defect(jacobians, prepared.scale), []
+    defect, messages = data_defect(jacobians, prepared.scale), _thin(prepared)
     if not look_symplectic(jacobians, error, prepared.scale):
         messages.append(
             f"the pairs do not look symplectic: ‖MᵀJM − J‖ is about {defect:.2g}, known to within "
@@ -254,6 +293,19 @@ def _diagnosed(prepared: Prepared, chart: str, reversor, seed: int) -> _Diagnosi
     if charts.half is not None:
         prepared = prepared.without(charts.half)
     return _Diagnosis(prepared, charts, defect, [*messages, *charts.messages])
+
+
+def _thin(prepared: Prepared) -> list[str]:
+    """A warning where the states lie on a curve, or on the torus of an orbit."""
+    seen = [i for i in range(2 * prepared.dim) if i not in prepared.coordinates.cyclic]
+    dimension = sampled_dimension(prepared.y0[:, seen], prepared.scale[seen])
+    if dimension > min(prepared.dim, len(seen) - 1):
+        return []
+    where = "a curve" if dimension == 1 else f"a surface of dimension {dimension}"
+    return [
+        f"the pairs lie on {where} of the {len(seen)}-dimensional phase space, as those of one "
+        "orbit do: the map is learned there only"
+    ]
 
 
 def _assembled(
@@ -283,8 +335,25 @@ def _assembled(
     return chosen, entry, compile_seconds
 
 
-def _noise(chosen: Candidate, entry: Entry, prepared: Prepared, judges: Judges):
-    """The noise that the residuals suggest, (2d,), and what is said of it."""
+def _what_is_left(
+    chosen: Candidate, entry: Entry, prepared: Prepared, judges: Judges, stalled: bool
+) -> tuple[np.ndarray | None, list[str]]:
+    """The noise (2d,) that the residuals suggest, where larger models no longer helped, and what is
+    said of the residuals: noise, friction, or a parameter that differs between sequences."""
+    rows = np.sort(judges.training)[:_RESIDUAL_PAIRS]
+    _, params = entry.sweep.solve(entry.size, Clock(), lambda message: None)
+    images, solved = refined_images(prepared, entry.sweep.chart, entry.size.family, params, rows)
+    rows, residual = rows[solved], (prepared.y1[rows] - images)[solved]
+    sequence = sequences_of(judges.pairs.z0, judges.pairs.z1)[rows]
+    scaled = prepared.y0[rows] / prepared.scale, residual / prepared.scale
+    if differs_between_sequences(*scaled, sequence):
+        return None, [
+            "what is left over agrees within a sequence and differs between sequences: something "
+            "that the states do not hold (a mass, a length, a field) differs between them; learn "
+            "those of one value by themselves"
+        ]
+    if not stalled:
+        return None, []
     # Noise of both states enters the difference: σ √2 for a map near the identity. The fit averages
     # it over the rows that each coefficient has.
     noise = chosen.deviations / np.sqrt(2.0)
@@ -295,13 +364,7 @@ def _noise(chosen: Candidate, entry: Entry, prepared: Prepared, judges: Judges):
         f"(the map's own error is then about {implied:.1g} of it), or a structure that these "
         "functions cannot represent"
     ]
-    rows = judges.training[:_VOLUME_PAIRS]
-    _, params = entry.sweep.solve(entry.size, Clock(), lambda message: None)
-    images, solved = refined_images(
-        prepared, entry.sweep.chart, entry.size.family, params, rows
-    )
-    residual = (prepared.y1[rows] - images)[solved]
-    change, error = volume_change(prepared.y0[rows][solved], residual)
+    change, error = volume_change(prepared.y0[rows], residual)
     if abs(change) > _CERTAIN * error:
         messages.append(
             f"what is left over is no noise: phase-space volumes change by {change:.2g} "

@@ -32,6 +32,7 @@ from gfnn_jax.learn.assemble import Assembled, composed, stepped
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
 from gfnn_jax.learn.clock import Clock, OutOfTime
 from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.phase_space import symplectic_form
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,8 +83,8 @@ class LearnedHamiltonian:
 
     candidate: as the others of a fit, its error measured by steps in NumPy. flow: the piece.
     terms, formula: what H is. truncation: largest error of the flow's own steps on the held-out
-    states, ÷ scale. omega_h: the fastest oscillation over the data, times dt; beyond π one dt does
-    not tell H. contraction: the fixed point's factor where it is largest. condition: of the terms'
+    states, ÷ scale. omega_h: the fastest oscillation of the linearised flow, times dt, in the median over
+    the data; beyond π pairs of one dt do not tell H. contraction: the fixed point's factor where it is largest. condition: of the terms'
     columns. null_terms: that the data do not tell from the others. left_out: pairs that the flow
     does not resolve.
     """
@@ -343,23 +344,22 @@ def _operations(family: Terms, rates, dt: float, steps: Steps) -> float:
 
 
 def _omega_h(hessian, dt: float) -> float:
-    """The fastest oscillation of the linearised flow, in radians per step."""
-    from gfnn_jax.phase_space import symplectic_form
-
+    """The fastest oscillation of the linearised flow, in radians per step: its median over states."""
     turned = symplectic_form(hessian.shape[-1] // 2) @ hessian
-    return float(dt * np.abs(np.linalg.eigvals(turned).imag).max())
+    rates = np.abs(np.linalg.eigvals(turned).imag).max(axis=-1)
+    return float(dt * np.median(rates))
 
 
 def _messages(found: _Fitted, omega_h: float, left_out: int, prepared, judges) -> Iterator[str]:
     if omega_h > np.pi:
         yield (
-            f"the fastest oscillation of the learned H turns by {omega_h:.2g} > π in a step: pairs of "
-            f"one dt do not tell H there; pairs with a shorter dt than {prepared.dt:g} would"
+            f"the fastest oscillation of the learned H turns by {omega_h:.2g} > π in a step (ωh > π): "
+            f"pairs of one dt do not tell H there; a shorter dt than {prepared.dt:g} does"
         )
-    if found.error.bound > judges.tolerance.bound:
+    elif found.error.bound > judges.tolerance.bound:
         yield (
             f"no H of the terms tried meets the tolerance (best {found.error.relative:.2e} of the "
-            "spread): other terms are needed, the map has no flow, or an oscillation turns by more "
+            "spread): other terms are needed, or the map has no flow, or an oscillation turns by more "
             f"than π in dt = {prepared.dt:g} (ωh > π)"
         )
     if left_out:

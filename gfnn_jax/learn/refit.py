@@ -39,9 +39,7 @@ def refit(fitted: Fit, chunks: Iterable[Pairs], held: Pairs) -> Fit:
     """
     started = time.perf_counter()
     tolerance = fitted.asked
-    messages = [
-        m for m in fitted.messages if m != not_met(fitted.chosen, tolerance, fitted.ended)
-    ]
+    messages = [m for m in fitted.messages if m != not_met(fitted.chosen, tolerance, fitted.ended)]
 
     def warn(message: str) -> None:
         messages.append(message)

@@ -25,6 +25,7 @@ _FINALISTS = 3  # that are validated where none meets the tolerance
 # estimate is within the first factor of the tolerance, and from then on sizes are validated whose
 # estimate times the ratio is within the second.
 _CALIBRATED, _HOPEFUL = 1e3, 1.3
+_KEPT = 0.1  # of the last kept map's error: a map so much better is kept in its stead
 
 
 class Entry(NamedTuple):
@@ -52,11 +53,13 @@ def search(
     clock: Clock,
     say: Callable[[str], Any],
     tell: Callable[[Candidate], Any],
+    on_validated: Callable[[Entry], Any] | None = None,
 ) -> Found:
     """Climb the sweeps. A sweep has ``sizes`` with ``operations`` by rising order, and
     ``judge(size, clock, say)`` and ``validate(size, judged, clock, say)``, which give candidates.
 
     bound: the tolerance on a candidate's ``validation_bound``. tell: called with every candidate.
+    on_validated: called with every entry whose steps have been looked at.
     """
     queue = sorted(
         ((size.operations, i, n) for i, s in enumerate(sweeps) for n, size in enumerate(s.sizes))
@@ -66,7 +69,7 @@ def search(
     ratio = [1.0 / _CALIBRATED] * len(sweeps)  # of a step's error to its estimate
     beaten, stalled = [0] * len(sweeps), [0] * len(sweeps)
     left: set[int] = set()
-    cheapest, ended = np.inf, ""
+    cheapest, kept, ended = np.inf, np.inf, ""
     try:
         for operations, i, n in queue:
             if i in left or operations >= cheapest:
@@ -75,12 +78,17 @@ def search(
             sweep, size = sweeps[i], sweeps[i].sizes[n]
             judged = sweep.judge(size, clock, say)
             candidate = judged
-            if ratio[i] * judged.validation_bound <= _HOPEFUL * bound:
+            # Something to keep should the search be interrupted is worth a few more looks.
+            keep = on_validated is not None and judged.validation_relative < _KEPT * kept
+            kept = min(kept, judged.validation_relative) if keep else kept
+            if keep or ratio[i] * judged.validation_bound <= _HOPEFUL * bound:
                 candidate = sweep.validate(size, judged, clock, say)
                 if np.isfinite(candidate.validation_relative) and judged.validation_relative > 0:
                     ratio[i] = candidate.validation_relative / judged.validation_relative
             entries.append(Entry(candidate, sweep, size))
             tell(candidate)
+            if candidate.validated and on_validated is not None:
+                on_validated(entries[-1])
             if candidate.validated and candidate.validation_bound <= bound:
                 cheapest = min(cheapest, operations)
                 left.add(i)

@@ -29,6 +29,7 @@ _MOST_TERMS = 1_500
 _ROWS_PER_TERM = 3
 # Rows × terms² of one factor: about ten seconds on two cores.
 _MOST_OPERATIONS = 1.2e11
+_OPERATIONS_PER_SECOND = 1e10  # of a factorisation on one thread, for the estimate that is told
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
 _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
 _CHECKPOINT_SECONDS = 10.0
@@ -97,7 +98,7 @@ class LinearSweep:
         started = time.perf_counter()
         train, held = self._factor(size.group, clock, say)
         count = size.family.num_parameters
-        (train_rms, held_rms), = least_squares.residuals(train, held, [count])
+        ((train_rms, held_rms),) = least_squares.residuals(train, held, [count])
         return self._candidate(size, train_rms, held_rms, time.perf_counter() - started)
 
     def validate(self, size: Size, judged: Candidate, clock: Clock, say) -> Candidate:
@@ -123,11 +124,15 @@ class LinearSweep:
 
     def _factor(self, group, clock: Clock, say) -> tuple:
         if group not in self._factors:
-            say(f"{self.chart.name}: {group.num_parameters} terms of {group.label}")
             # Shuffled rows: the first of them are a sample, where all would take too long.
-            width = self._train[0].shape[1]
-            most = int(_MOST_OPERATIONS / (group.num_parameters**2 * width))
-            train = [tuple(a[: max(most, 1)] for a in self._train)]
+            count, width = len(self._train[0]), self._train[0].shape[1]
+            taken = min(count, max(1, int(_MOST_OPERATIONS / (group.num_parameters**2 * width))))
+            seconds = 2 * taken * width * group.num_parameters**2 / _OPERATIONS_PER_SECOND
+            say(
+                f"{self.chart.name}: {group.num_parameters} terms of {group.label}, {taken} pairs, "
+                f"about {max(1, round(seconds))} s"
+            )
+            train = [tuple(a[:taken] for a in self._train)]
             self._factors[group] = tuple(
                 least_squares.reduce(group, rows, self._weight, on_block=clock.check)
                 for rows in (train, [self._held])
@@ -197,9 +202,7 @@ class NetworkSweep:
 
     def validate(self, size: Size, judged: Candidate, clock: Clock, say) -> Candidate:
         """The trained network with its error measured by steps."""
-        return validated(
-            judged, self.prepared, self.chart, size.family, self._params, self.judges
-        )
+        return validated(judged, self.prepared, self.chart, size.family, self._params, self.judges)
 
     def solve(self, size: Size, clock: Clock, say) -> tuple[Any, Any]:
         """The params of the trained network."""

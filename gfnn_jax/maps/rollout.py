@@ -37,8 +37,8 @@ def scan_steps(
 def rollout(step: Callable, z0, num_steps: int, *, save_every: int = 1):
     """Roll out a plain step function z -> z of one state (2d,) from a batch of initial states.
 
-    z0: (B, 2d), NumPy or JAX. Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first.
-    Compiled once for each ``step``: pass the same function again, not a new lambda.
+    z0: (B, 2d), NumPy or JAX. Returns the states (B, 1 + num_steps // save_every, 2d), the initial
+    ones first. Compiled once for each ``step``: pass the same function again, not a new lambda.
     """
     z0 = z0 if isinstance(z0, jax.Array) else np.asarray(z0)
     return _rollout(step, z0, num_steps // save_every, save_every)

@@ -114,7 +114,7 @@ class SymplecticMap:
         return self.scale.shape[-1] // 2
 
     def save(self, folder, **options) -> None:
-        """Write a model folder, which ``gfnn.load`` reads; see `maps.saved.save` for the options."""
+        """Write a model folder, which ``gfnn.load`` reads; `maps.saved.save` has the options."""
         from gfnn_jax.maps import saved  # stands after this module: a shorthand for its function
 
         saved.save(self, folder, **options)
@@ -174,9 +174,7 @@ class SymplecticMap:
             raise ValueError(
                 f"expected num_steps >= 0 and save_every >= 1, got {num_steps} and {save_every}"
             )
-        return _rollout(
-            self, self._states(z0), num_steps // save_every, save_every, stop_outside
-        )
+        return _rollout(self, self._states(z0), num_steps // save_every, save_every, stop_outside)
 
     def _states(self, z):
         dtype = np.dtype(self.scale.dtype)

@@ -32,21 +32,47 @@ def unfinished(
     Raises InputError where ``out`` is in the way, where an unfinished job is there and neither
     ``resume`` nor ``overwrite`` is set, and where ``resume`` meets another job.
     """
-    ensure_new(out, overwrite, folder=True)
     folder = out.with_name(out.name + ".partial")
-    _make_way(folder, json.loads(json.dumps(job)), what, overwrite=overwrite, resume=resume)
-    atomic_write(folder / JOB, json.dumps(job))
+    # What an interrupted job has left in ``out`` may be replaced by the same job.
+    ensure_new(out, overwrite or (resume and (folder / JOB).is_file()), folder=True)
+    with _claimed(out, what):
+        _make_way(folder, json.loads(json.dumps(job)), what, overwrite=overwrite, resume=resume)
+        atomic_write(folder / JOB, json.dumps(job))
+        try:
+            yield folder
+        except BaseException as error:
+            found = kept(folder)
+            if not found:
+                _discard(folder)
+            if isinstance(error, KeyboardInterrupt):
+                told = f"{folder} keeps {', '.join(found)}: --resume goes on with it"
+                error.add_note(told if found else f"nothing of the {what} was kept")
+            raise
+        _discard(folder)
+
+
+@contextlib.contextmanager
+def _claimed(out: Path, what: str) -> Iterator[None]:
+    """``OUT.lock`` held by this process, where the system has such locks; a killed process lets go
+    of it. Raises InputError where another process holds it."""
     try:
-        yield folder
-    except BaseException as error:
-        found = kept(folder)
-        if not found:
-            _discard(folder)
-        if isinstance(error, KeyboardInterrupt):
-            told = f"{folder} keeps {', '.join(found)}: --resume goes on with it"
-            error.add_note(told if found else f"nothing of the {what} was kept")
-        raise
-    _discard(folder)
+        import fcntl
+    except ImportError:
+        yield
+        return
+    path = out.with_name(out.name + ".lock")
+    with failures_as_work_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        stream = open(path, "w")  # noqa: SIM115, closed below
+    with stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(f"{out}: another process is writing this {what}") from error
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
 
 
 def kept(folder: Path) -> list[str]:
