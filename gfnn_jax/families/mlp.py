@@ -101,7 +101,8 @@ class Mlp(DifferentiatedByJax):
         dtype = jax.tree.leaves(params)[0].dtype
         x = self.seen(w).astype(dtype)
         amplitude = jnp.asarray(self.amplitude, dtype)
-        return amplitude * self._network(dtype).apply({"params": params}, x)[..., 0]
+        out: Any = self._network(dtype).apply({"params": params}, x)
+        return amplitude * out[..., 0]
 
     def seen(self, w):
         """What the network sees at w (..., 2d): (..., num_inputs)."""

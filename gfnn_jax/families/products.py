@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from functools import cache, cached_property, partial
+from typing import Any
 
 import jax
 import numpy as np
@@ -34,7 +35,7 @@ def chebyshev(x, degree: int):
 
 
 def fourier(x, degree: int):
-    """1, cos x, .., cos Dx, sin x, .., sin Dx of x (...), by doubling e^{i(k+j)x} = e^{ikx} e^{ijx}:
+    """1, cos x, .., cos Dx, sin x, .., sin Dx of x (...), by e^{i(k+j)x} = e^{ikx} e^{ijx}:
     (..., 2D + 1)."""
     xp = namespace(x)
     c = xp.stack([xp.ones_like(x), xp.cos(x)], axis=-1)
@@ -139,7 +140,9 @@ class _Half:
             one = xp.ones_like(like[..., :1])
             tables = [one, one[..., None, :][..., :0, :], one[..., None, None, :][..., :0, :0, :]]
             return tables[: order + 1]
-        factors = []  # of each variable: the factor of every product, and its derivatives
+        factors: list[
+            Any
+        ] = []  # of each variable: the factor of every product, and its derivatives
         for j, f in enumerate(functions):
             side_by_side = _product(f, xp.asarray(self.picks(j, order), dtype=f.dtype))
             factors.append(

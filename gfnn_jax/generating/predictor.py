@@ -166,7 +166,7 @@ def _by_degree(inputs: Inputs, y, target, unit) -> list[tuple[PolynomialModel, f
     ridge = _RIDGE * np.linalg.norm(design[~held], axis=0)
     rows = np.vstack([design[~held], np.diag(ridge)])
     with one_thread():
-        q, r = scipy.linalg.qr(rows, mode="economic", check_finite=False)
+        q, r = np.linalg.qr(rows)
     along = q.T @ np.vstack([target[~held], np.zeros((width, target.shape[1]))])
     found, closest = [], np.inf
     for degree in range(1, top + 1):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +43,7 @@ def search(
     checkpoints = on_better = None
     if kept_in is not None:
         checkpoints = TrainingCheckpoints(kept_in, job or {})
-        record = {"unfinished": job}
-
-        def on_better(map_: SymplecticMap, candidate: Candidate) -> None:
-            found = record | {"validation_relative": candidate.validation_relative}
-            saved.save(map_, kept_in / BEST, scene=scene, record=found, overwrite=True)
-
+        on_better = partial(_keep, kept_in / BEST, scene, job)
     try:
         with failures_of_arithmetic():
             return fit(
@@ -57,6 +53,14 @@ def search(
             )  # fmt: skip
     except FitError as error:
         raise InputError(str(error)) from error
+
+
+def _keep(
+    folder: Path, scene: Scene | None, job: Any, map_: SymplecticMap, candidate: Candidate
+) -> None:
+    """The best map so far, on disk."""
+    record = {"unfinished": job, "validation_relative": candidate.validation_relative}
+    saved.save(map_, folder, scene=scene, record=record, overwrite=True)
 
 
 def line(candidate: Candidate) -> str:

@@ -40,12 +40,12 @@ class Candidate:
     """One size of one family in one chart: what it is, how accurate, what a step costs.
 
     validation_rms: RMS per component of the one-step error Z_predicted − Z on held-out pairs, in
-    the user's units. validation_relative: the RMS over coordinates of error ÷ spread. validation_bound:
-    upper 95 % bound of the one that the tolerance is for. validated: whether these were measured by
-    steps; else they are estimates from the gradient's residual. deviations: (2d,) the error's RMS
-    in each coordinate. train_rms: as validation_relative, of the training pairs' residual.
-    operations: floating-point operations per predicted step. fit_seconds: of its factorisation and
-    solve, or its training. map: of the chosen one.
+    the user's units. validation_relative: the RMS over coordinates of error ÷ spread.
+    validation_bound: upper 95 % bound of the one that the tolerance is for. validated: whether
+    these were measured by steps; else they are estimates from the gradient's residual. deviations:
+    (2d,) the error's RMS in each coordinate. train_rms: as validation_relative, of the training
+    pairs' residual. operations: floating-point operations per predicted step. fit_seconds: of its
+    factorisation and solve, or its training. map: of the chosen one.
     """
 
     label: str

@@ -100,7 +100,9 @@ class _Refit:
             self._difference(images - np.asarray(pairs.z1)), self.spread, self.tolerance
         )
 
-    def reduce(self, chunks: Iterable[Pairs], held: Pairs) -> tuple:
+    def reduce(
+        self, chunks: Iterable[Pairs], held: Pairs
+    ) -> tuple[least_squares.Reduced, least_squares.Reduced]:
         """The factors of all pairs but outliers and those held out, and of those held out."""
         family, chart, dt = self.generated.family, self.generated.chart, float(self.map.dt)
         weight = residual_weight(chart, self.generated.scale, dt)

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from gfnn_jax.arrays import as_row
 from gfnn_jax.coordinates import TWO_PI, Coordinates
@@ -141,7 +142,7 @@ class SymplecticMap:
         """
         z = self._states(z)
         ran = self.step(z)[1].iterations
-        if isinstance(ran, jax.core.Tracer):
+        if isinstance(ran, Tracer):
             return _defect(self, z, True)
         # A single update is the usual case; its derivative compiles in half the time.
         return _compiled_defect(self, z, 1 if np.max(np.asarray(ran), initial=0) <= 1 else True)
