@@ -50,7 +50,7 @@ def test_a_step_without_an_image_makes_the_error_infinite():
 
 def test_errors_of_angles_are_to_the_nearest_image():
     z0 = np.random.default_rng(2).uniform(-3, 3, (20, 2))
-    pairs = Pairs(z0, z0 + [2 * np.pi, 0.0], 1.0)
+    pairs = Pairs(z0, z0 + np.array([2 * np.pi, 0.0]), 1.0)
     rows = np.arange(20)
     judges = Judges(pairs, rows, rows, Tolerance(1.0))
     assert judges.error_of(z0, Coordinates("angle", angles=(0,))).rms < 1e-15

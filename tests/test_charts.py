@@ -103,9 +103,7 @@ def test_pair_asks_for_its_own_gradient_from_either_side(chart):
     back, dt = chart.reverse(DT)
     for one, step, pair in ((chart, DT, (z, image)), (back, dt, (image, z))):
         np.testing.assert_allclose(one.evaluation_point(*pair), w, atol=1e-14)
-        np.testing.assert_allclose(
-            one.target_gradient(*pair, step), gradient, rtol=0, atol=1e-13
-        )
+        np.testing.assert_allclose(one.target_gradient(*pair, step), gradient, rtol=0, atol=1e-13)
 
 
 @EVERY
@@ -173,7 +171,9 @@ def test_second_derivative_through_the_step():
 
     z, step = STATES[0, :2], 1e-5
     hessian = derivatives(z)[1]
-    ends = np.stack([derivatives(z + move)[0] for move in step * np.vstack([np.eye(2), -np.eye(2)])])
+    ends = np.stack(
+        [derivatives(z + move)[0] for move in step * np.vstack([np.eye(2), -np.eye(2)])]
+    )
     np.testing.assert_allclose(hessian, (ends[:2] - ends[2:]) / (2 * step), rtol=0, atol=1e-8)
     np.testing.assert_allclose(hessian, hessian.T, rtol=0, atol=1e-12)
 
@@ -241,7 +241,12 @@ def test_types_2_and_3_of_a_separable_hamiltonian_are_symplectic_euler():
 def test_midpoint_rule_is_of_second_order():
     start, time = np.array([0.1, -0.2, 0.3, 0.25]), 1.6
     reference = scipy.integrate.solve_ivp(
-        lambda t, z: henon_heiles_field(z), (0, time), start, method="DOP853", rtol=1e-13, atol=1e-14
+        lambda t, z: henon_heiles_field(z),
+        (0, time),
+        start,
+        method="DOP853",
+        rtol=1e-13,
+        atol=1e-14,
     ).y[:, -1]
     counts, errors = np.array([8, 16, 32]), []
     for count in counts:

@@ -181,7 +181,7 @@ def test_what_was_compiled_for_some_data_serves_others():
 
 
 def test_a_plain_function_becomes_a_family_and_a_family_stays():
-    family, params = case("products", "plain")
+    family, _ = case("products", "plain")
     assert as_family(family) is family
     made = as_family(quartic)
     assert isinstance(made, Family)

@@ -7,7 +7,6 @@ import pytest
 import gfnn_jax as gfnn
 from gfnn_jax.data.files import iterate_pairs, read_sample, read_trajectories
 from gfnn_jax.jobs import fit as fit_job
-from gfnn_jax.learn.refit import refit
 
 
 @pytest.fixture(scope="module")
@@ -68,63 +67,10 @@ def test_all_pairs_fit_better_than_the_sample(file, tmp_path, monkeypatch):
     assert error(ran.fit.map) < 0.6 * error(sample.map)
 
 
-@pytest.fixture(scope="module")
-def sampled(file):
-    """Pairs of a file, those held out, and a fit of a sample of the others."""
-    pairs = read_trajectories(file).pairs()
-    scene = gfnn.scenes.make("standard-map-regular")
-    few = pairs.take(slice(200, 500))
-    return pairs, pairs.take(slice(200)), gfnn.fit(few, scene, tolerance=1e-3, chart="type2")
-
-
-def moved(fit, pairs):
-    return np.asarray(fit.map.step(pairs.z0)[0])
-
-
-def test_outliers_are_left_out_of_a_refit(sampled):
-    pairs, held, fit = sampled
-    z1, rows = np.array(pairs.z1), [100, 700, 2_500]  # the first of them among those held out
-    z1[rows] += [[0.0, 1e3], [0.0, 1e3], [np.pi, 0.0]]
-    wrong = gfnn.Pairs(pairs.z0, z1, 1.0)
-    clean = pairs.take(np.delete(np.arange(3_000), rows))
-    with pytest.warns(gfnn.FitWarning, match="3 of 3000 pairs are far from what the others tell"):
-        again = refit(fit, [wrong], wrong.take(slice(200)))
-    assert again.met
-    assert again.num_pairs == 2_997
-    other = refit(fit, [clean], held.take(np.delete(np.arange(200), 100)))
-    np.testing.assert_allclose(moved(again, held), moved(other, held), rtol=0, atol=1e-12)
-
-
-def test_those_held_out_have_no_part_in_a_refit(sampled):
-    pairs, held, fit = sampled
-    others = pairs.take(slice(200, None))
-    np.testing.assert_array_equal(
-        moved(refit(fit, [pairs], held), held),
-        moved(refit(fit, [others], held), held),
-    )
-
-
-@pytest.mark.parametrize("kick", [5e-4, 1e3])
-def test_a_worse_refit_is_not_kept(sampled, kick):
-    """Pairs of another map: close enough to be believed, or so far that nothing is left."""
-    pairs, held, fit = sampled
-    others = pairs.take(slice(200, None))
-    other = gfnn.Pairs(others.z0, others.z1 + np.array([0.0, kick]), 1.0)
-    with pytest.warns(gfnn.FitWarning, match="whose map is kept"):
-        again = refit(fit, [other], held)
-    np.testing.assert_array_equal(moved(again, held), moved(fit, held))
-    assert again.num_pairs == fit.num_pairs
-    assert any("whose map is kept" in message for message in again.messages)
-
-
-def test_refitting_to_the_same_pairs_in_chunks_changes_nothing(file):
-    scene = gfnn.scenes.make("standard-map-regular")
-    pairs = read_trajectories(file).pairs()
-    fit = gfnn.fit(pairs, scene, tolerance=1e-3, chart="type2")
-    held = pairs.take(slice(200))
-    once = refit(fit, [pairs], held)
-    chunked = refit(fit, iterate_pairs(file, 700), held)
-    assert chunked.num_pairs == once.num_pairs == 3_000
-    np.testing.assert_allclose(
-        chunked.map.step(pairs.z0)[0], once.map.step(pairs.z0)[0], rtol=0, atol=1e-12
-    )
+def test_chunks_of_a_file_are_its_pairs(file):
+    whole, chunks = read_trajectories(file).pairs(), list(iterate_pairs(file, 700))
+    assert len(chunks) > 4
+    assert max(map(len, chunks)) <= 700
+    for name in ("z0", "z1"):
+        joined = np.concatenate([getattr(chunk, name) for chunk in chunks])
+        np.testing.assert_array_equal(joined, getattr(whole, name))

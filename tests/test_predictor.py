@@ -103,6 +103,17 @@ def test_noise_and_few_pairs_end_the_rise():
     assert few[-1].predictor.forward.family.num_parameters <= 4
 
 
+def test_a_coordinate_at_rest_has_no_part_in_it():
+    """All its products vanish; a coordinate that is constant but not zero alike."""
+    rest = np.zeros((600, 1))
+    z0, z1 = (
+        np.concatenate([z[:, :1], rest, z[:, 1:], rest + 0.1], axis=1)
+        for z in (STATES, kicked(STATES))
+    )
+    model = fit_predictors(MIDPOINT, z0, z1, DT)[-1].predictor.forward
+    np.testing.assert_allclose(model(z0), unknowns(MIDPOINT, z0, z1), rtol=0, atol=1e-5)
+
+
 def test_angles_go_round_and_the_rest_stays_small_far_away():
     z0 = STATES * [np.pi, 1.0]
     model = fit_predictors(TYPE2, z0, kicked(z0), DT, angles=(0,))[-1].predictor.forward

@@ -164,6 +164,7 @@ def _by_degree(inputs: Inputs, y, target, unit) -> list[tuple[PolynomialModel, f
     design = _design(largest, inputs(y))
     width = design.shape[1]
     ridge = _RIDGE * np.linalg.norm(design[~held], axis=0)
+    ridge = np.where(ridge > 0, ridge, 1.0)  # a product that vanishes on all states: no part of it
     rows = np.vstack([design[~held], np.diag(ridge)])
     with one_thread():
         q, r = np.linalg.qr(rows)
