@@ -88,7 +88,7 @@ class Mlp(DifferentiatedByJax):
 
     @property
     def operations(self) -> tuple[int, int]:
-        """Floating-point operations of ∇S (forward, back), and with its Hessian (a tangent each)."""
+        """Floating-point operations of ∇S (forward, back), with its Hessian (a tangent each)."""
         gradient = 4 * (self.num_parameters - sum(self.hidden))
         return gradient, gradient * (1 + self.inputs.num_variables)
 

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from functools import cache, cached_property, partial
+from functools import cache, cached_property, partial, reduce
+from operator import mul
 from typing import Any
 
 import jax
@@ -149,11 +150,10 @@ class _Half:
                 [side_by_side[..., r * terms : (r + 1) * terms] for r in range(order + 1)]
             )
 
-        def product(*raised):
-            return math.prod(
-                (f[raised.count(j)] for j, f in enumerate(factors[1:], 1)),
-                start=factors[0][raised.count(0)],
-            )
+        def product(*raised) -> Any:
+            """Of the factors, each differentiated as often as its variable is among ``raised``."""
+            orders = (raised.count(j) for j in range(n))
+            return reduce(mul, (f[order] for f, order in zip(factors, orders, strict=True)))
 
         tables = [product()]
         if order > 0:
