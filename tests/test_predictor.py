@@ -1,7 +1,6 @@
 """Where solves start: close on the data, harmless far from them, for both directions."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -11,7 +10,14 @@ from analytic import generated, pendulum
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE2
-from gfnn_jax.generating.predictor import CLOSE, Fitted, Predictor, affordable, fit_predictors
+from gfnn_jax.generating.predictor import (
+    CLOSE,
+    Fitted,
+    PolynomialModel,
+    Predictor,
+    affordable,
+    fit_predictors,
+)
 
 DT = 0.4
 STATES = np.random.default_rng(0).uniform(-1, 1, (600, 2))
@@ -81,18 +87,23 @@ def test_what_a_family_affords_rises_with_its_cost(rising):
     assert degrees[-1] == rising[-1].predictor.forward.family.degree
 
 
+class Costing(PolynomialModel):
+    """A model, or a family, of which only the operations count."""
+
+    operations = None
+
+    def __init__(self, operations):
+        object.__setattr__(self, "operations", operations)
+
+
 def test_a_dear_model_is_taken_where_it_spares_updates():
     """Of those that are close the closest that costs no more than what it spares."""
-
-    def costing(operations):
-        return SimpleNamespace(operations=operations)
-
     known = ((1e-3, 40), (1e-6, 600), (4e-8, 1_800), (5e-9, 2_600))
-    fitted = [Fitted(Predictor(costing(n), costing(n)), error) for error, n in known]
-    assert affordable(fitted, costing((100, 400))).error == 4e-8
-    assert affordable(fitted, costing((100, 600))).error == 5e-9
-    assert affordable(fitted, costing((100, 200))).error == 1e-3
-    assert affordable(fitted, costing((10_000, 20_000))).error == 5e-9
+    fitted = [Fitted(Predictor(Costing(n), Costing(n)), error) for error, n in known]
+    assert affordable(fitted, Costing((100, 400))).error == 4e-8
+    assert affordable(fitted, Costing((100, 600))).error == 5e-9
+    assert affordable(fitted, Costing((100, 200))).error == 1e-3
+    assert affordable(fitted, Costing((10_000, 20_000))).error == 5e-9
 
 
 def test_noise_and_few_pairs_end_the_rise():

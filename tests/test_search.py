@@ -21,7 +21,7 @@ class Sweep:
     """Sizes with an estimate and an error each; it notes what it is asked."""
 
     def __init__(self, sizes, family="polynomial", chart="midpoint", most=np.inf):
-        self.sizes = [Size(*s) if len(s) == 3 else Size(*s, s[1]) for s in sizes]
+        self.sizes = [Size(float(s[0]), s[1], s[-1]) for s in sizes]
         self.family, self.chart, self.most = family, chart, most
         self.judged, self.validated = [], []
 
