@@ -398,7 +398,7 @@ def speed_against_error(
         xscale="log",
         yscale="log",
         xlabel="operations per step and trajectory (thousands)",
-        ylabel="one-step error (RMS)",
+        ylabel="one-step error ÷ spread",
     )
     ax.margins(0.12)
     ax.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))  # more labels would cover each other

@@ -45,12 +45,8 @@ def assemble(
     error = judges.error_of(
         np.where(steps.failed[:, None], np.nan, steps.images), prepared.coordinates
     )
-    gradient, with_hessian = family.operations
-    more = np.where(steps.iterations > 1, steps.iterations, 0).mean()
-    predictor = generated.predictor.forward.operations
     candidate = dataclasses.replace(
         with_error(candidate, error), map=map_,
-        operations=float(with_hessian + gradient + more * with_hessian + predictor),
         newton_iterations_max=int(steps.iterations.max()),
         microseconds_per_step=steps.microseconds_per_step,
     )  # fmt: skip

@@ -7,6 +7,7 @@ Only sizes that may be accurate enough, and the few best where none is, are vali
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -25,6 +26,7 @@ _FINALISTS = 3  # that are validated where none meets the tolerance
 # estimate is within the first factor of the tolerance, and from then on sizes are validated whose
 # estimate times the ratio is within the second.
 _CALIBRATED, _HOPEFUL = 1e3, 1.3
+_NO_WORSE = 1.03  # an error larger by this factor is as good, if the map is cheaper
 _KEPT = 0.1  # of the last kept map's error: a map so much better is kept in its stead
 
 
@@ -102,11 +104,28 @@ def search(
         ended = f"the budget of {clock.max_seconds:g} s is spent"
     if not np.isfinite(cheapest):
         entries = _finalists(entries, clock, say)
+    entries = [_calibrated(e, ratio[sweeps.index(e.sweep)]) for e in entries]
     if np.isfinite(cheapest):
         ended = "the tolerance is met"
     elif not ended:
         ended = _why(sweeps, left, stalled)
     return Found(entries, _ranking(entries, bound), _stalled_sweeps(entries), ended)
+
+
+def _calibrated(entry: Entry, ratio: float) -> Entry:
+    """The entry with its estimate multiplied by the ratio that its sweep has shown, if any."""
+    candidate = entry.candidate
+    if candidate.validated or ratio == 1.0 / _CALIBRATED:
+        return entry
+    return entry._replace(
+        candidate=dataclasses.replace(
+            candidate,
+            validation_rms=ratio * candidate.validation_rms,
+            validation_relative=ratio * candidate.validation_relative,
+            validation_bound=ratio * candidate.validation_bound,
+            deviations=ratio * candidate.deviations,
+        )
+    )
 
 
 def _finalists(entries: list[Entry], clock: Clock, say) -> list[Entry]:
@@ -115,6 +134,10 @@ def _finalists(entries: list[Entry], clock: Clock, say) -> list[Entry]:
         (e for e in entries if not e.candidate.validated),
         key=lambda e: (e.candidate.validation_relative, e.candidate.train_rms),
     )
+    # Of those that are as good as the best, the cheapest comes second.
+    as_good = [e for e in best[1:] if _as_good(e, best[0])]
+    second = sorted(as_good, key=lambda e: e.candidate.operations)[:1]
+    best = [*best[:1], *second, *(e for e in best[1:] if e not in second)]
     done: dict[int, Entry] = {}
     for entry in best[:_FINALISTS]:
         if done and clock.left <= 0:
@@ -128,11 +151,22 @@ def _finalists(entries: list[Entry], clock: Clock, say) -> list[Entry]:
 def _ranking(entries: list[Entry], bound: float) -> list[Entry]:
     validated = [e for e in entries if e.candidate.validated]
     meeting = [e for e in validated if e.candidate.validation_bound <= bound]
-    others = [e for e in validated if e.candidate.validation_bound > bound]
+    others = sorted(
+        (e for e in validated if e.candidate.validation_bound > bound),
+        key=lambda e: (e.candidate.validation_relative, e.candidate.train_rms),
+    )
+    as_good = [e for e in others if _as_good(e, others[0])]
     return [
         *sorted(meeting, key=lambda e: e.candidate.operations),
-        *sorted(others, key=lambda e: (e.candidate.validation_relative, e.candidate.train_rms)),
+        *sorted(as_good, key=lambda e: e.candidate.operations),
+        *(e for e in others if not _as_good(e, others[0])),
     ]
+
+
+def _as_good(entry: Entry, best: Entry) -> bool:
+    """Whether an entry's error is no larger than the best one's but for what is not worth while."""
+    limit = _NO_WORSE * best.candidate.validation_relative
+    return entry.candidate.validation_relative <= limit
 
 
 def _beats(rival: Candidate, candidate: Candidate) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -67,6 +68,9 @@ def _claimed(out: Path, what: str) -> Iterator[None]:
     with stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # Another process may have removed the file since it was opened: then the lock is void.
+            if os.fstat(stream.fileno()).st_ino != path.stat().st_ino:
+                raise BlockingIOError
         except OSError as error:
             raise InputError(f"{out}: another process is writing this {what}") from error
         try:
