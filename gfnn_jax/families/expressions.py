@@ -441,7 +441,7 @@ _REARRANGE = {
 def _trees(values):
     """An object array of expressions of an array of numbers or expressions."""
     values = np.asarray(values, dtype=object)
-    return np.frompyfunc(as_expression, 1, 1)(values) if values.size else values
+    return _elementwise(as_expression, values) if values.size else values
 
 
 def _run(jaxpr, constants, arguments) -> list:
@@ -502,4 +502,4 @@ def _applied(primitive, params, values) -> list:
 
 
 def _elementwise(function, *values):
-    return np.frompyfunc(function, len(values), 1)(*values)
+    return np.asarray(np.frompyfunc(function, len(values), 1)(*values), dtype=object)

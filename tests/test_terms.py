@@ -1,0 +1,154 @@
+"""Terms as formulas are written: parsed text, traced functions, derivatives, refusals."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gfnn_jax.errors import InputError
+from gfnn_jax.families import Family, LinearFamily
+from gfnn_jax.families.expressions import parse, to_text, traced
+from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
+from gfnn_jax.scenes import SCENES
+from gfnn_jax.scenes.pcr3bp import features
+
+RNG = np.random.default_rng(0)
+W = RNG.uniform(0.3, 0.9, (5, 2, 4))
+FAMILIES = {
+    "polynomials": polynomial_terms(2, 4),
+    "angles": polynomial_terms(2, 3, angles=(0, 1)),
+    "features": polynomial_terms(2, 2, features=features),
+    "given": given_terms(
+        2, ["1/(1 + sin(q1 - q2)**2)", "exp(-q1**2)*tanh(p2)", "log(q1**2 + 1)/sqrt(p1**2 + 2)"]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_derivatives_are_those_of_jax_in_both_namespaces(name):
+    family = FAMILIES[name]
+    assert isinstance(family, Family)
+    assert isinstance(family, LinearFamily)
+    c = RNG.standard_normal(family.num_parameters)
+    one = partial(family, jnp.asarray(c))
+    w = jnp.asarray(W)
+    value, gradient, hessian, *by_jax = jax.jit(
+        lambda w: (
+            family.value(jnp.asarray(c), w),
+            jax.grad(lambda w: one(w).sum())(w),
+            jax.vmap(jax.vmap(jax.hessian(one)))(w),
+            *family.gradient_and_hessian(jnp.asarray(c), w),
+        )
+    )(w)
+    for found in (family.gradient_and_hessian(c, W), by_jax):
+        np.testing.assert_allclose(found[0], gradient, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(found[1], hessian, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(family.gradient(c, W), gradient, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(family.term_gradients(W) @ c, gradient, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(family.value(c, W), value, rtol=1e-11)
+
+
+def test_many_terms_are_one_product_of_matrices():
+    family = polynomial_terms(2, 6)
+    c = RNG.standard_normal(family.num_parameters)
+    by_jax = jax.jit(family.gradient_and_hessian)(jnp.asarray(c), jnp.asarray(W))
+    for found, expected in zip(by_jax, family.gradient_and_hessian(c, W), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(family.term_gradients(W) @ c, by_jax[0], rtol=1e-11, atol=1e-11)
+
+
+def test_numbers_of_terms():
+    assert polynomial_terms(2, 3).num_parameters == 34
+    assert polynomial_terms(2, 4).num_parameters == 69
+    # sin² is 1 − cos²: half of what two variables per angle would give.
+    assert polynomial_terms(1, 2, angles=(0,)).term_names == (
+        "cos(q1)", "sin(q1)", "p1",
+        "cos(q1)²", "cos(q1) sin(q1)", "cos(q1) p1", "sin(q1) p1", "p1²",
+    )  # fmt: skip
+    assert "q2" not in " ".join(polynomial_terms(2, 2, cyclic=(1,)).term_names)
+
+
+def test_a_reversor_leaves_the_even_terms():
+    family = polynomial_terms(2, 2, reversor=(1, 1, -1, -1))
+    z = RNG.uniform(-1, 1, (6, 4))
+    c = RNG.standard_normal(family.num_parameters)
+    np.testing.assert_allclose(family.value(c, z), family.value(c, z * [1, 1, -1, -1]), rtol=1e-14)
+    assert polynomial_terms(2, 2, features=features, reversor=(1, -1, -1, 1)).num_parameters == 17
+
+
+@pytest.mark.parametrize("name", ["pcr3bp", "henon-heiles-regular", "two-body"])
+def test_a_scenes_hamiltonian_is_traced_to_text(name):
+    """From a Python function to text, and back to a function of the same values."""
+    scene = SCENES[name]()
+    (tree,) = traced(scene.hamiltonian, scene.dim)
+    again = parse(to_text(tree, scene.dim), scene.dim)
+    family = Terms(scene.dim, (to_text(again, scene.dim),), ((1,),))
+    z = W.reshape(-1, 4)
+    expected = jax.vmap(scene.hamiltonian)(jnp.asarray(z))
+    np.testing.assert_allclose(family.value(np.ones(1), z), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda z: z[0] ** 2 / (1 + z[3] ** 2),
+        lambda z: jnp.sum(z[:2] * z[2:]) ** 1.5,
+        lambda z: jnp.linalg.norm(z[:2]) ** -3,
+        lambda z: jnp.stack([z @ z, jnp.exp(-z[0]) * jnp.cos(z[1] - z[2])]),
+        lambda z: jnp.concatenate([z[::-1], z[jnp.array([0, 2])] - 1]) * 2.0,
+    ],
+)
+def test_functions_are_traced(function):
+    family = given_terms(2, [function])
+    count = family.num_parameters
+    z = W.reshape(-1, 4)
+    found = np.stack([family.value(np.eye(count)[j], z) for j in range(count)], axis=-1)
+    expected = jax.vmap(function)(jnp.asarray(z)).reshape(len(z), -1)
+    np.testing.assert_allclose(found, expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("__import__('os')", "a call of '__import__'"),
+        ("q1^2", "a power is written \\*\\*"),
+        ("q3", "the name 'q3'"),
+        ("(lambda: 1)()", "a call of"),
+        ("q1.real", "'q1.real'"),
+        ("sin(q1, q2)", "with 2 arguments"),
+        ("q1 if p1 else 2", "expected numbers"),
+        ("q1**p1", "an exponent that is not a number"),
+        ("1 + 2", "the same at every state"),
+        ("q1 +", "is no expression"),
+        ("'a'", "expected numbers"),
+        ("9.0**9**9*q1", "is no expression"),
+        ("q1 + " * 400 + "q1", "at most"),
+        ("-" * 200 + "q1", "levels"),
+        ("", "is no expression"),
+    ],
+)
+def test_other_text_is_refused_in_one_line(text, says):
+    with pytest.raises(InputError, match=says) as caught:
+        given_terms(2, [text])
+    assert "\n" not in str(caught.value)
+
+
+def test_a_function_that_has_no_formula_is_refused():
+    with pytest.raises(InputError, match="has no formula here"):
+        given_terms(1, [lambda z: jnp.maximum(z[0], z[1])])
+
+
+def test_one_degree_of_freedom_has_short_names():
+    assert given_terms(1, ["p**2 - cos(q)"]).variables == ("p1**2 - cos(q1)",)
+
+
+def test_terms_are_joined_and_taken():
+    own = given_terms(2, ["1/q1", "p1**2/q1"])
+    both = joined(own, polynomial_terms(2, 2))
+    assert both.num_parameters == 2 + 14
+    some = both.take([0, 3])
+    assert some.term_names == (both.term_names[0], both.term_names[3])
+    assert set(some.variables) < set(both.variables)
+    assert hash(some) == hash(both.take([0, 3]))  # static: what is compiled for one serves both
