@@ -6,6 +6,8 @@ import types
 
 import jax
 import pytest
+import scipy.linalg  # noqa: F401, its threads are limited too
+from threadpoolctl import threadpool_limits
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -33,6 +35,9 @@ def pytest_configure(config):
     for name, value in shared.items():
         os.environ[name.upper()] = str(value)
         jax.config.update(name, value)
+    # The suite's workers want all cores: threads of the linear algebra would wait for each other.
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    threadpool_limits(limits=1, user_api="blas")
 
 
 @pytest.fixture(autouse=True, scope="module")
