@@ -478,7 +478,7 @@ def chaos(quick: bool) -> tuple[list[Case], Numbers]:
                           "; ".join(p for p in (said, counts(info.status)) if p),
                           wrong=int(differ > 4)))  # fmt: skip
         few, long = (10, 500) if quick else (50, 20_000)
-        ours, theirs = (lyapunov(step, z0[:few], long) for step in (fit.map.apply, scene.step))
+        ours, theirs = (lyapunov(step, z0[:few], long) for step in (fit.map.step, scene.step))
         scatter = math.hypot(*(np.std(x) / math.sqrt(few) for x in (ours, theirs)))
         differ = abs(ours.mean() - theirs.mean()) / scatter
         said = f"λ = {ours.mean():.4f}, exact map {theirs.mean():.4f}, {differ:.1f} σ apart"
@@ -536,7 +536,7 @@ def near_escape(quick: bool) -> tuple[list[Case], Numbers]:
              wrong=int(divergence > 3 * floor)),
     ]  # fmt: skip
     few, long = (4, 500) if quick else (32, 10_000)
-    mine = lyapunov(fit.map.apply, z0[:few], long) / scene.dt
+    mine = lyapunov(fit.map.step, z0[:few], long) / scene.dt
     theirs_rate = lyapunov_by_shadow(scene, z0[:few], long) / scene.dt
     scatter = math.hypot(*(np.std(x) / math.sqrt(few) for x in (mine, theirs_rate)))
     differ = abs(mine.mean() - theirs_rate.mean()) / scatter

@@ -66,7 +66,7 @@ def _differentiation(angle: bool, degree: int) -> np.ndarray:
 
 # JAX multiplies matrices so small, of so few rows, entry by entry: to call the matrix library takes
 # longer (one lane of the standard map: 4.8 µs a step instead of 2.6; benchmarks/speed.py).
-_FEW_ROWS, _FEW_ENTRIES = 32, 128
+_FEW_ROWS, _FEW_ENTRIES = 8, 128
 
 
 def _product(f, picks):
@@ -141,11 +141,9 @@ class _Half:
             one = xp.ones_like(like[..., :1])
             tables = [one, one[..., None, :][..., :0, :], one[..., None, None, :][..., :0, :0, :]]
             return tables[: order + 1]
-        factors: list[
-            Any
-        ] = []  # of each variable: the factor of every product, and its derivatives
+        factors: list[Any] = []  # of each variable: its factor of every product, and derivatives
         for j, f in enumerate(functions):
-            side_by_side = _product(f, xp.asarray(self.picks(j, order), dtype=f.dtype))
+            side_by_side: Any = _product(f, xp.asarray(self.picks(j, order), dtype=f.dtype))
             factors.append(
                 [side_by_side[..., r * terms : (r + 1) * terms] for r in range(order + 1)]
             )
