@@ -51,7 +51,10 @@ def test_known_coefficients():
     np.testing.assert_allclose(gauss(2).matrix, expected, atol=1e-17)
 
 
-@pytest.mark.parametrize("options", [{}, {"stages": 4, "substeps": 3}, {"newton": True, "stages": 5}])
+OPTIONS = [{}, {"stages": 4, "substeps": 3}, {"newton": True, "stages": 5}]
+
+
+@pytest.mark.parametrize("options", OPTIONS)
 def test_steps_are_those_of_numpy_and_of_the_exact_flow(options):
     piece = flow(**options)
     assert isinstance(piece, Piece)
@@ -83,7 +86,8 @@ def test_inverse_and_defect(newton):
 @pytest.mark.parametrize("newton", [False, True])
 def test_derivatives_in_everything_forward_and_reverse(newton):
     def image(params, dt, z):
-        return Flow(FAMILY, params, dt, jnp.ones(4), 3, 1 if newton else 2, newton).step(z[None])[0][0]
+        piece = Flow(FAMILY, params, dt, jnp.ones(4), 3, 1 if newton else 2, newton)
+        return piece.step(z[None])[0][0]
 
     at = (jnp.asarray(C), jnp.asarray(0.5), jnp.asarray(Z[0]))
     everything = (0, 1, 2)

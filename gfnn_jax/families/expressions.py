@@ -1,9 +1,9 @@
 """Expressions in the coordinates of a state: trees made of text or of a Python function.
 
-Text is parsed with `ast` against a list of allowed names; nothing is ever evaluated as code, so that
-a term a user gives is data. A Python function is traced by JAX, once, into the same tree. Values and
-first and second derivatives are those of truncated Taylor arithmetic: the same lines compute in
-NumPy and are traced by JAX.
+Text is parsed with `ast` against a list of allowed names; nothing is ever evaluated as code, so
+that a term a user gives is data. A Python function is traced by JAX, once, into the same tree.
+Values and first and second derivatives are those of truncated Taylor arithmetic: the same lines
+compute in NumPy and are traced by JAX.
 """
 
 from __future__ import annotations
@@ -206,8 +206,9 @@ def _parsed(node, names, text, depth) -> Expression:
 
     if depth > _DEEPEST:
         raise refuse(f"more than {_DEEPEST} levels")
-    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-        return number(node.value)
+    value = node.value if isinstance(node, ast.Constant) else None
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return number(value)
     if isinstance(node, ast.Name):
         if node.id in names:
             return coordinate(names[node.id])

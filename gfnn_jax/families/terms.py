@@ -42,7 +42,7 @@ class _Plan:
 
     def __init__(self, powers: np.ndarray):
         self.powers = powers
-        count, variables = powers.shape
+        variables = powers.shape[1]
         closed: set[tuple[int, ...]] = {(0,) * variables}
         ahead = [tuple(row) for row in powers.tolist()]
         while ahead:

@@ -64,8 +64,8 @@ class FlowFit(NamedTuple):
     """Coefficients (terms,) and how well the pairs determine them.
 
     rms: per component of (Φ(z₀) − z₁) ÷ scale on the pairs that were used. standard_errors:
-    (terms,), from the Gauss–Newton factor. factor: R of [∂r/∂c, r] (m + 1, m + 1), and ``rows``, for
-    which it stands. condition: of the scaled columns. used: (N,) the pairs in the loss.
+    (terms,), from the Gauss–Newton factor. factor: R of [∂r/∂c, r] (m + 1, m + 1), and ``rows``,
+    for which it stands. condition: of the scaled columns. used: (N,) the pairs in the loss.
     iterations: Gauss–Newton steps taken. steps: how the flow was computed in the end.
     """
 

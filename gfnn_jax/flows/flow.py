@@ -3,8 +3,8 @@
     K_i = J∇H(z + h Σ_j a_ij K_j),      Z = z + h Σ_i b_i K_i
 
 Symplectic for every H, separable or not, and symmetric in time: the inverse is the same method
-with −dt. The stages are solved to roundoff, by fixed point or, where h‖H''‖ is too large for that to
-contract, by Newton's method. Their number and the substeps are fixed for a piece: a count that
+with −dt. The stages are solved to roundoff, by fixed point or, where h‖H''‖ is too large for that
+to contract, by Newton's method. Their number and the substeps are fixed for a piece: a count that
 depended on the state would make the map discontinuous.
 """
 
@@ -29,9 +29,9 @@ from gfnn_jax.solve.newton import Evaluation
 from gfnn_jax.solve.status import NON_FINITE, NOT_CONVERGED, OK, Info
 
 _MOST, _MOST_NEWTON = 100, 40
-# A change of the stages of so many eps of the state is none; one below eps^¾ that no longer halves is
-# roundoff. With 2 eps in place of the first, what the iteration leaves is of one sign: the energy of
-# Hénon–Heiles at h = 0.5 then drifts by 2.4e-18 of itself per step instead of 1e-18.
+# A change of the stages of so many eps of the state is none; one below eps^¾ that no longer halves
+# is roundoff. With 2 eps in place of the first, what the iteration leaves is of one sign: the
+# energy of Hénon–Heiles at h = 0.5 then drifts by 2.4e-18 of itself per step instead of 1e-18.
 _FLOOR_EPS, _SETTLED = 0.05, 0.75
 
 

@@ -47,7 +47,7 @@ class Options:
     rise: of the held-out error that dropping terms may cost; rounding: below which it is roundoff.
     gained: a library that lowers the error by less has not helped; twice in a row ends the search.
     truncation: a flow's own error, as a part of the tolerance. contracting: a fixed point's factor
-    up to which it is preferred to Newton's method. max_seconds: after which the best so far is taken.
+    up to which it is preferred to Newton's method. max_seconds: of the search.
     """
 
     degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 8)
@@ -84,10 +84,10 @@ class LearnedHamiltonian:
 
     candidate: as the others of a fit, its error measured by steps in NumPy. flow: the piece.
     terms, formula: what H is. truncation: largest error of the flow's own steps on the held-out
-    states, ÷ scale. omega_h: the fastest oscillation of the linearised flow, times dt, in the median over
-    the data; beyond π pairs of one dt do not tell H. contraction: the fixed point's factor where it is largest. condition: of the terms'
-    columns. null_terms: that the data do not tell from the others. left_out: pairs that the flow
-    does not resolve.
+    states, ÷ scale. omega_h: the fastest oscillation of the linearised flow, times dt, in the
+    median over the data; beyond π pairs of one dt may not tell H. contraction: the fixed point's
+    factor where it is largest. condition: of the terms' columns. null_terms: that the data do not
+    tell from the others. left_out: pairs that the flow does not resolve.
     """
 
     candidate: Candidate
@@ -287,7 +287,8 @@ def _learned(
     )  # fmt: skip
     candidate = Candidate(
         label=f"H, {family.num_parameters} terms", family=family.name, chart="flow",
-        num_parameters=family.num_parameters, operations=_operations(family, rates, prepared.dt, steps),
+        num_parameters=family.num_parameters,
+        operations=_operations(family, rates, prepared.dt, steps),
         validation_rms=error.rms, validation_relative=error.relative,
         validation_bound=error.bound, deviations=error.deviations, train_rms=fit.rms,
         fit_seconds=seconds, condition=fit.condition, rank=family.num_parameters,
@@ -304,8 +305,8 @@ def _learned(
         r not in set(fit.used.tolist()) for r in judges.training[: len(fit.used)].tolist()
     )
     return LearnedHamiltonian(
-        with_error(candidate, error), flow, terms, formula(terms), float(np.abs(off).max()), omega_h,
-        contraction, fit.condition, found.null, left_out,
+        with_error(candidate, error), flow, terms, formula(terms), float(np.abs(off).max()),
+        omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(found, omega_h, left_out, prepared, judges)),
     )  # fmt: skip
 
@@ -346,7 +347,7 @@ def _operations(family: Terms, rates, dt: float, steps: Steps) -> float:
 
 
 def _omega_h(hessian, dt: float) -> float:
-    """The fastest oscillation of the linearised flow, in radians per step: its median over states."""
+    """The fastest oscillation of the linearised flow, radians per step, its median over states."""
     turned = symplectic_form(hessian.shape[-1] // 2) @ hessian
     rates = np.abs(np.linalg.eigvals(turned).imag).max(axis=-1)
     return float(dt * np.median(rates))
@@ -356,9 +357,9 @@ def _messages(found: _Fitted, omega_h: float, left_out: int, prepared, judges) -
     if found.error.bound > judges.tolerance.bound:
         yield (
             f"no H of the terms tried meets the tolerance (best {found.error.relative:.2e} of the "
-            f"spread, its fastest oscillation {omega_h:.2g} in a step): the pairs carry noise, other terms "
-            f"are needed, the map has no flow, or ωh > π at dt = {prepared.dt:g} and only a shorter dt "
-            "tells H"
+            f"spread, its fastest oscillation {omega_h:.2g} in a step): the pairs carry noise, other "
+            f"terms are needed, it has no flow, or ωh > π at dt {prepared.dt:g}: then only a "
+            "shorter dt tells H"
         )
     if left_out:
         yield f"{left_out} pairs are not resolved by the flow's own steps: they are left out"
