@@ -357,8 +357,8 @@ def _messages(found: _Fitted, omega_h: float, left_out: int, prepared, judges) -
     if found.error.bound > judges.tolerance.bound:
         yield (
             f"no H of the terms tried meets the tolerance (best {found.error.relative:.2e} of the "
-            f"spread, its fastest oscillation {omega_h:.2g} in a step): the pairs carry noise, other "
-            "terms are needed, the map has no flow, or ωh > π at "
+            f"spread, its fastest oscillation {omega_h:.2g} in a step): the pairs carry noise, "
+            "other terms are needed, the map has no flow, or ωh > π at "
             f"dt = {prepared.dt:g}, and then only a shorter dt tells H"
         )
     if left_out:
