@@ -340,7 +340,20 @@ def test_a_tolerance_out_of_reach_gives_the_best_and_says_so():
         fit = gfnn.fit(pendulum_pairs(60), chart="midpoint", family="polynomial", tolerance=1e-18)
     assert not fit.met
     validated = [c for c in fit.candidates if c.validated]
-    assert fit.chosen.validation_relative == min(c.validation_relative for c in validated)
+    # A few per cent are not worth a larger model.
+    assert fit.chosen.validation_relative <= 1.03 * min(c.validation_relative for c in validated)
+
+
+def test_what_is_found_on_the_way_is_handed_on(pendulum_fit):
+    """Maps of falling error, the last of them the chosen one's."""
+    kept = []
+    fit = quiet_fit(pendulum_pairs(), tolerance=1e-7, on_better=lambda *kind: kept.append(kind))
+    bounds = [candidate.validation_bound for _, candidate in kept]
+    assert len(bounds) > 1
+    assert bounds == sorted(bounds, reverse=True)
+    assert fit.chosen.label == pendulum_fit.chosen.label == kept[-1][1].label
+    z = disc(200, seed=2)
+    np.testing.assert_allclose(kept[-1][0].step(z)[0], fit.map.step(z)[0], rtol=0, atol=1e-14)
 
 
 def test_a_map_without_all_images_is_still_given(monkeypatch):

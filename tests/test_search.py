@@ -42,9 +42,9 @@ class Sweep:
         )  # fmt: skip
 
 
-def found_in(*sweeps, bound=1e-6, clock=None, told=None):
+def found_in(*sweeps, bound=1e-6, clock=None, told=None, on_validated=None):
     tell = (lambda c: None) if told is None else told.append
-    return search(sweeps, bound, clock or Clock(), lambda message: None, tell)
+    return search(sweeps, bound, clock or Clock(), lambda message: None, tell, on_validated)
 
 
 def order(found):
@@ -129,6 +129,28 @@ def test_where_nothing_meets_the_tolerance_the_few_best_are_validated():
     assert order(found) == [640, 320, 160]
     assert "more pairs would help" in found.ended
     assert len(found.entries) == 6
+
+
+def test_of_maps_that_are_as_good_the_cheaper_is_chosen():
+    sweep = Sweep([(10, 1e-1), (20, 1.02e-2), (40, 1.01e-2), (80, 1e-2)])
+    assert order(found_in(sweep, bound=1e-20)) == [20, 40, 80]
+
+
+def test_estimates_are_told_with_the_ratio_that_their_sweep_has_shown():
+    """So that they can be compared with what steps have measured."""
+    found = found_in(Sweep([(o, 0.02 * e, e) for o, e in FALLING]), bound=1e-6)
+    told = [e.candidate.validation_relative for e in found.entries]
+    np.testing.assert_allclose(told, [1e-2, 1e-4, 1e-6])
+    assert [e.candidate.validated for e in found.entries] == [True, False, True]
+
+
+def test_what_may_be_kept_is_validated_on_the_way():
+    """Something to keep should the search be interrupted, each ten times as accurate."""
+    kept, sweep = [], Sweep([(10.0 + n, 10.0 ** -(1 + n / 4)) for n in range(13)])
+    found_in(sweep, bound=1e-12, on_validated=kept.append)
+    errors = [entry.candidate.validation_relative for entry in kept]
+    assert 3 <= len(kept) <= 4
+    assert all(later < 0.1 * former for former, later in zip(errors, errors[1:], strict=False))
 
 
 def test_a_finalist_whose_steps_fail_is_ranked_last():
