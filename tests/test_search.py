@@ -1,6 +1,7 @@
 """The search's policy, on sweeps that are made up: what is tried, in what order, what is chosen."""
 
 import dataclasses
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -150,7 +151,7 @@ def test_what_may_be_kept_is_validated_on_the_way():
     found_in(sweep, bound=1e-12, on_validated=kept.append)
     errors = [entry.candidate.validation_relative for entry in kept]
     assert 3 <= len(kept) <= 4
-    assert all(later < 0.1 * former for former, later in zip(errors, errors[1:], strict=False))
+    assert all(later < 0.1 * former for former, later in pairwise(errors))
 
 
 def test_a_finalist_whose_steps_fail_is_ranked_last():
