@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gfnn_jax import scenes
-    from gfnn_jax.compile_cache import enable_compile_cache
+    from gfnn_jax.compiling import enable_compile_cache
     from gfnn_jax.errors import FitError, FitWarning, InputError, WorkError
     from gfnn_jax.evaluate import figures, metrics
     from gfnn_jax.families import from_function
@@ -46,7 +46,7 @@ _HOMES = {
     "Scene": "scenes",
     "SymplecticMap": "maps.symplectic_map",
     "WorkError": "errors",
-    "enable_compile_cache": "compile_cache",
+    "enable_compile_cache": "compiling",
     "fit": "learn.fit",
     "from_function": "families",
     "load": "maps.saved",

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from gfnn_jax.compile_cache import enable_compile_cache
+from gfnn_jax.compiling import enable_compile_cache
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new

@@ -13,7 +13,7 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 
 # A module imports only from rooms before its own; the modules of a room share its place.
 ORDER = (
-    "arrays", "errors", "phase_space", "coordinates", "compile_cache", "threads", "storage",
+    "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "storage",
     "scenes", "families", "solve", "generating", "flows", "maps", "fitting", "learn", "data",
     "baselines", "evaluate", "jobs", "cli", "__main__",
 )  # fmt: skip

@@ -15,8 +15,9 @@ from typing import Any, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
-from gfnn_jax.arrays import namespace
+from gfnn_jax.arrays import matmul, namespace
 
 
 @runtime_checkable
@@ -138,3 +139,43 @@ def as_family(function: Any) -> Any:
     if not callable(function) or hasattr(type(function), "gradient_and_hessian"):
         return function
     return from_function(function)
+
+
+def gradient_by_hessian(family: Family, params: Any, w: Any, args: Any = None) -> Any:
+    """∂f/∂w (..., 2d), whose own derivative in w is by the family's Hessian.
+
+    A derivative of ``gradient`` by JAX is symmetric only up to the rounding of its terms, and a
+    step is only as symplectic as S'' is symmetric; the Hessian is so to the last bit.
+    """
+    if namespace(w) is np:
+        return family.gradient(params, w, args)
+    return _gradient_by_hessian(family, params, w, args)
+
+
+@jax.custom_jvp
+def _gradient_by_hessian(family, params, w, args):
+    return family.gradient(params, w, args)
+
+
+@partial(_gradient_by_hessian.defjvp, symbolic_zeros=True)
+def _gradient_by_hessian_jvp(primals, tangents):
+    family, params, w, args = primals
+    gradient, hessian = family.gradient_and_hessian(params, w, args)
+    dot = jnp.zeros_like(gradient)
+    if not isinstance(tangents[2], SymbolicZero):
+        dot = matmul(hessian, tangents[2][..., None])[..., 0]
+    others_dot = (tangents[0], tangents[1], tangents[3])
+    if not all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(others_dot)):
+        dot = (
+            dot
+            + jax.jvp(
+                lambda family, params, args: family.gradient(params, w, args),
+                (family, params, args),
+                jax.tree.map(_instantiated, others_dot),
+            )[1]
+        )
+    return gradient, dot
+
+
+def _instantiated(tangent):
+    return jnp.zeros(tangent.shape, tangent.dtype) if isinstance(tangent, SymbolicZero) else tangent

@@ -16,6 +16,7 @@ import numpy as np
 
 from gfnn_jax.arrays import namespace
 from gfnn_jax.families import as_family
+from gfnn_jax.families.family import gradient_by_hessian
 from gfnn_jax.generating.charts import AnyChart, Chart
 from gfnn_jax.phase_space import apply_j
 from gfnn_jax.solve import newton
@@ -38,7 +39,7 @@ class ImplicitStep:
         """The residual; aux is ∇S(w), (B, 2d)."""
         (family, params, dt, scale), (z, known, args) = shared, lanes
         w = self.chart.complete(known, x)
-        gradient = family.gradient(params, w, args)
+        gradient = gradient_by_hessian(family, params, w, args)
         return self._evaluation(z, w, gradient, dt, scale)[0]
 
     def linearise(self, shared, lanes, x) -> tuple[Evaluation, Any]:

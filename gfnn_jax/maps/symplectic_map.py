@@ -19,6 +19,7 @@ import numpy as np
 from jax.core import Tracer
 
 from gfnn_jax.arrays import as_row
+from gfnn_jax.compiling import compiled_sooner
 from gfnn_jax.coordinates import TWO_PI, Coordinates
 from gfnn_jax.generating.generated import Generated, two_sum
 from gfnn_jax.maps.domain import Domain
@@ -142,10 +143,9 @@ class SymplecticMap:
         """
         z = self._states(z)
         ran = self.step(z)[1].iterations
-        if isinstance(ran, Tracer):
-            return _defect(self, z, True)
         # A single update is the usual case; its derivative compiles in half the time.
-        return _compiled_defect(self, z, 1 if np.max(np.asarray(ran), initial=0) <= 1 else True)
+        once = not isinstance(ran, Tracer) and np.max(np.asarray(ran), initial=0) <= 1
+        return _defect(self, z, 1 if once else True)
 
     def determinant(self, z):
         """Chart determinant () or (B,) at z, of the piece where it is smallest."""
@@ -265,12 +265,13 @@ def _or_one_state(function):
     return either
 
 
-@jax.jit
+@compiled_sooner
 @_or_one_state
 def _step(map_, z):
     return map_._apply(z)
 
 
+@partial(compiled_sooner, static_argnums=(2,), seldom_run=True)
 @_or_one_state
 def _defect(map_, z, unrolled):
     def tangent(unit):
@@ -281,13 +282,7 @@ def _defect(map_, z, unrolled):
     return symplecticity_defect(jacobian, map_.scale)
 
 
-# Run once or twice: compiling counts, not running.
-_compiled_defect = jax.jit(
-    _defect, static_argnums=2, compiler_options={"xla_backend_optimization_level": 0}
-)
-
-
-@jax.jit
+@compiled_sooner
 @_or_one_state
 def _determinant(map_, z):
     y, _, _ = map_._inner(z)
@@ -320,7 +315,7 @@ def _begun(map_, z, stop_outside):
     )  # fmt: skip
 
 
-_start = partial(jax.jit, static_argnums=2)(_begun)
+_start = compiled_sooner(_begun, (2,))
 
 
 def _advanced(map_, lanes, num_saved, save_every, stop_outside):
@@ -356,10 +351,10 @@ def _advanced(map_, lanes, num_saved, save_every, stop_outside):
     return lanes, jnp.moveaxis(saved, 0, 1)
 
 
-_advance = partial(jax.jit, static_argnums=(2, 3, 4))(_advanced)
+_advance = compiled_sooner(_advanced, (2, 3, 4))
 
 
-@partial(jax.jit, static_argnums=(2, 3, 4))
+@partial(compiled_sooner, static_argnums=(2, 3, 4))
 @_or_one_state
 def _rollout(map_, z, num_saved, save_every, stop_outside):
     lanes = _begun(map_, z, stop_outside)

@@ -1,0 +1,66 @@
+"""How programs are compiled: in little time, and kept between processes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from functools import partial, wraps
+from pathlib import Path
+from typing import Any
+
+# XLA's emitters of fused loops take a third to a half of what a step takes to compile, and its
+# steps run no faster by them (jaxlib 0.10.2 on two cores; benchmarks/speed.py --only start).
+_SOONER = {"xla_cpu_use_fusion_emitters": False}
+# Half of the rest; such programs run several times slower.
+_SOONEST = {**_SOONER, "xla_backend_optimization_level": 0}
+
+
+def enable_compile_cache(folder: str | Path | None = None) -> Path:
+    """Keep compiled programs in ``folder``, so that the next process need not compile them again.
+
+    folder: None: the one that JAX is configured for, else ``gfnn_jax`` in ``$XDG_CACHE_HOME`` or
+    ``~/.cache``. Returns the folder. What was compiled before the call is not kept.
+    """
+    import jax  # loaded when first used: `gfnn --help` needs none
+    from jax.experimental.compilation_cache import compilation_cache
+
+    configured = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if folder is None and configured is not None:
+        return Path(configured)
+    if folder is None:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gfnn_jax"
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    compilation_cache.reset_cache()  # JAX looks only once whether there is one
+    return Path(folder)
+
+
+def compiled_sooner(
+    function: Callable, static_argnums: tuple[int, ...] = (), *, seldom_run: bool = False
+) -> Callable:
+    """As ``jax.jit(function, static_argnums)``; on a CPU compiled in less time where it is called
+    with numbers. Inside another transformation it is that one's to say how it is compiled.
+
+    seldom_run: whether to compile counts and to run does not.
+    """
+    import jax  # loaded when first used: `gfnn --help` needs none
+    from jax.core import Tracer
+
+    jitted = partial(jax.jit, function, static_argnums=static_argnums)
+    plain, sooner = jitted(), jitted(compiler_options=_SOONEST if seldom_run else _SOONER)
+
+    @wraps(function)
+    def call(*arguments: Any) -> Any:
+        nonlocal sooner
+        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments))
+        if traced or jax.default_backend() != "cpu":
+            return plain(*arguments)
+        try:
+            return sooner(*arguments)
+        except jax.errors.JaxRuntimeError as error:
+            if "No such compile option" not in str(error):
+                raise
+            sooner = plain  # a release of XLA that has only one kind of emitter
+            return plain(*arguments)
+
+    return call
