@@ -126,13 +126,6 @@ def _parser() -> argparse.ArgumentParser:
         "--absolute-tolerance", type=_positive, metavar="E",
         help="instead of --tolerance: bound on the RMS per component, in the data's units",
     )  # fmt: skip
-    command.add_argument(
-        "--max-seconds", type=_positive, default=120.0, metavar="S",
-        help="the best map by then is kept (default 120)",
-    )  # fmt: skip
-    command.add_argument(
-        "--strict", action="store_true", help="exit status 1 where the tolerance is not met"
-    )
 
     command = commands.add_parser(
         "predict", help="predict with a learned map",
@@ -191,6 +184,13 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
         help="the old name of --family",
     )  # fmt: skip
     command.add_argument("--seed", type=_seed, default=0, metavar="N")
+    command.add_argument(
+        "--max-seconds", type=_positive, default=120.0, metavar="S",
+        help="for the fit: the best map by then is kept (default 120)",
+    )  # fmt: skip
+    command.add_argument(
+        "--strict", action="store_true", help="exit status 1 where the tolerance is not met"
+    )
     _add_output_options(command)
 
 
@@ -272,11 +272,12 @@ def _run(arguments: argparse.Namespace) -> None:
     with progress.on_stderr() as shown:
         ran = run(
             arguments.scene, out=out, quick=arguments.quick, seed=arguments.seed, dt=arguments.dt,
-            tolerance=arguments.tolerance, chart=arguments.chart, learn=arguments.learn,
-            family=arguments.family, overwrite=arguments.overwrite, resume=arguments.resume,
-            progress=shown,
+            tolerance=arguments.tolerance, max_seconds=arguments.max_seconds,
+            chart=arguments.chart, learn=arguments.learn, family=arguments.family,
+            overwrite=arguments.overwrite, resume=arguments.resume, progress=shown,
         )  # fmt: skip
     _summarise(ran, out)
+    _hold_to(arguments.strict, out / "model")
 
 
 def _fit(arguments: argparse.Namespace) -> None:
@@ -299,14 +300,15 @@ def _fit(arguments: argparse.Namespace) -> None:
             overwrite=arguments.overwrite, resume=arguments.resume, progress=shown,
         )  # fmt: skip
     _summarise(ran, arguments.out)
-    if arguments.strict and not _met(arguments.out):
-        raise WorkError(f"{arguments.out}: is written, but misses the tolerance (--strict)")
+    _hold_to(arguments.strict, arguments.out)
 
 
-def _met(model: Path) -> bool:
+def _hold_to(strict: bool, model: Path) -> None:
+    """Raises WorkError where a strict user's model misses the tolerance."""
     from gfnn_jax.maps.saved import record
 
-    return record(model)["fit"]["tolerance_met"]
+    if strict and not record(model)["fit"]["tolerance_met"]:
+        raise WorkError(f"{model}: is written, but misses the tolerance (--strict)")
 
 
 def _predict(arguments: argparse.Namespace) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gfnn_jax.arrays import matmul, namespace
+from gfnn_jax.errors import FitError
 
 # The axis of length 2d is called phase: jaxtyping would read "2d" as an expression.
 Scalar = Float[Array, ""]
@@ -94,11 +95,25 @@ class Pairs:
 
     z0, z1: shape (N, 2d), q first; NumPy or JAX arrays. dt: the time between them (the paper's h),
     in the user's unit of time; 1 for a map that has no time.
+
+    Raises FitError where z0 and z1 are no arrays of one such shape.
     """
 
     z0: Any
     z1: Any
     dt: float
+
+    def __post_init__(self):
+        # JAX makes pairs of whatever it maps arrays to; a user's are lists or arrays.
+        kinds = {type(z).__name__ for z in (self.z0, self.z1) if isinstance(z, (list, tuple))}
+        if kinds:
+            raise FitError(f"expected arrays z0 and z1 of shape (N, 2d), got a {kinds.pop()}")
+        if not all(isinstance(z, (np.ndarray, jax.Array)) for z in (self.z0, self.z1)):
+            return
+        if self.z0.shape != self.z1.shape or self.z0.ndim != 2 or self.z0.shape[1] % 2:
+            raise FitError(
+                f"expected z0 and z1 of one shape (N, 2d), got {self.z0.shape} and {self.z1.shape}"
+            )
 
     def __len__(self) -> int:
         return self.z0.shape[0]

@@ -6,17 +6,6 @@ import subprocess
 import sys
 import types
 
-# Nearly all of the suite's time goes into compiling programs that run once: this halves it. Set
-# before JAX is loaded, for pytest's workers and the programs that tests start, too.
-SOON_COMPILED = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-if "XLA_FLAGS" not in os.environ:
-    # XLA ends a process that asks for what it does not know: that of another release might.
-    tried = subprocess.run(
-        [sys.executable, "-c", "import jax; jax.devices()"], capture_output=True, check=False,
-        env={**os.environ, "XLA_FLAGS": SOON_COMPILED},
-    )  # fmt: skip
-    os.environ["XLA_FLAGS"] = SOON_COMPILED if tried.returncode == 0 else ""
-
 import jax
 import pytest
 import scipy.linalg  # noqa: F401, its threads are limited too
@@ -25,6 +14,10 @@ from threadpoolctl import threadpool_limits
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+# Nearly all of the suite's time goes into compiling programs that run once: this halves it.
+SOON_COMPILED = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 
 
 def pytest_addoption(parser):
@@ -41,6 +34,13 @@ def pytest_configure(config):
         from jaxtyping import install_import_hook
 
         install_import_hook("gfnn_jax", "beartype.beartype")
+    if "XLA_FLAGS" not in os.environ:  # which JAX reads when it is first used
+        # XLA ends a process that asks for what it does not know: that of another release might.
+        tried = subprocess.run(
+            [sys.executable, "-c", "import jax; jax.devices()"], capture_output=True, check=False,
+            env={**os.environ, "XLA_FLAGS": SOON_COMPILED},
+        )  # fmt: skip
+        os.environ["XLA_FLAGS"] = SOON_COMPILED if tried.returncode == 0 else ""
     shared = {
         "jax_compilation_cache_dir": str(config.cache.mkdir("compiled")),
         "jax_persistent_cache_min_compile_time_secs": 0.02,

@@ -16,6 +16,7 @@ from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.search import search
 from gfnn_jax.phase_space import Pairs
+from gfnn_jax.storage.factors import KeptFactors
 
 
 def test_a_relative_error_is_that_of_each_coordinate_in_its_own_spread():
@@ -83,12 +84,12 @@ def kicked(num=2_000):
     return Pairs(z, np.stack([q + 0.3 * p, p], axis=1), 0.3)
 
 
-def of_kicks(num=2_000):
+def of_kicks(num=2_000, factors=None):
     """The sweep of polynomials in type 2, without any compilation."""
     pairs = kicked(num)
     prepared = prepare(pairs, Coordinates("plain"))
     judges = Judges(pairs, *split_rows(pairs, 0), Tolerance(1e-11))
-    return sweeps.LinearSweep(prepared, TYPE2, judges, "polynomial", None, None)
+    return sweeps.LinearSweep(prepared, TYPE2, judges, "polynomial", None, None, factors)
 
 
 def quiet(_):
@@ -131,3 +132,20 @@ def test_a_factorisation_stops_when_the_time_is_spent():
     sweep = of_kicks()
     with pytest.raises(OutOfTime):
         sweep.judge(sweep.sizes[0], Clock(max_seconds=0.0), quiet)
+
+
+def test_a_fit_that_goes_on_takes_the_factors_that_were_kept(monkeypatch, tmp_path):
+    monkeypatch.setattr(sweeps, "_WORTH_KEEPING", 0.0)
+    first = search([of_kicks(factors=KeptFactors(tmp_path))], 1e-11, Clock(), quiet, quiet)
+
+    def again():
+        return search([of_kicks(factors=KeptFactors(tmp_path))], 1e-11, Clock(), quiet, quiet)
+
+    with monkeypatch.context() as without:
+        without.setattr(sweeps.least_squares, "reduce", None)
+        second = again()
+    for one, other in zip(first.entries, second.entries, strict=True):
+        assert one.candidate.validation_relative == other.candidate.validation_relative
+    damaged = next((tmp_path / "factors").iterdir())
+    damaged.write_bytes(damaged.read_bytes()[:100])
+    assert again().ranking[0].candidate.label == "polynomial 4"

@@ -15,6 +15,7 @@ from hypothesis.extra import numpy as hnp
 
 from gfnn_jax.data import files
 from gfnn_jax.data.files import DataWarning
+from gfnn_jax.data.summary import summary
 from gfnn_jax.errors import InputError
 
 RNG = np.random.default_rng(0)
@@ -460,3 +461,19 @@ def test_zip_members_are_not_trusted(tmp_path):
         archive.writestr("z1.npy", b"")
     with pytest.raises(InputError, match="damaged"):
         files.read_trajectories(path, dt=1.0)
+
+
+def test_a_summary_says_what_is_there(tmp_path):
+    z0 = np.array([[0.0, 1.0], [2.0, 3.0], [4.0, 5.0], [4.0, 5.0]])
+    z1 = z0 + np.array([0.5, -2.0])
+    first, q, p = summary(files.read_trajectories(save(tmp_path / "a.npz", z0=z0, z1=z1, dt=0.1)))
+    assert first == (
+        "4 pairs, d = 1, dt = 0.1; sequences: 4 of 2 states, no gap inside a sequence; copies: 1"
+    )
+    assert q.startswith("q1: 0 to 4.5, spread 1.6")
+    assert p.startswith("p1: -1 to 5, spread")
+    assert p.endswith("movement in a step 2")
+    path = csv(tmp_path / "a.csv", "t,q1 [km],p1", table(np.c_[np.arange(9.0), np.ones(9)]))
+    with pytest.warns(DataWarning, match="constant"):
+        _, q, _ = summary(files.read_trajectories(path))
+    assert q == "q1: 0 to 8 km, spread 2.582, movement in a step 1"

@@ -81,7 +81,6 @@ def stop(_):
         ({"scene": "standard-map-regular", "angles": (0,)}, "a scene or angles"),
         ({"rows": 5}, "at least 8 different pairs"),
         ({"nan": True}, "row 3"),
-        ({"short": True}, "of one shape"),
         ({"angles": (0,), "chart": "type1"}, "no meaning for angles"),
         ({"dt": 0.0}, "time step"),
         ({"dt": math.nan}, "time step"),
@@ -94,8 +93,6 @@ def test_refuses_in_one_line(change, words):
     pairs = dataclasses.replace(pairs, dt=change.pop("dt", 0.4))
     if change.pop("nan", False):
         pairs.z1[3, 0] = np.nan
-    if change.pop("short", False):
-        pairs = gfnn.Pairs(pairs.z0[1:], pairs.z1, pairs.dt)
     if "scene" in change:
         change["scene"] = gfnn.scenes.make(change["scene"])
     with pytest.raises(gfnn.FitError, match=words) as refused:

@@ -235,7 +235,8 @@ def test_data_of_a_scene_take_one_compilation_per_program_and_shape(compilations
     assert of_an_orbit.count <= 3
 
 
-def test_a_hundred_thousand_pairs_are_quick_and_finite():
+@pytest.mark.slow
+def test_a_hundred_thousand_pairs_are_finite():
     pairs = tr.sample_pairs(scenes.pcr3bp(), 100_000, jax.random.key(8))
     assert np.isfinite(pairs.z1).all()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gfnn_jax.data.files import iterate_pairs, read_sample, read_trajectories
+from gfnn_jax.data.summary import summary
 from gfnn_jax.evaluate import report
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.search import BEST, failures_of_arithmetic, scene_named, search
@@ -44,6 +45,8 @@ def fit(
     scene = scene_named(scene_name) if scene_name is not None else None
     large = data.is_file() and data.stat().st_size > _LARGE_BYTES
     trajectories = (read_sample if large else read_trajectories)(data, dt=dt)
+    for line in summary(trajectories):
+        progress.tell(line)
     options = {
         "tolerance": tolerance, "absolute_tolerance": absolute_tolerance, "chart": chart,
         "learn": learn, "family": family, "seed": seed,

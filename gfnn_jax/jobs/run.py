@@ -16,7 +16,7 @@ from gfnn_jax.jobs.rollouts import NUM_STEPS, NUM_TRAJECTORIES, map_rollouts
 from gfnn_jax.jobs.search import scene_named, search
 from gfnn_jax.jobs.written import MODEL, Ran, already_done, pairs_digest, write
 from gfnn_jax.learn.candidates import Candidate
-from gfnn_jax.learn.fit import Fit
+from gfnn_jax.learn.fit import MAX_SECONDS, Fit
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene
 from gfnn_jax.scenes.trajectories import reference_trajectories, sample_pairs, sample_test_states
@@ -36,6 +36,7 @@ def run(
     seed: int = 0,
     dt: float | None = None,
     tolerance: float | None = None,
+    max_seconds: float = MAX_SECONDS,
     chart: str = "auto",
     learn: str = "auto",
     family: str = "auto",
@@ -76,8 +77,9 @@ def run(
         pairs = _finite(sample_pairs(scene, num_pairs, key_pairs))
         z0 = np.asarray(sample_test_states(scene, num_trajectories, key_test))
         fitted = search(
-            pairs, scene, progress=progress, kept_in=kept_in, job=job, **options, **more
-        )
+            pairs, scene, max_seconds=max_seconds, progress=progress, kept_in=kept_in, job=job,
+            **options, **more,
+        )  # fmt: skip
         progress.say(f"reference trajectories of {NUM_STEPS} steps")
         reference = np.asarray(reference_trajectories(scene, z0, NUM_STEPS))
         progress.say(f"rollouts of {NUM_STEPS} steps")

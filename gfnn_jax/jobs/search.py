@@ -21,6 +21,7 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene
 from gfnn_jax.storage.checkpoints import TrainingCheckpoints
+from gfnn_jax.storage.factors import KeptFactors
 
 BEST = "best"
 
@@ -36,18 +37,18 @@ def search(
 ) -> Fit:
     """The fit of these pairs, with the options of ``gfnn.fit``.
 
-    kept_in, job: the folder where a training's checkpoints and the best map so far are kept, and
-    whose they are. Raises InputError
-    for data or a request that cannot give a map, WorkError where the arithmetic fails.
+    kept_in, job: the folder where a training's checkpoints, factors and the best map so far are
+    kept, and whose they are. Raises InputError for data or a request that cannot give a map,
+    WorkError where the arithmetic fails.
     """
-    checkpoints = on_better = None
+    checkpoints = factors = on_better = None
     if kept_in is not None:
-        checkpoints = TrainingCheckpoints(kept_in, job or {})
+        checkpoints, factors = TrainingCheckpoints(kept_in, job or {}), KeptFactors(kept_in)
         on_better = partial(_keep, kept_in / BEST, scene, job)
     try:
         with failures_of_arithmetic():
             return fit(
-                pairs, scene, checkpoints=checkpoints, on_progress=progress.say,
+                pairs, scene, checkpoints=checkpoints, factors=factors, on_progress=progress.say,
                 on_candidate=lambda candidate: progress.tell(line(candidate)),
                 on_better=on_better, **options,
             )  # fmt: skip

@@ -33,10 +33,6 @@ def check_request(
         raise FitError(f"expected a tolerance > 0, got {tolerance}")
     if not isinstance(pairs, Pairs):
         raise FitError(f"expected gfnn.Pairs(z0, z1, dt), got {type(pairs).__name__}")
-    if pairs.z0.shape != pairs.z1.shape or pairs.z0.ndim != 2 or pairs.z0.shape[1] % 2:
-        raise FitError(
-            f"expected z0 and z1 of one shape (N, 2d), got {pairs.z0.shape} and {pairs.z1.shape}"
-        )
     if scene is not None and scene.dim != pairs.dim:
         raise FitError(f"scene {scene.name} has dim {scene.dim}, the pairs have {pairs.dim}")
     if scene is not None and angles:

@@ -133,6 +133,7 @@ def fit(
     max_seconds: float | None = MAX_SECONDS,
     max_iterations: int = 250,
     checkpoints: Any = None,
+    factors: Any = None,
     on_progress: Callable[[str], Any] = lambda message: None,
     on_candidate: Callable[[Candidate], Any] = lambda candidate: None,
     on_better: Callable[[SymplecticMap, Candidate], Any] | None = None,
@@ -150,7 +151,8 @@ def fit(
     angles:    without a scene, the indices of z that have period 2π.
     max_seconds: after which the search ends with the best map so far; None: no budget.
     max_iterations: of the training of "mlp".
-    checkpoints: a ``TrainingCheckpoints``, which a training saves to and goes on from.
+    checkpoints, factors: a ``TrainingCheckpoints`` and a ``KeptFactors``, which an interrupted fit
+               has saved to and the same fit goes on from.
     on_progress, on_candidate: called with what is being done, and with every candidate.
     on_better: called with a map and its candidate whenever steps have shown one that is more
                accurate than those before, so that it can be kept should the fit be interrupted.
@@ -191,7 +193,7 @@ def fit(
             NetworkSweep(prepared, charts.charts[0], judges, max_iterations, seed, checkpoints)
         ]
     else:
-        sweeps = list(sweeps_for(family, charts.charts, prepared, scene, judges))
+        sweeps = list(sweeps_for(family, charts.charts, prepared, scene, judges, factors))
     better = _Better(prepared, judges, on_better) if on_better is not None else None
     found = search(sweeps, bound.bound, clock, on_progress, on_candidate, better)
     if not found.ranking:

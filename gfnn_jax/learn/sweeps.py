@@ -29,6 +29,7 @@ _MOST_TERMS = 1_500
 _ROWS_PER_TERM = 3
 # Rows × terms² of one factor: about ten seconds on two cores.
 _MOST_OPERATIONS = 1.2e11
+_WORTH_KEEPING = 1.0  # seconds
 _OPERATIONS_PER_SECOND = 1e10  # of a factorisation on one thread, for the estimate that is told
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
 _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
@@ -50,30 +51,37 @@ class Size:
         return float(gradient + with_hessian)
 
 
-def sweeps_for(request: str, charts: Sequence[AnyChart], prepared, scene, judges) -> Iterator:
+def sweeps_for(
+    request: str, charts: Sequence[AnyChart], prepared, scene, judges, factors=None
+) -> Iterator:
     """The sweeps of the families that apply, chart by chart.
 
     request: "auto", "polynomial", "features" (the scene's) or "sines"; with "auto" random sines
-    are tried where polynomials have too many terms.
+    are tried where polynomials have too many terms. factors: as ``LinearSweep`` takes them.
     """
     features = scene.features if scene is not None else None
     for chart in charts:
         # Only the midpoint S inherits the parity.
         reversor = scene.reversor if scene is not None and chart == MIDPOINT else None
         if request in ("auto", "polynomial"):
-            yield LinearSweep(prepared, chart, judges, "polynomial", None, reversor)
+            yield LinearSweep(prepared, chart, judges, "polynomial", None, reversor, factors)
         if request in ("auto", "features") and features is not None:
-            yield LinearSweep(prepared, chart, judges, "features", features, reversor)
+            yield LinearSweep(prepared, chart, judges, "features", features, reversor, factors)
         if request == "sines" or (request == "auto" and prepared.dim > 2):
-            yield LinearSweep(prepared, chart, judges, "sines", None, None)
+            yield LinearSweep(prepared, chart, judges, "sines", None, None, factors)
 
 
 class LinearSweep:
-    """The sizes of one linear family in one chart."""
+    """The sizes of one linear family in one chart.
+
+    factors: a ``KeptFactors``, where factors that took long are kept for a fit that goes on.
+    """
 
     def __init__(
-        self, prepared: Prepared, chart: AnyChart, judges: Judges, kind: str, features, reversor
-    ):
+        self, prepared: Prepared, chart: AnyChart, judges: Judges, kind: str, features, reversor,
+        factors=None,
+    ):  # fmt: skip
+        self._kept = factors
         self.prepared, self.chart, self.judges, self.kind = prepared, chart, judges, kind
         self._train, self._weight = _rows(prepared, chart, judges.training)
         self._held, _ = _rows(prepared, chart, judges.held_out)
@@ -124,20 +132,42 @@ class LinearSweep:
 
     def _factor(self, group, clock: Clock, say) -> tuple:
         if group not in self._factors:
-            # Shuffled rows: the first of them are a sample, where all would take too long.
-            count, width = len(self._train[0]), self._train[0].shape[1]
-            taken = min(count, max(1, int(_MOST_OPERATIONS / (group.num_parameters**2 * width))))
-            seconds = 2 * taken * width * group.num_parameters**2 / _OPERATIONS_PER_SECOND
-            say(
-                f"{self.chart.name}: {group.num_parameters} terms of {group.label}, {taken} pairs, "
-                f"about {max(1, round(seconds))} s"
-            )
-            train = [tuple(a[:taken] for a in self._train)]
-            self._factors[group] = tuple(
-                least_squares.reduce(group, rows, self._weight, on_block=clock.check)
-                for rows in (train, [self._held])
-            )
+            self._factors[group] = self._known(group) or self._computed(group, clock, say)
         return self._factors[group]
+
+    def _known(self, group) -> tuple | None:
+        """The factors that an interrupted fit of the same pairs has kept."""
+        stored = self._kept.load(self._named(group)) if self._kept is not None else None
+        if stored is None:
+            return None
+        return tuple(
+            least_squares.Reduced(np.asfortranarray(stored[part]), int(stored[f"{part}_rows"]))
+            for part in ("train", "held")
+        )
+
+    def _computed(self, group, clock: Clock, say) -> tuple:
+        # Shuffled rows: the first of them are a sample, where all would take too long.
+        count, width = len(self._train[0]), self._train[0].shape[1]
+        taken = min(count, max(1, int(_MOST_OPERATIONS / (group.num_parameters**2 * width))))
+        seconds = 2 * taken * width * group.num_parameters**2 / _OPERATIONS_PER_SECOND
+        say(
+            f"{self.chart.name}: {group.num_parameters} terms of {group.label}, {taken} pairs, "
+            f"about {max(1, round(seconds))} s"
+        )
+        started = time.perf_counter()
+        train, held = (
+            least_squares.reduce(group, rows, self._weight, on_block=clock.check)
+            for rows in ([tuple(a[:taken] for a in self._train)], [self._held])
+        )
+        if self._kept is not None and time.perf_counter() - started > _WORTH_KEEPING:
+            self._kept.save(
+                self._named(group), train=train.factor, train_rows=train.rows, held=held.factor,
+                held_rows=held.rows,
+            )  # fmt: skip
+        return train, held
+
+    def _named(self, group) -> str:
+        return f"{self.chart.name} {self.kind} {group.num_parameters}"
 
     def _candidate(self, size: Size, train_rms, held_rms, seconds) -> Candidate:
         error = self.judges.estimate(held_rms)

@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,9 @@ def unfinished(
     # What an interrupted job has left in ``out`` may be replaced by the same job.
     ensure_new(out, overwrite or (resume and (folder / JOB).is_file()), folder=True)
     with _claimed(out, what):
-        _make_way(folder, json.loads(json.dumps(job)), what, overwrite=overwrite, resume=resume)
+        # What another release has kept may mean something else to this one.
+        job = {**json.loads(json.dumps(job)), "release": version("gfnn_jax")}
+        _make_way(folder, job, what, overwrite=overwrite, resume=resume)
         atomic_write(folder / JOB, json.dumps(job))
         try:
             yield folder

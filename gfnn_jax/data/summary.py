@@ -1,0 +1,33 @@
+"""What a trajectory file holds, in a few lines to read before a fit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gfnn_jax.data.files import TrajectoryData
+
+
+def summary(data: TrajectoryData) -> list[str]:
+    """Lines of text: how many pairs, and of each column its range, spread and movement in a step.
+
+    spread: the standard deviation. movement: the root mean square of the change in one step. An
+    error relative to the spread is what a tolerance is for.
+    """
+    pairs, lengths = data.pairs(), data.lengths
+    both = np.concatenate([pairs.z0, pairs.z1], axis=1)
+    copies = len(both) - len(np.unique(both, axis=0))
+    of = (
+        f"{lengths.min()}" if lengths.min() == lengths.max() else f"{lengths.min()}–{lengths.max()}"
+    )
+    lines = [
+        f"{data.num_pairs} pairs, d = {data.dim}, dt = {data.dt:g}; sequences: {len(lengths)} of "
+        f"{of} states, no gap inside a sequence; copies: {copies}"
+    ]
+    move = np.sqrt(np.mean((pairs.z1 - pairs.z0) ** 2, axis=0))
+    low, high = data.states.min(axis=0), data.states.max(axis=0)
+    names = [f"{letter}{i + 1}" for letter in "qp" for i in range(data.dim)]
+    for name, *numbers in zip(names, low, high, data.states.std(axis=0), move, strict=True):
+        unit = f" {data.units[name]}" if name in data.units else ""
+        a, b, spread, step = (f"{x:.4g}" for x in numbers)
+        lines.append(f"{name}: {a} to {b}{unit}, spread {spread}, movement in a step {step}")
+    return lines
