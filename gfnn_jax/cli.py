@@ -174,6 +174,10 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
     command.add_argument(
         "--learn", choices=LEARN, default="auto", help="what is learned (default %(default)s)"
     )
+    command.add_argument(
+        "--terms", type=_texts, default=(), metavar="TEXT",
+        help='of H, that you know: "p1**2; 1/sqrt(q1**2 + q2**2)"',
+    )  # fmt: skip
     command.add_argument("--chart", choices=CHARTS, default="auto", help="default %(default)s")
     command.add_argument(
         "--family", choices=FAMILIES, default="auto",
@@ -240,6 +244,10 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(","))
 
 
+def _texts(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(";") if part.strip())
+
+
 def _indices(text: str) -> tuple[int, ...]:
     parts = text.split(",")
     found = tuple(int(part) for part in parts if part.strip().isdecimal())
@@ -263,7 +271,6 @@ def _scenes(arguments: argparse.Namespace) -> None:
 
 def _run(arguments: argparse.Namespace) -> None:
     out = arguments.out or Path("runs") / arguments.scene
-    _check_learn(arguments.learn)
     if not arguments.resume:
         ensure_new(out, arguments.overwrite, folder=True)
     _set_up_jax()
@@ -273,15 +280,15 @@ def _run(arguments: argparse.Namespace) -> None:
         ran = run(
             arguments.scene, out=out, quick=arguments.quick, seed=arguments.seed, dt=arguments.dt,
             tolerance=arguments.tolerance, max_seconds=arguments.max_seconds,
-            chart=arguments.chart, learn=arguments.learn, family=arguments.family,
-            overwrite=arguments.overwrite, resume=arguments.resume, progress=shown,
+            chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
+            family=arguments.family, overwrite=arguments.overwrite, resume=arguments.resume,
+            progress=shown,
         )  # fmt: skip
     _summarise(ran, out)
     _hold_to(arguments.strict, out / "model")
 
 
 def _fit(arguments: argparse.Namespace) -> None:
-    _check_learn(arguments.learn)
     if arguments.tolerance is not None and arguments.absolute_tolerance is not None:
         raise InputError("expected --tolerance or --absolute-tolerance, not both")
     if not arguments.resume:
@@ -295,9 +302,10 @@ def _fit(arguments: argparse.Namespace) -> None:
             arguments.data, out=arguments.out, dt=arguments.dt,
             tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
             absolute_tolerance=arguments.absolute_tolerance, max_seconds=arguments.max_seconds,
-            chart=arguments.chart, learn=arguments.learn, family=arguments.family,
-            scene_name=arguments.scene, angles=arguments.angles, seed=arguments.seed,
-            overwrite=arguments.overwrite, resume=arguments.resume, progress=shown,
+            chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
+            family=arguments.family, scene_name=arguments.scene, angles=arguments.angles,
+            seed=arguments.seed, overwrite=arguments.overwrite, resume=arguments.resume,
+            progress=shown,
         )  # fmt: skip
     _summarise(ran, arguments.out)
     _hold_to(arguments.strict, arguments.out)
@@ -353,11 +361,6 @@ def _compare(arguments: argparse.Namespace) -> None:
     print(f"written to {out}")
 
 
-def _check_learn(learn: str) -> None:
-    if learn == "hamiltonian":
-        raise InputError("--learn hamiltonian: not available yet; --learn map learns the map")
-
-
 def _summarise(ran: Any, out: Path) -> None:
     if ran is None:
         print(f"{out}: is there already, from this very job")
@@ -372,6 +375,8 @@ def _summarise(ran: Any, out: Path) -> None:
         f"{fit['validation_rms']:.2e}, {fit['validation_relative']:.2e} of the spread (tolerance "
         f"{fit['tolerance']:g}), symplecticity defect {report['map']['symplecticity_defect']:.1e}"
     )
+    if report["hamiltonian"] is not None:
+        print(f"H = {report['hamiltonian']['formula']}")
     print(fit["ended"])
     rollout = report["rollout"]
     if rollout is not None:

@@ -75,7 +75,7 @@ def assemble(
             "ended": fit.ended,
             "messages": list(fit.messages),
         },
-        "hamiltonian": None,
+        "hamiltonian": _hamiltonian(fit),
         "map": {
             "symplecticity_defect": fit.symplecticity_defect,
             "chart_determinant_min": fit.model_determinant_min,
@@ -103,6 +103,13 @@ def assemble(
             for c in fit.candidates
         ],
     }
+
+
+def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
+    """H as it was learned, where its flow meets the tolerance or was chosen."""
+    if fit.hamiltonian is None or fit.formula is None:
+        return None
+    return {"formula": fit.formula, "terms": [term._asdict() for term in fit.hamiltonian.terms]}
 
 
 def rollout_part(

@@ -29,6 +29,7 @@ def fit(
     max_seconds: float = 120.0,
     chart: str = "auto",
     learn: str = "auto",
+    terms: tuple[str, ...] = (),
     family: str = "auto",
     scene_name: str | None = None,
     angles: tuple[int, ...] = (),
@@ -49,7 +50,7 @@ def fit(
         progress.tell(line)
     options = {
         "tolerance": tolerance, "absolute_tolerance": absolute_tolerance, "chart": chart,
-        "learn": learn, "family": family, "seed": seed,
+        "learn": learn, "terms": list(terms), "family": family, "seed": seed,
     }  # fmt: skip
     job = {
         "command": "fit", "data": trajectories.digest, "dt": trajectories.dt, "scene": scene_name,
@@ -67,7 +68,7 @@ def fit(
             if told := publish(kept_in / BEST, out):
                 stop.add_note(told)
             raise
-        if large and family != "mlp":
+        if large and family != "mlp" and fitted.chosen.learns == "map":
             progress.say("all pairs of the file, for the chosen candidate")
             held = trajectories.pairs().take(slice(_HELD))
             with failures_of_arithmetic():

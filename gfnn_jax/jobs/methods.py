@@ -131,8 +131,8 @@ def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollout
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FitWarning)  # kept in fit.messages
         fit = search(
-            Pairs(z[:, 0], z[:, 1], scene.dt), scene, tolerance=tolerance, seed=data.seed,
-            progress=progress,
+            Pairs(z[:, 0], z[:, 1], scene.dt), scene, tolerance=tolerance, learn="map",
+            seed=data.seed, progress=progress,
         )  # fmt: skip
     chosen = fit.chosen
     part = {

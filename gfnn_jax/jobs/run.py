@@ -39,6 +39,7 @@ def run(
     max_seconds: float = MAX_SECONDS,
     chart: str = "auto",
     learn: str = "auto",
+    terms: tuple[str, ...] = (),
     family: str = "auto",
     overwrite: bool = False,
     resume: bool = False,
@@ -61,7 +62,7 @@ def run(
         num_pairs, default = min(num_pairs, QUICK_PAIRS), max(default, QUICK_TOLERANCE)
     options = {
         "tolerance": default if tolerance is None else tolerance, "chart": chart, "learn": learn,
-        "family": family, "seed": seed,
+        "terms": list(terms), "family": family, "seed": seed,
     }  # fmt: skip
     num_trajectories = QUICK_TRAJECTORIES if quick else NUM_TRAJECTORIES
     job = {

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gfnn_jax.errors import FitError
+from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.terms import given_terms
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.learn.candidates import Tolerance
 from gfnn_jax.phase_space import Pairs, sizes, split
@@ -12,7 +13,7 @@ from gfnn_jax.scenes.scene import AroundOrbit, Scene
 from gfnn_jax.scenes.trajectories import sample_states
 
 FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
-LEARNS = ("auto", "map")
+LEARNS = ("auto", "map", "hamiltonian")
 CHART_NAMES = ("auto", *CHARTS)
 
 _OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; those in other units do
@@ -21,7 +22,7 @@ _COARSE = 0.01  # of what a step moves
 
 
 def check_request(
-    pairs: Pairs, scene: Scene | None, *, tolerance, chart, learn, family, angles
+    pairs: Pairs, scene: Scene | None, *, tolerance, chart, learn, family, angles, terms=()
 ) -> None:
     """Raises FitError where the request or the pairs cannot give a map."""
     for name, value, known in (
@@ -44,6 +45,16 @@ def check_request(
         )
     if not 0 < float(pairs.dt) < np.inf:
         raise FitError(f"expected a time step that is finite and above 0, got {pairs.dt}")
+    if isinstance(terms, str):
+        raise FitError(f"expected a sequence of terms, got the text '{terms}'")
+    try:
+        given_terms(pairs.dim, terms)
+    except InputError as error:
+        raise FitError(str(error)) from error
+    if terms and learn == "map":
+        raise FitError("terms are those of H: expected learn='auto' or 'hamiltonian' with them")
+    if learn == "hamiltonian" and (family != "auto" or chart != "auto"):
+        raise FitError("family and chart are those of S: learn='hamiltonian' has none")
     if family == "features" and (scene is None or scene.features is None):
         raise FitError("family 'features' needs a scene that declares features")
     for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):

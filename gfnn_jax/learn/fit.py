@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from gfnn_jax.learn.check import (
     unlike_the_scene,
 )
 from gfnn_jax.learn.choose_charts import Charts, choose_charts
+from gfnn_jax.learn.choose_law import law_of, preferred
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.diagnose import (
     ChartJudgement,
@@ -40,6 +41,8 @@ from gfnn_jax.learn.diagnose import (
     sequences_of,
     volume_change,
 )
+from gfnn_jax.learn.flows import LearnedHamiltonian
+from gfnn_jax.learn.flows import assembled as flow_assembled
 from gfnn_jax.learn.held_out import first_occurrences, split_rows
 from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.search import Entry, Found, search
@@ -69,7 +72,8 @@ class Fit:
     residuals suggest where larger models stopped helping, else None. messages: the warnings.
     ended: why the search ended. seconds: of it all; compile_seconds: of compiling, in them.
     test_states: (n, 2d) held-out states. model_determinant_min: the chosen chart's determinant
-    there, where it is closest to 0.
+    there, where it is closest to 0; NaN for a flow, which has no chart. hamiltonian: H, where one
+    was found, whether its flow was chosen or not.
     """
 
     map: SymplecticMap
@@ -86,6 +90,15 @@ class Fit:
     compile_seconds: float
     test_states: np.ndarray
     model_determinant_min: float
+    hamiltonian: LearnedHamiltonian | None = None
+
+    @property
+    def formula(self) -> str | None:
+        """H as text, where one was found that meets the tolerance or was chosen."""
+        law = self.hamiltonian
+        if law is None or not (self.chosen.learns == "hamiltonian" or self._met_by(law.candidate)):
+            return None
+        return law.formula
 
     @property
     def tolerance(self) -> float:
@@ -99,7 +112,10 @@ class Fit:
     @property
     def met(self) -> bool:
         """Whether the chosen candidate's validation error is within the tolerance, at 95 %."""
-        return self.chosen.validation_bound <= self.tolerance
+        return self._met_by(self.chosen)
+
+    def _met_by(self, candidate: Candidate) -> bool:
+        return candidate.validation_bound <= self.tolerance
 
     @cached_property
     def symplecticity_defect(self) -> float:
@@ -126,6 +142,7 @@ def fit(
     tolerance: float = 1e-6,
     absolute_tolerance: float | None = None,
     learn: str = "auto",
+    terms: Sequence[str | Callable] = (),
     family: str = "auto",
     chart: str = "auto",
     angles: tuple[int, ...] = (),
@@ -145,7 +162,10 @@ def fit(
     tolerance: bound on the RMS over coordinates of the one-step error ÷ that coordinate's spread,
                at its upper 95 % bound; a pure number.
     absolute_tolerance: in its stead, on the RMS per component in the user's units.
-    learn:     "auto" or "map".
+    learn:     "map": S, whose step is an implicit equation; "hamiltonian": H, whose flow is the
+               map; "auto": both, and H is taken where it meets the tolerance at no more than four
+               times the cost of a step, because it holds outside the data and at any time step.
+    terms:     of H that the user knows: text such as "1/sqrt(q1**2 + q2**2)", or functions of z.
     family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp".
     chart:     "auto" or one of type1, type2, type3, midpoint.
     angles:    without a scene, the indices of z that have period 2π.
@@ -168,8 +188,9 @@ def fit(
     if absolute_tolerance is not None:
         bound = Tolerance(absolute_tolerance, relative=False)
     check_request(
-        pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, angles=angles
-    )
+        pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, angles=angles,
+        terms=terms,
+    )  # fmt: skip
     messages: list[str] = []
 
     def warn(new: list[str]) -> None:
@@ -184,30 +205,46 @@ def fit(
     on_progress("looking at the map's local Jacobians")
     pairs, prepared, new = _prepared(pairs, coordinates)
     warn(new)
+    plain = prepared
     seen = _diagnosed(prepared, chart, scene.reversor if scene else None, seed)
     warn(seen.messages)
     prepared, charts = seen.prepared, seen.charts
     judges = Judges(pairs, *split_rows(pairs, seed), bound)
-    if family == "mlp":
-        sweeps: list[Any] = [
+    better = _Better(prepared, judges, on_better) if on_better is not None else None
+    wanted = learn if (family, chart) == ("auto", "auto") else "map"
+    law = law_of(plain, judges, scene, wanted, terms, clock, on_progress)
+    if law is not None:
+        on_candidate(law.candidate)
+        if better is not None:
+            better.offer(law.candidate, lambda: composed(law.flow, plain, judges))
+    if learn == "hamiltonian":
+        sweeps: list[Any] = []
+    elif family == "mlp":
+        sweeps = [
             NetworkSweep(prepared, charts.charts[0], judges, max_iterations, seed, checkpoints)
         ]
     else:
         sweeps = list(sweeps_for(family, charts.charts, prepared, scene, judges, factors))
-    better = _Better(prepared, judges, on_better) if on_better is not None else None
-    found = search(sweeps, bound.bound, clock, on_progress, on_candidate, better)
-    if not found.ranking:
+    met_by_law = law is not None and law.candidate.validation_bound <= bound.bound
+    dearest = law.candidate.operations if law is not None and met_by_law else np.inf
+    found = search(sweeps, bound.bound, clock, on_progress, on_candidate, better, dearest)
+    if not found.ranking and law is None:
         raise FitError(_nothing_found(found, pairs, clock))
-    chosen, entry, compile_seconds = _assembled(found, prepared, judges, clock, on_progress)
+    choice = _chosen(found, law, prepared, plain, judges, clock, on_progress)
+    chosen, entry, compile_seconds = choice
     noise = None
     if chosen.validation_bound > bound.bound:
         warn([not_met(chosen, bound, found.ended)])
-    if chosen.validation_bound > bound.bound and chosen.validation_relative > _ROUNDOFF:
+        warn(list(law.messages) if entry is None and law is not None else [])
+    left_over = chosen.validation_bound > bound.bound and chosen.validation_relative > _ROUNDOFF
+    if left_over and entry is not None:
         stalled = (chosen.chart, chosen.family) in found.stalled
         noise, new = _what_is_left(chosen, entry, prepared, judges, stalled)
         warn(new)
-    entries = [e for e in found.entries if e.size is not entry.size]
-    candidates = [*(e.candidate for e in entries), dataclasses.replace(chosen, chosen=True)]
+    others = [e.candidate for e in found.entries if entry is None or e.size is not entry.size]
+    if law is not None and entry is not None:
+        others.append(law.candidate)
+    candidates = [*others, dataclasses.replace(chosen, chosen=True)]
     test = np.asarray(pairs.z0)[judges.held_out][:_JUDGED]
     return Fit(
         map=chosen.map,
@@ -216,10 +253,11 @@ def fit(
         num_pairs=len(pairs),
         judgements=charts.judgements,
         data_defect=seen.data_defect,
-        base_map=prepared.half is not None,
+        base_map=entry is not None and prepared.half is not None,
+        hamiltonian=law,
         noise=noise,
         messages=tuple(messages),
-        ended=found.ended,
+        ended=found.ended if learn != "hamiltonian" else _ended(chosen, bound),
         seconds=clock.seconds,
         compile_seconds=compile_seconds,
         test_states=test,
@@ -236,10 +274,15 @@ class _Better:
         self._best = np.inf
 
     def __call__(self, entry: Entry) -> None:
-        candidate = entry.candidate
-        if not candidate.validation_bound < self._best:
-            return
-        self._best = candidate.validation_bound
+        self.offer(entry.candidate, lambda: self._map_of(entry))
+
+    def offer(self, candidate: Candidate, make: Callable[[], SymplecticMap]) -> None:
+        """Hand on the map that ``make`` makes, if its candidate is better than those before."""
+        if candidate.validation_bound < self._best:
+            self._best = candidate.validation_bound
+            self._on_better(make(), candidate)
+
+    def _map_of(self, entry: Entry) -> SymplecticMap:
         _, params = entry.sweep.solve(entry.size, Clock(), lambda message: None)
         family = entry.size.family
         generated = Generated(
@@ -247,7 +290,7 @@ class _Better:
         )
         features = getattr(getattr(family, "inputs", None), "features", None)
         generated = with_predictor(generated, self._prepared, self._judges.training, features)
-        self._on_better(composed(generated, self._prepared, self._judges), candidate)
+        return composed(generated, self._prepared, self._judges)
 
 
 def _prepared(pairs: Pairs, coordinates: Coordinates) -> tuple[Pairs, Prepared, list[str]]:
@@ -308,6 +351,31 @@ def _thin(prepared: Prepared) -> list[str]:
         f"the pairs lie on {where} of the {len(seen)}-dimensional phase space, as those of one "
         "orbit do: the map is learned there only"
     ]
+
+
+def _chosen(
+    found: Found, law: LearnedHamiltonian | None, prepared: Prepared, plain: Prepared,
+    judges: Judges, clock: Clock, say,
+) -> tuple[Candidate, Entry | None, float]:  # fmt: skip
+    """The chosen candidate with its map; where it comes from, None for the law; and the seconds
+    that compiling took."""
+    best = found.ranking[0].candidate if found.ranking else None
+    if law is None or not (best is None or preferred(law.candidate, best, judges.tolerance.bound)):
+        return _assembled(found, prepared, judges, clock, say)
+    say(f"compiling the flow of {law.candidate.label}")
+    assembled = flow_assembled(law, plain, judges)
+    if best is not None and not assembled.candidate.validation_bound <= max(
+        judges.tolerance.bound, 1.1 * law.candidate.validation_bound
+    ):  # its own steps do not bear it out
+        return _assembled(found, prepared, judges, clock, say)
+    return assembled.candidate, None, assembled.compile_seconds
+
+
+def _ended(chosen: Candidate, tolerance: Tolerance) -> str:
+    """Why a search for H alone ended."""
+    if chosen.validation_bound <= tolerance.bound:
+        return "the tolerance is met"
+    return "no larger library of terms promised to meet it"
 
 
 def _assembled(
@@ -397,10 +465,13 @@ def _nothing_found(found: Found, pairs: Pairs, clock: Clock) -> str:
 
 
 def smallest_determinant(map_: SymplecticMap, prepared: Prepared, judges: Judges) -> float:
-    """The chart's determinant over some held-out pairs, where it is closest to 0. NumPy."""
+    """The chart's determinant over some held-out pairs, where it is closest to 0. NaN where no
+    piece has a chart. NumPy."""
     import jax
 
-    piece = next(p for p in map_.pieces if isinstance(p, Generated))
+    piece = next((p for p in map_.pieces if isinstance(p, Generated)), None)
+    if piece is None:
+        return float("nan")
     piece = jax.tree.map(np.asarray, piece)
     rows = judges.held_out[:_JUDGED]
     determinant = piece.determinant(prepared.y0[rows], prepared.y1[rows])

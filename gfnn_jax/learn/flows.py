@@ -134,9 +134,10 @@ def learn_hamiltonian(
     problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, check=clock.check)
     bound = judges.tolerance.bound
     best: _Fitted | None = None
-    last, poor = None, 0
+    last, poor, errors = None, 0, []
+    libraries = list(_libraries(prepared, judges, scene, terms, options))
     try:
-        for family in _libraries(prepared, judges, scene, terms, options):
+        for family in libraries:
             say(f"H: {family.num_parameters} terms")
             found = _fitted(problem, family, prepared, judges, last, options, say)
             better = best is None or found.error.relative < options.gained * best.error.relative
@@ -144,7 +145,11 @@ def learn_hamiltonian(
             if best is None or found.error.relative < best.error.relative:
                 best = found
             last = found
+            errors.append(found.error.bound)
             if best.error.bound <= bound or poor == 2:
+                break
+            if _out_of_reach(errors, len(libraries) - len(errors), bound):
+                options = dataclasses.replace(options, thresholds=())  # no law: nothing to read
                 break
     except OutOfTime:
         if best is None:
@@ -160,6 +165,15 @@ def learn_hamiltonian(
     except OutOfTime:
         pass  # what was found stands
     return _learned(best, problem, prepared, judges, time.perf_counter() - started, options)
+
+
+def _out_of_reach(errors: list[float], left: int, bound: float) -> bool:
+    """Whether the libraries that are left, each gaining as much as the best of the last two gains,
+    would still miss the bound."""
+    if len(errors) < 3 or not np.isfinite(errors[-3:]).all():
+        return False
+    gain = min(errors[-1] / errors[-2], errors[-2] / errors[-3], 1.0)
+    return errors[-1] * gain**left > bound
 
 
 def _libraries(prepared, judges, scene, terms, options: Options) -> Iterator[Terms]:

@@ -56,12 +56,14 @@ def search(
     say: Callable[[str], Any],
     tell: Callable[[Candidate], Any],
     on_validated: Callable[[Entry], Any] | None = None,
+    dearest: float = np.inf,
 ) -> Found:
     """Climb the sweeps. A sweep has ``sizes`` with ``operations`` by rising order, and
     ``judge(size, clock, say)`` and ``validate(size, judged, clock, say)``, which give candidates.
 
     bound: the tolerance on a candidate's ``validation_bound``. tell: called with every candidate.
-    on_validated: called with every entry whose steps have been looked at.
+    on_validated: called with every entry whose steps have been looked at. dearest: operations from
+    which a size is of no use, because something else meets the tolerance with so many.
     """
     queue = sorted(
         ((size.operations, i, n) for i, s in enumerate(sweeps) for n, size in enumerate(s.sizes))
@@ -71,7 +73,7 @@ def search(
     ratio = [1.0 / _CALIBRATED] * len(sweeps)  # of a step's error to its estimate
     beaten, stalled = [0] * len(sweeps), [0] * len(sweeps)
     left: set[int] = set()
-    cheapest, kept, ended = np.inf, np.inf, ""
+    cheapest, kept, ended = dearest, np.inf, ""
     try:
         for operations, i, n in queue:
             if i in left or operations >= cheapest:

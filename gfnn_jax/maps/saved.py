@@ -23,6 +23,8 @@ from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.mlp import Mlp
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import Chart, TypeOne
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import PolynomialModel, Predictor
@@ -38,7 +40,7 @@ _TYPES: dict[str, type] = {
     kind.__name__: kind
     for kind in (
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
-        Products, Sines, Mlp, Inputs,
+        Products, Sines, Mlp, Inputs, Flow, Terms,
     )
 }  # fmt: skip
 # Names that were used before, in models that may still be about.

@@ -21,6 +21,7 @@ from jax.core import Tracer
 from gfnn_jax.arrays import as_row
 from gfnn_jax.compiling import compiled_sooner
 from gfnn_jax.coordinates import TWO_PI, Coordinates
+from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated, two_sum
 from gfnn_jax.maps.domain import Domain
 from gfnn_jax.maps.rollout import scan_steps
@@ -148,8 +149,18 @@ class SymplecticMap:
         return _defect(self, z, 1 if once else True)
 
     def determinant(self, z):
-        """Chart determinant () or (B,) at z, of the piece where it is smallest."""
+        """Chart determinant () or (B,) at z, of the piece where it is smallest; NaN where no piece
+        has a chart."""
         return _determinant(self, self._states(z))
+
+    def hamiltonian(self, z):
+        """H () or (B,) at z, of a map that is the flow of one Hamiltonian. Raises ValueError of any
+        other map."""
+        if len(self.pieces) != 1 or not isinstance(self.pieces[0], Flow):
+            raise ValueError(
+                "expected a map that is the flow of a Hamiltonian (learn='hamiltonian')"
+            )
+        return _hamiltonian(self, self._states(z))
 
     def start(self, z0, *, stop_outside: bool = False) -> Lanes:
         """Lanes at step 0 from z0 (B, 2d). Initial states outside the domain have that status."""
@@ -284,6 +295,12 @@ def _defect(map_, z, unrolled):
 
 @compiled_sooner
 @_or_one_state
+def _hamiltonian(map_, z):
+    return map_.pieces[0].value(map_._inner(z)[0])
+
+
+@compiled_sooner
+@_or_one_state
 def _determinant(map_, z):
     y, _, _ = map_._inner(z)
     found = []
@@ -292,6 +309,8 @@ def _determinant(map_, z):
         if isinstance(piece, Generated):
             found.append(piece.determinant(y, image))
         y = image
+    if not found:
+        return jnp.full(z.shape[0], jnp.nan, z.dtype)
     found = jnp.stack(found, axis=-1)
     smallest = jnp.argmin(jnp.abs(found), axis=-1)
     return jnp.take_along_axis(found, smallest[:, None], axis=-1)[:, 0]

@@ -1,0 +1,80 @@
+"""Whether a Hamiltonian is learned beside the map, and when it is preferred to it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.errors import FitError
+from gfnn_jax.learn.candidates import Candidate, Judges
+from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.flows import OPTIONS, LearnedHamiltonian, learn_hamiltonian
+from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.scenes.scene import Scene
+
+# Beside a map only a law of few terms is looked for: a larger one is no shorter to say than S.
+_BESIDE = dataclasses.replace(OPTIONS, most_terms=60, max_seconds=10.0)
+# A law holds outside the data and at any time step: so much dearer a step it may be.
+DEARER = 4.0
+
+
+def law_of(
+    prepared: Prepared,
+    judges: Judges,
+    scene: Scene | None,
+    learn: str,
+    terms: Sequence[str | Callable],
+    clock: Clock,
+    say: Callable[[str], Any],
+) -> LearnedHamiltonian | None:
+    """The Hamiltonian of these pairs, or None where none is asked for or, with "auto", none is
+    found.
+
+    prepared: without a base map. Raises FitError where a Hamiltonian is asked for and there is none
+    to learn.
+    """
+    if learn == "map":
+        return None
+    unfit = _unfit(prepared, scene)
+    if unfit is not None:
+        if learn == "hamiltonian":
+            raise FitError(f"expected data of an autonomous flow to learn H from: {unfit}")
+        return None
+    options = OPTIONS if learn == "hamiltonian" or terms else _BESIDE
+    try:
+        return learn_hamiltonian(
+            prepared, judges, scene, terms=terms, clock=clock, say=say, options=options
+        )
+    except OutOfTime as spent:
+        if learn == "hamiltonian":
+            raise FitError(
+                f"expected a budget of more than {clock.max_seconds:g} s: no H was fitted by then"
+            ) from spent
+    except FitError:
+        if learn == "hamiltonian":
+            raise
+    return None
+
+
+def _unfit(prepared: Prepared, scene: Scene | None) -> str | None:
+    """Why the pairs are not those of an autonomous flow, where that is known."""
+    if scene is not None and scene.timeless:
+        return f"the scene {scene.name} is a map without time"
+    if scene is not None and scene.period is not None:
+        return f"the Hamiltonian of the scene {scene.name} depends on time"
+    if any(a >= prepared.dim for a in prepared.coordinates.angles):
+        return "a momentum is an angle"
+    return None
+
+
+def preferred(law: Candidate, chosen: Candidate, bound: float) -> bool:
+    """Whether the law is taken instead of the map that was chosen: where it alone meets the
+    tolerance, or meets it and is not four times dearer, or where none meets it and it is better."""
+    if law.validation_bound <= bound:
+        return not chosen.validation_bound <= bound or law.operations <= DEARER * chosen.operations
+    if chosen.validation_bound <= bound or not np.isfinite(law.validation_relative):
+        return False
+    return law.validation_relative <= chosen.validation_relative
