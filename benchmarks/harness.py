@@ -115,7 +115,10 @@ def in_float32(map_: SymplecticMap) -> SymplecticMap:
 
 def fitted(pairs: gfnn.Pairs, scene: Scene | None, fresh: gfnn.Pairs, **options):
     """(fit, what was measured of it). The options are those of `gfnn.fit`; the benchmarks' targets
-    are absolute errors, so most ask for an ``absolute_tolerance``."""
+    are absolute errors, so most ask for an ``absolute_tolerance``. Maps are learned, not laws,
+    which have a benchmark of their own; without a budget, which would make results depend on what
+    else the machine does."""
+    options = {"learn": "map", "max_seconds": None, **options}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)  # kept in fit.messages
         fit = gfnn.fit(pairs, scene, seed=SEED, on_progress=lambda m: print(f"  {m}"), **options)

@@ -458,8 +458,8 @@ def scaling(quick: bool) -> Numbers:
 
     def selection_seconds(num_pairs):
         pairs = gfnn.sample_pairs(scene, num_pairs, jax.random.key(SEED))
-        gfnn.fit(pairs, scene, absolute_tolerance=1e-6)  # compiles
-        return gfnn.fit(pairs, scene, absolute_tolerance=1e-6)
+        gfnn.fit(pairs, scene, learn="map", absolute_tolerance=1e-6)  # compiles
+        return gfnn.fit(pairs, scene, learn="map", absolute_tolerance=1e-6)
 
     def rollout_seconds(map_, z0, num_steps):
         return timed(lambda: map_.rollout(z0, num_steps, save_every=num_steps)[0], 2).seconds

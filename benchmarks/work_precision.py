@@ -177,8 +177,8 @@ def our_maps(bench: Bench, num_pairs: int, quick: bool, omit) -> Iterator[Number
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", gfnn.FitWarning)
                 return gfnn.fit(
-                    pairs, scene, chart=chart, family=family, seed=SEED, tolerance=tolerance,
-                    max_iterations=MLP_ITERATIONS,
+                    pairs, scene, learn="map", chart=chart, family=family, seed=SEED,
+                    tolerance=tolerance, max_iterations=MLP_ITERATIONS,
                 )  # fmt: skip
 
         try:

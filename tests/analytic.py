@@ -1,14 +1,16 @@
 """Maps whose generating functions are known in closed form: tests of what is done with a map need
-no fit."""
+no fit. And pairs of Hénon and Heiles, by SciPy's integrator."""
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.integrate import solve_ivp
 
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.families import from_function
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.phase_space import Pairs
 
 
 @from_function
@@ -61,3 +63,16 @@ def rotated(z, angle):
     q, p = z[..., 0], z[..., 1]
     c, s = np.cos(angle), np.sin(angle)
     return np.stack([q * c + p * s, p * c - q * s], axis=-1)
+
+
+def henon_heiles_pairs(num, seed=0, radius=0.4, dt=0.5):
+    """Pairs of states that are uniform in a box, all orbits in one integration."""
+
+    def field(_, flat):
+        q1, q2, p1, p2 = flat.reshape(4, -1)
+        return np.stack([p1, p2, -q1 - 2 * q1 * q2, -q2 - q1**2 + q2**2]).ravel()
+
+    z0 = np.random.default_rng(seed).uniform(-radius, radius, (num, 4))
+    # Many orbits share the tolerance of a step: each is closer than one alone would be.
+    solved = solve_ivp(field, (0, dt), z0.T.ravel(), "DOP853", rtol=2.3e-14, atol=1e-16)
+    return Pairs(z0, solved.y[:, -1].reshape(4, -1).T, dt)

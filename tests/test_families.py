@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gfnn_jax.families import Family, LinearFamily, as_family, from_function
+from gfnn_jax.families.family import symmetric_gradient, symmetric_gradient_and_hessian
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp
 from gfnn_jax.families.products import Products
@@ -100,6 +101,30 @@ def test_closed_derivatives_are_those_of_autodiff(kind, inputs):
     found = family.gradient_and_hessian(params, W[0])
     for one, other in zip(found, automatic(family, params, W[0]), strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12 * (1 + np.abs(other).max()))
+
+
+@pytest.mark.parametrize("kind", ["products", "sines"])
+def test_the_gradients_derivative_is_symmetric_to_the_last_bit(kind):
+    """And the same as JAX's to rounding, in w as in the parameters."""
+    family, params = case(kind, "angles and cyclic")
+    w, dot = jnp.asarray(W[0]), np.random.default_rng(2).normal(size=W[0].shape)
+
+    def jacobian(gradient):
+        return np.asarray(jax.jit(jax.vmap(jax.jacfwd(lambda v: gradient(params, v))))(w))
+
+    found = jacobian(functools.partial(symmetric_gradient, family))
+    np.testing.assert_array_equal(found, np.swapaxes(found, 1, 2))
+    np.testing.assert_allclose(found, jacobian(family.gradient), rtol=1e-11, atol=1e-12)
+
+    def along(gradient):
+        """Of the gradient and the Hessian, along a direction of all arguments."""
+        dots = (jax.tree.map(lambda a: 0.1 * jnp.ones_like(a), params), dot)
+        return jax.jit(lambda: jax.jvp(gradient, (params, w), dots)[1])()
+
+    expected = along(family.gradient_and_hessian)
+    found = along(functools.partial(symmetric_gradient_and_hessian, family))
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-11)
 
 
 @pytest.mark.parametrize(("kind", "inputs"), [*LINEAR, ("from_function", "plain")])

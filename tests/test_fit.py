@@ -51,7 +51,7 @@ def rms(map_, z0, z1):
 
 @pytest.fixture(scope="module")
 def pendulum_fit():
-    return quiet_fit(pendulum_pairs(), tolerance=1e-7)
+    return quiet_fit(pendulum_pairs(), tolerance=1e-7, learn="map")
 
 
 class LookedAt(Exception):
@@ -285,7 +285,7 @@ def test_the_table_shows_all_candidates_and_marks_the_chosen(pendulum_fit):
 
 def test_one_seed_chooses_one_map(pendulum_fit):
     told = []
-    again = quiet_fit(pendulum_pairs(), tolerance=1e-7, on_candidate=told.append)
+    again = quiet_fit(pendulum_pairs(), tolerance=1e-7, learn="map", on_candidate=told.append)
     names = [(c.chart, c.label, c.validation_rms) for c in pendulum_fit.candidates]
     assert names == [(c.chart, c.label, c.validation_rms) for c in again.candidates]
     assert len(told) == len(again.candidates)
@@ -344,7 +344,9 @@ def test_a_tolerance_out_of_reach_gives_the_best_and_says_so():
 def test_what_is_found_on_the_way_is_handed_on(pendulum_fit):
     """Maps of falling error, the last of them the chosen one's."""
     kept = []
-    fit = quiet_fit(pendulum_pairs(), tolerance=1e-7, on_better=lambda *kind: kept.append(kind))
+    fit = quiet_fit(
+        pendulum_pairs(), tolerance=1e-7, learn="map", on_better=lambda *kind: kept.append(kind)
+    )
     bounds = [candidate.validation_bound for _, candidate in kept]
     assert len(bounds) > 1
     assert bounds == sorted(bounds, reverse=True)

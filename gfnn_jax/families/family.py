@@ -141,40 +141,85 @@ def as_family(function: Any) -> Any:
     return from_function(function)
 
 
-def gradient_by_hessian(family: Family, params: Any, w: Any, args: Any = None) -> Any:
-    """∂f/∂w (..., 2d), whose own derivative in w is by the family's Hessian.
+def symmetric_gradient(family: Family, params: Any, w: Any, args: Any = None) -> Any:
+    """∂f/∂w (..., 2d), whose own derivative in w is the family's Hessian.
 
     A derivative of ``gradient`` by JAX is symmetric only up to the rounding of its terms, and a
     step is only as symplectic as S'' is symmetric; the Hessian is so to the last bit.
     """
     if namespace(w) is np:
         return family.gradient(params, w, args)
-    return _gradient_by_hessian(family, params, w, args)
+    return _gradient(family, params, w, args)
+
+
+def symmetric_gradient_and_hessian(
+    family: Family, params: Any, w: Any, args: Any = None
+) -> tuple[Any, Any]:
+    """∂f/∂w, as ``symmetric_gradient`` has it, and ∂²f/∂w² (..., 2d, 2d)."""
+    if namespace(w) is np:
+        return family.gradient_and_hessian(params, w, args)
+    return _gradient_and_hessian(family, params, w, args)
 
 
 @jax.custom_jvp
-def _gradient_by_hessian(family, params, w, args):
+def _gradient(family, params, w, args):
     return family.gradient(params, w, args)
 
 
-@partial(_gradient_by_hessian.defjvp, symbolic_zeros=True)
-def _gradient_by_hessian_jvp(primals, tangents):
+@partial(_gradient.defjvp, symbolic_zeros=True)
+def _gradient_jvp(primals, tangents):
     family, params, w, args = primals
     gradient, hessian = family.gradient_and_hessian(params, w, args)
+    return gradient, _gradient_dot(gradient, hessian, primals, tangents)
+
+
+@jax.custom_jvp
+def _gradient_and_hessian(family, params, w, args):
+    return family.gradient_and_hessian(params, w, args)
+
+
+@partial(_gradient_and_hessian.defjvp, symbolic_zeros=True)
+def _gradient_and_hessian_jvp(primals, tangents):
+    both, (_, hessian_dot) = _jvp(
+        lambda f, p, w, a: f.gradient_and_hessian(p, w, a), primals, tangents
+    )
+    return both, (_gradient_dot(*both, primals, tangents), hessian_dot)
+
+
+def _gradient_dot(gradient, hessian, primals, tangents):
+    """The tangent of the gradient: S'' ẇ, and what the other tangents add."""
+    family, params, w, args = primals
+    family_dot, params_dot, w_dot, args_dot = tangents
     dot = jnp.zeros_like(gradient)
-    if not isinstance(tangents[2], SymbolicZero):
-        dot = matmul(hessian, tangents[2][..., None])[..., 0]
-    others_dot = (tangents[0], tangents[1], tangents[3])
-    if not all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(others_dot)):
-        dot = (
-            dot
-            + jax.jvp(
-                lambda family, params, args: family.gradient(params, w, args),
-                (family, params, args),
-                jax.tree.map(_instantiated, others_dot),
-            )[1]
-        )
-    return gradient, dot
+    if not isinstance(w_dot, SymbolicZero):
+        dot = matmul(hessian, w_dot[..., None])[..., 0]
+    others = (family_dot, params_dot, args_dot)
+    if _vanish(others):
+        return dot
+    _, more = _jvp(
+        lambda family, params, args: family.gradient(params, w, args),
+        (family, params, args),
+        others,
+    )
+    return dot + more
+
+
+def _jvp(function, primals, tangents):
+    """``jax.jvp`` in those arguments alone whose tangents do not vanish: less to compile."""
+    moving = [i for i, tangent in enumerate(tangents) if not _vanish(tangent)]
+
+    def of_moving(*given):
+        arguments = list(primals)
+        for i, argument in zip(moving, given, strict=True):
+            arguments[i] = argument
+        return function(*arguments)
+
+    dots = [jax.tree.map(_instantiated, tangents[i]) for i in moving]
+    return jax.jvp(of_moving, [primals[i] for i in moving], dots)
+
+
+def _vanish(tangents) -> bool:
+    return all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(tangents))
 
 
 def _instantiated(tangent):

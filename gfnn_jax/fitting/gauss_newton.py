@@ -220,13 +220,13 @@ class Problem:
             yield rows[first : first + size]
 
     def fit(
-        self, family, start, rows=None, *, rounds: bool = True,
+        self, family, start, rows=None, *, rounds: bool = True, steps: Steps | None = None,
         say: Callable[[str], Any] = lambda message: None,
     ) -> FlowFit:  # fmt: skip
         """Levenberg–Marquardt from ``start`` (terms,) over these rows.
 
         rounds: quiet pairs first, with coarse steps; else all at once, from a start that is known
-        to be close.
+        to be close. steps: of the flow in the end; None: the cheapest whose error is roundoff.
         """
         options = self.options
         rows = np.arange(len(self.z0)) if rows is None else np.asarray(rows)
@@ -238,19 +238,19 @@ class Problem:
             count = int(np.ceil(fraction * len(sample)))
             if fraction < 1 and count < least:
                 continue
-            steps = self._coarse(family, c, sample)
-            quiet = self._quietest(family, c, steps, sample, count)
+            coarse = self._coarse(family, c, sample)
+            quiet = self._quietest(family, c, coarse, sample, count)
             if len(quiet) < min(least, len(sample)):
                 break
-            c, _, made = self._descend(family, c, steps, quiet, options.early)
+            c, _, made = self._descend(family, c, coarse, quiet, options.early)
             iterations += made
             say(f"H of {family.num_parameters} terms: {len(quiet)} of {len(rows)} pairs")
         if rounds:
-            steps = self._coarse(family, c, sample)
-            quiet = self._quietest(family, c, steps, sample, len(sample))
-            c, _, made = self._descend(family, c, steps, quiet, options.most)
+            coarse = self._coarse(family, c, sample)
+            quiet = self._quietest(family, c, coarse, sample, len(sample))
+            c, _, made = self._descend(family, c, coarse, quiet, options.most)
             iterations += made
-        steps = self.fine_steps(family, c, rows)
+        steps = self.fine_steps(family, c, rows) if steps is None else steps
         used = self._quietest(family, c, steps, rows, len(rows))
         c, factor, made = self._descend(family, c, steps, used, options.most)
         return _summary(c, factor, used, iterations + made, steps)

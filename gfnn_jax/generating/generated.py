@@ -16,7 +16,7 @@ import numpy as np
 
 from gfnn_jax.arrays import namespace
 from gfnn_jax.families import as_family
-from gfnn_jax.families.family import gradient_by_hessian
+from gfnn_jax.families.family import symmetric_gradient, symmetric_gradient_and_hessian
 from gfnn_jax.generating.charts import AnyChart, Chart
 from gfnn_jax.phase_space import apply_j
 from gfnn_jax.solve import newton
@@ -39,14 +39,14 @@ class ImplicitStep:
         """The residual; aux is ∇S(w), (B, 2d)."""
         (family, params, dt, scale), (z, known, args) = shared, lanes
         w = self.chart.complete(known, x)
-        gradient = gradient_by_hessian(family, params, w, args)
+        gradient = symmetric_gradient(family, params, w, args)
         return self._evaluation(z, w, gradient, dt, scale)[0]
 
     def linearise(self, shared, lanes, x) -> tuple[Evaluation, Any]:
         """The residual and its Jacobian ∂r/∂x (B, n, n)."""
         (family, params, dt, scale), (z, known, args) = shared, lanes
         w = self.chart.complete(known, x)
-        gradient, hessian = family.gradient_and_hessian(params, w, args)
+        gradient, hessian = symmetric_gradient_and_hessian(family, params, w, args)
         evaluation, unit = self._evaluation(z, w, gradient, dt, scale)
         return evaluation, self.chart.residual_jacobian(hessian, dt) / unit[..., None]
 

@@ -266,7 +266,7 @@ def _sparse(problem, full: _Fitted, prepared, judges, options: Options, say) -> 
         family = full.family.take(kept)
         say(f"H: {len(kept)} of {full.family.num_parameters} terms")
         start = full.fit.coefficients[list(kept)]
-        fit = problem.fit(family, start, full.fit.used, rounds=False)
+        fit = problem.fit(family, start, full.fit.used, rounds=False, steps=full.fit.steps)
         error = _held_out_error(problem, family, fit, prepared, judges)
         if error.relative <= max(options.rise * full.error.relative, options.rounding):
             return _Fitted(family, fit, error, full.null)

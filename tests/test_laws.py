@@ -1,0 +1,158 @@
+"""Hamiltonians in ``gfnn.fit``: when one is learned, when it is preferred, what comes with it."""
+
+import dataclasses
+import json
+import types
+
+import jax
+import numpy as np
+import pytest
+from analytic import henon_heiles_pairs
+from test_cli import gfnn as command
+
+import gfnn_jax as gfnn
+from gfnn_jax.evaluate import report
+from gfnn_jax.learn.choose_law import preferred
+
+FORMULA = "0.5 q1² + 0.5 q2² + 0.5 p1² + 0.5 p2² + q1² q2 - 0.333333333333 q2³"
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    """Hénon–Heiles at dt = 0.5, from another solver, told nothing of it."""
+    return henon_heiles_pairs(200)
+
+
+@pytest.fixture(scope="module")
+def law(pairs):
+    return gfnn.fit(pairs, tolerance=1e-12)
+
+
+def test_a_law_of_six_numbers_comes_out_of_raw_pairs(law):
+    assert law.chosen.learns == "hamiltonian"
+    assert law.formula == FORMULA
+    exact = [0.5, 0.5, 0.5, 0.5, 1.0, -1 / 3]
+    found = [term.coefficient for term in law.hamiltonian.terms]
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-11)
+    assert law.met
+    assert law.symplecticity_defect < 1e-13
+    assert np.isnan(law.model_determinant_min)
+
+
+def test_the_law_holds_where_no_pair_was(law, pairs):
+    fresh = henon_heiles_pairs(50, seed=1, radius=0.6)  # the data reach 0.4
+    assert np.abs(fresh.z0).max() > np.abs(pairs.z0).max()
+    np.testing.assert_allclose(law.map.step(fresh.z0)[0], fresh.z1, rtol=0, atol=1e-12)
+
+
+def test_h_can_be_evaluated_and_does_not_drift(law, pairs):
+    q1, q2, p1, p2 = pairs.z0[:20].T
+    energy = 0.5 * (q1**2 + q2**2 + p1**2 + p2**2) + q1**2 * q2 - q2**3 / 3
+    np.testing.assert_allclose(law.map.hamiltonian(pairs.z0[:20]), energy, rtol=0, atol=1e-12)
+    assert law.map.hamiltonian(pairs.z0[0]).shape == ()
+    states, info = law.map.rollout(0.5 * pairs.z0[:5], 2_000, save_every=2_000)
+    assert not info.status.any()
+    drift = law.map.hamiltonian(states[:, -1]) - law.map.hamiltonian(states[:, 0])
+    assert np.abs(drift).max() < 1e-13
+
+
+def test_a_saved_law_is_the_same_map(law, pairs, tmp_path):
+    law.map.save(tmp_path / "m")
+    again = gfnn.load(tmp_path / "m")
+    np.testing.assert_array_equal(again.step(pairs.z0)[0], law.map.step(pairs.z0)[0])
+
+
+def test_the_report_holds_the_formula(law):
+    told = report.assemble(law, scene=None, dt=0.5, seed=0, data={}, rollout=None)
+    told = json.loads(report.to_json(told))
+    assert told["hamiltonian"]["formula"] == FORMULA
+    assert told["hamiltonian"]["terms"][0].keys() == {"term", "coefficient", "std"}
+    assert told["map"]["chart_determinant_min"] is None
+    assert told["model"]["learns"] == "hamiltonian"
+
+
+def test_a_map_asked_for_is_a_map(pairs):
+    fit = gfnn.fit(pairs, tolerance=1e-3, learn="map")
+    assert fit.chosen.learns == "map"
+    assert fit.hamiltonian is None
+    assert fit.formula is None
+    with pytest.raises(ValueError, match="learn='hamiltonian'"):
+        fit.map.hamiltonian(pairs.z0)
+
+
+def candidate(operations, error):
+    return types.SimpleNamespace(
+        operations=operations, validation_bound=error, validation_relative=error
+    )
+
+
+@pytest.mark.parametrize(
+    ("law", "map_", "taken"),
+    [
+        (candidate(4.0, 1e-9), candidate(1.0, 1e-9), True),  # four times as dear, and it holds
+        (candidate(4.1, 1e-9), candidate(1.0, 1e-9), False),
+        (candidate(100.0, 1e-9), candidate(1.0, 1e-7), True),  # it alone meets the tolerance
+        (candidate(1.0, 1e-7), candidate(100.0, 1e-9), False),
+        (candidate(9.0, 1e-6), candidate(1.0, 1e-5), True),  # neither does
+        (candidate(1.0, 1e-5), candidate(9.0, 1e-6), False),
+        (candidate(1.0, np.inf), candidate(9.0, np.inf), False),
+    ],
+)
+def test_when_a_law_is_preferred(law, map_, taken):
+    assert preferred(law, map_, 1e-8) is taken
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"scene": "standard-map-regular"}, "a map without time"),
+        ({"scene": "driven-pendulum"}, "depends on time"),
+        ({"terms": "p1**2"}, "a sequence of terms"),
+        ({"terms": ["p1**"]}, "p1"),
+        ({"terms": ["p3**2"]}, "p3"),
+        ({"terms": ["__import__('os')"]}, "__import__"),
+        ({"terms": ["p1**2"], "learn": "map"}, "expected learn='auto' or 'hamiltonian'"),
+        ({"family": "sines"}, "those of S"),
+        ({"chart": "type2"}, "those of S"),
+    ],
+)
+def test_refusals(options, words):
+    options = {"learn": "hamiltonian", **options}
+    z = np.random.default_rng(0).normal(size=(100, 2))
+    scene = gfnn.scenes.make(options.pop("scene")) if "scene" in options else None
+    with pytest.raises(gfnn.FitError, match=words) as refused:
+        gfnn.fit(gfnn.Pairs(z, z + 0.1, 0.1), scene, **options)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_known_term_makes_a_hard_law_easy():
+    """A rational potential, which no polynomial of few terms is."""
+
+    def hamiltonian(c, z):
+        return 0.5 * z[1] ** 2 - 1 / (1 + 4 * z[0] ** 2) + 0 * c
+
+    flow = gfnn_flow(hamiltonian)
+    z0 = np.random.default_rng(0).uniform(-1, 1, (300, 2))
+    pairs = gfnn.Pairs(z0, np.asarray(flow.step(jax.numpy.asarray(z0))[0]), 0.2)
+    fit = gfnn.fit(pairs, tolerance=1e-12, learn="hamiltonian", terms=["1/(1 + 4*q1**2)"])
+    assert fit.met
+    terms = {t.term: t.coefficient for t in fit.hamiltonian.terms}
+    assert len(terms) == 2
+    np.testing.assert_allclose(sorted(terms.values()), [-1, 0.5], rtol=0, atol=1e-10)
+
+
+def gfnn_flow(hamiltonian):
+    """An exact flow for as much as double precision tells: 8 stages in 4 substeps."""
+    from gfnn_jax.flows.flow import Flow
+
+    return Flow(hamiltonian, np.zeros(()), 0.2, np.ones(2), stages=8, substeps=4)
+
+
+def test_the_command_prints_the_formula(tmp_path, capsys, pairs):
+    data = tmp_path / "d.npz"
+    np.savez(data, **{k: v for k, v in dataclasses.asdict(pairs).items() if k != "dt"}, dt=0.5)
+    assert command("fit", data, "--out", tmp_path / "m", "--learn", "hamiltonian") == 0
+    assert f"H = {FORMULA[:20]}" in capsys.readouterr().out
+    np.save(tmp_path / "z0.npy", pairs.z0[:3])
+    predict = ("predict", tmp_path / "m", "--initial", tmp_path / "z0.npy", "--num-steps", 10)
+    assert command(*predict, "--out", tmp_path / "p.npz") == 0
