@@ -1,0 +1,261 @@
+"""Learning H: formulas out of raw pairs, and what their flows are worth beside maps.
+
+    python benchmarks/laws.py            every row (about ten minutes on two cores)
+    python benchmarks/laws.py --quick    two of them
+
+Each row learns from pairs of a system whose H is known, and judges by states that no fit has seen:
+the one-step error, the error at step 1,000 beside that of the reference itself, the coefficients,
+the time of a step in a batch of 1,000, and the defect of the executed step.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from harness import (
+    SEED,
+    TABLES,
+    Numbers,
+    between_markers,
+    finite,
+    main,
+    markdown,
+    number,
+    results,
+    timed,
+)
+
+import gfnn_jax as gfnn
+from gfnn_jax.families.terms import polynomial_terms
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.phase_space import apply_j
+from gfnn_jax.scenes.trajectories import reference_error
+
+STEPS, ORBITS, BATCH = 1_000, 100, 1_000
+DRIFT_STEPS = 1_000_000
+# Of the double pendulum: the angles' difference in the denominator.
+RATIONAL = ("1/(1 + sin(q1 - q2)**2)",)
+
+
+# Fits and what is measured of them
+
+
+def learned(pairs: gfnn.Pairs, fresh: gfnn.Pairs, scene=None, **options) -> tuple[Any, Numbers]:
+    """(fit, figures) of the law of these pairs."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)
+        fit = gfnn.fit(pairs, scene, seed=SEED, **{"learn": "auto", **options})
+    error = np.asarray(fit.map.step(fresh.z0)[0]) - np.asarray(fresh.z1)
+    law = fit.hamiltonian
+    z = np.resize(np.asarray(fresh.z0), (BATCH, fresh.z0.shape[1]))
+    rolled = timed(lambda: fit.map.rollout(z, 100, save_every=100)[0], 3)
+    return fit, {
+        "pairs": len(pairs),
+        "chosen": fit.chosen.learns,
+        "label": fit.chosen.label,
+        "one_step_rms": float(np.sqrt(np.mean(error**2))),
+        "fit_seconds": fit.seconds - fit.compile_seconds,
+        "compile_seconds": fit.compile_seconds,
+        "microseconds_per_step": 1e6 * rolled.seconds / (100 * BATCH),
+        "symplecticity_defect": fit.symplecticity_defect,
+        "formula": fit.formula,
+        "num_terms": None if law is None else len(law.terms),
+        "messages": list(fit.messages),
+    }
+
+
+def coefficient_error(fit, expected: dict[str, float]) -> float | None:
+    """The largest error of a coefficient; None where other terms were found."""
+    if fit.formula is None or {t.term for t in fit.hamiltonian.terms} != set(expected):
+        return None
+    return max(abs(t.coefficient - expected[t.term]) for t in fit.hamiltonian.terms)
+
+
+def rolled_out(fit, scene, num_orbits: int, exact_error: bool = True) -> Numbers:
+    """Position errors of fresh orbits at the last step, and the reference's own."""
+    z0 = np.asarray(gfnn.sample_test_states(scene, num_orbits, jax.random.key(SEED + 2)))
+    reference = np.asarray(gfnn.reference_trajectories(scene, z0, STEPS))
+    states, info = fit.map.rollout(z0, STEPS)
+    error = gfnn.metrics.position_error(np.asarray(states), reference)[:, -1]
+    known = np.isfinite(error)
+    status = np.bincount(np.asarray(info.status), minlength=5)
+    return {
+        "error_median": float(np.median(np.where(known, error, np.inf))),
+        "error_worst": float(np.max(np.where(known, error, np.inf))),
+        "lost": int((~known).sum()),
+        "not_converged": int(status[3]),
+        "reference_error": float(reference_error(scene, z0[:5], STEPS)) if exact_error else None,
+    }
+
+
+def pairs_of(scene, num_pairs: int) -> tuple[gfnn.Pairs, gfnn.Pairs]:
+    """Pairs to learn from, and fresh ones."""
+    key, fresh = jax.random.split(jax.random.key(SEED))
+    return finite(gfnn.sample_pairs(scene, num_pairs, key)), finite(
+        gfnn.sample_pairs(scene, 1_000, fresh)
+    )
+
+
+def pairs_by_flow(hamiltonian: Callable, draw: Callable, num_pairs: int, dt: float, substeps=20):
+    """Pairs and fresh ones of a system that is no scene: twelve Gauss stages in many substeps."""
+    z = draw(np.random.default_rng(SEED), num_pairs + 1_000)
+    width = z.shape[1]
+    flow = Flow(hamiltonian, np.zeros(()), dt, np.ones(width), stages=10, substeps=substeps)
+    image, info = jax.jit(lambda z: flow.step(z))(jnp.asarray(z))
+    good = np.asarray(info.status) == 0
+    z, image = z[good], np.asarray(image)[good]
+    whole = gfnn.Pairs(z, image, dt)
+    return whole.take(slice(1_000, None)), whole.take(slice(1_000))
+
+
+# The rows
+
+
+def henon_heiles(name: str, quick: bool) -> Numbers:
+    """Hénon–Heiles from 100 pairs, told nothing."""
+    scene = gfnn.scenes.make(name)
+    pairs, fresh = pairs_of(scene, 100)
+    fit, found = learned(pairs, fresh, tolerance=1e-13)
+    exact = {"q1²": 0.5, "q2²": 0.5, "p1²": 0.5, "p2²": 0.5, "q1² q2": 1.0, "q2³": -1 / 3}
+    regular = scene.regular and not quick
+    return {
+        **found,
+        "coefficient_error": coefficient_error(fit, exact),
+        **(rolled_out(fit, scene, 20) if regular else {}),
+        **(drift(fit, scene) if regular else {}),
+    }
+
+
+def drift(fit, scene) -> Numbers:
+    """How the energy error of ten orbits grows over a million steps."""
+    z0 = np.asarray(gfnn.sample_test_states(scene, 10, jax.random.key(SEED + 3)))
+    saved = 200
+    states, _ = fit.map.rollout(z0, DRIFT_STEPS, save_every=DRIFT_STEPS // saved)
+    energy = np.asarray(jax.vmap(jax.vmap(scene.invariants["energy"]))(states))
+    error = np.abs(energy - energy[:, :1]).mean(axis=0)[1:]
+    steps = DRIFT_STEPS // saved * np.arange(1, saved + 1)
+    exponent = np.polyfit(np.log(steps), np.log(error), 1)[0]
+    return {"drift_exponent": float(exponent), "energy_error_end": float(error[-1])}
+
+
+def long_step(dt: float, quick: bool) -> Numbers:
+    """Hénon–Heiles at a long step, 400 pairs, by ``auto``."""
+    scene = gfnn.scenes.henon_heiles(1 / 12, dt)
+    pairs, fresh = pairs_of(scene, 400)
+    return learned(pairs, fresh, tolerance=1e-12)[1]
+
+
+def three_bodies(quick: bool) -> Numbers:
+    """Planar restricted three bodies, the scene's features."""
+    scene = gfnn.scenes.make("pcr3bp")
+    pairs, fresh = pairs_of(scene, 1_000)
+    fit, found = learned(pairs, fresh, scene, tolerance=1e-12)
+    return {**found, **rolled_out(fit, scene, ORBITS, exact_error=False)}
+
+
+def cartesian_two_body(quick: bool) -> Numbers:
+    """Two bodies in Cartesian coordinates, 1/r among thirty terms, e up to 0.6."""
+
+    def draw(rng, num):
+        """At the pericentre of orbits of semi-major axis 1, turned by any angle, both senses."""
+        e, angle, phase = rng.uniform(0, 0.6, num), *rng.uniform(0, 2 * np.pi, (2, num))
+        # The eccentric anomaly, so that all of the orbit is seen.
+        r = 1 - e * np.cos(phase)
+        b = np.sqrt(1 - e**2)
+        x = np.stack([np.cos(phase) - e, b * np.sin(phase)])
+        v = np.stack([-np.sin(phase) / r, b * np.cos(phase) / r])
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        return np.concatenate([np.einsum("ijn,jn->in", turn, y) for y in (x, v)]).T
+
+    def hamiltonian(_, z):
+        return 0.5 * (z[2] ** 2 + z[3] ** 2) - 1 / jnp.sqrt(z[0] ** 2 + z[1] ** 2)
+
+    pairs, fresh = pairs_by_flow(hamiltonian, draw, 500, 0.1)
+    fit, found = learned(pairs, fresh, tolerance=1e-13, terms=["1/sqrt(q1**2 + q2**2)"])
+    exact = {"1/sqrt(q1**2 + q2**2)": -1.0, "p1²": 0.5, "p2²": 0.5}
+    return {**found, "coefficient_error": coefficient_error(fit, exact)}
+
+
+def double_pendulum(dt: float, terms: Sequence[str], quick: bool) -> Numbers:
+    """Two equal rods and masses; the angles cover their circles."""
+
+    def hamiltonian(_, z):
+        q1, q2, p1, p2 = z[0], z[1], z[2], z[3]
+        c = jnp.cos(q1 - q2)
+        kinetic = (p1**2 + 2 * p2**2 - 2 * p1 * p2 * c) / (2 * (1 + jnp.sin(q1 - q2) ** 2))
+        return kinetic - 2 * jnp.cos(q1) - jnp.cos(q2)
+
+    def draw(rng, num):
+        angles, momenta = rng.uniform(-np.pi, np.pi, (num, 2)), rng.uniform(-1, 1, (num, 2))
+        return np.concatenate([angles, momenta], axis=1)
+
+    pairs, fresh = pairs_by_flow(hamiltonian, draw, 5_000, dt)
+    learn = {"learn": "hamiltonian", "terms": terms} if terms else {"learn": "auto"}
+    return learned(pairs, fresh, angles=(0, 1), tolerance=1e-12 if terms else 1e-6, **learn)[1]
+
+
+def derivative_matching(name: str, quick: bool) -> Numbers:
+    """H from finite differences of the same pairs: J∇H(½(z₀ + z₁)) = (z₁ − z₀)/dt, least squares
+    over the same eighteen terms. Its flow is judged as the others are."""
+    scene = gfnn.scenes.make(name)
+    pairs, fresh = pairs_of(scene, 100)
+    family = polynomial_terms(2, 3)
+    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
+    gradients = family.term_gradients(0.5 * (z0 + z1))
+    target = -apply_j(z1 - z0) / pairs.dt
+    design = gradients.reshape(-1, family.num_parameters)
+    c = np.linalg.lstsq(design, target.ravel(), rcond=None)[0]
+    flow = Flow(family, c, pairs.dt, np.ones(4), stages=8)
+    error = np.asarray(flow.step(jnp.asarray(fresh.z0))[0]) - np.asarray(fresh.z1)
+    exact = dict.fromkeys(family.term_names, 0.0)
+    exact |= {"q1²": 0.5, "q2²": 0.5, "p1²": 0.5, "p2²": 0.5, "q1² q2": 1.0, "q2³": -1 / 3}
+    off = [abs(v - exact[n]) for n, v in zip(family.term_names, c, strict=True)]
+    return {
+        "pairs": len(pairs), "chosen": "derivative matching", "num_terms": len(c),
+        "one_step_rms": float(np.sqrt(np.mean(error**2))), "coefficient_error": max(off),
+    }  # fmt: skip
+
+
+PIECES = {
+    "henon-heiles-regular": partial(henon_heiles, "henon-heiles-regular"),
+    "henon-heiles-chaotic": partial(henon_heiles, "henon-heiles-chaotic"),
+    "henon-heiles-derivatives": partial(derivative_matching, "henon-heiles-regular"),
+    **{f"henon-heiles-dt-{dt:g}": partial(long_step, dt) for dt in (1.0, 2.0, 3.0, 4.0)},
+    "three-bodies": three_bodies,
+    "two-body-cartesian": cartesian_two_body,
+    **{
+        f"double-pendulum-{dt:g}{'-term' if terms else ''}": partial(double_pendulum, dt, terms)
+        for dt in (0.05, 0.2)
+        for terms in ((), RATIONAL)
+    },
+}  # fmt: skip
+
+
+def tables() -> None:
+    """The table of RESULTS.md."""
+    heads = (
+        "system", "pairs", "chosen", "terms", "one-step RMS", "coefficients", "step 1,000",
+        "lost", "fit, s", "µs a step", "defect",
+    )  # fmt: skip
+    rows = []
+    for name, result in results(PIECES, "laws").items():
+        m = result["measured"]
+        rows.append([
+            name, number(m["pairs"]), m["chosen"], number(m.get("num_terms")),
+            *(number(m.get(key)) for key in (
+                "one_step_rms", "coefficient_error", "error_median", "lost", "fit_seconds",
+                "microseconds_per_step", "symplecticity_defect",
+            )),
+        ])  # fmt: skip
+    between_markers(TABLES, "laws", markdown(heads, rows))
+
+
+if __name__ == "__main__":
+    quick = ("henon-heiles-regular", "henon-heiles-dt-1")
+    main(__doc__ or "", PIECES, "laws", tables, None, quick)
