@@ -41,6 +41,7 @@ from gfnn_jax.learn.diagnose import (
     volume_change,
 )
 from gfnn_jax.learn.held_out import first_occurrences, split_rows
+from gfnn_jax.learn.noise import state_noise
 from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.search import Entry, Found, search
 from gfnn_jax.learn.sweeps import NetworkSweep, sweeps_for
@@ -55,6 +56,7 @@ _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 _RESIDUAL_PAIRS = 2_000  # whose residuals are looked at
+_NOISE_PAIRS = 1_024  # from which the noise of the states is measured
 
 
 @dataclasses.dataclass(frozen=True)
@@ -354,23 +356,21 @@ def _what_is_left(
         ]
     if not stalled:
         return None, []
-    # Noise of both states enters the difference: σ √2 for a map near the identity. The fit averages
-    # it over the rows that each coefficient has.
-    noise = chosen.deviations / np.sqrt(2.0)
-    implied = np.sqrt(2.0 * chosen.num_parameters / (judges.training.size * 2 * prepared.dim))
-    messages = [
-        "larger models are no more accurate: the pairs seem to carry noise of about "
-        f"{', '.join(f'{sigma:.1e}' for sigma in noise)} on the coordinates in their order "
-        f"(the map's own error is then about {implied:.1g} of it), or a structure that these "
-        "functions cannot represent"
-    ]
     change, error = volume_change(prepared.y0[rows], residual)
     if abs(change) > _CERTAIN * error:
-        messages.append(
+        return None, [
             f"what is left over is no noise: phase-space volumes change by {change:.2g} "
             f"(± {error:.1g}) of themselves in a step, as by friction: no symplectic map does"
-        )
-    return noise, messages
+        ]
+    # The fit averages the noise over the rows that each coefficient has.
+    taken = chosen.num_parameters / (judges.training.size * 2 * prepared.dim)
+    noise = state_noise(chosen.map, judges.pairs.take(rows[:_NOISE_PAIRS]), taken)
+    return noise, [
+        "larger models are no more accurate: the pairs seem to carry noise of about "
+        f"{', '.join(f'{sigma:.1e}' for sigma in noise)} on the coordinates in their order "
+        f"(the map's own error is then about {np.sqrt(2 * taken):.1g} of it), or a structure that "
+        "these functions cannot represent"
+    ]
 
 
 def not_met(chosen: Candidate, tolerance: Tolerance, ended: str) -> str:
