@@ -19,7 +19,7 @@ def long_ones_slow(name):
 
 
 @pytest.mark.usefixtures("as_a_user")
-@pytest.mark.parametrize("name", map(long_ones_slow, benchmark.CASES))
+@pytest.mark.parametrize("name", [long_ones_slow(name) for name in benchmark.CASES])
 def test_what_is_said_is_true(name):
     measured = benchmark.measure(name)
     assert measured["wrong"] == [], measured["messages"]

@@ -25,6 +25,7 @@ from gfnn_jax.learn.check import (
     check_number,
     check_request,
     coarse_tolerance,
+    not_radians,
     unlike_the_scene,
 )
 from gfnn_jax.learn.choose_charts import Charts, choose_charts
@@ -43,7 +44,7 @@ from gfnn_jax.learn.diagnose import (
 from gfnn_jax.learn.held_out import first_occurrences, split_rows
 from gfnn_jax.learn.noise import state_noise
 from gfnn_jax.learn.prepare import Prepared, prepare
-from gfnn_jax.learn.search import Entry, Found, search
+from gfnn_jax.learn.search import AS_FAR, Entry, Found, search
 from gfnn_jax.learn.sweeps import NetworkSweep, sweeps_for
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, require_x64
@@ -201,9 +202,13 @@ def fit(
     chosen, entry, compile_seconds = _assembled(found, prepared, judges, clock, on_progress)
     noise = None
     if chosen.validation_bound > bound.bound:
-        warn([not_met(chosen, bound, found.ended)])
+        warn([*not_radians(pairs, coordinates), not_met(chosen, bound, found.ended)])
     if chosen.validation_bound > bound.bound and chosen.validation_relative > _ROUNDOFF:
-        stalled = (chosen.chart, chosen.family) in found.stalled
+        stalled = any(  # the chosen sweep, or another that has come as far
+            (e.candidate.chart, e.candidate.family) in found.stalled
+            and e.candidate.validation_relative <= AS_FAR * chosen.validation_relative
+            for e in found.entries
+        )
         noise, new = _what_is_left(chosen, entry, prepared, judges, stalled)
         warn(new)
     entries = [e for e in found.entries if e.size is not entry.size]

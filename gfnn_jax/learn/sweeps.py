@@ -88,9 +88,12 @@ class LinearSweep:
         else:
             signs = variable_signs(inputs, reversor, w) if reversor is not None else None
             groups = ((Products(inputs, degree, signs) for degree in g) for g in _DEGREES)
+        known = len(_SINES) if kind == "sines" else sum(map(len, _DEGREES))
         self.sizes = [
             Size(family, group[-1]) for group in _determined(groups, w.size) for family in group
         ]
+        # Else the last size is the largest there is, or the most terms are reached.
+        self.short_of_pairs = len(self.sizes) < known and w.size < _ROWS_PER_TERM * _MOST_TERMS
         self._factors: dict[Any, tuple] = {}
 
     def judge(self, size: Size, clock: Clock, say: Callable[[str], Any]) -> Candidate:
@@ -154,6 +157,7 @@ class NetworkSweep:
     """The one size of a network, trained by Levenberg–Marquardt."""
 
     kind = "mlp"
+    short_of_pairs = False  # its one size is trained on any number of pairs
 
     def __init__(self, prepared, chart, judges: Judges, max_iterations, seed, checkpoints):
         self.prepared, self.chart, self.judges = prepared, chart, judges
