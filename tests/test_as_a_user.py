@@ -9,8 +9,10 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import as_a_user as benchmark
 
-LONG = {"satellite", "penning-linear", "penning-quartic", "double-pendulum", "fput-4", "fput-8",
-        "noisy-file", "interleaved"}  # fmt: skip
+LONG = {
+    "satellite", "satellite-any-height", "penning-linear", "penning-quartic", "double-pendulum",
+    "fput-4", "fput-8", "noisy-file", "interleaved",
+}  # fmt: skip
 
 
 def long_ones_slow(name):

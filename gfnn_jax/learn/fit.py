@@ -367,14 +367,14 @@ def _what_is_left(
             f"what is left over is no noise: phase-space volumes change by {change:.2g} "
             f"(± {error:.1g}) of themselves in a step, as by friction: no symplectic map does"
         ]
-    # The fit averages the noise over the rows that each coefficient has.
     taken = chosen.num_parameters / (judges.training.size * 2 * prepared.dim)
     noise = state_noise(chosen.map, judges.pairs.take(rows[:_NOISE_PAIRS]), taken)
+    own = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))
     return noise, [
         "larger models are no more accurate: the pairs seem to carry noise of about "
         f"{', '.join(f'{sigma:.1e}' for sigma in noise)} on the coordinates in their order "
-        f"(the map's own error is then about {np.sqrt(2 * taken):.1g} of it), or a structure that "
-        "these functions cannot represent"
+        f"(the map's own error is then about {own:.1g} of it), or a structure that these "
+        "functions cannot represent"
     ]
 
 

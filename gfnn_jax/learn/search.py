@@ -197,9 +197,7 @@ def _stalled_sweeps(entries: list[Entry]) -> set[tuple[str, str]]:
     return found
 
 
-def _why(
-    sweeps: Sequence[Any], left: set[int], stalled: list[int], best: Sequence[float]
-) -> str:
+def _why(sweeps: Sequence[Any], left: set[int], stalled: list[int], best: Sequence[float]) -> str:
     """Why a search that met nothing ended before its time. Sweeps far from the best one's error
     tell nothing."""
     good = [i for i, s in enumerate(sweeps) if s.sizes and best[i] <= AS_FAR * min(best)]

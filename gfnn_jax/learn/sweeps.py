@@ -32,6 +32,8 @@ _MOST_OPERATIONS = 1.2e11
 _OPERATIONS_PER_SECOND = 1e10  # of a factorisation on one thread, for the estimate that is told
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
 _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
+# Pairs of a block that goes to one of two halves: long beside the noise that neighbours share.
+_HALVES_BLOCK = 50
 _CHECKPOINT_SECONDS = 10.0
 
 
@@ -124,6 +126,24 @@ class LinearSweep:
         train, held = self._factor(size.group, clock, say)
         solved = least_squares.solve(train, held, size.family.num_parameters)
         return solved, size.family.unflatten(solved.coefficients)
+
+    def own_error(self, size: Size) -> float:
+        """What noise leaves wrong in the size's ∇S, in the measure of train_rms: half of the
+        difference between the fits to either half of the training pairs, blocks in time."""
+        half = self.judges.training // _HALVES_BLOCK % 2
+        train, held = self._factor(size.group, Clock(), lambda message: None)
+        count = size.family.num_parameters
+        one, other = (
+            least_squares.solve(
+                least_squares.reduce(
+                    size.family, [tuple(a[half == i] for a in self._train)], self._weight
+                ),
+                held, count,
+            ).coefficients
+            for i in (0, 1)
+        )  # fmt: skip
+        missed = np.linalg.norm(train.factor[:count, :count] @ (one - other))
+        return float(missed) / (2 * np.sqrt(train.rows))
 
     def _factor(self, group, clock: Clock, say) -> tuple:
         if group not in self._factors:
