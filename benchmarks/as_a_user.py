@@ -341,7 +341,8 @@ def interleaved() -> Case:
 def recorded(law: Field, half: Sequence[float], sigma: float) -> np.ndarray:
     """Forty sequences (40, 51, 2d) with noise on every state."""
     states = sequences(law, box(half)(40, 1), 0.2, 50)
-    return states + sigma * np.random.default_rng([SEED, 4]).normal(size=states.shape)
+    rng = np.random.default_rng([SEED, 4, round(-np.log10(sigma))])
+    return states + sigma * rng.normal(size=states.shape)
 
 
 def noisy(law: Field, half: Sequence[float], sigma: float) -> Case:
@@ -413,7 +414,8 @@ def by_command(case: Case) -> Learned:
         report = json.loads((model / "report.json").read_text(encoding="utf-8"))
         map_ = gfnn.load(model)
     fit, chosen = report["fit"], report["model"]
-    said = [line for line in done.stderr.splitlines() if "warning" in line]
+    before, lines = "gfnn: warning: ", done.stderr.splitlines()
+    said = [line.removeprefix(before) for line in lines if line.startswith(before)]
     return Learned(
         map_, seconds, said, fit["ended"], f"{chosen['chart']} {chosen['label']}",
         fit["validation_relative"], fit["validation_bound"], fit["tolerance_met"],
@@ -506,15 +508,16 @@ def measure(name: str) -> Numbers:
 
 def table(measured: Numbers) -> str:
     """Markdown: a line per case."""
-    heads = ["case", "pairs", "seconds", "chosen", "claimed", "true error", "met", "what was said",
-             "truthful"]  # fmt: skip
+    heads = ["case", "pairs", "seconds", "chosen", "claimed", "true error", "met",
+             "noise measured ÷ true", "what was said", "truthful"]  # fmt: skip
     rows = []
     for name, m in measured.items():
         said = "; ".join([*(message.split(":")[0] for message in m["messages"]), m["ended"]])
         truthful = "yes" if m["truthful"] else f"**no**: {'; '.join(m['wrong'])}"
+        noise = ", ".join(f"{ratio:.2f}" for ratio in m["noise_ratio"] or ()) or "–"
         rows.append([name, number(m["pairs"]), number(m["seconds"]), m["model"],
                      number(m["claimed"]), number(m["true_error"]), "yes" if m["met"] else "no",
-                     said, truthful])  # fmt: skip
+                     noise, said, truthful])  # fmt: skip
     return markdown(heads, rows)
 
 

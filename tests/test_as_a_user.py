@@ -32,11 +32,13 @@ def test_the_quick_cases_write_their_result(tmp_path, monkeypatch):
     benchmark.main(["--quick", "--out", str(tmp_path)])
     found = benchmark.read({"": tmp_path / "as-a-user.json"})[""]
     assert list(found["measured"]) == [n for n in benchmark.CASES if n in benchmark.QUICK]
-    assert "| friction | 9 |" in benchmark.table(found["measured"])
+    table = benchmark.table(found["measured"])
+    assert "| friction | 9 | 1 |" in table
+    assert "| 1.00, 1.04 |" in table
 
 
 MEASURED = {
     "seconds": 1.0, "pairs": 9, "model": "midpoint polynomial 2", "claimed": 1e-7,
-    "true_error": 1e-7, "met": True, "messages": [], "ended": "the tolerance is met",
-    "truthful": False, "wrong": ["met"],
+    "true_error": 1e-7, "met": True, "messages": [], "noise_ratio": [1.0, 1.04],
+    "ended": "the tolerance is met", "truthful": False, "wrong": ["met"],
 }  # fmt: skip
