@@ -23,6 +23,7 @@ class Sweep:
 
     def __init__(self, sizes, family="polynomial", chart="midpoint", most=np.inf):
         self.sizes = [Size(float(s[0]), s[1], s[-1]) for s in sizes]
+        self.short_of_pairs = True
         self.family, self.chart, self.most = family, chart, most
         self.judged, self.validated = [], []
 
@@ -129,6 +130,8 @@ def test_where_nothing_meets_the_tolerance_the_few_best_are_validated():
     assert sorted(sweep.validated) == [160, 320, 640]
     assert order(found) == [640, 320, 160]
     assert "more pairs would help" in found.ended
+    sweep.short_of_pairs = False
+    assert "no larger model to try" in found_in(sweep, bound=1e-20).ended
     assert len(found.entries) == 6
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.generating.charts import CHARTS
@@ -110,4 +111,19 @@ def coarse_tolerance(pairs: Pairs, tolerance: Tolerance) -> list[str]:
     return [
         f"a step moves the states by {size:.1e}{unit}: a tolerance of {tolerance.bound:g} is more "
         "than a hundredth of that, and met by maps that know little of the motion"
+    ]
+
+
+def not_radians(pairs: Pairs, coordinates: Coordinates) -> list[str]:
+    """Warnings where what is declared an angle hardly is one: it runs over more than two turns, and
+    moves by more than half a turn in a step. For fits that came out badly."""
+    if coordinates.forward is not CARTESIAN.forward:
+        return []
+    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
+    range_, move = np.ptp(z0, axis=0), np.abs(z1 - z0).max(axis=0)
+    return [
+        f"coordinate {a}, given as an angle, runs over {range_[a]:.3g} and moves by up to "
+        f"{move[a]:.3g} in a step: an angle has period 2π (radians); are these degrees?"
+        for a in coordinates.angles
+        if range_[a] > 2 * TWO_PI and move[a] > np.pi
     ]

@@ -6,13 +6,15 @@ Neighbours also tell which pairs are outliers, and the residuals of a fit whethe
 
 from __future__ import annotations
 
+import math
+from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.generating.charts import AnyChart
-from gfnn_jax.phase_space import symplecticity_defect
+from gfnn_jax.phase_space import sizes, symplecticity_defect
 
 _CENTRES = 400
 # Neighbours per unknown of a local fit: enough to average noise, few enough to stay local.
@@ -37,6 +39,8 @@ _THIN = 0.05
 # What an affine fit within sequences may leave of a residual that agrees within them; neighbours
 # among which the nearest one of another sequence is sought.
 _EXPLAINED, _SEQUENCE_NEIGHBOURS = 0.25, 50
+# A cubic law is fitted where there are so many pairs for each of its terms.
+_PAIRS_PER_TERM = 10
 # A determinant this far from zero is safe; below the lower figure the chart folds inside the data.
 SAFE, SINGULAR = 0.2, 0.03
 
@@ -204,16 +208,34 @@ def volume_change(z, residual) -> tuple[float, float]:
 
     z, residual: (N, 2d), states and Z − Z_predicted. The residual of a symplectic map is noise or
     has no divergence; friction is linear in z to first order, and its trace is the rate at which
-    volumes shrink. (0, inf) where a linear law explains less than half of the residual.
+    volumes shrink. The fit takes up a part of it, by a field without divergence that is not linear:
+    the divergence is the mean of a cubic law's over the states, or a linear law's where the pairs
+    are few. (0, inf) where the law explains less than half of the residual.
     """
-    z, residual = np.asarray(z), np.asarray(residual)
-    design = np.column_stack([np.ones(len(z)), (z - z.mean(axis=0))])
-    solution = np.linalg.lstsq(design, residual, rcond=None)[0]
-    rest = residual - design @ solution
+    z, residual, width = np.asarray(z), np.asarray(residual), np.shape(z)[1]
+    size = sizes(z)
+    x = (z - z.mean(axis=0)) / size
+    few = len(z) < _PAIRS_PER_TERM * math.comb(width + 3, 3)
+    degrees = range(2 if few else 4)
+    terms = [t for k in degrees for t in combinations_with_replacement(range(width), k)]
+    powers = np.array([[term.count(i) for i in range(width)] for term in terms])
+
+    def monomials(exponents):
+        return np.prod(x[:, None, :] ** exponents[None, :, :], axis=2)
+
+    design = monomials(powers)
+    coefficients = np.linalg.lstsq(design, residual, rcond=None)[0]
+    rest = residual - design @ coefficients
     if np.mean(rest**2) > 0.5 * np.mean(residual**2):
         return 0.0, np.inf
-    variance = np.linalg.pinv(design.T @ design).diagonal()[1:] * rest.var(axis=0)
-    return float(np.trace(solution[1:])), float(np.sqrt(variance.sum()))
+    covariance = np.linalg.pinv(design.T @ design)
+    change, variance = 0.0, 0.0
+    for i, unit in enumerate(np.eye(width, dtype=int)):
+        lowered = monomials(np.maximum(powers - unit, 0))
+        slope = powers[:, i] * lowered.mean(axis=0) / size[i]  # of each term, in direction i
+        change += slope @ coefficients[:, i]
+        variance += slope @ covariance @ slope * rest[:, i].var()
+    return float(change), float(np.sqrt(variance))
 
 
 def sampled_dimension(y, scale) -> int:

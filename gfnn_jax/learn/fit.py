@@ -25,6 +25,7 @@ from gfnn_jax.learn.check import (
     check_number,
     check_request,
     coarse_tolerance,
+    not_radians,
     unlike_the_scene,
 )
 from gfnn_jax.learn.choose_charts import Charts, choose_charts
@@ -44,8 +45,9 @@ from gfnn_jax.learn.diagnose import (
 from gfnn_jax.learn.flows import LearnedHamiltonian
 from gfnn_jax.learn.flows import assembled as flow_assembled
 from gfnn_jax.learn.held_out import first_occurrences, split_rows
+from gfnn_jax.learn.noise import state_noise
 from gfnn_jax.learn.prepare import Prepared, prepare
-from gfnn_jax.learn.search import Entry, Found, search
+from gfnn_jax.learn.search import AS_FAR, Entry, Found, search
 from gfnn_jax.learn.sweeps import NetworkSweep, sweeps_for
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, require_x64
@@ -58,6 +60,7 @@ _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 _RESIDUAL_PAIRS = 2_000  # whose residuals are looked at
+_NOISE_PAIRS = 1_024  # from which the noise of the states is measured
 
 
 @dataclasses.dataclass(frozen=True)
@@ -234,12 +237,17 @@ def fit(
     chosen, entry, compile_seconds = choice
     noise = None
     if chosen.validation_bound > bound.bound:
-        warn([not_met(chosen, bound, found.ended)])
+        warn([*not_radians(pairs, coordinates), not_met(chosen, bound, found.ended)])
         warn(list(law.messages) if entry is None and law is not None else [])
+    looked_at = entry or (found.ranking[0] if found.ranking else None)
     left_over = chosen.validation_bound > bound.bound and chosen.validation_relative > _ROUNDOFF
-    if left_over and entry is not None:
-        stalled = (chosen.chart, chosen.family) in found.stalled
-        noise, new = _what_is_left(chosen, entry, prepared, judges, stalled)
+    if left_over and looked_at is not None:
+        stalled = any(  # the chosen sweep, or another that has come as far
+            (e.candidate.chart, e.candidate.family) in found.stalled
+            and e.candidate.validation_relative <= AS_FAR * chosen.validation_relative
+            for e in found.entries
+        )
+        noise, new = _what_is_left(chosen, looked_at, prepared, judges, stalled)
         warn(new)
     others = [e.candidate for e in found.entries if entry is None or e.size is not entry.size]
     if law is not None and entry is not None:
@@ -409,7 +417,10 @@ def _what_is_left(
     chosen: Candidate, entry: Entry, prepared: Prepared, judges: Judges, stalled: bool
 ) -> tuple[np.ndarray | None, list[str]]:
     """The noise (2d,) that the residuals suggest, where larger models no longer helped, and what is
-    said of the residuals: noise, friction, or a parameter that differs between sequences."""
+    said of the residuals: noise, friction, or a parameter that differs between sequences.
+
+    entry: of the best map, whose residuals are looked at.
+    """
     rows = np.sort(judges.training)[:_RESIDUAL_PAIRS]
     _, params = entry.sweep.solve(entry.size, Clock(), lambda message: None)
     images, solved = refined_images(prepared, entry.sweep.chart, entry.size.family, params, rows)
@@ -424,23 +435,23 @@ def _what_is_left(
         ]
     if not stalled:
         return None, []
-    # Noise of both states enters the difference: σ √2 for a map near the identity. The fit averages
-    # it over the rows that each coefficient has.
-    noise = chosen.deviations / np.sqrt(2.0)
-    implied = np.sqrt(2.0 * chosen.num_parameters / (judges.training.size * 2 * prepared.dim))
-    messages = [
-        "larger models are no more accurate: the pairs seem to carry noise of about "
-        f"{', '.join(f'{sigma:.1e}' for sigma in noise)} on the coordinates in their order "
-        f"(the map's own error is then about {implied:.1g} of it), or a structure that these "
-        "functions cannot represent"
-    ]
     change, error = volume_change(prepared.y0[rows], residual)
     if abs(change) > _CERTAIN * error:
-        messages.append(
+        return None, [
             f"what is left over is no noise: phase-space volumes change by {change:.2g} "
             f"(± {error:.1g}) of themselves in a step, as by friction: no symplectic map does"
-        )
-    return noise, messages
+        ]
+    taken = chosen.num_parameters / (judges.training.size * 2 * prepared.dim)
+    noise = state_noise(chosen.map, judges.pairs.take(rows[:_NOISE_PAIRS]), taken)
+    own = ""
+    if chosen.learns == "map":
+        part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))
+        own = f" (the map's own error is then about {part:.1g} of it)"
+    return noise, [
+        "larger models are no more accurate: the pairs seem to carry noise of about "
+        f"{', '.join(f'{sigma:.1e}' for sigma in noise)} on the coordinates in their order{own}, "
+        "or a structure that these functions cannot represent"
+    ]
 
 
 def not_met(chosen: Candidate, tolerance: Tolerance, ended: str) -> str:

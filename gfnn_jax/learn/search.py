@@ -27,6 +27,8 @@ _FINALISTS = 3  # that are validated where none meets the tolerance
 # estimate times the ratio is within the second.
 _CALIBRATED, _HOPEFUL = 1e3, 1.3
 _NO_WORSE = 1.03  # an error larger by this factor is as good, if the map is cheaper
+# A sweep whose error is within this factor of the best one's has come as far.
+AS_FAR = 1.25
 _KEPT = 0.1  # of the last kept map's error: a map so much better is kept in its stead
 
 
@@ -59,7 +61,8 @@ def search(
     dearest: float = np.inf,
 ) -> Found:
     """Climb the sweeps. A sweep has ``sizes`` with ``operations`` by rising order, and
-    ``judge(size, clock, say)`` and ``validate(size, judged, clock, say)``, which give candidates.
+    ``judge(size, clock, say)`` and ``validate(size, judged, clock, say)``, which give candidates,
+    and ``short_of_pairs``: whether more pairs would allow larger sizes.
 
     bound: the tolerance on a candidate's ``validation_bound``. tell: called with every candidate.
     on_validated: called with every entry whose steps have been looked at. dearest: operations from
@@ -110,7 +113,7 @@ def search(
     if np.isfinite(cheapest):
         ended = "the tolerance is met"
     elif not ended:
-        ended = _why(sweeps, left, stalled)
+        ended = _why(sweeps, left, stalled, best)
     return Found(entries, _ranking(entries, bound), _stalled_sweeps(entries), ended)
 
 
@@ -196,10 +199,14 @@ def _stalled_sweeps(entries: list[Entry]) -> set[tuple[str, str]]:
     return found
 
 
-def _why(sweeps: Sequence[Any], left: set[int], stalled: list[int]) -> str:
-    """Why a search that met nothing ended before its time."""
-    if any(stalled[i] == _STALLED for i in left):
+def _why(sweeps: Sequence[Any], left: set[int], stalled: list[int], best: Sequence[float]) -> str:
+    """Why a search that met nothing ended before its time. Sweeps far from the best one's error
+    tell nothing."""
+    good = [i for i, s in enumerate(sweeps) if s.sizes and best[i] <= AS_FAR * min(best)]
+    if any(i in left and stalled[i] == _STALLED for i in good):
         return "larger models are no more accurate: noise, or a structure they cannot represent"
-    if any(sweep.sizes for sweep in sweeps):
+    if any(sweeps[i].short_of_pairs for i in good):
         return "the pairs determine no larger model: more pairs would help"
+    if good:
+        return "there is no larger model to try: a smaller dt or region of states would help"
     return "the pairs determine no model at all"

@@ -33,6 +33,8 @@ _WORTH_KEEPING = 1.0  # seconds
 _OPERATIONS_PER_SECOND = 1e10  # of a factorisation on one thread, for the estimate that is told
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
 _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
+# Pairs of a block that goes to one of two halves: long beside the noise that neighbours share.
+_HALVES_BLOCK = 50
 _CHECKPOINT_SECONDS = 10.0
 
 
@@ -96,9 +98,12 @@ class LinearSweep:
         else:
             signs = variable_signs(inputs, reversor, w) if reversor is not None else None
             groups = ((Products(inputs, degree, signs) for degree in g) for g in _DEGREES)
+        known = len(_SINES) if kind == "sines" else sum(map(len, _DEGREES))
         self.sizes = [
             Size(family, group[-1]) for group in _determined(groups, w.size) for family in group
         ]
+        # Else the last size is the largest there is, or the most terms are reached.
+        self.short_of_pairs = len(self.sizes) < known and w.size < _ROWS_PER_TERM * _MOST_TERMS
         self._factors: dict[Any, tuple] = {}
 
     def judge(self, size: Size, clock: Clock, say: Callable[[str], Any]) -> Candidate:
@@ -129,6 +134,24 @@ class LinearSweep:
         train, held = self._factor(size.group, clock, say)
         solved = least_squares.solve(train, held, size.family.num_parameters)
         return solved, size.family.unflatten(solved.coefficients)
+
+    def own_error(self, size: Size) -> float:
+        """What noise leaves wrong in the size's ∇S, in the measure of train_rms: half of the
+        difference between the fits to either half of the training pairs, blocks in time."""
+        half = self.judges.training // _HALVES_BLOCK % 2
+        train, held = self._factor(size.group, Clock(), lambda message: None)
+        count = size.family.num_parameters
+        one, other = (
+            least_squares.solve(
+                least_squares.reduce(
+                    size.family, [tuple(a[half == i] for a in self._train)], self._weight
+                ),
+                held, count,
+            ).coefficients
+            for i in (0, 1)
+        )  # fmt: skip
+        missed = np.linalg.norm(train.factor[:count, :count] @ (one - other))
+        return float(missed) / (2 * np.sqrt(train.rows))
 
     def _factor(self, group, clock: Clock, say) -> tuple:
         if group not in self._factors:
@@ -184,6 +207,7 @@ class NetworkSweep:
     """The one size of a network, trained by Levenberg–Marquardt."""
 
     kind = "mlp"
+    short_of_pairs = False  # its one size is trained on any number of pairs
 
     def __init__(self, prepared, chart, judges: Judges, max_iterations, seed, checkpoints):
         self.prepared, self.chart, self.judges = prepared, chart, judges

@@ -1,0 +1,46 @@
+"""The noise of the states from the residuals of a map that is known exactly."""
+
+import numpy as np
+import pytest
+from analytic import exact_oscillator, generated, map_of, oscillator, rotated
+
+import gfnn_jax as gfnn
+from gfnn_jax.generating.charts import MIDPOINT
+from gfnn_jax.learn.noise import state_noise
+
+
+def noisy_turns(angle, sigma, num_steps):
+    """1,000 pairs of the oscillator's map and the map, errors of sigma (2,) on all states."""
+    rng = np.random.default_rng(0)
+    states = [rng.normal(size=(1_000 // num_steps, 2))]
+    for _ in range(num_steps):
+        states.append(rotated(states[-1], angle))
+    states = np.stack(states, axis=1)
+    states += sigma * rng.normal(size=states.shape)
+    z0, z1 = states[:, :-1].reshape(-1, 2), states[:, 1:].reshape(-1, 2)
+    piece = generated(oscillator, exact_oscillator(angle), MIDPOINT, angle)
+    return map_of(piece, z0), gfnn.Pairs(z0, z1, angle)
+
+
+@pytest.mark.parametrize("num_steps", [1, 50])
+@pytest.mark.parametrize("sigma", [(1e-3, 1e-3), (1e-6, 3e-6), (3e-2, 1e-2)])
+@pytest.mark.parametrize("angle", [0.1, 1.0])
+def test_noise_is_measured_per_coordinate(angle, sigma, num_steps):
+    noise = state_noise(*noisy_turns(angle, np.array(sigma), num_steps), taken=0.0)
+    np.testing.assert_allclose(noise, sigma, rtol=0.2)
+
+
+def test_a_quarter_turn_of_single_pairs_tells_the_sum_alone():
+    """q and p change places: each is given half, though all of it is in q."""
+    sigma = np.array([1e-3, 0.0])
+    noise = state_noise(*noisy_turns(np.pi / 2, sigma, 1), taken=0.0)
+    np.testing.assert_allclose(noise, np.sqrt(np.mean(sigma**2)), rtol=0.1)
+    shared = state_noise(*noisy_turns(np.pi / 2, sigma, 50), taken=0.0)
+    assert shared[0] == pytest.approx(1e-3, rel=0.1)
+    assert shared[1] < 1e-4
+
+
+def test_coefficients_take_a_part_of_the_noise():
+    map_, pairs = noisy_turns(0.1, np.array([1e-3, 1e-3]), 1)
+    ratio = state_noise(map_, pairs, taken=0.36) / state_noise(map_, pairs, taken=0.0)
+    np.testing.assert_allclose(ratio, 1.25)
