@@ -297,7 +297,7 @@ def test_an_absolute_tolerance_is_in_the_users_units(pendulum_fit):
     unit = np.array([1e3, 1e3])
     pairs = pendulum_pairs()
     pairs = gfnn.Pairs(pairs.z0 * unit, pairs.z1 * unit, pairs.dt)
-    fit = quiet_fit(pairs, absolute_tolerance=1e-4)
+    fit = quiet_fit(pairs, absolute_tolerance=1e-4, learn="map")
     assert fit.met
     assert fit.tolerance == 1e-4
     z = disc(200, seed=3)
@@ -309,7 +309,8 @@ def test_units_do_not_matter(pendulum_fit):
     """q, p and time in other units, each in its own: the same functions give the same map, and the
     same states are outside the domain."""
     pairs, unit = pendulum_pairs(), np.array([[3e3, 7e-2]])
-    other = quiet_fit(gfnn.Pairs(pairs.z0 * unit, pairs.z1 * unit, 60.0 * pairs.dt), tolerance=1e-7)
+    pairs = gfnn.Pairs(pairs.z0 * unit, pairs.z1 * unit, 60.0 * pairs.dt)
+    other = quiet_fit(pairs, tolerance=1e-7, learn="map")
     assert other.chosen.label == pendulum_fit.chosen.label
     assert other.chosen.chart == pendulum_fit.chosen.chart
     z = np.concatenate([disc(150, seed=4), 1.5 * disc(50, seed=5)])
