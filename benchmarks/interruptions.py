@@ -74,7 +74,7 @@ def interrupted(family: str, quick: bool) -> Numbers:
 
 def data_of(folder: Path) -> tuple[Path, np.ndarray]:
     """A file of pairs of Hénon–Heiles, and states to predict from."""
-    pairs = gfnn.sample_pairs(gfnn.scenes.make("henon-heiles-regular"), 4_000, jax.random.key(0))
+    pairs = gfnn.sample_pairs(gfnn.scenes.make("henon-heiles-regular"), 1_000, jax.random.key(0))
     path = folder / "pairs.npz"
     np.savez(path, z0=pairs.z0, z1=pairs.z1, dt=pairs.dt)
     return path, np.asarray(pairs.z0)[:100]
@@ -98,7 +98,7 @@ def stopped(command: Sequence[str], name: str, delay: float) -> Numbers | None:
     _, told = process.communicate()
     return {
         "signal": name, "after_seconds": delay, "obeyed_in_seconds": time.perf_counter() - sent,
-        "exit_status": process.returncode, "told": told.strip().splitlines()[-1:],
+        "exit_status": process.returncode, "told": told.strip().splitlines()[-3:],
     }  # fmt: skip
 
 
