@@ -224,3 +224,8 @@ def test_a_function_may_hold_numbers_and_take_args():
     assert jax.tree.leaves(family) == [3.0]
     gradient = family.gradient(None, W, np.float64(0.5))
     np.testing.assert_allclose(gradient, 6 * W + 0.5 * np.eye(4)[0], rtol=1e-14)
+
+
+def test_no_states_have_no_features():
+    for inputs in (INPUTS["features"], INPUTS["plain"]):
+        assert inputs(np.zeros((0, 4))).shape == (0, inputs.num_variables)

@@ -63,3 +63,13 @@ def test_a_singular_lane_spoils_no_other(n):
     assert not np.isfinite(traced[5]).all()
     assert not abs(sign[5]) > 0
     np.testing.assert_allclose(np.asarray(traced)[others], good[others], rtol=1e-8)
+
+
+def test_a_singular_lane_of_many_is_not_finite_and_spoils_no_other():
+    """Nine unknowns are LAPACK's: NumPy's raises for the whole batch."""
+    matrix = np.random.default_rng(3).normal(size=(3, 9, 9))
+    matrix[1, 4] = matrix[1, 5]
+    x = small_solve(matrix, np.ones((3, 9)))
+    assert np.isnan(x[1]).all()
+    expected = np.linalg.solve(matrix[[0, 2]], np.ones((2, 9, 1)))[..., 0]
+    np.testing.assert_allclose(x[[0, 2]], expected, rtol=1e-10)

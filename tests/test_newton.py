@@ -115,6 +115,20 @@ def test_residual_above_the_floor_by_roundoff_ends_ok_at_once():
     assert info.iterations.max() <= 6
 
 
+def test_a_lane_stops_where_the_determinant_would_change_sign():
+    """det = (1 + 0.1 x)(x − ½) is zero between guess and root, where the residual shows no slope:
+    only its sign tells that the root is on another branch."""
+
+    def beyond(_, theta, x):
+        return jnp.stack([x[0] + 0.05 * x[0] ** 2 - theta, x[1] * (x[0] - 0.5)])
+
+    guess = np.array([[0.0, 0.0], [0.6, 0.0]])
+    x, _, info = solved(PerLane(beyond), np.ones(2), guess)
+    assert info.status.tolist() == [NOT_CONVERGED, OK]
+    assert x[0, 0] < 0.5
+    np.testing.assert_allclose(x[1], [10 * (np.sqrt(1.2) - 1), 0.0], rtol=0, atol=1e-15)
+
+
 @pytest.mark.parametrize("most", [1, 3])
 def test_iterations_never_exceed_their_limit(most):
     x, _, info = solved(SQUARE, np.array([[1e4], [2.0]]), np.array([[1.0], [1.5]]), most)

@@ -359,13 +359,14 @@ def marginal_panels(panels: Mapping, bins: int) -> Figure:
 
 @style()
 def speed_against_error(
-    kilo_operations, errors, labels: Sequence[str], chosen, tolerance=None, ax=None
+    kilo_operations, errors, labels: Sequence[str], chosen, tolerance=None, ax=None, estimated=()
 ) -> Axes:
     """Candidates: one-step error against the counted operations of a predicted step, log–log.
 
     kilo_operations, errors: (K,). The points are numbered by rising cost and named on the right;
     the chosen one is ringed, the staircase joins those that no other beats in both, and the dotted
-    line is the tolerance asked for.
+    line is the tolerance asked for. estimated: indices of errors that no step has measured; their
+    points are hollow.
     """
     ax = _axes(ax, WIDTH * 1.6, HEIGHT * 1.15)
     cost, error = np.asarray(kilo_operations, float), np.asarray(errors, float)
@@ -380,7 +381,11 @@ def speed_against_error(
         lw=1,
         label="best for its cost",
     )
-    ax.plot(cost, error, ls="none", marker="o", color=COLOURS[0], ms=5, label="candidate")
+    about = np.isin(np.arange(len(cost)), estimated)
+    dots = {"ls": "none", "marker": "o", "color": COLOURS[0], "ms": 5}
+    ax.plot(cost[~about], error[~about], **dots, label="candidate")
+    if about.any():
+        ax.plot(cost[about], error[about], **dots, mfc="white", label="candidate, estimated")
     ax.plot(
         cost[chosen],
         error[chosen],

@@ -130,7 +130,8 @@ def feature_tables(features: Callable, w, *, order: int) -> tuple:
         return _feature_tables(features, order, w)
     flat = w.reshape(-1, w.shape[-1])
     size = min(_CHUNK, 2 ** max(6, (len(flat) - 1).bit_length()))
-    padded = np.concatenate([flat, np.broadcast_to(flat[-1:], (-len(flat) % size, w.shape[-1]))])
+    count = max(1, -(-len(flat) // size))
+    padded = np.resize(flat, (count * size, w.shape[-1]))  # repeated, or zeros for none
     blocks = [
         _compiled_tables(features, order, block) for block in padded.reshape(-1, size, w.shape[-1])
     ]

@@ -122,6 +122,7 @@ def _figures(fit: Fit, scene: Scene, measured: Measured, reference) -> dict[str,
         drawn["candidates"] = figures.speed_against_error(
             [c.operations / 1e3 for c in shown], [c.validation_relative for c in shown],
             [_labelled(c) for c in shown], shown.index(fit.chosen), fit.tolerance,
+            estimated=[i for i, c in enumerate(shown) if not c.validated],
         )  # fmt: skip
     if scene.name == "two-body":
         errors = [

@@ -10,6 +10,7 @@ from gfnn_jax.arrays import namespace
 
 # Up to the first size by cofactors, up to the second by unrolled elimination, beyond by LAPACK.
 # A batch of 1,000 systems of size 4: 0.08, 0.14, 0.8 µs each; seconds to compile 0.3, 1.2, 0.7.
+# Of size 8, unrolled: 1.6 µs and 8 s; by LAPACK: 2.6 µs and 0.5 s.
 _COFACTORS_UP_TO, _UNROLL_UP_TO = 4, 8
 
 
@@ -93,4 +94,6 @@ def _by_lapack(matrix, rhs):
     try:
         return namespace(matrix, rhs).linalg.solve(matrix, rhs[..., None])[..., 0]
     except np.linalg.LinAlgError:  # one singular lane: NumPy would answer none
-        return (np.linalg.pinv(matrix) @ rhs[..., None])[..., 0]
+        regular = np.linalg.matrix_rank(matrix) == matrix.shape[-1]
+        x = (np.linalg.pinv(matrix) @ rhs[..., None])[..., 0]
+        return np.where(regular[..., None], x, np.nan)
