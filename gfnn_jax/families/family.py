@@ -180,10 +180,11 @@ def _gradient_and_hessian(family, params, w, args):
 
 @partial(_gradient_and_hessian.defjvp, symbolic_zeros=True)
 def _gradient_and_hessian_jvp(primals, tangents):
-    both, (_, hessian_dot) = _jvp(
+    (gradient, hessian), (_, hessian_dot) = _jvp(
         lambda f, p, w, a: f.gradient_and_hessian(p, w, a), primals, tangents
     )
-    return both, (_gradient_dot(*both, primals, tangents), hessian_dot)
+    gradient_dot = _gradient_dot(gradient, hessian, primals, tangents)
+    return (gradient, hessian), (gradient_dot, hessian_dot)
 
 
 def _gradient_dot(gradient, hessian, primals, tangents):
@@ -222,5 +223,5 @@ def _vanish(tangents) -> bool:
     return all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(tangents))
 
 
-def _instantiated(tangent):
+def _instantiated(tangent: Any) -> Any:
     return jnp.zeros(tangent.shape, tangent.dtype) if isinstance(tangent, SymbolicZero) else tangent

@@ -14,7 +14,7 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
 from gfnn_jax.learn.candidates import Candidate, Judges, refined_images, with_error
 from gfnn_jax.learn.prepare import Prepared
-from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.maps.symplectic_map import Piece, SymplecticMap
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.solve.status import LEFT_DOMAIN
 
@@ -71,11 +71,11 @@ def with_predictor(generated: Generated, prepared: Prepared, rows, features=None
     return dataclasses.replace(generated, predictor=chosen.predictor)
 
 
-def composed(generated: Generated, prepared: Prepared, judges: Judges) -> SymplecticMap:
+def composed(piece: Piece, prepared: Prepared, judges: Judges) -> SymplecticMap:
     """The piece between the halves of the base map, in the scene's coordinates: leaves of JAX."""
     half = prepared.half
     map_ = SymplecticMap(
-        pieces=(generated,) if half is None else (half, generated, half),
+        pieces=(piece,) if half is None else (half, piece, half),
         coordinates=prepared.coordinates,
         domain=prepared.domain,
         scale=sizes(judges.pairs.z0),

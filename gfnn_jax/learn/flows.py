@@ -394,7 +394,7 @@ def formula(terms: Sequence[Term]) -> str:
 
 def assembled(learned: LearnedHamiltonian, prepared: Prepared, judges: Judges) -> Assembled:
     """The candidate's map, its error and its time per step measured by the steps that users run."""
-    map_ = composed(learned.flow, prepared, judges)  # pyright: ignore[reportArgumentType]
+    map_ = composed(learned.flow, prepared, judges)
     steps = stepped(map_, np.asarray(judges.pairs.z0)[judges.held_out])
     states = np.where(steps.failed[:, None], np.nan, steps.images)
     error = judges.error_of(states, prepared.coordinates)
