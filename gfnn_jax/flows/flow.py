@@ -106,7 +106,7 @@ class Flow:
         """H at states z (..., 2d), NumPy or JAX."""
         return self.family.value(self.params, z, args)
 
-    def step(self, z, args=None, *, unrolled: bool = False):
+    def step(self, z, args=None, *, unrolled: bool | int = False):
         """(Z, Info) of the states z (B, 2d), by JAX."""
 
         def substep(z):
@@ -136,7 +136,7 @@ class Flow:
         carry, infos = jax.lax.scan(lambda c, _: substep(c), carry, length=self.substeps)
         return carry, jax.tree.map(lambda a: jnp.max(a, axis=0), infos)
 
-    def _increment(self, z, args, unrolled: bool):
+    def _increment(self, z, args, unrolled: bool | int):
         """(Z − z, Info) of one substep."""
         shared = (self.family, self.params, self.dt / self.substeps, self.scale)
         if self.newton:
