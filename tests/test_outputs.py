@@ -1,5 +1,7 @@
 """Outputs: nothing is overwritten unasked, nothing is left half written."""
 
+import signal
+
 import pytest
 
 from gfnn_jax.errors import InputError, WorkError
@@ -151,3 +153,21 @@ def test_a_folder_of_others_is_never_removed(tmp_path):
         with pytest.raises(InputError, match="is no unfinished job"), job(tmp_path, **options):
             pass
     assert (tmp_path / "out.partial" / "thesis.tex").read_text() == "kept"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_waits_for_the_end_of_a_write(number):
+    before, written = signal.getsignal(number), []
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    signal.signal(number, stop)
+    try:
+        with pytest.raises(KeyboardInterrupt), outputs.uninterrupted():
+            signal.raise_signal(number)
+            written.append("all of it")
+        assert written == ["all of it"]
+        assert signal.getsignal(number) is stop
+    finally:
+        signal.signal(number, before)

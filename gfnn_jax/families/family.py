@@ -224,4 +224,6 @@ def _vanish(tangents) -> bool:
 
 
 def _instantiated(tangent: Any) -> Any:
-    return jnp.zeros(tangent.shape, tangent.dtype) if isinstance(tangent, SymbolicZero) else tangent
+    if isinstance(tangent, SymbolicZero):
+        return jnp.zeros(tangent.shape, tangent.dtype)  # pyright: ignore[reportArgumentType]
+    return tangent

@@ -24,7 +24,12 @@ import jax
 import numpy as np
 
 from gfnn_jax.errors import InputError
-from gfnn_jax.storage.outputs import atomic_folder, failures_as_work_errors, restore_interrupted
+from gfnn_jax.storage.outputs import (
+    atomic_folder,
+    failures_as_work_errors,
+    restore_interrupted,
+    uninterrupted,
+)
 
 FORMAT = 2
 _SUMS = "SHA256SUMS"
@@ -154,7 +159,8 @@ def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
         "structure": _structure(tree, iter(range(len(leaves)))),
     }
     text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
-    with atomic_folder(folder) as new:
+    # Orbax writes in threads of its own, which would go on in a folder that is gone.
+    with uninterrupted(), atomic_folder(folder) as new:
         if stored:
             _orbax().save((new / "arrays").absolute(), stored)
         (new / _JSON).write_text(text, encoding="utf-8")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -70,6 +71,28 @@ def failures_as_work_errors(path) -> Iterator[None]:
         yield
     except OSError as error:
         raise WorkError(f"{path}: writing failed: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """SIGINT and SIGTERM wait until the block ends. Elsewhere than in the main thread, where no
+    signal comes, nothing is done."""
+    waiting: list[int] = []
+    try:
+        before = {
+            number: signal.signal(number, lambda number, _: waiting.append(number))
+            for number in (signal.SIGINT, signal.SIGTERM)
+        }
+    except ValueError:
+        yield
+        return
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if waiting:
+            signal.raise_signal(waiting[0])
 
 
 @contextlib.contextmanager
