@@ -162,11 +162,15 @@ def test_a_signal_waits_for_the_end_of_a_write(number):
     def stop(*_):
         raise KeyboardInterrupt
 
-    signal.signal(number, stop)
-    try:
-        with pytest.raises(KeyboardInterrupt), outputs.uninterrupted():
+    def write():
+        with outputs.uninterrupted():
             signal.raise_signal(number)
             written.append("all of it")
+
+    signal.signal(number, stop)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            write()
         assert written == ["all of it"]
         assert signal.getsignal(number) is stop
     finally:
