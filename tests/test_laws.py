@@ -112,6 +112,10 @@ def test_when_a_law_is_preferred(law, map_, taken):
         ({"terms": ["p3**2"]}, "p3"),
         ({"terms": ["__import__('os')"]}, "__import__"),
         ({"terms": ["p1**2"], "learn": "map"}, "expected learn='auto' or 'hamiltonian'"),
+        ({"terms": [3]}, "texts or functions"),
+        ({"terms": ["sqrt(q1)"]}, "finite at all states, got 'sqrt"),
+        ({"tolerance": "1e-6"}, "a number as tolerance"),
+        ({"angles": 0}, "a tuple of indices"),
         ({"family": "sines"}, "those of S"),
         ({"chart": "type2"}, "those of S"),
     ],
@@ -156,3 +160,33 @@ def test_the_command_prints_the_formula(tmp_path, capsys, pairs):
     np.save(tmp_path / "z0.npy", pairs.z0[:3])
     predict = ("predict", tmp_path / "m", "--initial", tmp_path / "z0.npy", "--num-steps", 10)
     assert command(*predict, "--out", tmp_path / "p.npz") == 0
+
+
+def test_single_precision_data_give_a_law_too(pairs):
+    single = gfnn.Pairs(pairs.z0.astype("f4"), pairs.z1.astype("f4"), pairs.dt)
+    fit = gfnn.fit(single, tolerance=1e-5)
+    assert fit.chosen.learns == "hamiltonian"
+    assert len(fit.hamiltonian.terms) == 6
+
+
+def test_an_alias_is_named_and_the_map_is_had_in_time():
+    """A quarter turn and more in a step: the slowest of many laws. Half a turn: none at all."""
+
+    def turned(angle):
+        c, s = np.cos(angle), np.sin(angle)
+        z = np.random.default_rng(0).uniform(-1, 1, (300, 2))
+        return gfnn.Pairs(z, z @ np.array([[c, -s], [s, c]]), 1.0)
+
+    with pytest.warns(gfnn.FitWarning, match="frequencies differ by 2π per step"):
+        fit = gfnn.fit(turned(4.0), tolerance=1e-8)
+    assert fit.met
+    fit = gfnn.fit(turned(np.pi), tolerance=1e-8, max_seconds=20)
+    assert fit.met
+    assert fit.chosen.learns == "map"
+    assert fit.seconds < 20
+
+
+def test_nothing_moves_and_nothing_is_said_of_it():
+    z = np.random.default_rng(0).uniform(-1, 1, (100, 2))
+    fit = gfnn.fit(gfnn.Pairs(z, z, 0.1), tolerance=1e-8)
+    assert fit.formula in ("0", None)

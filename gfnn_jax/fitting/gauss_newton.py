@@ -149,6 +149,10 @@ def fitted_gradients(family, z, gradient, scale) -> np.ndarray:
     return np.linalg.lstsq(rows / size, (gradient * weight).ravel(), rcond=1e-12)[0] / size
 
 
+# A flow that needs more is dearer than any map, and its linear start is seldom right.
+MOST_SUBSTEPS = 64
+
+
 def substeps_for(family, coefficients, z, dt: float, reach: float = OPTIONS.reach) -> int:
     """Substeps so that h‖H''‖ is within reach for nearly all of the states z (N, 2d)."""
     _, hessian = family.gradient_and_hessian(coefficients, z)
@@ -156,7 +160,7 @@ def substeps_for(family, coefficients, z, dt: float, reach: float = OPTIONS.reac
     if not finite.any():
         return 1
     rates = frequencies(hessian[finite])
-    return int(np.clip(np.ceil(dt * np.quantile(rates, 0.95) / reach), 1, 64))
+    return int(np.clip(np.ceil(dt * np.quantile(rates, 0.95) / reach), 1, MOST_SUBSTEPS))
 
 
 def frequencies(hessian) -> np.ndarray:
@@ -182,11 +186,13 @@ class Problem:
         self.z0, self.z1, self.dt, self.scale = z0, z1, dt, scale
         self.options, self.check = options, check
 
+    def _images(self, family, coefficients, z, steps: Steps, **options):
+        return images(family, coefficients, z, self.dt, steps, on_substep=self.check, **options)
+
     def residuals(self, family, coefficients, steps: Steps, rows) -> np.ndarray:
         """(Φ(z₀) − z₁) ÷ scale of these rows (n, 2d); not finite where the flow fails."""
         parts = [
-            (images(family, coefficients, self.z0[b], self.dt, steps).states - self.z1[b])
-            / self.scale
+            (self._images(family, coefficients, self.z0[b], steps).states - self.z1[b]) / self.scale
             for b in self._blocks(rows, 0)
         ]
         return np.concatenate(parts) if parts else np.zeros((0, self.z0.shape[1]))
@@ -198,7 +204,7 @@ class Problem:
         for block in self._blocks(rows, count * steps.stages):
             if failed:
                 break
-            found = images(family, coefficients, self.z0[block], self.dt, steps, derivatives=True)
+            found = self._images(family, coefficients, self.z0[block], steps, derivatives=True)
             residual = (found.states - self.z1[block]) / self.scale
             slope = found.by_coefficient / self.scale[:, None]
             part = np.concatenate([slope, residual[..., None]], axis=-1).reshape(-1, count + 1)
@@ -279,10 +285,10 @@ class Problem:
         sample = rows[:: -(-len(rows) // self.options.judged)]
         z = self.z0[sample]
         substeps = substeps_for(family, c, z, self.dt, self.options.reach)
-        reference = images(family, c, z, self.dt, Steps(12, 4 * substeps)).states
+        reference = self._images(family, c, z, Steps(12, 4 * substeps)).states
 
         def error(steps: Steps) -> float:
-            states = images(family, c, z, self.dt, steps).states
+            states = self._images(family, c, z, steps).states
             off = np.abs((states - reference) / self.scale).max(axis=1)
             off = np.sort(np.where(np.isfinite(off), off, np.inf))
             return float(off[int(0.95 * (len(off) - 1))])
@@ -291,6 +297,8 @@ class Problem:
         errors: dict[Steps, float] = {}
         steps, best = Steps(counts[-1], substeps), np.inf
         for more in (1, 2, 4):
+            if more > 1 and more * substeps > MOST_SUBSTEPS:
+                break
             for stages in counts:
                 steps = Steps(stages, more * substeps)
                 errors[steps] = error(steps)

@@ -7,6 +7,7 @@ shape (s, B, 2d): a sum over stages is then one matrix product.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,11 +44,14 @@ class Images(NamedTuple):
     by_coefficient: Any = None
 
 
-def images(family, params, z, dt: float, steps: Steps, *, args=None, derivatives: bool = False):
+def images(
+    family, params, z, dt: float, steps: Steps, *, args=None, derivatives: bool = False,
+    on_substep: Callable[[], Any] = lambda: None,
+):  # fmt: skip
     """Images of the states z (B, 2d) after dt, in NumPy. Lanes that fail are not finite.
 
     derivatives: the exact ones of the collocation, in the state and in the coefficients of a
-    linear family.
+    linear family. on_substep: called before each; it may raise to stop.
     """
     rule, h = gauss(steps.stages), dt / steps.substeps
     width = z.shape[1]
@@ -56,6 +60,7 @@ def images(family, params, z, dt: float, steps: Steps, *, args=None, derivatives
     by_coefficient: Any = 0.0
     with np.errstate(all="ignore"):
         for _ in range(steps.substeps):
+            on_substep()
             slopes, done = solve_stages(family, params, z, h, rule, args, newton=steps.newton)
             solved = solved & done
             if derivatives:
@@ -171,11 +176,17 @@ def solve(matrix, rhs):
     return out
 
 
-def truncation(family, params, z, dt: float, steps: Steps, *, args=None) -> np.ndarray:
+def truncation(
+    family, params, z, dt: float, steps: Steps, *, args=None,
+    on_substep: Callable[[], Any] = lambda: None,
+) -> np.ndarray:  # fmt: skip
     """How far images of the states z (B, 2d) are from those of twice the substeps, (B, 2d): not
     finite where one of them fails."""
     finer = dataclasses.replace(steps, substeps=2 * steps.substeps)
-    one, other = (images(family, params, z, dt, s, args=args).states for s in (steps, finer))
+    one, other = (
+        images(family, params, z, dt, s, args=args, on_substep=on_substep).states
+        for s in (steps, finer)
+    )
     return one - other
 
 

@@ -64,24 +64,25 @@ def fit(
                 trajectories.pairs(), scene, angles=angles, max_seconds=max_seconds,
                 progress=progress, kept_in=kept_in, job=job, **options,
             )  # fmt: skip
+            if large and family != "mlp" and fitted.chosen.learns == "map":
+                progress.say("all pairs of the file, for the chosen candidate")
+                held = trajectories.pairs().take(slice(_HELD))
+                with failures_of_arithmetic():
+                    fitted = refit(fitted, iterate_pairs(data, _FIT_CHUNK, dt=dt), held)
+            progress.say("the report: compiling the derivative of a step")
+            result = report.assemble(
+                fitted, scene=scene_name, dt=trajectories.dt, seed=seed, rollout=None,
+                data={
+                    "source": trajectories.source,
+                    "digest": trajectories.digest,
+                    "precision": trajectories.precision,
+                    "units": trajectories.units,
+                },
+            )  # fmt: skip
         except KeyboardInterrupt as stop:
             if told := publish(kept_in / BEST, out):
                 stop.add_note(told)
             raise
-        if large and family != "mlp" and fitted.chosen.learns == "map":
-            progress.say("all pairs of the file, for the chosen candidate")
-            held = trajectories.pairs().take(slice(_HELD))
-            with failures_of_arithmetic():
-                fitted = refit(fitted, iterate_pairs(data, _FIT_CHUNK, dt=dt), held)
-        result = report.assemble(
-            fitted, scene=scene_name, dt=trajectories.dt, seed=seed, rollout=None,
-            data={
-                "source": trajectories.source,
-                "digest": trajectories.digest,
-                "precision": trajectories.precision,
-                "units": trajectories.units,
-            },
-        )  # fmt: skip
         with atomic_folder(out) as folder:
             write(folder, folder, fitted, result, job)
     return Ran(fitted, out, result)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numbers
+
+import jax
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
@@ -31,10 +34,20 @@ def check_request(
     ):  # fmt: skip
         if value not in known:
             raise FitError(f"expected a {name} among {', '.join(known)}; got '{value}'")
-    if not tolerance > 0:
-        raise FitError(f"expected a tolerance > 0, got {tolerance}")
     if not isinstance(pairs, Pairs):
         raise FitError(f"expected gfnn.Pairs(z0, z1, dt), got {type(pairs).__name__}")
+    for name, value in (("tolerance", tolerance), ("time step", pairs.dt)):
+        if not isinstance(value, numbers.Real) and np.shape(value) != ():
+            raise FitError(f"expected a number as {name}, got {value!r}")
+        if isinstance(value, str) or value is None:
+            raise FitError(f"expected a number as {name}, got {value!r}")
+    if not tolerance > 0:
+        raise FitError(f"expected a tolerance > 0, got {tolerance}")
+    for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):
+        if np.dtype(z.dtype).kind not in "fiu":
+            raise FitError(f"expected {name} of real numbers, got {z.dtype}")
+    if not isinstance(angles, (tuple, list)) or any(not isinstance(a, int) for a in angles):
+        raise FitError(f"expected angles as a tuple of indices, got {angles!r}")
     if scene is not None and scene.dim != pairs.dim:
         raise FitError(f"scene {scene.name} has dim {scene.dim}, the pairs have {pairs.dim}")
     if scene is not None and angles:
@@ -48,9 +61,11 @@ def check_request(
         raise FitError(f"expected a time step that is finite and above 0, got {pairs.dt}")
     if isinstance(terms, str):
         raise FitError(f"expected a sequence of terms, got the text '{terms}'")
+    if any(not (isinstance(term, str) or callable(term)) for term in terms):
+        raise FitError(f"expected terms as texts or functions of z, got {terms!r}")
     try:
         given_terms(pairs.dim, terms)
-    except InputError as error:
+    except (InputError, jax.errors.ConcretizationTypeError) as error:
         raise FitError(str(error)) from error
     if terms and learn == "map":
         raise FitError("terms are those of H: expected learn='auto' or 'hamiltonian' with them")

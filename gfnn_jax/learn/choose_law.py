@@ -19,6 +19,7 @@ from gfnn_jax.scenes.scene import Scene
 _BESIDE = dataclasses.replace(OPTIONS, most_terms=60, max_seconds=10.0)
 # A law holds outside the data and at any time step: so much dearer a step it may be.
 DEARER = 4.0
+_PART = 0.3  # of the time that is left, for H beside a map
 
 
 def law_of(
@@ -44,18 +45,21 @@ def law_of(
             raise FitError(f"expected data of an autonomous flow to learn H from: {unfit}")
         return None
     options = OPTIONS if learn == "hamiltonian" or terms else _BESIDE
+    if learn == "auto":  # the map, which every system has, is to have the better part of the time
+        seconds = min(options.max_seconds, _PART * clock.left)
+        options = dataclasses.replace(options, max_seconds=seconds)
     try:
-        return learn_hamiltonian(
-            prepared, judges, scene, terms=terms, clock=clock, say=say, options=options
-        )
+        with np.errstate(all="ignore"):  # starts that run away are part of the search
+            return learn_hamiltonian(
+                prepared, judges, scene, terms=terms, clock=clock, say=say, options=options
+            )
     except OutOfTime as spent:
         if learn == "hamiltonian":
-            raise FitError(
-                f"expected a budget of more than {clock.max_seconds:g} s: no H was fitted by then"
-            ) from spent
-    except FitError:
-        if learn == "hamiltonian":
-            raise
+            seconds = min(options.max_seconds, clock.max_seconds or np.inf)
+            raise FitError(f"expected an H that is fitted in {seconds:g} s: none was") from spent
+    except (FitError, np.linalg.LinAlgError) as error:
+        if learn == "hamiltonian" or terms:
+            raise FitError(str(error)) from error
     return None
 
 

@@ -194,6 +194,9 @@ def fit(
         pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, angles=angles,
         terms=terms,
     )  # fmt: skip
+    pairs = dataclasses.replace(
+        pairs, z0=np.asarray(pairs.z0, np.float64), z1=np.asarray(pairs.z1, np.float64)
+    )
     messages: list[str] = []
 
     def warn(new: list[str]) -> None:
@@ -217,9 +220,9 @@ def fit(
     wanted = learn if (family, chart) == ("auto", "auto") else "map"
     law = law_of(plain, judges, scene, wanted, terms, clock, on_progress)
     if law is not None:
-        on_candidate(law.candidate)
         if better is not None:
             better.offer(law.candidate, lambda: composed(law.flow, plain, judges))
+        on_candidate(law.candidate)
     if learn == "hamiltonian":
         sweeps: list[Any] = []
     elif family == "mlp":
@@ -236,9 +239,11 @@ def fit(
     choice = _chosen(found, law, prepared, plain, judges, clock, on_progress)
     chosen, entry, compile_seconds = choice
     noise = None
+    ended = found.ended if learn != "hamiltonian" else _ended(chosen, bound)
+    if law is not None and (entry is None or met_by_law):
+        warn(list(law.messages))
     if chosen.validation_bound > bound.bound:
-        warn([*not_radians(pairs, coordinates), not_met(chosen, bound, found.ended)])
-        warn(list(law.messages) if entry is None and law is not None else [])
+        warn([*not_radians(pairs, coordinates), not_met(chosen, bound, ended)])
     looked_at = entry or (found.ranking[0] if found.ranking else None)
     left_over = chosen.validation_bound > bound.bound and chosen.validation_relative > _ROUNDOFF
     if left_over and looked_at is not None:
@@ -265,7 +270,7 @@ def fit(
         hamiltonian=law,
         noise=noise,
         messages=tuple(messages),
-        ended=found.ended if learn != "hamiltonian" else _ended(chosen, bound),
+        ended=ended,
         seconds=clock.seconds,
         compile_seconds=compile_seconds,
         test_states=test,

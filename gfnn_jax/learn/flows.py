@@ -17,6 +17,7 @@ from gfnn_jax.coordinates import to_user
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
 from gfnn_jax.fitting.gauss_newton import (
+    MOST_SUBSTEPS,
     FlowFit,
     Problem,
     frequencies,
@@ -24,6 +25,7 @@ from gfnn_jax.fitting.gauss_newton import (
     midpoint_start,
     null_terms,
     significant_terms,
+    substeps_for,
 )
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.flows.flow import Flow
@@ -68,6 +70,7 @@ class Options:
 OPTIONS = Options()
 _ROUNDOFF = 1e-12  # of the spread: above it the pairs carry noise, and every one of them counts
 _FREQUENCY_STATES = 500
+_FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
 
 
 class Term(NamedTuple):
@@ -104,8 +107,11 @@ class LearnedHamiltonian:
 
 
 class _Fitted(NamedTuple):
+    """rows: that the fit was given; it has left out those that the flow does not resolve."""
+
     family: Terms
     fit: FlowFit
+    rows: np.ndarray
     error: OneStepError
     null: tuple[str, ...]
 
@@ -131,6 +137,8 @@ def learn_hamiltonian(
     if prepared.half is not None:
         raise FitError("expected pairs without a base map: it is no part of a flow")
     started = time.perf_counter()
+    if terms:
+        _check_finite(given_terms(prepared.dim, terms), prepared.y0[judges.training])
     problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, check=clock.check)
     bound = judges.tolerance.bound
     best: _Fitted | None = None
@@ -158,13 +166,28 @@ def learn_hamiltonian(
         raise FitError(
             f"expected more pairs: {len(prepared.y0)} are too few for any library of terms"
         )
+    if substeps_for(best.family, best.fit.coefficients, prepared.y0, prepared.dt) >= MOST_SUBSTEPS:
+        raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
     try:
         best = _sparse(problem, best, prepared, judges, options, say)
         if best.error.relative > _ROUNDOFF and len(best.fit.used) < len(judges.training):
             best = _refitted(problem, best, judges.training, prepared, judges)
     except OutOfTime:
         pass  # what was found stands
+    problem.check = lambda: None
     return _learned(best, problem, prepared, judges, time.perf_counter() - started, options)
+
+
+def _check_finite(given: Terms, z) -> None:
+    """Raises FitError for a user's term that has no value or no slope at some of the states."""
+    slopes = given.term_gradients(z)
+    for j, name in enumerate(given.term_names):
+        bad = ~np.isfinite(slopes[:, :, j]).all(axis=1)
+        if bad.any():
+            raise FitError(
+                f"expected terms that are finite at all states, got '{name}', which is not at "
+                f"{int(bad.sum())} of {len(z)}"
+            )
 
 
 def _out_of_reach(errors: list[float], left: int, bound: float) -> bool:
@@ -215,7 +238,7 @@ def _fitted(problem, family, prepared, judges, last: _Fitted | None, options, sa
     fit = problem.fit(family, _start(problem, family, rows, last), rows, say=say)
     fit = _resolved(problem, family, fit, rows)
     error = _held_out_error(problem, family, fit, prepared, judges)
-    return _Fitted(family, fit, error, tuple(names[j] for j in null))
+    return _Fitted(family, fit, rows, error, tuple(names[j] for j in null))
 
 
 def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
@@ -234,7 +257,8 @@ def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
 
 def _resolved(problem, family, fit: FlowFit, rows) -> FlowFit:
     """The fit without the pairs that the flow's own steps do not resolve."""
-    off = truncation(family, fit.coefficients, problem.z0[fit.used], problem.dt, fit.steps)
+    z = problem.z0[fit.used]
+    off = truncation(family, fit.coefficients, z, problem.dt, fit.steps, on_substep=problem.check)
     off = np.abs(off / problem.scale).max(axis=1)
     limit = max(10 * fit.rms, 100 * float(np.median(off)), 1e-13)
     good = off <= limit
@@ -269,17 +293,16 @@ def _sparse(problem, full: _Fitted, prepared, judges, options: Options, say) -> 
         fit = problem.fit(family, start, full.fit.used, rounds=False, steps=full.fit.steps)
         error = _held_out_error(problem, family, fit, prepared, judges)
         if error.relative <= max(options.rise * full.error.relative, options.rounding):
-            return _Fitted(family, fit, error, full.null)
+            return _Fitted(family, fit, full.rows, error, full.null)
     return full
 
 
 def _refitted(problem, found: _Fitted, rows, prepared, judges) -> _Fitted:
     """Fitted to all training pairs: each of them averages the noise."""
-    unresolved = np.setdiff1d(rows[: len(found.fit.used)], found.fit.used)
-    rows = np.setdiff1d(rows, unresolved)
+    rows = np.setdiff1d(rows, np.setdiff1d(found.rows, found.fit.used))
     fit = problem.fit(found.family, found.fit.coefficients, rows, rounds=False)
     error = _held_out_error(problem, found.family, fit, prepared, judges)
-    return found._replace(fit=fit, error=error)
+    return found._replace(fit=fit, rows=rows, error=error)
 
 
 def _learned(
@@ -315,13 +338,11 @@ def _learned(
         )
     )
     omega_h = _omega_h(hessian, prepared.dt)
-    left_out = sum(
-        r not in set(fit.used.tolist()) for r in judges.training[: len(fit.used)].tolist()
-    )
+    left_out = len(np.setdiff1d(found.rows, fit.used))
     return LearnedHamiltonian(
         with_error(candidate, error), flow, terms, formula(terms), float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
-        tuple(_messages(found, omega_h, left_out, prepared, judges)),
+        tuple(_messages(error, omega_h, left_out, prepared, judges)),
     )  # fmt: skip
 
 
@@ -367,13 +388,21 @@ def _omega_h(hessian, dt: float) -> float:
     return float(dt * np.median(rates))
 
 
-def _messages(found: _Fitted, omega_h: float, left_out: int, prepared, judges) -> Iterator[str]:
-    if found.error.bound > judges.tolerance.bound:
+def _messages(
+    error: OneStepError, omega_h: float, left_out: int, prepared, judges
+) -> Iterator[str]:
+    if error.bound > judges.tolerance.bound:
         yield (
-            f"no H of the terms tried meets the tolerance (best {found.error.relative:.2e} of the "
+            f"no H of the terms tried meets the tolerance (best {error.relative:.2e} of the "
             f"spread, its fastest oscillation {omega_h:.2g} in a step): the pairs carry noise, "
             "other terms are needed, the map has no flow, or ωh > π at "
             f"dt = {prepared.dt:g}, and then only a shorter dt tells H"
+        )
+    elif omega_h > _FAST:
+        yield (
+            f"H oscillates by {omega_h:.2g} radians in a step (ωh, its median over the states): "
+            "any H whose frequencies differ by 2π per step gives the same pairs; this is the "
+            "slowest"
         )
     if left_out:
         yield f"{left_out} pairs are not resolved by the flow's own steps: they are left out"
@@ -383,6 +412,8 @@ def formula(terms: Sequence[Term]) -> str:
     """H as text: "0.5 p1² + 0.5 p2² - 0.333333333333 q2³"."""
     text = ""
     for term, coefficient, std in terms:
+        if coefficient == 0:
+            continue
         sign = " - " if coefficient < 0 else " + "
         size = abs(coefficient)
         digits = 12 if std <= 0 else int(np.clip(np.ceil(np.log10(size / std)) + 1, 2, 12))
