@@ -238,7 +238,9 @@ def test_orbits_are_regular_or_chaotic_as_they_should_be(name):
         assert np.quantile(found, 0.95) < 0.008
     else:
         found = exponents(scene, tr.sample_test_states(scene, 60, jax.random.key(4)))
-        assert np.quantile(found, 0.05) > 0.05  # an orbit may stick to an island for long
+        # An orbit may stick to an island for a part of the time.
+        assert np.median(found) > 0.1
+        assert found.min() > 2 * 0.008
 
 
 def test_orbits_of_the_section_stay_in_the_island_and_of_the_pendulum_near_the_disc():
