@@ -224,7 +224,13 @@ def exponents(scene, states):
     return np.asarray(optimised(states)) / LYAPUNOV_TIME
 
 
-@pytest.mark.parametrize("name", scenes.names())
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=pytest.mark.slow if n == "henon-heiles-printed" else ())
+        for n in scenes.names()
+    ],
+)
 def test_orbits_are_regular_or_chaotic_as_they_should_be(name):
     """An exponent that falls as log(t)/t is regular: by t = 2,000 far below any chaotic one."""
     scene = scenes.make(name)

@@ -173,7 +173,14 @@ def test_time_dependent_hamiltonian():
     np.testing.assert_allclose(z[0, :, 0], (np.cos(t) - np.cos(2 * t)) / 3, atol=1e-13, rtol=0)
 
 
-@pytest.mark.parametrize("name", scenes.names())
+# Each like henon-heiles-regular, but for the energy or a term of H.
+ALIKE = ("henon-heiles-printed", "henon-heiles-chaotic")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow if n in ALIKE else ()) for n in scenes.names()],
+)
 def test_pairs_are_the_same_bits_for_the_same_seed_and_conserve_the_invariants(name):
     scene = scenes.make(name)
     pairs, again, other = (tr.sample_pairs(scene, 16, jax.random.key(s)) for s in (3, 3, 4))
