@@ -116,6 +116,7 @@ def test_when_a_law_is_preferred(law, map_, taken):
         ({"terms": ["sqrt(q1)"]}, "finite at all states, got 'sqrt"),
         ({"tolerance": "1e-6"}, "a number as tolerance"),
         ({"angles": 0}, "a tuple of indices"),
+        ({"terms": ["p1**2"], "learn": "auto", "chart": "type2"}, "no family or chart"),
         ({"family": "sines"}, "those of S"),
         ({"chart": "type2"}, "those of S"),
     ],

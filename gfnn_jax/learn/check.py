@@ -67,8 +67,10 @@ def check_request(
         given_terms(pairs.dim, terms)
     except (InputError, jax.errors.ConcretizationTypeError) as error:
         raise FitError(str(error)) from error
-    if terms and learn == "map":
-        raise FitError("terms are those of H: expected learn='auto' or 'hamiltonian' with them")
+    if terms and (learn == "map" or (family, chart) != ("auto", "auto")):
+        raise FitError(
+            "terms are those of H: expected learn='auto' or 'hamiltonian', and no family or chart"
+        )
     if learn == "hamiltonian" and (family != "auto" or chart != "auto"):
         raise FitError("family and chart are those of S: learn='hamiltonian' has none")
     if family == "features" and (scene is None or scene.features is None):
