@@ -24,6 +24,7 @@ from gfnn_jax.families.expressions import (
     Expression,
     call,
     coordinate,
+    coordinate_names,
     count_operations,
     depends_on,
     jets,
@@ -152,6 +153,12 @@ class Terms:
     @cached_property
     def _trees(self) -> list[Expression]:
         return [parse(text, self.dim) for text in self.variables]
+
+    @property
+    def quadratic(self) -> bool:
+        """Whether every term is a coordinate or a product of two: the gradient is affine."""
+        plain = set(self.variables) <= set(coordinate_names(self.dim))
+        return plain and all(sum(row) <= 2 for row in self.powers)
 
     @property
     def _plan(self) -> _Plan:

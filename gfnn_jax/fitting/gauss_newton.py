@@ -11,7 +11,8 @@ singular values come every damping at once, the condition number and the standar
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +30,9 @@ class Options:
     early, most: Gauss–Newton steps of the early rounds and of the last.
     rows_per_term: rows that a round has for each term, at least.
     dampings: tried in turn, in units of the largest singular value.
-    gained: a step that lowers the residual by less has converged.
+    gained: a step that lowers the residual by less has converged. promised: a step that was to
+    lower it by no more than this, and does not, has met the floor of rounding or truncation.
+    foretold: how well the linearised problem must tell the next residual for a start to be close.
     null: of a term's size; one that is closer to the span of those before it is not known apart.
     block_bytes: of the arrays that a block of pairs takes.
     reach: h‖H''‖ of one substep. coarse_stages: of the early rounds.
@@ -43,6 +46,8 @@ class Options:
     rows_per_term: float = 1.5
     dampings: tuple[float, ...] = (0.0, 1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
     gained: float = 1e-2
+    promised: float = 0.1
+    foretold: float = 0.1
     null: float = 1e-10
     block_bytes: int = 32 * 2**20
     reach: float = 1.0
@@ -240,7 +245,10 @@ class Problem:
         least = int(np.ceil(options.rows_per_term * family.num_parameters / self.z0.shape[1]))
         most = max(options.fewest, int(options.early_rows * least / options.rows_per_term))
         sample = rows[:: -(-len(rows) // most)] if len(rows) > most else rows
-        for fraction in options.fractions if rounds else ():
+        if rounds:
+            near = self._near(family, c, sample)
+            c, iterations = (c, 0) if near is None else (near, 1)
+        for fraction in options.fractions if rounds and near is None else ():
             count = int(np.ceil(fraction * len(sample)))
             if fraction < 1 and count < least:
                 continue
@@ -256,10 +264,24 @@ class Problem:
             quiet = self._quietest(family, c, coarse, sample, len(sample))
             c, _, made = self._descend(family, c, coarse, quiet, options.most)
             iterations += made
-        steps = self.fine_steps(family, c, rows) if steps is None else steps
+        steps = self.fine_steps(family, c, rows)[0] if steps is None else steps
         used = self._quietest(family, c, steps, rows, len(rows))
         c, factor, made = self._descend(family, c, steps, used, options.most)
         return _summary(c, factor, used, iterations + made, steps)
+
+    def _near(self, family, c, rows) -> np.ndarray | None:
+        """c after one Gauss–Newton step over all of these rows, where the linearised problem
+        foretells the residual that is left: then the start is close. Else None."""
+        coarse = self._coarse(family, c, rows)
+        here = self.factor(family, c, coarse, self._quietest(family, c, coarse, rows, len(rows)))
+        if not np.isfinite(here.cost) or here.rows < family.num_parameters:
+            return None
+        step = _Steps(here.matrix)
+        tried = c - step.damped(0.0)
+        size = self.residuals(family, tried, coarse, rows)
+        cost = float(np.linalg.norm(size))
+        off = abs(cost - step.cost)
+        return tried if off <= self.options.foretold * here.cost else None
 
     def _quietest(self, family, c, steps: Steps, rows, count: int):
         """The ``count`` of these rows that c explains best, without those whose flow fails."""
@@ -278,38 +300,27 @@ class Problem:
         substeps = substeps_for(family, c, self.z0[rows], self.dt, self.options.reach)
         return Steps(self.options.coarse_stages, substeps, newton=False)
 
-    def fine_steps(self, family, c, rows, tolerance: float | None = None) -> Steps:
-        """The cheapest steps whose own error, ÷ scale, is within the tolerance at nearly all of
-        these rows; None: at roundoff."""
-        tolerance = _FINE if tolerance is None else tolerance
+    def fine_steps(
+        self, family, c, rows, tolerances: Sequence[float | None] = (None,)
+    ) -> tuple[Steps, ...]:
+        """For each tolerance the cheapest steps whose own error, ÷ scale, is within it at nearly
+        all of these rows; None: at roundoff."""
         sample = rows[:: -(-len(rows) // self.options.judged)]
         z = self.z0[sample]
         substeps = substeps_for(family, c, z, self.dt, self.options.reach)
         reference = self._images(family, c, z, Steps(12, 4 * substeps)).states
 
+        @functools.cache
         def error(steps: Steps) -> float:
             states = self._images(family, c, z, steps).states
             off = np.abs((states - reference) / self.scale).max(axis=1)
             off = np.sort(np.where(np.isfinite(off), off, np.inf))
             return float(off[int(0.95 * (len(off) - 1))])
 
-        counts = (3, 4, 5, 6, 8, 10, 12)
-        errors: dict[Steps, float] = {}
-        steps, best = Steps(counts[-1], substeps), np.inf
-        for more in (1, 2, 4):
-            if more > 1 and more * substeps > MOST_SUBSTEPS:
-                break
-            for stages in counts:
-                steps = Steps(stages, more * substeps)
-                errors[steps] = error(steps)
-                if errors[steps] <= tolerance:
-                    return steps
-            best = min(errors.values())
-            if best <= _ROUNDED:  # all that rounding leaves
-                break
-        if not np.isfinite(best):  # a flow that runs away from the data
-            return steps
-        return next(s for s, e in errors.items() if e <= 3 * best)
+        return tuple(
+            _cheapest(error, substeps, _FINE if tolerance is None else tolerance)
+            for tolerance in tolerances
+        )
 
     def _descend(self, family, c, steps: Steps, rows, most: int):
         """Gauss–Newton steps until nothing is gained: (coefficients, their factor, steps taken)."""
@@ -317,12 +328,15 @@ class Problem:
         floor = _ROUNDOFF * np.sqrt(rows.size * self.z0.shape[1])
         first_damping, made = 0, 0
         while made < most and floor < here.cost < np.inf:
-            found = None
+            found, step = None, _Steps(here.matrix)
+            promised = 1 - step.cost / here.cost
             for n in range(first_damping, len(self.options.dampings)):
-                tried = c - _damped_step(here.matrix, self.options.dampings[n])
+                tried = c - step.damped(self.options.dampings[n])
                 there = self.factor(family, tried, steps, rows)
                 if there.cost < here.cost:
                     found = n
+                    break
+                if promised < self.options.promised and there.cost < 2 * here.cost:
                     break
             if found is None:
                 break
@@ -335,6 +349,30 @@ class Problem:
         return c, here, made
 
 
+def _cheapest(error: Callable[[Steps], float], substeps: int, tolerance: float) -> Steps:
+    """The cheapest steps within the tolerance, else those from which on rounding leaves nothing to
+    gain, else within a few times of the best there are."""
+    counts = (3, 4, 5, 6, 8, 10, 12)
+    errors: dict[Steps, float] = {}
+    steps = Steps(counts[-1], substeps)
+    for more in (1, 2, 4):
+        if more > 1 and more * substeps > MOST_SUBSTEPS:
+            break
+        last = None
+        for stages in counts:
+            steps = Steps(stages, more * substeps)
+            errors[steps] = error(steps)
+            if errors[steps] <= tolerance:
+                return steps
+            if last and errors[last] <= min(_ROUNDED, 2 * errors[steps]):
+                return last
+            last = steps
+    best = min(errors.values())
+    if not np.isfinite(best):  # a flow that runs away from the data
+        return steps
+    return next(s for s, e in errors.items() if e <= 3 * best)
+
+
 def _scaled(factor):
     count = factor.shape[1] - 1
     a, b = factor[:, :count], factor[:, count]
@@ -344,13 +382,22 @@ def _scaled(factor):
     return size, s, vt, u.T @ b
 
 
-def _damped_step(factor, damping: float) -> np.ndarray:
-    """δ that minimises ‖R δ − r‖² + (damping s₀)² ‖size δ‖²; c − δ is the next iterate."""
-    size, s, vt, along = _scaled(factor)
-    cutoff = np.finfo(float).eps * max(factor.shape) * s[0]
-    known = s > cutoff
-    filters = np.where(known, s, 0.0) / np.where(known, s**2 + (damping * s[0]) ** 2, 1.0)
-    return vt.T @ (filters * along) / size
+class _Steps:
+    """The steps δ of every damping from one factor: c − δ is the next iterate. cost: what the
+    linearised problem leaves of the residual after the undamped one."""
+
+    def __init__(self, factor):
+        self._size, self._s, self._vt, self._along = _scaled(factor)
+        cutoff = np.finfo(float).eps * max(factor.shape) * self._s[0]
+        self._known = self._s > cutoff
+        told = np.sum(self._along[self._known] ** 2)
+        self.cost = float(np.sqrt(max(np.sum(factor[:, -1] ** 2) - told, 0.0)))
+
+    def damped(self, damping: float) -> np.ndarray:
+        """δ that minimises ‖R δ − r‖² + (damping s₀)² ‖size δ‖²."""
+        s = np.where(self._known, self._s, 0.0)
+        filters = s / np.where(self._known, s**2 + (damping * self._s[0]) ** 2, 1.0)
+        return self._vt.T @ (filters * self._along) / self._size
 
 
 def _summary(c, found: Factor, used, iterations: int, steps: Steps) -> FlowFit:

@@ -70,6 +70,8 @@ class Options:
 OPTIONS = Options()
 _ROUNDOFF = 1e-12  # of the spread: above it the pairs carry noise, and every one of them counts
 _FREQUENCY_STATES = 500
+_NEAR_ROUNDOFF = 3e-15  # of the spread
+_HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
 _FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
 
 
@@ -144,6 +146,11 @@ def learn_hamiltonian(
     best: _Fitted | None = None
     last, poor, errors = None, 0, []
     libraries = list(_libraries(prepared, judges, scene, terms, options))
+    if len(libraries) > 1 and libraries[0].quadratic:
+        affine = _affine_error(prepared, judges).bound
+        if affine > _HOPELESS * bound:
+            errors.append(affine)
+            del libraries[0]
     try:
         for family in libraries:
             say(f"H: {family.num_parameters} terms")
@@ -156,7 +163,7 @@ def learn_hamiltonian(
             errors.append(found.error.bound)
             if best.error.bound <= bound or poor == 2:
                 break
-            if _out_of_reach(errors, len(libraries) - len(errors), bound):
+            if _out_of_reach(errors, len(libraries) - 1 - libraries.index(family), bound):
                 options = dataclasses.replace(options, thresholds=())  # no law: nothing to read
                 break
     except OutOfTime:
@@ -188,6 +195,20 @@ def _check_finite(given: Terms, z) -> None:
                 f"expected terms that are finite at all states, got '{name}', which is not at "
                 f"{int(bad.sum())} of {len(z)}"
             )
+
+
+def _affine_error(prepared, judges) -> OneStepError:
+    """The held-out error of the affine map that is closest to the training pairs: that of a
+    quadratic H, whose flow is affine, is hardly smaller."""
+
+    def design(rows):
+        z = prepared.y0[rows] / prepared.scale
+        return np.column_stack([np.ones(len(z)), z])
+
+    moved = prepared.y1 - prepared.y0
+    known = np.linalg.lstsq(design(judges.training), moved[judges.training], rcond=None)[0]
+    found = prepared.y0[judges.held_out] + design(judges.held_out) @ known
+    return judges.error_of(to_user(prepared.coordinates, found), prepared.coordinates)
 
 
 def _out_of_reach(errors: list[float], left: int, bound: float) -> bool:
@@ -347,8 +368,8 @@ def _learned(
 
 
 def _cheapest(problem, family, fit: FlowFit, rates, judges: Judges, options: Options) -> Steps:
-    """Steps whose own error is a tenth of the tolerance; at roundoff where that is not twice as
-    dear."""
+    """Steps whose own error is a tenth of the tolerance; near roundoff, or at it, where that is not
+    twice as dear."""
 
     def cost(steps: Steps) -> float:
         return _operations(family, rates, problem.dt, steps)
@@ -357,10 +378,9 @@ def _cheapest(problem, family, fit: FlowFit, rates, judges: Judges, options: Opt
     if not judges.tolerance.relative:
         bound = bound / float(problem.scale.max())
     bound = max(bound, 0.3 * fit.rms)
-    rows = judges.training
-    coarse = problem.fine_steps(family, fit.coefficients, rows, bound)
-    fine = problem.fine_steps(family, fit.coefficients, rows)
-    return fine if cost(fine) < 2 * cost(coarse) else coarse
+    tolerances = (bound, min(bound, _NEAR_ROUNDOFF), None)
+    found = problem.fine_steps(family, fit.coefficients, judges.training, tolerances)
+    return next(s for s in reversed(found) if s == found[0] or cost(s) < 2 * cost(found[0]))
 
 
 def _contraction(rates, dt: float, steps: Steps) -> float:
