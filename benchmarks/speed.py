@@ -128,7 +128,7 @@ def evaluations(map_: SymplecticMap, states) -> Numbers:
 def step(quick: bool) -> Numbers:
     measured = {}
     for name in ["standard-map-regular"] if quick else STEPS:
-        num_steps = 200 if quick else FEWER_STEPS.get(name, 2_000)
+        num_steps = 200 if quick else FEWER_STEPS.get(name, 500)
         tolerance, num_pairs, _, _ = STEPS[name]
         scene = gfnn.scenes.make(name)
         pairs, fresh = drawn(scene, num_pairs, quick)
@@ -147,7 +147,7 @@ def step(quick: bool) -> Numbers:
         def alone(map_=fit.map, one=one, num_steps=num_steps):
             return map_.advance(one, 1, save_every=10 * num_steps)[1]
 
-        batch, single = timed(together, 7).seconds, timed(alone, 7).seconds
+        batch, single = timed(together, 5).seconds, timed(alone, 5).seconds
         row = {
             **evaluations(fit.map, visited),
             "one_step_rms": about["one_step_rms"],
@@ -162,7 +162,7 @@ def step(quick: bool) -> Numbers:
         }
         if len(fit.map.pieces) == 1 and not fit.map.coordinates.angles:
             plain = textbook(fit.map)
-            fresh_newton = timed(lambda: rollout(plain, z, num_steps, save_every=num_steps), 7)  # noqa: B023
+            fresh_newton = timed(lambda: rollout(plain, z, num_steps, save_every=num_steps), 3)  # noqa: B023
             row["against_newton"] = fresh_newton.seconds / batch
         measured[name] = row
     return measured
@@ -172,7 +172,7 @@ def waiting(batch: Callable[[], Any]) -> float:
     """Seconds of a rollout in which every lane of a batch waits for the one that takes longest."""
     with mock.patch.object(newton, "_FEWEST", LANES):
         jax.clear_caches()
-        seconds = timed(batch, 7).seconds
+        seconds = timed(batch, 3).seconds
     jax.clear_caches()
     return seconds
 

@@ -1,6 +1,7 @@
 """Hamiltonians in ``gfnn.fit``: when one is learned, when it is preferred, what comes with it."""
 
 import dataclasses
+import importlib
 import json
 import types
 
@@ -12,8 +13,12 @@ from test_cli import gfnn as command
 
 import gfnn_jax as gfnn
 from gfnn_jax.evaluate import report
+from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.learn import choose_law
 from gfnn_jax.learn.choose_law import preferred
+from gfnn_jax.learn.draw import drawn
 
+fit_module = importlib.import_module("gfnn_jax.learn.fit")  # the name is that of its function too
 FORMULA = "0.5 q1² + 0.5 q2² + 0.5 p1² + 0.5 p2² + q1² q2 - 0.333333333333 q2³"
 
 
@@ -191,3 +196,38 @@ def test_nothing_moves_and_nothing_is_said_of_it():
     z = np.random.default_rng(0).uniform(-1, 1, (100, 2))
     fit = gfnn.fit(gfnn.Pairs(z, z, 0.1), tolerance=1e-8)
     assert fit.formula in ("0", None)
+
+
+def test_a_law_is_made_a_map_at_another_time_step(law):
+    fast = law.accelerate(dt=0.2, tolerance=1e-6, num_pairs=800)
+    assert fast.chosen.learns == "map"
+    assert fast.met
+    fresh = henon_heiles_pairs(100, seed=5, dt=0.2)
+    error = np.asarray(fast.map.step(fresh.z0)[0]) - fresh.z1
+    assert np.sqrt(np.mean(error**2)) < 1e-6 * np.std(fresh.z0)
+
+
+def test_pairs_are_drawn_in_the_region_that_is_named(law):
+    region = [[-0.2, 0.1, -0.3, 0.0], [0.2, 0.4, 0.3, 0.1]]
+    pairs = drawn(law.hamiltonian.flow, CARTESIAN, None, 0.3, region=region, num_pairs=500)
+    assert pairs.dt == 0.3
+    np.testing.assert_allclose(pairs.z0.min(axis=0), region[0], atol=0.02)
+    np.testing.assert_allclose(pairs.z0.max(axis=0), region[1], atol=0.02)
+    with pytest.raises(gfnn.InputError, match=r"region of shape \(2, 4\), lowest values below"):
+        law.accelerate(region=region[::-1])
+    with pytest.raises(gfnn.FitError, match="a Hamiltonian that meets its tolerance, got none"):
+        dataclasses.replace(law, hamiltonian=None).accelerate()
+
+
+def test_a_map_that_is_far_cheaper_than_the_law_is_fitted_to_pairs_of_the_law(pairs, monkeypatch):
+    few = pairs.take(np.arange(60))
+    for module in (fit_module, choose_law):  # as if the law's step were ten times as dear
+        monkeypatch.setattr(module, "DEARER", 0.4)
+    found = gfnn.fit(few, tolerance=1e-5)
+    assert found.chosen.learns == "map"
+    assert found.chosen.num_parameters * 3 > 60 * 4  # more than the pairs alone determine
+    assert found.formula == FORMULA
+    assert "drawn from H" in found.ended
+    fresh = henon_heiles_pairs(100, seed=5)
+    error = np.asarray(found.map.step(fresh.z0)[0]) - fresh.z1
+    assert np.sqrt(np.mean(error**2)) < 1e-5 * np.std(fresh.z0)

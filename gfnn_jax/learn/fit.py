@@ -29,7 +29,7 @@ from gfnn_jax.learn.check import (
     unlike_the_scene,
 )
 from gfnn_jax.learn.choose_charts import Charts, choose_charts
-from gfnn_jax.learn.choose_law import law_of, preferred
+from gfnn_jax.learn.choose_law import DEARER, law_of, preferred
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.diagnose import (
     ChartJudgement,
@@ -42,6 +42,7 @@ from gfnn_jax.learn.diagnose import (
     sequences_of,
     volume_change,
 )
+from gfnn_jax.learn.draw import NUM_PAIRS, drawn
 from gfnn_jax.learn.flows import LearnedHamiltonian
 from gfnn_jax.learn.flows import assembled as flow_assembled
 from gfnn_jax.learn.held_out import first_occurrences, split_rows
@@ -50,7 +51,7 @@ from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.search import AS_FAR, Entry, Found, search
 from gfnn_jax.learn.sweeps import NetworkSweep, sweeps_for
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.phase_space import Pairs, require_x64
+from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
 
 MAX_SECONDS = 120.0
@@ -76,7 +77,7 @@ class Fit:
     ended: why the search ended. seconds: of it all; compile_seconds: of compiling, in them.
     test_states: (n, 2d) held-out states. model_determinant_min: the chosen chart's determinant
     there, where it is closest to 0; NaN for a flow, which has no chart. hamiltonian: H, where one
-    was found, whether its flow was chosen or not.
+    was found, whether its flow was chosen or not. pairs: that were taken. scene: as given.
     """
 
     map: SymplecticMap
@@ -94,6 +95,46 @@ class Fit:
     test_states: np.ndarray
     model_determinant_min: float
     hamiltonian: LearnedHamiltonian | None = None
+    pairs: Pairs | None = None
+    scene: Scene | None = None
+
+    def accelerate(
+        self, *, dt: float | None = None, region=None, tolerance: float | None = None,
+        num_pairs: int = NUM_PAIRS, seed: int = 0, max_seconds: float | None = MAX_SECONDS,
+        on_progress: Callable[[str], Any] = lambda message: None,
+    ) -> Fit:  # fmt: skip
+        """A generated map of the Hamiltonian that was learned, fitted to pairs drawn from its flow.
+
+        dt: the time of its step; None: that of the data. region: (2, 2d), lowest and highest
+        values of the states to be predicted; None: where the data were and where the flow takes
+        them. tolerance: relative to the spread of the drawn states; None: as was asked for.
+
+        Raises FitError where no Hamiltonian was learned that meets the tolerance or was chosen, or
+        its flow fails in the region, InputError for a region that is none.
+        """
+        if self.hamiltonian is None or self.formula is None:
+            raise FitError("expected a fit with a Hamiltonian that meets its tolerance, got none")
+        assert self.pairs is not None
+        flow, coordinates = self.hamiltonian.flow, self.map.coordinates
+        dt = float(self.pairs.dt) if dt is None else dt
+        if not (isinstance(dt, (int, float)) and 0 < dt < np.inf):
+            raise FitError(f"expected a time step that is finite and above 0, got {dt!r}")
+        pairs = drawn(
+            flow, coordinates, self.pairs.z0, dt, region=region, num_pairs=num_pairs, seed=seed
+        )
+        return fit(
+            pairs, self.scene, learn="map", seed=seed, max_seconds=max_seconds,
+            angles=() if self.scene is not None else coordinates.angles, on_progress=on_progress,
+            tolerance=self.relative_tolerance if tolerance is None else tolerance,
+        )  # fmt: skip
+
+    @property
+    def relative_tolerance(self) -> float:
+        """The tolerance as a part of the spread, whichever way it was asked for."""
+        if self.asked.relative:
+            return self.asked.bound
+        assert self.pairs is not None
+        return self.asked.bound / float(np.max(sizes(self.pairs.z0)))
 
     @property
     def formula(self) -> str | None:
@@ -232,8 +273,15 @@ def fit(
     else:
         sweeps = list(sweeps_for(family, charts.charts, prepared, scene, judges, factors))
     met_by_law = law is not None and law.candidate.validation_bound <= bound.bound
-    dearest = law.candidate.operations if law is not None and met_by_law else np.inf
+    dearest = law.candidate.operations / DEARER if law is not None and met_by_law else np.inf
     found = search(sweeps, bound.bound, clock, on_progress, on_candidate, better, dearest)
+    if law is not None and met_by_law and _more_pairs_would_help(sweeps, found, bound, dearest):
+        on_progress("drawing pairs from the flow of H")
+        of_law = _search_of_law(
+            law, pairs, judges, scene, coordinates, dearest, clock, on_progress, on_candidate, seed
+        )
+        if of_law is not None:
+            judges, prepared, charts, found = of_law
     if not found.ranking and law is None:
         raise FitError(_nothing_found(found, pairs, clock))
     choice = _chosen(found, law, prepared, plain, judges, clock, on_progress)
@@ -258,7 +306,7 @@ def fit(
     if law is not None and entry is not None:
         others.append(law.candidate)
     candidates = [*others, dataclasses.replace(chosen, chosen=True)]
-    test = np.asarray(pairs.z0)[judges.held_out][:_JUDGED]
+    test = np.asarray(judges.pairs.z0)[judges.held_out][:_JUDGED]
     return Fit(
         map=chosen.map,
         candidates=tuple(sorted(candidates, key=lambda c: (c.operations, c.validation_relative))),
@@ -275,7 +323,48 @@ def fit(
         compile_seconds=compile_seconds,
         test_states=test,
         model_determinant_min=smallest_determinant(chosen.map, prepared, judges),
+        pairs=pairs,
+        scene=scene,
     )
+
+
+class _Searched(NamedTuple):
+    judges: Judges
+    prepared: Prepared
+    charts: Charts
+    found: Found
+
+
+def _more_pairs_would_help(sweeps, found: Found, bound: Tolerance, dearest: float) -> bool:
+    """Whether none of the sizes that the pairs determine meets the tolerance, and larger ones would
+    still be cheap enough."""
+    if found.ranking and found.ranking[0].candidate.validation_bound <= bound.bound:
+        return False
+    return any(s.short_of_pairs and s.sizes and s.sizes[-1].operations < dearest for s in sweeps)
+
+
+def _search_of_law(
+    law: LearnedHamiltonian, pairs: Pairs, judges: Judges, scene: Scene | None,
+    coordinates: Coordinates, dearest: float, clock: Clock, say, tell, seed: int,
+) -> _Searched | None:  # fmt: skip
+    """Maps fitted to pairs that are drawn from the law's flow, and judged by the user's held-out
+    pairs; None where none of them meets the tolerance."""
+    more = drawn(law.flow, coordinates, pairs.z0, float(pairs.dt), seed=seed)
+    held = pairs.take(judges.held_out)
+    both = Pairs(
+        np.concatenate([more.z0, held.z0]), np.concatenate([more.z1, held.z1]), float(pairs.dt)
+    )
+    rows = np.arange(len(both))
+    judges = Judges(both, rows[: len(more)], rows[len(more) :], judges.tolerance)
+    seen = _diagnosed(prepare(both, coordinates), "auto", scene.reversor if scene else None, seed)
+    sweeps = list(sweeps_for("auto", seen.charts.charts, seen.prepared, scene, judges))
+    found = search(sweeps, judges.tolerance.bound, clock, say, tell, None, dearest)
+    if not found.ranking:
+        return None
+    if found.ranking[0].candidate.validation_bound > judges.tolerance.bound:
+        return None
+    found = found._replace(ended="the tolerance is met, by a map of pairs drawn from H's flow")
+    return _Searched(judges, seen.prepared, seen.charts, found)
 
 
 class _Better:
