@@ -12,8 +12,8 @@ from analytic import henon_heiles_pairs
 from test_cli import gfnn as command
 
 import gfnn_jax as gfnn
-from gfnn_jax.evaluate import report
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.evaluate import report
 from gfnn_jax.learn import choose_law
 from gfnn_jax.learn.choose_law import preferred
 from gfnn_jax.learn.draw import drawn
