@@ -91,9 +91,9 @@ def solve_stages(family, params, z, h: float, rule, args=None, *, newton: bool =
         lanes = np.flatnonzero(open_)
         inside = z[lanes] + h * _summed(rule.matrix, slopes[:, lanes])
         new = apply_j(family.gradient(params, inside, args))
-        moved = h * np.abs(new - slopes[:, lanes])
+        moved = abs(h) * np.abs(new - slopes[:, lanes])
         slopes[:, lanes] = new
-        relative = np.max(moved / (size[lanes] + h * np.abs(new)), axis=(0, 2))
+        relative = np.max(moved / (size[lanes] + abs(h) * np.abs(new)), axis=(0, 2))
         ratio = relative / change[lanes]
         closed = (relative <= _FLOOR) | ((relative <= _SETTLED) & (ratio > 0.5))
         given_up = ~closed & ~(ratio < _SLOW) & (n > _FIRST)

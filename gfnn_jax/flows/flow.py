@@ -20,6 +20,7 @@ import numpy as np
 
 from gfnn_jax.arrays import as_row, matmul
 from gfnn_jax.families import as_family
+from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.generating.generated import two_sum
 from gfnn_jax.phase_space import apply_j, symplectic_form
@@ -105,6 +106,12 @@ class Flow:
     def value(self, z, args=None):
         """H at states z (..., 2d), NumPy or JAX."""
         return self.family.value(self.params, z, args)
+
+    def image(self, z):
+        """Images of the states z (N, 2d), in NumPy: NaN where a stage has no solution."""
+        steps = Steps(self.stages, self.substeps)
+        dt = float(np.asarray(self.dt))
+        return images(self.family, np.asarray(self.params), z, dt, steps).states
 
     def step(self, z, args=None, *, unrolled: bool | int = False):
         """(Z, Info) of the states z (B, 2d), by JAX."""

@@ -72,10 +72,9 @@ def with_predictor(generated: Generated, prepared: Prepared, rows, features=None
 
 
 def composed(piece: Piece, prepared: Prepared, judges: Judges) -> SymplecticMap:
-    """The piece between the halves of the base map, in the scene's coordinates: leaves of JAX."""
-    half = prepared.half
+    """The piece between those that were factored out, in the scene's coordinates: leaves of JAX."""
     map_ = SymplecticMap(
-        pieces=(piece,) if half is None else (half, piece, half),
+        pieces=(*prepared.before, piece, *prepared.after),
         coordinates=prepared.coordinates,
         domain=prepared.domain,
         scale=sizes(judges.pairs.z0),

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_inner, to_user
+from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_user
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.prepare import Prepared
@@ -143,8 +143,7 @@ def validated(candidate: Candidate, prepared, chart, family, params, judges: Jud
     """The candidate with its error measured by steps on the held-out pairs."""
     images, solved = refined_images(prepared, chart, family, params, judges.held_out)
     images = np.where(solved[:, None], images, np.nan)
-    if prepared.half is not None:
-        images = prepared.half.image(images)
+    images = prepared.whole_image(images)
     error = judges.error_of(to_user(prepared.coordinates, images), prepared.coordinates)
     return with_error(candidate, error)
 
@@ -154,9 +153,3 @@ def with_error(candidate: Candidate, error: OneStepError) -> Candidate:
         candidate, validation_rms=error.rms, validation_relative=error.relative,
         validation_bound=error.bound, deviations=error.deviations, validated=True,
     )  # fmt: skip
-
-
-def as_prepared(prepared: Prepared, z) -> np.ndarray:
-    """Images z (N, 2d) of the user's coordinates where S is learned, angles not lifted."""
-    y = to_inner(prepared.coordinates, z)
-    return y if prepared.half is None else prepared.half.inverse().image(y)

@@ -26,7 +26,16 @@ _COARSE = 0.01  # of what a step moves
 
 
 def check_request(
-    pairs: Pairs, scene: Scene | None, *, tolerance, chart, learn, family, angles, terms=()
+    pairs: Pairs,
+    scene: Scene | None,
+    *,
+    tolerance,
+    chart,
+    learn,
+    family,
+    angles,
+    terms=(),
+    base=None,
 ) -> None:
     """Raises FitError where the request or the pairs cannot give a map."""
     for name, value, known in (
@@ -71,6 +80,15 @@ def check_request(
         raise FitError(
             "terms are those of H: expected learn='auto' or 'hamiltonian', and no family or chart"
         )
+    if base is not None:
+        if not (isinstance(base, str) or callable(base)):
+            raise FitError(f"expected a base Hamiltonian as text or a function of z, got {base!r}")
+        if learn == "hamiltonian" or terms:
+            raise FitError("a base Hamiltonian is factored out of the map: it goes with S alone")
+        try:
+            given_terms(pairs.dim, (base,))
+        except (InputError, jax.errors.ConcretizationTypeError) as error:
+            raise FitError(str(error)) from error
     if learn == "hamiltonian" and (family != "auto" or chart != "auto"):
         raise FitError("family and chart are those of S: learn='hamiltonian' has none")
     if family == "features" and (scene is None or scene.features is None):

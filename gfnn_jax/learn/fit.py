@@ -18,6 +18,8 @@ import numpy as np
 
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.errors import FitError, FitWarning
+from gfnn_jax.families.terms import given_terms
+from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.assemble import assemble, composed, with_predictor
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance, refined_images
@@ -43,13 +45,13 @@ from gfnn_jax.learn.diagnose import (
     volume_change,
 )
 from gfnn_jax.learn.draw import NUM_PAIRS, drawn
-from gfnn_jax.learn.flows import LearnedHamiltonian
+from gfnn_jax.learn.flows import LearnedHamiltonian, around, flow_of, flow_operations
 from gfnn_jax.learn.flows import assembled as flow_assembled
 from gfnn_jax.learn.held_out import first_occurrences, split_rows
 from gfnn_jax.learn.noise import state_noise
 from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.search import AS_FAR, Entry, Found, search
-from gfnn_jax.learn.sweeps import NetworkSweep, sweeps_for
+from gfnn_jax.learn.sweeps import NetworkSweep, sweeps_for, trial_residual
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
@@ -59,6 +61,8 @@ MAX_SECONDS = 120.0
 _MOST_OUTLIERS = 0.05  # of the pairs may be left out
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken
+_TRIAL_PAIRS = 1_000  # by which it is found out where a flow is to be factored out
+_EXPLAINED = 0.1  # of the spread: a law that errs by more explains too little to be factored out
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 _RESIDUAL_PAIRS = 2_000  # whose residuals are looked at
 _NOISE_PAIRS = 1_024  # from which the noise of the states is measured
@@ -187,6 +191,7 @@ def fit(
     absolute_tolerance: float | None = None,
     learn: str = "auto",
     terms: Sequence[str | Callable] = (),
+    base: str | Callable | None = None,
     family: str = "auto",
     chart: str = "auto",
     angles: tuple[int, ...] = (),
@@ -210,6 +215,8 @@ def fit(
                map; "auto": both, and H is taken where it meets the tolerance at no more than four
                times the cost of a step, because it holds outside the data and at any time step.
     terms:     of H that the user knows: text such as "1/sqrt(q1**2 + q2**2)", or functions of z.
+    base:      a Hamiltonian that the user knows a part of the map by, as such text or a function:
+               its flow is factored out, and S learns what it leaves over.
     family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp".
     chart:     "auto" or one of type1, type2, type3, midpoint.
     angles:    without a scene, the indices of z that have period 2π.
@@ -233,7 +240,7 @@ def fit(
         bound = Tolerance(absolute_tolerance, relative=False)
     check_request(
         pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, angles=angles,
-        terms=terms,
+        terms=terms, base=base,
     )  # fmt: skip
     pairs = dataclasses.replace(
         pairs, z0=np.asarray(pairs.z0, np.float64), z1=np.asarray(pairs.z1, np.float64)
@@ -253,12 +260,16 @@ def fit(
     pairs, prepared, new = _prepared(pairs, coordinates)
     warn(new)
     plain = prepared
+    if base is not None:
+        known = given_terms(prepared.dim, (base,))
+        flow = flow_of(known, np.ones(known.num_parameters), prepared)
+        prepared = _factored_out(flow, prepared, seed)
     seen = _diagnosed(prepared, chart, scene.reversor if scene else None, seed)
     warn(seen.messages)
     prepared, charts = seen.prepared, seen.charts
     judges = Judges(pairs, *split_rows(pairs, seed), bound)
     better = _Better(prepared, judges, on_better) if on_better is not None else None
-    wanted = learn if (family, chart) == ("auto", "auto") else "map"
+    wanted = learn if (family, chart, base) == ("auto", "auto", None) else "map"
     law = law_of(plain, judges, scene, wanted, terms, clock, on_progress)
     if law is not None:
         if better is not None:
@@ -282,6 +293,13 @@ def fit(
         )
         if of_law is not None:
             judges, prepared, charts, found = of_law
+    elif law is not None and _law_explains_most(law, found, bound, clock):
+        on_progress(f"learning what the flow of {law.candidate.label} leaves over")
+        around = _search_around(
+            law, plain, judges, scene, clock, on_progress, on_candidate, better, seed
+        )
+        if around is not None and _better_than(around.found, found, law):
+            judges, prepared, charts, found = around
     if not found.ranking and law is None:
         raise FitError(_nothing_found(found, pairs, clock))
     choice = _chosen(found, law, prepared, plain, judges, clock, on_progress)
@@ -314,7 +332,7 @@ def fit(
         num_pairs=len(pairs),
         judgements=charts.judgements,
         data_defect=seen.data_defect,
-        base_map=entry is not None and prepared.half is not None,
+        base_map=entry is not None and bool(prepared.before or prepared.after),
         hamiltonian=law,
         noise=noise,
         messages=tuple(messages),
@@ -367,12 +385,78 @@ def _search_of_law(
     return _Searched(judges, seen.prepared, seen.charts, found)
 
 
+def _law_explains_most(law: LearnedHamiltonian, found: Found, bound: Tolerance, clock) -> bool:
+    """Whether nothing meets the tolerance, but S might with most of the motion factored out. What
+    stalls in noise would stall without it too."""
+    if clock.left <= 0 or not found.ranking or found.stalled:
+        return False
+    best = found.ranking[0].candidate
+    error = law.candidate.validation_relative
+    return best.validation_bound > bound.bound and error < _EXPLAINED
+
+
+def _search_around(
+    law: LearnedHamiltonian, plain: Prepared, judges: Judges, scene: Scene | None, clock: Clock,
+    say, tell, better, seed: int,
+) -> _Searched | None:  # fmt: skip
+    """Maps of the law's flow Φ and of S, which learns what Φ leaves over; None where Φ has no image
+    of some of the states, or no chart covers what is left."""
+    try:
+        flow = flow_of(law.flow.family, np.asarray(law.flow.params), plain)
+        prepared = _factored_out(flow, plain, seed)
+        seen = _diagnosed(prepared, "auto", scene.reversor if scene else None, seed)
+    except FitError:
+        return None
+    more = flow_operations(flow, plain)
+    sweeps = list(sweeps_for("auto", seen.charts.charts, seen.prepared, scene, judges))
+    if better is not None:
+        better.prepared = seen.prepared
+    found = search(sweeps, judges.tolerance.bound, clock, say, tell, better)
+    entries, ranking = (
+        [
+            e._replace(
+                candidate=dataclasses.replace(
+                    e.candidate,
+                    operations=e.candidate.operations + more,
+                    label=f"{e.candidate.label} around H",
+                )
+            )
+            for e in part
+        ]
+        for part in (found.entries, found.ranking)
+    )
+    found = found._replace(entries=entries, ranking=ranking)
+    return _Searched(judges, seen.prepared, seen.charts, found)
+
+
+def _factored_out(flow: Flow, plain: Prepared, seed: int) -> Prepared:
+    """The pairs without the flow: before, after, or half on either side of what is learned,
+    whichever leaves the map that a small S comes closest to."""
+
+    def left_over(prepared: Prepared) -> float:
+        rows = np.random.default_rng(seed).permutation(len(prepared.y0))[:_TRIAL_PAIRS]
+        return trial_residual(prepared.take(rows))
+
+    tried = [plain.without(*pieces) for pieces in around(flow)]
+    errors = [left_over(prepared) for prepared in tried]
+    return tried[0] if errors[0] <= 2 * min(errors) else tried[int(np.argmin(errors))]
+
+
+def _better_than(around: Found, found: Found, law: LearnedHamiltonian) -> bool:
+    """Whether the maps around the law have a better one than the others and the law itself."""
+    if not around.ranking:
+        return False
+    others = [found.ranking[0].candidate, law.candidate]
+    best = around.ranking[0].candidate
+    return all(best.validation_bound < other.validation_bound for other in others)
+
+
 class _Better:
     """Hands on the map of every entry that is more accurate than those before. Nothing is compiled:
     the map is judged by the steps that the search made."""
 
     def __init__(self, prepared: Prepared, judges: Judges, on_better: Callable):
-        self._prepared, self._judges, self._on_better = prepared, judges, on_better
+        self.prepared, self._judges, self._on_better = prepared, judges, on_better
         self._best = np.inf
 
     def __call__(self, entry: Entry) -> None:
@@ -388,11 +472,11 @@ class _Better:
         _, params = entry.sweep.solve(entry.size, Clock(), lambda message: None)
         family = entry.size.family
         generated = Generated(
-            family, params, entry.sweep.chart, self._prepared.dt, self._prepared.scale
+            family, params, entry.sweep.chart, self.prepared.dt, self.prepared.scale
         )
         features = getattr(getattr(family, "inputs", None), "features", None)
-        generated = with_predictor(generated, self._prepared, self._judges.training, features)
-        return composed(generated, self._prepared, self._judges)
+        generated = with_predictor(generated, self.prepared, self._judges.training, features)
+        return composed(generated, self.prepared, self._judges)
 
 
 def _prepared(pairs: Pairs, coordinates: Coordinates) -> tuple[Pairs, Prepared, list[str]]:
@@ -438,7 +522,7 @@ def _diagnosed(prepared: Prepared, chart: str, reversor, seed: int) -> _Diagnosi
         )
     charts = choose_charts(chart, prepared, reversor, jacobians)
     if charts.half is not None:
-        prepared = prepared.without(charts.half)
+        prepared = prepared.without(charts.half, charts.half)
     return _Diagnosis(prepared, charts, defect, [*messages, *charts.messages])
 
 

@@ -136,7 +136,7 @@ def learn_hamiltonian(
     """
     left = options.max_seconds if clock is None else min(options.max_seconds, clock.left)
     clock = Clock(left)
-    if prepared.half is not None:
+    if prepared.before or prepared.after:
         raise FitError("expected pairs without a base map: it is no part of a flow")
     started = time.perf_counter()
     if terms:
@@ -381,6 +381,40 @@ def _cheapest(problem, family, fit: FlowFit, rates, judges: Judges, options: Opt
     tolerances = (bound, min(bound, _NEAR_ROUNDOFF), None)
     found = problem.fine_steps(family, fit.coefficients, judges.training, tolerances)
     return next(s for s in reversed(found) if s == found[0] or cost(s) < 2 * cost(found[0]))
+
+
+def flow_of(family: Terms, params, prepared: Prepared) -> Flow:
+    """The flow of a law over dt, to roundoff: to be factored out.
+
+    prepared: without a base map. Raises FitError where it has no image of some of the states.
+    """
+    y0, y1, dt, scale = prepared.y0, prepared.y1, prepared.dt, prepared.scale
+    problem = Problem(y0, y1, dt, scale)
+    (steps,) = problem.fine_steps(family, params, np.arange(len(y0)))
+    _, hessian = family.gradient_and_hessian(params, y0[:_FREQUENCY_STATES])
+    by_newton = not _contraction(frequencies(hessian), dt, steps) <= OPTIONS.contracting
+    flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, by_newton)
+    failed = ~np.isfinite(np.concatenate([flow.image(y0), flow.inverse().image(y1)])).all(axis=1)
+    if failed.any():
+        raise FitError(
+            "expected a law whose flow takes every state a step on and back, got "
+            f"{int(failed.sum())} of {len(y0) + len(y1)} without an image"
+        )
+    return flow
+
+
+def around(flow: Flow) -> list[tuple[Flow | None, Flow | None]]:
+    """(before, after) what is learned: half of the flow on either side, which keeps the symmetry in
+    time, or all of it on one, which suits a kick."""
+    half = dataclasses.replace(flow, dt=0.5 * flow.dt)
+    return [(half, half), (flow, None), (None, flow)]
+
+
+def flow_operations(flow: Flow, prepared: Prepared) -> float:
+    """Floating-point operations per step of the flow."""
+    _, hessian = flow.family.gradient_and_hessian(flow.params, prepared.y0[:_FREQUENCY_STATES])
+    steps = Steps(flow.stages, flow.substeps)
+    return _operations(flow.family, frequencies(hessian), float(flow.dt), steps)
 
 
 def _contraction(rates, dt: float, steps: Steps) -> float:

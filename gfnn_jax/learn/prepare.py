@@ -8,6 +8,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import Coordinates, lift, to_inner
 from gfnn_jax.errors import FitError
+from gfnn_jax.flows.flow import Flow
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.domain import Domain, covering
 from gfnn_jax.phase_space import Pairs, sizes
@@ -19,7 +20,9 @@ class Prepared:
 
     y0, y1: (N, 2d) inner coordinates, angles lifted, the base map factored out. scale: (2d,) sizes
     of the inner coordinates. angle_centre: (a,) of each angle's interval. whole: the angles that
-    cover their circle. half: R^½ of the base map R, or None.
+    cover their circle. before, after: pieces that were factored out, in the order in which they
+    are applied around what is learned: R^½ on both sides for an affine base map R, the flow of a
+    law.
     """
 
     y0: np.ndarray
@@ -30,7 +33,8 @@ class Prepared:
     whole: tuple[int, ...]
     coordinates: Coordinates
     dt: float
-    half: Affine | None = None
+    before: tuple[Affine | Flow, ...] = ()
+    after: tuple[Affine | Flow, ...] = ()
 
     @property
     def dim(self) -> int:
@@ -41,11 +45,25 @@ class Prepared:
         """Of these rows alone; sizes and domain are theirs."""
         return _sized(dataclasses.replace(self, y0=self.y0[rows], y1=self.y1[rows]))
 
-    def without(self, half: Affine) -> Prepared:
-        """The base map R factored out: R^½ z -> R^−½ Z. The domain stays that of the states."""
-        return dataclasses.replace(
-            self, y0=half.image(self.y0), y1=half.inverse().image(self.y1), half=half
-        )
+    def without(self, before: Affine | Flow | None, after: Affine | Flow | None) -> Prepared:
+        """These pieces factored out: before(z) -> after⁻¹(Z). The domain stays that of the
+        states."""
+        found = self
+        if before is not None:
+            found = dataclasses.replace(
+                found, y0=before.image(found.y0), before=(*found.before, before)
+            )
+        if after is not None:
+            found = dataclasses.replace(
+                found, y1=after.inverse().image(found.y1), after=(after, *found.after)
+            )
+        return found
+
+    def whole_image(self, y: np.ndarray) -> np.ndarray:
+        """The images of what is learned, y (N, 2d), as those of the map."""
+        for piece in self.after:
+            y = piece.image(y)
+        return y
 
 
 def prepare(pairs: Pairs, coordinates: Coordinates) -> Prepared:

@@ -24,6 +24,7 @@ from gfnn_jax.learn.prepare import Prepared
 # Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
 # judged from one factor of the rows of its largest.
 _DEGREES = ((2, 3), (4, 5, 6), (7, 8), (9, 10), (12, 14), (16, 18, 20))
+_TRIAL = (2, 3, 4, 5, 6)
 _SINES = (100, 200, 400, 800, 1_600)
 _MOST_TERMS = 1_500
 _ROWS_PER_TERM = 3
@@ -276,6 +277,28 @@ def _every_few_seconds(checkpoints) -> Callable | None:
             last = time.monotonic()
 
     return save
+
+
+def trial_residual(prepared: Prepared) -> float:
+    """The held-out residual of ∇S, ÷ scale, of polynomials of a low degree in the midpoint chart:
+    how near these pairs are to a map that a small S generates. Infinite where some are missing."""
+    half = len(prepared.y0) // 2
+    (w, target), weight = _rows(prepared, MIDPOINT, slice(None))
+    if not np.isfinite(w + target).all():
+        return float("inf")
+    coordinates = prepared.coordinates
+    inputs = box_inputs(
+        w, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+        cyclic=coordinates.cyclic,
+    )  # fmt: skip
+    groups = list(_determined(([Products(inputs, degree)] for degree in _TRIAL), w.size // 2))
+    family = groups[-1][0] if groups else Products(inputs, 1)
+    train, held = (
+        least_squares.reduce(family, [(w[rows], target[rows])], weight)
+        for rows in (slice(half), slice(half, None))
+    )
+    ((_, residual),) = least_squares.residuals(train, held, [family.num_parameters])
+    return residual
 
 
 def _rows(prepared: Prepared, chart: AnyChart, rows):
