@@ -12,7 +12,7 @@ import numpy as np
 
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
-from gfnn_jax.families.products import Products
+from gfnn_jax.families.products import Products, number_of_terms
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.fitting import least_squares
 from gfnn_jax.fitting.levenberg_marquardt import LMState, levenberg_marquardt
@@ -44,6 +44,7 @@ class Size:
 
     family: Any
     group: Any  # the largest family that is judged from the same factor
+    extent: float  # the logarithm of the error falls in proportion: a degree, or log₂ of a number
 
     @property
     def operations(self) -> float:
@@ -100,8 +101,9 @@ class LinearSweep:
             groups = ((Products(inputs, degree, signs) for degree in g) for g in _DEGREES)
         known = len(_SINES) if kind == "sines" else sum(map(len, _DEGREES))
         self.sizes = [
-            Size(family, group[-1]) for group in _determined(groups, w.size) for family in group
-        ]
+            Size(family, group[-1], _extent(family))
+            for group in _determined(groups, w.size) for family in group
+        ]  # fmt: skip
         # Else the last size is the largest there is, or the most terms are reached.
         self.short_of_pairs = len(self.sizes) < known and w.size < _ROWS_PER_TERM * _MOST_TERMS
         self._factors: dict[Any, tuple] = {}
@@ -128,6 +130,21 @@ class LinearSweep:
         )
         seconds = judged.fit_seconds + time.perf_counter() - started
         return dataclasses.replace(candidate, fit_seconds=seconds)
+
+    def at(self, extent: float) -> str:
+        """What the size of this extent is, how many terms it has, and how many pairs they take."""
+        family = self.sizes[0].family
+        if isinstance(family, Sines):
+            label = f"{family.name} {(terms := round(2**extent))}"
+        else:
+            degree = round(extent)
+            label = f"{family.name} {degree}"
+            terms = number_of_terms(family.inputs.is_angle, degree, family.signs)
+        rows = self._train[0].shape
+        share = rows[0] / (rows[0] + len(self.judges.held_out))
+        pairs = int(np.ceil(_ROWS_PER_TERM * terms / rows[1] / share))
+        most = f", more than the {_MOST_TERMS:,} that are tried" if terms > _MOST_TERMS else ""
+        return f"{label} ({terms:,} terms{most}; about {pairs:,} pairs)"
 
     def solve(self, size: Size, clock: Clock, say) -> tuple[least_squares.LeastSquaresFit, Any]:
         """The coefficients of this size, and the params of its family."""
@@ -219,7 +236,7 @@ class NetworkSweep:
             cyclic=coordinates.cyclic,
         )  # fmt: skip
         family = Mlp(inputs, _MLP_HIDDEN, _MLP_ACTIVATION, amplitude_of(w, target))
-        self._train, self.sizes = (w, target), [Size(family, family)]
+        self._train, self.sizes = (w, target), [Size(family, family, 0.0)]
         self._params: Any = None
 
     def judge(self, size: Size, clock: Clock, say: Callable[[str], Any]) -> Candidate:
@@ -261,6 +278,11 @@ class NetworkSweep:
     def solve(self, size: Size, clock: Clock, say) -> tuple[Any, Any]:
         """The params of the trained network."""
         return None, self._params
+
+
+def _extent(family) -> float:
+    """The degree of products, or log₂ of the number of sines."""
+    return float(np.log2(family.num_parameters) if isinstance(family, Sines) else family.degree)
 
 
 def _every_few_seconds(checkpoints) -> Callable | None:
