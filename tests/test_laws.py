@@ -153,6 +153,40 @@ def gfnn_flow(hamiltonian):
     return Flow(hamiltonian, np.zeros(()), 0.2, np.ones(2), stages=8, substeps=4)
 
 
+def test_what_the_pairs_do_not_determine_is_named():
+    """Two oscillators, and the second one stands still in all pairs."""
+    z = np.random.default_rng(0).uniform(-1, 1, (200, 4)) * np.array([1.0, 0.0, 1.0, 0.0])
+    c, s = np.cos(0.3), np.sin(0.3)
+    turn = np.kron(np.array([[c, -s], [s, c]]), np.eye(2))
+    fit = gfnn.fit(gfnn.Pairs(z, z @ turn, 0.3), learn="hamiltonian")
+    assert fit.formula == "0.5 q1² + 0.5 p1²"
+    assert "3 terms of H (q2², q2 p2, p2²)" in " ".join(fit.messages)
+
+
+def test_terms_that_are_the_same_everywhere_are_no_gap_in_the_pairs(pairs):
+    fit = gfnn.fit(pairs, learn="hamiltonian", terms=["q1**2 + q2**2"], tolerance=1e-10)
+    assert fit.hamiltonian.null_terms
+    assert not any("do not determine" in message for message in fit.messages)
+
+
+def test_what_a_law_leaves_over_is_diagnosed():
+    """Pendulums of different length, told nothing of it: the states have no law."""
+    rng = np.random.default_rng(0)
+    rates = np.repeat(rng.uniform(0.8, 1.2, 20), 30)
+    phase = np.repeat(rng.uniform(0, 6, 20), 30) + 0.2 * np.tile(np.arange(30), 20) * rates
+    size = np.repeat(rng.uniform(0.3, 1, 20), 30)
+
+    def states(phase):
+        return np.stack([size * np.cos(phase), -size * rates * np.sin(phase)], axis=1)
+
+    z = states(phase)
+    later = states(phase + 0.2 * rates)
+    for i in range(20):  # to the bit, as those of a recording
+        later[30 * i : 30 * i + 29] = z[30 * i + 1 : 30 * i + 30]
+    fit = gfnn.fit(gfnn.Pairs(z, later, 0.2), tolerance=1e-10, learn="hamiltonian")
+    assert "differs between the sequences" in fit.ended
+
+
 def test_the_command_prints_the_formula(tmp_path, capsys, pairs):
     data = tmp_path / "d.npz"
     np.savez(data, **{k: v for k, v in dataclasses.asdict(pairs).items() if k != "dt"}, dt=0.5)

@@ -26,7 +26,7 @@ _COARSE = 0.01  # of what a step moves
 
 
 def check_request(
-    pairs: Pairs, scene: Scene | None, *, tolerance, chart, learn, family, angles, terms=()
+    pairs: Pairs, scene: Scene | None, *, tolerance, chart, learn, family, angles, terms=(), seed=0
 ) -> None:
     """Raises FitError where the request or the pairs cannot give a map."""
     for name, value, known in (
@@ -36,6 +36,8 @@ def check_request(
             raise FitError(f"expected a {name} among {', '.join(known)}; got '{value}'")
     if not isinstance(pairs, Pairs):
         raise FitError(f"expected gfnn.Pairs(z0, z1, dt), got {type(pairs).__name__}")
+    if not (isinstance(seed, numbers.Integral) and 0 <= seed < 2**32):
+        raise FitError(f"expected a whole number from 0 to 2**32 - 1 as seed, got {seed!r}")
     for name, value in (("tolerance", tolerance), ("time step", pairs.dt)):
         if not isinstance(value, numbers.Real) and np.shape(value) != ():
             raise FitError(f"expected a number as {name}, got {value!r}")

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.coordinates import CARTESIAN, Coordinates, nearest_image
 from gfnn_jax.errors import FitError, FitWarning
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.assemble import assemble, composed, with_predictor
+from gfnn_jax.learn.assemble import assemble, composed, stepped, with_predictor
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance, refined_images
 from gfnn_jax.learn.check import (
     check_number,
@@ -192,7 +192,7 @@ def fit(
         bound = Tolerance(absolute_tolerance, relative=False)
     check_request(
         pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, angles=angles,
-        terms=terms,
+        terms=terms, seed=seed,
     )  # fmt: skip
     pairs = dataclasses.replace(
         pairs, z0=np.asarray(pairs.z0, np.float64), z1=np.asarray(pairs.z1, np.float64)
@@ -242,18 +242,24 @@ def fit(
     ended = found.ended if learn != "hamiltonian" else _ended(chosen, bound)
     if law is not None and (entry is None or met_by_law):
         warn(list(law.messages))
-    if chosen.validation_bound > bound.bound:
-        warn([*not_radians(pairs, coordinates), not_met(chosen, bound, ended)])
     looked_at = entry or (found.ranking[0] if found.ranking else None)
-    left_over = chosen.validation_bound > bound.bound and chosen.validation_relative > _ROUNDOFF
-    if left_over and looked_at is not None:
+    diagnosis: list[str] = []
+    if chosen.validation_bound > bound.bound and chosen.validation_relative > _ROUNDOFF:
         stalled = any(  # the chosen sweep, or another that has come as far
             (e.candidate.chart, e.candidate.family) in found.stalled
             and e.candidate.validation_relative <= AS_FAR * chosen.validation_relative
             for e in found.entries
         )
-        noise, new = _what_is_left(chosen, looked_at, prepared, judges, stalled)
-        warn(new)
+        if looked_at is None:
+            stalled = law is not None and law.stalled
+        left_over = _what_is_left(chosen, looked_at, prepared, judges, stalled)
+        noise, diagnosis = left_over.noise, left_over.messages
+        if left_over.reason and stalled:
+            ended = f"larger models are no more accurate: {left_over.reason}"
+        elif left_over.reason:
+            ended = f"{ended}; {left_over.reason}"
+    if chosen.validation_bound > bound.bound:
+        warn([*not_radians(pairs, coordinates), not_met(chosen, bound, ended), *diagnosis])
     others = [e.candidate for e in found.entries if entry is None or e.size is not entry.size]
     if law is not None and entry is not None:
         others.append(law.candidate)
@@ -418,45 +424,76 @@ def _assembled(
     return chosen, entry, compile_seconds
 
 
-def _what_is_left(
-    chosen: Candidate, entry: Entry, prepared: Prepared, judges: Judges, stalled: bool
-) -> tuple[np.ndarray | None, list[str]]:
-    """The noise (2d,) that the residuals suggest, where larger models no longer helped, and what is
-    said of the residuals: noise, friction, or a parameter that differs between sequences.
+class _LeftOver(NamedTuple):
+    """What the residuals suggest: the noise (2d,), what is said of them, and the reason why no
+    larger model would help where that is known."""
 
-    entry: of the best map, whose residuals are looked at.
+    noise: np.ndarray | None
+    messages: list[str]
+    reason: str = ""
+
+
+def _what_is_left(
+    chosen: Candidate, entry: Entry | None, prepared: Prepared, judges: Judges, stalled: bool
+) -> _LeftOver:
+    """Noise, where larger models no longer helped, friction, or a parameter that differs between
+    sequences.
+
+    entry: of the best map, whose residuals are looked at; None: those of the chosen law.
     """
     rows = np.sort(judges.training)[:_RESIDUAL_PAIRS]
-    _, params = entry.sweep.solve(entry.size, Clock(), lambda message: None)
-    images, solved = refined_images(prepared, entry.sweep.chart, entry.size.family, params, rows)
-    rows, residual = rows[solved], (prepared.y1[rows] - images)[solved]
+    y0, residual, solved = _residuals(chosen, entry, prepared, judges, rows)
+    rows, y0, residual = rows[solved], y0[solved], residual[solved]
     sequence = sequences_of(judges.pairs.z0, judges.pairs.z1)[rows]
-    scaled = prepared.y0[rows] / prepared.scale, residual / prepared.scale
-    if differs_between_sequences(*scaled, sequence):
-        return None, [
+    scale = judges.spread if entry is None else prepared.scale
+    if differs_between_sequences(y0 / scale, residual / scale, sequence):
+        message = (
             "what is left over agrees within a sequence and differs between sequences: something "
             "that the states do not hold (a mass, a length, a field) differs between them; learn "
             "those of one value by themselves"
-        ]
+        )
+        return _LeftOver(None, [message], "something that the states do not hold differs between "
+                         "the sequences")  # fmt: skip
     if not stalled:
-        return None, []
-    change, error = volume_change(prepared.y0[rows], residual)
+        return _LeftOver(None, [])
+    change, error = volume_change(y0, residual)
     if abs(change) > _CERTAIN * error:
-        return None, [
+        message = (
             f"what is left over is no noise: phase-space volumes change by {change:.2g} "
             f"(± {error:.1g}) of themselves in a step, as by friction: no symplectic map does"
-        ]
+        )
+        return _LeftOver(None, [message], "volumes of phase space change, as by friction")
     taken = chosen.num_parameters / (judges.training.size * 2 * prepared.dim)
     noise = state_noise(chosen.map, judges.pairs.take(rows[:_NOISE_PAIRS]), taken)
     own = ""
-    if chosen.learns == "map":
+    if chosen.learns == "map" and entry is not None:
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))
         own = f" (the map's own error is then about {part:.1g} of it)"
-    return noise, [
+    message = (
         "larger models are no more accurate: the pairs seem to carry noise of about "
         f"{', '.join(f'{sigma:.1e}' for sigma in noise)} on the coordinates in their order{own}, "
         "or a structure that these functions cannot represent"
-    ]
+    )
+    return _LeftOver(noise, [message])
+
+
+def _residuals(
+    chosen: Candidate, entry: Entry | None, prepared: Prepared, judges: Judges, rows
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States and residuals (N, 2d) of these pairs, and which of them were predicted (N,): as
+    prepared where S was learned, in the user's coordinates where only a law was."""
+    if entry is not None:
+        _, params = entry.sweep.solve(entry.size, Clock(), lambda message: None)
+        images, solved = refined_images(
+            prepared, entry.sweep.chart, entry.size.family, params, rows
+        )
+        return prepared.y0[rows], prepared.y1[rows] - images, solved
+    pairs, coordinates = judges.pairs.take(rows), prepared.coordinates
+    angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
+    z0 = np.asarray(pairs.z0)
+    steps = stepped(chosen.map, z0, timed=False)
+    residual = nearest_image(np.asarray(pairs.z1) - steps.images, angles)
+    return z0, residual, ~steps.failed & np.isfinite(residual).all(axis=1)
 
 
 def not_met(chosen: Candidate, tolerance: Tolerance, ended: str) -> str:
