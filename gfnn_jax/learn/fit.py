@@ -172,7 +172,8 @@ def fit(
     family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp".
     chart:     "auto" or one of type1, type2, type3, midpoint.
     angles:    without a scene, the indices of z that have period 2π.
-    max_seconds: after which the search ends with the best map so far; None: no budget.
+    max_seconds: for all of it; the search ends with the best map so far while there is time to
+               compile its step. None: no budget.
     max_iterations: of the training of "mlp".
     checkpoints, factors: a ``TrainingCheckpoints`` and a ``KeptFactors``, which an interrupted fit
                has saved to and the same fit goes on from.
@@ -185,7 +186,7 @@ def fit(
     meets the tolerance, where a chart is close to singular, where pairs contradict their neighbours
     (a few are left out), and where the pairs do not look symplectic.
     """
-    clock = Clock(max_seconds)
+    clock = Clock(max_seconds, pairs.dim if isinstance(pairs, Pairs) else None)
     require_x64("a fit")
     bound = Tolerance(tolerance)
     if absolute_tolerance is not None:
@@ -416,7 +417,7 @@ def _assembled(
         expected = entry.candidate.validation_bound
         if assembled.candidate.validation_bound <= max(judges.tolerance.bound, 1.1 * expected):
             break
-        if clock.left <= 0:
+        if clock.left_in_all < assembled.compile_seconds:
             break
     chosen, entry = min(
         tried, key=lambda t: (t[0].validation_bound > judges.tolerance.bound, t[0].validation_bound)
