@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-# From fewer sizes nothing is foretold: an even S gains nothing from its second degree.
-_SIZES = 3
+# Sizes of a smaller range foretell nothing: an even S gains nothing from every other degree.
+_RANGE = 2.0
 # A size whose error is not this much smaller than all before it has gained nothing.
 _GAINED = 0.8
 # Extrapolated over more than so many times the extents that were seen, a course means nothing.
@@ -46,7 +46,7 @@ def course(sizes: Sequence[tuple[float, float]]) -> Course | None:
     of the last two, each over two gains, so that a sweep is rather thought to be good.
     """
     finite = [(x, e) for x, e in sizes if 0 < e < math.inf]
-    if len(finite) < _SIZES:
+    if not finite or finite[-1][0] - finite[0][0] < _RANGE:
         return None
     gains = finite[:1]
     for extent, error in finite[1:]:
