@@ -313,7 +313,7 @@ def friction() -> Case:
     """A pendulum that loses a fiftieth of its momentum per time: the fit of any map misses it."""
     data, fresh = swings(1_000, friction=0.02)
     return Case(
-        data, fresh, meets=False, words=("friction",), never=("noise",),
+        data, fresh, meets=False, words=("friction",), never=("carry noise", "noise, or"),
         volume_change=float(np.expm1(-0.02 * data.dt)),
     )  # fmt: skip
 
