@@ -298,7 +298,10 @@ def hidden_parameter() -> Case:
     law = partial(pendulum, stiffness=stiffness)
     states, fresh = (sequences(law, box([1.0, 1.0])(40, s), 0.2, 50) for s in (1, 2))
     words = ("differs? between (the )?sequences",)
-    return Case(in_sequence(states, 0.2), in_sequence(fresh, 0.2), meets=False, words=words)
+    return Case(
+        in_sequence(states, 0.2), in_sequence(fresh, 0.2), meets=False, words=words,
+        never=("noise, or a structure",),
+    )  # fmt: skip
 
 
 def twenty_pairs() -> Case:
@@ -310,7 +313,7 @@ def friction() -> Case:
     """A pendulum that loses a fiftieth of its momentum per time: the fit of any map misses it."""
     data, fresh = swings(1_000, friction=0.02)
     return Case(
-        data, fresh, meets=False, words=("friction",), never=("carry noise",),
+        data, fresh, meets=False, words=("friction",), never=("carry noise", "noise, or"),
         volume_change=float(np.expm1(-0.02 * data.dt)),
     )  # fmt: skip
 

@@ -21,6 +21,7 @@ from gfnn_jax.compiling import enable_compile_cache
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new
+from gfnn_jax.storage.partial import told_of
 
 # Those of `learn.check`, which would bring JAX; a test compares them.
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
@@ -54,6 +55,7 @@ class _Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line ``argv`` (without the program's name) and return the exit status."""
+    arguments = argparse.Namespace()
     try:
         arguments = _parser().parse_args(argv)
         with _sigterm(), _warnings_in_one_line():
@@ -68,7 +70,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt as stop:
         terminated = isinstance(stop, _Terminated)
-        kept = getattr(stop, "__notes__", ["nothing was kept"])  # notes of who keeps something
+        # Notes of who keeps something; before its work begins, an earlier job may have.
+        before = told_of(arguments.out) if getattr(arguments, "out", None) else None
+        kept = getattr(stop, "__notes__", [before or "nothing was kept"])
         return _fail(
             143 if terminated else 130,
             "; ".join(["terminated" if terminated else "stopped", *kept]),
@@ -178,6 +182,11 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
         "--terms", type=_texts, default=(), metavar="TEXT",
         help='of H, that you know: "p1**2; 1/sqrt(q1**2 + q2**2)"',
     )  # fmt: skip
+    command.add_argument(
+        "--base", metavar="TEXT",
+        help='an H that you know a part of the map by: "p1**2/2 - cos(q1)"; its flow is factored '
+        "out, and S learns what it leaves over",
+    )  # fmt: skip
     command.add_argument("--chart", choices=CHARTS, default="auto", help="default %(default)s")
     command.add_argument(
         "--family", choices=FAMILIES, default="auto",
@@ -270,7 +279,7 @@ def _scenes(arguments: argparse.Namespace) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    out = arguments.out or Path("runs") / arguments.scene
+    out = arguments.out = arguments.out or Path("runs") / arguments.scene
     if not arguments.resume:
         ensure_new(out, arguments.overwrite, folder=True)
     _set_up_jax()
@@ -281,6 +290,7 @@ def _run(arguments: argparse.Namespace) -> None:
             arguments.scene, out=out, quick=arguments.quick, seed=arguments.seed, dt=arguments.dt,
             tolerance=arguments.tolerance, max_seconds=arguments.max_seconds,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
+            base=arguments.base,
             family=arguments.family, overwrite=arguments.overwrite, resume=arguments.resume,
             progress=shown,
         )  # fmt: skip
@@ -303,6 +313,7 @@ def _fit(arguments: argparse.Namespace) -> None:
             tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
             absolute_tolerance=arguments.absolute_tolerance, max_seconds=arguments.max_seconds,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
+            base=arguments.base,
             family=arguments.family, scene_name=arguments.scene, angles=arguments.angles,
             seed=arguments.seed, overwrite=arguments.overwrite, resume=arguments.resume,
             progress=shown,
@@ -341,7 +352,7 @@ def _predict(arguments: argparse.Namespace) -> None:
 
 
 def _compare(arguments: argparse.Namespace) -> None:
-    out = arguments.out or Path("runs") / f"compare-{arguments.scene}"
+    out = arguments.out = arguments.out or Path("runs") / f"compare-{arguments.scene}"
     if not arguments.resume:
         ensure_new(out, arguments.overwrite, folder=True)
     _set_up_jax()

@@ -8,7 +8,7 @@ import pytest
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
-from gfnn_jax.generating.charts import TYPE2
+from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.learn import sweeps
 from gfnn_jax.learn.candidates import Judges, Tolerance, one_step_error
 from gfnn_jax.learn.clock import Clock, OutOfTime
@@ -149,3 +149,22 @@ def test_a_fit_that_goes_on_takes_the_factors_that_were_kept(monkeypatch, tmp_pa
     damaged = next((tmp_path / "factors").iterdir())
     damaged.write_bytes(damaged.read_bytes()[:100])
     assert again().ranking[0].candidate.label == "polynomial 4"
+
+
+@pytest.mark.parametrize(("odd", "even"), [(0.0, True), (1e-4, False), (1e-1, False)])
+def test_an_even_generating_function_is_known_by_its_pairs(odd, even, monkeypatch):
+    """A kick by the force −q − q³/2 − odd q² of each of three coordinates, and a drift."""
+    monkeypatch.setattr(sweeps, "_MOST_TERMS", 300)  # degree 4
+    z = np.random.default_rng(0).uniform(-0.5, 0.5, (900, 6))
+    q, p = z[:, :3], z[:, 3:]
+    p = p - 0.1 * (q + q**3 / 2 + odd * q**2)
+    pairs = Pairs(z, np.concatenate([q + 0.1 * p, p], axis=1), 0.1)
+    prepared = prepare(pairs, Coordinates("cartesian"))
+    judges = Judges(pairs, *split_rows(pairs, 0), Tolerance(1e-6))
+    assert sweeps.is_even(prepared, judges) == even
+    (found,) = sweeps.sweeps_for("polynomial", [MIDPOINT], prepared, None, judges)
+    assert [size.family.degree for size in found.sizes] == ([2, 4] if even else [2, 3, 4])
+    if even:
+        judged = found.judge(found.sizes[-1], Clock(), lambda message: None)
+        assert judged.label == "even polynomial 4"
+        assert judged.num_parameters == 21 + 126

@@ -23,6 +23,7 @@ from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.generating.generated import Generated
+from gfnn_jax.jobs import fit as jobs_fit
 from gfnn_jax.jobs import predict as predict_job
 from gfnn_jax.jobs import progress, search
 from gfnn_jax.learn import check
@@ -190,6 +191,7 @@ BAD_USAGE = [
     (("predict", "{model}", "{to}", "--num-steps", "1e3"), WHOLE + "1e3"),
     (("predict", "{model}", "{to}", "--num-steps", "1" + 20 * "0"), WHOLE + "1000"),
     (("predict", "{model}", "{to}", "--save-every", "-1"), WHOLE + "-1"),
+    (("predict", "{model}", "{to}", "--save-every", "99"), "--save-every of at most --num-steps"),
     (("predict", "{model}", "{to}", "--outside", "maybe"), "invalid choice: 'maybe'"),
     (("predict", "{model}", "{to}", "--out", "{data}"), "exists already"),
     (("predict", "{model}", "{to}", "--out", "{new}.csv"), "is written as .npz"),
@@ -424,6 +426,61 @@ def test_nothing_is_left_where_nothing_was_kept(tmp_path, capsys, monkeypatch):
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == "gfnn: stopped; nothing of the fit was kept"
     assert [p.name for p in tmp_path.iterdir()] == ["d.npz"]
+
+
+def test_what_an_earlier_fit_kept_is_told_however_soon_a_signal_comes(
+    tmp_path, capsys, monkeypatch
+):
+    def stop(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    (tmp_path / "m.partial" / "best").mkdir(parents=True)
+    (tmp_path / "m.partial" / "job.json").write_text("{}")
+    monkeypatch.setattr(jobs_fit, "read_trajectories", stop)
+    fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m", "--resume")
+    assert gfnn(*fit) == 130
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == f"gfnn: stopped; {tmp_path}/m.partial keeps best: --resume goes on with it"
+
+
+def stopped_with(better):
+    """A fit that hands on these (map, candidate) and is then interrupted."""
+
+    def fit(*args, on_better, **kwargs):
+        for map_, candidate in better:
+            on_better(map_, candidate)
+        raise KeyboardInterrupt
+
+    return fit
+
+
+def test_an_interrupted_fit_publishes_the_best_of_all_its_runs(
+    fitted, tmp_path, capsys, monkeypatch
+):
+    """A resumed fit meets its small sizes again; what it left in OUT it may replace."""
+    fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m", "--resume")
+    for error, best in ((1e-2, 1e-2), (1e-3, 1e-3), (1e-1, 1e-3)):
+        candidate = dataclasses.replace(fitted.chosen, validation_relative=error)
+        monkeypatch.setattr(search, "fit", stopped_with([(fitted.map, candidate)]))
+        assert gfnn(*fit) == 130
+        assert "m and can be used" in capsys.readouterr().err
+        assert models.record(tmp_path / "m")["validation_relative"] == best
+    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
+    assert gfnn(*fit) == 0
+    assert "unfinished" not in models.record(tmp_path / "m")
+
+
+def test_an_interrupted_fit_leaves_an_older_model_as_it_is(fitted, tmp_path, capsys, monkeypatch):
+    fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m", "--overwrite")
+    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
+    assert gfnn(*fit) == 0
+    before = files(tmp_path / "m")
+    monkeypatch.setattr(search, "fit", stopped_with([(fitted.map, fitted.chosen)]))
+    capsys.readouterr()
+    assert gfnn(*fit) == 130
+    assert files(tmp_path / "m") == before
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert f"m is as it was before; the best map so far is in {tmp_path}/m.partial/best" in told
 
 
 def test_a_killed_fit_that_kept_nothing_is_in_nobodys_way(fitted, tmp_path, monkeypatch):

@@ -82,6 +82,8 @@ def stop(_):
         ({"rows": 5}, "at least 8 different pairs"),
         ({"nan": True}, "row 3"),
         ({"angles": (0,), "chart": "type1"}, "no meaning for angles"),
+        ({"seed": -1}, "a whole number from 0 to 2..32 - 1 as seed, got -1"),
+        ({"seed": 1.5}, "as seed, got 1.5"),
         ({"dt": 0.0}, "time step"),
         ({"dt": math.nan}, "time step"),
         ({"dt": -0.4}, "time step"),

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 from analytic import henon_heiles_pairs
+from scipy.integrate import solve_ivp
 from test_cli import gfnn as command
 
 import gfnn_jax as gfnn
@@ -158,6 +159,40 @@ def gfnn_flow(hamiltonian):
     return Flow(hamiltonian, np.zeros(()), 0.2, np.ones(2), stages=8, substeps=4)
 
 
+def test_what_the_pairs_do_not_determine_is_named():
+    """Two oscillators, and the second one stands still in all pairs."""
+    z = np.random.default_rng(0).uniform(-1, 1, (200, 4)) * np.array([1.0, 0.0, 1.0, 0.0])
+    c, s = np.cos(0.3), np.sin(0.3)
+    turn = np.kron(np.array([[c, -s], [s, c]]), np.eye(2))
+    fit = gfnn.fit(gfnn.Pairs(z, z @ turn, 0.3), learn="hamiltonian")
+    assert fit.formula == "0.5 q1² + 0.5 p1²"
+    assert "3 terms of H (q2², q2 p2, p2²)" in " ".join(fit.messages)
+
+
+def test_terms_that_are_the_same_everywhere_are_no_gap_in_the_pairs(pairs):
+    fit = gfnn.fit(pairs, learn="hamiltonian", terms=["q1**2 + q2**2"], tolerance=1e-10)
+    assert fit.hamiltonian.null_terms
+    assert not any("do not determine" in message for message in fit.messages)
+
+
+def test_what_a_law_leaves_over_is_diagnosed():
+    """Pendulums of different length, told nothing of it: the states have no law."""
+    rng = np.random.default_rng(0)
+    rates = np.repeat(rng.uniform(0.8, 1.2, 20), 30)
+    phase = np.repeat(rng.uniform(0, 6, 20), 30) + 0.2 * np.tile(np.arange(30), 20) * rates
+    size = np.repeat(rng.uniform(0.3, 1, 20), 30)
+
+    def states(phase):
+        return np.stack([size * np.cos(phase), -size * rates * np.sin(phase)], axis=1)
+
+    z = states(phase)
+    later = states(phase + 0.2 * rates)
+    for i in range(20):  # to the bit, as those of a recording
+        later[30 * i : 30 * i + 29] = z[30 * i + 1 : 30 * i + 30]
+    fit = gfnn.fit(gfnn.Pairs(z, later, 0.2), tolerance=1e-10, learn="hamiltonian")
+    assert "differs between the sequences" in fit.ended
+
+
 def test_the_command_prints_the_formula(tmp_path, capsys, pairs):
     data = tmp_path / "d.npz"
     np.savez(data, **{k: v for k, v in dataclasses.asdict(pairs).items() if k != "dt"}, dt=0.5)
@@ -231,3 +266,30 @@ def test_a_map_that_is_far_cheaper_than_the_law_is_fitted_to_pairs_of_the_law(pa
     fresh = henon_heiles_pairs(100, seed=5)
     error = np.asarray(found.map.step(fresh.z0)[0]) - fresh.z1
     assert np.sqrt(np.mean(error**2)) < 1e-5 * np.std(fresh.z0)
+
+
+def test_a_known_law_leaves_little_to_learn(tmp_path):
+    """A pendulum that is kicked after every step: no H has that map, and S of what the pendulum's
+    flow leaves over is k cos(3q)/3h."""
+
+    def kicked(num, seed):
+        rng = np.random.default_rng(seed)
+        z0 = np.column_stack([rng.uniform(-np.pi, np.pi, num), rng.uniform(-1.5, 1.5, num)])
+        half = solve_ivp(
+            lambda _, y: np.concatenate([y[num:], -np.sin(y[:num])]), (0, 1.0), z0.T.ravel(),
+            method="DOP853", rtol=1e-13, atol=1e-13,
+        ).y[:, -1].reshape(2, num)  # fmt: skip
+        z1 = np.column_stack([half[0], half[1] + 0.5 * np.sin(3 * half[0])])
+        return gfnn.Pairs(z0, z1, 1.0)
+
+    fit = gfnn.fit(kicked(300, 0), angles=(0,), base="0.5*p**2 - cos(q)", tolerance=1e-11)
+    assert fit.met
+    assert fit.chosen.num_parameters < 30
+    fit.map.save(tmp_path / "m")
+    fresh = kicked(100, 1)
+    for map_ in (fit.map, gfnn.load(tmp_path / "m")):
+        error = np.asarray(map_.step(fresh.z0)[0]) - fresh.z1
+        assert np.abs(error).max() < 1e-10
+    assert fit.symplecticity_defect < 1e-12
+    back = np.asarray(fit.map.inverse(fresh.z1)[0])
+    np.testing.assert_allclose(back, fresh.z0, rtol=0, atol=1e-10)

@@ -95,6 +95,21 @@ def test_interrupted_exchange_of_folders(tmp_path):
     assert (tmp_path / "f" / "x").read_text() == "before"
 
 
+def test_a_signal_waits_for_the_end_of_an_exchange_of_folders(tmp_path, monkeypatch):
+    """Between the two renames neither the old folder nor the new one would be there."""
+    rename = outputs.os.rename
+
+    def slow(*names):
+        signal.raise_signal(signal.SIGINT)
+        rename(*names)
+
+    (tmp_path / "f").mkdir()
+    monkeypatch.setattr(outputs.os, "rename", slow)
+    with pytest.raises(KeyboardInterrupt), outputs.atomic_folder(tmp_path / "f") as new:
+        (new / "x").write_text("after")
+    assert (tmp_path / "f" / "x").read_text() == "after"
+
+
 def job(tmp_path, *, overwrite=False, resume=False, **what):
     return unfinished(
         tmp_path / "out", {"seed": 0} | what, what="job", overwrite=overwrite, resume=resume

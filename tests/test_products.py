@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gfnn_jax.families.inputs import Inputs, box_inputs, variable_signs
-from gfnn_jax.families.products import Products, chebyshev, fourier
+from gfnn_jax.families.products import Products, chebyshev, fourier, number_of_terms
 
 
 @pytest.mark.parametrize("degree", range(9))
@@ -168,3 +168,14 @@ def test_features_of_many_states_are_those_of_each(compilations):
     raw = np.stack([np.sum(q * q, 1), np.sum(p * p, 1), np.sum(q * p, 1)], axis=1)
     np.testing.assert_allclose(many * inputs.scale + inputs.centre, raw, rtol=0, atol=1e-14)
     np.testing.assert_allclose(few, many[:100], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("even", [False, True])
+@pytest.mark.parametrize("case", list(CASES))
+def test_terms_are_counted_without_making_them(case, even):
+    if even and "cyclic" in case:
+        pytest.skip("reversors of cyclic coordinates are the inputs' tests")
+    for degree in (2, 5):
+        family = family_of(case, degree, even)
+        counted = number_of_terms(family.inputs.is_angle, degree, family.signs)
+        assert counted == family.num_parameters

@@ -16,13 +16,14 @@ class Size(NamedTuple):
     operations: float
     estimate: float
     error: float
+    extent: float
 
 
 class Sweep:
     """Sizes with an estimate and an error each; it notes what it is asked."""
 
     def __init__(self, sizes, family="polynomial", chart="midpoint", most=np.inf):
-        self.sizes = [Size(float(s[0]), s[1], s[-1]) for s in sizes]
+        self.sizes = [Size(float(s[0]), s[1], s[-1], n) for n, s in enumerate(sizes, 2)]
         self.short_of_pairs = True
         self.family, self.chart, self.most = family, chart, most
         self.judged, self.validated = [], []
@@ -35,6 +36,9 @@ class Sweep:
             f"{self.family} {size.operations:g}", self.family, self.chart, 3, size.operations,
             size.estimate, size.estimate, size.estimate, np.ones(2), size.estimate, 0.0,
         )  # fmt: skip
+
+    def at(self, extent):
+        return f"{self.family} {extent:g}"
 
     def validate(self, size, judged, clock, say):
         self.validated.append(size.operations)
@@ -195,3 +199,81 @@ def test_no_sizes_at_all():
     found = found_in(Sweep([]))
     assert found.ranking == found.entries == []
     assert found.ended == "the pairs determine no model at all"
+
+
+# What errors lead to
+
+
+def geometric(first, rate, count, operations=10.0, every=1):
+    """Sizes whose error falls by the factor ``rate`` with every so many of them."""
+    return [(operations * 2**n, first * rate ** (n // every)) for n in range(count)]
+
+
+def test_a_sweep_that_leads_to_less_than_another_has_is_left():
+    """Sines, four orders worse than a polynomial of the same cost, are tried no further."""
+    sines = Sweep(geometric(2e-1, 0.5, 8), family="sines")
+    products = Sweep(geometric(1e-2, 1e-3, 3, operations=15.0, every=2), family="polynomial")
+    found_in(products, sines)
+    assert len(sines.judged) == 3  # the third is where its course shows
+    assert len(products.judged) == 3
+
+
+def test_a_sweep_that_leads_nowhere_is_left_where_another_leads_to_the_tolerance():
+    slow = Sweep(geometric(1.1e-1, 0.5, 8), chart="type2")
+    fast = Sweep(geometric(1e-1, 0.2, 9, operations=11.0))
+    found = found_in(fast, slow, bound=1e-6)
+    assert found.ended == "the tolerance is met"
+    assert len(slow.judged) == 3
+
+
+def test_a_sweep_that_gains_with_every_other_size_is_not_given_up():
+    """An even S: what looks slow over one size is fast over two."""
+    even = Sweep(geometric(1e-1, 1e-2, 9, every=2))
+    other = Sweep(geometric(1e-1, 0.3, 9, operations=11.0), family="sines")
+    found = found_in(even, other, bound=1e-9)
+    assert found.ranking[0].sweep is even
+    assert found.ended == "the tolerance is met"
+
+
+def test_the_only_sweep_is_climbed_to_its_end_however_slow():
+    sweep = Sweep(geometric(1e-1, 0.7, 8))
+    found_in(sweep, bound=1e-12)
+    assert len(sweep.judged) == 8
+
+
+@pytest.mark.parametrize(
+    ("sizes", "said"),
+    [
+        (geometric(1e-1, 1e-1, 4), "extrapolated, polynomial 7 would meet the tolerance"),
+        # Degrees 2 to 5 of an even S: 1e-1, 1e-1, 1e-3, 1e-3. The sixth has 1e-5, the eighth 1e-7.
+        (geometric(1e-1, 1e-2, 4, every=2), "extrapolated, polynomial 8 would meet the tolerance"),
+        (geometric(1e-1, 0.79, 5), "too slowly"),
+    ],
+)
+def test_what_would_be_needed_is_said(sizes, said):
+    assert said in found_in(Sweep(sizes), bound=1e-6).ended
+
+
+def test_nothing_is_foretold_from_two_sizes_or_a_stall():
+    for sizes in ([(10, 1e-1), (20, 1e-2)], [(10 + n, 1e-1) for n in range(6)]):
+        assert ";" not in found_in(Sweep(sizes), bound=1e-6).ended
+
+
+def test_what_the_spent_budget_cut_off_is_foretold():
+    sweep = Sweep(geometric(1e-1, 1e-1, 9), most=4)
+    found = found_in(sweep, bound=1e-7, clock=Clock(max_seconds=1_000.0))
+    assert found.ended == (
+        "the budget of 1000 s is spent; extrapolated, polynomial 8 would meet the tolerance"
+    )
+
+
+# The clock
+
+
+def test_the_compilation_that_follows_the_search_is_reserved():
+    plain, of_three = Clock(max_seconds=60.0), Clock(max_seconds=60.0, dim=3)
+    assert plain.left - of_three.left == pytest.approx(9.0, abs=1.0)
+    assert of_three.left_in_all == pytest.approx(60.0, abs=1.0)
+    short = Clock(max_seconds=3.0, dim=3)
+    assert short.left > 2.0  # a fifth of a budget at most
+    assert Clock(dim=3).left == Clock(dim=3).left_in_all == np.inf

@@ -127,6 +127,7 @@ def test_functions_are_traced(function):
         ("q1 + " * 400 + "q1", "at most"),
         ("-" * 200 + "q1", "levels"),
         ("", "is no expression"),
+        ("1e999*q1", "a number that is beyond float64"),
     ],
 )
 def test_other_text_is_refused_in_one_line(text, says):

@@ -208,6 +208,8 @@ def _parsed(node, names, text, depth) -> Expression:
         raise refuse(f"more than {_DEEPEST} levels")
     value = node.value if isinstance(node, ast.Constant) else None
     if isinstance(value, (int, float)) and not isinstance(value, bool):
+        if not math.isfinite(value):
+            raise refuse("a number that is beyond float64")
         return number(value)
     if isinstance(node, ast.Name):
         if node.id in names:

@@ -77,6 +77,22 @@ def _product(f, picks):
     return sum(f[..., k : k + 1] * as_row(picks[k], f) for k in range(len(picks)))
 
 
+def number_of_terms(is_angle: tuple[bool, ...], degree: int, signs=None) -> int:
+    """How many products a basis of this degree has, counted without making it."""
+    counts = np.zeros((2, degree + 1), dtype=object)  # by parity and total degree
+    counts[0, 0] = 1
+    for angle, sign in zip(is_angle, signs or (1,) * len(is_angle), strict=True):
+        after = np.zeros_like(counts)
+        for k in range(degree + 1):
+            # A cosine is even and a sine odd; a polynomial is as its degree.
+            odd = [False, True][: 1 + (k > 0)] if angle else [k % 2 == 1]
+            for flips in odd:
+                moved = counts[::-1] if flips and sign < 0 else counts
+                after[:, k:] += moved[:, : degree + 1 - k]
+        counts = after
+    return int(counts[0].sum()) - 1  # a constant generates nothing
+
+
 @dataclasses.dataclass(frozen=True)
 class _Half:
     """The products of one-dimensional functions over one half of the variables."""

@@ -30,6 +30,7 @@ def fit(
     chart: str = "auto",
     learn: str = "auto",
     terms: tuple[str, ...] = (),
+    base: str | None = None,
     family: str = "auto",
     scene_name: str | None = None,
     angles: tuple[int, ...] = (),
@@ -50,7 +51,7 @@ def fit(
         progress.tell(line)
     options = {
         "tolerance": tolerance, "absolute_tolerance": absolute_tolerance, "chart": chart,
-        "learn": learn, "terms": list(terms), "family": family, "seed": seed,
+        "learn": learn, "terms": list(terms), "base": base, "family": family, "seed": seed,
     }  # fmt: skip
     job = {
         "command": "fit", "data": trajectories.digest, "dt": trajectories.dt, "scene": scene_name,

@@ -12,6 +12,7 @@ import numpy as np
 
 from gfnn_jax.data.files import read_initial_states
 from gfnn_jax.data.predictions import PredictionWriter
+from gfnn_jax.errors import InputError
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.symplectic_map import Lanes, SymplecticMap
@@ -47,6 +48,10 @@ def predict(
     than that, whatever ``num_steps``. A job that was killed goes on with ``resume`` where its last
     chunk ended, to the very bits that an uninterrupted one gives.
     """
+    if save_every > num_steps:
+        raise InputError(
+            f"expected --save-every of at most --num-steps, {num_steps}; got {save_every}"
+        )
     map_ = saved.load(model)
     dt = float(map_.dt)
     z0 = read_initial_states(initial, map_.dim)

@@ -59,9 +59,20 @@ def search(
 def _keep(
     folder: Path, scene: Scene | None, job: Any, map_: SymplecticMap, candidate: Candidate
 ) -> None:
-    """The best map so far, on disk."""
+    """The best map so far, on disk. A resumed fit meets its small sizes again: what it had kept is
+    better."""
+    if _error_of(folder) <= candidate.validation_relative:
+        return
     record = {"unfinished": job, "validation_relative": candidate.validation_relative}
     saved.save(map_, folder, scene=scene, record=record, overwrite=True)
+
+
+def _error_of(folder: Path) -> float:
+    """The error of the map that was kept there, infinite where none can be read."""
+    try:
+        return float(saved.record(folder)["validation_relative"])
+    except (InputError, KeyError):
+        return float("inf")
 
 
 def line(candidate: Candidate) -> str:

@@ -38,13 +38,23 @@ def write(folder: Path, model: Path, fit: Fit, result: dict[str, Any], job: dict
 
 
 def publish(best: Path, model: Path) -> str:
-    """The best map of an interrupted fit into the folder ``model``, where nothing stands there yet;
-    what is to be said of it, or nothing."""
-    if not best.is_dir() or model.exists():
+    """The best map of an interrupted fit into the folder ``model``; what is to be said of it, or
+    nothing. What stands there stays as it is, unless the same fit, interrupted before, left it."""
+    if not best.is_dir():
         return ""
+    if model.exists() and _unfinished(model) != _unfinished(best):
+        return f"{model} is as it was before; the best map so far is in {best}"
     with atomic_folder(model) as folder:
         shutil.copytree(best, folder, dirs_exist_ok=True)
     return f"the best map so far is in {model} and can be used"
+
+
+def _unfinished(model: Path) -> dict[str, Any] | None:
+    """The job of an interrupted fit whose best map a folder holds; None for any other folder."""
+    try:
+        return saved.record(model).get("unfinished")
+    except InputError:
+        return None
 
 
 def already_done(model: Path, job: dict[str, Any], resume: bool) -> bool:

@@ -36,6 +36,7 @@ def check_request(
     angles,
     terms=(),
     base=None,
+    seed=0,
 ) -> None:
     """Raises FitError where the request or the pairs cannot give a map."""
     for name, value, known in (
@@ -45,6 +46,8 @@ def check_request(
             raise FitError(f"expected a {name} among {', '.join(known)}; got '{value}'")
     if not isinstance(pairs, Pairs):
         raise FitError(f"expected gfnn.Pairs(z0, z1, dt), got {type(pairs).__name__}")
+    if not (isinstance(seed, numbers.Integral) and 0 <= seed < 2**32):
+        raise FitError(f"expected a whole number from 0 to 2**32 - 1 as seed, got {seed!r}")
     for name, value in (("tolerance", tolerance), ("time step", pairs.dt)):
         if not isinstance(value, numbers.Real) and np.shape(value) != ():
             raise FitError(f"expected a number as {name}, got {value!r}")

@@ -16,12 +16,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.coordinates import CARTESIAN, Coordinates, nearest_image
 from gfnn_jax.errors import FitError, FitWarning
 from gfnn_jax.families.terms import given_terms
-from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.assemble import assemble, composed, with_predictor
+from gfnn_jax.learn.assemble import assemble, composed, stepped, with_predictor
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance, refined_images
 from gfnn_jax.learn.check import (
     check_number,
@@ -30,28 +29,32 @@ from gfnn_jax.learn.check import (
     not_radians,
     unlike_the_scene,
 )
-from gfnn_jax.learn.choose_charts import Charts, choose_charts
 from gfnn_jax.learn.choose_law import DEARER, law_of, preferred
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.diagnose import (
     ChartJudgement,
-    data_defect,
     differs_between_sequences,
-    local_jacobians,
-    look_symplectic,
     outliers,
-    sampled_dimension,
     sequences_of,
     volume_change,
 )
+from gfnn_jax.learn.diagnosed import diagnosed
 from gfnn_jax.learn.draw import NUM_PAIRS, drawn
-from gfnn_jax.learn.flows import LearnedHamiltonian, around, flow_of, flow_operations
+from gfnn_jax.learn.flows import LearnedHamiltonian, flow_of
 from gfnn_jax.learn.flows import assembled as flow_assembled
 from gfnn_jax.learn.held_out import first_occurrences, split_rows
+from gfnn_jax.learn.law_maps import (
+    better_than,
+    factored_out,
+    law_explains_most,
+    more_pairs_would_help,
+    search_around,
+    search_of_law,
+)
 from gfnn_jax.learn.noise import state_noise
 from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.search import AS_FAR, Entry, Found, search
-from gfnn_jax.learn.sweeps import NetworkSweep, sweeps_for, trial_residual
+from gfnn_jax.learn.sweeps import NetworkSweep, sweeps_for
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
@@ -61,8 +64,6 @@ MAX_SECONDS = 120.0
 _MOST_OUTLIERS = 0.05  # of the pairs may be left out
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken
-_TRIAL_PAIRS = 1_000  # by which it is found out where a flow is to be factored out
-_EXPLAINED = 0.1  # of the spread: a law that errs by more explains too little to be factored out
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 _RESIDUAL_PAIRS = 2_000  # whose residuals are looked at
 _NOISE_PAIRS = 1_024  # from which the noise of the states is measured
@@ -220,7 +221,8 @@ def fit(
     family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp".
     chart:     "auto" or one of type1, type2, type3, midpoint.
     angles:    without a scene, the indices of z that have period 2π.
-    max_seconds: after which the search ends with the best map so far; None: no budget.
+    max_seconds: for all of it; the search ends with the best map so far while there is time to
+               compile its step. None: no budget.
     max_iterations: of the training of "mlp".
     checkpoints, factors: a ``TrainingCheckpoints`` and a ``KeptFactors``, which an interrupted fit
                has saved to and the same fit goes on from.
@@ -233,14 +235,14 @@ def fit(
     meets the tolerance, where a chart is close to singular, where pairs contradict their neighbours
     (a few are left out), and where the pairs do not look symplectic.
     """
-    clock = Clock(max_seconds)
+    clock = Clock(max_seconds, pairs.dim if isinstance(pairs, Pairs) else None)
     require_x64("a fit")
     bound = Tolerance(tolerance)
     if absolute_tolerance is not None:
         bound = Tolerance(absolute_tolerance, relative=False)
     check_request(
         pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, angles=angles,
-        terms=terms, base=base,
+        terms=terms, base=base, seed=seed,
     )  # fmt: skip
     pairs = dataclasses.replace(
         pairs, z0=np.asarray(pairs.z0, np.float64), z1=np.asarray(pairs.z1, np.float64)
@@ -263,8 +265,8 @@ def fit(
     if base is not None:
         known = given_terms(prepared.dim, (base,))
         flow = flow_of(known, np.ones(known.num_parameters), prepared)
-        prepared = _factored_out(flow, prepared, seed)
-    seen = _diagnosed(prepared, chart, scene.reversor if scene else None, seed)
+        prepared = factored_out(flow, prepared, seed)
+    seen = diagnosed(prepared, chart, scene.reversor if scene else None, seed)
     warn(seen.messages)
     prepared, charts = seen.prepared, seen.charts
     judges = Judges(pairs, *split_rows(pairs, seed), bound)
@@ -286,19 +288,19 @@ def fit(
     met_by_law = law is not None and law.candidate.validation_bound <= bound.bound
     dearest = law.candidate.operations / DEARER if law is not None and met_by_law else np.inf
     found = search(sweeps, bound.bound, clock, on_progress, on_candidate, better, dearest)
-    if law is not None and met_by_law and _more_pairs_would_help(sweeps, found, bound, dearest):
+    if law is not None and met_by_law and more_pairs_would_help(sweeps, found, bound, dearest):
         on_progress("drawing pairs from the flow of H")
-        of_law = _search_of_law(
+        of_law = search_of_law(
             law, pairs, judges, scene, coordinates, dearest, clock, on_progress, on_candidate, seed
         )
         if of_law is not None:
             judges, prepared, charts, found = of_law
-    elif law is not None and _law_explains_most(law, found, bound, clock):
+    elif law is not None and law_explains_most(law, found, bound, clock):
         on_progress(f"learning what the flow of {law.candidate.label} leaves over")
-        around = _search_around(
+        around = search_around(
             law, plain, judges, scene, clock, on_progress, on_candidate, better, seed
         )
-        if around is not None and _better_than(around.found, found, law):
+        if around is not None and better_than(around.found, found, law):
             judges, prepared, charts, found = around
     if not found.ranking and law is None:
         raise FitError(_nothing_found(found, pairs, clock))
@@ -308,18 +310,24 @@ def fit(
     ended = found.ended if learn != "hamiltonian" else _ended(chosen, bound)
     if law is not None and (entry is None or met_by_law):
         warn(list(law.messages))
-    if chosen.validation_bound > bound.bound:
-        warn([*not_radians(pairs, coordinates), not_met(chosen, bound, ended)])
     looked_at = entry or (found.ranking[0] if found.ranking else None)
-    left_over = chosen.validation_bound > bound.bound and chosen.validation_relative > _ROUNDOFF
-    if left_over and looked_at is not None:
+    diagnosis: list[str] = []
+    if chosen.validation_bound > bound.bound and chosen.validation_relative > _ROUNDOFF:
         stalled = any(  # the chosen sweep, or another that has come as far
             (e.candidate.chart, e.candidate.family) in found.stalled
             and e.candidate.validation_relative <= AS_FAR * chosen.validation_relative
             for e in found.entries
         )
-        noise, new = _what_is_left(chosen, looked_at, prepared, judges, stalled)
-        warn(new)
+        if looked_at is None:
+            stalled = law is not None and law.stalled
+        left_over = _what_is_left(chosen, looked_at, prepared, judges, stalled)
+        noise, diagnosis = left_over.noise, left_over.messages
+        if left_over.reason and stalled:
+            ended = f"larger models are no more accurate: {left_over.reason}"
+        elif left_over.reason:
+            ended = f"{ended}; {left_over.reason}"
+    if chosen.validation_bound > bound.bound:
+        warn([*not_radians(pairs, coordinates), not_met(chosen, bound, ended), *diagnosis])
     others = [e.candidate for e in found.entries if entry is None or e.size is not entry.size]
     if law is not None and entry is not None:
         others.append(law.candidate)
@@ -344,111 +352,6 @@ def fit(
         pairs=pairs,
         scene=scene,
     )
-
-
-class _Searched(NamedTuple):
-    judges: Judges
-    prepared: Prepared
-    charts: Charts
-    found: Found
-
-
-def _more_pairs_would_help(sweeps, found: Found, bound: Tolerance, dearest: float) -> bool:
-    """Whether none of the sizes that the pairs determine meets the tolerance, and larger ones would
-    still be cheap enough."""
-    if found.ranking and found.ranking[0].candidate.validation_bound <= bound.bound:
-        return False
-    return any(s.short_of_pairs and s.sizes and s.sizes[-1].operations < dearest for s in sweeps)
-
-
-def _search_of_law(
-    law: LearnedHamiltonian, pairs: Pairs, judges: Judges, scene: Scene | None,
-    coordinates: Coordinates, dearest: float, clock: Clock, say, tell, seed: int,
-) -> _Searched | None:  # fmt: skip
-    """Maps fitted to pairs that are drawn from the law's flow, and judged by the user's held-out
-    pairs; None where none of them meets the tolerance."""
-    more = drawn(law.flow, coordinates, pairs.z0, float(pairs.dt), seed=seed)
-    held = pairs.take(judges.held_out)
-    both = Pairs(
-        np.concatenate([more.z0, held.z0]), np.concatenate([more.z1, held.z1]), float(pairs.dt)
-    )
-    rows = np.arange(len(both))
-    judges = Judges(both, rows[: len(more)], rows[len(more) :], judges.tolerance)
-    seen = _diagnosed(prepare(both, coordinates), "auto", scene.reversor if scene else None, seed)
-    sweeps = list(sweeps_for("auto", seen.charts.charts, seen.prepared, scene, judges))
-    found = search(sweeps, judges.tolerance.bound, clock, say, tell, None, dearest)
-    if not found.ranking:
-        return None
-    if found.ranking[0].candidate.validation_bound > judges.tolerance.bound:
-        return None
-    found = found._replace(ended="the tolerance is met, by a map of pairs drawn from H's flow")
-    return _Searched(judges, seen.prepared, seen.charts, found)
-
-
-def _law_explains_most(law: LearnedHamiltonian, found: Found, bound: Tolerance, clock) -> bool:
-    """Whether nothing meets the tolerance, but S might with most of the motion factored out. What
-    stalls in noise would stall without it too."""
-    if clock.left <= 0 or not found.ranking or found.stalled:
-        return False
-    best = found.ranking[0].candidate
-    error = law.candidate.validation_relative
-    return best.validation_bound > bound.bound and error < _EXPLAINED
-
-
-def _search_around(
-    law: LearnedHamiltonian, plain: Prepared, judges: Judges, scene: Scene | None, clock: Clock,
-    say, tell, better, seed: int,
-) -> _Searched | None:  # fmt: skip
-    """Maps of the law's flow Φ and of S, which learns what Φ leaves over; None where Φ has no image
-    of some of the states, or no chart covers what is left."""
-    try:
-        flow = flow_of(law.flow.family, np.asarray(law.flow.params), plain)
-        prepared = _factored_out(flow, plain, seed)
-        seen = _diagnosed(prepared, "auto", scene.reversor if scene else None, seed)
-    except FitError:
-        return None
-    more = flow_operations(flow, plain)
-    sweeps = list(sweeps_for("auto", seen.charts.charts, seen.prepared, scene, judges))
-    if better is not None:
-        better.prepared = seen.prepared
-    found = search(sweeps, judges.tolerance.bound, clock, say, tell, better)
-    entries, ranking = (
-        [
-            e._replace(
-                candidate=dataclasses.replace(
-                    e.candidate,
-                    operations=e.candidate.operations + more,
-                    label=f"{e.candidate.label} around H",
-                )
-            )
-            for e in part
-        ]
-        for part in (found.entries, found.ranking)
-    )
-    found = found._replace(entries=entries, ranking=ranking)
-    return _Searched(judges, seen.prepared, seen.charts, found)
-
-
-def _factored_out(flow: Flow, plain: Prepared, seed: int) -> Prepared:
-    """The pairs without the flow: before, after, or half on either side of what is learned,
-    whichever leaves the map that a small S comes closest to."""
-
-    def left_over(prepared: Prepared) -> float:
-        rows = np.random.default_rng(seed).permutation(len(prepared.y0))[:_TRIAL_PAIRS]
-        return trial_residual(prepared.take(rows))
-
-    tried = [plain.without(*pieces) for pieces in around(flow)]
-    errors = [left_over(prepared) for prepared in tried]
-    return tried[0] if errors[0] <= 2 * min(errors) else tried[int(np.argmin(errors))]
-
-
-def _better_than(around: Found, found: Found, law: LearnedHamiltonian) -> bool:
-    """Whether the maps around the law have a better one than the others and the law itself."""
-    if not around.ranking:
-        return False
-    others = [found.ranking[0].candidate, law.candidate]
-    best = around.ranking[0].candidate
-    return all(best.validation_bound < other.validation_bound for other in others)
 
 
 class _Better:
@@ -502,43 +405,6 @@ def _prepared(pairs: Pairs, coordinates: Coordinates) -> tuple[Pairs, Prepared, 
     return pairs, prepared, messages
 
 
-class _Diagnosis(NamedTuple):
-    prepared: Prepared
-    charts: Charts
-    data_defect: float
-    messages: list[str]
-
-
-def _diagnosed(prepared: Prepared, chart: str, reversor, seed: int) -> _Diagnosis:
-    """What the local Jacobians say: whether the pairs look symplectic, and which charts cover
-    them; the base map is factored out where one is needed."""
-    jacobians, error = local_jacobians(prepared.y0, prepared.y1, prepared.scale, seed=seed)
-    defect, messages = data_defect(jacobians, prepared.scale), _thin(prepared)
-    if not look_symplectic(jacobians, error, prepared.scale):
-        messages.append(
-            f"the pairs do not look symplectic: ‖MᵀJM − J‖ is about {defect:.2g}, known to within "
-            f"{error:.1g} (0 for a symplectic map): are q and p in order, p momenta and not "
-            "velocities, and no friction?"
-        )
-    charts = choose_charts(chart, prepared, reversor, jacobians)
-    if charts.half is not None:
-        prepared = prepared.without(charts.half, charts.half)
-    return _Diagnosis(prepared, charts, defect, [*messages, *charts.messages])
-
-
-def _thin(prepared: Prepared) -> list[str]:
-    """A warning where the states lie on a curve, or on the torus of an orbit."""
-    seen = [i for i in range(2 * prepared.dim) if i not in prepared.coordinates.cyclic]
-    dimension = sampled_dimension(prepared.y0[:, seen], prepared.scale[seen])
-    if dimension > min(prepared.dim, len(seen) - 1):
-        return []
-    where = "a curve" if dimension == 1 else f"a surface of dimension {dimension}"
-    return [
-        f"the pairs lie on {where} of the {len(seen)}-dimensional phase space, as those of one "
-        "orbit do: the map is learned there only"
-    ]
-
-
 def _chosen(
     found: Found, law: LearnedHamiltonian | None, prepared: Prepared, plain: Prepared,
     judges: Judges, clock: Clock, say,
@@ -583,7 +449,7 @@ def _assembled(
         expected = entry.candidate.validation_bound
         if assembled.candidate.validation_bound <= max(judges.tolerance.bound, 1.1 * expected):
             break
-        if clock.left <= 0:
+        if clock.left_in_all < assembled.compile_seconds:
             break
     chosen, entry = min(
         tried, key=lambda t: (t[0].validation_bound > judges.tolerance.bound, t[0].validation_bound)
@@ -591,45 +457,76 @@ def _assembled(
     return chosen, entry, compile_seconds
 
 
-def _what_is_left(
-    chosen: Candidate, entry: Entry, prepared: Prepared, judges: Judges, stalled: bool
-) -> tuple[np.ndarray | None, list[str]]:
-    """The noise (2d,) that the residuals suggest, where larger models no longer helped, and what is
-    said of the residuals: noise, friction, or a parameter that differs between sequences.
+class _LeftOver(NamedTuple):
+    """What the residuals suggest: the noise (2d,), what is said of them, and the reason why no
+    larger model would help where that is known."""
 
-    entry: of the best map, whose residuals are looked at.
+    noise: np.ndarray | None
+    messages: list[str]
+    reason: str = ""
+
+
+def _what_is_left(
+    chosen: Candidate, entry: Entry | None, prepared: Prepared, judges: Judges, stalled: bool
+) -> _LeftOver:
+    """Noise, where larger models no longer helped, friction, or a parameter that differs between
+    sequences.
+
+    entry: of the best map, whose residuals are looked at; None: those of the chosen law.
     """
     rows = np.sort(judges.training)[:_RESIDUAL_PAIRS]
-    _, params = entry.sweep.solve(entry.size, Clock(), lambda message: None)
-    images, solved = refined_images(prepared, entry.sweep.chart, entry.size.family, params, rows)
-    rows, residual = rows[solved], (prepared.y1[rows] - images)[solved]
+    y0, residual, solved = _residuals(chosen, entry, prepared, judges, rows)
+    rows, y0, residual = rows[solved], y0[solved], residual[solved]
     sequence = sequences_of(judges.pairs.z0, judges.pairs.z1)[rows]
-    scaled = prepared.y0[rows] / prepared.scale, residual / prepared.scale
-    if differs_between_sequences(*scaled, sequence):
-        return None, [
+    scale = judges.spread if entry is None else prepared.scale
+    if differs_between_sequences(y0 / scale, residual / scale, sequence):
+        message = (
             "what is left over agrees within a sequence and differs between sequences: something "
             "that the states do not hold (a mass, a length, a field) differs between them; learn "
             "those of one value by themselves"
-        ]
+        )
+        return _LeftOver(None, [message], "something that the states do not hold differs between "
+                         "the sequences")  # fmt: skip
     if not stalled:
-        return None, []
-    change, error = volume_change(prepared.y0[rows], residual)
+        return _LeftOver(None, [])
+    change, error = volume_change(y0, residual)
     if abs(change) > _CERTAIN * error:
-        return None, [
+        message = (
             f"what is left over is no noise: phase-space volumes change by {change:.2g} "
             f"(± {error:.1g}) of themselves in a step, as by friction: no symplectic map does"
-        ]
+        )
+        return _LeftOver(None, [message], "volumes of phase space change, as by friction")
     taken = chosen.num_parameters / (judges.training.size * 2 * prepared.dim)
     noise = state_noise(chosen.map, judges.pairs.take(rows[:_NOISE_PAIRS]), taken)
     own = ""
-    if chosen.learns == "map":
+    if chosen.learns == "map" and entry is not None:
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))
         own = f" (the map's own error is then about {part:.1g} of it)"
-    return noise, [
+    message = (
         "larger models are no more accurate: the pairs seem to carry noise of about "
         f"{', '.join(f'{sigma:.1e}' for sigma in noise)} on the coordinates in their order{own}, "
         "or a structure that these functions cannot represent"
-    ]
+    )
+    return _LeftOver(noise, [message])
+
+
+def _residuals(
+    chosen: Candidate, entry: Entry | None, prepared: Prepared, judges: Judges, rows
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States and residuals (N, 2d) of these pairs, and which of them were predicted (N,): as
+    prepared where S was learned, in the user's coordinates where only a law was."""
+    if entry is not None:
+        _, params = entry.sweep.solve(entry.size, Clock(), lambda message: None)
+        images, solved = refined_images(
+            prepared, entry.sweep.chart, entry.size.family, params, rows
+        )
+        return prepared.y0[rows], prepared.y1[rows] - images, solved
+    pairs, coordinates = judges.pairs.take(rows), prepared.coordinates
+    angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
+    z0 = np.asarray(pairs.z0)
+    steps = stepped(chosen.map, z0, timed=False)
+    residual = nearest_image(np.asarray(pairs.z1) - steps.images, angles)
+    return z0, residual, ~steps.failed & np.isfinite(residual).all(axis=1)
 
 
 def not_met(chosen: Candidate, tolerance: Tolerance, ended: str) -> str:

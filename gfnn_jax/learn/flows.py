@@ -72,6 +72,8 @@ _ROUNDOFF = 1e-12  # of the spread: above it the pairs carry noise, and every on
 _FREQUENCY_STATES = 500
 _NEAR_ROUNDOFF = 3e-15  # of the spread
 _HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
+_NAMED = 5  # terms in a message
+_POOR = 2  # libraries in a row that do not help end the search
 _FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
 
 
@@ -92,7 +94,8 @@ class LearnedHamiltonian:
     states, ÷ scale. omega_h: the fastest oscillation of the linearised flow, times dt, in the
     median over the data; beyond π pairs of one dt may not tell H. contraction: the fixed point's
     factor where it is largest. condition: of the terms' columns. null_terms: that the data do not
-    tell from the others. left_out: pairs that the flow does not resolve.
+    tell from the others. left_out: pairs that the flow does not resolve. stalled: whether larger
+    libraries were no more accurate.
     """
 
     candidate: Candidate
@@ -106,16 +109,19 @@ class LearnedHamiltonian:
     null_terms: tuple[str, ...]
     left_out: int
     messages: tuple[str, ...]
+    stalled: bool
 
 
 class _Fitted(NamedTuple):
-    """rows: that the fit was given; it has left out those that the flow does not resolve."""
+    """rows: that the fit was given; it has left out those that the flow does not resolve.
+    undetermined: of the null terms, those that other states would tell from the rest."""
 
     family: Terms
     fit: FlowFit
     rows: np.ndarray
     error: OneStepError
     null: tuple[str, ...]
+    undetermined: tuple[str, ...]
 
 
 def learn_hamiltonian(
@@ -161,7 +167,7 @@ def learn_hamiltonian(
                 best = found
             last = found
             errors.append(found.error.bound)
-            if best.error.bound <= bound or poor == 2:
+            if best.error.bound <= bound or poor == _POOR:
                 break
             if _out_of_reach(errors, len(libraries) - 1 - libraries.index(family), bound):
                 options = dataclasses.replace(options, thresholds=())  # no law: nothing to read
@@ -182,7 +188,8 @@ def learn_hamiltonian(
     except OutOfTime:
         pass  # what was found stands
     problem.check = lambda: None
-    return _learned(best, problem, prepared, judges, time.perf_counter() - started, options)
+    learned = _learned(best, problem, prepared, judges, time.perf_counter() - started, options)
+    return dataclasses.replace(learned, stalled=poor == _POOR)
 
 
 def _check_finite(given: Terms, z) -> None:
@@ -253,13 +260,22 @@ def _fitted(problem, family, prepared, judges, last: _Fitted | None, options, sa
     z = prepared.y0[judges.training]
     enough = z[: max(200, 4 * family.num_parameters // z.shape[1])]
     kept, null = null_terms(family, enough)
+    elsewhere = null_terms(family, _scattered(enough))[0] if null else []
+    undetermined = tuple(names[j] for j in null if j in elsewhere)
     family = family.take(kept)
     count = int(np.ceil(options.judged_rows * family.num_parameters / z.shape[1]))
     rows = judges.training[: max(count, 100)]
     fit = problem.fit(family, _start(problem, family, rows, last), rows, say=say)
     fit = _resolved(problem, family, fit, rows)
     error = _held_out_error(problem, family, fit, prepared, judges)
-    return _Fitted(family, fit, rows, error, tuple(names[j] for j in null))
+    return _Fitted(family, fit, rows, error, tuple(names[j] for j in null), undetermined)
+
+
+def _scattered(z) -> np.ndarray:
+    """States of all directions around the states z."""
+    size = z.std(axis=0)
+    size = np.where(size > 0, size, np.maximum(np.abs(z).max(axis=0), size.max()))
+    return z + size * np.random.default_rng(0).normal(size=z.shape)
 
 
 def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
@@ -314,7 +330,7 @@ def _sparse(problem, full: _Fitted, prepared, judges, options: Options, say) -> 
         fit = problem.fit(family, start, full.fit.used, rounds=False, steps=full.fit.steps)
         error = _held_out_error(problem, family, fit, prepared, judges)
         if error.relative <= max(options.rise * full.error.relative, options.rounding):
-            return _Fitted(family, fit, full.rows, error, full.null)
+            return _Fitted(family, fit, full.rows, error, full.null, full.undetermined)
     return full
 
 
@@ -363,7 +379,8 @@ def _learned(
     return LearnedHamiltonian(
         with_error(candidate, error), flow, terms, formula(terms), float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
-        tuple(_messages(error, omega_h, left_out, prepared, judges)),
+        tuple(_messages(error, omega_h, left_out, prepared, judges, found.undetermined)),
+        stalled=False,
     )  # fmt: skip
 
 
@@ -443,7 +460,7 @@ def _omega_h(hessian, dt: float) -> float:
 
 
 def _messages(
-    error: OneStepError, omega_h: float, left_out: int, prepared, judges
+    error: OneStepError, omega_h: float, left_out: int, prepared, judges, undetermined
 ) -> Iterator[str]:
     if error.bound > judges.tolerance.bound:
         yield (
@@ -457,6 +474,12 @@ def _messages(
             f"H oscillates by {omega_h:.2g} radians in a step (ωh, its median over the states): "
             "any H whose frequencies differ by 2π per step gives the same pairs; this is the "
             "slowest"
+        )
+    if undetermined:
+        some = ", ".join(undetermined[:_NAMED]) + (", …" if len(undetermined) > _NAMED else "")
+        yield (
+            f"the pairs do not determine {len(undetermined)} terms of H ({some}): they are left "
+            "out, and H is known only where the pairs are"
         )
     if left_out:
         yield f"{left_out} pairs are not resolved by the flow's own steps: they are left out"

@@ -1,7 +1,9 @@
 """The search: which sizes of which sweeps are tried, in what order, and which one is chosen.
 
 All sweeps are climbed together by rising operations per step, until the next size costs more than
-one that is accurate enough. A sweep is left that no longer gains, or that another keeps beating.
+one that is accurate enough. A sweep is left that no longer gains, that another keeps beating, or
+whose errors do not lead to the tolerance where another's do, or whose largest size promises no more
+than another has reached.
 Only sizes that may be accurate enough, and the few best where none is, are validated by steps.
 """
 
@@ -15,6 +17,7 @@ import numpy as np
 
 from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.extrapolate import Course, course
 
 # A size that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
 # the odd degrees), and larger families only fit noise.
@@ -30,6 +33,7 @@ _NO_WORSE = 1.03  # an error larger by this factor is as good, if the map is che
 # A sweep whose error is within this factor of the best one's has come as far.
 AS_FAR = 1.25
 _KEPT = 0.1  # of the last kept map's error: a map so much better is kept in its stead
+_FAR = 10.0  # times the tolerance: a sweep that leads to no smaller error misses it
 
 
 class Entry(NamedTuple):
@@ -60,9 +64,11 @@ def search(
     on_validated: Callable[[Entry], Any] | None = None,
     dearest: float = np.inf,
 ) -> Found:
-    """Climb the sweeps. A sweep has ``sizes`` with ``operations`` by rising order, and
-    ``judge(size, clock, say)`` and ``validate(size, judged, clock, say)``, which give candidates,
-    and ``short_of_pairs``: whether more pairs would allow larger sizes.
+    """Climb the sweeps. A sweep has ``sizes`` with ``operations`` by rising order and an
+    ``extent`` with which the logarithm of the error falls in proportion, ``judge(size, clock,
+    say)`` and ``validate(size, judged, clock, say)``, which give candidates, ``short_of_pairs``:
+    whether more pairs would allow larger sizes, and ``at(extent)``, which says what a size of this
+    extent is and takes.
 
     bound: the tolerance on a candidate's ``validation_bound``. tell: called with every candidate.
     on_validated: called with every entry whose steps have been looked at. dearest: operations from
@@ -76,6 +82,7 @@ def search(
     ratio = [1.0 / _CALIBRATED] * len(sweeps)  # of a step's error to its estimate
     beaten, stalled = [0] * len(sweeps), [0] * len(sweeps)
     left: set[int] = set()
+    seen: list[list[tuple[float, float]]] = [[] for _ in sweeps]  # (extent, bound) of the estimates
     cheapest, kept, ended = dearest, np.inf, ""
     try:
         for operations, i, n in queue:
@@ -105,6 +112,8 @@ def search(
             beaten[i] += any(_beats(e.candidate, judged) for e in entries)
             if stalled[i] == _STALLED or beaten[i] == _BEATEN:
                 left.add(i)
+            seen[i].append((size.extent, judged.validation_bound))
+            left |= _hopeless(sweeps, seen, [_known(r) for r in ratio], left, bound)
     except OutOfTime:
         ended = f"the budget of {clock.max_seconds:g} s is spent"
     if not np.isfinite(cheapest):
@@ -112,9 +121,60 @@ def search(
     entries = [_calibrated(e, ratio[sweeps.index(e.sweep)]) for e in entries]
     if np.isfinite(cheapest):
         ended = "the tolerance is met"
-    elif not ended:
-        ended = _why(sweeps, left, stalled, best)
+    else:
+        ended = ended or _why(sweeps, stalled, best)
+        ended += _promised(sweeps, seen, [_known(r) for r in ratio], stalled, bound)
     return Found(entries, _ranking(entries, bound), _stalled_sweeps(entries), ended)
+
+
+def _known(ratio: float) -> float:
+    """The ratio of a step's error to its estimate, 1 until a step has been looked at."""
+    return 1.0 if ratio == 1.0 / _CALIBRATED else ratio
+
+
+def _courses(seen, ratio: list[float]) -> list[Course | None]:
+    """Where the errors of each sweep lead."""
+    return [course([(x, r * e) for x, e in sizes]) for sizes, r in zip(seen, ratio, strict=True)]
+
+
+def _hopeless(
+    sweeps: Sequence[Any], seen, ratio: list[float], left: set[int], bound: float
+) -> set[int]:
+    """The sweeps whose largest size would miss the bound by far, where another sweep has a smaller
+    error already, or has come as far and leads to the bound."""
+    ends = {
+        i: found.error_at(sweeps[i].sizes[-1].extent)
+        for i, found in enumerate(_courses(seen, ratio)) if found is not None
+    }  # fmt: skip
+    reached = _reached(seen, ratio)
+
+    def better(j: int, i: int) -> bool:
+        leads = j not in left and ends.get(j, np.inf) <= bound and reached[j] <= reached[i]
+        return j != i and (leads or reached[j] < ends[i])
+
+    far = [i for i, end in ends.items() if end > _FAR * bound]
+    return {i for i in far if any(better(j, i) for j in range(len(sweeps)))}
+
+
+def _reached(seen, ratio: list[float]) -> list[float]:
+    """The smallest error of each sweep, infinite where none is judged."""
+    return [r * min((e for _, e in s), default=np.inf) for s, r in zip(seen, ratio, strict=True)]
+
+
+def _promised(
+    sweeps: Sequence[Any], seen, ratio: list[float], stalled: Sequence[int], bound: float
+) -> str:
+    """What the most accurate sweep's errors, extrapolated, say of a size that would meet the bound;
+    nothing where they stall, or are too few to say."""
+    reached = _reached(seen, ratio)
+    i = int(np.argmin(reached)) if reached else 0
+    found = _courses(seen, ratio)[i] if reached else None
+    if found is None or stalled[i] == _STALLED:
+        return ""
+    extent = found.extent_for(bound)
+    if extent is None:
+        return "; its error falls too slowly to tell which size would meet the tolerance"
+    return f"; extrapolated, {sweeps[i].at(extent)} would meet the tolerance"
 
 
 def _calibrated(entry: Entry, ratio: float) -> Entry:
@@ -199,11 +259,11 @@ def _stalled_sweeps(entries: list[Entry]) -> set[tuple[str, str]]:
     return found
 
 
-def _why(sweeps: Sequence[Any], left: set[int], stalled: list[int], best: Sequence[float]) -> str:
+def _why(sweeps: Sequence[Any], stalled: list[int], best: Sequence[float]) -> str:
     """Why a search that met nothing ended before its time. Sweeps far from the best one's error
     tell nothing."""
     good = [i for i, s in enumerate(sweeps) if s.sizes and best[i] <= AS_FAR * min(best)]
-    if any(i in left and stalled[i] == _STALLED for i in good):
+    if any(stalled[i] == _STALLED for i in good):
         return "larger models are no more accurate: noise, or a structure they cannot represent"
     if any(sweeps[i].short_of_pairs for i in good):
         return "the pairs determine no larger model: more pairs would help"

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial, wraps
+from numbers import Integral
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -182,9 +183,17 @@ class SymplecticMap:
         RolloutInfo. A lane whose step fails, or that leaves the domain with ``stop_outside``,
         repeats NaN from there on. Raises ValueError where a number of steps or a shape is wrong.
         """
+        for name, number in (("num_steps", num_steps), ("save_every", save_every)):
+            if not isinstance(number, Integral):
+                raise ValueError(f"expected a whole number as {name}, got {number!r}")
         if save_every < 1 or num_steps < 0:
             raise ValueError(
                 f"expected num_steps >= 0 and save_every >= 1, got {num_steps} and {save_every}"
+            )
+        if save_every > num_steps > 0:
+            raise ValueError(
+                f"expected save_every <= num_steps, got {save_every} and {num_steps}: only the "
+                "initial states would be saved"
             )
         return _rollout(self, self._states(z0), num_steps // save_every, save_every, stop_outside)
 

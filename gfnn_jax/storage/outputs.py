@@ -139,9 +139,10 @@ def atomic_folder(path) -> Iterator[Path]:
                 if file.is_file():
                     with open(file, "rb") as stream:
                         os.fsync(stream.fileno())
-            if path.exists():
-                os.rename(path, old)
-            os.rename(beside, path)
+            with uninterrupted():  # or the old folder would be away, and the new one not there
+                if path.exists():
+                    os.rename(path, old)
+                os.rename(beside, path)
             sync_folder(path.absolute().parent)
             shutil.rmtree(old, ignore_errors=True)
         finally:

@@ -34,7 +34,7 @@ def unfinished(
     Raises InputError where ``out`` is in the way, where an unfinished job is there and neither
     ``resume`` nor ``overwrite`` is set, and where ``resume`` meets another job.
     """
-    folder = out.with_name(out.name + ".partial")
+    folder = _beside(out)
     # What an interrupted job has left in ``out`` may be replaced by the same job.
     ensure_new(out, overwrite or (resume and (folder / JOB).is_file()), folder=True)
     with _claimed(out, what):
@@ -45,12 +45,11 @@ def unfinished(
         try:
             yield folder
         except BaseException as error:
-            found = kept(folder)
-            if not found:
+            told = told_of(out)
+            if told is None:
                 _discard(folder)
             if isinstance(error, KeyboardInterrupt):
-                told = f"{folder} keeps {', '.join(found)}: --resume goes on with it"
-                error.add_note(told if found else f"nothing of the {what} was kept")
+                error.add_note(told or f"nothing of the {what} was kept")
             raise
         _discard(folder)
 
@@ -88,6 +87,18 @@ def kept(folder: Path) -> list[str]:
         return []
     names = (path.name for path in folder.iterdir())
     return sorted({Path(n).stem for n in names if n != JOB and not n.startswith(".")})
+
+
+def told_of(out: Path) -> str | None:
+    """What is to be said of an unfinished job of ``out``; None where it has kept nothing."""
+    folder = _beside(out)
+    if not ((folder / JOB).is_file() and (found := kept(folder))):
+        return None
+    return f"{folder} keeps {', '.join(found)}: --resume goes on with it"
+
+
+def _beside(out: Path) -> Path:
+    return out.with_name(out.name + ".partial")
 
 
 def _make_way(folder: Path, job, what: str, *, overwrite: bool, resume: bool) -> None:

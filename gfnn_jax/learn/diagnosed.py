@@ -1,0 +1,51 @@
+"""What the local Jacobians of the pairs say: are they symplectic, and which charts cover them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from gfnn_jax.learn.choose_charts import Charts, choose_charts
+from gfnn_jax.learn.diagnose import (
+    data_defect,
+    local_jacobians,
+    look_symplectic,
+    sampled_dimension,
+)
+from gfnn_jax.learn.prepare import Prepared
+
+
+class Diagnosis(NamedTuple):
+    prepared: Prepared
+    charts: Charts
+    data_defect: float
+    messages: list[str]
+
+
+def diagnosed(prepared: Prepared, chart: str, reversor, seed: int) -> Diagnosis:
+    """What the local Jacobians say: whether the pairs look symplectic, and which charts cover
+    them; the base map is factored out where one is needed."""
+    jacobians, error = local_jacobians(prepared.y0, prepared.y1, prepared.scale, seed=seed)
+    defect, messages = data_defect(jacobians, prepared.scale), _thin(prepared)
+    if not look_symplectic(jacobians, error, prepared.scale):
+        messages.append(
+            f"the pairs do not look symplectic: ‖MᵀJM − J‖ is about {defect:.2g}, known to within "
+            f"{error:.1g} (0 for a symplectic map): are q and p in order, p momenta and not "
+            "velocities, and no friction?"
+        )
+    charts = choose_charts(chart, prepared, reversor, jacobians)
+    if charts.half is not None:
+        prepared = prepared.without(charts.half, charts.half)
+    return Diagnosis(prepared, charts, defect, [*messages, *charts.messages])
+
+
+def _thin(prepared: Prepared) -> list[str]:
+    """A warning where the states lie on a curve, or on the torus of an orbit."""
+    seen = [i for i in range(2 * prepared.dim) if i not in prepared.coordinates.cyclic]
+    dimension = sampled_dimension(prepared.y0[:, seen], prepared.scale[seen])
+    if dimension > min(prepared.dim, len(seen) - 1):
+        return []
+    where = "a curve" if dimension == 1 else f"a surface of dimension {dimension}"
+    return [
+        f"the pairs lie on {where} of the {len(seen)}-dimensional phase space, as those of one "
+        "orbit do: the map is learned there only"
+    ]

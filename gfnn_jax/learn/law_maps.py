@@ -1,0 +1,131 @@
+"""Generated maps that a law helps to: of pairs of its flow, or of what its flow leaves over."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.errors import FitError
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.learn.candidates import Judges, Tolerance
+from gfnn_jax.learn.choose_charts import Charts
+from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.diagnosed import diagnosed
+from gfnn_jax.learn.draw import drawn
+from gfnn_jax.learn.flows import LearnedHamiltonian, around, flow_of, flow_operations
+from gfnn_jax.learn.prepare import Prepared, prepare
+from gfnn_jax.learn.search import Found, search
+from gfnn_jax.learn.sweeps import sweeps_for, trial_residual
+from gfnn_jax.phase_space import Pairs
+from gfnn_jax.scenes.scene import Scene
+
+_TRIAL_PAIRS = 1_000  # by which it is found out where a flow is to be factored out
+_EXPLAINED = 0.1  # of the spread: a law that errs by more explains too little to be factored out
+
+
+class Searched(NamedTuple):
+    judges: Judges
+    prepared: Prepared
+    charts: Charts
+    found: Found
+
+
+def more_pairs_would_help(sweeps, found: Found, bound: Tolerance, dearest: float) -> bool:
+    """Whether none of the sizes that the pairs determine meets the tolerance, and larger ones would
+    still be cheap enough."""
+    if found.ranking and found.ranking[0].candidate.validation_bound <= bound.bound:
+        return False
+    return any(s.short_of_pairs and s.sizes and s.sizes[-1].operations < dearest for s in sweeps)
+
+
+def search_of_law(
+    law: LearnedHamiltonian, pairs: Pairs, judges: Judges, scene: Scene | None,
+    coordinates: Coordinates, dearest: float, clock: Clock, say, tell, seed: int,
+) -> Searched | None:  # fmt: skip
+    """Maps fitted to pairs that are drawn from the law's flow, and judged by the user's held-out
+    pairs; None where none of them meets the tolerance."""
+    more = drawn(law.flow, coordinates, pairs.z0, float(pairs.dt), seed=seed)
+    held = pairs.take(judges.held_out)
+    both = Pairs(
+        np.concatenate([more.z0, held.z0]), np.concatenate([more.z1, held.z1]), float(pairs.dt)
+    )
+    rows = np.arange(len(both))
+    judges = Judges(both, rows[: len(more)], rows[len(more) :], judges.tolerance)
+    seen = diagnosed(prepare(both, coordinates), "auto", scene.reversor if scene else None, seed)
+    sweeps = list(sweeps_for("auto", seen.charts.charts, seen.prepared, scene, judges))
+    found = search(sweeps, judges.tolerance.bound, clock, say, tell, None, dearest)
+    if not found.ranking:
+        return None
+    if found.ranking[0].candidate.validation_bound > judges.tolerance.bound:
+        return None
+    found = found._replace(ended="the tolerance is met, by a map of pairs drawn from H's flow")
+    return Searched(judges, seen.prepared, seen.charts, found)
+
+
+def law_explains_most(law: LearnedHamiltonian, found: Found, bound: Tolerance, clock) -> bool:
+    """Whether nothing meets the tolerance, but S might with most of the motion factored out. What
+    stalls in noise would stall without it too."""
+    if clock.left <= 0 or not found.ranking or found.stalled:
+        return False
+    best = found.ranking[0].candidate
+    error = law.candidate.validation_relative
+    return best.validation_bound > bound.bound and error < _EXPLAINED
+
+
+def search_around(
+    law: LearnedHamiltonian, plain: Prepared, judges: Judges, scene: Scene | None, clock: Clock,
+    say, tell, better, seed: int,
+) -> Searched | None:  # fmt: skip
+    """Maps of the law's flow Φ and of S, which learns what Φ leaves over; None where Φ has no image
+    of some of the states, or no chart covers what is left."""
+    try:
+        flow = flow_of(law.flow.family, np.asarray(law.flow.params), plain)
+        prepared = factored_out(flow, plain, seed)
+        seen = diagnosed(prepared, "auto", scene.reversor if scene else None, seed)
+    except FitError:
+        return None
+    more = flow_operations(flow, plain)
+    sweeps = list(sweeps_for("auto", seen.charts.charts, seen.prepared, scene, judges))
+    if better is not None:
+        better.prepared = seen.prepared
+    found = search(sweeps, judges.tolerance.bound, clock, say, tell, better)
+    entries, ranking = (
+        [
+            e._replace(
+                candidate=dataclasses.replace(
+                    e.candidate,
+                    operations=e.candidate.operations + more,
+                    label=f"{e.candidate.label} around H",
+                )
+            )
+            for e in part
+        ]
+        for part in (found.entries, found.ranking)
+    )
+    found = found._replace(entries=entries, ranking=ranking)
+    return Searched(judges, seen.prepared, seen.charts, found)
+
+
+def factored_out(flow: Flow, plain: Prepared, seed: int) -> Prepared:
+    """The pairs without the flow: before, after, or half on either side of what is learned,
+    whichever leaves the map that a small S comes closest to."""
+
+    def left_over(prepared: Prepared) -> float:
+        rows = np.random.default_rng(seed).permutation(len(prepared.y0))[:_TRIAL_PAIRS]
+        return trial_residual(prepared.take(rows))
+
+    tried = [plain.without(*pieces) for pieces in around(flow)]
+    errors = [left_over(prepared) for prepared in tried]
+    return tried[0] if errors[0] <= 2 * min(errors) else tried[int(np.argmin(errors))]
+
+
+def better_than(around: Found, found: Found, law: LearnedHamiltonian) -> bool:
+    """Whether the maps around the law have a better one than the others and the law itself."""
+    if not around.ranking:
+        return False
+    others = [found.ranking[0].candidate, law.candidate]
+    best = around.ranking[0].candidate
+    return all(best.validation_bound < other.validation_bound for other in others)
