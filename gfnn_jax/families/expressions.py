@@ -271,8 +271,10 @@ def _text(tree: Expression, names) -> tuple[str, int]:
         left, right = inside(operands[0], _SUM), inside(operands[1], _SUM)
         return (f"{left} - {right[1:]}" if right.startswith("-") else f"{left} + {right}"), _SUM
     if operation == "*":
-        if operands[0].value == -1:
-            return f"-{inside(operands[1], _PRODUCT)}", _SUM
+        factor = operands[0].value
+        if factor is not None and factor < 0:
+            positive = _product(number(-factor), operands[1])
+            return f"-{inside(positive, _PRODUCT)}", _SUM
         return f"{inside(operands[0], _PRODUCT)}*{inside(operands[1], _PRODUCT)}", _PRODUCT
     if operation == "/":
         return f"{inside(operands[0], _PRODUCT)}/{inside(operands[1], _POWER)}", _PRODUCT
