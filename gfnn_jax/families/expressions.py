@@ -12,7 +12,7 @@ import ast
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -71,6 +71,13 @@ class Expression:
 
     operation: str
     operands: tuple
+
+    def __hash__(self):
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        return hash((self.operation, self.operands))
 
     def __add__(self, other):
         return _sum(self, as_expression(other))

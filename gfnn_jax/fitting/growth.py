@@ -22,7 +22,7 @@ from gfnn_jax.fitting.gauss_newton import (
     null_terms,
     significant,
 )
-from gfnn_jax.flows.collocation import images
+from gfnn_jax.flows.collocation import Steps, images
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Options:
 
     significant: float = 4.0
     weighty: float = 0.2
-    pairs: int = 800
+    pairs: int = 600
     rows_per_mode: float = 6.0
     null: float = 1e-6
     block: int = 400
@@ -54,7 +54,8 @@ OPTIONS = Options()
 _BOX_PAIRS = 2_000  # that the first box is told by
 _GAINED, _WORSE = 0.9, 1.2  # of the residual: a gain, and what fewer modes may cost
 _SETTLED = 0.1  # of the residual, below which a step is taken before candidates are looked at
-_RESOLVED = 1e-4  # of the last round's residual: what a flow's own steps may err by
+_RESOLVED, _AGAIN = 1e-4, 0.03  # of the residual: what a flow's own steps may err by, and what is
+# left of it when they are chosen again
 _FEWEST = 0.5  # of the pairs, whose flow must be computed
 
 
@@ -85,9 +86,15 @@ def grow(
     present = dict(zip(modes, c.tolist(), strict=True))
     best, before, idle, ended = Grown(start, c, np.inf), present, 0, ""
     pace: list[tuple[int, float]] = []
+    steps, resolved = None, 1.0
     for _ in range(options.rounds):
         count = int(options.rows_per_mode * len(present) / (2 * basis.dim))
-        looked = _Look(problem, basis, present, rows[: max(options.pairs, count)], best.rms)
+        some = rows[: max(options.pairs, count)]
+        if steps is None or best.rms < _AGAIN * resolved:
+            resolved = min(best.rms, 1.0)
+            family, c = basis.terms(list(present)), np.array(list(present.values()))
+            steps = problem.fine_steps(family, c, some, _RESOLVED * resolved)
+        looked = _Look(problem, basis, present, steps, some)
         if idle == options.idle:
             ended = "no candidate gains"
             break
@@ -101,20 +108,21 @@ def grow(
             best = Grown(*looked.without_new(), looked.rms)
             pace.append((len(best.coefficients), best.rms))
             yield best
+        if looked.rms <= goal:
+            ended = "the tolerance is met"
+            break
         before = present
         solved, rest = looked.solved(options.significant)
         room = most - len(solved)
-        gain = np.linalg.norm(rest) / max(np.linalg.norm(looked.residual), 1e-300)
+        gain = np.linalg.norm(rest) / np.linalg.norm(looked.residual)
         # What a long step leaves over is curvature, which asks for any mode.
         tried = basis.around(solved) if gain > _SETTLED else []
         found = looked.candidates(tried, rest, room, options)
-        if looked.rms <= goal:
-            ended = "the tolerance is met"
-        elif not found and gain > _GAINED:
+        if not found and gain > _GAINED:
             ended = "no room for more" if room <= 0 else "no candidate gains"
-        elif _out_of_reach(pace[-4:], goal, most):
+            break
+        if _out_of_reach(pace[-4:], goal, most):
             ended = f"more than {most} modes would be needed"
-        if ended:
             break
         present = solved | dict.fromkeys(found, 0.0)
     yield best._replace(ended=ended or f"{options.rounds} rounds are over")
@@ -143,12 +151,11 @@ class _Look:
     """The linearised problem of the present modes at their coefficients, on the pairs whose flow
     can be computed."""
 
-    def __init__(self, problem: Problem, basis: Modes, present: dict[Mode, float], rows, rms):
+    def __init__(self, problem: Problem, basis: Modes, present: dict[Mode, float], steps: Steps, rows):
         self._problem, self._basis, self.modes = problem, basis, list(present)
         self.family = basis.terms(self.modes)
         self.coefficients = np.array(list(present.values()))
-        off = _RESOLVED * min(rms, 1.0)
-        self._steps = problem.fine_steps(self.family, self.coefficients, rows, off)
+        self._steps = steps
         self._rows, self._good = rows, np.ones(len(rows), bool)
         found = self._images(self.family)
         residual = (found.states - problem.z1[rows]) / problem.scale
