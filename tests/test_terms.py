@@ -10,7 +10,7 @@ import pytest
 from gfnn_jax.errors import InputError
 from gfnn_jax.families import Family, LinearFamily
 from gfnn_jax.families.expressions import parse, to_text, traced
-from gfnn_jax.families.modes import Mode, Modes
+from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms, given_terms, joined, multiplied, polynomial_terms
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.pcr3bp import features

@@ -63,17 +63,13 @@ class Modes:
                 for i, value in zip(pair, m, strict=True):
                     wave[i] = value
                 waves.add(_directed(tuple(wave)))
-        given = [
-            tuple(int(j == k) for j in range(self.num_given)) for k in range(self.num_given)
-        ]
+        given = [tuple(int(j == k) for j in range(self.num_given)) for k in range(self.num_given)]
         plain = len(self.others) - self.num_given
         powers = [a for a in product(range(degree + 1), repeat=plain) if sum(a) <= degree]
         powers.sort(key=_size)
         return [
             *self._modes([(0,) * count], [(*a, *b) for b in given for a in powers]),
-            *self._modes(
-                sorted(waves, key=_size), [(*a, *(0,) * self.num_given) for a in powers]
-            ),
+            *self._modes(sorted(waves, key=_size), [(*a, *(0,) * self.num_given) for a in powers]),
         ]
 
     def around(self, known: Iterable[Mode]) -> list[Mode]:

@@ -16,12 +16,7 @@ import numpy as np
 
 from gfnn_jax.families.modes import Mode, Modes
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.fitting.gauss_newton import (
-    Problem,
-    midpoint_start,
-    null_terms,
-    significant,
-)
+from gfnn_jax.fitting.gauss_newton import Problem, midpoint_start, null_terms, significant
 from gfnn_jax.flows.collocation import Steps, images
 
 
@@ -29,6 +24,8 @@ from gfnn_jax.flows.collocation import Steps, images
 class Options:
     """Tuned on the double pendulum at dt 0.05 and 0.2.
 
+    boxes: (order, degree) of the first library, the largest that has at most ``box`` modes and for
+    which there are rows enough.
     significant: standard errors that a mode must have to come in or to stay.
     weighty: of the heaviest candidate's, below which one waits for the next round.
     pairs: that the rounds look at, and rows that each of its modes needs.
@@ -38,10 +35,12 @@ class Options:
     rounds: at most. idle: that may pass without a gain of a tenth.
     """
 
+    boxes: tuple[tuple[int, int], ...] = ((2, 2), (1, 2), (1, 1))
+    box: int = 250
     significant: float = 4.0
     weighty: float = 0.2
     pairs: int = 600
-    rows_per_mode: float = 6.0
+    rows_per_mode: float = 4.0
     null: float = 1e-6
     block: int = 400
     shortlist: int = 200
@@ -76,11 +75,13 @@ def grow(
     """The modes that these rows ask for, round by round, each better than the one before, until the
     residual is within ``goal`` or none gains.
 
-    most: modes at most.
+    most: modes at most. Nothing is found where the rows are too few for the smallest library.
     """
     enough = rows[:_BOX_PAIRS]
     z0, z1 = problem.z0[enough], problem.z1[enough]
-    modes = _box(basis, z0, len(rows) * 2 * basis.dim / options.rows_per_mode)
+    modes = _box(basis, z0, len(rows), options)
+    if not modes:
+        return
     start = basis.terms(modes)
     c = midpoint_start(start, z0, z1, problem.dt, problem.scale)
     present = dict(zip(modes, c.tolist(), strict=True))
@@ -88,6 +89,9 @@ def grow(
     pace: list[tuple[int, float]] = []
     steps, resolved = None, 1.0
     for _ in range(options.rounds):
+        if idle == options.idle:
+            ended = "no candidate gains"
+            break
         count = int(options.rows_per_mode * len(present) / (2 * basis.dim))
         some = rows[: max(options.pairs, count)]
         if steps is None or best.rms < _AGAIN * resolved:
@@ -95,9 +99,6 @@ def grow(
             family, c = basis.terms(list(present)), np.array(list(present.values()))
             steps = problem.fine_steps(family, c, some, _RESOLVED * resolved)
         looked = _Look(problem, basis, present, steps, some)
-        if idle == options.idle:
-            ended = "no candidate gains"
-            break
         if not looked.rms <= _WORSE * best.rms:
             present = {m: 0.5 * (before.get(m, 0.0) + present.get(m, 0.0))
                        for m in before | present}  # fmt: skip
@@ -112,12 +113,12 @@ def grow(
             ended = "the tolerance is met"
             break
         before = present
-        solved, rest = looked.solved(options.significant)
+        solved, rest, span = looked.solved(options.significant)
         room = most - len(solved)
         gain = np.linalg.norm(rest) / np.linalg.norm(looked.residual)
         # What a long step leaves over is curvature, which asks for any mode.
         tried = basis.around(solved) if gain > _SETTLED else []
-        found = looked.candidates(tried, rest, room, options)
+        found = looked.candidates(tried, rest, span, room, options)
         if not found and gain > _GAINED:
             ended = "no room for more" if room <= 0 else "no candidate gains"
             break
@@ -138,12 +139,12 @@ def _out_of_reach(pace: list[tuple[int, float]], goal: float, most: int) -> bool
     return added > 0 and gained / added * (most - count) < np.log(rms / goal)
 
 
-def _box(basis: Modes, z, most: float) -> list[Mode]:
-    """The largest box of modes that so many rows tell apart, without those that others explain."""
-    modes = basis.box()
-    if len(modes) > most:
-        modes = basis.box(order=1)
-    kept, _ = null_terms(basis.terms(modes), z)
+def _box(basis: Modes, z, pairs: int, options: Options) -> list[Mode]:
+    """The first library, without the modes that others explain."""
+    most = min(pairs * 2 * basis.dim / options.rows_per_mode, options.box)
+    boxes = (basis.box(*size) for size in options.boxes)
+    modes = next((modes for modes in boxes if len(modes) <= most), [])
+    kept, _ = null_terms(basis.terms(modes), z[: max(200, len(modes))]) if modes else ([], [])
     return [modes[j] for j in kept]
 
 
@@ -151,7 +152,9 @@ class _Look:
     """The linearised problem of the present modes at their coefficients, on the pairs whose flow
     can be computed."""
 
-    def __init__(self, problem: Problem, basis: Modes, present: dict[Mode, float], steps: Steps, rows):
+    def __init__(
+        self, problem: Problem, basis: Modes, present: dict[Mode, float], steps: Steps, rows
+    ):
         self._problem, self._basis, self.modes = problem, basis, list(present)
         self.family = basis.terms(self.modes)
         self.coefficients = np.array(list(present.values()))
@@ -180,27 +183,29 @@ class _Look:
 
     def without_new(self) -> tuple[Terms, np.ndarray]:
         """The library and its coefficients without the modes that have not been fitted yet."""
-        kept = np.flatnonzero(self.coefficients)
+        new = self.coefficients == 0
+        kept = np.flatnonzero(~new | new.all())
         return self.family.take(kept.tolist()), self.coefficients[kept]
 
-    def solved(self, threshold: float) -> tuple[dict[Mode, float], np.ndarray]:
-        """The modes that weigh at least so many standard errors with their next coefficients, and
-        the residual that the linearised problem then leaves."""
+    def solved(self, threshold: float) -> tuple[dict[Mode, float], np.ndarray, np.ndarray]:
+        """The modes that weigh at least so many standard errors with their next coefficients, the
+        residual (n,) that the linearised problem then leaves, and an orthonormal basis (n, modes)
+        of what these modes explain."""
         rows = np.concatenate([self.matrix, self.residual[:, None]], axis=1)
         factor = np.linalg.qr(rows, mode="r")
         kept, c = significant(factor, self.coefficients, len(rows), threshold)
         rest = self.residual + self.matrix[:, kept] @ c - self.matrix @ self.coefficients
-        self._span = np.linalg.qr(self.matrix[:, kept])[0]
-        return {self.modes[j]: float(v) for j, v in zip(kept, c, strict=True)}, rest
+        span = np.linalg.qr(self.matrix[:, kept])[0]
+        return {self.modes[j]: float(v) for j, v in zip(kept, c, strict=True)}, rest, span
 
-    def candidates(self, tried: list[Mode], rest, room: int, options: Options) -> list[Mode]:
+    def candidates(self, tried: list[Mode], rest, span, room: int, options: Options) -> list[Mode]:
         """Of the modes that are tried, those that the residual asks for: the heaviest, then the one
-        that is heaviest beside it, and so on."""
-        freedom = np.sqrt(len(rest) - self._span.shape[1])
+        that is heaviest beside it, and so on. rest, span: as `solved` gives them."""
+        freedom = np.sqrt(max(len(rest) - span.shape[1], 0))
         columns, heaviest = np.zeros((len(rest), 0)), np.zeros(0, dtype=int)
         for first in range(0, len(tried), options.block):
             part = np.arange(first, min(first + options.block, len(tried)))
-            found = self._beside(self._basis.terms([tried[j] for j in part]), options.null)
+            found = self._beside(span, [tried[j] for j in part], options.null)
             columns, heaviest = np.hstack([columns, found]), np.concatenate([heaviest, part])
             order = np.argsort(-np.abs(rest @ columns), kind="stable")[: options.shortlist]
             columns, heaviest = columns[:, order], heaviest[order]
@@ -221,13 +226,13 @@ class _Look:
             rest = rest - unit * (unit @ rest)
         return chosen
 
-    def _beside(self, family: Terms, null: float) -> np.ndarray:
-        """The derivatives in the family's coefficients without what the present modes explain, each
+    def _beside(self, span, modes: list[Mode], null: float) -> np.ndarray:
+        """The derivatives in the coefficients of these modes without what ``span`` explains, each
         column of length 1, or 0 where nothing is left."""
-        columns = self._columns(self._images(family).by_coefficient)
+        columns = self._columns(self._images(self._basis.terms(modes)).by_coefficient)
         size = np.linalg.norm(columns, axis=0)
         for _ in range(2):  # the second time makes them orthogonal to roundoff
-            columns = columns - self._span @ (self._span.T @ columns)
+            columns = columns - span @ (span.T @ columns)
         left = np.linalg.norm(columns, axis=0)
         good = np.isfinite(left) & (left > null * size)
         return np.where(good, columns / np.where(good, left, 1.0), 0.0)
