@@ -44,7 +44,7 @@ def test_growth_follows_the_difference_of_two_angles():
     pairs = pairs_of(terms, coefficients, 250, 0.05)
     problem = Problem(pairs.z0, pairs.z1, pairs.dt, np.ones(4))
     *_, found = grow(problem, BASIS, np.arange(250), 1e-9, 100)
-    assert found.ended == "the tolerance is met"
+    assert found.ended == "the training pairs meet the tolerance"
     heavy = np.abs(found.coefficients) > 1e-6
     names = [name for name, h in zip(found.family.term_names, heavy, strict=True) if h]
     expected = [name.replace("**2", "²").replace("*p", " p") for name in terms]

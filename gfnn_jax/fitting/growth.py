@@ -110,7 +110,7 @@ def grow(
             pace.append((len(best.coefficients), best.rms))
             yield best
         if looked.rms <= goal:
-            ended = "the tolerance is met"
+            ended = "the training pairs meet the tolerance"
             break
         before = present
         solved, rest, span = looked.solved(options.significant)
