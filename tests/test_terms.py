@@ -10,15 +10,17 @@ import pytest
 from gfnn_jax.errors import InputError
 from gfnn_jax.families import Family, LinearFamily
 from gfnn_jax.families.expressions import parse, to_text, traced
+from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.pcr3bp import features
 
 RNG = np.random.default_rng(0)
 W = RNG.uniform(0.3, 0.9, (5, 2, 4))
+MODES = Modes(2, (0, 1), ("p1", "p2", "1/(2 + cos(q1))"), 1)
 FAMILIES = {
     "polynomials": polynomial_terms(2, 4),
-    "angles": polynomial_terms(2, 3, angles=(0, 1)),
+    "modes": MODES.terms(MODES.box(1, 1)),
     "features": polynomial_terms(2, 2, features=features),
     "given": given_terms(
         2, ["1/(1 + sin(q1 - q2)**2)", "exp(-q1**2)*tanh(p2)", "log(q1**2 + 1)/sqrt(p1**2 + 2)"]
@@ -62,11 +64,6 @@ def test_many_terms_are_one_product_of_matrices():
 def test_numbers_of_terms():
     assert polynomial_terms(2, 3).num_parameters == 34
     assert polynomial_terms(2, 4).num_parameters == 69
-    # sin² is 1 − cos²: half of what two variables per angle would give.
-    assert polynomial_terms(1, 2, angles=(0,)).term_names == (
-        "cos(q1)", "sin(q1)", "p1",
-        "cos(q1)²", "cos(q1) sin(q1)", "cos(q1) p1", "sin(q1) p1", "p1²",
-    )  # fmt: skip
     assert "q2" not in " ".join(polynomial_terms(2, 2, cyclic=(1,)).term_names)
 
 

@@ -11,8 +11,9 @@ from __future__ import annotations
 import ast
 import dataclasses
 import math
+import operator
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -29,8 +30,6 @@ def _squared(xp, v):
 
 # name -> f, f', f'' of a value v with f(v) = y: functions of (xp, v, y).
 _FUNCTIONS: dict[str, tuple[Callable, Callable, Callable]] = {
-    "sin": (lambda xp, v: xp.sin(v), lambda xp, v, y: xp.cos(v), lambda xp, v, y: -y),
-    "cos": (lambda xp, v: xp.cos(v), lambda xp, v, y: -xp.sin(v), lambda xp, v, y: -y),
     "tan": (
         lambda xp, v: xp.tan(v),
         lambda xp, v, y: 1 + y * y,
@@ -56,7 +55,8 @@ _FUNCTIONS: dict[str, tuple[Callable, Callable, Callable]] = {
         lambda xp, v, y: -2 * v / _squared(xp, 1 + v * v),
     ),
 }  # fmt: skip
-FUNCTIONS = tuple(_FUNCTIONS)
+_CIRCULAR = ("sin", "cos")  # which share their values
+FUNCTIONS = (*_CIRCULAR, *_FUNCTIONS)
 _OTHER_NAMES = {"atan": "arctan", "ln": "log"}
 _CONSTANTS = {"pi": math.pi, "e": math.e}
 
@@ -71,6 +71,13 @@ class Expression:
 
     operation: str
     operands: tuple
+
+    def __hash__(self):
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        return hash((self.operation, self.operands))
 
     def __add__(self, other):
         return _sum(self, as_expression(other))
@@ -223,7 +230,7 @@ def _parsed(node, names, text, depth) -> Expression:
     if isinstance(node, ast.Call):
         name = node.func.id if isinstance(node.func, ast.Name) else "?"
         name = _OTHER_NAMES.get(name, name)
-        if name not in _FUNCTIONS or node.keywords or len(node.args) != 1:
+        if name not in FUNCTIONS or node.keywords or len(node.args) != 1:
             raise refuse(f"a call of '{ast.unparse(node.func)}' with {len(node.args)} arguments")
         return call(name, inner(node.args[0]))
     if isinstance(node, ast.BinOp):
@@ -273,8 +280,10 @@ def _text(tree: Expression, names) -> tuple[str, int]:
         left, right = inside(operands[0], _SUM), inside(operands[1], _SUM)
         return (f"{left} - {right[1:]}" if right.startswith("-") else f"{left} + {right}"), _SUM
     if operation == "*":
-        if operands[0].value == -1:
-            return f"-{inside(operands[1], _PRODUCT)}", _SUM
+        factor = operands[0].value
+        if factor is not None and factor < 0:
+            positive = _product(number(-factor), operands[1])
+            return f"-{inside(positive, _PRODUCT)}", _SUM
         return f"{inside(operands[0], _PRODUCT)}*{inside(operands[1], _PRODUCT)}", _PRODUCT
     if operation == "/":
         return f"{inside(operands[0], _PRODUCT)}/{inside(operands[1], _POWER)}", _PRODUCT
@@ -310,7 +319,7 @@ class Jet:
 
 def jets(trees: Sequence[Expression], w, order: int) -> list[Jet]:
     """The expressions at states w (..., 2d), with derivatives up to ``order`` (0, 1, 2)."""
-    known: dict[Expression, Jet] = {}
+    known: dict[Any, Any] = {}
     return [_jet(tree, w, order, known) for tree in trees]
 
 
@@ -330,6 +339,10 @@ def _jet_of(tree: Expression, w, order, known) -> Jet:
     first = _jet(operands[0], w, order, known)
     if operation == "power":
         return _composed(first, order, *_power_derivatives(xp, first.value, operands[1], order))
+    if operation in _CIRCULAR:
+        cos, sin = _circle(*_multiple(operands[0]), w, order, known)
+        y, slope = (sin, cos) if operation == "sin" else (cos, -sin)
+        return _composed(first, order, y, slope, -y if order > 1 else 0.0)
     if operation in _FUNCTIONS:
         f, df, ddf = _FUNCTIONS[operation]
         v = first.value if not isinstance(first.value, float) else xp.asarray(first.value)
@@ -349,6 +362,48 @@ def _jet_of(tree: Expression, w, order, known) -> Jet:
         curvature = -2 * slope * inverse if order > 1 else 0.0
         second = _composed(second, order, inverse, slope, curvature)
     return _multiplied(first, second, order)
+
+
+def _circle(part: Expression, n: int, w, order: int, known):
+    """cos and sin of n times an expression: of a multiple by products of those of smaller ones."""
+    if (part, n) not in known:
+        if n > 1:
+            c, s = _circle(part, n // 2, w, order, known)
+            d, t = _circle(part, n - n // 2, w, order, known)
+            known[part, n] = c * d - s * t, s * d + c * t
+        else:
+            xp, v = namespace(w), _jet(part, w, order, known).value
+            v = xp.asarray(v) if isinstance(v, float) else v
+            known[part, n] = xp.cos(v), xp.sin(v)
+    return known[part, n]
+
+
+@cache
+def _multiple(tree: Expression) -> tuple[Expression, int]:
+    """(part, n) with tree = n · part, n the greatest common divisor of a sum of whole multiples of
+    coordinates; (tree, 1) for anything else."""
+    found = _whole_multiples(tree)
+    if not found or (n := math.gcd(*found.values())) < 2:
+        return tree, 1
+    parts = [coordinate(i) * (m // n) for i, m in sorted(found.items())]
+    return reduce(operator.add, parts), n
+
+
+def _whole_multiples(tree: Expression) -> dict[int, int] | None:
+    """{i: m} of Σ m_i z_i, None for another tree."""
+    operation, operands = tree.operation, tree.operands
+    if operation == "coordinate":
+        return {operands[0]: 1}
+    if operation == "*":
+        m, inner = operands[0].value, _whole_multiples(operands[1])
+        if m is None or not m.is_integer() or inner is None:
+            return None
+        return {i: int(m) * k for i, k in inner.items()}
+    if operation == "+":
+        left, right = (_whole_multiples(o) for o in operands)
+        if left is not None and right is not None and not left.keys() & right.keys():
+            return left | right
+    return None
 
 
 def _power_derivatives(xp, v, exponent: float, order: int):

@@ -22,7 +22,6 @@ from gfnn_jax.arrays import matmul, namespace
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.expressions import (
     Expression,
-    call,
     coordinate,
     coordinate_names,
     count_operations,
@@ -45,7 +44,8 @@ class _Plan:
         self.powers = powers
         variables = powers.shape[1]
         closed: set[tuple[int, ...]] = {(0,) * variables}
-        ahead = [tuple(row) for row in powers.tolist()]
+        terms = [tuple(row) for row in powers.tolist()]
+        ahead = list(terms)
         while ahead:
             row = ahead.pop()
             if row not in closed:
@@ -60,27 +60,21 @@ class _Plan:
             for row in rows[1:]
             for k in [next(k for k in range(variables) if row[k])]
         ]
-        self.places = np.array([place[tuple(row)] for row in powers.tolist()], dtype=int)
+        self.places = np.array([place[row] for row in terms], dtype=int)
         # Of ∂/∂x_k: (term, product, factor) with ∂_k term = factor · product; ∂²/∂x_k∂x_l likewise.
-        self.slopes = [
-            _columns([(j, place[_less(a, k)], a[k]) for j, a in self._terms() if a[k]])
-            for k in range(variables)
-        ]
-        self.curvatures = {
-            (k, m): _columns(
-                [
-                    (j, place[_less(_less(a, k), m)], a[k] * _less(a, k)[m])
-                    for j, a in self._terms()
-                    if a[k] and _less(a, k)[m]
-                ]
-            )
-            for k in range(variables)
-            for m in range(k, variables)
-        }
-        self.curvatures = {pair: c for pair, c in self.curvatures.items() if len(c[0])}
-
-    def _terms(self):
-        return enumerate(tuple(row) for row in self.powers.tolist())
+        slopes: list[list] = [[] for _ in range(variables)]
+        curvatures: dict[tuple[int, int], list] = {}
+        for j, row in enumerate(terms):
+            used = [k for k in range(variables) if row[k]]
+            for n, k in enumerate(used):
+                less = _less(row, k)
+                slopes[k].append((j, place[less], row[k]))
+                for m in used[n:]:
+                    if less[m]:
+                        entry = (j, place[_less(less, m)], row[k] * less[m])
+                        curvatures.setdefault((k, m), []).append(entry)
+        self.slopes = [_columns(entries) for entries in slopes]
+        self.curvatures = {pair: _columns(curvatures[pair]) for pair in sorted(curvatures)}
 
     def products(self, variables: list, xp) -> list:
         """Every product, from the variables' values."""
@@ -330,50 +324,52 @@ def polynomial_terms(
     dim: int,
     degree: int,
     *,
-    angles: Sequence[int] = (),
     cyclic: Sequence[int] = (),
     features: Callable | None = None,
     reversor: Sequence[int] | None = None,
 ) -> Terms:
     """Every product of total degree 1 to ``degree`` of the coordinates, or of a scene's features.
 
-    angles: indices of z with period 2π, which enter by their cosines and sines; of sin² there is
-    none, it is 1 − cos². cyclic: indices that do not enter. features: ``features(z)`` -> (k,).
-    reversor: signs (2d,) under which H is even; terms that are odd are left out.
+    cyclic: indices of z that do not enter. features: ``features(z)`` -> (k,). reversor: signs (2d,)
+    under which H is even; terms that are odd are left out.
     """
     if features is not None:
         trees = traced(features, dim)
-        sines: set[int] = set()
     else:
-        trees, sines = [], set()
-        for i in range(2 * dim):
-            if i in cyclic:
-                continue
-            if i in angles and i < dim:
-                sines.add(len(trees) + 1)
-                trees += [call("cos", coordinate(i)), call("sin", coordinate(i))]
-            else:
-                trees.append(coordinate(i))
+        trees = [coordinate(i) for i in range(2 * dim) if i not in cyclic]
     odd = _odd(trees, dim, reversor)
     rows = tuple(
-        row
-        for row in _rows(len(trees), degree)
-        if all(row[k] < 2 for k in sines) and sum(row[k] for k in odd) % 2 == 0
-    )
+        row for row in _rows(len(trees), degree) if sum(row[k] for k in odd) % 2 == 0
+    )  # fmt: skip
     return Terms(dim, tuple(to_text(tree, dim) for tree in trees), rows)
 
 
 def joined(first: Terms, second: Terms) -> Terms:
     """The terms of both, those that are written alike once."""
-    variables = tuple(dict.fromkeys((*first.variables, *second.variables)))
+    variables, *rows = _over_both(first, second)
+    return Terms(first.dim, variables, tuple(dict.fromkeys(rows[0] + rows[1])))
+
+
+def multiplied(first: Terms, second: Terms) -> Terms:
+    """Every term of the first times every term of the second."""
+    variables, left, right = _over_both(first, second)
     rows = dict.fromkeys(
-        tuple(
-            row[family.variables.index(v)] if v in family.variables else 0 for v in variables
-        )
-        for family in (first, second)
-        for row in family.powers
-    )  # fmt: skip
+        tuple(a + b for a, b in zip(one, other, strict=True)) for one in left for other in right
+    )
     return Terms(first.dim, variables, tuple(rows))
+
+
+def _over_both(first: Terms, second: Terms):
+    """The variables of both families, and their powers over these."""
+    variables = tuple(dict.fromkeys((*first.variables, *second.variables)))
+    rows = (
+        [
+            tuple(row[f.variables.index(v)] if v in f.variables else 0 for v in variables)
+            for row in f.powers
+        ]
+        for f in (first, second)
+    )
+    return (variables, *rows)
 
 
 def _rows(variables: int, degree: int) -> list[tuple[int, ...]]:

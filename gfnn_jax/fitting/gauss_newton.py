@@ -417,11 +417,25 @@ def _summary(c, found: Factor, used, iterations: int, steps: Steps) -> FlowFit:
 def significant_terms(fit: FlowFit, threshold: float) -> np.ndarray:
     """The terms that are left when those below ``threshold`` standard errors go, the others solved
     for again (in the linearised problem), until none is below."""
-    count = len(fit.coefficients)
+    return significant(fit.factor, fit.coefficients, fit.rows, threshold, fit.rms)[0]
+
+
+def significant(
+    factor, coefficients, rows: int, threshold: float, rms: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """(kept, their coefficients) of the linearised problem that ``factor``, R of [∂r/∂c, r],
+    stands for: as `significant_terms`.
+
+    rms: of what the terms do not explain; None: of what all of them leave over.
+    """
+    count = len(coefficients)
     kept = np.arange(count)
-    a, r = fit.factor[:, :count], fit.factor[:, count]
-    target = a @ fit.coefficients - r  # the linearised problem: min ‖a c − target‖
-    noise = max(fit.rms, _ROUNDOFF) * np.sqrt(fit.rows / max(fit.rows - count, 1))
+    a, r = factor[:, :count], factor[:, count]
+    target = a @ coefficients - r  # min ‖a c − target‖
+    if rms is None:
+        rms = float(np.linalg.norm(factor[count:, count]) / np.sqrt(rows))
+    noise = max(rms, _ROUNDOFF) * np.sqrt(rows / max(rows - count, 1))
+    c = coefficients
     while kept.size:
         part = np.concatenate([a[:, kept], target[:, None]], axis=1)
         size, s, vt, along = _scaled(part)
@@ -435,5 +449,5 @@ def significant_terms(fit: FlowFit, threshold: float) -> np.ndarray:
         # Half of the weak ones at a time, the weakest first: they lend each other their weight.
         order = np.argsort(ratio)
         gone = order[: max(1, (weak.sum() + 1) // 2)]
-        kept = np.delete(kept, gone)
-    return kept
+        kept, c = np.delete(kept, gone), np.delete(c, gone)
+    return kept, c

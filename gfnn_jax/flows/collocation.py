@@ -46,12 +46,13 @@ class Images(NamedTuple):
 
 def images(
     family, params, z, dt: float, steps: Steps, *, args=None, derivatives: bool = False,
-    on_substep: Callable[[], Any] = lambda: None,
+    along: Any = None, on_substep: Callable[[], Any] = lambda: None,
 ):  # fmt: skip
     """Images of the states z (B, 2d) after dt, in NumPy. Lanes that fail are not finite.
 
     derivatives: the exact ones of the collocation, in the state and in the coefficients of a
-    linear family. on_substep: called before each; it may raise to stop.
+    linear family. along: another one, in whose coefficients they are instead, these 0.
+    on_substep: called before each substep; it may raise to stop.
     """
     rule, h = gauss(steps.stages), dt / steps.substeps
     width = z.shape[1]
@@ -65,7 +66,7 @@ def images(
             solved = solved & done
             if derivatives:
                 inside = z + h * _summed(rule.matrix, slopes)
-                by_z, by_c = _derivatives(family, params, inside, h, rule, args)
+                by_z, by_c = _derivatives(family, params, inside, h, rule, args, along or family)
                 by_state = by_z @ by_state
                 by_coefficient = by_z @ by_coefficient + by_c if np.ndim(by_coefficient) else by_c
             z = z + h * _summed(rule.weights[None, :], slopes)[0]
@@ -190,11 +191,11 @@ def truncation(
     return one - other
 
 
-def _derivatives(family, params, inside, h, rule, args):
+def _derivatives(family, params, inside, h, rule, args, along):
     """∂Z/∂z (B, 2d, 2d) and ∂Z/∂c (B, 2d, terms) of one step, its stage states (s, B, 2d).
 
-    N dK = JH'' dz + J∇φ dc with N the stage matrix, and dZ = dz + h Σ b_i dK_i: the rows h bᵀ N⁻¹
-    are solved for once, whatever the number of terms.
+    N dK = JH'' dz + J∇φ dc with N the stage matrix and φ the terms of ``along``, and
+    dZ = dz + h Σ b_i dK_i: the rows h bᵀ N⁻¹ are solved for once, whatever the number of terms.
     """
     count, lanes, width = inside.shape
     form = symplectic_form(width // 2)
@@ -208,5 +209,5 @@ def _derivatives(family, params, inside, h, rule, args):
     rows = rows.reshape(lanes, width, count * width)
     bent = hessian.transpose(1, 0, 2, 3).reshape(lanes, count * width, width)
     by_state = np.eye(width) + rows @ bent
-    terms = family.term_gradients(inside, args).transpose(1, 0, 2, 3)
+    terms = along.term_gradients(inside, args).transpose(1, 0, 2, 3)
     return by_state, rows @ terms.reshape(lanes, count * width, -1)

@@ -16,7 +16,9 @@ from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.scenes.scene import Scene
 
 # Beside a map only a law of few terms is looked for: a larger one is no shorter to say than S.
-_BESIDE = dataclasses.replace(OPTIONS, most_terms=60, max_seconds=10.0)
+_BESIDE = dataclasses.replace(
+    OPTIONS, most_terms=60, most_modes=150, max_seconds=10.0, mode_seconds=30.0
+)
 # A law holds outside the data and at any time step: so much dearer a step it may be.
 DEARER = 4.0
 _PART = 0.3  # of the time that is left, for H beside a map
@@ -46,8 +48,12 @@ def law_of(
         return None
     options = OPTIONS if learn == "hamiltonian" or terms else _BESIDE
     if learn == "auto":  # the map, which every system has, is to have the better part of the time
-        seconds = min(options.max_seconds, _PART * clock.left)
-        options = dataclasses.replace(options, max_seconds=seconds)
+        part = _PART * clock.left
+        options = dataclasses.replace(
+            options, max_seconds=min(options.max_seconds, part),
+            mode_seconds=min(options.mode_seconds, part),
+        )  # fmt: skip
+    started = clock.seconds
     try:
         with np.errstate(all="ignore"):  # starts that run away are part of the search
             return learn_hamiltonian(
@@ -55,8 +61,8 @@ def law_of(
             )
     except OutOfTime as spent:
         if learn == "hamiltonian":
-            seconds = min(options.max_seconds, clock.max_seconds or np.inf)
-            raise FitError(f"expected an H that is fitted in {seconds:g} s: none was") from spent
+            seconds = clock.seconds - started
+            raise FitError(f"expected an H that is fitted in {seconds:.2g} s: none was") from spent
     except (FitError, np.linalg.LinAlgError) as error:
         if learn == "hamiltonian" or terms:
             raise FitError(str(error)) from error

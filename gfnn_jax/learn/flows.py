@@ -1,7 +1,8 @@
 """Learn H: the Hamiltonian whose flow over dt maps z₀ to z₁, as a formula of few terms.
 
 Libraries of terms are tried by rising size, each from the one before, until one meets the
-tolerance; its terms that are nothing but noise go while the held-out error does not rise.
+tolerance; where there are angles, one library grows mode by mode. Terms that are nothing but noise
+go while the held-out error does not rise.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ import numpy as np
 
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
+from gfnn_jax.families.expressions import coordinate_names
+from gfnn_jax.families.modes import Modes
+from gfnn_jax.families.terms import Terms, given_terms, joined, multiplied, polynomial_terms
 from gfnn_jax.fitting.gauss_newton import (
     MOST_SUBSTEPS,
     FlowFit,
@@ -27,6 +30,7 @@ from gfnn_jax.fitting.gauss_newton import (
     significant_terms,
     substeps_for,
 )
+from gfnn_jax.fitting.growth import grow
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.gauss import gauss
@@ -39,23 +43,28 @@ from gfnn_jax.phase_space import symplectic_form
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Tuned on Hénon–Heiles at dt 0.5 to 3 and on three bodies.
+    """Tuned on Hénon–Heiles at dt 0.5 to 3, on three bodies and on the double pendulum.
 
     degrees: of the products of coordinates; feature_degrees: of a scene's features; given_degrees:
-    of the products that stand beside a user's own terms (0: his alone).
-    most_terms: of a library. rows_per_term: that a library needs.
+    of the products that stand beside a user's own terms (0: his alone), given_products: by which
+    his terms are multiplied too.
+    most_terms: of a library; most_modes: of one that grows. rows_per_term: that a library needs.
     judged_rows: per term, from which a library is judged; all pairs only count in the last fit.
     thresholds: standard errors below which terms go, tried in turn.
     rise: of the held-out error that dropping terms may cost; rounding: below which it is roundoff.
     gained: a library that lowers the error by less has not helped; twice in a row ends the search.
     truncation: a flow's own error, as a part of the tolerance. contracting: a fixed point's factor
-    up to which it is preferred to Newton's method. max_seconds: of the search.
+    up to which it is preferred to Newton's method. goal: residual that modes grow to, as a part of
+    the tolerance. max_seconds: of the search; mode_seconds: where modes grow, growth_part: the part
+    of them in which they may.
     """
 
     degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 8)
     feature_degrees: tuple[int, ...] = (2, 3)
     given_degrees: tuple[int, ...] = (0, 2, 3, 4)
+    given_products: tuple[int, ...] = (2,)
     most_terms: int = 350
+    most_modes: int = 500
     rows_per_term: float = 1.6
     judged_rows: float = 12.0
     thresholds: tuple[float, ...] = (1e4, 1e3, 100.0, 30.0, 10.0, 5.0, 3.0)
@@ -64,7 +73,10 @@ class Options:
     gained: float = 0.5
     truncation: float = 0.1
     contracting: float = 0.8
+    goal: float = 0.3
     max_seconds: float = 30.0
+    mode_seconds: float = 60.0
+    growth_part: float = 0.7
 
 
 OPTIONS = Options()
@@ -73,7 +85,7 @@ _FREQUENCY_STATES = 500
 _NEAR_ROUNDOFF = 3e-15  # of the spread
 _HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
 _NAMED = 5  # terms in a message
-_POOR = 2  # libraries in a row that do not help end the search
+_POOR, _POOR_GIVEN = 2, 3  # libraries in a row that do not help end the search; with given terms
 _FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
 
 
@@ -114,14 +126,17 @@ class LearnedHamiltonian:
 
 class _Fitted(NamedTuple):
     """rows: that the fit was given; it has left out those that the flow does not resolve.
-    undetermined: of the null terms, those that other states would tell from the rest."""
+    undetermined: of the null terms, those that other states would tell from the rest. ended: why a
+    library that grew did so no longer. stalled: whether larger libraries were no better."""
 
     family: Terms
     fit: FlowFit
     rows: np.ndarray
     error: OneStepError
     null: tuple[str, ...]
-    undetermined: tuple[str, ...]
+    undetermined: tuple[str, ...] = ()
+    ended: str = ""
+    stalled: bool = False
 
 
 def learn_hamiltonian(
@@ -140,14 +155,36 @@ def learn_hamiltonian(
 
     Raises FitError where no library can be tried, OutOfTime where the budget ends before the first.
     """
-    left = options.max_seconds if clock is None else min(options.max_seconds, clock.left)
-    clock = Clock(left)
+    basis = _modes(prepared, scene, terms)
+    most = options.max_seconds if basis is None else options.mode_seconds
+    clock = Clock(most if clock is None else min(most, clock.left))
     if prepared.before or prepared.after:
         raise FitError("expected pairs without a base map: it is no part of a flow")
     started = time.perf_counter()
     if terms:
         _check_finite(given_terms(prepared.dim, terms), prepared.y0[judges.training])
     problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, check=clock.check)
+    if basis is not None:
+        best = _grown(problem, basis, prepared, judges, clock, options, say)
+    else:
+        best, options = _searched(problem, prepared, judges, scene, terms, options, say)
+    if substeps_for(best.family, best.fit.coefficients, prepared.y0, prepared.dt) >= MOST_SUBSTEPS:
+        raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
+    try:
+        best = _sparse(problem, best, prepared, judges, options, say)
+        if best.error.relative > _ROUNDOFF and len(best.fit.used) < len(judges.training):
+            best = _refitted(problem, best, judges.training, prepared, judges)
+    except OutOfTime:
+        pass  # what was found stands
+    problem.check = lambda: None
+    return _learned(best, problem, prepared, judges, time.perf_counter() - started, options)
+
+
+def _searched(
+    problem, prepared, judges: Judges, scene, terms, options: Options, say
+) -> tuple[_Fitted, Options]:
+    """The smallest library that meets the tolerance, else the best; and the options, which try no
+    fewer terms where the tolerance is out of reach."""
     bound = judges.tolerance.bound
     best: _Fitted | None = None
     last, poor, errors = None, 0, []
@@ -167,7 +204,7 @@ def learn_hamiltonian(
                 best = found
             last = found
             errors.append(found.error.bound)
-            if best.error.bound <= bound or poor == _POOR:
+            if best.error.bound <= bound or poor == (_POOR_GIVEN if terms else _POOR):
                 break
             if _out_of_reach(errors, len(libraries) - 1 - libraries.index(family), bound):
                 options = dataclasses.replace(options, thresholds=())  # no law: nothing to read
@@ -179,17 +216,57 @@ def learn_hamiltonian(
         raise FitError(
             f"expected more pairs: {len(prepared.y0)} are too few for any library of terms"
         )
-    if substeps_for(best.family, best.fit.coefficients, prepared.y0, prepared.dt) >= MOST_SUBSTEPS:
-        raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
+    stalled = poor == (_POOR_GIVEN if terms else _POOR)
+    return best._replace(stalled=stalled), options
+
+
+def _modes(prepared: Prepared, scene, terms) -> Modes | None:
+    """The basis that grows, where an angle enters H by itself; else None."""
+    if scene is not None and scene.features is not None:
+        return None
+    dim, coordinates = prepared.dim, prepared.coordinates
+    angles = tuple(i for i in coordinates.angles if i < dim and i not in coordinates.cyclic)
+    if not angles:
+        return None
+    plain = [
+        name
+        for i, name in enumerate(coordinate_names(dim))
+        if i not in angles and i not in coordinates.cyclic
+    ]
+    own = given_terms(dim, terms).variables if terms else ()
+    own = tuple(text for text in own if text not in plain)
+    return Modes(dim, angles, (*plain, *own), len(own))
+
+
+def _grown(
+    problem, basis: Modes, prepared, judges: Judges, clock: Clock, options: Options, say
+) -> _Fitted:
+    """The library that has grown to the tolerance, or as far as the time and the pairs allow."""
+    goal = options.goal * judges.tolerance.bound
+    if not judges.tolerance.relative:
+        goal = goal / float(problem.scale.max())
+    most = int(len(judges.training) * 2 * prepared.dim / options.rows_per_term)
+    problem.check = Clock(options.growth_part * clock.left).check
+    grown, ended = None, "the time is over"
     try:
-        best = _sparse(problem, best, prepared, judges, options, say)
-        if best.error.relative > _ROUNDOFF and len(best.fit.used) < len(judges.training):
-            best = _refitted(problem, best, judges.training, prepared, judges)
+        for grown in grow(problem, basis, judges.training, goal, min(most, options.most_modes)):
+            ended = grown.ended
+            say(f"H grows: {len(grown.coefficients)} modes, error {grown.rms:.1e} {ended}")
     except OutOfTime:
-        pass  # what was found stands
-    problem.check = lambda: None
-    learned = _learned(best, problem, prepared, judges, time.perf_counter() - started, options)
-    return dataclasses.replace(learned, stalled=poor == _POOR)
+        if grown is None:
+            raise
+        ended = ended or "the time is over"
+    if grown is None or not np.isfinite(grown.rms):
+        raise FitError(
+            f"expected more pairs, or pairs of a flow: {len(prepared.y0)} tell no library of modes"
+        )
+    problem.check = clock.check
+    count = int(np.ceil(options.judged_rows * len(grown.coefficients) / (2 * prepared.dim)))
+    rows = judges.training[: max(count, 500)]
+    fit = problem.fit(grown.family, grown.coefficients, rows, rounds=False, say=say)
+    fit = _resolved(problem, grown.family, fit, rows)
+    error = _held_out_error(problem, grown.family, fit, prepared, judges)
+    return _Fitted(grown.family, fit, rows, error, (), ended=ended)
 
 
 def _check_finite(given: Terms, z) -> None:
@@ -245,13 +322,15 @@ def _libraries(prepared, judges, scene, terms, options: Options) -> Iterator[Ter
             yield own
             continue
         family = polynomial_terms(
-            dim, degree, angles=coordinates.angles, cyclic=coordinates.cyclic, features=features,
-            reversor=reversor,
-        )  # fmt: skip
-        family = family if own is None else joined(own, family)
-        if family.num_parameters > most:
-            return
-        yield family
+            dim, degree, cyclic=coordinates.cyclic, features=features, reversor=reversor
+        )
+        tried = [family] if own is None else [joined(own, family)]
+        if own is not None and degree in options.given_products:
+            tried.append(joined(tried[0], multiplied(own, family)))
+        for library in tried:
+            if library.num_parameters > most:
+                return
+            yield library
 
 
 def _fitted(problem, family, prepared, judges, last: _Fitted | None, options, say) -> _Fitted:
@@ -330,7 +409,7 @@ def _sparse(problem, full: _Fitted, prepared, judges, options: Options, say) -> 
         fit = problem.fit(family, start, full.fit.used, rounds=False, steps=full.fit.steps)
         error = _held_out_error(problem, family, fit, prepared, judges)
         if error.relative <= max(options.rise * full.error.relative, options.rounding):
-            return _Fitted(family, fit, full.rows, error, full.null, full.undetermined)
+            return full._replace(family=family, fit=fit, error=error)
     return full
 
 
@@ -379,8 +458,8 @@ def _learned(
     return LearnedHamiltonian(
         with_error(candidate, error), flow, terms, formula(terms), float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
-        tuple(_messages(error, omega_h, left_out, prepared, judges, found.undetermined)),
-        stalled=False,
+        tuple(_messages(error, omega_h, prepared, judges, found, left_out)),
+        stalled=found.stalled,
     )  # fmt: skip
 
 
@@ -460,7 +539,7 @@ def _omega_h(hessian, dt: float) -> float:
 
 
 def _messages(
-    error: OneStepError, omega_h: float, left_out: int, prepared, judges, undetermined
+    error: OneStepError, omega_h: float, prepared, judges, found: _Fitted, left_out: int
 ) -> Iterator[str]:
     if error.bound > judges.tolerance.bound:
         yield (
@@ -468,6 +547,7 @@ def _messages(
             f"spread, its fastest oscillation {omega_h:.2g} in a step): the pairs carry noise, "
             "other terms are needed, the map has no flow, or ωh > π at "
             f"dt = {prepared.dt:g}, and then only a shorter dt tells H"
+            + (f"; modes were added until {found.ended}" if found.ended else "")
         )
     elif omega_h > _FAST:
         yield (
@@ -475,10 +555,11 @@ def _messages(
             "any H whose frequencies differ by 2π per step gives the same pairs; this is the "
             "slowest"
         )
-    if undetermined:
-        some = ", ".join(undetermined[:_NAMED]) + (", …" if len(undetermined) > _NAMED else "")
+    if found.undetermined:
+        names = found.undetermined
+        some = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
         yield (
-            f"the pairs do not determine {len(undetermined)} terms of H ({some}): they are left "
+            f"the pairs do not determine {len(names)} terms of H ({some}): they are left "
             "out, and H is known only where the pairs are"
         )
     if left_out:
