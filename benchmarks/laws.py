@@ -32,8 +32,10 @@ from harness import (
 )
 
 import gfnn_jax as gfnn
-from gfnn_jax.families.terms import polynomial_terms
+from gfnn_jax.baselines import METHODS, Budget, Sequences
+from gfnn_jax.families.terms import given_terms, joined, polynomial_terms
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.maps.rollout import rollout
 from gfnn_jax.phase_space import apply_j
 from gfnn_jax.scenes.trajectories import reference_error
 
@@ -41,6 +43,11 @@ STEPS, ORBITS, BATCH = 1_000, 100, 1_000
 DRIFT_STEPS = 1_000_000
 # Of the double pendulum: the angles' difference in the denominator.
 RATIONAL = ("1/(1 + sin(q1 - q2)**2)",)
+
+
+HENON_HEILES = {"q1²": 0.5, "q2²": 0.5, "p1²": 0.5, "p2²": 0.5, "q1² q2": 1.0, "q2³": -1 / 3}
+# Published methods, at most so many seconds of training each.
+OTHERS, CAP = ("hnn", "srnn-2"), 60.0
 
 
 # Fits and what is measured of them
@@ -122,11 +129,10 @@ def henon_heiles(name: str, quick: bool) -> Numbers:
     scene = gfnn.scenes.make(name)
     pairs, fresh = pairs_of(scene, 100)
     fit, found = learned(pairs, fresh, tolerance=1e-13)
-    exact = {"q1²": 0.5, "q2²": 0.5, "p1²": 0.5, "p2²": 0.5, "q1² q2": 1.0, "q2³": -1 / 3}
     regular = scene.regular and not quick
     return {
         **found,
-        "coefficient_error": coefficient_error(fit, exact),
+        "coefficient_error": coefficient_error(fit, HENON_HEILES),
         **(rolled_out(fit, scene, 20) if regular else {}),
         **(drift(fit, scene) if regular else {}),
     }
@@ -159,8 +165,8 @@ def three_bodies(quick: bool) -> Numbers:
     return {**found, **rolled_out(fit, scene, ORBITS, exact_error=False)}
 
 
-def cartesian_two_body(quick: bool) -> Numbers:
-    """Two bodies in Cartesian coordinates, 1/r among thirty terms, e up to 0.6."""
+def two_body_pairs() -> tuple[gfnn.Pairs, gfnn.Pairs]:
+    """Two bodies in Cartesian coordinates, e up to 0.6: 500 pairs, and fresh ones."""
 
     def draw(rng, num):
         """At the pericentre of orbits of semi-major axis 1, turned by any angle, both senses."""
@@ -176,7 +182,12 @@ def cartesian_two_body(quick: bool) -> Numbers:
     def hamiltonian(_, z):
         return 0.5 * (z[2] ** 2 + z[3] ** 2) - 1 / jnp.sqrt(z[0] ** 2 + z[1] ** 2)
 
-    pairs, fresh = pairs_by_flow(hamiltonian, draw, 500, 0.1)
+    return pairs_by_flow(hamiltonian, draw, 500, 0.1)
+
+
+def cartesian_two_body(quick: bool) -> Numbers:
+    """Two bodies in Cartesian coordinates, 1/r among thirty terms, e up to 0.6."""
+    pairs, fresh = two_body_pairs()
     fit, found = learned(pairs, fresh, tolerance=1e-13, terms=["1/sqrt(q1**2 + q2**2)"])
     exact = {"1/sqrt(q1**2 + q2**2)": -1.0, "p1²": 0.5, "p2²": 0.5}
     return {**found, "coefficient_error": coefficient_error(fit, exact)}
@@ -200,12 +211,17 @@ def double_pendulum(dt: float, terms: Sequence[str], quick: bool) -> Numbers:
     return learned(pairs, fresh, angles=(0, 1), tolerance=1e-12 if terms else 1e-6, **learn)[1]
 
 
-def derivative_matching(name: str, quick: bool) -> Numbers:
+def derivative_matching(task: str, quick: bool) -> Numbers:
     """H from finite differences of the same pairs: J∇H(½(z₀ + z₁)) = (z₁ − z₀)/dt, least squares
-    over the 34 products up to degree 3. Its flow is judged as the others are."""
-    scene = gfnn.scenes.make(name)
-    pairs, fresh = pairs_of(scene, 100)
+    over the 34 products up to degree 3, and 1/r for two bodies. Its flow is judged as the others
+    are."""
+    pairs, fresh, scene = same_pairs(task)
     family = polynomial_terms(2, 3)
+    if scene is None:
+        family = joined(given_terms(2, ["1/sqrt(q1**2 + q2**2)"]), family)
+        exact = {"1/sqrt(q1**2 + q2**2)": -1.0, "p1²": 0.5, "p2²": 0.5}
+    else:
+        exact = HENON_HEILES
     z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
     gradients = family.term_gradients(0.5 * (z0 + z1))
     target = -apply_j(z1 - z0) / pairs.dt
@@ -213,8 +229,7 @@ def derivative_matching(name: str, quick: bool) -> Numbers:
     c = np.linalg.lstsq(design, target.ravel(), rcond=None)[0]
     flow = Flow(family, c, pairs.dt, np.ones(4), stages=8)
     error = np.asarray(flow.step(jnp.asarray(fresh.z0))[0]) - np.asarray(fresh.z1)
-    exact = dict.fromkeys(family.term_names, 0.0)
-    exact |= {"q1²": 0.5, "q2²": 0.5, "p1²": 0.5, "p2²": 0.5, "q1² q2": 1.0, "q2³": -1 / 3}
+    exact = dict.fromkeys(family.term_names, 0.0) | exact
     off = [abs(v - exact[n]) for n, v in zip(family.term_names, c, strict=True)]
     return {
         "pairs": len(pairs), "chosen": "derivative matching", "num_terms": len(c),
@@ -222,13 +237,49 @@ def derivative_matching(name: str, quick: bool) -> Numbers:
     }  # fmt: skip
 
 
+def same_pairs(task: str) -> tuple[gfnn.Pairs, gfnn.Pairs, Any]:
+    """The pairs of a task, fresh ones, and its scene where it has one."""
+    if task == "two-body-cartesian":
+        return *two_body_pairs(), None
+    scene = gfnn.scenes.make(task)
+    return *pairs_of(scene, 100), scene
+
+
+def of_others(task: str, method: str, quick: bool) -> Numbers:
+    """A published method on the same pairs, its public code's recipe and at most a minute."""
+    pairs, fresh, scene = same_pairs(task)
+    z = np.stack([np.asarray(pairs.z0), np.asarray(pairs.z1)], axis=1)
+    budget = Budget(jax.random.key(SEED + 4), 5.0 if quick else CAP)
+    found = METHODS[method].learn(Sequences(z, float(np.ravel(pairs.dt)[0])), budget)
+    step, training = found.step, found.training
+    error = np.asarray(jax.jit(jax.vmap(step))(fresh.z0)) - np.asarray(fresh.z1)
+    begun = np.resize(np.asarray(fresh.z0), (BATCH, fresh.z0.shape[1]))
+    rolled = timed(lambda: rollout(step, begun, 10, save_every=10), 1)
+    median = None
+    if scene is not None:
+        z0 = np.asarray(gfnn.sample_test_states(scene, 20, jax.random.key(SEED + 2)))
+        reference = np.asarray(gfnn.reference_trajectories(scene, z0, STEPS))
+        last = gfnn.metrics.position_error(np.asarray(rollout(step, z0, STEPS)), reference)[:, -1]
+        median = float(np.median(np.where(np.isfinite(last), last, np.inf)))
+    return {
+        "pairs": len(pairs), "chosen": METHODS[method].title, "label": found.label,
+        "num_terms": found.num_parameters, "one_step_rms": float(np.sqrt(np.mean(error**2))),
+        "error_median": median, "fit_seconds": training.seconds,
+        "compile_seconds": training.compile_seconds, "stopped_because": training.stopped_because,
+        "microseconds_per_step": 1e6 * rolled.seconds / (10 * BATCH),
+    }  # fmt: skip
+
+
 PIECES = {
     "henon-heiles-regular": partial(henon_heiles, "henon-heiles-regular"),
     "henon-heiles-chaotic": partial(henon_heiles, "henon-heiles-chaotic"),
     "henon-heiles-derivatives": partial(derivative_matching, "henon-heiles-regular"),
+    **{f"henon-heiles-{m}": partial(of_others, "henon-heiles-regular", m) for m in OTHERS},
     **{f"henon-heiles-dt-{dt:g}": partial(long_step, dt) for dt in (1.0, 2.0, 3.0, 4.0)},
     "three-bodies": three_bodies,
     "two-body-cartesian": cartesian_two_body,
+    "two-body-derivatives": partial(derivative_matching, "two-body-cartesian"),
+    **{f"two-body-{m}": partial(of_others, "two-body-cartesian", m) for m in OTHERS},
     **{
         f"double-pendulum-{dt:g}{'-term' if terms else ''}": partial(double_pendulum, dt, terms)
         for dt in (0.05, 0.2)

@@ -54,6 +54,12 @@ def apply_j(g):
     return namespace(g).concatenate([g[..., dim:], -g[..., :dim]], axis=-1)
 
 
+def area(z, moved):
+    """½ (p·δq − q·δp) (...) of states z and changes δ (..., 2d), NumPy or JAX: the integral of
+    ½ (p dq − q dp) along the straight line from z to z + δ."""
+    return -0.5 * namespace(z, moved).sum(z * apply_j(moved), axis=-1)
+
+
 def symplectic_form(dim: int) -> Float[np.ndarray, "phase phase"]:
     """The matrix J of shape (2d, 2d), float64 NumPy."""
     zero, one = np.zeros((dim, dim)), np.eye(dim)

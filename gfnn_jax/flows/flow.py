@@ -23,7 +23,7 @@ from gfnn_jax.families import as_family
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.generating.generated import two_sum
-from gfnn_jax.phase_space import apply_j, symplectic_form
+from gfnn_jax.phase_space import apply_j, area, symplectic_form
 from gfnn_jax.solve import newton
 from gfnn_jax.solve.linear import small_solve
 from gfnn_jax.solve.newton import Evaluation
@@ -133,6 +133,21 @@ class Flow:
         (z, compensation), info = self._repeated(substep, (z, compensation))
         return z, compensation, info
 
+    def action(self, z, image, origin, args=None):
+        """The action (B,) of the step from z (B, 2d) to its image: the method's own sum
+        Σ b_i of it, which is exact for a symplectic Runge–Kutta method."""
+        weights = gauss(self.stages).weights[None, :]
+
+        def substep(both):
+            z, total = both
+            slopes, info = self._slopes(z, args, False)
+            inside = z[None] + _summed(gauss(self.stages).matrix, slopes)
+            done = self.dt / self.substeps * self.family.value(self.params, inside, args)
+            total = total + _summed(weights, area(inside - origin[None], slopes) - done)[0]
+            return (z + _summed(weights, slopes)[0], total), info
+
+        return self._repeated(substep, (z, jnp.zeros(z.shape[:1], z.dtype)))[0][1]
+
     def inverse(self) -> Flow:
         """The inverse map: the same flow backwards."""
         return dataclasses.replace(self, dt=-self.dt)
@@ -145,6 +160,11 @@ class Flow:
 
     def _increment(self, z, args, unrolled: bool | int):
         """(Z − z, Info) of one substep."""
+        slopes, info = self._slopes(z, args, unrolled)
+        return _summed(gauss(self.stages).weights[None, :], slopes)[0], info
+
+    def _slopes(self, z, args, unrolled: bool | int):
+        """(h K (s, B, 2d), Info) of one substep."""
         shared = (self.family, self.params, self.dt / self.substeps, self.scale)
         if self.newton:
             equation = StageEquation(self.stages)
@@ -157,11 +177,9 @@ class Flow:
             else:
                 guess = jax.lax.stop_gradient(guess)
                 x, _, info = newton.root(equation, shared, (z, args), guess, _MOST_NEWTON)
-            slopes = jnp.swapaxes(x.reshape(len(z), self.stages, -1), 0, 1)
-        else:
-            solve = _fixed_point if unrolled else _stages
-            slopes, info = solve(self.stages, shared, z, args)
-        return _summed(gauss(self.stages).weights[None, :], slopes)[0], info
+            return jnp.swapaxes(x.reshape(len(z), self.stages, -1), 0, 1), info
+        solve = _fixed_point if unrolled else _stages
+        return solve(self.stages, shared, z, args)
 
 
 def _fixed_point(stages: int, shared, z, args):

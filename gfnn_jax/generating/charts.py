@@ -22,7 +22,7 @@ import dataclasses
 import numpy as np
 
 from gfnn_jax.arrays import as_row, namespace
-from gfnn_jax.phase_space import apply_j, split
+from gfnn_jax.phase_space import apply_j, area, split
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +78,14 @@ class Chart:
     def image(self, z, w, gradient, dt):
         """Z = z + h J∇S(w)."""
         return z + dt * apply_j(gradient)
+
+    def action(self, z0, z1, origin, generated):
+        """The step's action (...) about the origin, of ``generated`` = h S(w): see
+        `maps.modified_hamiltonian`."""
+        moved = z1 - z0
+        in_q, in_p = split(moved)
+        turned = area(0.5 * (z0 + z1) - origin, moved)
+        return turned - self.skew * namespace(moved).sum(in_q * in_p, axis=-1) - generated
 
     def reverse(self, dt):
         """Chart and time step of the inverse map, which the same S generates: (−c, −h)."""
@@ -170,6 +178,13 @@ class TypeOne:
         (q, q1), (in_q, in_q1) = split(w), split(gradient)
         image = [q1, dt * in_q1] if self.side == 0 else [q, -dt * in_q]
         return namespace(z).concatenate(image, axis=-1)
+
+    def action(self, z0, z1, origin, generated):
+        """As for the other charts; h S is ∫ p dq − H̃ dt from the side of q to that of Q."""
+        (q, p), (q1, p1) = split(z0), split(z1)
+        ends = 0.5 * namespace(q, q1).sum(p1 * q1 - p * q, axis=-1)
+        signed = generated if self.side == 0 else -generated
+        return signed - ends - area(origin, z1 - z0)
 
     def reverse(self, dt):
         """The same S read from its other side."""

@@ -132,6 +132,13 @@ class Generated:
         x, gradient, error = newton.refine(ImplicitStep(self.chart), shared, (z, known, args), x)
         return self.chart.image(z, self.chart.complete(known, x), gradient, self.dt), error
 
+    def action(self, z, image, origin, args=None):
+        """The action (B,) of the step from z (B, 2d) to its image: S itself, at their w. NumPy or
+        JAX."""
+        w = self.chart.evaluation_point(z, image)
+        generated = self.dt * self.family.value(self.params, w, args)
+        return self.chart.action(z, image, origin, generated)
+
     def inverse(self) -> Generated:
         """The inverse map: the same S, the chart read from its other side."""
         chart, dt = self.chart.reverse(self.dt)

@@ -308,7 +308,8 @@ def fit(
     chosen, entry, compile_seconds = choice
     noise = None
     ended = found.ended if learn != "hamiltonian" else _ended(chosen, bound)
-    if law is not None and (entry is None or met_by_law):
+    unmet = chosen.validation_bound > bound.bound
+    if law is not None and (entry is None or met_by_law or (unmet and law.fast)):
         warn(list(law.messages))
     looked_at = entry or (found.ranking[0] if found.ranking else None)
     diagnosis: list[str] = []

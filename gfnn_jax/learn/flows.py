@@ -123,6 +123,11 @@ class LearnedHamiltonian:
     messages: tuple[str, ...]
     stalled: bool
 
+    @property
+    def fast(self) -> bool:
+        """Whether H oscillates so fast that other laws are not far from the same pairs."""
+        return self.omega_h > _FAST
+
 
 class _Fitted(NamedTuple):
     """rows: that the fit was given; it has left out those that the flow does not resolve.

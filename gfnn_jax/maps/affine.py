@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from gfnn_jax.arrays import as_row, matmul
-from gfnn_jax.phase_space import apply_j
+from gfnn_jax.phase_space import apply_j, area
 from gfnn_jax.solve.status import OK, Info
 
 
@@ -42,6 +42,12 @@ class Affine:
         """(Z, compensation, Info) of z + compensation; a product's rounding is lost."""
         image, info = self.step(z)
         return image + matmul(compensation, self.matrix.T), jnp.zeros_like(z), info
+
+    def action(self, z, image, origin, args=None):
+        """The action (B,) of the step from z (B, 2d) to its image; about the centre it vanishes
+        there."""
+        centre = as_row(self.centre, z) - origin
+        return area(centre + as_row(self.shift, z), image) - area(centre, z)
 
     def inverse(self) -> Affine:
         """E⁻¹, which of a symplectic E is −J Eᵀ J."""
