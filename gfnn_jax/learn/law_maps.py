@@ -23,7 +23,7 @@ from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
 
 _TRIAL_PAIRS = 1_000  # by which it is found out where a flow is to be factored out
-_EXPLAINED = 0.1  # of the spread: a law that errs by more explains too little to be factored out
+_EXPLAINED = 0.3  # of the spread: a law that errs by more explains too little to be factored out
 
 
 class Searched(NamedTuple):
