@@ -29,6 +29,7 @@ def oscillator(num, length, dt=0.1, seed=0):
     return Sequences(np.stack(states, axis=1), dt)
 
 
+@pytest.mark.slow
 def test_the_flow_of_the_exact_hamiltonian_is_the_reference():
     """HNN's prediction, with H in place of its network: within the solver's tolerance."""
     scene = henon_heiles()

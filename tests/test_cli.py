@@ -763,7 +763,11 @@ def killed_training(arguments, seconds):
 
 
 @pytest.mark.parametrize(
-    ("kills", "tolerance"), [(1, 1e-3), pytest.param(20, 1e-14, marks=pytest.mark.slow)]
+    ("kills", "tolerance"),
+    [
+        pytest.param(1, 1e-3, marks=pytest.mark.slow),
+        pytest.param(20, 1e-14, marks=pytest.mark.slow),
+    ],
 )
 def test_killed_trainings_resume(kills, tolerance, tmp_path):
     """SIGKILLs at random moments of a training: the same map in the end, to the last bit."""

@@ -227,7 +227,7 @@ def exponents(scene, states):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(n, marks=pytest.mark.slow if n == "henon-heiles-printed" else ())
+        pytest.param(n, marks=pytest.mark.slow if n in ("henon-heiles-printed", "pcr3bp") else ())
         for n in scenes.names()
     ],
 )
@@ -249,6 +249,7 @@ def test_orbits_are_regular_or_chaotic_as_they_should_be(name):
         assert found.min() > 2 * 0.008
 
 
+@pytest.mark.slow
 def test_orbits_of_the_section_stay_in_the_island_and_of_the_pendulum_near_the_disc():
     section, pendulum = scenes.henon_heiles_section(), scenes.driven_pendulum()
     law = jax.random.key(5)
@@ -259,6 +260,7 @@ def test_orbits_of_the_section_stay_in_the_island_and_of_the_pendulum_near_the_d
     assert np.linalg.norm(z, axis=-1).max() < 0.8
 
 
+@pytest.mark.slow
 def test_chaotic_henon_heiles_stays_in_the_well():
     scene = scenes.henon_heiles(energy=1 / 6)
     for law in (scene.sampling, scene.test_states):

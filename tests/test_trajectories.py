@@ -173,8 +173,8 @@ def test_time_dependent_hamiltonian():
     np.testing.assert_allclose(z[0, :, 0], (np.cos(t) - np.cos(2 * t)) / 3, atol=1e-13, rtol=0)
 
 
-# Each like henon-heiles-regular, but for the energy or a term of H.
-ALIKE = ("henon-heiles-printed", "henon-heiles-chaotic")
+# Each like another, but for the energy, a term of H or the parameters: and long to compile.
+ALIKE = ("henon-heiles-printed", "henon-heiles-chaotic", "pcr3bp", "driven-pendulum")
 
 
 @pytest.mark.parametrize(
@@ -214,6 +214,7 @@ def test_spread_around_the_orbit(name):
     assert np.abs(np.corrcoef(offset.T) - np.eye(2 * scene.dim)).max() < 0.08
 
 
+@pytest.mark.slow
 def test_draws_run_all_along_the_orbit():
     scene = scenes.henon_heiles(energy=1 / 6)
     z = tr.sample_test_states(scene, 400, jax.random.key(7))

@@ -27,7 +27,10 @@ def test_the_fields_are_those_of_the_scenes(name):
     np.testing.assert_allclose(field, expected, rtol=1e-13, atol=1e-14)
 
 
-@pytest.mark.parametrize(("name", "order"), [("leapfrog", 2), ("Yoshida 4", 4), ("Kahan–Li 8", 8)])
+@pytest.mark.parametrize(
+    ("name", "order"),
+    [("leapfrog", 2), ("Yoshida 4", 4), pytest.param("Kahan–Li 8", 8, marks=pytest.mark.slow)],
+)
 def test_a_composition_has_its_order(name, order):
     scene = gfnn.scenes.make("henon-heiles-regular")
     z0 = jnp.array([[0.1, -0.2, 0.3, 0.1]])

@@ -286,8 +286,9 @@ def fit(
     else:
         sweeps = list(sweeps_for(family, charts.charts, prepared, scene, judges, factors))
     met_by_law = law is not None and law.candidate.validation_bound <= bound.bound
-    dearest = law.candidate.operations / DEARER if law is not None and met_by_law else np.inf
+    dearest = law.candidate.operations if law is not None and met_by_law else np.inf
     found = search(sweeps, bound.bound, clock, on_progress, on_candidate, better, dearest)
+    dearest /= DEARER  # of maps that would be chosen
     if law is not None and met_by_law and more_pairs_would_help(sweeps, found, bound, dearest):
         on_progress("drawing pairs from the flow of H")
         of_law = search_of_law(
