@@ -1,6 +1,7 @@
 """gfnn.fit: what is refused, what is held out, and that the choice is as accurate as it says."""
 
 import dataclasses
+import importlib
 import math
 import warnings
 
@@ -538,3 +539,22 @@ def test_a_linear_map_far_from_the_identity_needs_a_base_map():
     assert fit.base_map
     assert fit.met
     assert fit.symplecticity_defect < 1e-12
+
+
+def test_where_steps_do_not_bear_the_search_out_a_larger_map_is_taken(monkeypatch):
+    module = importlib.import_module("gfnn_jax.learn.fit")  # the name is that of its function too
+    assemble, refused = module.assemble, []
+
+    def the_first_fails(candidate, *rest):
+        assembled = assemble(candidate, *rest)
+        if not refused:
+            refused.append(candidate)
+            worse = dataclasses.replace(assembled.candidate, validation_bound=np.inf)
+            return assembled._replace(candidate=worse)
+        return assembled
+
+    monkeypatch.setattr(module, "assemble", the_first_fails)
+    fit = gfnn.fit(pendulum_pairs(), learn="map", tolerance=1e-4)
+    assert fit.met
+    assert (fit.chosen.chart, fit.chosen.family) == (refused[0].chart, refused[0].family)
+    assert fit.chosen.num_parameters > refused[0].num_parameters

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -53,7 +54,7 @@ from gfnn_jax.learn.law_maps import (
 )
 from gfnn_jax.learn.noise import state_noise
 from gfnn_jax.learn.prepare import Prepared, prepare
-from gfnn_jax.learn.search import AS_FAR, Entry, Found, search
+from gfnn_jax.learn.search import AS_FAR, MET, Entry, Found, search
 from gfnn_jax.learn.sweeps import NetworkSweep, sweeps_for
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
@@ -309,6 +310,8 @@ def fit(
     chosen, entry, compile_seconds = choice
     noise = None
     ended = found.ended if learn != "hamiltonian" else _ended(chosen, bound)
+    if ended.startswith(MET) and chosen.validation_bound > bound.bound:
+        ended = "the steps of a map that was to meet it do not converge from some of the states"
     unmet = chosen.validation_bound > bound.bound
     if law is not None and (entry is None or met_by_law or (unmet and law.fast)):
         warn(list(law.messages))
@@ -428,16 +431,20 @@ def _chosen(
 def _ended(chosen: Candidate, tolerance: Tolerance) -> str:
     """Why a search for H alone ended."""
     if chosen.validation_bound <= tolerance.bound:
-        return "the tolerance is met"
+        return MET
     return "no larger library of terms promised to meet it"
 
 
 def _assembled(
     found: Found, prepared: Prepared, judges: Judges, clock: Clock, say
 ) -> tuple[Candidate, Entry, float]:
-    """The first of the ranking whose own steps bear out what the search measured, else the best."""
+    """The first of the ranking whose own steps bear out what the search measured, else the best.
+    Where the steps of a map that was to meet the tolerance do not, larger ones of its sweep are
+    looked at before others."""
     compile_seconds, tried = 0.0, []
-    for entry in found.ranking:
+    first, bound = found.ranking[0], judges.tolerance.bound
+    larger = _larger(first, clock, say) if first.candidate.validation_bound <= bound else ()
+    for entry in itertools.chain([first], larger, found.ranking[1:]):
         say(f"compiling the step of {entry.candidate.chart} {entry.candidate.label}")
         sweep, size = entry.sweep, entry.size
         _, params = sweep.solve(size, Clock(), say)
@@ -466,6 +473,16 @@ class _LeftOver(NamedTuple):
     noise: np.ndarray | None
     messages: list[str]
     reason: str = ""
+
+
+def _larger(entry: Entry, clock: Clock, say) -> Iterator[Entry]:
+    """The larger sizes of an entry's sweep, validated by steps, as long as there is time."""
+    sizes = entry.sweep.sizes
+    for size in sizes[sizes.index(entry.size) + 1 :]:
+        if clock.left <= 0:
+            return
+        judged = entry.sweep.judge(size, Clock(), say)
+        yield Entry(entry.sweep.validate(size, judged, Clock(), say), entry.sweep, size)
 
 
 def _what_is_left(

@@ -30,6 +30,7 @@ _FINALISTS = 3  # that are validated where none meets the tolerance
 # estimate times the ratio is within the second.
 _CALIBRATED, _HOPEFUL = 1e3, 1.3
 _NO_WORSE = 1.03  # an error larger by this factor is as good, if the map is cheaper
+MET = "the tolerance is met"
 # A sweep whose error is within this factor of the best one's has come as far.
 AS_FAR = 1.25
 _KEPT = 0.1  # of the last kept map's error: a map so much better is kept in its stead
@@ -120,7 +121,7 @@ def search(
         entries = _finalists(entries, clock, say)
     entries = [_calibrated(e, ratio[sweeps.index(e.sweep)]) for e in entries]
     if np.isfinite(cheapest):
-        ended = "the tolerance is met"
+        ended = MET
     else:
         ended = ended or _why(sweeps, stalled, best)
         ended += _promised(sweeps, seen, [_known(r) for r in ratio], stalled, bound)
