@@ -297,7 +297,7 @@ def fit(
         )
         if of_law is not None:
             judges, prepared, charts, found = of_law
-    elif law is not None and law_explains_most(law, found, bound, clock):
+    elif law is not None and not met_by_law and law_explains_most(law, found, bound, clock):
         on_progress(f"learning what the flow of {law.candidate.label} leaves over")
         around = search_around(
             law, plain, judges, scene, clock, on_progress, on_candidate, better, seed
