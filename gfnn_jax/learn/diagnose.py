@@ -16,7 +16,9 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.phase_space import sizes, symplecticity_defect
 
-_CENTRES = 400
+# States at which a Jacobian is taken: so many, or as many as so many operations allow, in eight
+# degrees of freedom 50 instead of ten seconds and more.
+_CENTRES, _FEWEST_CENTRES, _OPERATIONS = 400, 50, 5e9
 # Neighbours per unknown of a local fit: enough to average noise, few enough to stay local.
 _NEIGHBOURS_PER_TERM = 3
 # From so many pairs on the neighbourhoods keep their size: more pairs then average the noise away
@@ -63,7 +65,7 @@ class ChartJudgement(NamedTuple):
 
 
 def local_jacobians(y0, y1, scale, *, seed: int = 0) -> tuple[np.ndarray, float]:
-    """Jacobians of y0 -> y1 at up to 400 of the states, (n, 2d, 2d), and the error of their entries
+    """Jacobians of y0 -> y1 at 50 to 400 of the states, (n, 2d, 2d), and the error of their entries
     in coordinates of unit size, infinite where most are not known in all directions.
 
     y0, y1: (N, 2d) with angles lifted; scale (2d,) makes the coordinates comparable. A local
@@ -77,7 +79,8 @@ def local_jacobians(y0, y1, scale, *, seed: int = 0) -> tuple[np.ndarray, float]
     terms = 1 + width + (len(i) if quadratic else 0)
     fewest = _NEIGHBOURS_PER_TERM * terms
     count = min(n, max(fewest, min(_MOST_NEIGHBOURS, fewest * n // _LOCAL_ENOUGH)))
-    chosen = np.random.default_rng(seed).permutation(n)[:_CENTRES]
+    affordable = max(_FEWEST_CENTRES, int(_OPERATIONS / (6 * count * terms**2)))
+    chosen = np.random.default_rng(seed).permutation(n)[: min(_CENTRES, affordable)]
     tree = cKDTree(x)
     while True:
         _, near = tree.query(x[chosen], k=count)
