@@ -41,7 +41,8 @@ the table of candidates:
              midpoint at ((q + Q)/2, (p + P)/2), type1 at (q, Q); capitals are one step later
   error      one-step error of held-out pairs; relative: RMS over coordinates of error divided by
              that coordinate's spread
-  95 % bound the tolerance is met where this upper bound of the relative error is within it"""
+  95 % bound the tolerance is met where this upper bound of the relative error is within it
+  outside    relative error at the outermost twentieth of the states, of a fit without them"""
 
 
 class _Terminated(KeyboardInterrupt):

@@ -294,3 +294,10 @@ def test_a_known_law_leaves_little_to_learn(tmp_path):
     assert fit.symplecticity_defect < 1e-12
     back = np.asarray(fit.map.inverse(fresh.z1)[0])
     np.testing.assert_allclose(back, fresh.z0, rtol=0, atol=1e-10)
+
+
+def test_a_law_holds_outside_the_states_that_it_was_fitted_to(law, pairs):
+    candidates = {c.learns: c for c in law.candidates if c.outside is not None}
+    assert candidates["hamiltonian"].outside < 1e-13
+    few = gfnn.fit(pairs, learn="map", tolerance=1e-4)
+    assert few.chosen.outside > 2 * few.chosen.validation_relative

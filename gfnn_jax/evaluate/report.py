@@ -93,6 +93,7 @@ def assemble(
                 "validation_rms": c.validation_rms,
                 "validation_relative": c.validation_relative,
                 "validation_bound": c.validation_bound,
+                "outside": c.outside,
                 "operations": c.operations,
                 "microseconds_per_step": c.microseconds_per_step,
                 "fit_seconds": c.fit_seconds,

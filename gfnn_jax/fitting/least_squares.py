@@ -94,6 +94,13 @@ def reduce(
     return Reduced(factor, seen)
 
 
+def merged(one: Reduced, other: Reduced) -> Reduced:
+    """The factor of the rows of both."""
+    with one_thread():
+        factor = _folded(np.array(one.factor, order="F"), np.array(other.factor, order="F"))
+    return Reduced(factor, one.rows + other.rows)
+
+
 def _blocks(rows, num_parameters: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """(w, target_gradient) of as many pairs as one block holds."""
     for w, target in rows:

@@ -44,8 +44,9 @@ class Candidate:
     validation_bound: upper 95 % bound of the one that the tolerance is for. validated: whether
     these were measured by steps; else they are estimates from the gradient's residual. deviations:
     (2d,) the error's RMS in each coordinate. train_rms: as validation_relative, of the training
-    pairs' residual. operations: floating-point operations of a step with one update, the
-    predictor's few not counted. fit_seconds: of its
+    pairs' residual. outside: the relative error at the outermost twentieth of the training states,
+    of a fit without them; of S estimated from the gradient's residual. operations: floating-point
+    operations of a step with one update, the predictor's few not counted. fit_seconds: of its
     factorisation and solve, or its training. map: of the chosen one.
     """
 
@@ -68,6 +69,7 @@ class Candidate:
     map: Any = dataclasses.field(default=None, repr=False)
     chosen: bool = False
     learns: str = "map"
+    outside: float | None = None
 
 
 class OneStepError(NamedTuple):

@@ -587,7 +587,7 @@ def candidates_table(fit: Fit):
     """The candidates of a fit as a ``rich`` table, by rising operations; the chosen one is marked.
 
     An error with ~ before it is an estimate from the gradient's residual; the others were measured
-    by steps.
+    by steps. Outside: the error at the outermost twentieth of the states, of a fit without them.
     """
     from rich.table import Table  # loaded when first used
 
@@ -597,14 +597,16 @@ def candidates_table(fit: Fit):
     table = Table(title=f"candidates for tolerance {fit.tolerance:g} ({fit.num_pairs} pairs)")
     for head in ("", "chart", "family"):
         table.add_column(head)
-    for head in ("parameters", "error ÷ spread", "95 % bound", "kflop/step", "µs/step", "fit s"):
+    numbers = ("parameters", "error ÷ spread", "95 % bound", "outside", "kflop/step", "µs/step",
+               "fit s")  # fmt: skip
+    for head in numbers:
         table.add_column(head, justify="right")
     for c in fit.candidates:
         sign = "" if c.validated else "~"
         table.add_row(
             "→" if c.chosen else "", c.chart, c.label, str(c.num_parameters),
             f"{sign}{c.validation_relative:.2e}", f"{sign}{c.validation_bound:.2e}",
-            f"{c.operations / 1e3:.1f}", number(c.microseconds_per_step, ".2f"),
-            f"{c.fit_seconds:.2f}",
+            number(c.outside, ".1e"), f"{c.operations / 1e3:.1f}",
+            number(c.microseconds_per_step, ".2f"), f"{c.fit_seconds:.2f}",
         )  # fmt: skip
     return table

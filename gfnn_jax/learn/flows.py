@@ -37,6 +37,7 @@ from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.learn.assemble import Assembled, composed, stepped
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
 from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.held_out import outermost
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.phase_space import symplectic_form
 
@@ -169,20 +170,29 @@ def learn_hamiltonian(
     if terms:
         _check_finite(given_terms(prepared.dim, terms), prepared.y0[judges.training])
     problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, check=clock.check)
+    everywhere, free = judges, (*prepared.coordinates.cyclic, *prepared.whole)
+    outer = outermost(prepared.y0[judges.training], free)
+    judges = dataclasses.replace(everywhere, training=everywhere.training[~outer])
     if basis is not None:
         best = _grown(problem, basis, prepared, judges, clock, options, say)
     else:
         best, options = _searched(problem, prepared, judges, scene, terms, options, say)
     if substeps_for(best.family, best.fit.coefficients, prepared.y0, prepared.dt) >= MOST_SUBSTEPS:
         raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
+    outside = None
     try:
         best = _sparse(problem, best, prepared, judges, options, say)
-        if best.error.relative > _ROUNDOFF and len(best.fit.used) < len(judges.training):
-            best = _refitted(problem, best, judges.training, prepared, judges)
+        there = dataclasses.replace(everywhere, held_out=everywhere.training[outer])
+        outside = _held_out_error(problem, best.family, best.fit, prepared, there).relative
+        if best.error.relative > _ROUNDOFF and len(best.fit.used) < len(everywhere.training):
+            best = _refitted(problem, best, everywhere.training, prepared, judges)
     except OutOfTime:
         pass  # what was found stands
     problem.check = lambda: None
-    return _learned(best, problem, prepared, judges, time.perf_counter() - started, options)
+    seconds = time.perf_counter() - started
+    learned = _learned(best, problem, prepared, everywhere, seconds, options)
+    candidate = dataclasses.replace(learned.candidate, outside=outside)
+    return dataclasses.replace(learned, candidate=candidate)
 
 
 def _searched(

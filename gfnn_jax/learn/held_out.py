@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 _FRACTION, _FEWEST, _MOST = 0.1, 4, 2_000
+_OUTSIDE = 0.05  # of the training pairs, by which errors outside the data are measured
 
 
 def first_occurrences(pairs) -> np.ndarray:
@@ -42,6 +43,16 @@ def split_rows(pairs, seed: int) -> tuple[np.ndarray, np.ndarray]:
     apart[1:] &= ~border
     held_out = rng.permutation(np.flatnonzero(held))[:_MOST]
     return rng.permutation(np.flatnonzero(apart)), held_out
+
+
+def outermost(y: np.ndarray, free: tuple[int, ...] = ()) -> np.ndarray:
+    """Which of the states y (N, 2d) are of the outermost twentieth, (N,) bool, by Mahalanobis'
+    distance. free: coordinates that do not count, as angles that cover their circle."""
+    seen = y[:, [i for i in range(y.shape[1]) if i not in free]]
+    centred = seen - seen.mean(axis=0)
+    inverse = np.linalg.pinv(centred.T @ centred, rcond=1e-12, hermitian=True)
+    distance = np.sum((centred @ inverse) * centred, axis=1)
+    return distance > np.quantile(distance, 1 - _OUTSIDE)
 
 
 def _blocks(goes_on: np.ndarray, target: int) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -19,6 +19,7 @@ from gfnn_jax.fitting.levenberg_marquardt import LMState, levenberg_marquardt
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.learn.candidates import Candidate, Judges, validated
 from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.held_out import outermost
 from gfnn_jax.learn.prepare import Prepared
 
 # Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
@@ -84,6 +85,16 @@ def sweeps_for(
             yield LinearSweep(prepared, chart, judges, "sines", None, None, factors)
 
 
+class _Factors(NamedTuple):
+    """Of the training rows, of those held out, and of the training rows without the outermost
+    twentieth and of that twentieth alone."""
+
+    train: least_squares.Reduced
+    held: least_squares.Reduced
+    inner: least_squares.Reduced
+    outer: least_squares.Reduced
+
+
 class LinearSweep:
     """The sizes of one linear family in one chart.
 
@@ -100,6 +111,8 @@ class LinearSweep:
         self.prepared, self.chart, self.judges, self.kind = prepared, chart, judges, kind
         self._train, self._weight = _rows(prepared, chart, judges.training)
         self._held, _ = _rows(prepared, chart, judges.held_out)
+        free = (*prepared.coordinates.cyclic, *prepared.whole)
+        self._outermost = outermost(prepared.y0[judges.training], free)
         coordinates = prepared.coordinates
         w = self._train[0]
         inputs = box_inputs(
@@ -119,12 +132,12 @@ class LinearSweep:
         ]  # fmt: skip
         # Else the last size is the largest there is, or the most terms are reached.
         self.short_of_pairs = len(self.sizes) < known and w.size < _ROWS_PER_TERM * _MOST_TERMS
-        self._factors: dict[Any, tuple] = {}
+        self._factors: dict[Any, _Factors] = {}
 
     def judge(self, size: Size, clock: Clock, say: Callable[[str], Any]) -> Candidate:
         """The size with its error estimated from the held-out residual of the gradient."""
         started = time.perf_counter()
-        train, held = self._factor(size.group, clock, say)
+        train, held = self._factor(size.group, clock, say)[:2]
         count = size.family.num_parameters
         ((train_rms, held_rms),) = least_squares.residuals(train, held, [count])
         return self._candidate(size, train_rms, held_rms, time.perf_counter() - started)
@@ -135,9 +148,14 @@ class LinearSweep:
         say(f"{judged.chart} {judged.label}: steps of the held-out pairs")
         started = time.perf_counter()
         solved, params = self.solve(size, clock, say)
-        candidate = dataclasses.replace(
-            judged, train_rms=solved.train_rms, condition=solved.condition, rank=solved.rank
+        factors = self._factor(size.group, clock, say)
+        ((_, outside),) = least_squares.residuals(
+            factors.inner, factors.outer, [size.family.num_parameters]
         )
+        candidate = dataclasses.replace(
+            judged, train_rms=solved.train_rms, condition=solved.condition, rank=solved.rank,
+            outside=outside,
+        )  # fmt: skip
         candidate = validated(
             candidate, self.prepared, self.chart, size.family, params, self.judges
         )
@@ -161,7 +179,7 @@ class LinearSweep:
 
     def solve(self, size: Size, clock: Clock, say) -> tuple[least_squares.LeastSquaresFit, Any]:
         """The coefficients of this size, and the params of its family."""
-        train, held = self._factor(size.group, clock, say)
+        train, held = self._factor(size.group, clock, say)[:2]
         solved = least_squares.solve(train, held, size.family.num_parameters)
         return solved, size.family.unflatten(solved.coefficients)
 
@@ -169,7 +187,7 @@ class LinearSweep:
         """What noise leaves wrong in the size's ∇S, in the measure of train_rms: half of the
         difference between the fits to either half of the training pairs, blocks in time."""
         half = self.judges.training // _HALVES_BLOCK % 2
-        train, held = self._factor(size.group, Clock(), lambda message: None)
+        train, held = self._factor(size.group, Clock(), lambda message: None)[:2]
         count = size.family.num_parameters
         one, other = (
             least_squares.solve(
@@ -183,22 +201,23 @@ class LinearSweep:
         missed = np.linalg.norm(train.factor[:count, :count] @ (one - other))
         return float(missed) / (2 * np.sqrt(train.rows))
 
-    def _factor(self, group, clock: Clock, say) -> tuple:
+    def _factor(self, group, clock: Clock, say) -> _Factors:
         if group not in self._factors:
             self._factors[group] = self._known(group) or self._computed(group, clock, say)
         return self._factors[group]
 
-    def _known(self, group) -> tuple | None:
+    def _known(self, group) -> _Factors | None:
         """The factors that an interrupted fit of the same pairs has kept."""
         stored = self._kept.load(self._named(group)) if self._kept is not None else None
         if stored is None:
             return None
-        return tuple(
+        inner, outer, held = (
             least_squares.Reduced(np.asfortranarray(stored[part]), int(stored[f"{part}_rows"]))
-            for part in ("train", "held")
+            for part in ("inner", "outer", "held")
         )
+        return _Factors(least_squares.merged(inner, outer), held, inner, outer)
 
-    def _computed(self, group, clock: Clock, say) -> tuple:
+    def _computed(self, group, clock: Clock, say) -> _Factors:
         # Shuffled rows: the first of them are a sample, where all would take too long.
         count, width = len(self._train[0]), self._train[0].shape[1]
         taken = min(count, max(1, int(_MOST_OPERATIONS / (group.num_parameters**2 * width))))
@@ -208,16 +227,19 @@ class LinearSweep:
             f"about {max(1, round(seconds))} s"
         )
         started = time.perf_counter()
-        train, held = (
-            least_squares.reduce(group, rows, self._weight, on_block=clock.check)
-            for rows in ([tuple(a[:taken] for a in self._train)], [self._held])
-        )
+        train, outermost = tuple(a[:taken] for a in self._train), self._outermost[:taken]
+        inner, outer, held = (
+            least_squares.reduce(group, [rows], self._weight, on_block=clock.check)
+            for rows in (
+                tuple(a[~outermost] for a in train), tuple(a[outermost] for a in train), self._held
+            )
+        )  # fmt: skip
         if self._kept is not None and time.perf_counter() - started > _WORTH_KEEPING:
             self._kept.save(
-                self._named(group), train=train.factor, train_rows=train.rows, held=held.factor,
-                held_rows=held.rows,
+                self._named(group), inner=inner.factor, inner_rows=inner.rows, outer=outer.factor,
+                outer_rows=outer.rows, held=held.factor, held_rows=held.rows,
             )  # fmt: skip
-        return train, held
+        return _Factors(least_squares.merged(inner, outer), held, inner, outer)
 
     def _named(self, group) -> str:
         return f"{self.chart.name} {self.kind} {group.num_parameters}"
