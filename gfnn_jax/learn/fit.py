@@ -55,6 +55,7 @@ from gfnn_jax.learn.noise import state_noise
 from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.search import AS_FAR, Entry, Found, search
 from gfnn_jax.learn.sweeps import NetworkSweep, sweeps_for
+from gfnn_jax.learn.varied import given_by, undiagnosed, without_constants
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
@@ -80,7 +81,7 @@ class Fit:
     one was factored out. noise: (2d,) standard deviation of each coordinate's noise that the
     residuals suggest where larger models stopped helping, else None. messages: the warnings.
     ended: why the search ended. seconds: of it all; compile_seconds: of compiling, in them.
-    test_states: (n, 2d) held-out states. model_determinant_min: the chosen chart's determinant
+    test_states: (n, 2d) held-out states, test_args their parameters. model_determinant_min: the chosen chart's determinant
     there, where it is closest to 0; NaN for a flow, which has no chart. hamiltonian: H, where one
     was found, whether its flow was chosen or not. pairs: that were taken. scene: as given.
     """
@@ -99,6 +100,7 @@ class Fit:
     compile_seconds: float
     test_states: np.ndarray
     model_determinant_min: float
+    test_args: dict[str, np.ndarray] | None = None
     hamiltonian: LearnedHamiltonian | None = None
     pairs: Pairs | None = None
     scene: Scene | None = None
@@ -120,8 +122,10 @@ class Fit:
         if self.hamiltonian is None or self.formula is None:
             raise FitError("expected a fit with a Hamiltonian that meets its tolerance, got none")
         assert self.pairs is not None
+        if self.map.parameters is not None:
+            raise FitError("expected a fit without parameters: a generated map has none")
         flow, coordinates = self.hamiltonian.flow, self.map.coordinates
-        dt = float(self.pairs.dt) if dt is None else dt
+        dt = float(np.asarray(self.map.dt)) if dt is None else dt
         if not (isinstance(dt, (int, float)) and 0 < dt < np.inf):
             raise FitError(f"expected a time step that is finite and above 0, got {dt!r}")
         pairs = drawn(
@@ -170,7 +174,7 @@ class Fit:
     def symplecticity_defect(self) -> float:
         """The largest defect of the chosen map's unrolled step at the test states. Compiled when it
         is first asked for."""
-        return float(np.max(np.asarray(self.map.defect(self.test_states))))
+        return float(np.max(np.asarray(self.map.defect(self.test_states, self.test_args))))
 
     @property
     def table(self) -> str:
@@ -208,6 +212,7 @@ def fit(
     """Learn the map of these pairs: the cheapest candidate within the tolerance, else the best.
 
     pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order.
+               Pairs of different dt, or with parameters (args), are learned as H.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
     tolerance: bound on the RMS over coordinates of the one-step error ÷ that coordinate's spread,
                at its upper 95 % bound; a pure number.
@@ -247,6 +252,9 @@ def fit(
     pairs = dataclasses.replace(
         pairs, z0=np.asarray(pairs.z0, np.float64), z1=np.asarray(pairs.z1, np.float64)
     )
+    pairs, unvaried = without_constants(pairs)
+    varied = bool(np.ndim(pairs.dt) or pairs.args)
+    learn = "hamiltonian" if varied else learn  # S is that of one dt and of one system
     messages: list[str] = []
 
     def warn(new: list[str]) -> None:
@@ -254,6 +262,7 @@ def fit(
         for message in new:
             warnings.warn(message, FitWarning, stacklevel=3)
 
+    warn(unvaried)
     if scene is not None and scene.features is not None and family in ("auto", "features"):
         warn(unlike_the_scene(pairs, scene))
     warn(coarse_tolerance(pairs, bound))
@@ -266,7 +275,10 @@ def fit(
         known = given_terms(prepared.dim, (base,))
         flow = flow_of(known, np.ones(known.num_parameters), prepared)
         prepared = factored_out(flow, prepared, seed)
-    seen = diagnosed(prepared, chart, scene.reversor if scene else None, seed)
+    if varied:
+        seen = undiagnosed(prepared)
+    else:
+        seen = diagnosed(prepared, chart, scene.reversor if scene else None, seed)
     warn(seen.messages)
     prepared, charts = seen.prepared, seen.charts
     judges = Judges(pairs, *split_rows(pairs, seed), bound)
@@ -333,7 +345,7 @@ def fit(
     if law is not None and entry is not None:
         others.append(law.candidate)
     candidates = [*others, dataclasses.replace(chosen, chosen=True)]
-    test = np.asarray(judges.pairs.z0)[judges.held_out][:_JUDGED]
+    test = judges.pairs.take(judges.held_out[:_JUDGED])
     return Fit(
         map=chosen.map,
         candidates=tuple(sorted(candidates, key=lambda c: (c.operations, c.validation_relative))),
@@ -348,7 +360,8 @@ def fit(
         ended=ended,
         seconds=clock.seconds,
         compile_seconds=compile_seconds,
-        test_states=test,
+        test_states=np.asarray(test.z0),
+        test_args=test.args,
         model_determinant_min=smallest_determinant(chosen.map, prepared, judges),
         pairs=pairs,
         scene=scene,
@@ -392,7 +405,7 @@ def _prepared(pairs: Pairs, coordinates: Coordinates) -> tuple[Pairs, Prepared, 
         pairs = pairs.take(first)
         check_number(pairs)
     prepared = prepare(pairs, coordinates)
-    found = outliers(prepared.y0, prepared.y1, prepared.scale)
+    found = outliers(prepared.y0, prepared.y1, prepared.scale, given_by(prepared))
     if len(found):
         few = len(found) <= _MOST_OUTLIERS * len(pairs)
         rows = ", ".join(map(str, first[found[:5]])) + (", …" if len(found) > 5 else "")
@@ -525,7 +538,7 @@ def _residuals(
     pairs, coordinates = judges.pairs.take(rows), prepared.coordinates
     angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
     z0 = np.asarray(pairs.z0)
-    steps = stepped(chosen.map, z0, timed=False)
+    steps = stepped(chosen.map, z0, pairs.dt, pairs.args, timed=False)
     residual = nearest_image(np.asarray(pairs.z1) - steps.images, angles)
     return z0, residual, ~steps.failed & np.isfinite(residual).all(axis=1)
 
