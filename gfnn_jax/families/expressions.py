@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.arrays import namespace
+from gfnn_jax.arrays import as_row, namespace
 from gfnn_jax.errors import InputError
 
 _LONGEST_TEXT, _DEEPEST = 2_000, 60
@@ -343,7 +343,9 @@ def jets(trees: Sequence[Expression], w, order: int, args=None) -> list[Jet]:
     """The expressions at states w (..., 2d), with derivatives in w up to ``order`` (0, 1, 2). args:
     the parameters' values (k,) or, for lanes of w, (..., k)."""
     count = 0 if args is None else args.shape[-1]
-    known: dict[Any, Any] = {parameter(i): Jet(args[..., i], {}, {}) for i in range(count)}
+    known: dict[Any, Any] = {
+        parameter(i): Jet(as_row(args[..., i], w[..., 0]), {}, {}) for i in range(count)
+    }
     return [_jet(tree, w, order, known) for tree in trees]
 
 

@@ -53,7 +53,7 @@ class StageEquation:
         (family, params, h, scale), (z, args, *own) = shared, lanes
         h = own[0] if own else h
         slopes, inside = self._inside(z, x)
-        field = h * apply_j(family.gradient(params, inside, args))
+        field = _beside(h, inside) * apply_j(family.gradient(params, inside, args))
         return self._evaluation(z, slopes, field, scale)
 
     def linearise(self, shared, lanes, x) -> tuple[Evaluation, Any]:
@@ -62,7 +62,8 @@ class StageEquation:
         h = own[0] if own else h
         slopes, inside = self._inside(z, x)
         gradient, hessian = family.gradient_and_hessian(params, inside, args)
-        evaluation = self._evaluation(z, slopes, h * apply_j(gradient), scale)
+        field = _beside(h, inside) * apply_j(gradient)
+        evaluation = self._evaluation(z, slopes, field, scale)
         unit = jnp.tile(scale, self.stages)
         return evaluation, stage_matrix(hessian, h, self.stages) / unit[None, :, None]
 
@@ -157,7 +158,8 @@ class Flow:
             z, total = both
             slopes, info = self._slopes(z, args, False)
             inside = z[None] + _summed(gauss(self.stages).matrix, slopes)
-            done = self.dt / self.substeps * self.family.value(self.params, inside, args)
+            energy = self.family.value(self.params, inside, args)
+            done = _beside(self.dt / self.substeps, energy) * energy
             total = total + _summed(weights, area(inside - origin[None], slopes) - done)[0]
             return (z + _summed(weights, slopes)[0], total), info
 
@@ -217,7 +219,8 @@ def _fixed_point(stages: int, shared, z, args):
 
     def improve(carry):
         slopes, change, open_, iterations = carry
-        new = h * apply_j(family.gradient(params, z[None] + _summed(matrix, slopes), args))
+        inside = z[None] + _summed(matrix, slopes)
+        new = _beside(h, inside) * apply_j(family.gradient(params, inside, args))
         moved = jax.lax.stop_gradient(jnp.max(jnp.abs(new - slopes) / size, axis=(0, 2)))
         settled = (moved <= eps**_SETTLED) & (moved > 0.5 * change)
         goes_on = ~((moved <= _FLOOR_EPS * eps) | settled) & jnp.isfinite(moved)
@@ -253,7 +256,7 @@ def _stages_jvp(stages, primals, tangents):
     def field(shared, z, args):
         family, params, h, _ = shared
         inside = z[None] + _summed(gauss(stages).matrix, slopes)
-        return h * apply_j(family.gradient(params, inside, args))
+        return _beside(h, inside) * apply_j(family.gradient(params, inside, args))
 
     _, field_dot = jax.jvp(field, primals, tangents)
     inside = z[None] + _summed(gauss(stages).matrix, slopes)
@@ -263,6 +266,11 @@ def _stages_jvp(stages, primals, tangents):
     integer_dot: Any = np.zeros(info.status.shape, jax.dtypes.float0)
     info_dot = Info(integer_dot, integer_dot, jnp.zeros_like(info.residual))
     return (slopes, info), (slopes_dot, info_dot)
+
+
+def _beside(h, like):
+    """h, a number or one of each lane, as it multiplies an array of stages."""
+    return as_row(h, like) if jnp.ndim(h) else h
 
 
 def _summed(matrix, slopes):

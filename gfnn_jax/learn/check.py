@@ -73,7 +73,7 @@ def check_request(
             f"expected different angles among 0..{2 * pairs.dim - 1}, got {tuple(angles)}"
         )
     if own_dt or pairs.args:
-        check_varied(pairs, learn=learn, family=family, chart=chart, base=base)
+        check_varied(pairs)
     if not own_dt and not 0 < float(pairs.dt) < np.inf:
         raise FitError(f"expected a time step that is finite and above 0, got {pairs.dt}")
     if isinstance(terms, str):

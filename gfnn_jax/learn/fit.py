@@ -55,7 +55,7 @@ from gfnn_jax.learn.noise import state_noise
 from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.search import AS_FAR, Entry, Found, search
 from gfnn_jax.learn.sweeps import NetworkSweep, sweeps_for
-from gfnn_jax.learn.varied import given_by, undiagnosed, without_constants
+from gfnn_jax.learn.varied import as_varied, given_by, undiagnosed
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
@@ -252,9 +252,7 @@ def fit(
     pairs = dataclasses.replace(
         pairs, z0=np.asarray(pairs.z0, np.float64), z1=np.asarray(pairs.z1, np.float64)
     )
-    pairs, unvaried = without_constants(pairs)
-    varied = bool(np.ndim(pairs.dt) or pairs.args)
-    learn = "hamiltonian" if varied else learn  # S is that of one dt and of one system
+    pairs, learn, new = as_varied(pairs, learn=learn, family=family, chart=chart, base=base)
     messages: list[str] = []
 
     def warn(new: list[str]) -> None:
@@ -262,7 +260,7 @@ def fit(
         for message in new:
             warnings.warn(message, FitWarning, stacklevel=3)
 
-    warn(unvaried)
+    warn(new)
     if scene is not None and scene.features is not None and family in ("auto", "features"):
         warn(unlike_the_scene(pairs, scene))
     warn(coarse_tolerance(pairs, bound))
@@ -275,7 +273,7 @@ def fit(
         known = given_terms(prepared.dim, (base,))
         flow = flow_of(known, np.ones(known.num_parameters), prepared)
         prepared = factored_out(flow, prepared, seed)
-    if varied:
+    if prepared.varied:
         seen = undiagnosed(prepared)
     else:
         seen = diagnosed(prepared, chart, scene.reversor if scene else None, seed)

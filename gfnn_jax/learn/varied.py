@@ -6,6 +6,8 @@ parameters too, any system of the family.
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from gfnn_jax.errors import FitError, InputError
@@ -16,10 +18,12 @@ from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.phase_space import Pairs, sizes
 
 _SAME = 1e-9  # of its size: a parameter, or a dt, that varies by less does not
+_PRINTED = 1e-5  # of dt: what printed times may differ by
+_NEARLY_ALL = 0.9  # of the pairs
 
 
-def check_varied(pairs: Pairs, *, learn: str, family: str, chart: str, base) -> None:
-    """Raises FitError, in one line, for a dt or args that cannot be used, or a request for S."""
+def check_varied(pairs: Pairs) -> None:
+    """Raises FitError, in one line, for a dt of each pair or args that cannot be used."""
     args = pairs.args or {}
     try:
         check_names(pairs.dim, tuple(args))
@@ -37,17 +41,41 @@ def check_varied(pairs: Pairs, *, learn: str, family: str, chart: str, base) -> 
                 f"expected {what}, got {int(bad.sum())} of {len(bad)} that are not, the first is "
                 f"{values[row]} in row {row}"
             )
+
+
+def as_varied(
+    pairs: Pairs, *, learn: str, family: str, chart: str, base
+) -> tuple[Pairs, str, list[str]]:
+    """The pairs as they vary, what is learned of them, and what is to be said.
+
+    A dt that is the same in all is one number; so is one that is the same in nearly all, and the
+    others, those across a gap, are left out unless only H is asked for. A parameter that is the
+    same in all is none. Pairs that still differ tell H alone: raises FitError where a map is asked
+    for.
+    """
+    pairs, messages = _without_constants(pairs)
+    if np.ndim(pairs.dt) and learn != "hamiltonian":
+        usual = np.median(pairs.dt)
+        rows = np.flatnonzero(np.abs(pairs.dt - usual) <= _PRINTED * usual)
+        if len(rows) >= _NEARLY_ALL * len(pairs):
+            messages.append(
+                f"{len(pairs) - len(rows)} of {len(pairs)} pairs are not dt = {usual:g} apart: "
+                "they are left out (learn='hamiltonian' uses them)"
+            )
+            pairs = pairs.take(rows)
+            pairs = dataclasses.replace(pairs, dt=float(np.mean(pairs.dt)))
+    differs = "dt" if np.ndim(pairs.dt) else "parameters" if pairs.args else None
+    if differs is None:
+        return pairs, learn, messages
     if learn == "map" or (family, chart) != ("auto", "auto") or base is not None:
-        what = "dt" if columns else "parameters"
         raise FitError(
-            f"the pairs differ in their {what}: expected learn='auto' or 'hamiltonian', and no "
+            f"the pairs differ in their {differs}: expected learn='auto' or 'hamiltonian', and no "
             "family, chart or base, for S is that of one dt and of one system"
         )
+    return pairs, "hamiltonian", messages
 
 
-def without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
-    """The pairs as they vary: a dt that is the same in all is one number, a parameter that is the
-    same in all is none, and said so."""
+def _without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
     dt = np.asarray(pairs.dt)
     one = float(np.mean(dt)) if dt.ndim and np.ptp(dt) <= _SAME * np.mean(dt) else pairs.dt
     args = {name: np.asarray(v, np.float64) for name, v in (pairs.args or {}).items()}
