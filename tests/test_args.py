@@ -49,11 +49,12 @@ def test_terms_of_parameters_have_the_gradients_of_jax():
     rng = np.random.default_rng(0)
     c, z, args = rng.normal(size=4), rng.normal(size=(5, 2)), rng.uniform(0.5, 2, (5, 1))
 
-    def by_hand(z, l):
-        x = 0.5 * jnp.log(l) - 0.1
+    def by_hand(z, a):
+        x = 0.5 * jnp.log(a) - 0.1
         t7 = 64 * x**7 - 112 * x**5 + 56 * x**3 - 7 * x
-        values = [z[1] ** 2 / l**2, l * jnp.cos(z[0]), t7 * z[0] * z[1]]
-        return sum(a * v for a, v in zip(c, [*values, (4 * z[0] ** 3 - 3 * z[0]) * l], strict=True))
+        values = [z[1] ** 2 / a**2, a * jnp.cos(z[0]), t7 * z[0] * z[1]]
+        values.append((4 * z[0] ** 3 - 3 * z[0]) * a)
+        return sum(x * v for x, v in zip(c, values, strict=True))
 
     gradient, hessian = jax.jit(
         lambda z, a: (jax.vmap(jax.grad(by_hand))(z, a), jax.vmap(jax.hessian(by_hand))(z, a))
@@ -130,7 +131,7 @@ def test_a_law_is_read_with_its_parameter(learned):
     terms = {t.term: t.coefficient for t in learned.hamiltonian.terms}
     assert terms == pytest.approx({"cos(q1) l": -9.81, "p1² (1/l)²": 0.5}, rel=1e-12)
     z, length, _ = pendulums(50, seed=1)
-    found, info = learned.map.step(z, {"l": length}, dt=0.05)
+    found, _ = learned.map.step(z, {"l": length}, dt=0.05)
     np.testing.assert_allclose(found, image(z, length, 0.05), atol=1e-13)
     assert learned.symplecticity_defect < 1e-13
 
@@ -152,13 +153,14 @@ def test_a_dependence_that_is_no_power_is_a_series():
 
     rows = functions_of_parameters(1, ("l",), args, own=False)
     errors = list(walked([base], rows, attempt, float, bound=1e-10, most=100))
-    assert errors[-1] < 1e-10 and errors[0] > 1e-3  # powers do not serve
+    assert errors[-1] < 1e-10
+    assert errors[0] > 1e-3  # powers do not serve
     assert tried[-1] <= 42
 
 
 def test_rollouts_take_parameters_by_name_and_by_place(learned):
     z, length, _ = pendulums(8, seed=2)
-    by_name, info = learned.map.rollout(z, 20, params={"l": length}, dt=0.05)
+    by_name, _ = learned.map.rollout(z, 20, params={"l": length}, dt=0.05)
     by_place, _ = learned.map.rollout(z, 20, params=length[:, None], dt=0.05)
     np.testing.assert_array_equal(by_name, by_place)
     one, _ = learned.map.rollout(z[0], 20, params={"l": length[0]}, dt=0.05)
@@ -260,10 +262,9 @@ def test_pairs_that_cannot_be_used(dt, args, options, message):
 
 def test_a_parameter_that_never_varies_is_left_out():
     given = {"learn": "auto", "family": "auto", "chart": "auto", "base": None}
-    pairs, learn, messages = as_varied(
-        gfnn.Pairs(Z, Z, 0.1, {"l": np.ones(40), "m": DT}), **given
-    )
-    assert list(pairs.args) == ["m"] and learn == "hamiltonian"
+    pairs, learn, messages = as_varied(gfnn.Pairs(Z, Z, 0.1, {"l": np.ones(40), "m": DT}), **given)
+    assert list(pairs.args) == ["m"]
+    assert learn == "hamiltonian"
     assert messages == [
         "the parameter l is 1 in all pairs: it is left out, for its effect is not known"
     ]
@@ -272,7 +273,8 @@ def test_a_parameter_that_never_varies_is_left_out():
 def test_pairs_are_a_pytree_with_their_dt_and_args():
     pairs = gfnn.Pairs(Z, Z, DT, {"l": DT})
     half = jax.tree.map(lambda a: a[:20], pairs)
-    assert len(half) == 20 and half.dt.shape == half.args["l"].shape == (20,)
+    assert len(half) == 20
+    assert half.dt.shape == half.args["l"].shape == (20,)
     assert jax.tree.map(lambda a: a[:20], gfnn.Pairs(Z, Z, 0.1)).dt == 0.1
 
 
@@ -311,7 +313,8 @@ def test_a_csv_with_uneven_times_and_a_column_more(tmp_path, capsys):
     predicted = np.load(out)
     last, length = rows[29::30, 2:4], rows[29::30, 4]
     np.testing.assert_array_equal(predicted["params"][:, 0], length)
-    assert predicted["dt"] == 0.05 and predicted["param_names"].tolist() == ["l"]
+    assert predicted["dt"] == 0.05
+    assert predicted["param_names"].tolist() == ["l"]
     np.testing.assert_allclose(predicted["trajectories"][:, 1], image(last, length, 0.05),
                                atol=1e-10)  # fmt: skip
     capsys.readouterr()

@@ -362,7 +362,8 @@ BAD_FILES = {
     "dt of trajectories": (npz(trajectories=Z[None], dt=[0.1, 0.2]), "must be one number"),
     "dt of one pair": (npz(z0=Z, z1=Z, dt=-Z[:, 0]), "first dt[0] = -"),
     "times fall": (
-        npz(trajectories=Z[None], times=Z[None, :, 0] % 0.7), "times must rise, found times[0, "
+        npz(trajectories=Z[None], times=Z[None, :, 0] % 0.7),
+        "times must rise, found times[0, ",
     ),
     "times and dt": (npz(trajectories=Z[None], times=Z[None, :, 0], dt=0.1), "found both"),
     "times shape": (npz(trajectories=Z[None], times=Z[:, 0, None]), "the shape of the traj"),

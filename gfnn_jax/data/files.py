@@ -540,9 +540,8 @@ def _read_params(path, names: list[str], member) -> tuple[tuple[str, ...], np.nd
         )
     called = tuple(f"a{i + 1}" for i in range(values.shape[1]))
     if "param_names" in names:
-        with _damage(path, "param_names"):
-            with np.load(path, allow_pickle=False) as file:
-                called = tuple(np.atleast_1d(file["param_names"]).astype(str).tolist())
+        with _damage(path, "param_names"), np.load(path, allow_pickle=False) as file:
+            called = tuple(np.atleast_1d(file["param_names"]).astype(str).tolist())
         if len(called) != values.shape[1] or len(set(called)) < len(called):
             raise InputError(
                 f"{path}: param_names must be {values.shape[1]} different names, found "

@@ -8,7 +8,7 @@ from gfnn_jax.data.files import TrajectoryData
 
 
 def summary(data: TrajectoryData) -> list[str]:
-    """Lines of text: how many pairs, and of each column its range, spread and movement in a step, of
+    """Lines of text: how many pairs, of each column its range, spread and movement in a step, of
     each parameter its range.
 
     spread: the standard deviation. movement: the root mean square of the change in one step. An
@@ -35,7 +35,5 @@ def summary(data: TrajectoryData) -> list[str]:
         lines.append(f"{name}: {a} to {b}{unit}, spread {spread}, movement in a step {step}")
     for name, values in (data.args or {}).items():
         count = len(np.unique(values))
-        lines.append(
-            f"parameter {name}: {values.min():.4g} to {values.max():.4g}, {count} values"
-        )
+        lines.append(f"parameter {name}: {values.min():.4g} to {values.max():.4g}, {count} values")
     return lines

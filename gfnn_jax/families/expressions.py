@@ -195,7 +195,9 @@ def check_names(dim: int, names: Sequence[str]) -> None:
         if not name.isidentifier() or keyword.iskeyword(name):
             raise InputError(f"expected letters, digits and _ as a parameter's name, got '{name}'")
         if name in taken or _CHEBYSHEV.fullmatch(name):
-            raise InputError(f"expected a name for a parameter that has no meaning yet, got '{name}'")
+            raise InputError(
+                f"expected a name for a parameter that has no meaning yet, got '{name}'"
+            )
 
 
 @cache
@@ -342,10 +344,10 @@ class Jet:
 def jets(trees: Sequence[Expression], w, order: int, args=None) -> list[Jet]:
     """The expressions at states w (..., 2d), with derivatives in w up to ``order`` (0, 1, 2). args:
     the parameters' values (k,) or, for lanes of w, (..., k)."""
-    count = 0 if args is None else args.shape[-1]
-    known: dict[Any, Any] = {
-        parameter(i): Jet(as_row(args[..., i], w[..., 0]), {}, {}) for i in range(count)
-    }
+    known: dict[Any, Any] = {}
+    if args is not None:
+        for i in range(args.shape[-1]):
+            known[parameter(i)] = Jet(as_row(args[..., i], w[..., 0]), {}, {})
     return [_jet(tree, w, order, known) for tree in trees]
 
 

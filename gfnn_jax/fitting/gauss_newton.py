@@ -161,9 +161,7 @@ def fitted_gradients(family, z, gradient, scale, args=None) -> np.ndarray:
 MOST_SUBSTEPS = 64
 
 
-def substeps_for(
-    family, coefficients, z, dt, reach: float = OPTIONS.reach, *, args=None
-) -> int:
+def substeps_for(family, coefficients, z, dt, reach: float = OPTIONS.reach, *, args=None) -> int:
     """Substeps so that h‖H''‖ is within reach for nearly all of the states z (N, 2d), at the
     longest dt."""
     _, hessian = family.gradient_and_hessian(coefficients, z, args)

@@ -89,7 +89,8 @@ def _summed(matrix, slopes):
 def solve_stages(family, params, z, h, rule, args=None, *, newton: bool = True):
     """The slopes K (s, B, 2d) at states z (B, 2d), and which lanes were solved to roundoff (B,).
 
-    h: a number or (B, 1). By fixed point; with ``newton``, lanes in which that hardly contracts by Newton's method.
+    h: a number or (B, 1). By fixed point; with ``newton``, lanes in which that hardly contracts by
+    Newton's method.
     """
     size = np.abs(z) + np.abs(z).mean(axis=1, keepdims=True)  # of each coordinate's lane
     slopes = np.repeat(apply_j(family.gradient(params, z, args))[None], len(rule.weights), axis=0)

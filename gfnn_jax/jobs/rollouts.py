@@ -26,9 +26,7 @@ class Rollouts(NamedTuple):
     seconds: float
 
 
-def map_rollouts(
-    map_: SymplecticMap, z0, num_steps: int = NUM_STEPS, params=None
-) -> Rollouts:
+def map_rollouts(map_: SymplecticMap, z0, num_steps: int = NUM_STEPS, params=None) -> Rollouts:
     """Rollouts of a symplectic map from z0 (B, 2d) with its params (B, k); predicted twice, as the
     first time compiles."""
     predict = partial(map_.rollout, params=params)

@@ -105,7 +105,7 @@ class Steps(NamedTuple):
 
 
 def stepped(
-    map_: SymplecticMap, z: np.ndarray, dt=None, args=None, *, timed: bool = True
+    map_: SymplecticMap, z: np.ndarray, dt: Any = None, args=None, *, timed: bool = True
 ) -> Steps:
     """One step of the states z (N, 2d), in blocks of one shape; times are 0 unless ``timed``. dt:
     of each state (N,), or that of the map. args: name -> (N,), as those of `Pairs`."""

@@ -81,9 +81,10 @@ class Fit:
     one was factored out. noise: (2d,) standard deviation of each coordinate's noise that the
     residuals suggest where larger models stopped helping, else None. messages: the warnings.
     ended: why the search ended. seconds: of it all; compile_seconds: of compiling, in them.
-    test_states: (n, 2d) held-out states, test_args their parameters. model_determinant_min: the chosen chart's determinant
-    there, where it is closest to 0; NaN for a flow, which has no chart. hamiltonian: H, where one
-    was found, whether its flow was chosen or not. pairs: that were taken. scene: as given.
+    test_states: (n, 2d) held-out states, test_args their parameters. model_determinant_min: the
+    chosen chart's determinant there, where it is closest to 0; NaN for a flow, which has no chart.
+    hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
+    scene: as given.
     """
 
     map: SymplecticMap

@@ -242,9 +242,8 @@ def _walked(
         plain=plain, features=scene.features if scene is not None else None,
         reversor=scene.reversor if scene is not None else None, own=own,
     )  # fmt: skip
-    functions = functions_of_parameters(
-        prepared.dim, prepared.parameters, prepared.args[judges.training], own is not None
-    )
+    _, args = prepared.given(judges.training)
+    functions = functions_of_parameters(prepared.dim, prepared.parameters, args, own is not None)
     most = len(judges.training) * 2 * prepared.dim / options.rows_per_term
     best: _Fitted | None = None
 
@@ -500,9 +499,7 @@ def _learned(
     )  # fmt: skip
     rates = frequencies(hessian)
     if prepared.own_dt is not None:  # the map's own dt, from which others follow
-        problem = Problem(
-            prepared.y0, prepared.y1, prepared.dt, prepared.scale, args=prepared.args
-        )
+        problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, args=prepared.args)
     steps = _cheapest(problem, family, fit, rates, judges, options)
     contraction = _contraction(rates, prepared.dt, steps)
     by_newton = contraction > options.contracting

@@ -98,8 +98,10 @@ def _chebyshev(dim: int, parameters: tuple[str, ...], args, degree: int, options
     """Products of Chebyshev polynomials, of total degree up to ``degree``."""
     arguments = []
     for name, values in zip(parameters, args.T, strict=True):
-        if values.min() > 0 and _keeps_away(values) and np.ptp(np.log(values)) > np.log(
-            options.apart
+        if (
+            values.min() > 0
+            and _keeps_away(values)
+            and np.ptp(np.log(values)) > np.log(options.apart)
         ):
             name, values = f"log({name})", np.log(values)
         centre, half = 0.5 * (values.max() + values.min()), 0.5 * np.ptp(values)

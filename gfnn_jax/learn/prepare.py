@@ -65,9 +65,7 @@ class Prepared:
         """Of these rows alone; sizes and domain are theirs."""
         own_dt, args = of_lanes(self.own_dt, rows), of_lanes(self.args, rows)
         return _sized(
-            dataclasses.replace(
-                self, y0=self.y0[rows], y1=self.y1[rows], own_dt=own_dt, args=args
-            )
+            dataclasses.replace(self, y0=self.y0[rows], y1=self.y1[rows], own_dt=own_dt, args=args)
         )
 
     def without(self, before: Affine | Flow | None, after: Affine | Flow | None) -> Prepared:
@@ -104,8 +102,9 @@ def prepare(pairs: Pairs, coordinates: Coordinates) -> Prepared:
     whole = tuple(i for i, c in zip(coordinates.angles, covered, strict=True) if c)
     empty = covering(y0[:0], ignore=tuple(range(y0.shape[1])))
     own_dt = np.asarray(pairs.dt, np.float64) if np.ndim(pairs.dt) else None
-    names = tuple(pairs.args or ())
-    args = np.stack([pairs.args[name] for name in names], axis=-1) if names else None
+    given: dict[str, np.ndarray] = pairs.args or {}
+    names = tuple(given)
+    args = np.stack([given[name] for name in names], axis=-1) if names else None
     dt = float(pairs.dt if own_dt is None else np.median(own_dt))
     return _sized(
         Prepared(

@@ -107,7 +107,8 @@ class SymplecticMap:
     Methods take states z (2d,) or (B, 2d), NumPy or JAX, and answer with JAX arrays. A map that was
     learned with parameters takes their values too: name -> a number or (B,), or an array (k,) or
     (B, k). They can be differentiated, in forward and reverse mode, in z, in the parameters' values
-    and in the map's own leaves, by the implicit-function theorem; ``jax.vmap`` and ``jax.jit`` work over them.
+    and in the map's own leaves, by the implicit-function theorem; ``jax.vmap`` and ``jax.jit`` work
+    over them.
     """
 
     pieces: tuple

@@ -132,7 +132,7 @@ class Scene:
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be finite and > 0, not {value}")
         if self.parameters and self.hamiltonian is None:
-            raise ValueError(f"{self.name}: parameters are those of a hamiltonian, which is missing")
+            raise ValueError(f"{self.name}: parameters need a hamiltonian that takes them")
         if self.period is not None:
             periods = self.dt / self.period
             if round(periods) < 1 or abs(periods - round(periods)) > 1e-9 * periods:
