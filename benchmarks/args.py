@@ -132,12 +132,43 @@ def mass(quick: bool, terms: Sequence[Any]) -> Numbers:
     return learned(KEPLER, 4_000, quick, dt_range=(0.05, 0.5), dt=0.2, tolerance=1e-12, terms=terms)
 
 
+def kicked(z, strength):
+    """The standard map."""
+    p = z[:, 1] + strength * np.sin(z[:, 0])
+    return np.stack([z[:, 0] + p, p], axis=1)
+
+
+def standard_map(quick: bool) -> Numbers:
+    """The strength of the kick as a parameter, in (0.5, 2): S, for there is no flow."""
+    rng = np.random.default_rng(SEED)
+
+    def sampled(count: int):
+        return rng.uniform(0, 2 * np.pi, (count, 2)), rng.uniform(0.5, 2, count)
+
+    z, strength = sampled(2_000)
+    pairs = gfnn.Pairs(z, np.mod(kicked(z, strength), 2 * np.pi), 1.0, {"k": strength})
+    fit = gfnn.fit(pairs, angles=(0, 1), tolerance=1e-12, seed=SEED)
+    z, strength = sampled(1_000)
+    states, info = fit.map.step(z, {"k": strength})
+    one = gfnn.metrics.one_step_rms(np.asarray(states), kicked(z, strength), (0, 1))
+    rolled = timed(lambda: fit.map.rollout(z, 100, params=strength, save_every=100))
+    return {
+        "pairs": len(pairs), "judged_at_dt": 1.0, "num_terms": fit.chosen.num_parameters,
+        "one_step_rms": one, "error_median": None, "error_largest": None, "reference_error": None,
+        "outside": int(np.sum(np.asarray(info.status) > 0)), "fit_seconds": fit.chosen.fit_seconds,
+        "microseconds_per_step": 1e6 * rolled.seconds / (100 * BATCH),
+        "symplecticity_defect": fit.symplecticity_defect,
+        "terms": list(fit.map.pieces[0].family.term_names), "messages": list(fit.messages),
+    }  # fmt: skip
+
+
 PIECES = {
     "irregular-henon-heiles": irregular,
     "pendulum-length": length,
     "pendulum-length-terms": partial(length, terms=("p**2/l**2", "l*cos(q)")),
     "compound-pendulum": no_power,
     "kepler-mass-terms": partial(mass, terms=("1/sqrt(q1**2 + q2**2)",)),
+    "standard-map-strength": standard_map,
 }
 
 

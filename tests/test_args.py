@@ -102,14 +102,12 @@ def test_irregular_sampling_serves_any_dt():
     z0, dt = rng.uniform(-1, 1, (150, 2)), rng.uniform(0.1, 1.2, 150)
     z1 = images(law, np.ones(1), z0, dt, FINE).states
     fit = gfnn.fit(gfnn.Pairs(z0, z1, dt), tolerance=1e-11)
-    assert fit.chosen.validation_relative < 1e-13  # each pair at its own dt
+    assert fit.chosen.validation_relative < 1e-13  # by steps, each pair's at its own dt
     assert float(fit.map.dt) == np.median(dt)
     found, info = fit.map.step(z0, dt=3.0)  # beyond what was sampled: more substeps
     expected = images(law, np.ones(1), z0, 3.0, Steps(8, 16)).states
     np.testing.assert_allclose(found, expected, atol=1e-12)
     assert not info.status.any()
-    found, _ = fit.map.step(z0, dt=dt)
-    np.testing.assert_allclose(found, z1, atol=1e-13)
 
 
 def test_a_gap_in_uniform_data_costs_a_pair_and_not_the_map():
@@ -156,6 +154,27 @@ def test_a_dependence_that_is_no_power_is_a_series():
     assert errors[-1] < 1e-10
     assert errors[0] > 1e-3  # powers do not serve
     assert tried[-1] <= 42
+
+
+def kicked(z, strength):
+    """The standard map."""
+    p = z[:, 1] + strength * np.sin(z[:, 0])
+    return np.stack([z[:, 0] + p, p], axis=1)
+
+
+def test_a_map_without_a_flow_has_parameters_too():
+    rng = np.random.default_rng(0)
+    z, strength = rng.uniform(0, 2 * np.pi, (500, 2)), rng.uniform(0.5, 2, 500)
+    pairs = gfnn.Pairs(z, np.mod(kicked(z, strength), 2 * np.pi), 1.0, {"k": strength})
+    fit = gfnn.fit(pairs, angles=(0, 1), tolerance=1e-12)
+    assert fit.chosen.learns == "map"
+    assert set(fit.map.pieces[0].family.term_names) == {"p1²", "cos(q1) k"}
+    z, strength = rng.uniform(0, 2 * np.pi, (50, 2)), rng.uniform(0.5, 2, 50)
+    found, _ = fit.map.step(z, {"k": strength})
+    error = np.asarray(found) - kicked(z, strength)
+    assert np.abs(error - 2 * np.pi * np.round(error / (2 * np.pi))).max() < 1e-13
+    with pytest.raises(ValueError, match="a map of dt = 1 only: fit with learn='hamiltonian'"):
+        fit.map.step(z, {"k": strength}, dt=0.5)
 
 
 def test_rollouts_take_parameters_by_name_and_by_place(learned):
@@ -250,7 +269,8 @@ DT = np.linspace(0.1, 0.2, 40)
         (0.1, {"arm length": DT}, {}, "letters, digits and _ as a parameter's name"),
         (0.1, {"l": np.where(DT > 0.19, np.nan, DT)}, {}, "finite values of l, got 4 of 40"),
         (DT, None, {"learn": "map"}, "the pairs differ in their dt: expected learn='auto'"),
-        (0.1, {"l": DT}, {"chart": "type2"}, "the pairs differ in their parameters"),
+        (DT, {"l": DT}, {"chart": "type2"}, "the pairs differ in their dt: expected learn='auto'"),
+        (0.1, {"l": DT}, {"family": "sines"}, "the pairs differ in their parameters"),
         (0.1, {"l": DT}, {"terms": ["m*p**2"]}, "has the name 'm'"),
     ],
 )
@@ -264,7 +284,7 @@ def test_a_parameter_that_never_varies_is_left_out():
     given = {"learn": "auto", "family": "auto", "chart": "auto", "base": None}
     pairs, learn, messages = as_varied(gfnn.Pairs(Z, Z, 0.1, {"l": np.ones(40), "m": DT}), **given)
     assert list(pairs.args) == ["m"]
-    assert learn == "hamiltonian"
+    assert learn == "auto"
     assert messages == [
         "the parameter l is 1 in all pairs: it is left out, for its effect is not known"
     ]

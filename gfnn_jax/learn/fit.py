@@ -51,6 +51,8 @@ from gfnn_jax.learn.law_maps import (
     search_around,
     search_of_law,
 )
+from gfnn_jax.learn.map_of_parameters import assembled as map_assembled
+from gfnn_jax.learn.map_of_parameters import map_of
 from gfnn_jax.learn.noise import state_noise
 from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.search import AS_FAR, Entry, Found, search
@@ -284,11 +286,15 @@ def fit(
     better = _Better(prepared, judges, on_better) if on_better is not None else None
     wanted = learn if (family, chart, base) == ("auto", "auto", None) else "map"
     law = law_of(plain, judges, scene, wanted, terms, clock, on_progress)
+    of_map = None
+    lawless = law is None or law.candidate.validation_bound > bound.bound
+    if prepared.args is not None and learn != "hamiltonian" and lawless:
+        of_map = map_of(prepared, judges, scene, chart, law, clock, on_progress)
     if law is not None:
         if better is not None:
             better.offer(law.candidate, lambda: composed(law.flow, plain, judges))
         on_candidate(law.candidate)
-    if learn == "hamiltonian":
+    if learn == "hamiltonian" or prepared.varied:
         sweeps: list[Any] = []
     elif family == "mlp":
         sweeps = [
@@ -313,14 +319,18 @@ def fit(
         )
         if around is not None and better_than(around.found, found, law):
             judges, prepared, charts, found = around
-    if not found.ranking and law is None:
+    if not found.ranking and law is None and of_map is None:
         raise FitError(_nothing_found(found, pairs, clock))
-    choice = _chosen(found, law, prepared, plain, judges, clock, on_progress)
+    if of_map is not None:
+        candidate, seconds = map_assembled(of_map, prepared, judges)
+        choice = candidate, None, seconds
+    else:
+        choice = _chosen(found, law, prepared, plain, judges, clock, on_progress)
     chosen, entry, compile_seconds = choice
     noise = None
-    ended = found.ended if learn != "hamiltonian" else _ended(chosen, bound)
+    ended = _ended(chosen, bound) if not sweeps else found.ended
     unmet = chosen.validation_bound > bound.bound
-    if law is not None and (entry is None or met_by_law or (unmet and law.fast)):
+    if law is not None and of_map is None and (entry is None or met_by_law or (unmet and law.fast)):
         warn(list(law.messages))
     looked_at = entry or (found.ranking[0] if found.ranking else None)
     diagnosis: list[str] = []
@@ -341,7 +351,7 @@ def fit(
     if chosen.validation_bound > bound.bound:
         warn([*not_radians(pairs, coordinates), not_met(chosen, bound, ended), *diagnosis])
     others = [e.candidate for e in found.entries if entry is None or e.size is not entry.size]
-    if law is not None and entry is not None:
+    if law is not None and (entry is not None or of_map is not None):
         others.append(law.candidate)
     candidates = [*others, dataclasses.replace(chosen, chosen=True)]
     test = judges.pairs.take(judges.held_out[:_JUDGED])
@@ -573,7 +583,8 @@ def smallest_determinant(map_: SymplecticMap, prepared: Prepared, judges: Judges
         return float("nan")
     piece = jax.tree.map(np.asarray, piece)
     rows = judges.held_out[:_JUDGED]
-    determinant = piece.determinant(prepared.y0[rows], prepared.y1[rows])
+    args = prepared.given(rows)[1]
+    determinant = piece.determinant(prepared.y0[rows], prepared.y1[rows], args)
     return float(determinant[np.argmin(np.abs(determinant))])
 
 

@@ -50,8 +50,8 @@ def as_varied(
 
     A dt that is the same in all is one number; so is one that is the same in nearly all, and the
     others, those across a gap, are left out unless only H is asked for. A parameter that is the
-    same in all is none. Pairs that still differ tell H alone: raises FitError where a map is asked
-    for.
+    same in all is none. Pairs of different dt tell H alone: raises FitError where a map is asked
+    for, or a family or base of it where there are parameters.
     """
     pairs, messages = _without_constants(pairs)
     if np.ndim(pairs.dt) and learn != "hamiltonian":
@@ -67,10 +67,12 @@ def as_varied(
     differs = "dt" if np.ndim(pairs.dt) else "parameters" if pairs.args else None
     if differs is None:
         return pairs, learn, messages
+    if differs == "parameters" and (family, base) == ("auto", None):
+        return pairs, "map" if chart != "auto" else learn, messages
     if learn == "map" or (family, chart) != ("auto", "auto") or base is not None:
         raise FitError(
             f"the pairs differ in their {differs}: expected learn='auto' or 'hamiltonian', and no "
-            "family, chart or base, for S is that of one dt and of one system"
+            "family, chart or base, for S is that of one dt"
         )
     return pairs, "hamiltonian", messages
 
