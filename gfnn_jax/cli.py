@@ -142,6 +142,10 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--initial", type=Path, metavar="FILE", required=True)
     command.add_argument("--num-steps", type=_count, metavar="N", required=True)
     command.add_argument("--save-every", type=_count, metavar="K", default=1)
+    command.add_argument(
+        "--dt", type=_positive, metavar="H",
+        help="another time step than the data's, of a model that learned a Hamiltonian",
+    )  # fmt: skip
     command.add_argument("--out", type=Path, metavar="FILE", required=True, help=".npz to write")
     command.add_argument(
         "--outside", choices=("continue", "stop"), default="continue",
@@ -342,7 +346,7 @@ def _predict(arguments: argparse.Namespace) -> None:
     with progress.on_stderr() as shown:
         predicted = predict(
             arguments.model, arguments.initial, num_steps=arguments.num_steps,
-            save_every=arguments.save_every, out=arguments.out,
+            save_every=arguments.save_every, out=arguments.out, dt=arguments.dt,
             stop_outside=arguments.outside == "stop", overwrite=arguments.overwrite,
             resume=arguments.resume, progress=shown,
         )  # fmt: skip

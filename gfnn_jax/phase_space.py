@@ -7,8 +7,7 @@ degrees of freedom, never 2d.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -94,20 +93,23 @@ def hamiltonian_vector_field(hamiltonian: Callable) -> Callable:
     return field
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("z0", "z1"), meta_fields=("dt",))
+@jax.tree_util.register_pytree_node_class
 @dataclasses.dataclass(frozen=True)
 class Pairs:
     """States and their images one time step later: what a map is learned from.
 
     z0, z1: shape (N, 2d), q first; NumPy or JAX arrays. dt: the time between them (the paper's h),
-    in the user's unit of time; 1 for a map that has no time.
+    in the user's unit of time; 1 for a map that has no time. One number, or one of each pair (N,).
+    args: parameters of the system in which each pair was measured, name -> (N,); an array (N, k) or
+    (N,) stands for parameters of the names a1, a2, …
 
-    Raises FitError where z0 and z1 are no arrays of one such shape.
+    Raises FitError where these are no arrays of such shapes.
     """
 
     z0: Any
     z1: Any
-    dt: float
+    dt: Any
+    args: Any = None
 
     def __post_init__(self):
         # JAX makes pairs of whatever it maps arrays to; a user's are lists or arrays.
@@ -120,6 +122,30 @@ class Pairs:
             raise FitError(
                 f"expected z0 and z1 of one shape (N, 2d), got {self.z0.shape} and {self.z1.shape}"
             )
+        if isinstance(self.dt, (list, tuple, np.ndarray, jax.Array)):
+            self._set("dt", np.asarray(self.dt) if np.ndim(self.dt) else self.dt)
+            if np.ndim(self.dt) and np.shape(self.dt) != (len(self),):
+                raise FitError(
+                    f"expected dt, one number or one of each pair ({len(self)},), got "
+                    f"{np.shape(self.dt)}"
+                )
+        if self.args is not None:
+            self._set("args", _named(self.args, len(self)))
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    def tree_flatten(self):
+        """Arrays are leaves; a dt of all pairs is not."""
+        own = bool(np.ndim(self.dt))
+        leaves = (self.z0, self.z1, self.args, *([self.dt] if own else []))
+        return leaves, None if own else self.dt
+
+    @classmethod
+    def tree_unflatten(cls, dt, leaves) -> Pairs:
+        """The inverse."""
+        z0, z1, args, *own = leaves
+        return cls(z0, z1, own[0] if own else dt, args)
 
     def __len__(self) -> int:
         return self.z0.shape[0]
@@ -131,4 +157,23 @@ class Pairs:
 
     def take(self, rows) -> Pairs:
         """The pairs of these rows (an index array or a slice)."""
-        return Pairs(self.z0[rows], self.z1[rows], self.dt)
+        dt = self.dt[rows] if np.ndim(self.dt) else self.dt
+        args = self.args and {name: values[rows] for name, values in self.args.items()}
+        return Pairs(self.z0[rows], self.z1[rows], dt, args)
+
+
+def _named(args: Any, count: int) -> dict[str, Any]:
+    """Parameters by their names, each (N,)."""
+    if not isinstance(args, Mapping):
+        if np.ndim(args) not in (1, 2) or len(args) != count:
+            raise FitError(
+                f"expected args as name -> ({count},) or as an array ({count}, k), got "
+                f"{type(args).__name__} of shape {np.shape(args)}"
+            )
+        columns = np.asarray(args).reshape(count, -1).T
+        return {f"a{i + 1}": column for i, column in enumerate(columns)}
+    found = {name: np.asarray(values) for name, values in args.items()}
+    for name, values in found.items():
+        if values.dtype != object and values.shape != (count,):
+            raise FitError(f"expected args['{name}'] of shape ({count},), got {values.shape}")
+    return found

@@ -119,7 +119,7 @@ def test_scenes(capsys):
     assert gfnn("scenes") == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["two-body", "dim", "2", "dt", "0.1"] in [line[:5] for line in lines]
-    assert len(lines) == 9
+    assert len(lines) == 10
 
 
 @pytest.mark.parametrize("command", [(), ("run",), ("fit",), ("predict",), ("scenes",)])

@@ -95,6 +95,11 @@ def test_which_scenes_are_separable():
     assert not separable(scenes.make("pcr3bp"))
 
 
+def test_a_scene_with_parameters_is_not_compared(tmp_path):
+    with pytest.raises(InputError, match="has parameters, which the other methods do not take"):
+        comparison.compare("pendulum-length", out=tmp_path / "c")
+
+
 def test_methods_that_apply():
     everywhere = comparison.chosen_methods((), scenes.make("two-body"))
     assert set(comparison.TITLES) - set(everywhere) == {"onet-2", "onet-5"}

@@ -12,8 +12,8 @@ from gfnn_jax import cli
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
-# Its commands are those of the README, which are tested always.
-SLOW = ("your-own-data",)
+# What these show is tested always elsewhere: the README, tests/test_args.py.
+SLOW = ("your-own-data", "args")
 INSTALL = ("python3 -m venv ", ".venv/bin/pip install ")
 
 

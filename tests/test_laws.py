@@ -300,4 +300,5 @@ def test_a_law_holds_outside_the_states_that_it_was_fitted_to(law, pairs):
     candidates = {c.learns: c for c in law.candidates if c.outside is not None}
     assert candidates["hamiltonian"].outside < 1e-13
     few = gfnn.fit(pairs, learn="map", tolerance=1e-4)
+    assert few.chosen.outside is not None
     assert few.chosen.outside > 2 * few.chosen.validation_relative

@@ -293,7 +293,7 @@ def test_a_new_scene_needs_its_own_file_only(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True
     )
-    assert done.stdout.split() == ["True", "4000", "1e-08", "10"]
+    assert done.stdout.split() == ["True", "4000", "1e-08", "11"]
 
 
 def test_the_same_scene_made_twice_has_the_same_functions():
@@ -306,7 +306,7 @@ def test_the_same_scene_made_twice_has_the_same_functions():
 
 
 def test_names_and_mistakes():
-    assert len(scenes.names()) == 9
+    assert len(scenes.names()) == 10
     for name in scenes.names():
         assert scenes.make(name).name == name
         assert "\n" not in scenes.make(name).purpose

@@ -191,11 +191,38 @@ def test_pairs_are_the_same_bits_for_the_same_seed_and_conserve_the_invariants(n
     np.testing.assert_array_equal(pairs.z0, again.z0)
     np.testing.assert_array_equal(pairs.z1, again.z1)
     assert not (pairs.z0 == other.z0).any()
-    np.testing.assert_array_equal(pairs.z1, tr.reference_trajectories(scene, pairs.z0, 1)[:, 1])
+    params = np.stack([*pairs.args.values()], axis=-1) if pairs.args else None
+    found = tr.reference_trajectories(scene, pairs.z0, 1, params=params)
+    np.testing.assert_array_equal(pairs.z1, found[:, 1])
     for invariant in scene.invariants.values():
         start, end = (jax.jit(jax.vmap(invariant))(z) for z in (pairs.z0, pairs.z1))
         np.testing.assert_allclose(end, start, atol=1e-14, rtol=0)
         assert np.ptp(start) > 1e-4
+
+
+def test_a_scene_with_a_parameter():
+    """Its energy is conserved for each length, and pairs at random times are those of its flow."""
+    scene, key = scenes.pendulum_length(), jax.random.key(3)
+    pairs = tr.sample_pairs(scene, 30, key, dt_range=(0.1, 0.5))
+    length = pairs.args["l"]
+    assert ((length > 0.5) & (length < 2)).all()
+    assert ((pairs.dt > 0.1) & (pairs.dt < 0.5)).all()
+    np.testing.assert_array_equal(tr.sample_states(scene, 30, key), pairs.z0)
+    np.testing.assert_array_equal(tr.sample_params(scene, 30, key)[:, 0], length)
+
+    def energy(z):
+        return z[:, 1] ** 2 / (2 * length**2) - 9.81 * length * np.cos(z[:, 0])
+
+    np.testing.assert_allclose(energy(pairs.z1), energy(pairs.z0), rtol=1e-12, atol=1e-12)
+    later = tr.reference_trajectories(
+        dataclasses.replace(scene, dt=pairs.dt[0]), pairs.z0[:1], 1, params=length[:1]
+    )
+    np.testing.assert_allclose(later[0, 1], pairs.z1[0], rtol=1e-12)
+    with pytest.raises(ValueError, match="expected params l for the scene pendulum-length"):
+        tr.reference_trajectories(scene, pairs.z0, 1)
+    for unfit in (scenes.standard_map(), scenes.driven_pendulum()):
+        with pytest.raises(ValueError, match=r"of an autonomous flow; got 0\.1 and 0\.2"):
+            tr.sample_pairs(unfit, 5, key, dt_range=(0.1, 0.2))
 
 
 @pytest.mark.parametrize("name", ["henon-heiles-regular", "pcr3bp", "standard-map-regular"])

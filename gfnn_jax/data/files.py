@@ -1,13 +1,16 @@
 """A user's trajectories and initial states in: reading and checking.
 
-Three kinds of file hold the same thing, sequences of states z = (q, p), q first, at a uniform
-time step:
+Three kinds of file hold the same thing, sequences of states z = (q, p), q first, and the time
+between them, one number where it is always the same:
 
-- ``.npz``: ``z0``, ``z1`` of shape (N, 2d), or ``trajectories`` of shape (M, L, 2d) with optional
-  ``lengths`` (M,), rows beyond a length ignored; and ``dt``.
+- ``.npz``: ``z0``, ``z1`` of shape (N, 2d) with ``dt``, a number or (N,); or ``trajectories`` of
+  shape (M, L, 2d) with optional ``lengths`` (M,), rows beyond a length ignored, and ``dt`` or
+  ``times`` (M, L). Optional ``params``, parameters of the system, (N, k) or (M, k), with
+  ``param_names``.
 - ``.npy``: one array of shape (L, 2d) or (M, L, 2d).
 - ``.csv``: a header that names the columns ``t, q1..qd, p1..pd`` in any order, optionally
-  ``sequence``; units as in ``q1 [km]`` or ``q1 (km)``.
+  ``sequence``; units as in ``q1 [km]`` or ``q1 (km)``. Every further column is a parameter, where
+  it is constant in each sequence.
 
 All are read as blocks of consecutive rows, so that a whole file and a file larger than memory go
 through the same checks. Every refusal is an `InputError`: one line that says what was expected
@@ -51,11 +54,13 @@ class DataWarning(UserWarning):
 
 @dataclasses.dataclass(frozen=True)
 class TrajectoryData:
-    """Sequences of states at a uniform time step, one after the other.
+    """Sequences of states, one after the other.
 
     states:    (T, 2d) float64, q first: the sequences' states, concatenated.
     lengths:   (M,) the number of states in each sequence. Pairs z0, z1 are sequences of two.
-    dt:        time between consecutive states, in the user's unit of time.
+    dt:        time between consecutive states, in the user's unit of time; one of each pair
+               (num_pairs,) where it is not always the same.
+    args:      parameters, name -> (num_pairs,), or None.
     source:    the file it came from; digest: the SHA-256 of that file.
     precision: the dtype that the file stores, "float32" say; ``states`` is float64 always.
     units:     units by column name, as a CSV header gave them.
@@ -63,11 +68,12 @@ class TrajectoryData:
 
     states: np.ndarray
     lengths: np.ndarray
-    dt: float
+    dt: Any
     source: str
     digest: str
     precision: str = "float64"
     units: dict[str, str] = dataclasses.field(default_factory=dict)
+    args: dict[str, np.ndarray] | None = None
 
     @property
     def dim(self) -> int:
@@ -90,7 +96,7 @@ class TrajectoryData:
         starts = np.ones(len(self.states), bool)
         starts[np.cumsum(self.lengths) - 1] = False
         rows = np.flatnonzero(starts)
-        return Pairs(self.states[rows], self.states[rows + 1], self.dt)
+        return Pairs(self.states[rows], self.states[rows + 1], self.dt, self.args)
 
     def last_states(self) -> np.ndarray:
         """The last state of each sequence, (M, 2d)."""
@@ -108,6 +114,9 @@ def read_trajectories(path, *, dt: float | None = None) -> TrajectoryData:
         blocks = list(source.blocks(2**62 if source.is_array else BLOCK_ROWS))
         states = np.concatenate([np.empty((0, 2 * source.dim)), *(b.states for b in blocks)])
         sequence = np.concatenate([np.empty(0), *(b.sequence for b in blocks)])
+        own = joined([b.own for b in blocks])
+    going = np.flatnonzero(sequence[1:] == sequence[:-1])
+    dt, args = source.of_pairs(own, going)
     ends = np.flatnonzero(sequence[1:] != sequence[:-1]) + 1
     lengths = np.diff(np.concatenate([[0], ends, [len(sequence)]])) if len(sequence) else ends
     pairs = len(states) - len(lengths)
@@ -119,7 +128,7 @@ def read_trajectories(path, *, dt: float | None = None) -> TrajectoryData:
         )
     _warn_of_odd_columns(path, states, sequence)
     return TrajectoryData(
-        states, lengths, source.dt, str(path), _digest(path), source.precision, source.units
+        states, lengths, dt, str(path), _digest(path), source.precision, source.units, args
     )
 
 
@@ -132,22 +141,29 @@ def read_sample(
     same probability, as a sequence of two states. Memory is that of the sample and a few blocks.
     """
     rng = np.random.default_rng(seed)
-    kept, priority = None, np.empty(0)
+    kept, priority, dts = None, np.empty(0), np.empty(0)
+    args: dict[str, np.ndarray] = {}
     for pairs in iterate_pairs(path, BLOCK_ROWS, dt=dt):
         rows = np.stack([pairs.z0, pairs.z1], axis=1)
         kept = rows if kept is None else np.concatenate([kept, rows])
         priority = np.concatenate([priority, rng.random(len(rows))])
-        dt = pairs.dt
+        dts = np.concatenate([dts, np.broadcast_to(pairs.dt, len(rows))])
+        args = {n: np.append(args.get(n, []), v) for n, v in (pairs.args or {}).items()}
         if len(kept) > num_pairs:
             first = np.argpartition(priority, num_pairs)[:num_pairs]
-            kept, priority = kept[first], priority[first]
-    if kept is None or dt is None:
+            kept, priority, dts = kept[first], priority[first], dts[first]
+            args = {name: values[first] for name, values in args.items()}
+    if kept is None:
         raise InputError(f"{path}: no pair of consecutive states found")
     states = kept.reshape(-1, kept.shape[-1])
     lengths = np.full(len(kept), 2)
+    same = np.ptp(dts) == 0
     with _open(path, dt) as source:
         precision, units = source.precision, source.units
-    return TrajectoryData(states, lengths, dt, str(path), _digest(path), precision, units)
+    return TrajectoryData(
+        states, lengths, float(dts[0]) if same else dts, str(path), _digest(path), precision, units,
+        args or None,
+    )  # fmt: skip
 
 
 def iterate_pairs(path, chunk: int, *, dt: float | None = None) -> Iterator[Any]:
@@ -161,13 +177,22 @@ def iterate_pairs(path, chunk: int, *, dt: float | None = None) -> Iterator[Any]
 
     with _open(path, dt) as source:
         last_state, last_sequence = np.empty((0, 2 * source.dim)), np.empty(0)
+        last_own: list[np.ndarray | None] = []
         for block in source.blocks(chunk):
             states = np.concatenate([last_state, block.states])
             sequence = np.concatenate([last_sequence, block.sequence])
+            own = joined([*last_own, block.own])
             rows = np.flatnonzero(sequence[1:] == sequence[:-1])
             if len(rows):
-                yield Pairs(states[rows], states[rows + 1], source.dt)
+                yield Pairs(states[rows], states[rows + 1], *source.of_pairs(own, rows))
             last_state, last_sequence = states[-1:], sequence[-1:]
+            last_own = [None if own is None else own[-1:]]
+
+
+def joined(parts: list[np.ndarray | None]) -> np.ndarray | None:
+    """The rows of all parts; None where they have none."""
+    found = [part for part in parts if part is not None]
+    return np.concatenate(found) if found else None
 
 
 def read_initial_states(path, dim: int) -> np.ndarray:
@@ -176,24 +201,44 @@ def read_initial_states(path, dim: int) -> np.ndarray:
     An ``.npy`` of shape (B, 2d), an ``.npz`` with ``z0``, or a ``.csv`` without a column ``t``
     holds one state a row; of any other trajectory file each sequence gives its last state.
     """
+    return read_initial(path, dim)[0]
+
+
+def read_initial(
+    path, dim: int, parameters: tuple[str, ...] = ()
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """(states, params) to predict from: as `read_initial_states`, with the values (B, k) of these
+    parameters, which the file must hold; None where there are none."""
     with _open(path, None, initial=True) as source:
         if source.dim != dim:
             raise InputError(
                 f"{path}: expected states of {2 * dim} columns (d = {dim}), found "
                 f"{2 * source.dim} columns (d = {source.dim})"
             )
-        found: list[np.ndarray] = []
+        missing = [name for name in parameters if name not in source.parameters]
+        if missing:
+            raise InputError(
+                f"{path}: expected the parameter{'s' * (len(missing) > 1)} {', '.join(missing)}, "
+                "which the model was learned with, beside the states; found "
+                f"{', '.join(source.parameters) or 'none'}"
+            )
+        found: list[_Block] = []
         held: _Block | None = None  # the last row so far: the end of its sequence, or not
         for block in source.blocks(BLOCK_ROWS):
             ends = np.flatnonzero(block.sequence[1:] != block.sequence[:-1])
             if held is not None and held.sequence[0] != block.sequence[0]:
-                found.append(held.checked(path).states)
-            found.append(block.rows(ends).checked(path).states)
+                found.append(held.checked(path))
+            found.append(block.rows(ends).checked(path))
             held = block.rows(np.array([len(block.sequence) - 1]))
         if held is None:
             raise InputError(f"{path}: holds no states")
-        found.append(held.checked(path).states)
-    return np.concatenate(found)
+        found.append(held.checked(path))
+    states = np.concatenate([block.states for block in found])
+    if not parameters:
+        return states, None
+    own = joined([block.own for block in found])
+    assert own is not None
+    return states, own[:, [1 + source.parameters.index(name) for name in parameters]]
 
 
 # ---------------------------------------------------------------------------------------------
@@ -204,16 +249,19 @@ def read_initial_states(path, dim: int) -> np.ndarray:
 @dataclasses.dataclass
 class _Block:
     """Consecutive rows. ``sequence`` (n,) changes where one sequence ends and the next begins;
-    ``locate(row, column)`` says where in the file a number stands."""
+    ``locate(row, column)`` says where in the file a number stands. ``own`` (n, 1 + k): the row's
+    time and parameters, where the file has these."""
 
     states: np.ndarray
     sequence: np.ndarray
     locate: Callable[[int, int], str]
+    own: np.ndarray | None = None
 
     def rows(self, index: np.ndarray) -> _Block:
         return _Block(
-            self.states[index], self.sequence[index], lambda r, c: self.locate(int(index[r]), c)
-        )
+            self.states[index], self.sequence[index], lambda r, c: self.locate(int(index[r]), c),
+            None if self.own is None else self.own[index],
+        )  # fmt: skip
 
     def checked(self, path) -> _Block:
         """Itself, if every number is finite and not too large; else InputError."""
@@ -233,14 +281,27 @@ class _Block:
 
 @dataclasses.dataclass
 class _Source:
-    """An open file: what its header says, and its rows in blocks of at most so many."""
+    """An open file: what its header says, and its rows in blocks of at most so many.
+
+    uneven: whether the times that were read so far are not dt apart. parameters: names of those
+    that the rows have.
+    """
 
     dim: int
-    dt: float  # NaN where initial states need none
+    dt: float  # NaN where initial states need none, or the times say it
     precision: str
     units: dict[str, str]
     is_array: bool
     blocks: Callable[[int], Iterator[_Block]]
+    parameters: tuple[str, ...] = ()
+    uneven: bool = False
+
+    def of_pairs(self, own: np.ndarray | None, rows) -> tuple[Any, dict[str, np.ndarray] | None]:
+        """(dt, args) of the pairs that begin in these rows."""
+        if own is None:
+            return self.dt, None
+        dt = own[rows + 1, 0] - own[rows, 0] if self.uneven else self.dt
+        return dt, {name: own[rows, 1 + i] for i, name in enumerate(self.parameters)} or None
 
 
 @contextlib.contextmanager
@@ -281,6 +342,10 @@ def _check_dt(dt: Any, what: str) -> float:
 
 
 def _agreed_dt(path, given: float | None, found: float | None) -> float:
+    if found is not None and np.isnan(found):
+        if given is not None:
+            raise InputError(f"{path}: the given dt = {given} disagrees with times that are uneven")
+        return found
     if given is None and found is None:
         raise InputError(f"{path}: holds no time step and none was given (dt)")
     if given is None or found is None:
@@ -426,24 +491,106 @@ def _open_npz(path: Path, stream, dt, initial: bool) -> _Source:
         return _StoredArray(path, name, opened, archive.getinfo(f"{name}.npy").file_size)
 
     if initial and "z0" in names:
-        return _array_source(path, member("z0"), None, np.nan, each_row=True)
+        params = _read_params(path, names, member)
+        return _array_source(path, member("z0"), None, np.nan, each_row=True, params=params)
     is_pairs = "z0" in names and "z1" in names
     if is_pairs == ("trajectories" in names):
         raise InputError(
             f"{path}: expected either the arrays z0 and z1, or trajectories; found "
             f"{', '.join(names[:8]) or 'none'}{', ...' * (len(names) > 8)}"
         )
-    found = None
+    found, own_dt = None, None
     if "dt" in names and not initial:
-        found = _check_dt(member("dt").whole(), f"{path}: dt")
+        value = member("dt").whole()
+        if is_pairs and value.size > 1:
+            own_dt, found = value, np.nan
+        else:
+            found = _check_dt(value, f"{path}: dt")
     trajectories = None if is_pairs else member("trajectories")
     if trajectories is not None and found is not None and "steps" in names:
         found *= _stride(path, trajectories.shape, member("steps").whole())
-    dt = np.nan if initial else _agreed_dt(path, dt, found)
+    params = _read_params(path, names, member)
     if trajectories is None:
-        return _pairs_source(path, member("z0"), member("z1"), dt)
+        dt = _agreed_dt(path, dt, found)
+        return _pairs_source(path, member("z0"), member("z1"), dt, own_dt, params)
     lengths = member("lengths").whole() if "lengths" in names else None
-    return _array_source(path, trajectories, lengths, dt)
+    times = None
+    if "times" in names and not initial:
+        if found is not None:
+            raise InputError(f"{path}: expected dt or times, found both")
+        times = member("times").whole().astype(np.float64)
+        found = _times_dt(path, times, trajectories.shape, lengths)
+    dt = np.nan if initial else _agreed_dt(path, dt, found)
+    return _array_source(path, trajectories, lengths, dt, times=times, params=params)
+
+
+def _read_params(path, names: list[str], member) -> tuple[tuple[str, ...], np.ndarray] | None:
+    """The names (k,) and the values (n, k) of the parameters; None where there are none."""
+    if "params" not in names:
+        return None
+    values = member("params").whole().astype(np.float64)
+    if values.ndim == 1:
+        values = values[:, None]
+    if values.ndim != 2 or values.shape[1] == 0:
+        raise InputError(f"{path}: params must have shape (n, k), found {values.shape}")
+    if not np.isfinite(values).all():
+        row, column = np.argwhere(~np.isfinite(values))[0]
+        raise InputError(
+            f"{path}: params not finite (NaN or infinity), first params[{row}, {column}]"
+        )
+    called = tuple(f"a{i + 1}" for i in range(values.shape[1]))
+    if "param_names" in names:
+        with _damage(path, "param_names"), np.load(path, allow_pickle=False) as file:
+            called = tuple(np.atleast_1d(file["param_names"]).astype(str).tolist())
+        if len(called) != values.shape[1] or len(set(called)) < len(called):
+            raise InputError(
+                f"{path}: param_names must be {values.shape[1]} different names, found "
+                f"{', '.join(called)}"
+            )
+    return called, values
+
+
+def _own_columns(path, times, params, count: int, what: str, repeat: int):
+    """What rows have beside their states (rows, 1 + k), or None: times of all rows, and params of
+    each of ``count`` sequences of ``repeat`` rows."""
+    if times is None and params is None:
+        return None
+    if params is not None and len(params[1]) != count:
+        raise InputError(
+            f"{path}: params must have a row for each of the {count} {what}, found "
+            f"{params[1].shape}"
+        )
+    columns = [np.zeros((count * repeat, 1)) if times is None else times.reshape(-1, 1)]
+    if params is not None:
+        columns.append(np.repeat(params[1], repeat, axis=0))
+    return np.concatenate(columns, axis=1)
+
+
+def _times_dt(path, times, shape, lengths) -> float:
+    """The time step of ``times`` (M, L), NaN where they are uneven."""
+    times = times[None] if times.ndim == 1 else times
+    if times.shape != ((1, *shape[:1]) if len(shape) == 2 else shape[:2]):
+        raise InputError(
+            f"{path}: times must have the shape of the trajectories without the last axis, found "
+            f"{times.shape} beside {shape}"
+        )
+    steps = np.diff(times, axis=1)
+    if lengths is not None and lengths.shape == times.shape[:1]:
+        steps = np.where(np.arange(1, times.shape[1]) < lengths[:, None], steps, 1.0)
+        used = np.arange(1, times.shape[1]) < lengths[:, None]
+    else:
+        used = np.ones(steps.shape, bool)
+    bad = ~(np.isfinite(steps) & (steps > 0)) & used
+    if bad.any():
+        m, i = (int(k) for k in np.argwhere(bad)[0])
+        raise InputError(
+            f"{path}: times must rise, found times[{m}, {i + 1}] = {times[m, i + 1]:g} after "
+            f"{times[m, i]:g}"
+        )
+    usual = float(np.median(steps[used])) if used.any() else np.nan
+    slack = TIME_TOLERANCE * usual + 4 * np.finfo(np.float64).eps * np.abs(times[:, 1:])
+    even = bool((np.abs(steps - usual) <= slack)[used].all())
+    return float(np.mean(steps[used])) if even else np.nan
 
 
 def _stride(path, shape: tuple[int, ...], steps: np.ndarray) -> float:
@@ -456,13 +603,31 @@ def _stride(path, shape: tuple[int, ...], steps: np.ndarray) -> float:
     return float(gaps[0])
 
 
-def _pairs_source(path, z0: _StoredArray, z1: _StoredArray, dt: float) -> _Source:
-    """z0, z1 as sequences of two states."""
+def _pairs_source(
+    path, z0: _StoredArray, z1: _StoredArray, dt: float, own_dt=None, params=None
+) -> _Source:
+    """z0, z1 as sequences of two states. own_dt: of each pair; params: names and values."""
     if len(z0.shape) != 2 or z0.shape != z1.shape:
         raise InputError(
             f"{path}: z0 and z1 must both have shape (N, 2d), found {z0.shape} and {z1.shape}"
         )
     dim = _check_width(path, "z0", z0.shape)
+    times = None
+    if own_dt is not None:
+        if own_dt.shape != z0.shape[:1]:
+            raise InputError(
+                f"{path}: dt must be one number or have shape ({z0.shape[0]},), found "
+                f"{own_dt.shape}"
+            )
+        bad = ~(np.isfinite(own_dt) & (own_dt > 0))
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise InputError(
+                f"{path}: dt must be finite and above 0, found {int(bad.sum())} that are not, "
+                f"first dt[{row}] = {own_dt[row]:g}"
+            )
+        times = np.stack([np.zeros(len(own_dt)), own_dt], axis=1)
+    own = _own_columns(path, times, params, z0.shape[0], "pairs", 2)
 
     def blocks(rows: int) -> Iterator[_Block]:
         pair = 0
@@ -470,16 +635,21 @@ def _pairs_source(path, z0: _StoredArray, z1: _StoredArray, dt: float) -> _Sourc
         for a, b in zip(z0.read_rows(rows), z1.read_rows(rows), strict=True):
             states = np.stack([a, b], axis=1).reshape(-1, 2 * dim)
             sequence = np.repeat(np.arange(pair, pair + len(a)), 2)
-            yield _Block(states, sequence, lambda r, c, n=pair: f"z{r % 2}[{n + r // 2}, {c}]")
+            beside = None if own is None else own[2 * pair : 2 * (pair + len(a))]
+            yield _Block(
+                states, sequence, lambda r, c, n=pair: f"z{r % 2}[{n + r // 2}, {c}]", beside
+            )
             pair += len(a)
 
     precision = str(np.result_type(z0.dtype, z1.dtype))
-    return _Source(dim, dt, precision, {}, True, blocks)
+    called = () if params is None else params[0]
+    return _Source(dim, dt, precision, {}, True, blocks, called, own_dt is not None)
 
 
 def _array_source(
-    path, array: _StoredArray, lengths: np.ndarray | None, dt: float, *, each_row: bool = False
-) -> _Source:
+    path, array: _StoredArray, lengths: np.ndarray | None, dt: float, *, each_row: bool = False,
+    times: np.ndarray | None = None, params=None,
+) -> _Source:  # fmt: skip
     """(L, 2d) or (M, L, 2d); with ``each_row`` every row is a sequence of its own."""
     shape = array.shape
     if len(shape) not in (2, 3) or (each_row and len(shape) != 2):
@@ -489,6 +659,8 @@ def _array_source(
     count, length = (1, shape[0]) if len(shape) == 2 else shape[:2]
     if lengths is not None:
         lengths = _check_lengths(path, lengths, count, length)
+    each = (shape[0], 1) if each_row else (count, length)
+    own = _own_columns(path, times, params, each[0], "states" if each_row else "sequences", each[1])
 
     def locate(row: int, column: int) -> str:
         index = (row, column) if len(shape) == 2 else (*divmod(row, length), column)
@@ -499,14 +671,17 @@ def _array_source(
         for states in array.read_rows(rows):
             row = np.arange(start, start + len(states))
             sequence = row if each_row else row // length
-            block = _Block(states, sequence, lambda r, c, n=start: locate(n + r, c))
+            beside = None if own is None else own[start : start + len(states)]
+            block = _Block(states, sequence, lambda r, c, n=start: locate(n + r, c), beside)
             if lengths is not None:
                 block = block.rows(np.flatnonzero(row % length < lengths[sequence]))
             start += len(states)
             if len(block.states):
                 yield block
 
-    return _Source(dim, dt, str(array.dtype), {}, True, blocks)
+    uneven = times is not None and bool(np.isnan(dt))
+    called = () if params is None else params[0]
+    return _Source(dim, dt, str(array.dtype), {}, True, blocks, called, uneven)
 
 
 def _check_lengths(path, lengths: np.ndarray, count: int, longest: int) -> np.ndarray:
@@ -570,9 +745,7 @@ def _open_csv(path: Path, stream, dt, initial: bool) -> _Source:
                 f"{path}: the header must name q1..qd and p1..pd once each: {', '.join(columns)} "
                 f"{what} in {','.join(names)}"
             )
-    ignored = [n for n in names if n not in (*wanted, "t", "sequence")]
-    if ignored:
-        warnings.warn(f"{path}: columns ignored: {', '.join(ignored)}", DataWarning, stacklevel=4)
+    further = [n for n in names if n not in (*wanted, "t", "sequence")]
     columns = [names.index(n) for n in wanted]
     each_row = initial and "t" not in names and "sequence" not in names
 
@@ -583,6 +756,17 @@ def _open_csv(path: Path, stream, dt, initial: bool) -> _Source:
     found = None if initial or "t" not in names else _csv_dt(path, names, *first)
     dt = np.nan if initial else _agreed_dt(path, dt, found)
     usual = dt if found is None else found
+    sequence = first[0][:, names.index("sequence")] if "sequence" in names else None
+    same = slice(0) if each_row else slice(None) if sequence is None else np.diff(sequence) == 0
+    moving = [n for n in further if np.any(np.diff(first[0][:, names.index(n)])[same] != 0)]
+    if moving:  # no parameters: an energy, say
+        warnings.warn(
+            f"{path}: columns ignored: {', '.join(moving)} (not constant in a sequence)",
+            DataWarning, stacklevel=4,
+        )  # fmt: skip
+    parameters = [n for n in further if n not in moving]
+    beside = [names.index(n) for n in parameters]
+    with_time = "t" in names and not initial
 
     def blocks(rows: int) -> Iterator[_Block]:
         seen: set[float] = set()
@@ -602,21 +786,38 @@ def _open_csv(path: Path, stream, dt, initial: bool) -> _Source:
                     seen.add(float(sequence[row]))
             else:
                 sequence = np.zeros(len(table))
-            if "t" in names and not initial:
-                time = table[:, names.index("t")]
-                _check_times(
-                    path, np.append(last[1], time), np.append(last[0], sequence), lines, usual
-                )
-                last = np.array([sequence[-1], time[-1]])
-            else:
-                last = np.array([sequence[-1], np.nan])
+            time = table[:, names.index("t")] if with_time else np.zeros(len(table))
+            if with_time:
+                before = np.append(last[1], time), np.append(last[0], sequence)
+                _check_times_rise(path, *before, lines)
+                source.uneven |= not _even(*before, usual)
+            values = table[:, beside]
+            if not each_row:
+                _check_constant(path, parameters, values, sequence, lines)
+            last = np.array([sequence[-1], time[-1] if with_time else np.nan])
             yield _Block(
                 table[:, columns],
                 sequence,
                 lambda r, c, lines=lines: f"line {lines[r]}, {wanted[c]}",
+                np.column_stack([time, values]),
             )
 
-    return _Source(dim, float(dt), "float64", units, False, blocks)
+    called = tuple(re.sub(r"\W+", "_", name) for name in parameters)
+    source = _Source(dim, float(dt), "float64", units, False, blocks, called)
+    return source
+
+
+def _check_constant(path, names: list[str], values, sequence, lines) -> None:
+    """Raises InputError where a parameter changes within a sequence."""
+    changes = (values[1:] != values[:-1]) & (sequence[1:] == sequence[:-1])[:, None]
+    bad = changes.any(axis=1) | ~np.isfinite(values).all(axis=1)[1:]
+    if bad.any():
+        row = int(np.argmax(bad)) + 1
+        raise InputError(
+            f"{path}: line {lines[row]}: expected {', '.join(names)} finite and constant in each "
+            f"sequence, as parameters are, found {', '.join(f'{v:g}' for v in values[row])} after "
+            f"{', '.join(f'{v:g}' for v in values[row - 1])}"
+        )
 
 
 def _cut(tables, rows: int):
@@ -663,18 +864,20 @@ def _csv_fault(path, names: list[str], text: list[str], line_number: int) -> str
 
 
 def _csv_dt(path, names: list[str], table: np.ndarray, lines: np.ndarray) -> float | None:
-    """The time step of the first rows; None if no sequence among them has two states."""
+    """The time step of the first rows, NaN where they are uneven; None if no sequence among them
+    has two states."""
     time = table[:, names.index("t")]
     sequence = table[:, names.index("sequence")] if "sequence" in names else np.zeros(len(table))
     steps = np.diff(time)[sequence[1:] == sequence[:-1]]
     if len(steps) == 0:
         return None
-    # The median ignores a gap; then every step must agree with it, and the mean is more accurate.
+    # The median ignores a gap; where every step agrees with it, the mean is more accurate.
     usual = float(np.median(steps))
     if not (np.isfinite(usual) and usual > 0):
         raise InputError(f"{path}: the column t must rise, found a usual step of {usual}")
-    _check_times(path, np.append(np.nan, time), np.append(np.nan, sequence), lines, usual)
-    return float(np.mean(steps))
+    before = np.append(np.nan, time), np.append(np.nan, sequence)
+    _check_times_rise(path, *before, lines)
+    return float(np.mean(steps)) if _even(*before, usual) else np.nan
 
 
 def _only_rounded(time: np.ndarray, sequence: np.ndarray, dt: float) -> bool:
@@ -698,15 +901,24 @@ def _only_rounded(time: np.ndarray, sequence: np.ndarray, dt: float) -> bool:
     return True
 
 
-def _check_times(path, time: np.ndarray, sequence: np.ndarray, lines: np.ndarray, dt: float):
-    """Every step within a sequence is dt, but for the rounding of printed times. ``time`` and
-    ``sequence`` start one row before."""
-    step = np.diff(time)
-    slack = TIME_TOLERANCE * dt + 4 * np.finfo(np.float64).eps * np.abs(time[1:])
-    # "not (... <= ...)" so that NaN counts as wrong.
-    bad = np.flatnonzero((sequence[1:] == sequence[:-1]) & ~(np.abs(step - dt) <= slack))
-    if len(bad) and not _only_rounded(time, sequence, dt):
+def _check_times_rise(path, time: np.ndarray, sequence: np.ndarray, lines: np.ndarray):
+    """Raises InputError where times do not rise in a sequence. ``time`` and ``sequence`` start one
+    row before."""
+    # "not (... > 0)" so that NaN counts as wrong.
+    bad = np.flatnonzero((sequence[1:] == sequence[:-1]) & ~(np.diff(time) > 0))
+    if len(bad) or not np.isfinite(time[1:]).all():
+        row = bad[0] if len(bad) else int(np.argmin(np.isfinite(time[1:])))
         raise InputError(
-            f"{path}: the time step is not uniform: {step[bad[0]]:.9g} in line {lines[bad[0]]} "
-            f"where {dt:.9g} is usual ({len(bad)} such row{'s' * (len(bad) != 1)})"
+            f"{path}: the column t must rise in a sequence, found {time[row + 1]:.9g} in line "
+            f"{lines[row]} after {time[row]:.9g}"
         )
+
+
+def _even(time: np.ndarray, sequence: np.ndarray, dt: float) -> bool:
+    """Whether every step within a sequence is dt, but for the rounding of printed times. ``time``
+    and ``sequence`` start one row before."""
+    if np.isnan(dt):
+        return False
+    slack = TIME_TOLERANCE * dt + 4 * np.finfo(np.float64).eps * np.abs(time[1:])
+    even = np.abs(np.diff(time) - dt) <= slack
+    return bool(even[sequence[1:] == sequence[:-1]].all()) or _only_rounded(time, sequence, dt)

@@ -36,12 +36,14 @@ _ASSEMBLY_BYTES = 64 * 2**20
 
 class PredictionWriter:
     """Writes one prediction file: ``trajectories`` (B, S, 2d), ``status`` (B,), ``left_at`` (B,),
-    ``steps`` (S,) and ``dt``, all float64 or int64, and ``job``, a digest of what was asked for.
+    ``steps`` (S,) and ``dt``, all float64 or int64, ``params`` (B, k) and ``param_names`` (k,)
+    where the map has parameters, and ``job``, a digest of what was asked for.
 
     out:       the ``.npz`` to write; ``OUT.partial`` holds the chunks until `finish`.
     shape:     (B, 2d).
     num_steps, save_every: N and K; saved are the S = 1 + N // K states of steps 0, K, 2K, ...
     dt:        the time step of the map.
+    params:    the names (k,) and values (B, k) of its parameters.
     identity:  a JSON-able dict that says which job this is (digests of the model and of the initial
                states, say): a job is resumed only if all of it agrees.
     resume:    go on with ``OUT.partial`` where there is one; else start. Where ``out`` is this very
@@ -65,6 +67,7 @@ class PredictionWriter:
         save_every: int = 1,
         dt: float,
         identity: dict[str, Any],
+        params: tuple[tuple[str, ...], np.ndarray] | None = None,
         resume: bool = False,
         overwrite: bool = False,
     ):
@@ -72,6 +75,7 @@ class PredictionWriter:
         self.partial = self.out.with_name(self.out.name + ".partial")
         self.steps = range(0, num_steps + 1, save_every)
         self.dt = float(dt)
+        self.params = params
         self.lanes, self.width = shape
         self.saved = 0
         self.carry: dict[str, np.ndarray] | None = None
@@ -157,6 +161,9 @@ class PredictionWriter:
             raise ValueError(f"{self.saved} of {self.total} states are there")
         status = np.asarray(status).astype(np.int64).reshape(self.lanes)
         left_at = np.asarray(left_at).astype(np.int64).reshape(self.lanes)
+        named: list[tuple[str, np.ndarray]] = []
+        if self.params is not None:
+            named = [("params", self.params[1]), ("param_names", np.array(self.params[0]))]
         with atomic_file(self.out) as stream, zipfile.ZipFile(stream, "w") as archive:
             shape = (self.lanes, self.total, self.width)
             with _member(archive, "trajectories", shape, np.float64) as member:
@@ -166,9 +173,10 @@ class PredictionWriter:
                 ("left_at", left_at),
                 ("dt", np.asarray(self.dt)),
                 ("job", np.asarray(self._job_digest)),
+                *named,
             ):
                 with _member(archive, name, array.shape, array.dtype) as member:
-                    member.write(array.tobytes())
+                    member.write(np.ascontiguousarray(array).tobytes())
             with _member(archive, "steps", (self.total,), np.int64) as member:
                 for first in range(0, self.total, 2**20):
                     part = self.steps[first : first + 2**20]

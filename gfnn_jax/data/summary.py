@@ -8,7 +8,8 @@ from gfnn_jax.data.files import TrajectoryData
 
 
 def summary(data: TrajectoryData) -> list[str]:
-    """Lines of text: how many pairs, and of each column its range, spread and movement in a step.
+    """Lines of text: how many pairs, of each column its range, spread and movement in a step, of
+    each parameter its range.
 
     spread: the standard deviation. movement: the root mean square of the change in one step. An
     error relative to the spread is what a tolerance is for.
@@ -19,8 +20,10 @@ def summary(data: TrajectoryData) -> list[str]:
     of = (
         f"{lengths.min()}" if lengths.min() == lengths.max() else f"{lengths.min()}–{lengths.max()}"
     )
+    dt = np.asarray(data.dt)
+    every = f"{dt:g}" if dt.ndim == 0 else f"{dt.min():g} to {dt.max():g}"
     lines = [
-        f"{data.num_pairs} pairs, d = {data.dim}, dt = {data.dt:g}; sequences: {len(lengths)} of "
+        f"{data.num_pairs} pairs, d = {data.dim}, dt = {every}; sequences: {len(lengths)} of "
         f"{of} states, no gap inside a sequence; copies: {copies}"
     ]
     move = np.sqrt(np.mean((pairs.z1 - pairs.z0) ** 2, axis=0))
@@ -30,4 +33,7 @@ def summary(data: TrajectoryData) -> list[str]:
         unit = f" {data.units[name]}" if name in data.units else ""
         a, b, spread, step = (f"{x:.4g}" for x in numbers)
         lines.append(f"{name}: {a} to {b}{unit}, spread {spread}, movement in a step {step}")
+    for name, values in (data.args or {}).items():
+        count = len(np.unique(values))
+        lines.append(f"parameter {name}: {values.min():.4g} to {values.max():.4g}, {count} values")
     return lines

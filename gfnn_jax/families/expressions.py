@@ -10,15 +10,17 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import keyword
 import math
 import operator
+import re
 from collections.abc import Callable, Sequence
 from functools import cache, cached_property, reduce
 from typing import Any
 
 import numpy as np
 
-from gfnn_jax.arrays import namespace
+from gfnn_jax.arrays import as_row, namespace
 from gfnn_jax.errors import InputError
 
 _LONGEST_TEXT, _DEEPEST = 2_000, 60
@@ -55,6 +57,7 @@ _FUNCTIONS: dict[str, tuple[Callable, Callable, Callable]] = {
         lambda xp, v, y: -2 * v / _squared(xp, 1 + v * v),
     ),
 }  # fmt: skip
+_CHEBYSHEV = re.compile(r"T\d{1,2}")
 _CIRCULAR = ("sin", "cos")  # which share their values
 FUNCTIONS = (*_CIRCULAR, *_FUNCTIONS)
 _OTHER_NAMES = {"atan": "arctan", "ln": "log"}
@@ -65,8 +68,9 @@ _CONSTANTS = {"pi": math.pi, "e": math.e}
 class Expression:
     """A node: ``operation`` with its ``operands``.
 
-    "number" holds a float, "coordinate" an index of z, "power" a base and a float; "+", "*", "/"
-    have two nodes, the name of a function one.
+    "number" holds a float, "coordinate" an index of z, "parameter" one of the args, "power" a base
+    and a float; "+", "*", "/" have two nodes, the name of a function one, as has "T3", a Chebyshev
+    polynomial.
     """
 
     operation: str
@@ -121,6 +125,10 @@ def number(value: float) -> Expression:
 
 def coordinate(index: int) -> Expression:
     return Expression("coordinate", (index,))
+
+
+def parameter(index: int) -> Expression:
+    return Expression("parameter", (index,))
 
 
 def as_expression(value: Any) -> Expression:
@@ -180,18 +188,31 @@ def coordinate_names(dim: int) -> tuple[str, ...]:
     return tuple(f"{letter}{i + 1}" for letter in "qp" for i in range(dim))
 
 
+def check_names(dim: int, names: Sequence[str]) -> None:
+    """Raises InputError where parameters of these names could not stand in an expression."""
+    taken = {*coordinate_names(dim), *FUNCTIONS, *_OTHER_NAMES, "q", "p", "t"}
+    for name in names:
+        if not name.isidentifier() or keyword.iskeyword(name):
+            raise InputError(f"expected letters, digits and _ as a parameter's name, got '{name}'")
+        if name in taken or _CHEBYSHEV.fullmatch(name):
+            raise InputError(
+                f"expected a name for a parameter that has no meaning yet, got '{name}'"
+            )
+
+
 @cache
-def parse(text: str, dim: int) -> Expression:
-    """The tree of an expression in q1..qd, p1..pd (q, p where d = 1).
+def parse(text: str, dim: int, parameters: tuple[str, ...] = ()) -> Expression:
+    """The tree of an expression in q1..qd, p1..pd (q, p where d = 1) and the parameters.
 
     Raises InputError, in one line, for anything but numbers, + - * / **, the coordinates and the
     functions of the list.
     """
     if len(text) > _LONGEST_TEXT:
         raise InputError(f"expected a term of at most {_LONGEST_TEXT} characters, got {len(text)}")
-    names = {name: i for i, name in enumerate(coordinate_names(dim))}
+    names = {name: coordinate(i) for i, name in enumerate(coordinate_names(dim))}
     if dim == 1:
-        names.update(q=0, p=1)
+        names.update(q=coordinate(0), p=coordinate(1))
+    names.update({name: parameter(i) for i, name in enumerate(parameters)})
     try:
         tree = ast.parse(text.strip(), mode="eval").body
         return _parsed(tree, names, text, 0)
@@ -220,7 +241,7 @@ def _parsed(node, names, text, depth) -> Expression:
         return number(value)
     if isinstance(node, ast.Name):
         if node.id in names:
-            return coordinate(names[node.id])
+            return names[node.id]
         if node.id in _CONSTANTS:
             return number(_CONSTANTS[node.id])
         raise refuse(f"the name '{node.id}'")
@@ -230,7 +251,8 @@ def _parsed(node, names, text, depth) -> Expression:
     if isinstance(node, ast.Call):
         name = node.func.id if isinstance(node.func, ast.Name) else "?"
         name = _OTHER_NAMES.get(name, name)
-        if name not in FUNCTIONS or node.keywords or len(node.args) != 1:
+        known = name in FUNCTIONS or _CHEBYSHEV.fullmatch(name)
+        if not known or node.keywords or len(node.args) != 1:
             raise refuse(f"a call of '{ast.unparse(node.func)}' with {len(node.args)} arguments")
         return call(name, inner(node.args[0]))
     if isinstance(node, ast.BinOp):
@@ -256,14 +278,14 @@ def _parsed(node, names, text, depth) -> Expression:
 _SUM, _PRODUCT, _POWER, _ATOM = range(4)
 
 
-def to_text(tree: Expression, dim: int) -> str:
+def to_text(tree: Expression, dim: int, parameters: tuple[str, ...] = ()) -> str:
     """The tree as text that `parse` reads back, every number to its last digit."""
-    return _text(tree, coordinate_names(dim))[0]
+    return _text(tree, (*coordinate_names(dim), *parameters), 2 * dim)[0]
 
 
-def _text(tree: Expression, names) -> tuple[str, int]:
+def _text(tree: Expression, names, width: int) -> tuple[str, int]:
     def inside(operand, least: int) -> str:
-        text, binds = _text(operand, names)
+        text, binds = _text(operand, names, width)
         return text if binds >= least else f"({text})"
 
     operation, operands = tree.operation, tree.operands
@@ -273,6 +295,8 @@ def _text(tree: Expression, names) -> tuple[str, int]:
         return text, _ATOM if operands[0] >= 0 and "e" not in text else _SUM
     if operation == "coordinate":
         return names[operands[0]], _ATOM
+    if operation == "parameter":
+        return names[width + operands[0]], _ATOM
     if operation == "power":
         exponent = repr(operands[1]).removesuffix(".0")
         return f"{inside(operands[0], _ATOM)}**{exponent}", _POWER
@@ -287,11 +311,11 @@ def _text(tree: Expression, names) -> tuple[str, int]:
         return f"{inside(operands[0], _PRODUCT)}*{inside(operands[1], _PRODUCT)}", _PRODUCT
     if operation == "/":
         return f"{inside(operands[0], _PRODUCT)}/{inside(operands[1], _POWER)}", _PRODUCT
-    return f"{operation}({_text(operands[0], names)[0]})", _ATOM
+    return f"{operation}({_text(operands[0], names, width)[0]})", _ATOM
 
 
 def depends_on(tree: Expression) -> set[int]:
-    """Indices of the coordinates that the expression holds."""
+    """Indices of the coordinates that the expression holds; parameters are none."""
     if tree.operation == "coordinate":
         return {tree.operands[0]}
     return set().union(*(depends_on(o) for o in tree.operands if isinstance(o, Expression)))
@@ -300,7 +324,7 @@ def depends_on(tree: Expression) -> set[int]:
 def count_operations(tree: Expression) -> int:
     """Floating-point operations of its value, a function counted as ten."""
     inner = sum(count_operations(o) for o in tree.operands if isinstance(o, Expression))
-    cost = {"number": 0, "coordinate": 0, "+": 1, "*": 1, "/": 4, "power": 4}
+    cost = {"number": 0, "coordinate": 0, "parameter": 0, "+": 1, "*": 1, "/": 4, "power": 4}
     return inner + cost.get(tree.operation, 10)
 
 
@@ -317,9 +341,13 @@ class Jet:
     curvature: dict[tuple[int, int], Any]
 
 
-def jets(trees: Sequence[Expression], w, order: int) -> list[Jet]:
-    """The expressions at states w (..., 2d), with derivatives up to ``order`` (0, 1, 2)."""
+def jets(trees: Sequence[Expression], w, order: int, args=None) -> list[Jet]:
+    """The expressions at states w (..., 2d), with derivatives in w up to ``order`` (0, 1, 2). args:
+    the parameters' values (k,) or, for lanes of w, (..., k)."""
     known: dict[Any, Any] = {}
+    if args is not None:
+        for i in range(args.shape[-1]):
+            known[parameter(i)] = Jet(as_row(args[..., i], w[..., 0]), {}, {})
     return [_jet(tree, w, order, known) for tree in trees]
 
 
@@ -336,7 +364,11 @@ def _jet_of(tree: Expression, w, order, known) -> Jet:
         return Jet(operands[0], {}, {})
     if operation == "coordinate":
         return Jet(w[..., operands[0]], {operands[0]: 1.0} if order else {}, {})
+    if operation == "parameter":
+        raise ValueError("expected the values of the parameters (args), got none")
     first = _jet(operands[0], w, order, known)
+    if _CHEBYSHEV.fullmatch(operation):
+        return _chebyshev(first, operands[0], int(operation[1:]), order, known)
     if operation == "power":
         return _composed(first, order, *_power_derivatives(xp, first.value, operands[1], order))
     if operation in _CIRCULAR:
@@ -362,6 +394,21 @@ def _jet_of(tree: Expression, w, order, known) -> Jet:
         curvature = -2 * slope * inverse if order > 1 else 0.0
         second = _composed(second, order, inverse, slope, curvature)
     return _multiplied(first, second, order)
+
+
+def _chebyshev(x: Jet, part: Expression, n: int, order: int, known) -> Jet:
+    """T_n(x) of the jet x of an expression: T_n = 2x T_n−1 − T_n−2."""
+    if n < 2:
+        return x if n else Jet(1.0, {}, {})
+    if ("T", part, n) not in known:
+        last, before = (_chebyshev(x, part, k, order, known) for k in (n - 1, n - 2))
+        twice = _multiplied(Jet(2.0, {}, {}), _multiplied(x, last, order), order)
+        less = _multiplied(Jet(-1.0, {}, {}), before, order)
+        known["T", part, n] = Jet(
+            twice.value + less.value,
+            _added(twice.slope, less.slope), _added(twice.curvature, less.curvature),
+        )  # fmt: skip
+    return known["T", part, n]
 
 
 def _circle(part: Expression, n: int, w, order: int, known):

@@ -38,9 +38,10 @@ _MOST_WRITTEN_OUT = 400
 
 class _Plan:
     """How the products of powers (N, k) and their derivatives are computed: from a set of products
-    that is closed under division, each one earlier product times a variable."""
+    that is closed under division, each one earlier product times a variable. still: the variables
+    that no coordinate changes, of which nothing is a derivative."""
 
-    def __init__(self, powers: np.ndarray):
+    def __init__(self, powers: np.ndarray, still: tuple[int, ...] = ()):
         self.powers = powers
         variables = powers.shape[1]
         closed: set[tuple[int, ...]] = {(0,) * variables}
@@ -65,7 +66,7 @@ class _Plan:
         slopes: list[list] = [[] for _ in range(variables)]
         curvatures: dict[tuple[int, int], list] = {}
         for j, row in enumerate(terms):
-            used = [k for k in range(variables) if row[k]]
+            used = [k for k in range(variables) if row[k] and k not in still]
             for n, k in enumerate(used):
                 less = _less(row, k)
                 slopes[k].append((j, place[less], row[k]))
@@ -116,23 +117,26 @@ def _columns(entries: list) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @cache
-def _plan_of(powers: tuple[tuple[int, ...], ...]) -> _Plan:
-    return _Plan(np.array(powers, dtype=int))
+def _plan_of(powers: tuple[tuple[int, ...], ...], still: tuple[int, ...]) -> _Plan:
+    return _Plan(np.array(powers, dtype=int), still)
 
 
 @partial(
-    jax.tree_util.register_dataclass, data_fields=(), meta_fields=("dim", "variables", "powers")
-)  # fmt: skip
+    jax.tree_util.register_dataclass,
+    data_fields=(),
+    meta_fields=("dim", "variables", "powers", "parameters"),
+)
 @dataclasses.dataclass(frozen=True)
 class Terms:
     """Products of powers of ``variables``, expressions as text, one row of ``powers`` (N, k) each.
 
-    params: the coefficients (N,).
+    params: the coefficients (N,). parameters: the names of the args, which variables may hold.
     """
 
     dim: int
     variables: tuple[str, ...]
     powers: tuple[tuple[int, ...], ...]
+    parameters: tuple[str, ...] = ()
 
     name = "terms"
 
@@ -146,7 +150,7 @@ class Terms:
 
     @cached_property
     def _trees(self) -> list[Expression]:
-        return [parse(text, self.dim) for text in self.variables]
+        return [parse(text, self.dim, self.parameters) for text in self.variables]
 
     @property
     def quadratic(self) -> bool:
@@ -156,7 +160,11 @@ class Terms:
 
     @property
     def _plan(self) -> _Plan:
-        return _plan_of(self.powers)
+        return _plan_of(self.powers, self._still)
+
+    @cached_property
+    def _still(self) -> tuple[int, ...]:
+        return tuple(k for k, tree in enumerate(self._trees) if not depends_on(tree))
 
     @property
     def term_names(self) -> tuple[str, ...]:
@@ -193,6 +201,7 @@ class Terms:
             self.dim,
             tuple(self.variables[k] for k in used),
             tuple(tuple(row) for row in kept[:, used].tolist()),
+            self.parameters,
         )
 
     def unflatten(self, coefficients):
@@ -204,7 +213,7 @@ class Terms:
 
     def value(self, params, w, args=None):
         """f, shape (...): params (N,), w (..., 2d)."""
-        variables = self._variables(w, 0)
+        variables = self._variables(w, 0, args)
         products = self._products(variables, w)
         places = self._plan.places
         columns = [(np.arange(len(places)), places, np.ones(len(places)))]
@@ -212,7 +221,7 @@ class Terms:
 
     def gradient(self, params, w, args=None):
         """∂f/∂w (..., 2d)."""
-        variables = self._variables(w, 1)
+        variables = self._variables(w, 1, args)
         products = self._products(variables, w)
         slopes = self._plan.combined(params, products, self._plan.slopes)
         return self._stacked(_pulled_back(variables, slopes), w)
@@ -220,7 +229,7 @@ class Terms:
     def gradient_and_hessian(self, params, w, args=None):
         """∂f/∂w (..., 2d) and ∂²f/∂w² (..., 2d, 2d)."""
         xp, width = namespace(w), w.shape[-1]
-        variables, plan = self._variables(w, 2), self._plan
+        variables, plan = self._variables(w, 2, args), self._plan
         products = self._products(variables, w)
         pairs = list(plan.curvatures)
         found = plan.combined(
@@ -253,7 +262,7 @@ class Terms:
 
     def term_gradients(self, w, args=None):
         """∇ of every term at w (..., 2d): (..., 2d, N). NumPy."""
-        variables, plan = self._variables(w, 1), self._plan
+        variables, plan = self._variables(w, 1, args), self._plan
         products = np.stack(self._products(variables, w), axis=-1)
         out = np.zeros((*w.shape, self.num_parameters))
         for variable, (j, i, factor) in zip(variables, plan.slopes, strict=True):
@@ -263,8 +272,8 @@ class Terms:
                 out[..., index, j] += along * (slope if unit else slope[..., None])
         return out
 
-    def _variables(self, w, order: int) -> list:
-        return jets(self._trees, w, order)
+    def _variables(self, w, order: int, args) -> list:
+        return jets(self._trees, w, order, args)
 
     def _products(self, variables, w) -> list:
         xp, zero = namespace(w), namespace(w).zeros_like(w[..., 0])
@@ -302,22 +311,26 @@ def _superscript(exponent: int) -> str:
 # Which terms a family has.
 
 
-def given_terms(dim: int, given: Sequence[str | Callable]) -> Terms:
+def given_terms(
+    dim: int, given: Sequence[str | Callable], parameters: tuple[str, ...] = ()
+) -> Terms:
     """A user's own terms as they are: text, or functions of z (2d,), each of which may be several.
+    parameters: names that a text may use beside those of the coordinates.
 
     Raises InputError for a term that is not understood, or that does not depend on the state.
     """
     texts: list[str] = []
     for term in given:
-        trees = [parse(term, dim)] if isinstance(term, str) else traced(term, dim)
+        trees = [parse(term, dim, parameters)] if isinstance(term, str) else traced(term, dim)
         for tree in trees:
-            text = to_text(tree, dim)
+            text = to_text(tree, dim, parameters)
             if not depends_on(tree):
                 raise InputError(f"the term '{text}' is the same at every state: leave it out")
             texts.append(text)
     unique = tuple(dict.fromkeys(texts))
     count = range(len(unique))
-    return Terms(dim, unique, tuple(tuple(int(k == j) for k in count) for j in count))
+    rows = tuple(tuple(int(k == j) for k in count) for j in count)
+    return Terms(dim, unique, rows, parameters)
 
 
 def polynomial_terms(
@@ -347,7 +360,7 @@ def polynomial_terms(
 def joined(first: Terms, second: Terms) -> Terms:
     """The terms of both, those that are written alike once."""
     variables, *rows = _over_both(first, second)
-    return Terms(first.dim, variables, tuple(dict.fromkeys(rows[0] + rows[1])))
+    return Terms(first.dim, variables, tuple(dict.fromkeys(rows[0] + rows[1])), first.parameters)
 
 
 def multiplied(first: Terms, second: Terms) -> Terms:
@@ -356,7 +369,7 @@ def multiplied(first: Terms, second: Terms) -> Terms:
     rows = dict.fromkeys(
         tuple(a + b for a, b in zip(one, other, strict=True)) for one in left for other in right
     )
-    return Terms(first.dim, variables, tuple(rows))
+    return Terms(first.dim, variables, tuple(rows), first.parameters)
 
 
 def _over_both(first: Terms, second: Terms):

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from gfnn_jax.flows.collocation import Steps, images
+from gfnn_jax.flows.collocation import Steps, images, of_lanes
 from gfnn_jax.phase_space import apply_j, symplectic_form
 
 
@@ -96,10 +96,12 @@ class Factor(NamedTuple):
 # Where a fit starts.
 
 
-def null_terms(family, z, tolerance: float = OPTIONS.null) -> tuple[list[int], list[int]]:
-    """(kept, null): the terms that states z (N, 2d) tell apart, and those whose gradient is a
-    combination of those before them."""
-    gradients = family.term_gradients(z)
+def null_terms(
+    family, z, tolerance: float = OPTIONS.null, *, args=None
+) -> tuple[list[int], list[int]]:
+    """(kept, null): the terms that states z (N, 2d) with these args (N, k) tell apart, and those
+    whose gradient is a combination of those before them."""
+    gradients = family.term_gradients(z, args)
     columns = gradients.reshape(-1, gradients.shape[-1])
     size = np.linalg.norm(columns, axis=0)
     scaled = columns / np.where(size > 0, size, 1.0)
@@ -116,9 +118,10 @@ def null_terms(family, z, tolerance: float = OPTIONS.null) -> tuple[list[int], l
     return kept, sorted(set(range(scaled.shape[1])) - set(kept))
 
 
-def midpoint_start(family, z0, z1, dt: float, scale) -> np.ndarray:
-    """The linear problem (z₁ − z₀)/h = J∇H(½(z₀ + z₁)): exact to O(h²)."""
-    return fitted_gradients(family, 0.5 * (z0 + z1), -apply_j(z1 - z0) / dt, scale)
+def midpoint_start(family, z0, z1, dt, scale, args=None) -> np.ndarray:
+    """The linear problem (z₁ − z₀)/h = J∇H(½(z₀ + z₁)): exact to O(h²). dt: a number or (N,)."""
+    h = dt[:, None] if np.ndim(dt) else dt
+    return fitted_gradients(family, 0.5 * (z0 + z1), -apply_j(z1 - z0) / h, scale, args)
 
 
 def log_start(family, z0, z1, dt: float, scale) -> np.ndarray | None:
@@ -142,12 +145,12 @@ def log_start(family, z0, z1, dt: float, scale) -> np.ndarray | None:
     return fitted_gradients(family, z0, gradient, scale)
 
 
-def fitted_gradients(family, z, gradient, scale) -> np.ndarray:
-    """Coefficients whose ∇H is closest to gradients (N, 2d) at states z, each in the unit of what
-    it changes."""
+def fitted_gradients(family, z, gradient, scale, args=None) -> np.ndarray:
+    """Coefficients whose ∇H is closest to gradients (N, 2d) at states z with these args, each in
+    the unit of what it changes."""
     dim = z.shape[1] // 2
     weight = 1.0 / np.roll(scale, dim)
-    terms = family.term_gradients(z) * weight[:, None]
+    terms = family.term_gradients(z, args) * weight[:, None]
     rows = terms.reshape(-1, terms.shape[-1])
     size = np.linalg.norm(rows, axis=0)
     size = np.where(size > 0, size, 1.0)
@@ -158,14 +161,15 @@ def fitted_gradients(family, z, gradient, scale) -> np.ndarray:
 MOST_SUBSTEPS = 64
 
 
-def substeps_for(family, coefficients, z, dt: float, reach: float = OPTIONS.reach) -> int:
-    """Substeps so that h‖H''‖ is within reach for nearly all of the states z (N, 2d)."""
-    _, hessian = family.gradient_and_hessian(coefficients, z)
+def substeps_for(family, coefficients, z, dt, reach: float = OPTIONS.reach, *, args=None) -> int:
+    """Substeps so that h‖H''‖ is within reach for nearly all of the states z (N, 2d), at the
+    longest dt."""
+    _, hessian = family.gradient_and_hessian(coefficients, z, args)
     finite = np.isfinite(hessian).all(axis=(1, 2))
     if not finite.any():
         return 1
     rates = frequencies(hessian[finite])
-    return int(np.clip(np.ceil(dt * np.quantile(rates, 0.95) / reach), 1, MOST_SUBSTEPS))
+    return int(np.clip(np.ceil(np.max(dt) * np.quantile(rates, 0.95) / reach), 1, MOST_SUBSTEPS))
 
 
 def frequencies(hessian) -> np.ndarray:
@@ -180,24 +184,34 @@ def frequencies(hessian) -> np.ndarray:
 class Problem:
     """Pairs z0 -> z1 (N, 2d) a time dt apart, and how the flow between them is computed.
 
+    dt: a number, or one of each pair (N,). args: of each pair (N, k), or None.
     scale: (2d,) sizes of the coordinates, by which residuals are divided.
     check: called between blocks; it may raise to stop.
     """
 
     def __init__(
-        self, z0, z1, dt: float, scale, *, options: Options = OPTIONS,
+        self, z0, z1, dt, scale, *, args=None, options: Options = OPTIONS,
         check: Callable[[], Any] = lambda: None,
     ):  # fmt: skip
-        self.z0, self.z1, self.dt, self.scale = z0, z1, dt, scale
+        self.z0, self.z1, self.dt, self.scale, self.args = z0, z1, dt, scale, args
         self.options, self.check = options, check
 
-    def _images(self, family, coefficients, z, steps: Steps, **options):
-        return images(family, coefficients, z, self.dt, steps, on_substep=self.check, **options)
+    def given(self, rows) -> tuple[Any, Any]:
+        """(dt, args) of these rows."""
+        return of_lanes(self.dt, rows), of_lanes(self.args, rows)
+
+    def images(self, family, coefficients, rows, steps: Steps, **options):
+        """`flows.collocation.images` of the states z0 of these rows, each after its own dt."""
+        dt, args = self.given(rows)
+        return images(
+            family, coefficients, self.z0[rows], dt, steps, args=args, on_substep=self.check,
+            **options,
+        )  # fmt: skip
 
     def residuals(self, family, coefficients, steps: Steps, rows) -> np.ndarray:
         """(Φ(z₀) − z₁) ÷ scale of these rows (n, 2d); not finite where the flow fails."""
         parts = [
-            (self._images(family, coefficients, self.z0[b], steps).states - self.z1[b]) / self.scale
+            (self.images(family, coefficients, b, steps).states - self.z1[b]) / self.scale
             for b in self._blocks(rows, 0)
         ]
         return np.concatenate(parts) if parts else np.zeros((0, self.z0.shape[1]))
@@ -209,7 +223,7 @@ class Problem:
         for block in self._blocks(rows, count * steps.stages):
             if failed:
                 break
-            found = self._images(family, coefficients, self.z0[block], steps, derivatives=True)
+            found = self.images(family, coefficients, block, steps, derivatives=True)
             residual = (found.states - self.z1[block]) / self.scale
             slope = found.by_coefficient / self.scale[:, None]
             part = np.concatenate([slope, residual[..., None]], axis=-1).reshape(-1, count + 1)
@@ -297,8 +311,13 @@ class Problem:
         return float(np.median(np.where(np.isfinite(size), size, np.inf)))
 
     def _coarse(self, family, c, rows) -> Steps:
-        substeps = substeps_for(family, c, self.z0[rows], self.dt, self.options.reach)
+        substeps = self.substeps_for(family, c, rows)
         return Steps(self.options.coarse_stages, substeps, newton=False)
+
+    def substeps_for(self, family, c, rows) -> int:
+        """As the function of this name, of these rows."""
+        dt, args = self.given(rows)
+        return substeps_for(family, c, self.z0[rows], dt, self.options.reach, args=args)
 
     def fine_steps(
         self, family, c, rows, tolerances: Sequence[float | None] = (None,)
@@ -306,13 +325,12 @@ class Problem:
         """For each tolerance the cheapest steps whose own error, ÷ scale, is within it at nearly
         all of these rows; None: at roundoff."""
         sample = rows[:: -(-len(rows) // self.options.judged)]
-        z = self.z0[sample]
-        substeps = substeps_for(family, c, z, self.dt, self.options.reach)
-        reference = self._images(family, c, z, Steps(12, 4 * substeps)).states
+        substeps = self.substeps_for(family, c, sample)
+        reference = self.images(family, c, sample, Steps(12, 4 * substeps)).states
 
         @functools.cache
         def error(steps: Steps) -> float:
-            states = self._images(family, c, z, steps).states
+            states = self.images(family, c, sample, steps).states
             off = np.abs((states - reference) / self.scale).max(axis=1)
             off = np.sort(np.where(np.isfinite(off), off, np.inf))
             return float(off[int(0.95 * (len(off) - 1))])

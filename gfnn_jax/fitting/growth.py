@@ -17,7 +17,7 @@ import numpy as np
 from gfnn_jax.families.modes import Mode, Modes
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import Problem, midpoint_start, null_terms, significant
-from gfnn_jax.flows.collocation import Steps, images
+from gfnn_jax.flows.collocation import Steps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +83,7 @@ def grow(
     if not modes:
         return
     start = basis.terms(modes)
-    c = midpoint_start(start, z0, z1, problem.dt, problem.scale)
+    c = midpoint_start(start, z0, z1, problem.given(enough)[0], problem.scale)
     present = dict(zip(modes, c.tolist(), strict=True))
     best, before, idle, ended = Grown(start, c, np.inf), present, 0, ""
     pace: list[tuple[int, float]] = []
@@ -172,10 +172,9 @@ class _Look:
     def _images(self, along: Terms):
         p = self._problem
         p.check()
-        return images(
-            self.family, self.coefficients, p.z0[self._rows], p.dt, self._steps, along=along,
-            derivatives=True, on_substep=p.check,
-        )  # fmt: skip
+        return p.images(
+            self.family, self.coefficients, self._rows, self._steps, along=along, derivatives=True
+        )
 
     def _columns(self, by_coefficient):
         slope = by_coefficient[self._good] / self._problem.scale[:, None]

@@ -44,17 +44,24 @@ class Images(NamedTuple):
     by_coefficient: Any = None
 
 
+def of_lanes(value, lanes):
+    """Of these lanes, what differs between lanes; a number, or None, is that of all of them."""
+    return value[lanes] if np.ndim(value) else value
+
+
 def images(
-    family, params, z, dt: float, steps: Steps, *, args=None, derivatives: bool = False,
+    family, params, z, dt, steps: Steps, *, args=None, derivatives: bool = False,
     along: Any = None, on_substep: Callable[[], Any] = lambda: None,
 ):  # fmt: skip
     """Images of the states z (B, 2d) after dt, in NumPy. Lanes that fail are not finite.
 
+    dt: a number, or one of each lane (B,). args: of each lane, (B, k), or None.
     derivatives: the exact ones of the collocation, in the state and in the coefficients of a
     linear family. along: another one, in whose coefficients they are instead, these 0.
     on_substep: called before each substep; it may raise to stop.
     """
     rule, h = gauss(steps.stages), dt / steps.substeps
+    h = h[:, None] if np.ndim(h) else h  # (B, 1) beside coordinates
     width = z.shape[1]
     solved = np.ones(len(z), bool)
     by_state: Any = np.broadcast_to(np.eye(width), (len(z), width, width))
@@ -79,10 +86,11 @@ def _summed(matrix, slopes):
     return (matrix @ slopes.reshape(len(slopes), -1)).reshape(-1, *slopes.shape[1:])
 
 
-def solve_stages(family, params, z, h: float, rule, args=None, *, newton: bool = True):
+def solve_stages(family, params, z, h, rule, args=None, *, newton: bool = True):
     """The slopes K (s, B, 2d) at states z (B, 2d), and which lanes were solved to roundoff (B,).
 
-    By fixed point; with ``newton``, lanes in which that hardly contracts by Newton's method.
+    h: a number or (B, 1). By fixed point; with ``newton``, lanes in which that hardly contracts by
+    Newton's method.
     """
     size = np.abs(z) + np.abs(z).mean(axis=1, keepdims=True)  # of each coordinate's lane
     slopes = np.repeat(apply_j(family.gradient(params, z, args))[None], len(rule.weights), axis=0)
@@ -90,11 +98,12 @@ def solve_stages(family, params, z, h: float, rule, args=None, *, newton: bool =
     open_, slow = np.ones(len(z), bool), np.zeros(len(z), bool)
     for n in range(_MOST):
         lanes = np.flatnonzero(open_)
-        inside = z[lanes] + h * _summed(rule.matrix, slopes[:, lanes])
-        new = apply_j(family.gradient(params, inside, args))
-        moved = abs(h) * np.abs(new - slopes[:, lanes])
+        step, given = of_lanes(h, lanes), of_lanes(args, lanes)
+        inside = z[lanes] + step * _summed(rule.matrix, slopes[:, lanes])
+        new = apply_j(family.gradient(params, inside, given))
+        moved = abs(step) * np.abs(new - slopes[:, lanes])
         slopes[:, lanes] = new
-        relative = np.max(moved / (size[lanes] + abs(h) * np.abs(new)), axis=(0, 2))
+        relative = np.max(moved / (size[lanes] + abs(step) * np.abs(new)), axis=(0, 2))
         ratio = relative / change[lanes]
         closed = (relative <= _FLOOR) | ((relative <= _SETTLED) & (ratio > 0.5))
         given_up = ~closed & ~(ratio < _SLOW) & (n > _FIRST)
@@ -106,7 +115,9 @@ def solve_stages(family, params, z, h: float, rule, args=None, *, newton: bool =
     left = np.flatnonzero(open_ | slow)
     solved = ~(open_ | slow)
     if left.size and newton:
-        slopes[:, left], solved[left] = _newton(family, params, z[left], h, rule, args)
+        slopes[:, left], solved[left] = _newton(
+            family, params, z[left], of_lanes(h, left), rule, of_lanes(args, left)
+        )
     return slopes, solved
 
 
@@ -127,7 +138,7 @@ def _newton(family, params, z, h, rule, args):
     fresh = np.ones(lanes, bool)
     for _ in range(3 * _MOST_NEWTON):
         if fresh.any():
-            matrix = stage_matrix(hessian[:, fresh], h, rule)
+            matrix = stage_matrix(hessian[:, fresh], of_lanes(h, fresh), rule)
             flat = error[:, fresh].transpose(1, 0, 2).reshape(fresh.sum(), -1)
             step[:, fresh] = (
                 solve(matrix, flat[..., None])[..., 0].reshape(-1, count, width).transpose(1, 0, 2)
@@ -155,11 +166,13 @@ def _largest(slopes):
     return np.where(np.isfinite(largest), largest, np.inf)
 
 
-def stage_matrix(hessian, h: float, rule):
+def stage_matrix(hessian, h, rule):
     """I − h A ⊗ JH'' (B, s·2d, s·2d) from the stages' Hessians (s, B, 2d, 2d): what a change of the
-    slopes K is multiplied by in their equation."""
+    slopes K is multiplied by in their equation. h: a number or (B, 1)."""
     count, lanes, width = hessian.shape[:3]
     turned = symplectic_form(width // 2) @ hessian
+    if np.ndim(h):
+        turned, h = h[None, :, :, None] * turned, 1.0
     coupled = np.einsum("ij,ibkl->bikjl", -h * rule.matrix, turned, optimize=False)
     coupled = coupled.reshape(lanes, count * width, count * width)
     coupled[:, np.arange(count * width), np.arange(count * width)] += 1.0
@@ -178,7 +191,7 @@ def solve(matrix, rhs):
 
 
 def truncation(
-    family, params, z, dt: float, steps: Steps, *, args=None,
+    family, params, z, dt, steps: Steps, *, args=None,
     on_substep: Callable[[], Any] = lambda: None,
 ) -> np.ndarray:  # fmt: skip
     """How far images of the states z (B, 2d) are from those of twice the substeps, (B, 2d): not
@@ -201,8 +214,9 @@ def _derivatives(family, params, inside, h, rule, args, along):
     form = symplectic_form(width // 2)
     _, hessian = family.gradient_and_hessian(params, inside, args)
     transposed = stage_matrix(hessian, h, rule).swapaxes(1, 2)
-    weights = np.kron(h * rule.weights[:, None], np.eye(width))
-    adjoint = solve(transposed, np.broadcast_to(weights, (lanes, *weights.shape)))
+    weights = np.kron(rule.weights[:, None], np.eye(width))
+    weights = h[:, :, None] * weights if np.ndim(h) else h * weights
+    adjoint = solve(transposed, np.broadcast_to(weights, (lanes, *weights.shape[-2:])))
     rows = (
         adjoint.reshape(lanes, count, width, width).transpose(0, 3, 1, 2) @ form
     )  # (B, 2d, s, 2d)

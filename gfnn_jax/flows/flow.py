@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from gfnn_jax.arrays import as_row, matmul
 from gfnn_jax.families import as_family
@@ -34,30 +35,35 @@ _MOST, _MOST_NEWTON = 100, 40
 # is roundoff. With 2 eps in place of the first, what the iteration leaves is of one sign: the
 # energy of Hénon–Heiles at h = 0.5 then drifts by 2.4e-18 of itself per step instead of 1e-18.
 _FLOOR_EPS, _SETTLED = 0.05, 0.75
+_WHOLE = 1e-12  # of a number of substeps: what rounding adds to a whole one
 
 
 @dataclasses.dataclass(frozen=True)
 class StageEquation:
     """The stages' equation as Newton's method wants it: x is h K, (B, s·2d).
 
-    shared = (family, params, h, scale); lanes = (z, args). Residuals are in units of ``scale``.
+    shared = (family, params, h, scale); lanes = (z, args), or (z, args, h (B, 1)) where every lane
+    has its own h. Residuals are in units of ``scale``.
     """
 
     stages: int
 
     def evaluate(self, shared, lanes, x) -> Evaluation:
         """The residual; aux is nothing."""
-        (family, params, h, scale), (z, args) = shared, lanes
+        (family, params, h, scale), (z, args, *own) = shared, lanes
+        h = own[0] if own else h
         slopes, inside = self._inside(z, x)
-        field = h * apply_j(family.gradient(params, inside, args))
+        field = _beside(h, inside) * apply_j(family.gradient(params, inside, args))
         return self._evaluation(z, slopes, field, scale)
 
     def linearise(self, shared, lanes, x) -> tuple[Evaluation, Any]:
         """The residual and its Jacobian ∂r/∂x (B, s·2d, s·2d)."""
-        (family, params, h, scale), (z, args) = shared, lanes
+        (family, params, h, scale), (z, args, *own) = shared, lanes
+        h = own[0] if own else h
         slopes, inside = self._inside(z, x)
         gradient, hessian = family.gradient_and_hessian(params, inside, args)
-        evaluation = self._evaluation(z, slopes, h * apply_j(gradient), scale)
+        field = _beside(h, inside) * apply_j(gradient)
+        evaluation = self._evaluation(z, slopes, field, scale)
         unit = jnp.tile(scale, self.stages)
         return evaluation, stage_matrix(hessian, h, self.stages) / unit[None, :, None]
 
@@ -83,7 +89,7 @@ class Flow:
     """The flow of H(params, ·) over dt. A piece: see `maps.symplectic_map`.
 
     family:   H, a family or a plain ``H(params, z)``; what it holds of the data are leaves.
-    dt:       the time of a step, of either sign; a number or a leaf.
+    dt:       the time of a step, of either sign; a number or a leaf, one for all lanes or (B,).
     scale:    (2d,) sizes of the coordinates, for the roundoff floor.
     stages:   s of each substep; the order is 2s.
     substeps: of dt, equal.
@@ -107,11 +113,21 @@ class Flow:
         """H at states z (..., 2d), NumPy or JAX."""
         return self.family.value(self.params, z, args)
 
-    def image(self, z):
-        """Images of the states z (N, 2d), in NumPy: NaN where a stage has no solution."""
+    def image(self, z, args=None):
+        """Images of the states z (N, 2d), in NumPy: NaN where a stage has no solution. args: (N, k)
+        or None."""
         steps = Steps(self.stages, self.substeps)
         dt = float(np.asarray(self.dt))
-        return images(self.family, np.asarray(self.params), z, dt, steps).states
+        return images(self.family, np.asarray(self.params), z, dt, steps, args=args).states
+
+    def over(self, dt) -> Flow:
+        """The flow over another dt, a number or (B,), in substeps that are no longer than those of
+        this one: its own error per unit of time stays what it was found to be."""
+        substeps = self.substeps
+        if not any(isinstance(t, Tracer) for t in (dt, self.dt)):
+            parts = np.max(np.abs(np.asarray(dt))) / np.max(np.abs(np.asarray(self.dt)))
+            substeps = max(1, int(np.ceil(self.substeps * parts * (1 - _WHOLE))))
+        return dataclasses.replace(self, dt=dt, substeps=substeps)
 
     def step(self, z, args=None, *, unrolled: bool | int = False):
         """(Z, Info) of the states z (B, 2d), by JAX."""
@@ -142,7 +158,8 @@ class Flow:
             z, total = both
             slopes, info = self._slopes(z, args, False)
             inside = z[None] + _summed(gauss(self.stages).matrix, slopes)
-            done = self.dt / self.substeps * self.family.value(self.params, inside, args)
+            energy = self.family.value(self.params, inside, args)
+            done = _beside(self.dt / self.substeps, energy) * energy
             total = total + _summed(weights, area(inside - origin[None], slopes) - done)[0]
             return (z + _summed(weights, slopes)[0], total), info
 
@@ -165,18 +182,23 @@ class Flow:
 
     def _slopes(self, z, args, unrolled: bool | int):
         """(h K (s, B, 2d), Info) of one substep."""
-        shared = (self.family, self.params, self.dt / self.substeps, self.scale)
+        h = self.dt / self.substeps
+        h = h[:, None] if jnp.ndim(h) else h
+        shared = (self.family, self.params, h, self.scale)
         if self.newton:
             equation = StageEquation(self.stages)
-            first = shared[2] * apply_j(self.family.gradient(self.params, z, args))
+            if args is not None:  # open lanes are taken out of the batch, with their own
+                args = jnp.broadcast_to(args, (z.shape[0], args.shape[-1]))
+            lanes = (z, args, h) if jnp.ndim(h) else (z, args)
+            first = h * apply_j(self.family.gradient(self.params, z, args))
             guess = jnp.tile(first, self.stages)
             if unrolled:
                 x, _, info = newton.iterate(
-                    equation, shared, (z, args), guess, most=_MOST_NEWTON, gather=False
+                    equation, shared, lanes, guess, most=_MOST_NEWTON, gather=False
                 )
             else:
                 guess = jax.lax.stop_gradient(guess)
-                x, _, info = newton.root(equation, shared, (z, args), guess, _MOST_NEWTON)
+                x, _, info = newton.root(equation, shared, lanes, guess, _MOST_NEWTON)
             return jnp.swapaxes(x.reshape(len(z), self.stages, -1), 0, 1), info
         solve = _fixed_point if unrolled else _stages
         return solve(self.stages, shared, z, args)
@@ -197,7 +219,8 @@ def _fixed_point(stages: int, shared, z, args):
 
     def improve(carry):
         slopes, change, open_, iterations = carry
-        new = h * apply_j(family.gradient(params, z[None] + _summed(matrix, slopes), args))
+        inside = z[None] + _summed(matrix, slopes)
+        new = _beside(h, inside) * apply_j(family.gradient(params, inside, args))
         moved = jax.lax.stop_gradient(jnp.max(jnp.abs(new - slopes) / size, axis=(0, 2)))
         settled = (moved <= eps**_SETTLED) & (moved > 0.5 * change)
         goes_on = ~((moved <= _FLOOR_EPS * eps) | settled) & jnp.isfinite(moved)
@@ -233,7 +256,7 @@ def _stages_jvp(stages, primals, tangents):
     def field(shared, z, args):
         family, params, h, _ = shared
         inside = z[None] + _summed(gauss(stages).matrix, slopes)
-        return h * apply_j(family.gradient(params, inside, args))
+        return _beside(h, inside) * apply_j(family.gradient(params, inside, args))
 
     _, field_dot = jax.jvp(field, primals, tangents)
     inside = z[None] + _summed(gauss(stages).matrix, slopes)
@@ -243,6 +266,11 @@ def _stages_jvp(stages, primals, tangents):
     integer_dot: Any = np.zeros(info.status.shape, jax.dtypes.float0)
     info_dot = Info(integer_dot, integer_dot, jnp.zeros_like(info.residual))
     return (slopes, info), (slopes_dot, info_dot)
+
+
+def _beside(h, like):
+    """h, a number or one of each lane, as it multiplies an array of stages."""
+    return as_row(h, like) if jnp.ndim(h) else h
 
 
 def _summed(matrix, slopes):
@@ -257,7 +285,8 @@ def _flat(slopes):
 
 
 def stage_matrix(hessian, h, stages: int):
-    """I − h A ⊗ JH'' (B, s·2d, s·2d), from the stages' Hessians (s, B, 2d, 2d)."""
+    """I − h A ⊗ JH'' (B, s·2d, s·2d), from the stages' Hessians (s, B, 2d, 2d); h: a number or
+    (B, 1)."""
     _, lanes, width, _ = hessian.shape
     form = jnp.asarray(symplectic_form(width // 2), hessian.dtype)
     matrix = jnp.asarray(gauss(stages).matrix, hessian.dtype)
@@ -265,4 +294,5 @@ def stage_matrix(hessian, h, stages: int):
     turned = jnp.einsum("ac,ilcb->liab", form, hessian, precision="highest")
     coupled = jnp.einsum("ij,liab->liajb", matrix, turned, precision="highest")
     size = stages * width
+    h = h[..., None] if jnp.ndim(h) else h
     return jnp.eye(size, dtype=hessian.dtype)[None] - h * coupled.reshape(lanes, size, size)

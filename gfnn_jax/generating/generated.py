@@ -96,6 +96,8 @@ class Generated:
         if self.predictor is not None:
             guess = guess + self.predictor.forward(z)
         shared = (self.family, self.params, self.dt, self.scale)
+        if args is not None:  # open lanes are taken out of the batch, with their own
+            args = jnp.broadcast_to(args, (z.shape[0], args.shape[-1]))
         equation, lanes = ImplicitStep(self.chart), (z, known, args)
         if unrolled:
             most = MOST_UPDATES if unrolled is True else unrolled

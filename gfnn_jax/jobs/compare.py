@@ -61,6 +61,8 @@ def compare(
     has them all.
     """
     scene = scene_named(name)
+    if scene.parameters:
+        raise InputError(f"the scene {name} has parameters, which the other methods do not take")
     cap = (QUICK_CAP if quick else CAP) if cap is None else cap
     chosen = chosen_methods(methods, scene)
     job = {

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from gfnn_jax.data.files import iterate_pairs, read_sample, read_trajectories
 from gfnn_jax.data.summary import summary
 from gfnn_jax.evaluate import report
@@ -54,7 +56,8 @@ def fit(
         "learn": learn, "terms": list(terms), "base": base, "family": family, "seed": seed,
     }  # fmt: skip
     job = {
-        "command": "fit", "data": trajectories.digest, "dt": trajectories.dt, "scene": scene_name,
+        "command": "fit", "data": trajectories.digest,
+        "dt": None if np.ndim(trajectories.dt) else trajectories.dt, "scene": scene_name,
         "angles": list(angles), **options,
     }  # fmt: skip
     if already_done(out, job, resume):
@@ -72,12 +75,15 @@ def fit(
                     fitted = refit(fitted, iterate_pairs(data, _FIT_CHUNK, dt=dt), held)
             progress.say("the report: compiling the derivative of a step")
             result = report.assemble(
-                fitted, scene=scene_name, dt=trajectories.dt, seed=seed, rollout=None,
+                fitted, scene=scene_name, dt=float(np.asarray(fitted.map.dt)), seed=seed,
+                rollout=None,
                 data={
                     "source": trajectories.source,
                     "digest": trajectories.digest,
                     "precision": trajectories.precision,
                     "units": trajectories.units,
+                    "dt": _range(trajectories.dt),
+                    "params": {n: _range(v) for n, v in (trajectories.args or {}).items()},
                 },
             )  # fmt: skip
         except KeyboardInterrupt as stop:
@@ -87,3 +93,8 @@ def fit(
         with atomic_folder(out) as folder:
             write(folder, folder, fitted, result, job)
     return Ran(fitted, out, result)
+
+
+def _range(values) -> list[float]:
+    """The smallest and the largest."""
+    return [float(np.min(values)), float(np.max(values))]

@@ -28,15 +28,16 @@ class Measured(NamedTuple):
     report: dict[str, Any]
 
 
-def measure(rollouts: Rollouts, scene: Scene, reference: np.ndarray) -> Measured:
-    """Errors against the reference (B, L, 2d), energy and growth."""
+def measure(rollouts: Rollouts, scene: Scene, reference: np.ndarray, params=None) -> Measured:
+    """Errors against the reference (B, L, 2d), energy and growth. params: (B, k), of a scene that
+    has parameters."""
     predicted, steps = rollouts.states, np.arange(reference.shape[1])
     error = metrics.position_error(predicted, reference, angles_of_z(scene))
     energy, drift = None, None
     conserved = scene.hamiltonian if scene.period is None else None
     hamiltonian = scene.invariants.get("energy", conserved)
     if hamiltonian is not None:
-        values = _along(hamiltonian, predicted)
+        values = _along(hamiltonian, predicted, params)
         energy = metrics.energy_error(np.asarray(values))
         drift = metrics.energy_drift(steps, energy)
     # Roundoff grows by other laws than the error of a model: no exponent where it is all there is.
@@ -52,9 +53,11 @@ def measure(rollouts: Rollouts, scene: Scene, reference: np.ndarray) -> Measured
 
 
 @partial(jax.jit, static_argnums=0)
-def _along(invariant, states):
+def _along(invariant, states, params):
     """Values (B, L) of an invariant along trajectories (B, L, 2d)."""
-    return jax.vmap(jax.vmap(invariant))(states)
+    if params is None:
+        return jax.vmap(jax.vmap(invariant))(states)
+    return jax.vmap(jax.vmap(lambda z, a: invariant(z, 0.0, a), (0, None)))(states, params)
 
 
 def angles_of_z(scene: Scene) -> tuple[int, ...]:

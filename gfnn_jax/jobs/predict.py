@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from gfnn_jax.data.files import read_initial_states
+from gfnn_jax.data.files import read_initial
 from gfnn_jax.data.predictions import PredictionWriter
 from gfnn_jax.errors import InputError
 from gfnn_jax.jobs.progress import SILENT, Progress
@@ -37,6 +37,7 @@ def predict(
     num_steps: int,
     save_every: int = 1,
     out: Path,
+    dt: float | None = None,
     stop_outside: bool = False,
     overwrite: bool = False,
     resume: bool = False,
@@ -44,6 +45,7 @@ def predict(
 ) -> Predicted:
     """Predict from the initial states in a file, in chunks along the steps, into ``out``.
 
+    dt: of a step, where it is not that of the data: of a map that is the flow of a Hamiltonian.
     Memory: one chunk of saved states, 32 MiB at most where a saved state of all lanes is no more
     than that, whatever ``num_steps``. A job that was killed goes on with ``resume`` where its last
     chunk ended, to the very bits that an uninterrupted one gives.
@@ -53,23 +55,33 @@ def predict(
             f"expected --save-every of at most --num-steps, {num_steps}; got {save_every}"
         )
     map_ = saved.load(model)
+    if dt is not None:
+        try:
+            map_ = map_.over(dt)
+        except ValueError as error:
+            raise InputError(f"--dt: {error}") from error
     dt = float(map_.dt)
-    z0 = read_initial_states(initial, map_.dim)
+    names = () if map_.parameters is None else map_.parameters.names
+    z0, params = read_initial(initial, map_.dim, names)
+    digest = hashlib.sha256(np.ascontiguousarray(z0).data)
+    if params is not None:
+        digest.update(np.ascontiguousarray(params).data)
     identity = {
         "model": saved.digest(model),
-        "initial": hashlib.sha256(np.ascontiguousarray(z0).data).hexdigest(),
+        "initial": digest.hexdigest(),
         "outside": "stop" if stop_outside else "continue",
     }
     writer = PredictionWriter(
         out, shape=z0.shape, num_steps=num_steps, save_every=save_every, dt=dt,
-        identity=identity, overwrite=overwrite, resume=resume,
+        identity=identity, params=None if params is None else (names, params),
+        overwrite=overwrite, resume=resume,
     )  # fmt: skip
     started = time.perf_counter()
     if writer.finished:
         with np.load(out, allow_pickle=False) as done:
             return Predicted(done["status"], done["left_at"], dt, 0.0)
     try:
-        lanes = _go_on(map_, z0, writer, num_steps, save_every, stop_outside, progress)
+        lanes = _go_on(map_, z0, params, writer, num_steps, save_every, stop_outside, progress)
         progress.say(f"writing {out}")
         status, left_at = np.asarray(lanes.status), np.asarray(lanes.left_at)
         writer.finish(status, left_at)
@@ -84,11 +96,12 @@ def predict(
 
 
 def _go_on(
-    map_: SymplecticMap, z0, writer: PredictionWriter, num_steps, save_every, stop_outside, progress
-) -> Lanes:
+    map_: SymplecticMap, z0, params, writer: PredictionWriter, num_steps, save_every, stop_outside,
+    progress,
+) -> Lanes:  # fmt: skip
     """All chunks that are not yet written; returns the lanes after the last step."""
     if writer.carry is None:
-        lanes = map_.start(z0, stop_outside=stop_outside)
+        lanes = map_.start(z0, params=params, stop_outside=stop_outside)
         writer.append(z0[:, None], lanes._asdict())
     else:
         lanes = Lanes(**{name: jax.device_put(value) for name, value in writer.carry.items()})
@@ -96,7 +109,9 @@ def _go_on(
     while writer.saved < writer.total:
         progress.say(f"step {(writer.saved - 1) * save_every} of {num_steps}")
         count = min(chunk, writer.total - writer.saved)
-        lanes, states = map_.advance(lanes, count, save_every=save_every, stop_outside=stop_outside)
+        lanes, states = map_.advance(
+            lanes, count, params=params, save_every=save_every, stop_outside=stop_outside
+        )
         writer.append(states, lanes._asdict())
     return lanes
 

@@ -19,7 +19,12 @@ from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.fit import MAX_SECONDS, Fit
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene
-from gfnn_jax.scenes.trajectories import reference_trajectories, sample_pairs, sample_test_states
+from gfnn_jax.scenes.trajectories import (
+    reference_trajectories,
+    sample_pairs,
+    sample_params,
+    sample_test_states,
+)
 from gfnn_jax.storage.outputs import atomic_folder
 from gfnn_jax.storage.partial import unfinished
 
@@ -78,14 +83,16 @@ def run(
         key_pairs, key_test = _keys(seed)
         pairs = _finite(sample_pairs(scene, num_pairs, key_pairs))
         z0 = np.asarray(sample_test_states(scene, num_trajectories, key_test))
+        params = sample_params(scene, num_trajectories, key_test, test=True)
         fitted = search(
             pairs, scene, max_seconds=max_seconds, progress=progress, kept_in=kept_in, job=job,
             **options, **more,
         )  # fmt: skip
         progress.say(f"reference trajectories of {NUM_STEPS} steps")
-        reference = np.asarray(reference_trajectories(scene, z0, NUM_STEPS))
+        reference = np.asarray(reference_trajectories(scene, z0, NUM_STEPS, params=params))
         progress.say(f"rollouts of {NUM_STEPS} steps")
-        measured = measure(map_rollouts(fitted.map, z0), scene, reference)
+        rollouts = map_rollouts(fitted.map, z0, params=params)
+        measured = measure(rollouts, scene, reference, params)
         result = report.assemble(
             fitted, scene=name, dt=scene.dt, seed=seed, rollout=measured.report,
             data={"source": "reference data of the scene", "digest": pairs_digest(pairs)},
@@ -109,7 +116,7 @@ def _finite(pairs: Pairs) -> Pairs:
     """In NumPy, without those whose state collides: it has no image."""
     z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
     known = np.isfinite(z1).all(axis=1)
-    return Pairs(z0[known], z1[known], pairs.dt)
+    return Pairs(z0, z1, pairs.dt, pairs.args).take(known)
 
 
 def _figures(fit: Fit, scene: Scene, measured: Measured, reference) -> dict[str, Any]:

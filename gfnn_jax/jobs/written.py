@@ -68,7 +68,8 @@ def already_done(model: Path, job: dict[str, Any], resume: bool) -> bool:
 
 
 def pairs_digest(pairs: Pairs) -> str:
-    """SHA-256 of the pairs' states."""
+    """SHA-256 of the pairs' states, and of the parameters where there are any."""
     digest = hashlib.sha256(np.ascontiguousarray(pairs.z0).data)
-    digest.update(np.ascontiguousarray(pairs.z1).data)
+    for array in (pairs.z1, *(pairs.args or {}).values()):
+        digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()

@@ -14,6 +14,7 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
 from gfnn_jax.learn.candidates import Candidate, Judges, refined_images, with_error
 from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.maps.parameters import sampled
 from gfnn_jax.maps.symplectic_map import Piece, SymplecticMap
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.solve.status import LEFT_DOMAIN
@@ -80,6 +81,7 @@ def composed(piece: Piece, prepared: Prepared, judges: Judges) -> SymplecticMap:
         scale=sizes(judges.pairs.z0),
         angle_centre=prepared.angle_centre,
         dt=prepared.dt,
+        parameters=None if prepared.args is None else sampled(prepared.parameters, prepared.args),
     )
     # Not jnp.asarray, which compiles a copy for every new shape.
     return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_)
@@ -102,13 +104,21 @@ class Steps(NamedTuple):
     compile_seconds: float
 
 
-def stepped(map_: SymplecticMap, z: np.ndarray, *, timed: bool = True) -> Steps:
-    """One step of the states z (N, 2d), in blocks of one shape; times are 0 unless ``timed``."""
+def stepped(
+    map_: SymplecticMap, z: np.ndarray, dt: Any = None, args=None, *, timed: bool = True
+) -> Steps:
+    """One step of the states z (N, 2d), in blocks of one shape; times are 0 unless ``timed``. dt:
+    of each state (N,), or that of the map. args: name -> (N,), as those of `Pairs`."""
     rows = np.resize(np.arange(len(z)), -(-len(z) // _BLOCK) * _BLOCK).reshape(-1, _BLOCK)
+    longest = map_.over(np.max(dt)) if np.ndim(dt) else map_  # as many substeps in every block
 
     def run(block) -> tuple[Any, float]:
+        own, given = longest, args and {name: values[block] for name, values in args.items()}
+        if np.ndim(dt):
+            piece = dataclasses.replace(longest.pieces[0], dt=dt[block])
+            own = dataclasses.replace(longest, pieces=(piece,), dt=dt[block])
         started = time.perf_counter()
-        out = jax.block_until_ready(map_.step(z[block]))
+        out = jax.block_until_ready(own.step(z[block], given))
         return jax.tree.map(np.asarray, out), time.perf_counter() - started
 
     (images, infos), first = run(rows[0])

@@ -12,6 +12,7 @@ from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.learn.candidates import Tolerance
+from gfnn_jax.learn.varied import check_varied
 from gfnn_jax.phase_space import Pairs, sizes, split
 from gfnn_jax.scenes.scene import AroundOrbit, Scene
 from gfnn_jax.scenes.trajectories import sample_states
@@ -48,7 +49,9 @@ def check_request(
         raise FitError(f"expected gfnn.Pairs(z0, z1, dt), got {type(pairs).__name__}")
     if not (isinstance(seed, numbers.Integral) and 0 <= seed < 2**32):
         raise FitError(f"expected a whole number from 0 to 2**32 - 1 as seed, got {seed!r}")
-    for name, value in (("tolerance", tolerance), ("time step", pairs.dt)):
+    own_dt = bool(np.ndim(pairs.dt))
+    one = () if own_dt else (("time step", pairs.dt),)
+    for name, value in (("tolerance", tolerance), *one):
         if not isinstance(value, numbers.Real) and np.shape(value) != ():
             raise FitError(f"expected a number as {name}, got {value!r}")
         if isinstance(value, str) or value is None:
@@ -69,14 +72,16 @@ def check_request(
         raise FitError(
             f"expected different angles among 0..{2 * pairs.dim - 1}, got {tuple(angles)}"
         )
-    if not 0 < float(pairs.dt) < np.inf:
+    if own_dt or pairs.args:
+        check_varied(pairs)
+    if not own_dt and not 0 < float(pairs.dt) < np.inf:
         raise FitError(f"expected a time step that is finite and above 0, got {pairs.dt}")
     if isinstance(terms, str):
         raise FitError(f"expected a sequence of terms, got the text '{terms}'")
     if any(not (isinstance(term, str) or callable(term)) for term in terms):
         raise FitError(f"expected terms as texts or functions of z, got {terms!r}")
     try:
-        given_terms(pairs.dim, terms)
+        given_terms(pairs.dim, terms, tuple(pairs.args or ()))
     except (InputError, jax.errors.ConcretizationTypeError) as error:
         raise FitError(str(error)) from error
     if terms and (learn == "map" or (family, chart) != ("auto", "auto")):

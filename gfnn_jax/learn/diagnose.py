@@ -107,15 +107,17 @@ def local_jacobians(y0, y1, scale, *, seed: int = 0) -> tuple[np.ndarray, float]
     return slope * scale[:, None] / scale[None, :], known
 
 
-def outliers(y0, y1, scale) -> np.ndarray:
+def outliers(y0, y1, scale, given=None) -> np.ndarray:
     """Rows of the pairs whose move contradicts that of the pairs around them.
 
-    y0, y1: (N, 2d) with angles lifted. A pair's move is predicted from its neighbours, by an affine
+    y0, y1: (N, 2d) with angles lifted. given: (N, k) of unit sizes, what else a move depends on. A
+    pair's move is predicted from its neighbours, by an affine
     fit. An outlier misses it by many times what that fit leaves over among them: the deleted
     studentised residual. A steep or noisy map leaves much over everywhere and has no outliers.
     Outliers hide each other: the others are looked at again without those found.
     """
     x, move = np.asarray(y0) / scale, (np.asarray(y1) - np.asarray(y0)) / scale
+    x = x if given is None else np.concatenate([x, given], axis=1)
     rows, found = np.arange(len(x)), []
     for _ in range(_OUTLIER_ROUNDS):
         outlying = _studentised(x[rows], move[rows]) > _OUTLYING

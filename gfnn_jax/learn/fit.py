@@ -52,10 +52,13 @@ from gfnn_jax.learn.law_maps import (
     search_around,
     search_of_law,
 )
+from gfnn_jax.learn.map_of_parameters import assembled as map_assembled
+from gfnn_jax.learn.map_of_parameters import map_of
 from gfnn_jax.learn.noise import state_noise
 from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.search import AS_FAR, MET, Entry, Found, search
 from gfnn_jax.learn.sweeps import NetworkSweep, sweeps_for
+from gfnn_jax.learn.varied import as_varied, given_by, undiagnosed
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
@@ -81,9 +84,10 @@ class Fit:
     one was factored out. noise: (2d,) standard deviation of each coordinate's noise that the
     residuals suggest where larger models stopped helping, else None. messages: the warnings.
     ended: why the search ended. seconds: of it all; compile_seconds: of compiling, in them.
-    test_states: (n, 2d) held-out states. model_determinant_min: the chosen chart's determinant
-    there, where it is closest to 0; NaN for a flow, which has no chart. hamiltonian: H, where one
-    was found, whether its flow was chosen or not. pairs: that were taken. scene: as given.
+    test_states: (n, 2d) held-out states, test_args their parameters. model_determinant_min: the
+    chosen chart's determinant there, where it is closest to 0; NaN for a flow, which has no chart.
+    hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
+    scene: as given.
     """
 
     map: SymplecticMap
@@ -100,6 +104,7 @@ class Fit:
     compile_seconds: float
     test_states: np.ndarray
     model_determinant_min: float
+    test_args: dict[str, np.ndarray] | None = None
     hamiltonian: LearnedHamiltonian | None = None
     pairs: Pairs | None = None
     scene: Scene | None = None
@@ -121,8 +126,10 @@ class Fit:
         if self.hamiltonian is None or self.formula is None:
             raise FitError("expected a fit with a Hamiltonian that meets its tolerance, got none")
         assert self.pairs is not None
+        if self.map.parameters is not None:
+            raise FitError("expected a fit without parameters: a generated map has none")
         flow, coordinates = self.hamiltonian.flow, self.map.coordinates
-        dt = float(self.pairs.dt) if dt is None else dt
+        dt = float(np.asarray(self.map.dt)) if dt is None else dt
         if not (isinstance(dt, (int, float)) and 0 < dt < np.inf):
             raise FitError(f"expected a time step that is finite and above 0, got {dt!r}")
         pairs = drawn(
@@ -171,7 +178,7 @@ class Fit:
     def symplecticity_defect(self) -> float:
         """The largest defect of the chosen map's unrolled step at the test states. Compiled when it
         is first asked for."""
-        return float(np.max(np.asarray(self.map.defect(self.test_states))))
+        return float(np.max(np.asarray(self.map.defect(self.test_states, self.test_args))))
 
     @property
     def table(self) -> str:
@@ -209,6 +216,7 @@ def fit(
     """Learn the map of these pairs: the cheapest candidate within the tolerance, else the best.
 
     pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order.
+               Pairs of different dt, or with parameters (args), are learned as H.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
     tolerance: bound on the RMS over coordinates of the one-step error ÷ that coordinate's spread,
                at its upper 95 % bound; a pure number.
@@ -248,6 +256,7 @@ def fit(
     pairs = dataclasses.replace(
         pairs, z0=np.asarray(pairs.z0, np.float64), z1=np.asarray(pairs.z1, np.float64)
     )
+    pairs, learn, new = as_varied(pairs, learn=learn, family=family, chart=chart, base=base)
     messages: list[str] = []
 
     def warn(new: list[str]) -> None:
@@ -255,6 +264,7 @@ def fit(
         for message in new:
             warnings.warn(message, FitWarning, stacklevel=3)
 
+    warn(new)
     if scene is not None and scene.features is not None and family in ("auto", "features"):
         warn(unlike_the_scene(pairs, scene))
     warn(coarse_tolerance(pairs, bound))
@@ -267,18 +277,25 @@ def fit(
         known = given_terms(prepared.dim, (base,))
         flow = flow_of(known, np.ones(known.num_parameters), prepared)
         prepared = factored_out(flow, prepared, seed)
-    seen = diagnosed(prepared, chart, scene.reversor if scene else None, seed)
+    if prepared.varied:
+        seen = undiagnosed(prepared)
+    else:
+        seen = diagnosed(prepared, chart, scene.reversor if scene else None, seed)
     warn(seen.messages)
     prepared, charts = seen.prepared, seen.charts
     judges = Judges(pairs, *split_rows(pairs, seed), bound)
     better = _Better(prepared, judges, on_better) if on_better is not None else None
     wanted = learn if (family, chart, base) == ("auto", "auto", None) else "map"
     law = law_of(plain, judges, scene, wanted, terms, clock, on_progress)
+    of_map = None
+    lawless = law is None or law.candidate.validation_bound > bound.bound
+    if prepared.args is not None and learn != "hamiltonian" and lawless:
+        of_map = map_of(prepared, judges, scene, chart, law, clock, on_progress)
     if law is not None:
         if better is not None:
             better.offer(law.candidate, lambda: composed(law.flow, plain, judges))
         on_candidate(law.candidate)
-    if learn == "hamiltonian":
+    if learn == "hamiltonian" or prepared.varied:
         sweeps: list[Any] = []
     elif family == "mlp":
         sweeps = [
@@ -304,16 +321,20 @@ def fit(
         )
         if around is not None and better_than(around.found, found, law):
             judges, prepared, charts, found = around
-    if not found.ranking and law is None:
+    if not found.ranking and law is None and of_map is None:
         raise FitError(_nothing_found(found, pairs, clock))
-    choice = _chosen(found, law, prepared, plain, judges, clock, on_progress)
+    if of_map is not None:
+        candidate, seconds = map_assembled(of_map, prepared, judges)
+        choice = candidate, None, seconds
+    else:
+        choice = _chosen(found, law, prepared, plain, judges, clock, on_progress)
     chosen, entry, compile_seconds = choice
     noise = None
-    ended = found.ended if learn != "hamiltonian" else _ended(chosen, bound)
+    ended = _ended(chosen, bound) if not sweeps else found.ended
     if ended.startswith(MET) and chosen.validation_bound > bound.bound:
         ended = "the steps of a map that was to meet it do not converge from some of the states"
     unmet = chosen.validation_bound > bound.bound
-    if law is not None and (entry is None or met_by_law or (unmet and law.fast)):
+    if law is not None and of_map is None and (entry is None or met_by_law or (unmet and law.fast)):
         warn(list(law.messages))
     looked_at = entry or (found.ranking[0] if found.ranking else None)
     diagnosis: list[str] = []
@@ -334,10 +355,10 @@ def fit(
     if chosen.validation_bound > bound.bound:
         warn([*not_radians(pairs, coordinates), not_met(chosen, bound, ended), *diagnosis])
     others = [e.candidate for e in found.entries if entry is None or e.size is not entry.size]
-    if law is not None and entry is not None:
+    if law is not None and (entry is not None or of_map is not None):
         others.append(law.candidate)
     candidates = [*others, dataclasses.replace(chosen, chosen=True)]
-    test = np.asarray(judges.pairs.z0)[judges.held_out][:_JUDGED]
+    test = judges.pairs.take(judges.held_out[:_JUDGED])
     return Fit(
         map=chosen.map,
         candidates=tuple(sorted(candidates, key=lambda c: (c.operations, c.validation_relative))),
@@ -352,7 +373,8 @@ def fit(
         ended=ended,
         seconds=clock.seconds,
         compile_seconds=compile_seconds,
-        test_states=test,
+        test_states=np.asarray(test.z0),
+        test_args=test.args,
         model_determinant_min=smallest_determinant(chosen.map, prepared, judges),
         pairs=pairs,
         scene=scene,
@@ -396,7 +418,7 @@ def _prepared(pairs: Pairs, coordinates: Coordinates) -> tuple[Pairs, Prepared, 
         pairs = pairs.take(first)
         check_number(pairs)
     prepared = prepare(pairs, coordinates)
-    found = outliers(prepared.y0, prepared.y1, prepared.scale)
+    found = outliers(prepared.y0, prepared.y1, prepared.scale, given_by(prepared))
     if len(found):
         few = len(found) <= _MOST_OUTLIERS * len(pairs)
         rows = ", ".join(map(str, first[found[:5]])) + (", …" if len(found) > 5 else "")
@@ -543,7 +565,7 @@ def _residuals(
     pairs, coordinates = judges.pairs.take(rows), prepared.coordinates
     angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
     z0 = np.asarray(pairs.z0)
-    steps = stepped(chosen.map, z0, timed=False)
+    steps = stepped(chosen.map, z0, pairs.dt, pairs.args, timed=False)
     residual = nearest_image(np.asarray(pairs.z1) - steps.images, angles)
     return z0, residual, ~steps.failed & np.isfinite(residual).all(axis=1)
 
@@ -579,7 +601,8 @@ def smallest_determinant(map_: SymplecticMap, prepared: Prepared, judges: Judges
         return float("nan")
     piece = jax.tree.map(np.asarray, piece)
     rows = judges.held_out[:_JUDGED]
-    determinant = piece.determinant(prepared.y0[rows], prepared.y1[rows])
+    args = prepared.given(rows)[1]
+    determinant = piece.determinant(prepared.y0[rows], prepared.y1[rows], args)
     return float(determinant[np.argmin(np.abs(determinant))])
 
 

@@ -28,7 +28,6 @@ from gfnn_jax.fitting.gauss_newton import (
     midpoint_start,
     null_terms,
     significant_terms,
-    substeps_for,
 )
 from gfnn_jax.fitting.growth import grow
 from gfnn_jax.flows.collocation import Steps, images, truncation
@@ -38,6 +37,7 @@ from gfnn_jax.learn.assemble import Assembled, composed, stepped
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
 from gfnn_jax.learn.clock import Clock, OutOfTime
 from gfnn_jax.learn.held_out import outermost
+from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.phase_space import symplectic_form
 
@@ -168,16 +168,22 @@ def learn_hamiltonian(
         raise FitError("expected pairs without a base map: it is no part of a flow")
     started = time.perf_counter()
     if terms:
-        _check_finite(given_terms(prepared.dim, terms), prepared.y0[judges.training])
-    problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, check=clock.check)
+        _check_finite(_own_terms(prepared, terms), prepared, judges.training)
+    problem = Problem(
+        prepared.y0, prepared.y1, prepared.each_dt, prepared.scale, args=prepared.args,
+        check=clock.check,
+    )  # fmt: skip
     everywhere, free = judges, (*prepared.coordinates.cyclic, *prepared.whole)
     outer = outermost(prepared.y0[judges.training], free)
     judges = dataclasses.replace(everywhere, training=everywhere.training[~outer])
-    if basis is not None:
+    if prepared.args is not None:
+        best = _walked(problem, prepared, judges, scene, terms, options, say)
+    elif basis is not None:
         best = _grown(problem, basis, prepared, judges, clock, options, say)
     else:
         best, options = _searched(problem, prepared, judges, scene, terms, options, say)
-    if substeps_for(best.family, best.fit.coefficients, prepared.y0, prepared.dt) >= MOST_SUBSTEPS:
+    everyone = np.arange(len(prepared.y0))
+    if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
         raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
     outside = None
     try:
@@ -204,7 +210,7 @@ def _searched(
     best: _Fitted | None = None
     last, poor, errors = None, 0, []
     libraries = list(_libraries(prepared, judges, scene, terms, options))
-    if len(libraries) > 1 and libraries[0].quadratic:
+    if len(libraries) > 1 and libraries[0].quadratic and not prepared.varied:
         affine = _affine_error(prepared, judges).bound
         if affine > _HOPELESS * bound:
             errors.append(affine)
@@ -235,19 +241,63 @@ def _searched(
     return best._replace(stalled=stalled), options
 
 
-def _modes(prepared: Prepared, scene, terms) -> Modes | None:
-    """The basis that grows, where an angle enters H by itself; else None."""
-    if scene is not None and scene.features is not None:
-        return None
+def _walked(
+    problem, prepared: Prepared, judges: Judges, scene, terms, options: Options, say
+) -> _Fitted:
+    """The best of the libraries of states and parameters, which grow together."""
+    own = _own_terms(prepared, terms) if terms else None
+    angles, plain = _angles_and_others(prepared)
+    states = state_libraries(
+        prepared.dim, prepared.parameters, angles=angles, cyclic=prepared.coordinates.cyclic,
+        plain=plain, features=scene.features if scene is not None else None,
+        reversor=scene.reversor if scene is not None else None, own=own,
+    )  # fmt: skip
+    _, args = prepared.given(judges.training)
+    functions = functions_of_parameters(prepared.dim, prepared.parameters, args, own is not None)
+    most = len(judges.training) * 2 * prepared.dim / options.rows_per_term
+    best: _Fitted | None = None
+
+    def attempt(family: Terms) -> _Fitted:
+        say(f"H: {family.num_parameters} terms")
+        return _fitted(problem, family, prepared, judges, best, options, say)
+
+    try:
+        for found in walked(
+            states, functions, attempt, lambda found: found.error.bound,
+            bound=judges.tolerance.bound, most=min(most, options.most_terms),
+        ):  # fmt: skip
+            if best is None or found.error.relative < best.error.relative:
+                best = found
+    except OutOfTime:
+        if best is None:
+            raise
+    if best is None:
+        raise FitError(
+            f"expected more pairs: {len(prepared.y0)} are too few for any library of terms"
+        )
+    return best._replace(stalled=best.error.bound > judges.tolerance.bound)
+
+
+def _angles_and_others(prepared: Prepared) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """The angles that enter H by themselves, and the names of the coordinates that are none."""
     dim, coordinates = prepared.dim, prepared.coordinates
     angles = tuple(i for i in coordinates.angles if i < dim and i not in coordinates.cyclic)
-    if not angles:
-        return None
-    plain = [
+    plain = tuple(
         name
         for i, name in enumerate(coordinate_names(dim))
         if i not in angles and i not in coordinates.cyclic
-    ]
+    )
+    return angles, plain
+
+
+def _modes(prepared: Prepared, scene, terms) -> Modes | None:
+    """The basis that grows, where an angle enters H by itself; else None."""
+    if prepared.args is not None or (scene is not None and scene.features is not None):
+        return None
+    dim = prepared.dim
+    angles, plain = _angles_and_others(prepared)
+    if not angles:
+        return None
     own = given_terms(dim, terms).variables if terms else ()
     own = tuple(text for text in own if text not in plain)
     return Modes(dim, angles, (*plain, *own), len(own))
@@ -284,9 +334,14 @@ def _grown(
     return _Fitted(grown.family, fit, rows, error, (), ended=ended)
 
 
-def _check_finite(given: Terms, z) -> None:
+def _own_terms(prepared: Prepared, terms) -> Terms:
+    return given_terms(prepared.dim, terms, prepared.parameters)
+
+
+def _check_finite(given: Terms, prepared: Prepared, rows) -> None:
     """Raises FitError for a user's term that has no value or no slope at some of the states."""
-    slopes = given.term_gradients(z)
+    z = prepared.y0[rows]
+    slopes = given.term_gradients(z, prepared.given(rows)[1])
     for j, name in enumerate(given.term_names):
         bad = ~np.isfinite(slopes[:, :, j]).all(axis=1)
         if bad.any():
@@ -326,7 +381,7 @@ def _libraries(prepared, judges, scene, terms, options: Options) -> Iterator[Ter
     features = scene.features if scene is not None else None
     most = len(judges.training) * 2 * dim / options.rows_per_term
     most = min(most, options.most_terms)
-    own = given_terms(dim, terms) if terms else None
+    own = _own_terms(prepared, terms) if terms else None
     if own is not None:
         degrees = options.given_degrees
     else:
@@ -353,8 +408,9 @@ def _fitted(problem, family, prepared, judges, last: _Fitted | None, options, sa
     names = family.term_names
     z = prepared.y0[judges.training]
     enough = z[: max(200, 4 * family.num_parameters // z.shape[1])]
-    kept, null = null_terms(family, enough)
-    elsewhere = null_terms(family, _scattered(enough))[0] if null else []
+    args = prepared.given(judges.training[: len(enough)])[1]
+    kept, null = null_terms(family, enough, args=args)
+    elsewhere = null_terms(family, _scattered(enough), args=args)[0] if null else []
     undetermined = tuple(names[j] for j in null if j in elsewhere)
     family = family.take(kept)
     count = int(np.ceil(options.judged_rows * family.num_parameters / z.shape[1]))
@@ -375,8 +431,10 @@ def _scattered(z) -> np.ndarray:
 def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
     """The start whose flow is nearest to the pairs: midpoint, logarithm, or the last library's."""
     z0, z1 = problem.z0[rows], problem.z1[rows]
-    starts = [midpoint_start(family, z0, z1, problem.dt, problem.scale)]
-    logarithm = log_start(family, z0, z1, problem.dt, problem.scale)
+    dt, args = problem.given(rows)
+    starts = [midpoint_start(family, z0, z1, dt, problem.scale, args)]
+    alike = args is None and np.ndim(dt) == 0  # pairs of one affine regression
+    logarithm = log_start(family, z0, z1, dt, problem.scale) if alike else None
     if logarithm is not None:
         starts.append(logarithm)
     if last is not None:
@@ -389,7 +447,10 @@ def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
 def _resolved(problem, family, fit: FlowFit, rows) -> FlowFit:
     """The fit without the pairs that the flow's own steps do not resolve."""
     z = problem.z0[fit.used]
-    off = truncation(family, fit.coefficients, z, problem.dt, fit.steps, on_substep=problem.check)
+    dt, args = problem.given(fit.used)
+    off = truncation(
+        family, fit.coefficients, z, dt, fit.steps, args=args, on_substep=problem.check
+    )
     off = np.abs(off / problem.scale).max(axis=1)
     limit = max(10 * fit.rms, 100 * float(np.median(off)), 1e-13)
     good = off <= limit
@@ -403,8 +464,8 @@ def _held_out_error(problem, family, fit: FlowFit, prepared, judges: Judges) -> 
 
 
 def _error_of(family, coefficients, steps: Steps, prepared, judges: Judges) -> OneStepError:
-    states = prepared.y0[judges.held_out]
-    found = images(family, coefficients, states, prepared.dt, steps).states
+    states, (dt, args) = prepared.y0[judges.held_out], prepared.given(judges.held_out)
+    found = images(family, coefficients, states, dt, steps, args=args).states
     return judges.error_of(to_user(prepared.coordinates, found), prepared.coordinates)
 
 
@@ -441,18 +502,25 @@ def _learned(
 ) -> LearnedHamiltonian:
     family, fit = found.family, found.fit
     rows = judges.held_out
-    z = prepared.y0[rows]
-    _, hessian = family.gradient_and_hessian(fit.coefficients, prepared.y0[:_FREQUENCY_STATES])
+    z, args = prepared.y0[rows], prepared.given(rows)[1]
+    _, hessian = family.gradient_and_hessian(
+        fit.coefficients, prepared.y0[:_FREQUENCY_STATES],
+        prepared.given(slice(_FREQUENCY_STATES))[1],
+    )  # fmt: skip
     rates = frequencies(hessian)
+    if prepared.own_dt is not None:  # the map's own dt, from which others follow
+        problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, args=prepared.args)
     steps = _cheapest(problem, family, fit, rates, judges, options)
     contraction = _contraction(rates, prepared.dt, steps)
     by_newton = contraction > options.contracting
-    off = truncation(family, fit.coefficients, z, prepared.dt, steps) / prepared.scale
-    error = _error_of(family, fit.coefficients, steps, prepared, judges)
+    off = truncation(family, fit.coefficients, z, prepared.dt, steps, args=args) / prepared.scale
     flow = Flow(
         family, fit.coefficients, prepared.dt, prepared.scale, steps.stages, steps.substeps,
         by_newton,
     )  # fmt: skip
+    longest = flow.over(np.max(prepared.each_dt)).substeps
+    of_all = dataclasses.replace(steps, substeps=longest)
+    error = _error_of(family, fit.coefficients, of_all, prepared, judges)
     candidate = Candidate(
         label=f"H, {family.num_parameters} terms", family=family.name, chart="flow",
         num_parameters=family.num_parameters,
@@ -599,7 +667,8 @@ def formula(terms: Sequence[Term]) -> str:
 def assembled(learned: LearnedHamiltonian, prepared: Prepared, judges: Judges) -> Assembled:
     """The candidate's map, its error and its time per step measured by the steps that users run."""
     map_ = composed(learned.flow, prepared, judges)
-    steps = stepped(map_, np.asarray(judges.pairs.z0)[judges.held_out])
+    held = judges.pairs.take(judges.held_out)
+    steps = stepped(map_, np.asarray(held.z0), held.dt, held.args)
     states = np.where(steps.failed[:, None], np.nan, steps.images)
     error = judges.error_of(states, prepared.coordinates)
     candidate = dataclasses.replace(

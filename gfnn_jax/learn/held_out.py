@@ -11,7 +11,9 @@ _OUTSIDE = 0.05  # of the training pairs, by which errors outside the data are m
 def first_occurrences(pairs) -> np.ndarray:
     """The rows where a pair stands for the first time: held-out copies of training pairs would
     judge nothing."""
-    rows = np.concatenate([np.asarray(pairs.z0), np.asarray(pairs.z1)], axis=1)
+    given = [] if not np.ndim(pairs.dt) else [pairs.dt]
+    given += [np.asarray(values) for values in (pairs.args or {}).values()]
+    rows = np.column_stack([np.asarray(pairs.z0), np.asarray(pairs.z1), *given])
     return np.sort(np.unique(rows, axis=0, return_index=True)[1])
 
 

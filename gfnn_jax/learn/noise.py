@@ -28,12 +28,15 @@ def state_noise(map_: SymplecticMap, pairs: Pairs, taken: float) -> np.ndarray:
     z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
     width, size, coordinates = z0.shape[1], sizes(z0), map_.coordinates
     angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
-    steps = stepped(map_, z0, timed=False)
+    given = pairs.dt, pairs.args
+    steps = stepped(map_, z0, *given, timed=False)
     residual = nearest_image(z1 - steps.images, angles)
     jacobian = np.empty((len(z0), width, width))
     for j, apart in enumerate(_APART * size):
         offset = apart * (np.arange(width) == j)
-        ahead, behind = (stepped(map_, z0 + s * offset, timed=False).images for s in (1, -1))
+        ahead, behind = (
+            stepped(map_, z0 + s * offset, *given, timed=False).images for s in (1, -1)
+        )
         jacobian[:, :, j] = nearest_image(ahead - behind, angles) / (2 * apart)
     known = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
     z0, z1, r, m = z0[known], z1[known], residual[known], jacobian[known]

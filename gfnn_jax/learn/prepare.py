@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
 from gfnn_jax.coordinates import Coordinates, lift, to_inner
 from gfnn_jax.errors import FitError
+from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.domain import Domain, covering
@@ -22,7 +24,8 @@ class Prepared:
     of the inner coordinates. angle_centre: (a,) of each angle's interval. whole: the angles that
     cover their circle. before, after: pieces that were factored out, in the order in which they
     are applied around what is learned: R^½ on both sides for an affine base map R, the flow of a
-    law.
+    law. dt: of all pairs, or in the middle of those that differ, which are ``own_dt`` (N,). args:
+    (N, k) values of the ``parameters``, or None.
     """
 
     y0: np.ndarray
@@ -35,6 +38,23 @@ class Prepared:
     dt: float
     before: tuple[Affine | Flow, ...] = ()
     after: tuple[Affine | Flow, ...] = ()
+    own_dt: np.ndarray | None = None
+    args: np.ndarray | None = None
+    parameters: tuple[str, ...] = ()
+
+    @property
+    def each_dt(self) -> Any:
+        """A number, or (N,) where the pairs differ."""
+        return self.dt if self.own_dt is None else self.own_dt
+
+    @property
+    def varied(self) -> bool:
+        """Whether pairs differ in their dt or in parameters."""
+        return self.own_dt is not None or self.args is not None
+
+    def given(self, rows) -> tuple[Any, Any]:
+        """(dt, args) of these rows."""
+        return of_lanes(self.each_dt, rows), of_lanes(self.args, rows)
 
     @property
     def dim(self) -> int:
@@ -43,7 +63,10 @@ class Prepared:
 
     def take(self, rows: np.ndarray) -> Prepared:
         """Of these rows alone; sizes and domain are theirs."""
-        return _sized(dataclasses.replace(self, y0=self.y0[rows], y1=self.y1[rows]))
+        own_dt, args = of_lanes(self.own_dt, rows), of_lanes(self.args, rows)
+        return _sized(
+            dataclasses.replace(self, y0=self.y0[rows], y1=self.y1[rows], own_dt=own_dt, args=args)
+        )
 
     def without(self, before: Affine | Flow | None, after: Affine | Flow | None) -> Prepared:
         """These pieces factored out: before(z) -> after⁻¹(Z). The domain stays that of the
@@ -78,9 +101,17 @@ def prepare(pairs: Pairs, coordinates: Coordinates) -> Prepared:
     y0, y1, centres, covered = lift(before, after, coordinates)
     whole = tuple(i for i, c in zip(coordinates.angles, covered, strict=True) if c)
     empty = covering(y0[:0], ignore=tuple(range(y0.shape[1])))
+    own_dt = np.asarray(pairs.dt, np.float64) if np.ndim(pairs.dt) else None
+    given: dict[str, np.ndarray] = pairs.args or {}
+    names = tuple(given)
+    args = np.stack([given[name] for name in names], axis=-1) if names else None
+    dt = float(pairs.dt if own_dt is None else np.median(own_dt))
     return _sized(
-        Prepared(y0, y1, np.ones(y0.shape[1]), empty, centres, whole, coordinates, float(pairs.dt))
-    )
+        Prepared(
+            y0, y1, np.ones(y0.shape[1]), empty, centres, whole, coordinates, dt, own_dt=own_dt,
+            args=args, parameters=names,
+        )
+    )  # fmt: skip
 
 
 def _sized(prepared: Prepared) -> Prepared:

@@ -26,6 +26,7 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated, two_sum
 from gfnn_jax.maps.domain import Domain
 from gfnn_jax.maps.modified_hamiltonian import NUM_STEPS, Cells, ModifiedHamiltonian, of_cells
+from gfnn_jax.maps.parameters import Parameters, as_args
 from gfnn_jax.maps.rollout import scan_steps
 from gfnn_jax.phase_space import require_x64, symplecticity_defect
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, Info
@@ -88,7 +89,7 @@ class RolloutInfo(NamedTuple):
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=("pieces", "domain", "scale", "angle_centre", "dt"),
+    data_fields=("pieces", "domain", "scale", "angle_centre", "dt", "parameters"),
     meta_fields=("coordinates",),
 )
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -101,10 +102,13 @@ class SymplecticMap:
     scale:        (2d,) sizes of the user's coordinates.
     angle_centre: (a,) centre of the interval of length 2π in which each angle is kept.
     dt:           the time one step takes.
+    parameters:   what the system depends on beside its state, where it was learned with that.
 
-    Methods take states z (2d,) or (B, 2d), NumPy or JAX, and answer with JAX arrays. They can be
-    differentiated, in forward and reverse mode, in z and in the map's own leaves, by the
-    implicit-function theorem; ``jax.vmap`` and ``jax.jit`` work over them.
+    Methods take states z (2d,) or (B, 2d), NumPy or JAX, and answer with JAX arrays. A map that was
+    learned with parameters takes their values too: name -> a number or (B,), or an array (k,) or
+    (B, k). They can be differentiated, in forward and reverse mode, in z, in the parameters' values
+    and in the map's own leaves, by the implicit-function theorem; ``jax.vmap`` and ``jax.jit`` work
+    over them.
     """
 
     pieces: tuple
@@ -113,6 +117,7 @@ class SymplecticMap:
     scale: Any
     angle_centre: Any
     dt: Any
+    parameters: Parameters | None = None
 
     def __post_init__(self):
         if isinstance(self.dt, (int, float)):
@@ -129,20 +134,42 @@ class SymplecticMap:
 
         saved.save(self, folder, **options)
 
-    def step(self, z):
-        """One step: (Z, Info); Info's leaves are () or (B,)."""
-        return _step(self, self._states(z))
+    def step(self, z, args=None, *, dt=None):
+        """One step: (Z, Info); Info's leaves are () or (B,). dt: of `over`."""
+        z = self._states(z)
+        map_ = self if dt is None else self.over(dt, z.shape[:-1])
+        return _step(map_, z, self._args(args, z))
 
-    def inverse(self, z):
+    def inverse(self, z, args=None):
         """One step back: (z, Info) of Z."""
-        return self.reversed().step(z)
+        return self.reversed().step(z, args)
+
+    def over(self, dt, lanes: tuple[int, ...] = ()) -> SymplecticMap:
+        """The map over another time than that of the data: of the flow of one Hamiltonian.
+
+        dt: a number, or one of each lane where that many ``lanes`` are to be stepped; above 0.
+        Raises ValueError for any other map: it is known at one dt only.
+        """
+        if len(self.pieces) != 1 or not isinstance(self.pieces[0], Flow):
+            raise ValueError(
+                f"expected the flow of a Hamiltonian to step another dt, got a map of dt = "
+                f"{float(np.asarray(self.dt)):g} only: fit with learn='hamiltonian'"
+            )
+        if not isinstance(dt, jax.Array):
+            dt = np.asarray(dt)
+            if dt.dtype.kind not in "fiu" or not (np.isfinite(dt) & (dt > 0)).all():
+                raise ValueError(f"expected a time step that is finite and above 0, got {dt}")
+        if dt.shape not in ((), lanes):
+            raise ValueError(f"expected one time step, or one of each state; got {dt.shape}")
+        dt = dt.astype(self.scale.dtype)
+        return dataclasses.replace(self, pieces=(self.pieces[0].over(dt),), dt=dt)
 
     def reversed(self) -> SymplecticMap:
         """The inverse map, as a map of its own."""
         pieces = tuple(piece.inverse() for piece in reversed(self.pieces))
         return dataclasses.replace(self, pieces=pieces)
 
-    def defect(self, z):
+    def defect(self, z, args=None):
         """Symplecticity defect () or (B,) of the step's unrolled derivative at z, in units of
         ``scale``.
 
@@ -150,24 +177,27 @@ class SymplecticMap:
         which would look symplectic however badly the solve had converged.
         """
         z = self._states(z)
-        ran = self.step(z)[1].iterations
+        args = self._args(args, z)
+        ran = _step(self, z, args)[1].iterations
         # A single update is the usual case; its derivative compiles in half the time.
         once = not isinstance(ran, Tracer) and np.max(np.asarray(ran), initial=0) <= 1
-        return _defect(self, z, 1 if once else True)
+        return _defect(self, z, args, 1 if once else True)
 
-    def determinant(self, z):
+    def determinant(self, z, args=None):
         """Chart determinant () or (B,) at z, of the piece where it is smallest; NaN where no piece
         has a chart."""
-        return _determinant(self, self._states(z))
+        z = self._states(z)
+        return _determinant(self, z, self._args(args, z))
 
-    def hamiltonian(self, z):
+    def hamiltonian(self, z, args=None):
         """H () or (B,) at z: what was learned where the map is the flow of one Hamiltonian; of any
         other map the modified Hamiltonian, of which ``modified_hamiltonian`` gives the error."""
         if len(self.pieces) != 1 or not isinstance(self.pieces[0], Flow):
-            return self.modified_hamiltonian(z).value
-        return _hamiltonian(self, self._states(z))
+            return self.modified_hamiltonian(z, args).value
+        z = self._states(z)
+        return _hamiltonian(self, z, self._args(args, z))
 
-    def modified_hamiltonian(self, z) -> ModifiedHamiltonian:
+    def modified_hamiltonian(self, z, args=None) -> ModifiedHamiltonian:
         """The Hamiltonian H̃ whose flow over dt is this map, at z: its value and the error of that,
         each () or (B,), in units of H. Its constant is that of S.
 
@@ -175,24 +205,30 @@ class SymplecticMap:
         the orbit turns slowly against a step (Hénon–Heiles: 1e-12 at dt 0.4, 1e-8 at 0.8), and of
         the size of H̃ for a map that is near no flow. NaN where one of these steps fails.
         """
-        return _modified(self, self._states(z))
+        z = self._states(z)
+        return _modified(self, z, self._args(args, z))
 
-    def start(self, z0, *, stop_outside: bool = False) -> Lanes:
+    def start(self, z0, *, params=None, stop_outside: bool = False) -> Lanes:
         """Lanes at step 0 from z0 (B, 2d). Initial states outside the domain have that status."""
-        return _start(self, self._states(z0), stop_outside)
+        z0 = self._states(z0)
+        return _start(self, z0, self._args(params, z0), stop_outside)
 
     def advance(
-        self, lanes: Lanes, num_saved: int, *, save_every: int = 1, stop_outside: bool = False
-    ) -> tuple[Lanes, Any]:
+        self, lanes: Lanes, num_saved: int, *, params=None, save_every: int = 1,
+        stop_outside: bool = False,
+    ) -> tuple[Lanes, Any]:  # fmt: skip
         """``num_saved`` blocks of ``save_every`` steps: the lanes after them, and the saved states
-        (B, num_saved, 2d)."""
-        return _advance(self, lanes, num_saved, save_every, stop_outside)
+        (B, num_saved, 2d). params: those that the lanes were started with."""
+        args = self._args(params, lanes.y)
+        return _advance(self, lanes, args, num_saved, save_every, stop_outside)
 
     def rollout(
-        self, z0, num_steps: int, *, save_every: int = 1, stop_outside: bool = False
-    ) -> tuple[Any, RolloutInfo]:
+        self, z0, num_steps: int, *, params=None, dt=None, save_every: int = 1,
+        stop_outside: bool = False,
+    ) -> tuple[Any, RolloutInfo]:  # fmt: skip
         """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d).
 
+        params: the values of a map's parameters. dt: of `over`, for each step.
         Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first, and a
         RolloutInfo. A lane whose step fails, or that leaves the domain with ``stop_outside``,
         repeats NaN from there on. Raises ValueError where a number of steps or a shape is wrong.
@@ -209,7 +245,13 @@ class SymplecticMap:
                 f"expected save_every <= num_steps, got {save_every} and {num_steps}: only the "
                 "initial states would be saved"
             )
-        return _rollout(self, self._states(z0), num_steps // save_every, save_every, stop_outside)
+        z0 = self._states(z0)
+        map_ = self if dt is None else self.over(dt, z0.shape[:-1])
+        args = self._args(params, z0)
+        return _rollout(map_, z0, args, num_steps // save_every, save_every, stop_outside)
+
+    def _args(self, given, z):
+        return as_args(self.parameters, given, z.shape, np.dtype(self.scale.dtype))
 
     def _states(self, z):
         dtype = np.dtype(self.scale.dtype)
@@ -262,13 +304,18 @@ class SymplecticMap:
             y = y.at[:, angles].set((y[:, angles] + turns * beyond) + turns * two_pi)
         return jax.vmap(self.coordinates.inverse)(y)
 
-    def _apply(self, z, *, unrolled: bool | int = False):
+    def _contains(self, y, args):
+        """Whether states and parameters lie where data were (B,)."""
+        inside = self.domain.contains(y)
+        return inside if self.parameters is None else inside & self.parameters.contains(args)
+
+    def _apply(self, z, args, *, unrolled: bool | int = False):
         """(Z, Info) of the states z (B, 2d) in the user's coordinates."""
         y, _, turns = self._inner(z)
-        inside = self.domain.contains(y)
+        inside = self._contains(y, args)
         infos = []
         for piece in self.pieces:
-            y, info = piece.step(y, unrolled=unrolled)
+            y, info = piece.step(y, args, unrolled=unrolled)
             infos.append(info)
         info = _worst(infos)
         status = jnp.where(info.status == OK, jnp.where(inside, OK, LEFT_DOMAIN), info.status)
@@ -288,28 +335,28 @@ def _worst(infos: list[Info]) -> Info:
 
 
 def _or_one_state(function):
-    """The function (map, z (B, 2d), ...) of a batch, for one state z (2d,) too."""
+    """The function (map, z (B, 2d), args, ...) of a batch, for one state z (2d,) too."""
 
     @wraps(function)
-    def either(map_, z, *static):
+    def either(map_, z, args, *static):
         if z.ndim == 2:
-            return function(map_, z, *static)
-        return jax.tree.map(lambda a: a[0], function(map_, z[None], *static))
+            return function(map_, z, args, *static)
+        return jax.tree.map(lambda a: a[0], function(map_, z[None], args, *static))
 
     return either
 
 
 @compiled_sooner
 @_or_one_state
-def _step(map_, z):
-    return map_._apply(z)
+def _step(map_, z, args):
+    return map_._apply(z, args)
 
 
-@partial(compiled_sooner, static_argnums=(2,), seldom_run=True)
+@partial(compiled_sooner, static_argnums=(3,), seldom_run=True)
 @_or_one_state
-def _defect(map_, z, unrolled):
+def _defect(map_, z, args, unrolled):
     def tangent(unit):
-        step = partial(map_._apply, unrolled=unrolled)
+        step = partial(map_._apply, args=args, unrolled=unrolled)
         return jax.jvp(lambda y: step(y)[0], (z,), (jnp.broadcast_to(unit, z.shape),))[1]
 
     jacobian = jax.vmap(tangent, out_axes=-1)(jnp.eye(z.shape[1], dtype=z.dtype))
@@ -318,18 +365,18 @@ def _defect(map_, z, unrolled):
 
 @compiled_sooner
 @_or_one_state
-def _hamiltonian(map_, z):
-    return map_.pieces[0].value(map_._inner(z)[0])
+def _hamiltonian(map_, z, args):
+    return map_.pieces[0].value(map_._inner(z)[0], args)
 
 
 @partial(compiled_sooner, seldom_run=True)
 @_or_one_state
-def _modified(map_, z):
+def _modified(map_, z, args):
     y = map_._inner(z)[0]
-    return of_cells(_cells(map_, y), _cells(map_.reversed(), y), map_.dt)
+    return of_cells(_cells(map_, y, args), _cells(map_.reversed(), y, args), map_.dt)
 
 
-def _cells(map_, y) -> Cells:
+def _cells(map_, y, args) -> Cells:
     """What the steps from y (B, 2d) on contribute to the modified Hamiltonian."""
 
     def advance(carry, _):
@@ -337,10 +384,10 @@ def _cells(map_, y) -> Cells:
         image, total = y, jnp.zeros(y.shape[:1], y.dtype)
         for piece in map_.pieces:
             before = image
-            image, info = piece.step(before)
+            image, info = piece.step(before, args)
             failed = (info.status > LEFT_DOMAIN)[:, None]
             image = jnp.where(failed, jnp.nan, image)
-            total = total + piece.action(before, image, origin)
+            total = total + piece.action(before, image, origin, args)
         reduced, _, _ = map_._reduce(image, jnp.zeros_like(image))
         return (reduced, origin + (reduced - image)), Cells(total, image - y, image - origin)
 
@@ -349,11 +396,11 @@ def _cells(map_, y) -> Cells:
 
 @compiled_sooner
 @_or_one_state
-def _determinant(map_, z):
+def _determinant(map_, z, args):
     y, _, _ = map_._inner(z)
     found = []
     for piece in map_.pieces:
-        image, _ = piece.step(y)
+        image, _ = piece.step(y, args)
         if isinstance(piece, Generated):
             found.append(piece.determinant(y, image))
         y = image
@@ -370,9 +417,9 @@ def _judge(status, inside, stop_outside: bool):
     return jnp.where((status <= LEFT_DOMAIN) & ~inside, outside, status)
 
 
-def _begun(map_, z, stop_outside):
+def _begun(map_, z, args, stop_outside):
     y, compensation, turns = map_._inner(z)
-    inside, finite = map_.domain.contains(y), jnp.all(jnp.isfinite(y), axis=-1)
+    inside, finite = map_._contains(y, args), jnp.all(jnp.isfinite(y), axis=-1)
     status = _judge(jnp.where(finite, OK, NON_FINITE), inside, stop_outside)
     count = jnp.zeros(z.shape[0], jnp.result_type(int))
     left_at = jnp.where(inside | ~finite, count - 1, count)
@@ -382,20 +429,20 @@ def _begun(map_, z, stop_outside):
     )  # fmt: skip
 
 
-_start = compiled_sooner(_begun, (2,))
+_start = compiled_sooner(_begun, (3,))
 
 
-def _advanced(map_, lanes, num_saved, save_every, stop_outside):
+def _advanced(map_, lanes, args, num_saved, save_every, stop_outside):
     def step(lanes: Lanes) -> Lanes:
         going = lanes.status <= LEFT_DOMAIN
         y, compensation = jnp.where(going[:, None], lanes.y, jnp.nan), lanes.compensation
         infos = []
         for piece in map_.pieces:
-            y, compensation, info = piece.compensated_step(y, compensation)
+            y, compensation, info = piece.compensated_step(y, compensation, args)
             infos.append(info)
         info = _worst(infos)
         y, compensation, turns = map_._reduce(y, compensation)
-        inside, finite = map_.domain.contains(y), jnp.all(jnp.isfinite(y), axis=-1)
+        inside, finite = map_._contains(y, args), jnp.all(jnp.isfinite(y), axis=-1)
         failed = jnp.where(finite, info.status, NON_FINITE)
         status = jnp.where(failed == OK, _judge(lanes.status, inside, stop_outside), failed)
         status = jnp.where(going, status, lanes.status).astype(jnp.int32)
@@ -418,13 +465,13 @@ def _advanced(map_, lanes, num_saved, save_every, stop_outside):
     return lanes, jnp.moveaxis(saved, 0, 1)
 
 
-_advance = compiled_sooner(_advanced, (2, 3, 4))
+_advance = compiled_sooner(_advanced, (3, 4, 5))
 
 
-@partial(compiled_sooner, static_argnums=(2, 3, 4))
+@partial(compiled_sooner, static_argnums=(3, 4, 5))
 @_or_one_state
-def _rollout(map_, z, num_saved, save_every, stop_outside):
-    lanes = _begun(map_, z, stop_outside)
-    lanes, saved = _advanced(map_, lanes, num_saved, save_every, stop_outside)
+def _rollout(map_, z, args, num_saved, save_every, stop_outside):
+    lanes = _begun(map_, z, args, stop_outside)
+    lanes, saved = _advanced(map_, lanes, args, num_saved, save_every, stop_outside)
     info = RolloutInfo(lanes.status, lanes.left_at, lanes.iterations)
     return jnp.concatenate([z[:, None], saved], axis=1), info

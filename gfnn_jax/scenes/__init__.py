@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # what is collected below
     from gfnn_jax.scenes.henon_heiles import henon_heiles
     from gfnn_jax.scenes.henon_heiles_section import henon_heiles_section
     from gfnn_jax.scenes.pcr3bp import pcr3bp
+    from gfnn_jax.scenes.pendulum_length import pendulum_length
     from gfnn_jax.scenes.standard_map import standard_map
     from gfnn_jax.scenes.two_body import two_body
 
@@ -75,6 +76,7 @@ __all__ = [
     "make",
     "names",
     "pcr3bp",
+    "pendulum_length",
     "standard_map",
     "two_body",
 ]

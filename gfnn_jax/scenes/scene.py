@@ -17,7 +17,8 @@ from gfnn_jax.phase_space import State
 
 @dataclasses.dataclass(frozen=True)
 class DrawnFrom:
-    """States drawn directly: ``draw(key, num)`` -> (num, 2d) float64, traced by ``jax.jit``."""
+    """States drawn directly: ``draw(key, num)`` -> (num, 2d) float64, traced by ``jax.jit``; of a
+    scene with k parameters (num, 2d + k), their values last."""
 
     draw: Callable
 
@@ -89,6 +90,8 @@ class Scene:
     step:          ``step(z)`` -> (2d,): the exact map.
     section:       the reference is the return map to it, and the scene a map without time.
     hamiltonian:   ``hamiltonian(z, t)`` -> scalar; autonomous ones ignore t (write ``t=0.0``).
+    parameters:    names (k,) of what differs between systems: ``hamiltonian(z, t, args)`` takes
+                   their values (k,), and ``sampling`` draws them beside the states.
     period:        of a hamiltonian that depends on t. ``dt`` is a whole number of periods, so that
                    every step is the same map.
     invariants:    name -> ``f(z)`` -> scalar, conserved exactly by the reference.
@@ -113,6 +116,7 @@ class Scene:
     step: Callable | None = None
     section: Section | None = None
     hamiltonian: Callable | None = None
+    parameters: tuple[str, ...] = ()
     period: float | None = None
     invariants: Mapping[str, Callable] = dataclasses.field(default_factory=dict)
     coordinates: Coordinates = CARTESIAN
@@ -127,6 +131,8 @@ class Scene:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be finite and > 0, not {value}")
+        if self.parameters and self.hamiltonian is None:
+            raise ValueError(f"{self.name}: parameters need a hamiltonian that takes them")
         if self.period is not None:
             periods = self.dt / self.period
             if round(periods) < 1 or abs(periods - round(periods)) > 1e-9 * periods:

@@ -56,12 +56,31 @@ def _solve(field, start, end, z, until=None):
     return jnp.where(solution.result == wanted, solution.ys[-1], jnp.nan)
 
 
+@dataclasses.dataclass(frozen=True)
+class _WithArgs:
+    """The vector field of a Hamiltonian with parameters: ``field(x, t)`` for x = (z, args), z of
+    ``width``, along which args stay as they are."""
+
+    hamiltonian: Callable
+    width: int
+
+    def field(self, x, t=0.0):
+        z, args = x[: self.width], x[self.width :]
+        along = hamiltonian_vector_field(lambda z, t: self.hamiltonian(z, t, args))
+        return jnp.concatenate([along(z, t), jnp.zeros_like(args)])
+
+
+def _field(hamiltonian):
+    given = isinstance(hamiltonian, _WithArgs)
+    return hamiltonian.field if given else hamiltonian_vector_field(hamiltonian)
+
+
 def _integrator(hamiltonian, dt):
     """``advance(t, z)`` by one ``dt``, for z (B, 2d); what fails becomes NaN for good.
 
     One solve for every dt: a trajectory does not depend on which of its states are saved.
     """
-    field = hamiltonian_vector_field(hamiltonian)
+    field = _field(hamiltonian)
     return jax.vmap(lambda t, z: _solve(field, t, t + dt, z), in_axes=(None, 0))
 
 
@@ -122,22 +141,39 @@ def _trajectories(z0, save_every, num_saved, dt, flow, step, section, hamiltonia
 
 def _reference(scene: Scene) -> tuple:
     """What a trajectory of the scene depends on."""
-    return scene.dt, scene.flow, scene.step, scene.section, scene.hamiltonian, scene.period
+    hamiltonian = scene.hamiltonian
+    if scene.parameters:
+        assert hamiltonian is not None
+        hamiltonian = _WithArgs(hamiltonian, 2 * scene.dim)
+    return scene.dt, scene.flow, scene.step, scene.section, hamiltonian, scene.period
 
 
 def reference_trajectories(
-    scene: Scene, z0: States, num_steps: int, *, save_every: int = 1
+    scene: Scene, z0: States, num_steps: int, *, save_every: int = 1, params=None
 ) -> Float[np.ndarray, "batch saved phase"]:
     """Reference trajectories from ``z0`` (B, 2d): (B, 1 + num_steps // save_every, 2d), z0 first.
 
     The scene's exact flow or exact map where it has one, else Dopri8, to its section where it has
-    one. Time starts at 0. Angles are
-    not reduced. From where a state escapes or collides its own row is NaN, and no other lane's.
+    one. Time starts at 0. params: (k,) or (B, k), where the scene has parameters. Angles are not
+    reduced. From where a state escapes or collides its own row is NaN, and no other lane's.
     """
     require_x64("a reference trajectory")
     z0 = np.asarray(z0, np.float64)
-    saved = _trajectories(z0, save_every, num_steps // save_every, *_reference(scene))
-    return np.concatenate([z0[:, None], np.moveaxis(np.asarray(saved), 0, 1)], axis=1)
+    x0 = _with_params(scene, z0, params)
+    saved = _trajectories(x0, save_every, num_steps // save_every, *_reference(scene))
+    saved = np.moveaxis(np.asarray(saved), 0, 1)[..., : z0.shape[1]]
+    return np.concatenate([z0[:, None], saved], axis=1)
+
+
+def _with_params(scene: Scene, z0, params):
+    """States and parameters beside each other (B, 2d + k)."""
+    count = len(scene.parameters)
+    if (params is not None) != bool(count):
+        wanted = f"params {', '.join(scene.parameters)}" if count else "no params"
+        raise ValueError(f"expected {wanted} for the scene {scene.name}")
+    if not count:
+        return z0
+    return np.concatenate([z0, np.broadcast_to(params, (len(z0), count))], axis=1)
 
 
 def flow_step(field: Callable, dt: float, tolerance: float) -> Callable:
@@ -234,22 +270,68 @@ def _draw(scene, law, num, key):
 
 def sample_states(scene: Scene, num: int, key) -> Drawn:
     """``num`` states of the scene's training law, (num, 2d)."""
-    return _draw(scene, scene.sampling, num, key)
+    return _draw(scene, scene.sampling, num, key)[:, : 2 * scene.dim]
+
+
+def sample_params(
+    scene: Scene, num: int, key, *, test: bool = False
+) -> Float[np.ndarray, "num params"] | None:
+    """The parameters (num, k) of the states that `sample_states`, or with ``test``
+    `sample_test_states`, draws with the same key; None where the scene has none."""
+    if not scene.parameters:
+        return None
+    law = (scene.test_states if test else None) or scene.sampling
+    return _draw(scene, law, num, key)[:, 2 * scene.dim :]
 
 
 def sample_test_states(scene: Scene, num: int, key) -> Drawn:
     """``num`` states for rollouts to start from, (num, 2d): the training law unless declared."""
-    return _draw(scene, scene.test_states or scene.sampling, num, key)
+    return _draw(scene, scene.test_states or scene.sampling, num, key)[:, : 2 * scene.dim]
 
 
 def sample_sequences(
     scene: Scene, num: int, length: int, key
 ) -> Float[np.ndarray, "num length phase"]:
     """``num`` reference sequences of ``length`` states each, from states of the training law."""
-    return reference_trajectories(scene, sample_states(scene, num, key), length - 1)
+    params = sample_params(scene, num, key)
+    return reference_trajectories(scene, sample_states(scene, num, key), length - 1, params=params)
 
 
-def sample_pairs(scene: Scene, num_pairs: int, key) -> Pairs:
-    """``num_pairs`` states of the training law and their images one ``dt`` later."""
-    z = sample_sequences(scene, num_pairs, 2, key)
-    return Pairs(z[:, 0], z[:, 1], scene.dt)
+def sample_pairs(
+    scene: Scene, num_pairs: int, key, *, dt_range: tuple[float, float] | None = None
+) -> Pairs:
+    """``num_pairs`` states of the training law and their images one ``dt`` later.
+
+    dt_range: the shortest and the longest time between the states of a pair, which is then drawn
+    uniformly for each: irregular sampling. Raises ValueError where the scene has no flow.
+    """
+    params = sample_params(scene, num_pairs, key)
+    args = None if params is None else dict(zip(scene.parameters, params.T, strict=True))
+    if dt_range is None:
+        z = sample_sequences(scene, num_pairs, 2, key)
+        return Pairs(z[:, 0], z[:, 1], scene.dt, args)
+    low, high = dt_range
+    if scene.timeless or scene.period is not None or not 0 < low < high < np.inf:
+        raise ValueError(
+            f"expected 0 < shortest < longest dt, of an autonomous flow; got {low:g} and {high:g} "
+            f"for the scene {scene.name}"
+        )
+    z0 = sample_states(scene, num_pairs, key)
+    dt = low + (high - low) * np.asarray(_uniform(jax.random.fold_in(key, 1), num=num_pairs))
+    reference = _reference(scene)
+    z1 = _after(_with_params(scene, z0, params), dt, flow=reference[1], hamiltonian=reference[4])
+    return Pairs(z0, np.asarray(z1)[:, : z0.shape[1]], dt, args)
+
+
+@partial(jax.jit, static_argnames=("num",))
+def _uniform(key, *, num):
+    return jax.random.uniform(key, (num,), jnp.float64)
+
+
+@partial(jax.jit, static_argnames=("flow", "hamiltonian"))
+def _after(x, dt, *, flow, hamiltonian):
+    """States x (B, ...) each a time dt (B,) later."""
+    if flow is not None:
+        return jax.vmap(flow)(x, dt)
+    field = _field(hamiltonian)
+    return jax.vmap(lambda x, dt: _solve(field, 0.0, dt, x))(x, dt)

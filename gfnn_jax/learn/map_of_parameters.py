@@ -1,0 +1,201 @@
+"""Learn S(w; parameters): the generating function of maps that differ in parameters.
+
+For kicked maps and return maps, which have no flow, and wherever no H is found. S = Σ c_jm φ_j(w)
+f_m(parameters) is linear in its coefficients; its libraries are those of an H with parameters, its
+data those of any S: target gradients at evaluation points.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.coordinates import to_user
+from gfnn_jax.errors import FitError
+from gfnn_jax.families.expressions import coordinate_names
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.fitting.gauss_newton import fitted_gradients, significant
+from gfnn_jax.generating.charts import CHARTS, AnyChart
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.learn.assemble import Assembled, composed, stepped
+from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
+from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.diagnose import SINGULAR
+from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
+from gfnn_jax.learn.prepare import Prepared
+
+_CHARTS = ("type2", "midpoint", "type3")  # that are tried, in this order
+_MOST_TERMS, _ROWS_PER_TERM = 500, 3
+_THRESHOLDS = (1e4, 1e3, 100.0, 30.0, 10.0)  # standard errors below which terms go, tried in turn
+_RISE, _ROUNDING = 1.1, 1e-15  # of the held-out error that this may cost
+_SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved
+
+
+class LearnedMap(NamedTuple):
+    """The candidate, its error measured by steps in NumPy, and the piece that S generates."""
+
+    candidate: Candidate
+    piece: Generated
+
+
+class _Tried(NamedTuple):
+    piece: Generated
+    error: OneStepError
+    train_rms: float
+
+
+def learn_map(
+    prepared: Prepared, judges: Judges, scene: Any = None, *, chart: str = "auto",
+    clock: Clock | None = None, say: Callable[[str], Any] = lambda message: None,
+) -> LearnedMap:  # fmt: skip
+    """The map of these pairs of one dt and several systems: of the first chart that meets the
+    tolerance, else of the best.
+
+    Raises FitError where no chart covers the data, or the pairs are too few.
+    """
+    clock, started = clock or Clock(), time.perf_counter()
+    best: _Tried | None = None
+    try:
+        for name in _CHARTS if chart == "auto" else (chart,):
+            for found in _of_chart(CHARTS[name], prepared, judges, scene, clock, say):
+                if best is None or found.error.bound < best.error.bound:
+                    best = found
+            if best is not None and best.error.bound <= judges.tolerance.bound:
+                break
+    except OutOfTime:
+        if best is None:
+            raise
+    if best is None or not np.isfinite(best.error.bound):
+        raise FitError(
+            "expected pairs that tell an S with parameters: they are too few, or no chart covers "
+            "them for all values of the parameters"
+        )
+    best = _sparse(best, prepared, judges)
+    piece = best.piece
+    gradient, with_hessian = piece.family.operations
+    candidate = Candidate(
+        label=f"S, {piece.family.num_parameters} terms", family=piece.family.name,
+        chart=piece.chart.name, num_parameters=piece.family.num_parameters,
+        operations=float(gradient + with_hessian), validation_rms=best.error.rms,
+        validation_relative=best.error.relative, validation_bound=best.error.bound,
+        deviations=best.error.deviations, train_rms=best.train_rms,
+        fit_seconds=time.perf_counter() - started,
+    )  # fmt: skip
+    return LearnedMap(with_error(candidate, best.error), piece)
+
+
+def map_of(
+    prepared: Prepared, judges: Judges, scene: Any, chart: str, law: Any, clock: Clock,
+    say: Callable[[str], Any],
+) -> LearnedMap | None:  # fmt: skip
+    """As `learn_map`; None where it finds none, or none that is better than the law that was."""
+    try:
+        with np.errstate(all="ignore"):
+            found = learn_map(prepared, judges, scene, chart=chart, clock=clock, say=say)
+    except (FitError, OutOfTime):
+        if law is None:
+            raise
+        return None
+    if law is not None and not found.candidate.validation_bound < law.candidate.validation_bound:
+        return None
+    return found
+
+
+def assembled(learned: LearnedMap, prepared: Prepared, judges: Judges) -> Assembled:
+    """The candidate's map, its error and its time per step measured by the steps that users run."""
+    map_ = composed(learned.piece, prepared, judges)
+    held = judges.pairs.take(judges.held_out)
+    steps = stepped(map_, np.asarray(held.z0), args=held.args)
+    states = np.where(steps.failed[:, None], np.nan, steps.images)
+    candidate = dataclasses.replace(
+        with_error(learned.candidate, judges.error_of(states, prepared.coordinates)), map=map_,
+        newton_iterations_max=int(steps.iterations.max()),
+        microseconds_per_step=steps.microseconds_per_step,
+    )  # fmt: skip
+    return Assembled(candidate, steps.compile_seconds)
+
+
+def _of_chart(chart: AnyChart, prepared: Prepared, judges: Judges, scene, clock: Clock, say):
+    """What is tried in this chart, in turn."""
+    coordinates, dim = prepared.coordinates, prepared.dim
+    angles = tuple(i for i in coordinates.angles if i < dim and i not in coordinates.cyclic)
+    plain = tuple(
+        name
+        for i, name in enumerate(coordinate_names(dim))
+        if i not in angles and i not in coordinates.cyclic
+    )
+    states = state_libraries(
+        dim, prepared.parameters, angles=angles, cyclic=coordinates.cyclic, plain=plain,
+        features=scene.features if scene is not None else None, reversor=None, own=None,
+    )  # fmt: skip
+    _, args = prepared.given(judges.training)
+    functions = functions_of_parameters(dim, prepared.parameters, args, own=False)
+
+    def attempt(family: Terms) -> _Tried:
+        clock.check()
+        say(f"S in {chart.name}: {family.num_parameters} terms")
+        return _fitted(chart, family, prepared, judges)
+
+    yield from walked(
+        states, functions, attempt, lambda tried: tried.error.bound,
+        bound=judges.tolerance.bound,
+        most=min(len(judges.training) * 2 * dim / _ROWS_PER_TERM, _MOST_TERMS),
+    )  # fmt: skip
+
+
+def _data(chart: AnyChart, prepared: Prepared, rows):
+    """(w, target gradient, args) of these rows."""
+    y0, y1 = prepared.y0[rows], prepared.y1[rows]
+    w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, prepared.dt)
+    return w, target, prepared.given(rows)[1]
+
+
+def _fitted(chart: AnyChart, family: Terms, prepared: Prepared, judges: Judges) -> _Tried:
+    """The library's S by least squares, and the error of its steps on the held-out pairs."""
+    w, target, args = _data(chart, prepared, judges.training)
+    c = fitted_gradients(family, w, target, prepared.scale, args)
+    return _judged(Generated(family, c, chart, prepared.dt, prepared.scale), prepared, judges)
+
+
+def _judged(piece: Generated, prepared: Prepared, judges: Judges) -> _Tried:
+    """With the errors of its steps; infinite where the chart folds over the held-out pairs."""
+    rows, family, params = judges.held_out, piece.family, piece.params
+    w, _, args = _data(piece.chart, prepared, rows)
+    images, off = piece.refined_step(prepared.y0[rows], w, args)
+    determinant = piece.determinant(prepared.y0[rows], prepared.y1[rows], args)
+    folds = not (determinant > SINGULAR).all() and not (determinant < -SINGULAR).all()
+    bad = ~(off < _SOLVED) | folds
+    images = np.where(bad[:, None], np.nan, images)
+    error = judges.error_of(to_user(prepared.coordinates, images), prepared.coordinates)
+    w, target, args = _data(piece.chart, prepared, judges.training)
+    left = (family.gradient(params, w, args) - target) * _weight(prepared)
+    return _Tried(piece, error, float(np.sqrt(np.mean(left**2))))
+
+
+def _weight(prepared: Prepared) -> np.ndarray:
+    """h over the scale of what each entry of ∇S changes (2d,)."""
+    return prepared.dt / np.roll(prepared.scale, prepared.dim)
+
+
+def _sparse(full: _Tried, prepared: Prepared, judges: Judges) -> _Tried:
+    """Without the terms that the pairs do not ask for, as far as the held-out error allows."""
+    piece = full.piece
+    w, target, args = _data(piece.chart, prepared, judges.training)
+    weight = _weight(prepared)
+    terms = (piece.family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
+    residual = terms @ piece.params - (target * weight).ravel()
+    factor = np.linalg.qr(np.column_stack([terms, residual]), mode="r")
+    tried: set[int] = set()
+    for threshold in _THRESHOLDS:
+        kept, _ = significant(factor, piece.params, len(residual), threshold)
+        if not 0 < len(kept) < piece.family.num_parameters or len(kept) in tried:
+            continue
+        tried.add(len(kept))
+        found = _fitted(piece.chart, piece.family.take(kept.tolist()), prepared, judges)
+        if found.error.relative <= max(_RISE * full.error.relative, _ROUNDING):
+            return found
+    return full

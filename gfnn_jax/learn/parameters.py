@@ -1,0 +1,155 @@
+"""Libraries of terms for an H that depends on parameters too: H = Σ c_jm φ_j(z) f_m(parameters).
+
+φ_j are those of a library of the state. f_m are first the products of small whole powers of the
+parameters, which most laws are made of (p²/(m l²), g l cos q), then Chebyshev polynomials, which
+any smooth dependence is. A parameter that keeps its sign enters these by its logarithm: every power
+of it is entire in that, where a pole near the data would slow the series in the parameter itself.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.families.modes import Modes
+from gfnn_jax.families.terms import Terms, joined, multiplied, polynomial_terms
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Tuned on the pendulum of varied length and on Kepler's problem of varied mass.
+
+    powers: the largest exponent of a parameter, total: of them all together. degrees: of the
+    Chebyshev polynomials, in turn. boxes: (order, degree) of the libraries with angles;
+    polynomials: degrees of those without; features: of a scene's. gained: a library that lowers
+    the error by less has not helped; leap: one that lowers it by more is taken at once.
+    apart: the ratio of the largest to the smallest value from which on logarithms are taken.
+    """
+
+    powers: int = 2
+    total: int = 3
+    degrees: tuple[int, ...] = (3, 6, 10, 15, 20, 26, 32)
+    boxes: tuple[tuple[int, int], ...] = ((1, 2), (2, 2), (2, 4), (4, 4))
+    polynomials: tuple[int, ...] = (2, 3, 4, 6, 8)
+    features: tuple[int, ...] = (2, 3)
+    gained: float = 0.5
+    leap: float = 0.03
+    apart: float = 1.2
+
+
+OPTIONS = Options()
+_FAR_FROM_ZERO = 0.02  # of the largest value: nearer to it a parameter has no negative powers
+
+
+def state_libraries(
+    dim: int, parameters: tuple[str, ...], *, angles: Sequence[int], cyclic: Sequence[int],
+    plain: tuple[str, ...], features, reversor, own: Terms | None, options: Options = OPTIONS,
+) -> list[Terms]:  # fmt: skip
+    """Libraries of the state alone, by rising size. angles: that enter H, plain: the names of the
+    other coordinates. own: a user's terms, which stand in all of them, at first alone."""
+    if angles and features is None:
+        basis = Modes(dim, tuple(angles), plain)
+        found = [basis.terms(basis.box(*size)) for size in options.boxes]
+    else:
+        degrees = options.polynomials if features is None else options.features
+        found = [
+            polynomial_terms(dim, d, cyclic=cyclic, features=features, reversor=reversor)
+            for d in degrees
+        ]
+    found = [dataclasses.replace(family, parameters=parameters) for family in found]
+    return found if own is None else [own, *(joined(own, family) for family in found)]
+
+
+def functions_of_parameters(
+    dim: int, parameters: tuple[str, ...], args: np.ndarray, own: bool, options: Options = OPTIONS
+) -> list[list[Terms]]:
+    """Rows of sets of functions of the parameters, whose values args are (N, k); in each row every
+    set spans those before it. own: whether none at all is the first."""
+    none = [_constant(dim, parameters)] if own else []
+    powers = _powers(dim, parameters, args, options)
+    series = [_chebyshev(dim, parameters, args, degree, options) for degree in options.degrees]
+    return [[*none, powers], series]
+
+
+def _constant(dim: int, parameters: tuple[str, ...]) -> Terms:
+    return Terms(dim, (), ((),), parameters)
+
+
+def _powers(dim: int, parameters: tuple[str, ...], args, options: Options) -> Terms:
+    """Products of whole powers, negative ones where a parameter keeps away from 0."""
+    inverse = [_keeps_away(column) for column in args.T]
+    ranges = [range(-options.powers if i else 0, options.powers + 1) for i in inverse]
+    exponents = [e for e in product(*ranges) if sum(map(abs, e)) <= options.total]
+    variables = (*parameters, *(f"1/{name}" for name in parameters))
+    rows = tuple((*(max(a, 0) for a in e), *(max(-a, 0) for a in e)) for e in exponents)
+    return Terms(dim, variables, rows, parameters)
+
+
+def _keeps_away(values) -> bool:
+    size = np.abs(values)
+    return bool(np.ptp(np.sign(values)) == 0 and size.min() > _FAR_FROM_ZERO * size.max())
+
+
+def _chebyshev(dim: int, parameters: tuple[str, ...], args, degree: int, options: Options) -> Terms:
+    """Products of Chebyshev polynomials, of total degree up to ``degree``."""
+    arguments = []
+    for name, values in zip(parameters, args.T, strict=True):
+        if (
+            values.min() > 0
+            and _keeps_away(values)
+            and np.ptp(np.log(values)) > np.log(options.apart)
+        ):
+            name, values = f"log({name})", np.log(values)
+        centre, half = 0.5 * (values.max() + values.min()), 0.5 * np.ptp(values)
+        arguments.append(f"({name} - {centre:.6g})/{half * (1 + 1e-5):.6g}")
+    variables = tuple(f"T{n}({x})" for x in arguments for n in range(1, degree + 1))
+    rows = []
+    for each in product(range(degree + 1), repeat=len(parameters)):
+        if sum(each) <= degree:
+            rows.append(tuple(int(n == m) for m in each for n in range(1, degree + 1)))
+    return Terms(dim, variables, tuple(sorted(rows, key=sum)), parameters)
+
+
+def walked(
+    states: Sequence[Terms],
+    functions: Sequence[Sequence[Terms]],
+    attempt: Callable[[Terms], Any],
+    error_of: Callable[[Any], float],
+    *,
+    bound: float,
+    most: float,
+    options: Options = OPTIONS,
+) -> Iterator[Any]:
+    """What ``attempt`` finds for products of a library of the state and one of the parameters, as
+    they are tried: of each row of functions, both grow, whichever lowers the error, until it is
+    within the bound or neither does. most: terms at most."""
+    at, best = 0, np.inf
+    for row in functions:
+        level, here = 0, np.inf
+        moves: list[tuple[int, int]] = [(0, 0)]
+        while moves:
+            tried: list[tuple[float, tuple[int, int]]] = []
+            for more, further in moves:
+                if at + more >= len(states) or level + further >= len(row):
+                    continue
+                family = multiplied(states[at + more], row[level + further])
+                if family.num_parameters > most:
+                    continue
+                found = attempt(family)
+                yield found
+                error = error_of(found)
+                best = min(best, error)
+                tried.append((error, (more, further)))
+                if best <= bound:
+                    return
+                if error < options.leap * here:
+                    break
+            error, move = min(tried, default=(np.inf, (0, 0)))
+            if not error < options.gained * here:
+                break
+            at, level, here = at + move[0], level + move[1], error
+            moves = [(0, 1), (1, 0), (1, 1)]

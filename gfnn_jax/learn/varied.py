@@ -1,0 +1,106 @@
+"""Pairs that differ in more than their states: in the time between them, in parameters.
+
+A generating function is that of one map; a Hamiltonian serves any dt and, as a function of the
+parameters too, any system of the family.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.expressions import check_names
+from gfnn_jax.learn.choose_charts import Charts
+from gfnn_jax.learn.diagnosed import Diagnosis
+from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.phase_space import Pairs, sizes
+
+_SAME = 1e-9  # of its size: a parameter, or a dt, that varies by less does not
+_PRINTED = 1e-5  # of dt: what printed times may differ by
+_NEARLY_ALL = 0.9  # of the pairs
+
+
+def check_varied(pairs: Pairs) -> None:
+    """Raises FitError, in one line, for a dt of each pair or args that cannot be used."""
+    args = pairs.args or {}
+    try:
+        check_names(pairs.dim, tuple(args))
+    except InputError as error:
+        raise FitError(str(error)) from error
+    columns = {"dt": np.asarray(pairs.dt)} if np.ndim(pairs.dt) else {}
+    for name, values in {**columns, **args}.items():
+        if np.asarray(values).dtype.kind not in "fiu":
+            raise FitError(f"expected {name} of real numbers, got {np.asarray(values).dtype}")
+        bad = ~np.isfinite(values) | (values <= 0 if name == "dt" else False)
+        if bad.any():
+            what = "finite time steps above 0" if name == "dt" else f"finite values of {name}"
+            row = int(np.argmax(bad))
+            raise FitError(
+                f"expected {what}, got {int(bad.sum())} of {len(bad)} that are not, the first is "
+                f"{values[row]} in row {row}"
+            )
+
+
+def as_varied(
+    pairs: Pairs, *, learn: str, family: str, chart: str, base
+) -> tuple[Pairs, str, list[str]]:
+    """The pairs as they vary, what is learned of them, and what is to be said.
+
+    A dt that is the same in all is one number; so is one that is the same in nearly all, and the
+    others, those across a gap, are left out unless only H is asked for. A parameter that is the
+    same in all is none. Pairs of different dt tell H alone: raises FitError where a map is asked
+    for, or a family or base of it where there are parameters.
+    """
+    pairs, messages = _without_constants(pairs)
+    if np.ndim(pairs.dt) and learn != "hamiltonian":
+        usual = np.median(pairs.dt)
+        rows = np.flatnonzero(np.abs(pairs.dt - usual) <= _PRINTED * usual)
+        if len(rows) >= _NEARLY_ALL * len(pairs):
+            messages.append(
+                f"{len(pairs) - len(rows)} of {len(pairs)} pairs are not dt = {usual:g} apart: "
+                "they are left out (learn='hamiltonian' uses them)"
+            )
+            pairs = pairs.take(rows)
+            pairs = dataclasses.replace(pairs, dt=float(np.mean(pairs.dt)))
+    differs = "dt" if np.ndim(pairs.dt) else "parameters" if pairs.args else None
+    if differs is None:
+        return pairs, learn, messages
+    if differs == "parameters" and (family, base) == ("auto", None):
+        return pairs, "map" if chart != "auto" else learn, messages
+    if learn == "map" or (family, chart) != ("auto", "auto") or base is not None:
+        raise FitError(
+            f"the pairs differ in their {differs}: expected learn='auto' or 'hamiltonian', and no "
+            "family, chart or base, for S is that of one dt"
+        )
+    return pairs, "hamiltonian", messages
+
+
+def _without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
+    dt = np.asarray(pairs.dt)
+    one = float(np.mean(dt)) if dt.ndim and np.ptp(dt) <= _SAME * np.mean(dt) else pairs.dt
+    args = {name: np.asarray(v, np.float64) for name, v in (pairs.args or {}).items()}
+    still = [name for name, v in args.items() if np.ptp(v) <= _SAME * np.abs(v).max()]
+    kept = {name: v for name, v in args.items() if name not in still}
+    messages = [
+        f"the parameter {name} is {args[name][0]:g} in all pairs: it is left out, for its effect "
+        "is not known"
+        for name in still
+    ]
+    return Pairs(pairs.z0, pairs.z1, one, kept or None), messages
+
+
+def given_by(prepared: Prepared) -> np.ndarray | None:
+    """What a pair's move depends on beside its state, (N, k) of unit sizes; None for nothing."""
+    if not prepared.varied:
+        return None
+    columns = [] if prepared.own_dt is None else [prepared.own_dt]
+    columns += [] if prepared.args is None else list(prepared.args.T)
+    given = np.column_stack(columns)
+    return given / sizes(given)
+
+
+def undiagnosed(prepared: Prepared) -> Diagnosis:
+    """Pairs of more than one map have no Jacobians that neighbours tell, and no charts."""
+    return Diagnosis(prepared, Charts([], None, {}, []), float("nan"), [])

@@ -1,0 +1,370 @@
+"""What a step depends on beside the state: its own dt, and parameters of the system."""
+
+import re
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax import cli
+from gfnn_jax.data.files import read_trajectories
+from gfnn_jax.families.terms import Terms, given_terms
+from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.flows.collocation import Steps, images
+from gfnn_jax.learn.parameters import functions_of_parameters, walked
+from gfnn_jax.learn.varied import as_varied
+
+LENGTH = given_terms(1, ["p**2/(2*l**2) - 9.81*l*cos(q)"], ("l",))
+FINE = Steps(8, 4)
+
+
+def pendulums(count, seed=0):
+    """States, lengths and times of pendulums."""
+    rng = np.random.default_rng(seed)
+    length, dt = rng.uniform(0.5, 2, count), rng.uniform(0.02, 0.1, count)
+    z = np.stack([rng.uniform(-2, 2, count), length**2 * rng.uniform(-2, 2, count)], axis=1)
+    return z, length, dt
+
+
+def image(z, length, dt):
+    return images(LENGTH, np.ones(1), z, dt, FINE, args=length[:, None]).states
+
+
+@pytest.fixture(scope="module")
+def learned():
+    z, length, dt = pendulums(400)
+    pairs = gfnn.Pairs(z, image(z, length, dt), dt, {"l": length})
+    return gfnn.fit(pairs, angles=(0,), tolerance=1e-11)
+
+
+# The arithmetic.
+
+
+def test_terms_of_parameters_have_the_gradients_of_jax():
+    texts = ["p1**2/l**2", "l*cos(q1)", "T7(0.5*log(l) - 0.1)*q1*p1", "T3(q1)*l"]
+    family = given_terms(1, texts, ("l",))
+    rng = np.random.default_rng(0)
+    c, z, args = rng.normal(size=4), rng.normal(size=(5, 2)), rng.uniform(0.5, 2, (5, 1))
+
+    def by_hand(z, a):
+        x = 0.5 * jnp.log(a) - 0.1
+        t7 = 64 * x**7 - 112 * x**5 + 56 * x**3 - 7 * x
+        values = [z[1] ** 2 / a**2, a * jnp.cos(z[0]), t7 * z[0] * z[1]]
+        values.append((4 * z[0] ** 3 - 3 * z[0]) * a)
+        return sum(x * v for x, v in zip(c, values, strict=True))
+
+    gradient, hessian = jax.jit(
+        lambda z, a: (jax.vmap(jax.grad(by_hand))(z, a), jax.vmap(jax.hessian(by_hand))(z, a))
+    )(z, args[:, 0])
+    found = family.gradient_and_hessian(c, z, args)
+    np.testing.assert_allclose(found[0], gradient, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(found[1], hessian, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(family.term_gradients(z, args) @ c, gradient, rtol=1e-12, atol=1e-13)
+    # A parameter is no coordinate of the state: stages have one more axis than lanes.
+    stages = family.gradient(c, np.stack([z, z + 1]), args)
+    np.testing.assert_allclose(stages[1], family.gradient(c, z + 1, args), rtol=1e-14)
+
+
+def test_images_of_lanes_are_those_of_each_lane_alone():
+    """Newton's lanes too: at the longest dt the fixed point does not contract."""
+    z, length, _ = pendulums(6)
+    dt, c = np.array([0.01, 0.3, 0.9, 0.05, 1.5, 0.2]), np.ones(1)
+    together = images(LENGTH, c, z, dt, Steps(4, 1), args=length[:, None], derivatives=True)
+    for i in range(len(z)):
+        alone = images(
+            LENGTH, c, z[i : i + 1], float(dt[i]), Steps(4, 1), args=length[i : i + 1, None],
+            derivatives=True,
+        )  # fmt: skip
+        for found, expected in zip(together, alone, strict=True):
+            np.testing.assert_allclose(found[i], expected[0], rtol=1e-11, atol=1e-12)
+
+
+def test_derivatives_in_the_coefficients_at_each_own_dt():
+    z, length, dt = pendulums(6)
+    family = given_terms(1, ["p**2/l**2", "l*cos(q)"], ("l",))
+    problem = Problem(z, z, dt, np.ones(2), args=length[:, None])
+    c, rows = np.array([0.5, -9.81]), np.arange(6)
+    slope = problem.images(family, c, rows, FINE, derivatives=True).by_coefficient
+    for j, e in enumerate(1e-5 * np.eye(2)):
+        ahead, behind = (problem.images(family, c + s * e, rows, FINE).states for s in (1, -1))
+        np.testing.assert_allclose(slope[:, :, j], (ahead - behind) / 2e-5, atol=1e-9)
+
+
+# Irregular sampling.
+
+
+def test_irregular_sampling_serves_any_dt():
+    law = given_terms(1, ["p**2/2 + q**2/2 + q**4/4"])
+    rng = np.random.default_rng(0)
+    z0, dt = rng.uniform(-1, 1, (150, 2)), rng.uniform(0.1, 1.2, 150)
+    z1 = images(law, np.ones(1), z0, dt, FINE).states
+    fit = gfnn.fit(gfnn.Pairs(z0, z1, dt), tolerance=1e-11)
+    assert fit.chosen.validation_relative < 1e-13  # by steps, each pair's at its own dt
+    assert float(fit.map.dt) == np.median(dt)
+    found, info = fit.map.step(z0, dt=3.0)  # beyond what was sampled: more substeps
+    expected = images(law, np.ones(1), z0, 3.0, Steps(8, 16)).states
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert not info.status.any()
+
+
+def test_a_gap_in_uniform_data_costs_a_pair_and_not_the_map():
+    z = np.random.default_rng(0).normal(size=(50, 2))
+    dt = np.where(np.arange(50) == 7, 0.3, 0.1)
+    options = {"learn": "auto", "family": "auto", "chart": "auto", "base": None}
+    pairs, learn, messages = as_varied(gfnn.Pairs(z, z, dt), **options)
+    assert (len(pairs), pairs.dt, learn) == (49, pytest.approx(0.1), "auto")
+    assert "1 of 50 pairs are not dt = 0.1 apart" in messages[0]
+    pairs, *_ = as_varied(gfnn.Pairs(z, z, dt), **{**options, "learn": "hamiltonian"})
+    assert len(pairs) == 50
+
+
+# Parameters.
+
+
+def test_a_law_is_read_with_its_parameter(learned):
+    assert len(learned.hamiltonian.terms) == 2
+    terms = {t.term: t.coefficient for t in learned.hamiltonian.terms}
+    assert terms == pytest.approx({"cos(q1) l": -9.81, "p1² (1/l)²": 0.5}, rel=1e-12)
+    z, length, _ = pendulums(50, seed=1)
+    found, _ = learned.map.step(z, {"l": length}, dt=0.05)
+    np.testing.assert_allclose(found, image(z, length, 0.05), atol=1e-13)
+    assert learned.symplecticity_defect < 1e-13
+
+
+def test_a_dependence_that_is_no_power_is_a_series():
+    """1/(l + 0.3)² in Chebyshev polynomials of log l; no flow is compiled."""
+    law = given_terms(1, ["p**2/(2*(l + 0.3)**2) + 5*q**2"], ("l",))
+    z, length, _ = pendulums(800)
+    args = length[:, None]
+    gradient = law.gradient(np.ones(1), z, args)
+    base = given_terms(1, ["p**2", "q**2"], ("l",))
+    tried = []
+
+    def attempt(family):
+        tried.append(family.num_parameters)
+        terms = family.term_gradients(z, args).reshape(-1, family.num_parameters)
+        c, *_ = np.linalg.lstsq(terms, gradient.ravel(), rcond=1e-14)
+        return np.abs(terms @ c - gradient.ravel()).max()
+
+    rows = functions_of_parameters(1, ("l",), args, own=False)
+    errors = list(walked([base], rows, attempt, float, bound=1e-10, most=100))
+    assert errors[-1] < 1e-10
+    assert errors[0] > 1e-3  # powers do not serve
+    assert tried[-1] <= 42
+
+
+def kicked(z, strength):
+    """The standard map."""
+    p = z[:, 1] + strength * np.sin(z[:, 0])
+    return np.stack([z[:, 0] + p, p], axis=1)
+
+
+def test_a_map_without_a_flow_has_parameters_too():
+    rng = np.random.default_rng(0)
+    z, strength = rng.uniform(0, 2 * np.pi, (500, 2)), rng.uniform(0.5, 2, 500)
+    pairs = gfnn.Pairs(z, np.mod(kicked(z, strength), 2 * np.pi), 1.0, {"k": strength})
+    fit = gfnn.fit(pairs, angles=(0, 1), tolerance=1e-12)
+    assert fit.chosen.learns == "map"
+    assert set(fit.map.pieces[0].family.term_names) == {"p1²", "cos(q1) k"}
+    z, strength = rng.uniform(0, 2 * np.pi, (50, 2)), rng.uniform(0.5, 2, 50)
+    found, _ = fit.map.step(z, {"k": strength})
+    error = np.asarray(found) - kicked(z, strength)
+    assert np.abs(error - 2 * np.pi * np.round(error / (2 * np.pi))).max() < 1e-13
+    with pytest.raises(ValueError, match="a map of dt = 1 only: fit with learn='hamiltonian'"):
+        fit.map.step(z, {"k": strength}, dt=0.5)
+
+
+def test_rollouts_take_parameters_by_name_and_by_place(learned):
+    z, length, _ = pendulums(8, seed=2)
+    by_name, _ = learned.map.rollout(z, 20, params={"l": length}, dt=0.05)
+    by_place, _ = learned.map.rollout(z, 20, params=length[:, None], dt=0.05)
+    np.testing.assert_array_equal(by_name, by_place)
+    one, _ = learned.map.rollout(z[0], 20, params={"l": length[0]}, dt=0.05)
+    np.testing.assert_allclose(one, by_name[0], atol=1e-13)
+    lanes = learned.map.over(0.05).start(z, params=length)
+    _, states = learned.map.over(0.05).advance(lanes, 20, params=length)
+    np.testing.assert_allclose(states, by_name[:, 1:], atol=1e-13)
+
+
+def test_parameters_outside_the_data_are_a_status_of_their_lane(learned):
+    z, _, _ = pendulums(3, seed=3)
+    length = np.array([1.0, 2.5, 1.5])
+    _, info = learned.map.step(0.1 * z, {"l": length})
+    assert info.status.tolist() == [0, 1, 0]
+    _, info = learned.map.rollout(0.1 * z, 5, params={"l": length}, stop_outside=True)
+    assert info.status.tolist() == [0, 2, 0]
+    assert info.left_at.tolist() == [-1, 0, -1]
+
+
+def test_a_length_is_found_from_an_orbit(learned):
+    """Gauss–Newton on one number, by `jax.grad` through a rollout."""
+    start, true = np.array([[0.5, 0.2]]), np.array([1.3])
+    orbit = start
+    for _ in range(20):
+        orbit = image(orbit, true, 0.05)
+
+    def missed(length):
+        return learned.map.rollout(start[0], 20, params=length, dt=0.05)[0][-1, 0] - orbit[0, 0]
+
+    value_and_slope = jax.jit(jax.value_and_grad(missed))
+    length = jnp.array([1.1])
+    for _ in range(6):
+        value, slope = value_and_slope(length)
+        length = length - value / slope
+    assert abs(float(length[0]) - 1.3) < 1e-12
+
+
+def test_a_saved_map_knows_its_parameters(learned, tmp_path):
+    learned.map.save(tmp_path / "m")
+    map_ = gfnn.load(tmp_path / "m")
+    assert map_.parameters.names == ("l",)
+    z, length, _ = pendulums(3)
+    for one, other in zip(map_.step(z, length), learned.map.step(z, length), strict=True):
+        np.testing.assert_array_equal(jax.tree.leaves(one)[0], jax.tree.leaves(other)[0])
+    assert map_.hamiltonian(z[0], {"l": 1.5}) == pytest.approx(
+        float(LENGTH.value(np.ones(1), z[0], np.array([1.5]))), rel=1e-12
+    )
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (None, "expected params l, which the map was learned with; got none"),
+        ({"m": 1.0}, "expected params l; got m"),
+        (np.ones((4, 2)), "of shape (1,) or (3, 1), got (4, 2)"),
+        ("long", "expected numbers as params, got 'long'"),
+    ],
+)
+def test_params_that_are_not_the_maps(learned, given, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        learned.map.step(np.zeros((3, 2)), given)
+
+
+def test_a_dt_that_a_map_does_not_serve(learned):
+    for dt in (0.0, -1.0, np.nan, "long"):
+        with pytest.raises(ValueError, match="finite and above 0"):
+            learned.map.step(np.zeros(2), {"l": 1.0}, dt=dt)
+    with pytest.raises(ValueError, match="one time step, or one of each state"):
+        learned.map.step(np.zeros((3, 2)), {"l": 1.0}, dt=np.ones(2))
+
+
+Z = np.random.default_rng(0).normal(size=(40, 2))
+DT = np.linspace(0.1, 0.2, 40)
+
+
+@pytest.mark.parametrize(
+    ("dt", "args", "options", "message"),
+    [
+        (np.where(DT > 0.19, -DT, DT), None, {}, "time steps above 0, got 4 of 40 that are not"),
+        (DT[:7], None, {}, "one number or one of each pair (40,), got (7,)"),
+        (0.1, {"l": DT[:7]}, {}, "expected args['l'] of shape (40,), got (7,)"),
+        (0.1, DT[:7], {}, "as name -> (40,) or as an array (40, k)"),
+        (0.1, {"q1": DT}, {}, "a name for a parameter that has no meaning yet, got 'q1'"),
+        (0.1, {"arm length": DT}, {}, "letters, digits and _ as a parameter's name"),
+        (0.1, {"l": np.where(DT > 0.19, np.nan, DT)}, {}, "finite values of l, got 4 of 40"),
+        (DT, None, {"learn": "map"}, "the pairs differ in their dt: expected learn='auto'"),
+        (DT, {"l": DT}, {"chart": "type2"}, "the pairs differ in their dt: expected learn='auto'"),
+        (0.1, {"l": DT}, {"family": "sines"}, "the pairs differ in their parameters"),
+        (0.1, {"l": DT}, {"terms": ["m*p**2"]}, "has the name 'm'"),
+    ],
+)
+def test_pairs_that_cannot_be_used(dt, args, options, message):
+    with pytest.raises(gfnn.FitError, match=re.escape(message)) as caught:
+        gfnn.fit(gfnn.Pairs(Z, Z, dt, args), **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_parameter_that_never_varies_is_left_out():
+    given = {"learn": "auto", "family": "auto", "chart": "auto", "base": None}
+    pairs, learn, messages = as_varied(gfnn.Pairs(Z, Z, 0.1, {"l": np.ones(40), "m": DT}), **given)
+    assert list(pairs.args) == ["m"]
+    assert learn == "auto"
+    assert messages == [
+        "the parameter l is 1 in all pairs: it is left out, for its effect is not known"
+    ]
+
+
+def test_pairs_are_a_pytree_with_their_dt_and_args():
+    pairs = gfnn.Pairs(Z, Z, DT, {"l": DT})
+    half = jax.tree.map(lambda a: a[:20], pairs)
+    assert len(half) == 20
+    assert half.dt.shape == half.args["l"].shape == (20,)
+    assert jax.tree.map(lambda a: a[:20], gfnn.Pairs(Z, Z, 0.1)).dt == 0.1
+
+
+# Files and the command line.
+
+
+def write_csv(path, parameter=True):
+    """Eight pendulums, measured when it suited: uneven t, and a column for the length."""
+    rng, rows = np.random.default_rng(4), []
+    z, length, _ = pendulums(8, seed=4)
+    t = np.zeros(8)
+    for _ in range(30):
+        rows += [[i, t[i], *z[i], length[i]] for i in range(8)]
+        dt = rng.uniform(0.02, 0.1, 8)
+        z, t = image(z, length, dt), t + dt
+    rows = np.array(rows)
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    header = "sequence,t,q1,p1" + ",l" * parameter
+    np.savetxt(path, rows[:, : 4 + parameter], delimiter=",", header=header, comments="",
+               fmt="%.17g")  # fmt: skip
+    return rows
+
+
+def test_a_csv_with_uneven_times_and_a_column_more(tmp_path, capsys):
+    rows = write_csv(tmp_path / "d.csv")
+    data = read_trajectories(tmp_path / "d.csv")
+    assert data.dt.shape == data.args["l"].shape == (8 * 29,)
+    np.testing.assert_allclose(data.dt[:29], np.diff(rows[:30, 1]), rtol=1e-13)
+    model, out = str(tmp_path / "m"), str(tmp_path / "p.npz")
+    terms = ["--angles", "0", "--terms", "p**2/l**2; l*cos(q)", "--tolerance", "1e-9"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert cli.main(["fit", str(tmp_path / "d.csv"), "--out", model, *terms]) == 0
+    predict = ["predict", model, "--num-steps", "10", "--dt", "0.05", "--out", out]
+    assert cli.main([*predict, "--initial", str(tmp_path / "d.csv")]) == 0
+    predicted = np.load(out)
+    last, length = rows[29::30, 2:4], rows[29::30, 4]
+    np.testing.assert_array_equal(predicted["params"][:, 0], length)
+    assert predicted["dt"] == 0.05
+    assert predicted["param_names"].tolist() == ["l"]
+    np.testing.assert_allclose(predicted["trajectories"][:, 1], image(last, length, 0.05),
+                               atol=1e-10)  # fmt: skip
+    capsys.readouterr()
+    write_csv(tmp_path / "without.csv", parameter=False)
+    predict[-1] = str(tmp_path / "other.npz")
+    assert cli.main([*predict, "--initial", str(tmp_path / "without.csv")]) == 2
+    told = capsys.readouterr().err.strip()
+    assert "expected the parameter l, which the model was learned with" in told
+    assert "\n" not in told
+
+
+def test_npz_of_params_and_times(tmp_path):
+    z, length, dt = pendulums(20)
+    z1 = image(z, length, dt)
+    np.savez(tmp_path / "p.npz", z0=z, z1=z1, dt=dt, params=length, param_names=["l"])
+    pairs = read_trajectories(tmp_path / "p.npz").pairs()
+    np.testing.assert_array_equal(pairs.args["l"], length)
+    np.testing.assert_allclose(pairs.dt, dt, rtol=1e-13)
+    both = np.stack([z, z1], axis=1)
+    times = np.stack([0 * dt, dt], axis=1)
+    np.savez(tmp_path / "t.npz", trajectories=both, times=times, params=length[:, None])
+    pairs = read_trajectories(tmp_path / "t.npz").pairs()
+    np.testing.assert_array_equal(pairs.args["a1"], length)
+    np.testing.assert_array_equal(pairs.z1, z1)
+    np.savez(tmp_path / "u.npz", trajectories=both, times=times * 0 + [0, 0.5])
+    assert read_trajectories(tmp_path / "u.npz").dt == 0.5
+
+
+def test_the_plan_of_terms_without_coordinates():
+    """A factor of parameters alone has no slope, and costs none."""
+    family = Terms(1, ("p1", "l"), ((2, 1), (2, 2)), ("l",))
+    found = family.gradient(np.array([1.0, 2.0]), np.array([[0.3, 0.5]]), np.array([[2.0]]))
+    np.testing.assert_allclose(found, [[0.0, 2 * 0.5 * (2.0 + 2 * 4.0)]])
