@@ -17,7 +17,7 @@ from gfnn_jax.scenes.scene import Scene
 
 # Beside a map only a law of few terms is looked for: a larger one is no shorter to say than S.
 _BESIDE = dataclasses.replace(
-    OPTIONS, most_terms=60, most_modes=150, max_seconds=10.0, mode_seconds=30.0
+    OPTIONS, most_terms=60, most_modes=150, max_seconds=20.0, mode_seconds=30.0
 )
 # A law holds outside the data and at any time step: so much dearer a step it may be.
 DEARER = 4.0

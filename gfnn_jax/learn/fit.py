@@ -276,7 +276,7 @@ def fit(
     if base is not None:
         known = given_terms(prepared.dim, (base,))
         flow = flow_of(known, np.ones(known.num_parameters), prepared)
-        prepared = factored_out(flow, prepared, seed)
+        _, prepared = factored_out([flow], prepared, seed)
     if prepared.varied:
         seen = undiagnosed(prepared)
     else:

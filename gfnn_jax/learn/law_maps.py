@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.errors import FitError
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.choose_charts import Charts
@@ -23,6 +26,7 @@ from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
 
 _TRIAL_PAIRS = 1_000  # by which it is found out where a flow is to be factored out
+_FITTED, _MOST_STRONG = 200, 6  # pairs and terms of the simplest law
 _EXPLAINED = 0.3  # of the spread: a law that errs by more explains too little to be factored out
 
 
@@ -82,8 +86,11 @@ def search_around(
     """Maps of the law's flow Φ and of S, which learns what Φ leaves over; None where Φ has no image
     of some of the states, or no chart covers what is left."""
     try:
-        flow = flow_of(law.flow.family, np.asarray(law.flow.params), plain)
-        prepared = factored_out(flow, plain, seed)
+        flows = [flow_of(law.flow.family, np.asarray(law.flow.params), plain)]
+        simple = strongest_terms(law, plain, judges)
+        if simple is not None:
+            flows.append(flow_of(*simple, plain))
+        flow, prepared = factored_out(flows, plain, seed)
         seen = diagnosed(prepared, "auto", scene.reversor if scene else None, seed)
     except FitError:
         return None
@@ -109,16 +116,37 @@ def search_around(
     return Searched(judges, seen.prepared, seen.charts, found)
 
 
-def factored_out(flow: Flow, plain: Prepared, seed: int) -> Prepared:
-    """The pairs without the flow: before, after, or half on either side of what is learned,
-    whichever leaves the map that a small S comes closest to."""
+def strongest_terms(
+    law: LearnedHamiltonian, plain: Prepared, judges: Judges
+) -> tuple[Terms, np.ndarray] | None:
+    """The fewest of the law's terms, the strongest first, whose flow explains most of the motion,
+    and their coefficients; None where it takes all of them. A law that was to explain what no H
+    does is rough, and what its flow leaves over is too."""
+    family, c = law.flow.family, np.asarray(law.flow.params)
+    rows = judges.training[:_TRIAL_PAIRS]
+    slopes = family.term_gradients(plain.y0[rows]) * plain.scale[:, None]
+    strength = np.abs(c) * np.sqrt(np.mean(np.sum(slopes**2, axis=1), axis=0))
+    order = np.argsort(-strength)
+    problem = Problem(plain.y0, plain.y1, plain.dt, plain.scale)
+    for count in range(1, min(len(c), _MOST_STRONG + 1)):
+        kept = np.sort(order[:count])
+        part = family.take(kept.tolist())
+        found = problem.fit(part, c[kept], rows[:_FITTED], rounds=False)
+        if found.rms < _EXPLAINED:
+            return part, found.coefficients
+    return None
+
+
+def factored_out(flows: Sequence[Flow], plain: Prepared, seed: int) -> tuple[Flow, Prepared]:
+    """The pairs without one of these flows: before, after, or half on either side of what is
+    learned, whichever leaves the map that a small S comes closest to."""
 
     def left_over(prepared: Prepared) -> float:
         rows = np.random.default_rng(seed).permutation(len(prepared.y0))[:_TRIAL_PAIRS]
         return trial_residual(prepared.take(rows))
 
-    tried = [plain.without(*pieces) for pieces in around(flow)]
-    errors = [left_over(prepared) for prepared in tried]
+    tried = [(flow, plain.without(*pieces)) for flow in flows for pieces in around(flow)]
+    errors = [left_over(prepared) for _, prepared in tried]
     return tried[0] if errors[0] <= 2 * min(errors) else tried[int(np.argmin(errors))]
 
 
