@@ -68,7 +68,8 @@ def fit(
                 trajectories.pairs(), scene, angles=angles, max_seconds=max_seconds,
                 progress=progress, kept_in=kept_in, job=job, **options,
             )  # fmt: skip
-            if large and family != "mlp" and fitted.chosen.learns == "map":
+            linear = family != "mlp" and fitted.chosen.learns == "map"
+            if large and linear and fitted.map.parameters is None:
                 progress.say("all pairs of the file, for the chosen candidate")
                 held = trajectories.pairs().take(slice(_HELD))
                 with failures_of_arithmetic():
