@@ -187,7 +187,7 @@ class Fit:
 
         text = io.StringIO()
         # Neither colours nor a notebook's own display: a string.
-        plain = Console(width=120, file=text, force_terminal=False, force_jupyter=False)
+        plain = Console(width=132, file=text, force_terminal=False, force_jupyter=False)
         plain.print(candidates_table(self))
         return text.getvalue()
 

@@ -20,13 +20,13 @@ from gfnn_jax.learn.diagnosed import diagnosed
 from gfnn_jax.learn.draw import drawn
 from gfnn_jax.learn.flows import LearnedHamiltonian, around, flow_of, flow_operations
 from gfnn_jax.learn.prepare import Prepared, prepare
-from gfnn_jax.learn.search import Found, search
+from gfnn_jax.learn.search import Entry, Found, search
 from gfnn_jax.learn.sweeps import sweeps_for, trial_residual
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
 
 _TRIAL_PAIRS = 1_000  # by which it is found out where a flow is to be factored out
-_FITTED, _MOST_STRONG = 200, 6  # pairs and terms of the simplest law
+_FITTED, _MOST_STRONG = 200, 4  # pairs and terms of the simplest laws
 _EXPLAINED = 0.3  # of the spread: a law that errs by more explains too little to be factored out
 
 
@@ -83,58 +83,73 @@ def search_around(
     law: LearnedHamiltonian, plain: Prepared, judges: Judges, scene: Scene | None, clock: Clock,
     say, tell, better, seed: int,
 ) -> Searched | None:  # fmt: skip
-    """Maps of the law's flow Φ and of S, which learns what Φ leaves over; None where Φ has no image
-    of some of the states, or no chart covers what is left."""
-    try:
-        flows = [flow_of(law.flow.family, np.asarray(law.flow.params), plain)]
-        simple = strongest_terms(law, plain, judges)
-        if simple is not None:
-            flows.append(flow_of(*simple, plain))
-        flow, prepared = factored_out(flows, plain, seed)
-        seen = diagnosed(prepared, "auto", scene.reversor if scene else None, seed)
-    except FitError:
-        return None
+    """Maps of a law's flow Φ and of S, which learns what Φ leaves over: of the whole law, then of
+    its strongest terms, which leave more over but smoother. None where Φ has no image of some of
+    the states, or no chart covers what is left."""
+    best: Searched | None = None
+    for laws in ([(law.flow.family, np.asarray(law.flow.params))], strongest(law, plain, judges)):
+        try:
+            flows = [flow_of(family, c, plain) for family, c in laws]
+            if not flows or clock.left <= 0:
+                break
+            flow, prepared = factored_out(flows, plain, seed)
+            seen = diagnosed(prepared, "auto", scene.reversor if scene else None, seed)
+        except FitError:
+            continue
+        found = _around(flow, seen, plain, judges, scene, clock, say, tell, better)
+        if found.found.ranking and (
+            best is None
+            or found.found.ranking[0].candidate.validation_bound
+            < best.found.ranking[0].candidate.validation_bound
+        ):
+            best = found
+        if best and best.found.ranking[0].candidate.validation_bound <= judges.tolerance.bound:
+            break
+    return best
+
+
+def _around(
+    flow: Flow, seen, plain: Prepared, judges: Judges, scene: Scene | None, clock: Clock, say, tell,
+    better,
+) -> Searched:  # fmt: skip
+    """The search for S around one flow, whose operations are added to every candidate's."""
     more = flow_operations(flow, plain)
     sweeps = list(sweeps_for("auto", seen.charts.charts, seen.prepared, scene, judges))
     if better is not None:
         better.prepared = seen.prepared
     found = search(sweeps, judges.tolerance.bound, clock, say, tell, better)
-    entries, ranking = (
-        [
-            e._replace(
-                candidate=dataclasses.replace(
-                    e.candidate,
-                    operations=e.candidate.operations + more,
-                    label=f"{e.candidate.label} around H",
-                )
-            )
-            for e in part
-        ]
-        for part in (found.entries, found.ranking)
-    )
+
+    def dearer(entry: Entry) -> Entry:
+        candidate = dataclasses.replace(
+            entry.candidate, operations=entry.candidate.operations + more,
+            label=f"{entry.candidate.label} around H",
+        )  # fmt: skip
+        return entry._replace(candidate=candidate)
+
+    entries, ranking = ([dearer(e) for e in part] for part in (found.entries, found.ranking))
     found = found._replace(entries=entries, ranking=ranking)
     return Searched(judges, seen.prepared, seen.charts, found)
 
 
-def strongest_terms(
+def strongest(
     law: LearnedHamiltonian, plain: Prepared, judges: Judges
-) -> tuple[Terms, np.ndarray] | None:
-    """The fewest of the law's terms, the strongest first, whose flow explains most of the motion,
-    and their coefficients; None where it takes all of them. A law that was to explain what no H
-    does is rough, and what its flow leaves over is too."""
+) -> list[tuple[Terms, np.ndarray]]:
+    """The law's one, two … strongest terms, with coefficients fitted anew, as far as their flow
+    explains most of the motion."""
     family, c = law.flow.family, np.asarray(law.flow.params)
     rows = judges.training[:_TRIAL_PAIRS]
     slopes = family.term_gradients(plain.y0[rows]) * plain.scale[:, None]
     strength = np.abs(c) * np.sqrt(np.mean(np.sum(slopes**2, axis=1), axis=0))
     order = np.argsort(-strength)
     problem = Problem(plain.y0, plain.y1, plain.dt, plain.scale)
+    laws = []
     for count in range(1, min(len(c), _MOST_STRONG + 1)):
         kept = np.sort(order[:count])
         part = family.take(kept.tolist())
         found = problem.fit(part, c[kept], rows[:_FITTED], rounds=False)
         if found.rms < _EXPLAINED:
-            return part, found.coefficients
-    return None
+            laws.append((part, found.coefficients))
+    return laws
 
 
 def factored_out(flows: Sequence[Flow], plain: Prepared, seed: int) -> tuple[Flow, Prepared]:
