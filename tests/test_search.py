@@ -23,7 +23,7 @@ class Sweep:
     """Sizes with an estimate and an error each; it notes what it is asked."""
 
     def __init__(self, sizes, family="polynomial", chart="midpoint", most=np.inf):
-        self.sizes = [Size(float(s[0]), s[1], s[-1], n) for n, s in enumerate(sizes, 2)]
+        self.sizes = [Size(float(s[0]), s[1], s[-1], float(n)) for n, s in enumerate(sizes, 2)]
         self.short_of_pairs = True
         self.family, self.chart, self.most = family, chart, most
         self.judged, self.validated = [], []
