@@ -179,3 +179,9 @@ def test_formulas():
     terms = (Term("q1²", -0.5, 1e-15), Term("p1²", 1.0, 1e-15), Term("q2", 0.12345, 0.01))
     assert formula(terms) == "-0.5 q1² + p1² + 0.123 q2"
     assert formula(()) == "0"
+
+
+def test_collocation_goes_back_in_time_as_accurately():
+    pairs = henon_heiles(20, 0.5)
+    back = images(HENON_HEILES, TRUE, pairs.z1, -0.5, Steps(8, 2)).states
+    np.testing.assert_allclose(back, pairs.z0, rtol=0, atol=1e-13)
