@@ -1,7 +1,6 @@
 """gfnn.fit: what is refused, what is held out, and that the choice is as accurate as it says."""
 
 import dataclasses
-import importlib
 import math
 import warnings
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
+from gfnn_jax.learn import choose
 from gfnn_jax.learn.diagnose import local_jacobians, look_symplectic
 from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.prepare import prepare
@@ -542,8 +542,7 @@ def test_a_linear_map_far_from_the_identity_needs_a_base_map():
 
 
 def test_where_steps_do_not_bear_the_search_out_a_larger_map_is_taken(monkeypatch):
-    module = importlib.import_module("gfnn_jax.learn.fit")  # the name is that of its function too
-    assemble, refused = module.assemble, []
+    assemble, refused = choose.assemble, []
 
     def the_first_fails(candidate, *rest):
         assembled = assemble(candidate, *rest)
@@ -553,7 +552,7 @@ def test_where_steps_do_not_bear_the_search_out_a_larger_map_is_taken(monkeypatc
             return assembled._replace(candidate=worse)
         return assembled
 
-    monkeypatch.setattr(module, "assemble", the_first_fails)
+    monkeypatch.setattr(choose, "assemble", the_first_fails)
     fit = gfnn.fit(pendulum_pairs(), learn="map", tolerance=1e-4)
     assert fit.met
     assert (fit.chosen.chart, fit.chosen.family) == (refused[0].chart, refused[0].family)

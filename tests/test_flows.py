@@ -123,6 +123,11 @@ def test_newton_solves_what_the_fixed_point_does_not():
     assert (made[True].step(z)[1].status == OK).all()
 
 
+def test_no_states_have_no_images():
+    found = images(FAMILY, C, np.empty((0, 4)), 0.5, Steps(6, 1))
+    assert found.states.shape == (0, 4)
+
+
 def test_a_plain_function_is_a_hamiltonian():
     def pendulum(params, z):
         return z[1] ** 2 / 2 - params * jnp.cos(z[0])

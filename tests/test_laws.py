@@ -1,7 +1,6 @@
 """Hamiltonians in ``gfnn.fit``: when one is learned, when it is preferred, what comes with it."""
 
 import dataclasses
-import importlib
 import json
 import types
 
@@ -15,11 +14,10 @@ from test_cli import gfnn as command
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.evaluate import report
-from gfnn_jax.learn import choose_law
+from gfnn_jax.learn import choose_law, searches
 from gfnn_jax.learn.choose_law import preferred
 from gfnn_jax.learn.draw import drawn
 
-fit_module = importlib.import_module("gfnn_jax.learn.fit")  # the name is that of its function too
 FORMULA = "0.5 q1² + 0.5 q2² + 0.5 p1² + 0.5 p2² + q1² q2 - 0.333333333333 q2³"
 
 
@@ -257,7 +255,7 @@ def test_pairs_are_drawn_in_the_region_that_is_named(law):
 
 def test_a_map_that_is_far_cheaper_than_the_law_is_fitted_to_pairs_of_the_law(pairs, monkeypatch):
     few = pairs.take(np.arange(60))
-    for module in (fit_module, choose_law):  # as if the law's step were ten times as dear
+    for module in (searches, choose_law):  # as if the law's step were ten times as dear
         monkeypatch.setattr(module, "DEARER", 0.4)
     found = gfnn.fit(few, tolerance=1e-5)
     assert found.chosen.learns == "map"

@@ -83,7 +83,7 @@ def images(
 
 def _summed(matrix, slopes):
     """Σ_j matrix_ij slopes_j for slopes (s, B, 2d)."""
-    return (matrix @ slopes.reshape(len(slopes), -1)).reshape(-1, *slopes.shape[1:])
+    return (matrix @ slopes.reshape(len(slopes), -1)).reshape(len(matrix), *slopes.shape[1:])
 
 
 def solve_stages(family, params, z, h, rule, args=None, *, newton: bool = True):

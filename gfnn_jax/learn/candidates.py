@@ -116,6 +116,10 @@ class Judges:
         """(2d,) of the user's coordinates."""
         return sizes(self.pairs.z0)
 
+    def met_by(self, candidate: Candidate) -> bool:
+        """Whether the candidate's error is within the tolerance, at 95 %."""
+        return candidate.validation_bound <= self.tolerance.bound
+
     def error_of(self, images: np.ndarray, coordinates) -> OneStepError:
         """Of the held-out pairs' images (N, 2d) in the user's coordinates."""
         angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
+from gfnn_jax.families.terms import given_terms
 from gfnn_jax.learn.choose_charts import Charts, choose_charts
 from gfnn_jax.learn.diagnose import (
     data_defect,
@@ -11,7 +14,10 @@ from gfnn_jax.learn.diagnose import (
     look_symplectic,
     sampled_dimension,
 )
+from gfnn_jax.learn.factor_out import factored_out
+from gfnn_jax.learn.flows import flow_of
 from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.learn.request import Request
 
 
 class Diagnosis(NamedTuple):
@@ -19,6 +25,21 @@ class Diagnosis(NamedTuple):
     charts: Charts
     data_defect: float
     messages: list[str]
+
+
+def diagnose_request(request: Request, plain: Prepared) -> Diagnosis:
+    """The diagnosis of the pairs that a fit takes; a law that the user knows is factored out.
+
+    Raises FitError where no chart covers the data.
+    """
+    if plain.varied:  # of more than one map: neighbours tell no Jacobian
+        return Diagnosis(plain, Charts([], None, {}, []), float("nan"), [])
+    prepared = plain
+    if request.base is not None:
+        known = given_terms(plain.dim, (request.base,))
+        flow = flow_of(known, np.ones(known.num_parameters), plain)
+        _, prepared = factored_out([flow], plain, request.seed)
+    return diagnosed(prepared, request.chart, request.reversor, request.seed)
 
 
 def diagnosed(prepared: Prepared, chart: str, reversor, seed: int) -> Diagnosis:

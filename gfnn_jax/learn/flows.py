@@ -446,6 +446,8 @@ def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
 
 def _resolved(problem, family, fit: FlowFit, rows) -> FlowFit:
     """The fit without the pairs that the flow's own steps do not resolve."""
+    if not len(fit.used):  # none of the flows that were tried has an image
+        return fit
     z = problem.z0[fit.used]
     dt, args = problem.given(fit.used)
     off = truncation(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,23 +17,23 @@ from gfnn_jax.learn.choose_charts import Charts
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.diagnosed import diagnosed
 from gfnn_jax.learn.draw import drawn
-from gfnn_jax.learn.flows import LearnedHamiltonian, around, flow_of, flow_operations
+from gfnn_jax.learn.factor_out import TRIAL_PAIRS, factored_out
+from gfnn_jax.learn.flows import LearnedHamiltonian, flow_of, flow_operations
 from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.search import Entry, Found, search
-from gfnn_jax.learn.sweeps import sweeps_for, trial_residual
+from gfnn_jax.learn.sweeps import sweeps_for
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
 
-_TRIAL_PAIRS = 1_000  # by which it is found out where a flow is to be factored out
 _FITTED, _MOST_STRONG = 200, 4  # pairs and terms of the simplest laws
 _EXPLAINED = 0.3  # of the spread: a law that errs by more explains too little to be factored out
 
 
-class Searched(NamedTuple):
-    judges: Judges
-    prepared: Prepared
-    charts: Charts
+class LawMaps(NamedTuple):
+    """The maps that were found, and the charts in which they were looked for."""
+
     found: Found
+    charts: Charts
 
 
 def more_pairs_would_help(sweeps, found: Found, bound: Tolerance, dearest: float) -> bool:
@@ -48,7 +47,7 @@ def more_pairs_would_help(sweeps, found: Found, bound: Tolerance, dearest: float
 def search_of_law(
     law: LearnedHamiltonian, pairs: Pairs, judges: Judges, scene: Scene | None,
     coordinates: Coordinates, dearest: float, clock: Clock, say, tell, seed: int,
-) -> Searched | None:  # fmt: skip
+) -> LawMaps | None:  # fmt: skip
     """Maps fitted to pairs that are drawn from the law's flow, and judged by the user's held-out
     pairs; None where none of them meets the tolerance."""
     more = drawn(law.flow, coordinates, pairs.z0, float(pairs.dt), seed=seed)
@@ -66,7 +65,7 @@ def search_of_law(
     if found.ranking[0].candidate.validation_bound > judges.tolerance.bound:
         return None
     found = found._replace(ended="the tolerance is met, by a map of pairs drawn from H's flow")
-    return Searched(judges, seen.prepared, seen.charts, found)
+    return LawMaps(found, seen.charts)
 
 
 def law_explains_most(law: LearnedHamiltonian, found: Found, bound: Tolerance, clock) -> bool:
@@ -82,11 +81,11 @@ def law_explains_most(law: LearnedHamiltonian, found: Found, bound: Tolerance, c
 def search_around(
     law: LearnedHamiltonian, plain: Prepared, judges: Judges, scene: Scene | None, clock: Clock,
     say, tell, better, seed: int,
-) -> Searched | None:  # fmt: skip
+) -> LawMaps | None:  # fmt: skip
     """Maps of a law's flow Φ and of S, which learns what Φ leaves over: of the whole law, then of
     its strongest terms, which leave more over but smoother. None where Φ has no image of some of
     the states, or no chart covers what is left."""
-    best: Searched | None = None
+    best: LawMaps | None = None
     for laws in ([(law.flow.family, np.asarray(law.flow.params))], strongest(law, plain, judges)):
         try:
             flows = [flow_of(family, c, plain) for family, c in laws]
@@ -111,12 +110,10 @@ def search_around(
 def _around(
     flow: Flow, seen, plain: Prepared, judges: Judges, scene: Scene | None, clock: Clock, say, tell,
     better,
-) -> Searched:  # fmt: skip
+) -> LawMaps:  # fmt: skip
     """The search for S around one flow, whose operations are added to every candidate's."""
     more = flow_operations(flow, plain)
     sweeps = list(sweeps_for("auto", seen.charts.charts, seen.prepared, scene, judges))
-    if better is not None:
-        better.prepared = seen.prepared
     found = search(sweeps, judges.tolerance.bound, clock, say, tell, better)
 
     def dearer(entry: Entry) -> Entry:
@@ -127,8 +124,7 @@ def _around(
         return entry._replace(candidate=candidate)
 
     entries, ranking = ([dearer(e) for e in part] for part in (found.entries, found.ranking))
-    found = found._replace(entries=entries, ranking=ranking)
-    return Searched(judges, seen.prepared, seen.charts, found)
+    return LawMaps(found._replace(entries=entries, ranking=ranking), seen.charts)
 
 
 def strongest(
@@ -137,7 +133,7 @@ def strongest(
     """The law's one, two … strongest terms, with coefficients fitted anew, as far as their flow
     explains most of the motion."""
     family, c = law.flow.family, np.asarray(law.flow.params)
-    rows = judges.training[:_TRIAL_PAIRS]
+    rows = judges.training[:TRIAL_PAIRS]
     slopes = family.term_gradients(plain.y0[rows]) * plain.scale[:, None]
     strength = np.abs(c) * np.sqrt(np.mean(np.sum(slopes**2, axis=1), axis=0))
     order = np.argsort(-strength)
@@ -150,19 +146,6 @@ def strongest(
         if found.rms < _EXPLAINED:
             laws.append((part, found.coefficients))
     return laws
-
-
-def factored_out(flows: Sequence[Flow], plain: Prepared, seed: int) -> tuple[Flow, Prepared]:
-    """The pairs without one of these flows: before, after, or half on either side of what is
-    learned, whichever leaves the map that a small S comes closest to."""
-
-    def left_over(prepared: Prepared) -> float:
-        rows = np.random.default_rng(seed).permutation(len(prepared.y0))[:_TRIAL_PAIRS]
-        return trial_residual(prepared.take(rows))
-
-    tried = [(flow, plain.without(*pieces)) for flow in flows for pieces in around(flow)]
-    errors = [left_over(prepared) for _, prepared in tried]
-    return tried[0] if errors[0] <= 2 * min(errors) else tried[int(np.argmin(errors))]
 
 
 def better_than(around: Found, found: Found, law: LearnedHamiltonian) -> bool:

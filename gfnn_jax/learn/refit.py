@@ -16,7 +16,8 @@ from gfnn_jax.fitting import least_squares
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.assemble import stepped
 from gfnn_jax.learn.candidates import Candidate, Tolerance, one_step_error, with_error
-from gfnn_jax.learn.fit import Fit, not_met
+from gfnn_jax.learn.conclude import not_met
+from gfnn_jax.learn.fit import Fit
 from gfnn_jax.learn.sweeps import residual_weight
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs

@@ -12,8 +12,6 @@ import numpy as np
 
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.expressions import check_names
-from gfnn_jax.learn.choose_charts import Charts
-from gfnn_jax.learn.diagnosed import Diagnosis
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.phase_space import Pairs, sizes
 
@@ -99,8 +97,3 @@ def given_by(prepared: Prepared) -> np.ndarray | None:
     columns += [] if prepared.args is None else list(prepared.args.T)
     given = np.column_stack(columns)
     return given / sizes(given)
-
-
-def undiagnosed(prepared: Prepared) -> Diagnosis:
-    """Pairs of more than one map have no Jacobians that neighbours tell, and no charts."""
-    return Diagnosis(prepared, Charts([], None, {}, []), float("nan"), [])

@@ -1,0 +1,92 @@
+"""The choice: the first of the ranking whose own steps bear out what the search measured."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from gfnn_jax.learn.assemble import assemble
+from gfnn_jax.learn.candidates import Candidate, Judges
+from gfnn_jax.learn.choose_law import preferred
+from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.flows import assembled as flow_assembled
+from gfnn_jax.learn.map_of_parameters import assembled as map_assembled
+from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.learn.request import Request
+from gfnn_jax.learn.search import Entry
+from gfnn_jax.learn.searches import Searched
+
+_BORNE_OUT = 1.1  # of the error that the search measured
+
+
+class Chosen(NamedTuple):
+    """The candidate with its map; the pairs as they were prepared for it, and which of them judged
+    it; the seconds that compiling took; the entry that it comes from, None for H and for an S with
+    parameters."""
+
+    candidate: Candidate
+    prepared: Prepared
+    judges: Judges
+    compile_seconds: float
+    entry: Entry | None = None
+
+
+def choose(searched: Searched, request: Request) -> Chosen:
+    """The candidate that is taken, its error and its time measured by the steps that users run."""
+    law, judges = searched.law, searched.judges
+    if searched.of_parameters is not None:
+        candidate, seconds = map_assembled(searched.of_parameters, searched.plain, judges)
+        return Chosen(candidate, searched.plain, judges, seconds)
+    ranking, bound = searched.found.ranking, judges.tolerance.bound
+    best = ranking[0].candidate if ranking else None
+    if law is None or not (best is None or preferred(law.candidate, best, bound)):
+        return _of_ranking(ranking, request)
+    request.say(f"compiling the flow of {law.candidate.label}")
+    candidate, seconds = flow_assembled(law, searched.plain, judges)
+    expected = max(bound, _BORNE_OUT * law.candidate.validation_bound)
+    if best is not None and not candidate.validation_bound <= expected:
+        return _of_ranking(ranking, request)
+    return Chosen(candidate, searched.plain, judges, seconds)
+
+
+def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
+    """The first whose own steps bear out what the search measured, else the best.
+
+    Where the steps of a map that was to meet the tolerance do not, larger ones of its sweep are
+    looked at before others.
+    """
+    clock, say, bound = request.clock, request.say, request.tolerance.bound
+    compile_seconds, tried = 0.0, []
+    first = ranking[0]
+    larger = _larger(first, clock, say) if first.candidate.validation_bound <= bound else ()
+    for entry in itertools.chain([first], larger, ranking[1:]):
+        say(f"compiling the step of {entry.candidate.chart} {entry.candidate.label}")
+        sweep, size = entry.sweep, entry.size
+        _, params = sweep.solve(size, Clock(), say)
+        inputs = getattr(size.family, "inputs", None)
+        assembled = assemble(
+            entry.candidate, sweep.prepared, sweep.chart, size.family, params,
+            getattr(inputs, "features", None), sweep.judges,
+        )  # fmt: skip
+        compile_seconds += assembled.compile_seconds
+        tried.append((assembled.candidate, entry))
+        expected = max(bound, _BORNE_OUT * entry.candidate.validation_bound)
+        if assembled.candidate.validation_bound <= expected:
+            break
+        if clock.left_in_all < assembled.compile_seconds:
+            break
+    candidate, entry = min(
+        tried, key=lambda t: (t[0].validation_bound > bound, t[0].validation_bound)
+    )
+    return Chosen(candidate, entry.sweep.prepared, entry.sweep.judges, compile_seconds, entry)
+
+
+def _larger(entry: Entry, clock: Clock, say) -> Iterator[Entry]:
+    """The larger sizes of an entry's sweep, validated by steps, as long as there is time."""
+    sizes = entry.sweep.sizes
+    for size in sizes[sizes.index(entry.size) + 1 :]:
+        if clock.left <= 0:
+            return
+        judged = entry.sweep.judge(size, Clock(), say)
+        yield Entry(entry.sweep.validate(size, judged, Clock(), say), entry.sweep, size)

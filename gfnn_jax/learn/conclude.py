@@ -1,0 +1,163 @@
+"""What a fit says in the end: why the search ended, and what is left over where nothing is met."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.coordinates import CARTESIAN, nearest_image
+from gfnn_jax.learn.assemble import stepped
+from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance, refined_images
+from gfnn_jax.learn.check import not_radians
+from gfnn_jax.learn.choose import Chosen
+from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.diagnose import differs_between_sequences, sequences_of, volume_change
+from gfnn_jax.learn.noise import state_noise
+from gfnn_jax.learn.request import Request
+from gfnn_jax.learn.search import AS_FAR, MET, Entry
+from gfnn_jax.learn.searches import Searched
+
+_CERTAIN = 5.0  # standard errors that make a change of volume certain
+_ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
+_RESIDUAL_PAIRS = 2_000  # whose residuals are looked at
+_NOISE_PAIRS = 1_024  # from which the noise of the states is measured
+
+
+class Conclusion(NamedTuple):
+    """Why the search ended; the noise (2d,) that the residuals suggest, or None; warnings."""
+
+    ended: str
+    noise: np.ndarray | None
+    messages: list[str]
+
+
+def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion:
+    """What is to be said of the chosen map."""
+    candidate, law, found = chosen.candidate, searched.law, searched.found
+    met = searched.judges.met_by(candidate)
+    ended, noise, messages = found.ended, None, []
+    if not searched.swept:
+        ended = MET if met else "no larger library of terms promised to meet it"
+    if ended.startswith(MET) and not met:
+        ended = "the steps of a map that was to meet it do not converge from some of the states"
+    if law is not None and searched.of_parameters is None:
+        on_law = chosen.entry is None or searched.met_by_law
+        messages += law.messages if on_law or (law.fast and not met) else ()
+    if met:
+        return Conclusion(ended, None, messages)
+    diagnosis: list[str] = []
+    if candidate.validation_relative > _ROUNDOFF:
+        stalled = _stalled(chosen, searched)
+        noise, diagnosis, reason = _what_is_left(chosen, searched, stalled)
+        if reason and stalled:
+            ended = f"larger models are no more accurate: {reason}"
+        elif reason:
+            ended = f"{ended}; {reason}"
+    messages += not_radians(chosen.judges.pairs, request.coordinates)
+    messages += [not_met(candidate, request.tolerance, ended), *diagnosis]
+    return Conclusion(ended, noise, messages)
+
+
+def _stalled(chosen: Chosen, searched: Searched) -> bool:
+    """Whether larger models stopped helping: in the chosen sweep, in another that has come as far,
+    or, where no S was found, among the libraries of H."""
+    found = searched.found
+    if chosen.entry is None and not found.ranking:
+        return searched.law is not None and searched.law.stalled
+    limit = AS_FAR * chosen.candidate.validation_relative
+    return any(
+        (e.candidate.chart, e.candidate.family) in found.stalled
+        and e.candidate.validation_relative <= limit
+        for e in found.entries
+    )
+
+
+class _LeftOver(NamedTuple):
+    """What the residuals suggest: the noise (2d,), what is said of them, and the reason why no
+    larger model would help where that is known."""
+
+    noise: np.ndarray | None
+    messages: list[str]
+    reason: str = ""
+
+
+def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOver:
+    """Noise, where larger models no longer helped, friction, or a parameter that differs between
+    sequences.
+
+    The residuals are those of the chosen map, or of the best generated one where H was chosen.
+    """
+    candidate, judges = chosen.candidate, searched.judges
+    entry = chosen.entry or next(iter(searched.found.ranking), None)
+    if entry is not None:
+        judges = entry.sweep.judges
+    rows = np.sort(judges.training)[:_RESIDUAL_PAIRS]
+    y0, residual, solved = _residuals(candidate, entry, judges, rows)
+    rows, y0, residual = rows[solved], y0[solved], residual[solved]
+    sequence = sequences_of(judges.pairs.z0, judges.pairs.z1)[rows]
+    scale = judges.spread if entry is None else entry.sweep.prepared.scale
+    if differs_between_sequences(y0 / scale, residual / scale, sequence):
+        message = (
+            "what is left over agrees within a sequence and differs between sequences: something "
+            "that the states do not hold (a mass, a length, a field) differs between them; learn "
+            "those of one value by themselves"
+        )
+        return _LeftOver(None, [message], "something that the states do not hold differs between "
+                         "the sequences")  # fmt: skip
+    if not stalled:
+        return _LeftOver(None, [])
+    change, error = volume_change(y0, residual)
+    if abs(change) > _CERTAIN * error:
+        message = (
+            f"what is left over is no noise: phase-space volumes change by {change:.2g} "
+            f"(± {error:.1g}) of themselves in a step, as by friction: no symplectic map does"
+        )
+        return _LeftOver(None, [message], "volumes of phase space change, as by friction")
+    taken = candidate.num_parameters / (judges.training.size * 2 * judges.pairs.dim)
+    noise = state_noise(candidate.map, judges.pairs.take(rows[:_NOISE_PAIRS]), taken)
+    own = ""
+    if candidate.learns == "map" and entry is not None:
+        part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))
+        own = f" (the map's own error is then about {part:.1g} of it)"
+    message = (
+        "larger models are no more accurate: the pairs seem to carry noise of about "
+        f"{', '.join(f'{sigma:.1e}' for sigma in noise)} on the coordinates in their order{own}, "
+        "or a structure that these functions cannot represent"
+    )
+    return _LeftOver(noise, [message])
+
+
+def _residuals(
+    chosen: Candidate, entry: Entry | None, judges: Judges, rows
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States and residuals (N, 2d) of these pairs, and which of them were predicted (N,): as
+    prepared where S was learned, in the user's coordinates where only a law was."""
+    if entry is not None:
+        prepared = entry.sweep.prepared
+        _, params = entry.sweep.solve(entry.size, Clock(), lambda message: None)
+        images, solved = refined_images(
+            prepared, entry.sweep.chart, entry.size.family, params, rows
+        )
+        return prepared.y0[rows], prepared.y1[rows] - images, solved
+    pairs, coordinates = judges.pairs.take(rows), chosen.map.coordinates
+    angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
+    z0 = np.asarray(pairs.z0)
+    steps = stepped(chosen.map, z0, pairs.dt, pairs.args, timed=False)
+    residual = nearest_image(np.asarray(pairs.z1) - steps.images, angles)
+    return z0, residual, ~steps.failed & np.isfinite(residual).all(axis=1)
+
+
+def not_met(chosen: Candidate, tolerance: Tolerance, ended: str) -> str:
+    """The warning that nothing meets the tolerance."""
+    error = chosen.validation_relative if tolerance.relative else chosen.validation_rms
+    found = (
+        f"has a one-step error of {error:.2e}{' of the spread' if tolerance.relative else ''} "
+        f"(95 % bound {chosen.validation_bound:.2e})"
+        if np.isfinite(error)
+        else "leaves held-out states without an image (its step does not converge there)"
+    )
+    return (
+        f"no candidate meets the tolerance {tolerance.bound:g}: the most accurate {found}; "
+        f"the search ended because {ended}"
+    )

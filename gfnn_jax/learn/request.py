@@ -1,0 +1,76 @@
+"""What is asked of a fit, checked before any work."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.learn.candidates import Candidate, Tolerance
+from gfnn_jax.learn.check import check_request, coarse_tolerance, unlike_the_scene
+from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.varied import as_varied
+from gfnn_jax.phase_space import Pairs
+from gfnn_jax.scenes.scene import Scene
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """The pairs in float64 and what is to be learned from them, as the arguments of `gfnn.fit`.
+
+    say, tell: its on_progress and on_candidate. messages: warnings about the pairs and the request.
+    """
+
+    pairs: Pairs
+    scene: Scene | None
+    coordinates: Coordinates
+    tolerance: Tolerance
+    learn: str
+    terms: Sequence[str | Callable]
+    base: str | Callable | None
+    family: str
+    chart: str
+    seed: int
+    clock: Clock
+    max_iterations: int
+    checkpoints: Any
+    factors: Any
+    say: Callable[[str], Any]
+    tell: Callable[[Candidate], Any]
+    messages: list[str]
+
+    @property
+    def reversor(self):
+        """The scene's, or None."""
+        return self.scene.reversor if self.scene is not None else None
+
+
+def checked(
+    pairs: Pairs, scene: Scene | None, *, tolerance, absolute_tolerance, learn, terms, base, family,
+    chart, angles, seed, clock: Clock, **others: Any,
+) -> Request:  # fmt: skip
+    """The request, with what is constant in the pairs as a constant.
+
+    Raises FitError, in one line, where it or the pairs cannot give a map.
+    """
+    bound = Tolerance(tolerance)
+    if absolute_tolerance is not None:
+        bound = Tolerance(absolute_tolerance, relative=False)
+    check_request(
+        pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, angles=angles,
+        terms=terms, base=base, seed=seed,
+    )  # fmt: skip
+    z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
+    pairs = dataclasses.replace(pairs, z0=z0, z1=z1)
+    pairs, learn, messages = as_varied(pairs, learn=learn, family=family, chart=chart, base=base)
+    if scene is not None and scene.features is not None and family in ("auto", "features"):
+        messages += unlike_the_scene(pairs, scene)
+    messages += coarse_tolerance(pairs, bound)
+    coordinates = scene.coordinates if scene else Coordinates("cartesian", angles=tuple(angles))
+    return Request(
+        pairs, scene, coordinates, bound, learn, terms, base, family, chart, seed, clock,
+        messages=messages, **others,
+    )  # fmt: skip

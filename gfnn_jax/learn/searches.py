@@ -1,0 +1,153 @@
+"""All that a fit searches for: H, S, and S with the help of H."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.errors import FitError
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.learn.assemble import composed, with_predictor
+from gfnn_jax.learn.candidates import Candidate, Judges
+from gfnn_jax.learn.choose_charts import Charts
+from gfnn_jax.learn.choose_law import DEARER, law_of
+from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.diagnosed import Diagnosis
+from gfnn_jax.learn.flows import LearnedHamiltonian
+from gfnn_jax.learn.law_maps import (
+    better_than,
+    law_explains_most,
+    more_pairs_would_help,
+    search_around,
+    search_of_law,
+)
+from gfnn_jax.learn.map_of_parameters import LearnedMap, map_of
+from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.learn.request import Request
+from gfnn_jax.learn.search import Entry, Found, search
+from gfnn_jax.learn.sweeps import NetworkSweep, sweeps_for
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+
+OnBetter = Callable[[SymplecticMap, Candidate], Any]
+
+
+class Searched(NamedTuple):
+    """law: H, or None. of_parameters: S with parameters, or None. found: the generated maps.
+    swept: whether any were looked for. charts: theirs. plain: the pairs as prepared, without a base
+    map or law factored out. judges: of the user's pairs."""
+
+    law: LearnedHamiltonian | None
+    of_parameters: LearnedMap | None
+    found: Found
+    swept: bool
+    charts: Charts
+    plain: Prepared
+    judges: Judges
+
+    @property
+    def met_by_law(self) -> bool:
+        return self.law is not None and self.judges.met_by(self.law.candidate)
+
+
+def searched(
+    request: Request, plain: Prepared, seen: Diagnosis, judges: Judges,
+    on_better: OnBetter | None,
+) -> Searched:  # fmt: skip
+    """Every candidate. Raises FitError where there is none."""
+    bound, clock, say, tell = request.tolerance, request.clock, request.say, request.tell
+    scene, prepared, charts = request.scene, seen.prepared, seen.charts
+    better = _Better(on_better) if on_better is not None else None
+    law = _law(request, plain, judges, better)
+    of_parameters = None
+    met_by_law = law is not None and judges.met_by(law.candidate)
+    if prepared.args is not None and request.learn != "hamiltonian" and not met_by_law:
+        of_parameters = map_of(prepared, judges, scene, request.chart, law, clock, say)
+    sweeps = _sweeps(request, seen, judges)
+    dearest = law.candidate.operations if law is not None and met_by_law else np.inf
+    found = search(sweeps, bound.bound, clock, say, tell, better, dearest)
+    dearest /= DEARER  # of maps that would be chosen
+    if law is not None and met_by_law and more_pairs_would_help(sweeps, found, bound, dearest):
+        say("drawing pairs from the flow of H")
+        drawn = search_of_law(
+            law, judges.pairs, judges, scene, request.coordinates, dearest, clock, say, tell,
+            request.seed,
+        )  # fmt: skip
+        if drawn is not None:
+            found, charts = drawn
+    elif law is not None and not met_by_law and law_explains_most(law, found, bound, clock):
+        say(f"learning what the flow of {law.candidate.label} leaves over")
+        around = search_around(law, plain, judges, scene, clock, say, tell, better, request.seed)
+        if around is not None and better_than(around.found, found, law):
+            found, charts = around
+    if not found.ranking and law is None and of_parameters is None:
+        raise FitError(_nothing_found(len(judges.pairs), clock))
+    return Searched(law, of_parameters, found, bool(sweeps), charts, plain, judges)
+
+
+def _law(
+    request: Request, plain: Prepared, judges: Judges, better: _Better | None
+) -> LearnedHamiltonian | None:
+    """H, where one is looked for and found."""
+    free = (request.family, request.chart, request.base) == ("auto", "auto", None)
+    law = law_of(
+        plain, judges, request.scene, request.learn if free else "map", request.terms,
+        request.clock, request.say,
+    )  # fmt: skip
+    if law is not None:
+        if better is not None:
+            better.offer(law.candidate, lambda: composed(law.flow, plain, judges))
+        request.tell(law.candidate)
+    return law
+
+
+def _sweeps(request: Request, seen: Diagnosis, judges: Judges) -> list[Any]:
+    """The sweeps of S over the charts that cover the data; none where H alone is learned, or the
+    pairs are of more than one map."""
+    charts, prepared = seen.charts.charts, seen.prepared
+    if request.learn == "hamiltonian" or prepared.varied:
+        return []
+    if request.family == "mlp":
+        return [
+            NetworkSweep(
+                prepared, charts[0], judges, request.max_iterations, request.seed,
+                request.checkpoints,
+            )
+        ]  # fmt: skip
+    return list(
+        sweeps_for(request.family, charts, prepared, request.scene, judges, request.factors)
+    )
+
+
+def _nothing_found(num_pairs: int, clock: Clock) -> str:
+    if clock.left <= 0:
+        return f"expected a budget of more than {clock.max_seconds:g} s: no candidate was finished"
+    return f"expected more pairs: {num_pairs} are too few for the smallest model of this kind"
+
+
+class _Better:
+    """Hands on the map of every entry that is more accurate than those before. Nothing is compiled:
+    the map is judged by the steps that the search made."""
+
+    def __init__(self, on_better: OnBetter):
+        self._on_better, self._best = on_better, np.inf
+
+    def __call__(self, entry: Entry) -> None:
+        self.offer(entry.candidate, lambda: _map_of(entry))
+
+    def offer(self, candidate: Candidate, make: Callable[[], SymplecticMap]) -> None:
+        """Hand on the map that ``make`` makes, if its candidate is better than those before."""
+        if candidate.validation_bound < self._best:
+            self._best = candidate.validation_bound
+            self._on_better(make(), candidate)
+
+
+def _map_of(entry: Entry) -> SymplecticMap:
+    sweep, family = entry.sweep, entry.size.family
+    prepared, judges = sweep.prepared, sweep.judges
+    _, params = sweep.solve(entry.size, Clock(), lambda message: None)
+    generated = Generated(family, params, sweep.chart, prepared.dt, prepared.scale)
+    features = getattr(getattr(family, "inputs", None), "features", None)
+    generated = with_predictor(generated, prepared, judges.training, features)
+    return composed(generated, prepared, judges)
