@@ -184,7 +184,8 @@ class Flow:
             after = number * (self.dt / self.substeps)
             return substep(carry, at_time(self.family, args, after))
 
-        carry, infos = jax.lax.scan(following, carry, jnp.arange(self.substeps))
+        numbers = jnp.arange(self.substeps, dtype=self.scale.dtype)
+        carry, infos = jax.lax.scan(following, carry, numbers)
         return carry, jax.tree.map(lambda a: jnp.max(a, axis=0), infos)
 
     def _increment(self, z, args, unrolled: bool | int):

@@ -253,7 +253,9 @@ def _walked(
         reversor=scene.reversor if scene is not None else None, own=own,
     )  # fmt: skip
     _, args = prepared.given(judges.training)
-    functions = functions_of_parameters(prepared.dim, prepared.parameters, args, own is not None)
+    functions = functions_of_parameters(
+        prepared.dim, prepared.parameters, args, own is not None, prepared.period
+    )
     most = len(judges.training) * 2 * prepared.dim / options.rows_per_term
     best: _Fitted | None = None
 
