@@ -38,8 +38,8 @@ class Options:
     powers: int = 2
     total: int = 3
     degrees: tuple[int, ...] = (3, 6, 10, 15, 20, 26, 32)
-    boxes: tuple[tuple[int, int], ...] = ((1, 2), (2, 2), (2, 4), (4, 4))
-    polynomials: tuple[int, ...] = (2, 3, 4, 6, 8)
+    boxes: tuple[tuple[int, int], ...] = ((1, 2), (2, 2), (2, 4), (4, 4), (6, 6))
+    polynomials: tuple[int, ...] = (2, 3, 4, 6, 8, 10, 12, 14)
     features: tuple[int, ...] = (2, 3)
     gained: float = 0.5
     leap: float = 0.03
@@ -167,7 +167,7 @@ def walked(
         level, here = 0, np.inf
         moves: list[tuple[int, int]] = [(0, 0)]
         while moves:
-            tried: list[tuple[float, tuple[int, int]]] = []
+            tried: list[tuple[int, float, tuple[int, int]]] = []
             for more, further in moves:
                 if at + more >= len(states) or level + further >= len(row):
                     continue
@@ -178,13 +178,19 @@ def walked(
                 yield found
                 error = error_of(found)
                 best = min(best, error)
-                tried.append((error, (more, further)))
+                tried.append((family.num_parameters, error, (more, further)))
                 if best <= bound:
                     return
                 if error < options.leap * here:
                     break
-            error, move = min(tried, default=(np.inf, (0, 0)))
-            if not error < options.gained * here:
-                break
-            at, level, here = at + move[0], level + move[1], error
-            moves = [(0, 1), (1, 0), (1, 1)]
+            # The smallest of those that are hardly worse than the best.
+            lowest = min((error for _, error, _ in tried), default=np.inf)
+            near = [entry for entry in tried if options.gained * entry[1] <= lowest]
+            _, error, move = min(near, default=(0, np.inf, (0, 0)))
+            if error < options.gained * here:
+                at, level, here = at + move[0], level + move[1], error
+                moves = [(0, 1), (1, 0), (1, 1)]
+                if move[0] and not move[1]:  # what has helped may help again
+                    moves = [(1, 0), (0, 1), (1, 1)]
+            else:  # of an even function no odd degree helps
+                moves = [(2, 0)] if moves != [(2, 0)] else []
