@@ -120,10 +120,16 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     if candidate.learns == "map" and entry is not None:
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))
         own = f" (the map's own error is then about {part:.1g} of it)"
+    hidden = ""
+    if len(np.unique(sequence)) == len(sequence):
+        hidden = (
+            "or to depend on something that the states do not hold (a parameter, a drive), which "
+            "single pairs do not tell from noise, "
+        )
     message = (
         "larger models are no more accurate: the pairs seem to carry noise of about "
         f"{', '.join(f'{sigma:.1e}' for sigma in noise)} on the coordinates in their order{own}, "
-        "or a structure that these functions cannot represent"
+        f"{hidden}or to have a structure that these functions cannot represent"
     )
     return _LeftOver(noise, [message])
 
