@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
-from gfnn_jax.arrays import matmul, namespace
+from gfnn_jax.arrays import as_row, matmul, namespace
 from gfnn_jax.phase_space import TIME
 
 
@@ -54,7 +54,10 @@ def at_time(family: Any, args: Any, after: Any) -> Any:
     if getattr(family, "parameters", ())[-1:] != (TIME,):
         return args
     xp = namespace(args, after)
-    time = args[..., -1] + after
+    time = args[..., -1]
+    if 0 < time.ndim < xp.ndim(after):  # of stages and lanes
+        time = as_row(time, after)
+    time = time + after
     still = xp.broadcast_to(args[..., :-1], (*time.shape, args.shape[-1] - 1))
     return xp.concatenate([still, time[..., None]], axis=-1)
 
