@@ -1,7 +1,9 @@
 """Driven systems: the time of the drive from the pairs to the prediction."""
 
+import dataclasses
 import re
 import warnings
+from fractions import Fraction
 
 import jax
 import numpy as np
@@ -108,8 +110,6 @@ def test_s_is_that_of_the_time_in_the_middle(name):
 
 def test_the_time_is_counted_and_not_summed():
     """After 10⁷ steps the phase of a period that no step divides is right to its last digits."""
-    from fractions import Fraction
-
     known = Parameters(("l", "t"), np.zeros(2), np.ones(2), np.float64(PERIOD))
     dt, steps, t0 = 0.1, 10_000_001, 1.3
     exact = float((Fraction(t0) + steps * Fraction(dt)) % Fraction(PERIOD))
@@ -153,21 +153,21 @@ def test_libraries_of_an_even_law_grow_past_odd_degrees():
 # A fit and its map.
 
 
-def test_a_driven_law_is_read_and_predicts_a_hundred_periods(learned):
+def test_a_driven_law_is_read_and_predicts_many_periods(learned):
     terms = {t.term: t.coefficient for t in learned.hamiltonian.terms}
     drive = f"cos(q1) cos({RATE!r}*t)"
     assert terms == pytest.approx({"cos(q1)": -1.0, drive: -0.15, "p1²": 0.5}, rel=1e-12)
     z, t0 = states(20, seed=1)
     z = 0.7 * z
-    found, info = learned.map.rollout(z, 1_600, t0=t0, save_every=1_600)
-    np.testing.assert_allclose(found[:, -1], after(z, t0, 1_600), atol=1e-11)
+    found, info = learned.map.rollout(z, 320, t0=t0, save_every=320)
+    np.testing.assert_allclose(found[:, -1], after(z, t0, 320), atol=1e-12)
     assert not np.asarray(info.status).any()
     assert learned.symplecticity_defect < 1e-13
     one, _ = learned.map.step(z, {"t": t0})
     np.testing.assert_allclose(one, image(z, t0), atol=1e-14)
     np.testing.assert_allclose(learned.map.inverse(one, t0=t0)[0], z, atol=1e-14)
     energy = learned.map.hamiltonian(z, t0=t0)
-    np.testing.assert_allclose(energy, LAW.value(C * [0.5 / 0.5, 1, 1], z, t0[:, None]), rtol=1e-12)
+    np.testing.assert_allclose(energy, LAW.value(C, z, t0[:, None]), rtol=1e-12)
 
 
 def test_any_dt_and_lanes_in_parts(learned):
@@ -205,8 +205,6 @@ def test_a_drive_that_was_seen_in_part_has_a_status(learned):
     z, t0 = states(300)
     t0 = np.mod(t0, 0.5 * PERIOD)
     known = sampled(("t",), t0[:, None], DT, PERIOD)
-    import dataclasses
-
     map_ = dataclasses.replace(learned.map, parameters=known)
     _, info = map_.step(0.1 * z[:2], t0=np.array([1.0, 4.0]))
     assert info.status.tolist() == [0, 1]
