@@ -4,8 +4,8 @@
     python benchmarks/args.py --quick    two of them
 
 Each row learns H from pairs of a system whose H is known, and judges by states, parameters and time
-steps that no fit has seen: the one-step error, the error at step 1,000 (driven: at step 1,600, after
-100 periods) beside that of the reference itself, and the time of a step in a batch of 1,000.
+steps that no fit has seen: the one-step error, the error at step 1,000 (driven: at step 1,600,
+after 100 periods) beside that of the reference itself, and the time of a step in a batch of 1,000.
 """
 
 from __future__ import annotations
@@ -190,7 +190,7 @@ def driven(quick: bool, num_pairs: int = 4_000, **options) -> Numbers:
     predicted, ended = fit.map.rollout(z0, steps, t0=t0, save_every=steps)
     error = gfnn.metrics.position_error(np.asarray(predicted)[:, -1:], reference, angles)
     own = gfnn.metrics.position_error(again, reference, angles)
-    begun, at = np.resize(z0, (BATCH, 2)), np.resize(t0, BATCH)
+    begun, at = np.resize(z0, (BATCH, 2)), np.resize(np.asarray(t0), BATCH)
     timed_steps = 10 if quick else 100
     rolled = timed(lambda: fit.map.rollout(begun, timed_steps, t0=at, save_every=timed_steps))
     return {

@@ -142,10 +142,12 @@ class Pairs:
     def _set_time(self) -> None:
         """The time of the drive both as ``t0`` and as the last of the args."""
         others = {name: values for name, values in (self.args or {}).items() if name != TIME}
-        t0 = (self.args or {}).get(TIME) if self.t0 is None else np.asarray(self.t0)
-        t0 = np.full(len(self), t0) if np.ndim(t0) == 0 and np.asarray(t0).dtype != object else t0
-        self._set("args", _named({**others, TIME: t0}, len(self)))
-        self._set("t0", self.args[TIME])
+        t0: Any = (self.args or {})[TIME] if self.t0 is None else self.t0
+        if np.ndim(t0) == 0:
+            t0 = np.full(len(self), t0)
+        args = _named({**others, TIME: t0}, len(self))
+        self._set("args", args)
+        self._set("t0", args[TIME])
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)

@@ -534,8 +534,8 @@ def _open_npz(path: Path, stream, dt, initial: bool, driven: bool) -> _Source:
     if "period" in names and not initial:
         period = _check_dt(member("period").whole(), f"{path}: period")
     with_t0 = "t0" in names and (driven or not initial)
-    if not initial and (with_t0 or "times" in names) < (period is not None):
-        raise InputError(f"{path}: expected t0, the time of the drive, beside its period; found none")
+    if period is not None and not (with_t0 or "times" in names):
+        raise InputError(f"{path}: expected t0, the time of the drive, beside its period; got none")
     if with_t0 and not initial and period is None:
         raise InputError(f"{path}: expected the drive's period beside t0, found none")
     if "dt" in names and (driven or not initial):
@@ -550,7 +550,9 @@ def _open_npz(path: Path, stream, dt, initial: bool, driven: bool) -> _Source:
     params = _read_params(path, names, member)
     if trajectories is None:
         dt, z0 = _agreed_dt(path, dt, found), member("z0")
-        t0 = np.mod(_read_t0(path, member, _rows_of(z0)), period) if with_t0 else None
+        t0 = None
+        if with_t0 and period is not None:
+            t0 = np.mod(_read_t0(path, member, _rows_of(z0)), period)
         return _pairs_source(path, z0, member("z1"), dt, own_dt, params, t0, period)
     lengths = member("lengths").whole() if "lengths" in names else None
     times = None
@@ -568,9 +570,7 @@ def _open_npz(path: Path, stream, dt, initial: bool, driven: bool) -> _Source:
         count, length = (1, *trajectories.shape)[-3:-1]
         times = _read_t0(path, member, count)[:, None] + dt * np.arange(length)
     dt = np.nan if initial or dt is None else dt
-    return _array_source(
-        path, trajectories, lengths, dt, times=times, params=params, period=period
-    )
+    return _array_source(path, trajectories, lengths, dt, times=times, params=params, period=period)
 
 
 def _rows_of(array: _StoredArray) -> int:

@@ -37,8 +37,8 @@ _ASSEMBLY_BYTES = 64 * 2**20
 class PredictionWriter:
     """Writes one prediction file: ``trajectories`` (B, S, 2d), ``status`` (B,), ``left_at`` (B,),
     ``steps`` (S,) and ``dt``, all float64 or int64, ``params`` (B, k) and ``param_names`` (k,)
-    where the map has parameters, ``t0`` (B,) and ``period`` where it is driven, and ``job``, a digest
-    of what was asked for.
+    where the map has parameters, ``t0`` (B,) and ``period`` where it is driven, and ``job``, a
+    digest of what was asked for.
 
     out:       the ``.npz`` to write; ``OUT.partial`` holds the chunks until `finish`.
     shape:     (B, 2d).

@@ -72,13 +72,13 @@ def predict(
         "initial": digest.hexdigest(),
         "outside": "stop" if stop_outside else "continue",
     }
-    own, drive = params, None
-    if params is not None and TIME in names:
-        names, own = names[:-1], params[:, :-1]
+    own, drive = None if params is None else (names, params), None
+    if params is not None and map_.parameters is not None and TIME in names:
         drive = params[:, -1], float(np.asarray(map_.parameters.period))
+        own = (names[:-1], params[:, :-1]) if len(names) > 1 else None
     writer = PredictionWriter(
         out, shape=z0.shape, num_steps=num_steps, save_every=save_every, dt=dt,
-        identity=identity, params=(names, own) if names else None, drive=drive,
+        identity=identity, params=own, drive=drive,
         overwrite=overwrite, resume=resume,
     )  # fmt: skip
     started = time.perf_counter()

@@ -85,7 +85,7 @@ def run(
         key_pairs, key_test = _keys(seed)
         pairs = _finite(sample_pairs(scene, num_pairs, key_pairs))
         z0 = np.asarray(sample_test_states(scene, num_trajectories, key_test))
-        given = {
+        given: dict[str, Any] = {
             "params": sample_params(scene, num_trajectories, key_test, test=True),
             "t0": sample_t0(scene, num_trajectories, key_test),
         }

@@ -121,7 +121,7 @@ def _one_phase(t0: float, dt: float, period: float) -> str:
     turns = dt / period
     if abs(turns - round(turns)) <= _SAME * max(turns, 1.0) and round(turns) > 0:
         return f"{told}, that of {round(turns)} whole period{'s' * (round(turns) > 1)} of the drive"
-    return f"{told}, and dt = {dt:g} is no whole number of periods: a second step is at another time"
+    return f"{told}; dt = {dt:g} is no whole number of periods: a second step is at another time"
 
 
 def given_by(prepared: Prepared) -> np.ndarray | None:

@@ -85,7 +85,7 @@ def stroboscopic(map_: SymplecticMap, t0: float = 0.0) -> SymplecticMap:
     Raises ValueError for any other map.
     """
     known = map_.parameters
-    if known is None or known.period is None or len(known.names) > 1 or len(map_.pieces) > 1:
+    if known is None or known.period is None or len(known.names) > 1 or len(map_.pieces) != 1:
         raise ValueError("expected a driven map of one piece and no parameter but the time")
     dt, period = float(np.asarray(map_.dt)), float(np.asarray(known.period))
     steps = round(period / dt)
@@ -95,9 +95,5 @@ def stroboscopic(map_: SymplecticMap, t0: float = 0.0) -> SymplecticMap:
             "by map.over(dt)"
         )
     dtype = np.dtype(map_.scale.dtype)
-    piece = OverPhases(
-        map_.pieces[0], known, np.asarray(t0, dtype), np.asarray(dt, dtype), steps
-    )
-    return dataclasses.replace(
-        map_, pieces=(piece,), dt=np.asarray(period, dtype), parameters=None
-    )
+    piece = OverPhases(map_.pieces[0], known, np.asarray(t0, dtype), np.asarray(dt, dtype), steps)
+    return dataclasses.replace(map_, pieces=(piece,), dt=np.asarray(period, dtype), parameters=None)

@@ -107,9 +107,9 @@ class SymplecticMap:
     Methods take states z (2d,) or (B, 2d), NumPy or JAX, and answer with JAX arrays. A map that was
     learned with parameters takes their values too: name -> a number or (B,), or an array (k,) or
     (B, k); that of a driven system takes t0, the time of the drive at z, a number or (B,), which
-    goes on with the steps. They can be differentiated, in forward and reverse mode, in z, in the parameters' values
-    and in the map's own leaves, by the implicit-function theorem; ``jax.vmap`` and ``jax.jit`` work
-    over them.
+    goes on with the steps. They can be differentiated, in forward and reverse mode, in z, in the
+    parameters' values and in the map's own leaves, by the implicit-function theorem; ``jax.vmap``
+    and ``jax.jit`` work over them.
     """
 
     pieces: tuple

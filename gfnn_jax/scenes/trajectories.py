@@ -159,8 +159,9 @@ def reference_trajectories(
     """Reference trajectories from ``z0`` (B, 2d): (B, 1 + num_steps // save_every, 2d), z0 first.
 
     The scene's exact flow or exact map where it has one, else Dopri8, to its section where it has
-    one. Time starts at 0, or at t0 (B,) where the scene has any phase. params: (k,) or (B, k), where
-    the scene has parameters. Angles are not reduced. From where a state escapes or collides its own row is NaN, and no other lane's.
+    one. Time starts at 0, or at t0 (B,) where the scene has any phase. params: (k,) or (B, k),
+    where the scene has parameters. Angles are not reduced. From where a state escapes or collides
+    its own row is NaN, and no other lane's.
     """
     require_x64("a reference trajectory")
     z0 = np.asarray(z0, np.float64)
@@ -228,11 +229,10 @@ def reference_error(scene: Scene, z0: States, num_steps: int) -> float:
     t0 = 0.0 if scene.any_phase else None
     first = reference_trajectories(scene, z0, num_steps, t0=t0)
     if scene.flow is None and not scene.timeless:
-        whole = scene.period is not None and not scene.any_phase
-        halves = 2 * round(scene.dt / scene.period) if whole else 2
-        halved = dataclasses.replace(
-            scene, dt=scene.dt / halves, period=None if whole else scene.period
-        )
+        period = None if scene.any_phase else scene.period
+        halves = 2 if period is None else 2 * round(scene.dt / period)
+        own = scene.period if scene.any_phase else None
+        halved = dataclasses.replace(scene, dt=scene.dt / halves, period=own)
         second = reference_trajectories(halved, z0, halves * num_steps, save_every=halves, t0=t0)
     else:
         moved = np.asarray(z0, np.float64) * (1 + np.finfo(np.float64).eps)
