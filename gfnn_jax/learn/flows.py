@@ -270,14 +270,16 @@ def _walked(
         ):  # fmt: skip
             if best is None or found.error.relative < best.error.relative:
                 best = found
+        stalled = best is not None and best.error.bound > judges.tolerance.bound
     except OutOfTime:
         if best is None:
             raise
+        stalled = False
     if best is None:
         raise FitError(
             f"expected more pairs: {len(prepared.y0)} are too few for any library of terms"
         )
-    return best._replace(stalled=best.error.bound > judges.tolerance.bound)
+    return best._replace(stalled=stalled)
 
 
 def _angles_and_others(prepared: Prepared) -> tuple[tuple[int, ...], tuple[str, ...]]:
