@@ -341,7 +341,7 @@ def sample_pairs(
     stroboscopic = scene.period is not None and not scene.any_phase
     if scene.timeless or stroboscopic or not 0 < low < high < np.inf:
         raise ValueError(
-            f"expected 0 < shortest < longest dt, of a flow; got {low:g} and {high:g} "
+            f"expected 0 < shortest < longest dt, of an autonomous flow; got {low:g} and {high:g} "
             f"for the scene {scene.name}"
         )
     z0 = sample_states(scene, num_pairs, key)
