@@ -690,8 +690,15 @@ def formula(terms: Sequence[Term]) -> str:
         digits = 12 if std <= 0 else int(np.clip(np.ceil(np.log10(size / std)) + 1, 2, 12))
         number = f"{size:.{digits}g}"
         factor = "" if number == "1" else f"{number} "
-        text += (sign if text else sign.strip().removeprefix("+")) + factor + term
+        shown = f"({term})" if factor and _is_sum(term) else term
+        text += (sign if text else sign.strip().removeprefix("+")) + factor + shown
     return text or "0"
+
+
+def _is_sum(term: str) -> bool:
+    """Whether a user's term is a sum, which a coefficient before it would not multiply."""
+    depth = np.cumsum([(c in "(") - (c in ")") for c in term])
+    return any(depth[i] == 0 and term[i : i + 3] in (" + ", " - ") for i in range(len(term)))
 
 
 def assembled(learned: LearnedHamiltonian, prepared: Prepared, judges: Judges) -> Assembled:
