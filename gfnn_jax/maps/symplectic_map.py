@@ -164,6 +164,18 @@ class SymplecticMap:
         dt = dt.astype(self.scale.dtype)
         return dataclasses.replace(self, pieces=(self.pieces[0].over(dt),), dt=dt)
 
+    def then(self, other: SymplecticMap) -> SymplecticMap:
+        """This map and the other one after it, as one map: sectors of a ring, phases of a period.
+
+        Its domain and its sizes are those of this map, its dt the sum of both. Raises ValueError
+        where the maps have different coordinates, or parameters.
+        """
+        if self.coordinates != other.coordinates or self.parameters or other.parameters:
+            raise ValueError("expected two maps of the same coordinates and without parameters")
+        return dataclasses.replace(
+            self, pieces=(*self.pieces, *other.pieces), dt=self.dt + other.dt
+        )
+
     def reversed(self) -> SymplecticMap:
         """The inverse map, as a map of its own."""
         pieces = tuple(piece.inverse() for piece in reversed(self.pieces))
