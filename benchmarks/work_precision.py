@@ -231,6 +231,7 @@ def our_laws(bench: Bench, quick: bool) -> Iterator[Numbers]:
     for tolerance in LAW_TOLERANCES[-1:] if quick else LAW_TOLERANCES:
         law = gfnn.fit(pairs, scene, learn="hamiltonian", terms=terms, seed=SEED,
                        tolerance=0.1 * tolerance)  # fmt: skip
+        assert law.hamiltonian is not None
         flow = law.hamiltonian.flow
         print(f"  law: {flow.stages} stages in {flow.substeps} substeps", flush=True)
         found = [

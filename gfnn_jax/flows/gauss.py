@@ -50,8 +50,8 @@ def gauss(stages: int) -> Gauss:
             if m != j:
                 lagrange[..., j] *= (at - nodes[m]) / (nodes[j] - nodes[m])
     matrix = nodes[:, None] * np.einsum("k,ikj->ij", weights, lagrange)
-    found = (a.astype(np.float64) for a in (matrix, weights, nodes))
-    return Gauss(*found, _coupling(matrix / weights))
+    coupling = _coupling(matrix / weights)
+    return Gauss(*(a.astype(np.float64) for a in (matrix, weights, nodes, coupling)))
 
 
 def _coupling(ratios) -> np.ndarray:
