@@ -23,6 +23,7 @@ from gfnn_jax.fitting.gauss_newton import (
     MOST_SUBSTEPS,
     FlowFit,
     Problem,
+    forward_start,
     frequencies,
     log_start,
     midpoint_start,
@@ -87,6 +88,8 @@ _NEAR_ROUNDOFF = 3e-15  # of the spread
 _HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
 _NAMED = 5  # terms in a message
 _POOR, _POOR_GIVEN = 2, 3  # libraries in a row that do not help end the search; with given terms
+_TURNING = 2_000  # pairs that tell how far a step turns the states
+_EXPLAINED = 0.05  # of the spread: an error below it is that of the right branch of the turns
 _FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
 
 
@@ -419,10 +422,16 @@ def _fitted(problem, family, prepared, judges, last: _Fitted | None, options, sa
     family = family.take(kept)
     count = int(np.ceil(options.judged_rows * family.num_parameters / z.shape[1]))
     rows = judges.training[: max(count, 100)]
-    fit = problem.fit(family, _start(problem, family, rows, last), rows, say=say)
-    fit = _resolved(problem, family, fit, rows)
-    error = _held_out_error(problem, family, fit, prepared, judges)
-    return _Fitted(family, fit, rows, error, tuple(names[j] for j in null), undetermined)
+    null_names, best = tuple(names[j] for j in null), None
+    for start in _starts(problem, family, rows, judges.training[:_TURNING], last):
+        fit = _resolved(problem, family, problem.fit(family, start, rows, say=say), rows)
+        error = _held_out_error(problem, family, fit, prepared, judges)
+        if best is None or error.relative < best.error.relative:
+            best = _Fitted(family, fit, rows, error, null_names, undetermined)
+        if error.relative <= _EXPLAINED:
+            break
+    assert best is not None
+    return best
 
 
 def _scattered(z) -> np.ndarray:
@@ -430,6 +439,20 @@ def _scattered(z) -> np.ndarray:
     size = z.std(axis=0)
     size = np.where(size > 0, size, np.maximum(np.abs(z).max(axis=0), size.max()))
     return z + size * np.random.default_rng(0).normal(size=z.shape)
+
+
+def _starts(problem, family, rows, many, last: _Fitted | None) -> Iterator[np.ndarray]:
+    """The start whose flow is nearest to the pairs; and the one that turns forwards what seems to
+    turn backwards, before it where that is by more than a quarter. many: rows that tell turns."""
+    dt, args = problem.given(many)
+    turned = None
+    if args is None and np.ndim(dt) == 0:
+        turned = forward_start(family, problem.z0[many], problem.z1[many], dt, problem.scale)
+    if turned is not None and turned[0] > _FAST:
+        yield turned[1]
+    yield _start(problem, family, rows, last)
+    if turned is not None and turned[0] <= _FAST:
+        yield turned[1]
 
 
 def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
@@ -640,9 +663,14 @@ def _messages(
         )
     elif omega_h > _FAST:
         yield (
-            f"H oscillates by {omega_h:.2g} radians in a step (ωh, its median over the states): "
-            "any H whose frequencies differ by 2π per step gives the same pairs; this is the "
-            "slowest"
+            f"H oscillates by {omega_h:.2g} radians in a step (ωh, its median over the states"
+            f"{', beyond π' if omega_h > np.pi else ''}): an H whose frequencies differ by 2π per "
+            "step gives the same pairs, or nearly; this is the "
+            + (
+                "simplest; a smaller dt, or several, would settle it"
+                if omega_h > np.pi
+                else "slowest"
+            )
         )
     if found.undetermined:
         names = found.undetermined
@@ -666,8 +694,15 @@ def formula(terms: Sequence[Term]) -> str:
         digits = 12 if std <= 0 else int(np.clip(np.ceil(np.log10(size / std)) + 1, 2, 12))
         number = f"{size:.{digits}g}"
         factor = "" if number == "1" else f"{number} "
-        text += (sign if text else sign.strip().removeprefix("+")) + factor + term
+        shown = f"({term})" if factor and _is_sum(term) else term
+        text += (sign if text else sign.strip().removeprefix("+")) + factor + shown
     return text or "0"
+
+
+def _is_sum(term: str) -> bool:
+    """Whether a user's term is a sum, which a coefficient before it would not multiply."""
+    depth = np.cumsum([(c in "(") - (c in ")") for c in term])
+    return any(depth[i] == 0 and term[i : i + 3] in (" + ", " - ") for i in range(len(term)))
 
 
 def assembled(learned: LearnedHamiltonian, prepared: Prepared, judges: Judges) -> Assembled:
