@@ -53,6 +53,8 @@ class Options:
     judged_rows: per term, from which a library is judged; all pairs only count in the last fit.
     thresholds: standard errors below which terms go, tried in turn.
     rise: of the held-out error that dropping terms may cost; rounding: below which it is roundoff.
+    flat: libraries one after the other whose errors differ by less have met the pairs' noise;
+    certain: standard errors below which a term is then noise (one in 16,000 by chance).
     gained: a library that lowers the error by less has not helped; twice in a row ends the search.
     truncation: a flow's own error, as a part of the tolerance. contracting: a fixed point's factor
     up to which it is preferred to Newton's method. goal: residual that modes grow to, as a part of
@@ -71,6 +73,8 @@ class Options:
     thresholds: tuple[float, ...] = (1e4, 1e3, 100.0, 30.0, 10.0, 5.0, 3.0)
     rise: float = 1.1
     rounding: float = 1e-15
+    flat: float = 1.2
+    certain: float = 4.0
     gained: float = 0.5
     truncation: float = 0.1
     contracting: float = 0.8
@@ -133,7 +137,8 @@ class LearnedHamiltonian:
 class _Fitted(NamedTuple):
     """rows: that the fit was given; it has left out those that the flow does not resolve.
     undetermined: of the null terms, those that other states would tell from the rest. ended: why a
-    library that grew did so no longer. stalled: whether larger libraries were no better."""
+    library that grew did so no longer. stalled: whether larger libraries were no better. noisy:
+    whether their errors were the same, which is that of the pairs."""
 
     family: Terms
     fit: FlowFit
@@ -143,6 +148,7 @@ class _Fitted(NamedTuple):
     undetermined: tuple[str, ...] = ()
     ended: str = ""
     stalled: bool = False
+    noisy: bool = False
 
 
 def learn_hamiltonian(
@@ -187,6 +193,8 @@ def learn_hamiltonian(
         raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
     outside = None
     try:
+        if best.noisy:
+            best = _refitted(problem, best, judges.training, prepared, judges)
         best = _sparse(problem, best, prepared, judges, options, say)
         there = dataclasses.replace(everywhere, held_out=everywhere.training[outer])
         outside = _held_out_error(problem, best.family, best.fit, prepared, there).relative
@@ -208,7 +216,8 @@ def _searched(
     fewer terms where the tolerance is out of reach."""
     bound = judges.tolerance.bound
     best: _Fitted | None = None
-    last, poor, errors = None, 0, []
+    tried: list[_Fitted] = []
+    poor, errors = 0, []
     libraries = list(_libraries(prepared, judges, scene, terms, options))
     if len(libraries) > 1 and libraries[0].quadratic and not prepared.varied:
         affine = _affine_error(prepared, judges).bound
@@ -218,12 +227,14 @@ def _searched(
     try:
         for family in libraries:
             say(f"H: {family.num_parameters} terms")
-            found = _fitted(problem, family, prepared, judges, last, options, say)
+            found = _fitted(
+                problem, family, prepared, judges, tried[-1] if tried else None, options, say
+            )
             better = best is None or found.error.relative < options.gained * best.error.relative
             poor = 0 if better else poor + 1
             if best is None or found.error.relative < best.error.relative:
                 best = found
-            last = found
+            tried.append(found)
             errors.append(found.error.bound)
             if best.error.bound <= bound or poor == (_POOR_GIVEN if terms else _POOR):
                 break
@@ -238,6 +249,10 @@ def _searched(
             f"expected more pairs: {len(prepared.y0)} are too few for any library of terms"
         )
     stalled = poor == (_POOR_GIVEN if terms else _POOR)
+    near = [f for f in tried if f.error.relative <= options.flat * best.error.relative]
+    if len(near) > 1 and best.error.bound > bound:  # noise: the fewest terms leave no more of it
+        best = near[0]._replace(noisy=True)
+        stalled, options = True, dataclasses.replace(options, thresholds=(options.certain,))
     return best._replace(stalled=stalled), options
 
 
