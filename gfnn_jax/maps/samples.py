@@ -94,7 +94,9 @@ class Samples:
         return np.broadcast_to(z0.astype(one.dtype), (len(self), *one.shape)), args
 
     def _together(self, z0) -> int:
-        return int(np.clip(_TOGETHER // max(z0.shape[1], 1), 1, len(self)))
+        """Samples at a time: they divide their number."""
+        most = int(np.clip(_TOGETHER // max(z0.shape[1], 1), 1, len(self)))
+        return next(k for k in range(most, 0, -1) if len(self) % k == 0)
 
 
 def sampled(map_: SymplecticMap, key, num: int) -> Samples:
@@ -125,10 +127,18 @@ def generator(key) -> np.random.Generator:
 
 def _mapped(samples: Samples, function, each: tuple, together: int):
     """function(map, *own) of every map with its own part of ``each``: ``together`` at a time."""
-    return jax.lax.map(
-        lambda own: function(samples.one(own[0]), *own[1:]), (samples.params, *each),
-        batch_size=together,
+
+    def one(own):
+        return function(samples.one(own[0]), *own[1:])
+
+    each, count = (samples.params, *each), len(samples)
+    if together == 1:  # no batch: a program takes one side of a branch
+        return jax.lax.map(one, each)
+    parts = jax.tree.map(
+        lambda a: a.reshape(count // together, together, *a.shape[1:]), each
     )  # fmt: skip
+    found = jax.lax.map(jax.vmap(one), parts)
+    return jax.tree.map(lambda a: a.reshape(count, *a.shape[2:]), found)
 
 
 @partial(compiled_sooner, static_argnums=(3, 4))
