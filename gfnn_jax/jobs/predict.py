@@ -177,7 +177,7 @@ def _go_on(
         progress.say(f"step {(writer.saved - 1) * save_every} of {num_steps}")
         count = min(chunk, writer.total - writer.saved)
         lanes, states = map_.advance(lanes, count, **options)
-        if drawn is not None:
+        if drawn is not None and of_samples is not None:
             of_samples, others = drawn.samples.advance(of_samples, count, **options)
             steps = writer.steps[writer.saved : writer.saved + count]
             states, passed = _with_bands(drawn, states, others, steps, passed)

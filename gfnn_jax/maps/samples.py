@@ -113,16 +113,15 @@ def sampled(map_: SymplecticMap, key, num: int) -> Samples:
     if num < 1:
         raise ValueError(f"expected a number of samples above 0, got {num}")
     piece, root = map_.pieces[map_.posterior.piece], np.asarray(map_.posterior.root)
-    drawn = generator(key).normal(size=(num, len(root))) @ root
+    drawn = _generator(key).normal(size=(num, len(root))) @ root
     params = np.asarray(piece.params) + piece.family.unflatten(drawn)
     bare = dataclasses.replace(map_, posterior=None)
     return Samples(bare, jax.device_put(params.astype(map_.scale.dtype)), map_.posterior.piece)
 
 
-def generator(key) -> np.random.Generator:
+def _generator(key) -> np.random.Generator:
     """NumPy's generator of a key of ``jax.random``: draws without compiling."""
-    typed = jnp.issubdtype(getattr(key, "dtype", None), jax.dtypes.prng_key)
-    return np.random.default_rng(np.asarray(jax.random.key_data(key) if typed else key).ravel())
+    return np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel())
 
 
 def _mapped(samples: Samples, function, each: tuple, together: int):
