@@ -38,14 +38,15 @@ _BAND_PARTS = 4  # beside a state: its std and three quantiles
 class PredictionWriter:
     """Writes one prediction file: ``trajectories`` (B, S, 2d), ``status`` (B,), ``left_at`` (B,),
     ``steps`` (S,) and ``dt``, all float64 or int64, ``params`` (B, k) and ``param_names`` (k,)
-    where the map has parameters, with ``bands`` also ``std`` (B, S, 2d) and ``quantiles``
-    (3, B, S, 2d), and ``job``, a digest of what was asked for.
+    where the map has parameters, ``t0`` (B,) and ``period`` where it is driven, with ``bands`` also
+    ``std`` (B, S, 2d) and ``quantiles`` (3, B, S, 2d), and ``job``, a digest of what was asked for.
 
     out:       the ``.npz`` to write; ``OUT.partial`` holds the chunks until `finish`.
     shape:     (B, 2d).
     num_steps, save_every: N and K; saved are the S = 1 + N // K states of steps 0, K, 2K, ...
     dt:        the time step of the map.
     params:    the names (k,) and values (B, k) of its parameters.
+    drive:     the time t0 (B,) of the drive at the initial states, and its period.
     bands:     whether states come with their std and three quantiles: (B, c, 5 · 2d).
     identity:  a JSON-able dict that says which job this is (digests of the model and of the initial
                states, say): a job is resumed only if all of it agrees.
@@ -71,6 +72,7 @@ class PredictionWriter:
         dt: float,
         identity: dict[str, Any],
         params: tuple[tuple[str, ...], np.ndarray] | None = None,
+        drive: tuple[np.ndarray, float] | None = None,
         bands: bool = False,
         resume: bool = False,
         overwrite: bool = False,
@@ -79,7 +81,7 @@ class PredictionWriter:
         self.partial = self.out.with_name(self.out.name + ".partial")
         self.steps = range(0, num_steps + 1, save_every)
         self.dt = float(dt)
-        self.params = params
+        self.params, self.drive = params, drive
         self.lanes, self._state = shape
         self.width = self._state * (1 + _BAND_PARTS if bands else 1)
         self.saved = 0
@@ -171,6 +173,8 @@ class PredictionWriter:
         named = [(name, np.asarray(value)) for name, value in more.items()]
         if self.params is not None:
             named += [("params", self.params[1]), ("param_names", np.array(self.params[0]))]
+        if self.drive is not None:
+            named += [("t0", self.drive[0]), ("period", np.asarray(self.drive[1]))]
         with atomic_file(self.out) as stream, zipfile.ZipFile(stream, "w") as archive:
             shape = (self.lanes, self.total, self._state)
             with _member(archive, "trajectories", shape, np.float64) as member:

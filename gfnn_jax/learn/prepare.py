@@ -25,7 +25,7 @@ class Prepared:
     cover their circle. before, after: pieces that were factored out, in the order in which they
     are applied around what is learned: R^½ on both sides for an affine base map R, the flow of a
     law. dt: of all pairs, or in the middle of those that differ, which are ``own_dt`` (N,). args:
-    (N, k) values of the ``parameters``, or None.
+    (N, k) values of the ``parameters``, or None. period: of a drive, whose time is their last.
     """
 
     y0: np.ndarray
@@ -41,6 +41,7 @@ class Prepared:
     own_dt: np.ndarray | None = None
     args: np.ndarray | None = None
     parameters: tuple[str, ...] = ()
+    period: float | None = None
 
     @property
     def each_dt(self) -> Any:
@@ -109,7 +110,7 @@ def prepare(pairs: Pairs, coordinates: Coordinates) -> Prepared:
     return _sized(
         Prepared(
             y0, y1, np.ones(y0.shape[1]), empty, centres, whole, coordinates, dt, own_dt=own_dt,
-            args=args, parameters=names,
+            args=args, parameters=names, period=pairs.period,
         )
     )  # fmt: skip
 

@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.compiling import compiled_sooner
@@ -53,35 +52,42 @@ class Samples:
         pieces[self.piece] = dataclasses.replace(pieces[self.piece], params=params)
         return dataclasses.replace(self.map, pieces=tuple(pieces), posterior=None)
 
-    def start(self, z0, *, params=None, stop_outside: bool = False) -> Lanes:
+    def start(self, z0, *, params=None, t0=None, stop_outside: bool = False) -> Lanes:
         """As `SymplecticMap.start`, leaves (n, B, ...). z0: (B, 2d), or (n, B, 2d) where every
         sample has its own."""
-        z0, args = self._given(z0, params)
+        z0, args = self._given(z0, params, t0)
         return _start(self, z0, args, stop_outside, self._together(z0))
 
     def advance(
-        self, lanes: Lanes, num_saved: int, *, params=None, save_every: int = 1,
+        self, lanes: Lanes, num_saved: int, *, params=None, t0=None, save_every: int = 1,
         stop_outside: bool = False,
     ) -> tuple[Lanes, Any]:  # fmt: skip
         """As `SymplecticMap.advance`: the lanes, and the saved states (n, B, num_saved, 2d)."""
-        args = self.map._args(params, lanes.y[0])
+        args = self.map._args(params, lanes.y[0], t0)
         together = self._together(lanes.y)
         return _advance(self, lanes, args, num_saved, save_every, stop_outside, together)
 
     def rollout(
-        self, z0, num_steps: int, *, params=None, save_every: int = 1, stop_outside: bool = False
+        self,
+        z0,
+        num_steps: int,
+        *,
+        params=None,
+        t0=None,
+        save_every: int = 1,
+        stop_outside: bool = False,
     ) -> tuple[Any, RolloutInfo]:
         """Predict with every map: states (n, B, 1 + num_steps // save_every, 2d), and a RolloutInfo
         of (n, B). z0: (B, 2d), or (n, B, 2d) where every sample has its own.
 
         Compiled once, whatever the samples. Raises ValueError where a shape is wrong.
         """
-        z0, args = self._given(z0, params)
+        z0, args = self._given(z0, params, t0)
         return _rollout(
             self, z0, args, num_steps // save_every, save_every, stop_outside, self._together(z0)
         )
 
-    def _given(self, z0, params) -> tuple[Any, Any]:
+    def _given(self, z0, params, t0) -> tuple[Any, Any]:
         """The states (n, B, 2d) and their args."""
         z0 = np.asarray(z0)
         if z0.ndim not in (2, 3) or (z0.ndim == 3 and len(z0) != len(self)):
@@ -90,7 +96,7 @@ class Samples:
                 f"({len(self)}, B, {2 * self.map.dim}), got {z0.shape}"
             )
         one = self.map._states(z0[0] if z0.ndim == 3 else z0)
-        args = self.map._args(params, one)
+        args = self.map._args(params, one, t0)
         return np.broadcast_to(z0.astype(one.dtype), (len(self), *one.shape)), args
 
     def _together(self, z0) -> int:

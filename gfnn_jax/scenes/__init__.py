@@ -17,6 +17,7 @@ from gfnn_jax.scenes.scene import AroundOrbit, DrawnFrom, Scene, Section, Unifor
 
 if TYPE_CHECKING:  # what is collected below
     from gfnn_jax.scenes.driven_pendulum import driven_pendulum
+    from gfnn_jax.scenes.driven_pendulum_phase import driven_pendulum_phase
     from gfnn_jax.scenes.henon_heiles import henon_heiles
     from gfnn_jax.scenes.henon_heiles_section import henon_heiles_section
     from gfnn_jax.scenes.pcr3bp import pcr3bp
@@ -71,6 +72,7 @@ __all__ = [
     "Section",
     "UniformInEllipse",
     "driven_pendulum",
+    "driven_pendulum_phase",
     "henon_heiles",
     "henon_heiles_section",
     "make",
