@@ -201,7 +201,7 @@ def _calibration_table(found: dict[str, Numbers]) -> str:
                     strict=True,
                 )
             ]
-            rows.append([name, f"{row['sigma']:g}", row["pairs"], row["labels"][0], *cells])
+            rows.append([name, f"{row['sigma']:g}", f"{row['pairs']:,}", row["labels"][0], *cells])
     return markdown(head, rows)
 
 
@@ -217,7 +217,7 @@ def _noise_table(found: dict[str, Numbers]) -> str:
     for name in ("noise-dt-0.5", "noise-dt-0.05"):
         for run in found[name]["measured"]["runs"] if name in found else ():
             noise = ", ".join(f"{1e3 * s:.2f}" for s in run["noise"] or ()) or "–"
-            rows.append([found[name]["measured"]["dt"], run["terms"], noise,
+            rows.append([str(found[name]["measured"]["dt"]), str(run["terms"]), noise,
                          *(f"{r:.1e}" for r in run["rms"])])  # fmt: skip
     return markdown(head, rows)
 
