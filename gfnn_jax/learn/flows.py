@@ -17,8 +17,11 @@ import numpy as np
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.expressions import coordinate_names
+from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.modes import Modes
+from gfnn_jax.families.products import Products
 from gfnn_jax.families.terms import Terms, given_terms, joined, multiplied, polynomial_terms
+from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.gauss_newton import (
     MOST_SUBSTEPS,
     FlowFit,
@@ -31,6 +34,7 @@ from gfnn_jax.fitting.gauss_newton import (
     significant_terms,
 )
 from gfnn_jax.fitting.growth import grow
+from gfnn_jax.fitting.least_squares import Reduced
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.gauss import gauss
@@ -40,7 +44,7 @@ from gfnn_jax.learn.clock import Clock, OutOfTime
 from gfnn_jax.learn.held_out import outermost
 from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
 from gfnn_jax.learn.prepare import Prepared
-from gfnn_jax.phase_space import symplectic_form
+from gfnn_jax.phase_space import apply_j, symplectic_form
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,10 +58,14 @@ class Options:
     judged_rows: per term, from which a library is judged; all pairs only count in the last fit.
     thresholds: standard errors below which terms go, tried in turn.
     rise: of the held-out error that dropping terms may cost; rounding: below which it is roundoff.
+    flat: libraries one after the other whose errors differ by less have met the pairs' noise;
+    certain: standard errors below which a term is then noise (one in 16,000 by chance).
     gained: a library that lowers the error by less has not helped; twice in a row ends the search.
     truncation: a flow's own error, as a part of the tolerance. contracting: a fixed point's factor
     up to which it is preferred to Newton's method. goal: residual that modes grow to, as a part of
-    the tolerance. max_seconds: of the search; mode_seconds: where modes grow, growth_part: the part
+    the tolerance. generators: degrees of those that look for misfit; sampled_rows: per term, where
+    what is left over is looked at.
+    max_seconds: of the search; mode_seconds: where modes grow, growth_part: the part
     of them in which they may.
     """
 
@@ -72,10 +80,14 @@ class Options:
     thresholds: tuple[float, ...] = (1e4, 1e3, 100.0, 30.0, 10.0, 5.0, 3.0)
     rise: float = 1.1
     rounding: float = 1e-15
+    flat: float = 1.2
+    certain: float = 4.0
     gained: float = 0.5
     truncation: float = 0.1
     contracting: float = 0.8
     goal: float = 0.3
+    generators: tuple[int, ...] = (2, 3, 4, 5, 6)
+    sampled_rows: int = 6
     max_seconds: float = 30.0
     mode_seconds: float = 60.0
     growth_part: float = 0.7
@@ -86,6 +98,7 @@ _ROUNDOFF = 1e-12  # of the spread: above it the pairs carry noise, and every on
 _FREQUENCY_STATES = 500
 _NEAR_ROUNDOFF = 3e-15  # of the spread
 _HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
+_FEWEST_SAMPLED = 1_000  # pairs that tell noise from misfit
 _NAMED = 5  # terms in a message
 _POOR, _POOR_GIVEN = 2, 3  # libraries in a row that do not help end the search; with given terms
 _TURNING = 2_000  # pairs that tell how far a step turns the states
@@ -111,7 +124,7 @@ class LearnedHamiltonian:
     median over the data; beyond π pairs of one dt may not tell H. contraction: the fixed point's
     factor where it is largest. condition: of the terms' columns. null_terms: that the data do not
     tell from the others. left_out: pairs that the flow does not resolve. stalled: whether larger
-    libraries were no more accurate.
+    libraries were no more accurate. root: (m, m), rootᵀ root is the coefficients' covariance.
     """
 
     candidate: Candidate
@@ -126,6 +139,7 @@ class LearnedHamiltonian:
     left_out: int
     messages: tuple[str, ...]
     stalled: bool
+    root: np.ndarray
 
     @property
     def fast(self) -> bool:
@@ -136,7 +150,8 @@ class LearnedHamiltonian:
 class _Fitted(NamedTuple):
     """rows: that the fit was given; it has left out those that the flow does not resolve.
     undetermined: of the null terms, those that other states would tell from the rest. ended: why a
-    library that grew did so no longer. stalled: whether larger libraries were no better."""
+    library that grew did so no longer. stalled: whether larger libraries were no better. noisy:
+    whether their errors were the same, which is that of the pairs."""
 
     family: Terms
     fit: FlowFit
@@ -146,6 +161,7 @@ class _Fitted(NamedTuple):
     undetermined: tuple[str, ...] = ()
     ended: str = ""
     stalled: bool = False
+    noisy: bool = False
 
 
 def learn_hamiltonian(
@@ -190,6 +206,8 @@ def learn_hamiltonian(
         raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
     outside = None
     try:
+        if best.noisy:
+            best = _refitted(problem, best, judges.training, prepared, judges)
         best = _sparse(problem, best, prepared, judges, options, say)
         there = dataclasses.replace(everywhere, held_out=everywhere.training[outer])
         outside = _held_out_error(problem, best.family, best.fit, prepared, there).relative
@@ -211,7 +229,8 @@ def _searched(
     fewer terms where the tolerance is out of reach."""
     bound = judges.tolerance.bound
     best: _Fitted | None = None
-    last, poor, errors = None, 0, []
+    tried: list[_Fitted] = []
+    poor, errors = 0, []
     libraries = list(_libraries(prepared, judges, scene, terms, options))
     if len(libraries) > 1 and libraries[0].quadratic and not prepared.varied:
         affine = _affine_error(prepared, judges).bound
@@ -221,12 +240,14 @@ def _searched(
     try:
         for family in libraries:
             say(f"H: {family.num_parameters} terms")
-            found = _fitted(problem, family, prepared, judges, last, options, say)
+            found = _fitted(
+                problem, family, prepared, judges, tried[-1] if tried else None, options, say
+            )
             better = best is None or found.error.relative < options.gained * best.error.relative
             poor = 0 if better else poor + 1
             if best is None or found.error.relative < best.error.relative:
                 best = found
-            last = found
+            tried.append(found)
             errors.append(found.error.bound)
             if best.error.bound <= bound or poor == (_POOR_GIVEN if terms else _POOR):
                 break
@@ -241,6 +262,10 @@ def _searched(
             f"expected more pairs: {len(prepared.y0)} are too few for any library of terms"
         )
     stalled = poor == (_POOR_GIVEN if terms else _POOR)
+    near = [f for f in tried if f.error.relative <= options.flat * best.error.relative]
+    if len(near) > 1 and best.error.bound > bound:  # noise: the fewest terms leave no more of it
+        best = near[0]._replace(noisy=True)
+        stalled, options = True, dataclasses.replace(options, thresholds=(options.certain,))
     return best._replace(stalled=stalled), options
 
 
@@ -571,8 +596,45 @@ def _learned(
         with_error(candidate, error), flow, terms, formula(terms), float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(error, omega_h, prepared, judges, found, left_out)),
-        stalled=found.stalled,
+        stalled=found.stalled, root=_root(found, problem, prepared, steps),
     )  # fmt: skip
+
+
+def _root(found: _Fitted, problem: Problem, prepared: Prepared, steps: Steps) -> np.ndarray:
+    """(m, m): rootᵀ root is the covariance of the coefficients. What is noise, a generator of
+    polynomials tells, which does not explain it; what it explains is misfit, of these steps too."""
+    fit, count = found.fit, found.family.num_parameters
+    pairs = max(_FEWEST_SAMPLED, OPTIONS.sampled_rows * count // prepared.y0.shape[1])
+    rows = fit.used[:pairs]
+    images = problem.images(found.family, fit.coefficients, rows, steps, derivatives=True)
+    residual = images.states - prepared.y1[rows]
+    if not np.isfinite(residual).all():  # of a flow that runs away from some of the states
+        return np.full((count, count), np.nan)
+    noise = unexplained(prepared, rows, residual, count)
+    slopes = (images.by_coefficient / problem.scale[:, None]).reshape(-1, count)
+    left = np.hypot(residual / problem.scale, _NEAR_ROUNDOFF).ravel()
+    train = Reduced(np.asfortranarray(fit.factor), fit.rows)
+    return uncertainty.root(train, count, slopes, left, noise=noise)
+
+
+def unexplained(prepared: Prepared, rows, residual, taken: int) -> float | None:
+    """Of the mean square of what a map leaves over (n, 2d) on these rows, the part that no
+    generator K explains, residual = J∇K at the images: K of as high a degree as the rows tell.
+    taken: coefficients that the map itself was given. None where they are too few."""
+    z, coordinates, width = prepared.y1[rows], prepared.coordinates, residual.shape[1]
+    inputs = box_inputs(
+        z, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+        cyclic=coordinates.cyclic,
+    )  # fmt: skip
+    sizes = [Products(inputs, degree) for degree in OPTIONS.generators]
+    most = min(len(rows) * width // OPTIONS.sampled_rows, OPTIONS.most_terms)
+    known = [family for family in sizes if family.num_parameters <= most]
+    if not known:
+        return None
+    weight = 1.0 / np.roll(prepared.scale, prepared.dim)
+    reduced = least_squares.reduce(known[-1], [(z, -apply_j(residual))], weight)
+    left = np.sum(reduced.factor[:, -1] ** 2) / max(reduced.rows - taken, 1)
+    return float(uncertainty.variance(reduced, known[-1].num_parameters) / left) if left else 1.0
 
 
 def _cheapest(problem, family, fit: FlowFit, rates, judges: Judges, options: Options) -> Steps:
