@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.phase_space import apply_j, symplectic_form
 
@@ -22,6 +23,8 @@ _SETTLED = 1e-12  # of it: what no longer shrinks below this is roundoff too
 # iteration of which costs as much as ten to thirty of these.
 _MOST, _SLOW, _FIRST = 60, 0.8, 4
 _MOST_NEWTON = 12
+# Of a derivative without matrices: Gauss–Newton steps need no more of it.
+_DERIVATIVE = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,8 +38,8 @@ class Steps:
 
 
 class Images(NamedTuple):
-    """Z (B, 2d); whether the stages were solved (B,); and, where asked for, ∂Z/∂z (B, 2d, 2d) and
-    ∂Z/∂c (B, 2d, terms)."""
+    """Z (B, 2d); whether the stages were solved (B,); and, where asked for, ∂Z/∂z (B, 2d, 2d), or
+    None where the family does without matrices, and ∂Z/∂c (B, 2d, terms)."""
 
     states: np.ndarray
     solved: np.ndarray
@@ -64,15 +67,21 @@ def images(
     h = h[:, None] if np.ndim(h) else h  # (B, 1) beside coordinates
     width = z.shape[1]
     solved = np.ones(len(z), bool)
-    by_state: Any = np.broadcast_to(np.eye(width), (len(z), width, width))
+    free = matrix_free(family)
+    by_state: Any = None if free else np.broadcast_to(np.eye(width), (len(z), width, width))
     by_coefficient: Any = 0.0
     with np.errstate(all="ignore"):
         for _ in range(steps.substeps):
             on_substep()
-            slopes, done = solve_stages(family, params, z, h, rule, args, newton=steps.newton)
+            newton = steps.newton and not free
+            slopes, done = solve_stages(family, params, z, h, rule, args, newton=newton)
             solved = solved & done
-            if derivatives:
-                inside = z + h * _summed(rule.matrix, slopes)
+            inside = z + h * _summed(rule.matrix, slopes) if derivatives else z
+            if derivatives and free:
+                by_coefficient = _carried(
+                    family, params, inside, h, rule, args, along or family, by_coefficient
+                )
+            elif derivatives:
                 by_z, by_c = _derivatives(family, params, inside, h, rule, args, along or family)
                 by_state = by_z @ by_state
                 by_coefficient = by_z @ by_coefficient + by_c if np.ndim(by_coefficient) else by_c
@@ -202,6 +211,27 @@ def truncation(
         for s in (steps, finer)
     )
     return one - other
+
+
+def _carried(family, params, inside, h, rule, args, along, before):
+    """∂Z/∂c (B, 2d, terms) of one step from its stage states (s, B, 2d) and ∂z/∂c before it, 0 or
+    of the same shape: by fixed point, with products H'' v alone.
+
+    dK = JH'' (dz + h A dK) + J∇φ dc. The iteration ends at a relative change of 1e-6.
+    """
+    bends = family.curvatures(params, inside, args)
+    before = np.moveaxis(before, -1, 0)[:, None] if np.ndim(before) else 0.0
+    explicit = apply_j(np.moveaxis(along.term_gradients(inside, args), -1, 0))
+    slopes = explicit
+    for _ in range(_MOST):
+        turned = np.stack([_summed(rule.matrix, of_term) for of_term in slopes])
+        new = explicit + apply_j(family.hessian_product(bends, before + h * turned))
+        change = np.abs(new - slopes).max(initial=0.0)
+        slopes = new
+        if not change > _DERIVATIVE * np.abs(new).max(initial=0.0):
+            break
+    moved = np.stack([_summed(rule.weights[None, :], of_term) for of_term in slopes])
+    return np.moveaxis((before + h * moved)[:, 0], 0, -1)
 
 
 def _derivatives(family, params, inside, h, rule, args, along):

@@ -18,15 +18,16 @@ from gfnn_jax.coordinates import to_user
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.modes import Modes
+from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms, given_terms, joined, multiplied, polynomial_terms
 from gfnn_jax.fitting.gauss_newton import (
     MOST_SUBSTEPS,
     FlowFit,
     Problem,
-    frequencies,
     log_start,
     midpoint_start,
     null_terms,
+    rates,
     significant_terms,
 )
 from gfnn_jax.fitting.growth import grow
@@ -85,8 +86,11 @@ _ROUNDOFF = 1e-12  # of the spread: above it the pairs carry noise, and every on
 _FREQUENCY_STATES = 500
 _NEAR_ROUNDOFF = 3e-15  # of the spread
 _HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
+_FEWEST_STRUCTURED = 4  # pairs, each of many rows
 _NAMED = 5  # terms in a message
-_POOR, _POOR_GIVEN = 2, 3  # libraries in a row that do not help end the search; with given terms
+# Libraries in a row that do not help end the search; with given terms; of a structure, whose
+# libraries differ in kind.
+_POOR, _POOR_GIVEN, _POOR_STRUCTURED = 2, 3, 5
 _FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
 
 
@@ -135,7 +139,7 @@ class _Fitted(NamedTuple):
     undetermined: of the null terms, those that other states would tell from the rest. ended: why a
     library that grew did so no longer. stalled: whether larger libraries were no better."""
 
-    family: Terms
+    family: Terms | Sums
     fit: FlowFit
     rows: np.ndarray
     error: OneStepError
@@ -167,14 +171,17 @@ def learn_hamiltonian(
     if prepared.before or prepared.after:
         raise FitError("expected pairs without a base map: it is no part of a flow")
     started = time.perf_counter()
-    if terms:
+    if terms and prepared.structure is None:
         _check_finite(_own_terms(prepared, terms), prepared, judges.training)
     problem = Problem(
         prepared.y0, prepared.y1, prepared.each_dt, prepared.scale, args=prepared.args,
         check=clock.check,
     )  # fmt: skip
     everywhere, free = judges, (*prepared.coordinates.cyclic, *prepared.whole)
-    outer = outermost(prepared.y0[judges.training], free)
+    if prepared.structure is None:
+        outer = outermost(prepared.y0[judges.training], free)
+    else:  # a state of many sites is in the middle and far out at once
+        outer = np.zeros(len(judges.training), bool)
     judges = dataclasses.replace(everywhere, training=everywhere.training[~outer])
     if prepared.args is not None:
         best = _walked(problem, prepared, judges, scene, terms, options, say)
@@ -189,7 +196,8 @@ def learn_hamiltonian(
     try:
         best = _sparse(problem, best, prepared, judges, options, say)
         there = dataclasses.replace(everywhere, held_out=everywhere.training[outer])
-        outside = _held_out_error(problem, best.family, best.fit, prepared, there).relative
+        if outer.any():
+            outside = _held_out_error(problem, best.family, best.fit, prepared, there).relative
         if best.error.relative > _ROUNDOFF and len(best.fit.used) < len(everywhere.training):
             best = _refitted(problem, best, everywhere.training, prepared, judges)
     except OutOfTime:
@@ -208,6 +216,8 @@ def _searched(
     fewer terms where the tolerance is out of reach."""
     bound = judges.tolerance.bound
     best: _Fitted | None = None
+    structured = prepared.structure is not None
+    most_poor = _POOR_STRUCTURED if structured else _POOR_GIVEN if terms else _POOR
     last, poor, errors = None, 0, []
     libraries = list(_libraries(prepared, judges, scene, terms, options))
     if len(libraries) > 1 and libraries[0].quadratic and not prepared.varied:
@@ -225,9 +235,11 @@ def _searched(
                 best = found
             last = found
             errors.append(found.error.bound)
-            if best.error.bound <= bound or poor == (_POOR_GIVEN if terms else _POOR):
+            if best.error.bound <= bound or poor == most_poor:
                 break
-            if _out_of_reach(errors, len(libraries) - 1 - libraries.index(family), bound):
+            if not structured and _out_of_reach(
+                errors, len(libraries) - 1 - libraries.index(family), bound
+            ):
                 options = dataclasses.replace(options, thresholds=())  # no law: nothing to read
                 break
     except OutOfTime:
@@ -237,8 +249,7 @@ def _searched(
         raise FitError(
             f"expected more pairs: {len(prepared.y0)} are too few for any library of terms"
         )
-    stalled = poor == (_POOR_GIVEN if terms else _POOR)
-    return best._replace(stalled=stalled), options
+    return best._replace(stalled=poor == most_poor), options
 
 
 def _walked(
@@ -374,9 +385,12 @@ def _out_of_reach(errors: list[float], left: int, bound: float) -> bool:
     return errors[-1] * gain**left > bound
 
 
-def _libraries(prepared, judges, scene, terms, options: Options) -> Iterator[Terms]:
+def _libraries(prepared, judges, scene, terms, options: Options) -> Iterator[Terms | Sums]:
     """Families by rising size, of as many terms as the training rows tell apart."""
     dim, coordinates = prepared.dim, prepared.coordinates
+    if prepared.structure is not None:
+        yield from prepared.structure.libraries(dim, terms)
+        return
     reversor = scene.reversor if scene is not None else None
     features = scene.features if scene is not None else None
     most = len(judges.training) * 2 * dim / options.rows_per_term
@@ -407,14 +421,15 @@ def _fitted(problem, family, prepared, judges, last: _Fitted | None, options, sa
     """The library fitted to as many training pairs as tell its terms, from the best start."""
     names = family.term_names
     z = prepared.y0[judges.training]
-    enough = z[: max(200, 4 * family.num_parameters // z.shape[1])]
+    least = 1 if prepared.structure else 200
+    enough = z[: max(least, -(-4 * family.num_parameters // z.shape[1]))]
     args = prepared.given(judges.training[: len(enough)])[1]
     kept, null = null_terms(family, enough, args=args)
     elsewhere = null_terms(family, _scattered(enough), args=args)[0] if null else []
     undetermined = tuple(names[j] for j in null if j in elsewhere)
     family = family.take(kept)
     count = int(np.ceil(options.judged_rows * family.num_parameters / z.shape[1]))
-    rows = judges.training[: max(count, 100)]
+    rows = judges.training[: max(count, _FEWEST_STRUCTURED if prepared.structure else 100)]
     fit = problem.fit(family, _start(problem, family, rows, last), rows, say=say)
     fit = _resolved(problem, family, fit, rows)
     error = _held_out_error(problem, family, fit, prepared, judges)
@@ -433,7 +448,8 @@ def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
     z0, z1 = problem.z0[rows], problem.z1[rows]
     dt, args = problem.given(rows)
     starts = [midpoint_start(family, z0, z1, dt, problem.scale, args)]
-    alike = args is None and np.ndim(dt) == 0  # pairs of one affine regression
+    # Pairs of one affine regression, more of them than it has unknowns.
+    alike = args is None and np.ndim(dt) == 0 and len(z0) > z0.shape[1]
     logarithm = log_start(family, z0, z1, dt, problem.scale) if alike else None
     if logarithm is not None:
         starts.append(logarithm)
@@ -505,16 +521,13 @@ def _learned(
     family, fit = found.family, found.fit
     rows = judges.held_out
     z, args = prepared.y0[rows], prepared.given(rows)[1]
-    _, hessian = family.gradient_and_hessian(
-        fit.coefficients, prepared.y0[:_FREQUENCY_STATES],
-        prepared.given(slice(_FREQUENCY_STATES))[1],
-    )  # fmt: skip
-    rates = frequencies(hessian)
+    some = slice(_FREQUENCY_STATES)
+    fastest = rates(family, fit.coefficients, prepared.y0[some], prepared.given(some)[1])
     if prepared.own_dt is not None:  # the map's own dt, from which others follow
         problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, args=prepared.args)
-    steps = _cheapest(problem, family, fit, rates, judges, options)
-    contraction = _contraction(rates, prepared.dt, steps)
-    by_newton = contraction > options.contracting
+    steps = _cheapest(problem, family, fit, fastest, judges, options)
+    contraction = _contraction(fastest, prepared.dt, steps)
+    by_newton = contraction > options.contracting and not matrix_free(family)
     off = truncation(family, fit.coefficients, z, prepared.dt, steps, args=args) / prepared.scale
     flow = Flow(
         family, fit.coefficients, prepared.dt, prepared.scale, steps.stages, steps.substeps,
@@ -526,7 +539,7 @@ def _learned(
     candidate = Candidate(
         label=f"H, {family.num_parameters} terms", family=family.name, chart="flow",
         num_parameters=family.num_parameters,
-        operations=_operations(family, rates, prepared.dt, steps),
+        operations=_operations(family, fastest, prepared.dt, steps),
         validation_rms=error.rms, validation_relative=error.relative,
         validation_bound=error.bound, deviations=error.deviations, train_rms=fit.rms,
         fit_seconds=seconds, condition=fit.condition, rank=family.num_parameters,
@@ -538,22 +551,22 @@ def _learned(
             family.term_names, fit.coefficients.tolist(), fit.standard_errors.tolist(), strict=True
         )
     )
-    omega_h = _omega_h(hessian, prepared.dt)
+    omega_h = _omega_h(family, fit.coefficients, prepared, fastest)
     left_out = len(np.setdiff1d(found.rows, fit.used))
     return LearnedHamiltonian(
-        with_error(candidate, error), flow, terms, formula(terms), float(np.abs(off).max()),
+        with_error(candidate, error), flow, terms, getattr(family, "prefix", "") + formula(terms), float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(error, omega_h, prepared, judges, found, left_out)),
         stalled=found.stalled,
     )  # fmt: skip
 
 
-def _cheapest(problem, family, fit: FlowFit, rates, judges: Judges, options: Options) -> Steps:
+def _cheapest(problem, family, fit: FlowFit, fastest, judges: Judges, options: Options) -> Steps:
     """Steps whose own error is a tenth of the tolerance; near roundoff, or at it, where that is not
     twice as dear."""
 
     def cost(steps: Steps) -> float:
-        return _operations(family, rates, problem.dt, steps)
+        return _operations(family, fastest, problem.dt, steps)
 
     bound = options.truncation * judges.tolerance.bound
     if not judges.tolerance.relative:
@@ -572,8 +585,8 @@ def flow_of(family: Terms, params, prepared: Prepared) -> Flow:
     y0, y1, dt, scale = prepared.y0, prepared.y1, prepared.dt, prepared.scale
     problem = Problem(y0, y1, dt, scale)
     (steps,) = problem.fine_steps(family, params, np.arange(len(y0)))
-    _, hessian = family.gradient_and_hessian(params, y0[:_FREQUENCY_STATES])
-    by_newton = not _contraction(frequencies(hessian), dt, steps) <= OPTIONS.contracting
+    fastest = rates(family, params, y0[:_FREQUENCY_STATES])
+    by_newton = not _contraction(fastest, dt, steps) <= OPTIONS.contracting
     flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, by_newton)
     failed = ~np.isfinite(np.concatenate([flow.image(y0), flow.inverse().image(y1)])).all(axis=1)
     if failed.any():
@@ -593,34 +606,38 @@ def around(flow: Flow) -> list[tuple[Flow | None, Flow | None]]:
 
 def flow_operations(flow: Flow, prepared: Prepared) -> float:
     """Floating-point operations per step of the flow."""
-    _, hessian = flow.family.gradient_and_hessian(flow.params, prepared.y0[:_FREQUENCY_STATES])
+    fastest = rates(flow.family, flow.params, prepared.y0[:_FREQUENCY_STATES])
     steps = Steps(flow.stages, flow.substeps)
-    return _operations(flow.family, frequencies(hessian), float(flow.dt), steps)
+    return _operations(flow.family, fastest, float(flow.dt), steps)
 
 
-def _contraction(rates, dt: float, steps: Steps) -> float:
+def _contraction(fastest, dt: float, steps: Steps) -> float:
     """The factor by which the stages' fixed point contracts in the end, where it is largest."""
     radius = np.abs(np.linalg.eigvals(gauss(steps.stages).matrix)).max()
-    return float(dt / steps.substeps * rates.max() * radius)
+    return float(dt / steps.substeps * fastest.max() * radius)
 
 
-def _operations(family: Terms, rates, dt: float, steps: Steps) -> float:
+def _operations(family: Terms | Sums, fastest, dt: float, steps: Steps) -> float:
     """Floating-point operations per step: as many iterations as roundoff takes at this factor."""
     gradient, with_hessian = family.operations
     width, s = 2 * family.dim, steps.stages
-    factor = _contraction(rates, dt, steps)
-    if factor > OPTIONS.contracting:
+    factor = _contraction(fastest, dt, steps)
+    if factor > OPTIONS.contracting and not matrix_free(family):
         one = s * with_hessian + (s * width) ** 3 * 2 / 3
         return float(steps.substeps * 4 * one)
-    iterations = 2 + np.log(1e-16) / np.log(max(factor, 1e-3))
+    iterations = 2 + np.log(1e-16) / np.log(np.clip(factor, 1e-3, OPTIONS.contracting))
     return float(steps.substeps * iterations * s * (gradient + 2 * width * s))
 
 
-def _omega_h(hessian, dt: float) -> float:
+def _omega_h(family, coefficients, prepared: Prepared, fastest) -> float:
     """The fastest oscillation of the linearised flow, radians per step, its median over states."""
-    turned = symplectic_form(hessian.shape[-1] // 2) @ hessian
-    rates = np.abs(np.linalg.eigvals(turned).imag).max(axis=-1)
-    return float(dt * np.median(rates))
+    if not matrix_free(family):
+        some = slice(_FREQUENCY_STATES)
+        z, args = prepared.y0[some], prepared.given(some)[1]
+        _, hessian = family.gradient_and_hessian(coefficients, z, args)
+        turned = symplectic_form(prepared.dim) @ hessian
+        fastest = np.abs(np.linalg.eigvals(turned).imag).max(axis=-1)
+    return float(prepared.dt * np.median(fastest))
 
 
 def _messages(
