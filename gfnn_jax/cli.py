@@ -27,6 +27,7 @@ from gfnn_jax.storage.partial import told_of
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
 FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
 LEARN = ("auto", "map", "hamiltonian")
+STRUCTURES = ("ring", "chain")
 
 EXIT_STATUS = """\
 exit status:
@@ -192,6 +193,11 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
         help='an H that you know a part of the map by: "p1**2/2 - cos(q1)"; its flow is factored '
         "out, and S learns what it leaves over",
     )  # fmt: skip
+    command.add_argument(
+        "--structure", choices=STRUCTURES,
+        help="of many degrees of freedom: H is a sum over equal sites, whose --terms are text in "
+        "q1, p1 of a site and q2, p2, … of the next ones",
+    )  # fmt: skip
     command.add_argument("--chart", choices=CHARTS, default="auto", help="default %(default)s")
     command.add_argument(
         "--family", choices=FAMILIES, default="auto",
@@ -295,7 +301,7 @@ def _run(arguments: argparse.Namespace) -> None:
             arguments.scene, out=out, quick=arguments.quick, seed=arguments.seed, dt=arguments.dt,
             tolerance=arguments.tolerance, max_seconds=arguments.max_seconds,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
-            base=arguments.base,
+            base=arguments.base, structure=arguments.structure,
             family=arguments.family, overwrite=arguments.overwrite, resume=arguments.resume,
             progress=shown,
         )  # fmt: skip
@@ -318,7 +324,7 @@ def _fit(arguments: argparse.Namespace) -> None:
             tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
             absolute_tolerance=arguments.absolute_tolerance, max_seconds=arguments.max_seconds,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
-            base=arguments.base,
+            base=arguments.base, structure=arguments.structure,
             family=arguments.family, scene_name=arguments.scene, angles=arguments.angles,
             seed=arguments.seed, overwrite=arguments.overwrite, resume=arguments.resume,
             progress=shown,

@@ -13,12 +13,13 @@ import dataclasses
 import re
 from collections.abc import Sequence
 from functools import partial
+from itertools import combinations
 from typing import Any
 
 import jax
 import numpy as np
 
-from gfnn_jax.arrays import namespace
+from gfnn_jax.arrays import matmul, namespace
 from gfnn_jax.families.expressions import depends_on, parse
 from gfnn_jax.families.terms import Terms, exponents, given_terms, joined
 from gfnn_jax.phase_space import split
@@ -38,6 +39,8 @@ class Windows:
 
     ends: str
     reach: int
+
+    prefix = "Σ_i "  # of a formula
 
     def gather(self, w):
         """w (..., 2d) as states (..., windows, 2·(reach + 1)) of the windows."""
@@ -66,7 +69,8 @@ class Windows:
         if self.ends == "ring":
             return sum(xp.roll(g[..., j], j, axis=-1) for j in range(count))
         nothing = [(0, 0)] * (g.ndim - 2)
-        total = sum(xp.pad(g[..., j], [*nothing, (j, self.reach - j)]) for j in range(count))
+        places = [[*nothing, (j, self.reach - j)] for j in range(count)]
+        total: Any = sum(xp.pad(g[..., j], place) for j, place in enumerate(places))
         return total[..., 1:-1] if self._held else total
 
     @property
@@ -80,6 +84,69 @@ class Windows:
     def named(self, text: str) -> str:
         """A term of the window's own q1, q2, … as one of a general site: q_i, q_{i+1}, …"""
         return re.sub(r"\b([qp])([0-9]+)", lambda m: f"{m[1]}_{_site(int(m[2]) - 1)}", text)
+
+
+@dataclasses.dataclass(frozen=True)
+class Groups:
+    """Groups of one or two bodies in a space of ``space`` dimensions, q body by body.
+
+    members: the bodies of each group. size: of all bodies.
+    """
+
+    members: tuple[tuple[int, ...], ...]
+    size: int
+    space: int
+
+    prefix = ""
+
+    def gather(self, w):
+        """w (..., 2d) as states (..., groups, 2k) of the groups, their bodies one after another."""
+        places = np.array(self.members)
+        sides = []
+        for x in split(w):
+            bodies = x.reshape(*x.shape[:-1], self.size, self.space)[..., places, :]
+            sides.append(bodies.reshape(*x.shape[:-1], len(places), -1))
+        return namespace(w).concatenate(sides, axis=-1)
+
+    def scatter(self, g):
+        """The transpose of ``gather``: (..., groups, 2k) -> (..., 2d)."""
+        count, lanes = len(self.members[0]), g.shape[:-2]
+        sides = g.reshape(*lanes, len(self.members), 2, count, self.space)
+        total: Any = 0.0
+        for m in range(count):
+            chosen = np.eye(self.size, dtype=g.dtype)[:, [group[m] for group in self.members]]
+            own = namespace(g).moveaxis(sides[..., m, :], -2, -3)  # (..., 2, groups, space)
+            total = total + matmul(chosen, own)
+        return total.reshape(*lanes, -1)
+
+    def count(self, dim: int) -> int:
+        """The number of groups."""
+        return len(self.members)
+
+    def named(self, text: str) -> str:
+        """A term of a group's own q1, q2, … in the positions and momenta of bodies."""
+        one = len(self.members) == 1
+        bodies = [str(b + 1) for b in self.members[0]] if one else ["i", "j"]
+        pair = f"|q_{bodies[0]} - q_{bodies[-1]}|"
+        for written, short in (
+            (distance(self.space), pair),
+            (f"({momentum_squared(self.space)})", f"|p_{bodies[0]}|²"),
+            (momentum_squared(self.space), f"|p_{bodies[0]}|²"),
+        ):
+            text = text.replace(written, short)
+        every = "Σ_{i<j} " if len(self.members[0]) == 2 else "Σ_i "
+        return text if one else every + text
+
+
+def momentum_squared(space: int) -> str:
+    """|p|² of a body as text."""
+    return " + ".join(f"p{k}**2" for k in range(1, space + 1))
+
+
+def distance(space: int) -> str:
+    """|q − q'| of two bodies as text."""
+    squares = (f"(q{k} - q{k + space})**2" for k in range(1, space + 1))
+    return f"sqrt({' + '.join(squares)})"
 
 
 def _site(ahead: int) -> str:
@@ -103,7 +170,6 @@ class Sums:
     parts: tuple[Part, ...]
 
     name = "sums"
-    prefix = "Σ_i "  # of a formula
     quadratic = False  # no affine map is tried in its stead: a dense matrix
 
     @property
@@ -113,6 +179,11 @@ class Sums:
     @property
     def num_parameters(self) -> int:
         return sum(part.terms.num_parameters for part in self.parts)
+
+    @property
+    def prefix(self) -> str:
+        """What stands before the formula."""
+        return self.parts[0].over.prefix
 
     @property
     def matrix_free(self) -> bool:
@@ -164,8 +235,8 @@ class Sums:
         )
 
     def curvatures(self, params, w, args=None) -> list:
-        """Of each part the Hessians (..., neighbourhoods, k, k) of its terms: what ``hessian_product``
-        takes."""
+        """Of each part the Hessians (..., neighbourhoods, k, k) of its terms, which
+        ``hessian_product`` takes."""
         return [
             part.terms.gradient_and_hessian(own, part.over.gather(w), args)[1]
             for part, own in self._with_params(params)
@@ -182,10 +253,11 @@ class Sums:
     def gradient_and_hessian(self, params, w, args=None):
         """∂f/∂w (..., 2d) and ∂²f/∂w² (..., 2d, 2d), a product for every column: for small d."""
         xp, width = namespace(w), w.shape[-1]
-        bends, columns = self.curvatures(params, w, args), []
-        for unit in np.eye(width, dtype=w.dtype):
-            columns.append(self.hessian_product(bends, xp.broadcast_to(unit, w.shape)))
-        return self.gradient(params, w, args), xp.stack(columns, axis=-1)
+        units = np.eye(width, dtype=w.dtype).reshape(width, *(1,) * (w.ndim - 1), width)
+        columns = self.hessian_product(
+            self.curvatures(params, w, args), xp.broadcast_to(units, (width, *w.shape))
+        )
+        return self.gradient(params, w, args), xp.moveaxis(columns, 0, -1)
 
     def term_gradients(self, w, args=None):
         """∇ of every term at w (..., 2d): (..., 2d, N). NumPy."""
@@ -230,6 +302,24 @@ def site_terms(dim: int, ends: str, reach: int, degree: int, functions: Sequence
         if terms.powers:
             parts.append(Part(terms, Windows(ends, near)))
     return Sums(dim, tuple(parts))
+
+
+def body_terms(bodies: int, space: int, powers: Sequence[int], *, alike: bool) -> Sums:
+    """|p_i|² of every body, and ``powers`` of the distances of every pair.
+
+    alike: whether all bodies share their coefficients; else each body and each pair has its own.
+    """
+    r = distance(space)
+    rows = tuple((max(n, 0), max(-n, 0)) for n in powers)
+    local = (
+        (Terms(space, (momentum_squared(space),), ((1,),)), [(i,) for i in range(bodies)]),
+        (Terms(2 * space, (r, f"1/{r}"), rows), list(combinations(range(bodies), 2))),
+    )
+    parts = []
+    for terms, groups in local:
+        for members in [groups] if alike else [[group] for group in groups]:
+            parts.append(Part(terms, Groups(tuple(members), bodies, space)))
+    return Sums(bodies * space, tuple(parts))
 
 
 def _furthest(row: tuple[int, ...]) -> int:

@@ -103,7 +103,8 @@ def solve_stages(family, params, z, h, rule, args=None, *, newton: bool = True):
     """
     size = np.abs(z) + np.abs(z).mean(axis=1, keepdims=True)  # of each coordinate's lane
     slopes = np.repeat(apply_j(family.gradient(params, z, args))[None], len(rule.weights), axis=0)
-    change = np.full(len(z), np.inf)
+    change, earlier = np.full((2, len(z)), np.inf)
+    free = matrix_free(family)
     open_, slow = np.ones(len(z), bool), np.zeros(len(z), bool)
     for n in range(_MOST):
         lanes = np.flatnonzero(open_)
@@ -115,8 +116,10 @@ def solve_stages(family, params, z, h, rule, args=None, *, newton: bool = True):
         relative = np.max(moved / (size[lanes] + abs(step) * np.abs(new)), axis=(0, 2))
         ratio = relative / change[lanes]
         closed = (relative <= _FLOOR) | ((relative <= _SETTLED) & (ratio > 0.5))
+        if free:  # q moves p and p moves q: changes shrink two iterations at a time
+            ratio = np.sqrt(relative / earlier[lanes])
         given_up = ~closed & ~(ratio < _SLOW) & (n > _FIRST)
-        change[lanes] = relative
+        earlier[lanes], change[lanes] = change[lanes], relative
         slow[lanes[given_up]] = True
         open_[lanes[closed | given_up]] = False
         if not open_.any():

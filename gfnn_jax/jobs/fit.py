@@ -33,6 +33,7 @@ def fit(
     learn: str = "auto",
     terms: tuple[str, ...] = (),
     base: str | None = None,
+    structure: str | None = None,
     family: str = "auto",
     scene_name: str | None = None,
     angles: tuple[int, ...] = (),
@@ -53,7 +54,8 @@ def fit(
         progress.tell(line)
     options = {
         "tolerance": tolerance, "absolute_tolerance": absolute_tolerance, "chart": chart,
-        "learn": learn, "terms": list(terms), "base": base, "family": family, "seed": seed,
+        "learn": learn, "terms": list(terms), "base": base, "structure": structure,
+        "family": family, "seed": seed,
     }  # fmt: skip
     job = {
         "command": "fit", "data": trajectories.digest,

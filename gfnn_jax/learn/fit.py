@@ -32,6 +32,7 @@ from gfnn_jax.learn.flows import LearnedHamiltonian
 from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
+from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
@@ -96,6 +97,8 @@ class Fit:
         assert self.pairs is not None
         if self.map.parameters is not None:
             raise FitError("expected a fit without parameters: a generated map has none")
+        if isinstance(self.map.domain, Ranges):
+            raise FitError("expected a fit without a structure: a generated map has none")
         flow, coordinates = self.hamiltonian.flow, self.map.coordinates
         dt = float(np.asarray(self.map.dt)) if dt is None else dt
         if not (isinstance(dt, (int, float)) and 0 < dt < np.inf):
@@ -197,7 +200,7 @@ def fit(
     base:      a Hamiltonian that the user knows a part of the map by, as such text or a function:
                its flow is factored out, and S learns what it leaves over.
     structure: "ring" or "chain" of equal sites: H is a sum over them, whose ``terms`` are text in a
-               site's q1, p1 and the next ones' q2, p2, … (`learn.structures`).
+               site's q1, p1 and the next ones' q2, p2, …; None: the scene's own.
     family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp".
     chart:     "auto" or one of type1, type2, type3, midpoint.
     angles:    without a scene, the indices of z that have period 2π.
@@ -227,8 +230,8 @@ def fit(
     request = checked(
         pairs, scene, tolerance=tolerance, absolute_tolerance=absolute_tolerance, learn=learn,
         terms=terms, base=base, structure=structure, family=family, chart=chart, angles=angles,
-        seed=seed, clock=clock, max_iterations=max_iterations, checkpoints=checkpoints, factors=factors, say=on_progress,
-        tell=on_candidate,
+        seed=seed, clock=clock, max_iterations=max_iterations, checkpoints=checkpoints,
+        factors=factors, say=on_progress, tell=on_candidate,
     )  # fmt: skip
     warn(request.messages)
     on_progress("looking at the map's local Jacobians")

@@ -87,6 +87,7 @@ _FREQUENCY_STATES = 500
 _NEAR_ROUNDOFF = 3e-15  # of the spread
 _HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
 _FEWEST_STRUCTURED = 4  # pairs, each of many rows
+_NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
 _NAMED = 5  # terms in a message
 # Libraries in a row that do not help end the search; with given terms; of a structure, whose
 # libraries differ in kind.
@@ -554,7 +555,8 @@ def _learned(
     omega_h = _omega_h(family, fit.coefficients, prepared, fastest)
     left_out = len(np.setdiff1d(found.rows, fit.used))
     return LearnedHamiltonian(
-        with_error(candidate, error), flow, terms, getattr(family, "prefix", "") + formula(terms), float(np.abs(off).max()),
+        with_error(candidate, error), flow, terms, getattr(family, "prefix", "") + formula(terms),
+        float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(error, omega_h, prepared, judges, found, left_out)),
         stalled=found.stalled,
@@ -685,6 +687,7 @@ def formula(terms: Sequence[Term]) -> str:
 
 def assembled(learned: LearnedHamiltonian, prepared: Prepared, judges: Judges) -> Assembled:
     """The candidate's map, its error and its time per step measured by the steps that users run."""
+    prepared = _in_relative_domain(learned.flow, prepared)
     map_ = composed(learned.flow, prepared, judges)
     held = judges.pairs.take(judges.held_out)
     steps = stepped(map_, np.asarray(held.z0), held.dt, held.args)
@@ -696,3 +699,14 @@ def assembled(learned: LearnedHamiltonian, prepared: Prepared, judges: Judges) -
         microseconds_per_step=steps.microseconds_per_step,
     )  # fmt: skip
     return Assembled(candidate, steps.compile_seconds)
+
+
+def _in_relative_domain(flow: Flow, prepared: Prepared) -> Prepared:
+    """With a domain that leaves out where the whole is, if no force depends on that."""
+    if prepared.structure is None:
+        return prepared
+    force = flow.family.gradient(flow.params, prepared.y0)[:, : prepared.dim]
+    moves = np.abs(force.sum(axis=1)).max() > _NO_FORCE * np.abs(force).sum(axis=1).max()
+    return dataclasses.replace(
+        prepared, domain=prepared.structure.domain(prepared.y0, uses_positions=bool(moves))
+    )

@@ -58,6 +58,9 @@ def checked(
 
     Raises FitError, in one line, where it or the pairs cannot give a map.
     """
+    free = (family, chart, base) == ("auto", "auto", None) and learn != "map"
+    if structure is None and scene is not None and free:
+        structure = scene.structure
     bound = Tolerance(tolerance)
     if absolute_tolerance is not None:
         bound = Tolerance(absolute_tolerance, relative=False)

@@ -23,7 +23,7 @@ from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.mlp import Mlp
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
-from gfnn_jax.families.sums import Part, Sums, Windows
+from gfnn_jax.families.sums import Groups, Part, Sums, Windows
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import Chart, TypeOne
@@ -42,7 +42,7 @@ _TYPES: dict[str, type] = {
     kind.__name__: kind
     for kind in (
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
-        Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, Sums, Part, Windows, Ranges,
+        Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, Sums, Part, Windows, Groups, Ranges,
     )
 }  # fmt: skip
 # Names that were used before, in models that may still be about.

@@ -13,15 +13,24 @@ import pkgutil
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from gfnn_jax.scenes.scene import AroundOrbit, DrawnFrom, Scene, Section, UniformInEllipse
+from gfnn_jax.scenes.scene import (
+    AroundOrbit,
+    DrawnFrom,
+    NormalSites,
+    Scene,
+    Section,
+    UniformInEllipse,
+)
 
 if TYPE_CHECKING:  # what is collected below
     from gfnn_jax.scenes.driven_pendulum import driven_pendulum
+    from gfnn_jax.scenes.fput import fput
     from gfnn_jax.scenes.henon_heiles import henon_heiles
     from gfnn_jax.scenes.henon_heiles_section import henon_heiles_section
     from gfnn_jax.scenes.pcr3bp import pcr3bp
     from gfnn_jax.scenes.pendulum_length import pendulum_length
     from gfnn_jax.scenes.standard_map import standard_map
+    from gfnn_jax.scenes.toda import toda
     from gfnn_jax.scenes.two_body import two_body
 
 _OTHER_MODULES = ("scene", "trajectories")
@@ -67,10 +76,12 @@ __all__ = [
     "SCENES",
     "AroundOrbit",
     "DrawnFrom",
+    "NormalSites",
     "Scene",
     "Section",
     "UniformInEllipse",
     "driven_pendulum",
+    "fput",
     "henon_heiles",
     "henon_heiles_section",
     "make",
@@ -78,5 +89,6 @@ __all__ = [
     "pcr3bp",
     "pendulum_length",
     "standard_map",
+    "toda",
     "two_body",
 ]
