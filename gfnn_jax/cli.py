@@ -27,7 +27,7 @@ from gfnn_jax.storage.partial import told_of
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
 FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
 LEARN = ("auto", "map", "hamiltonian")
-STRUCTURES = ("ring", "chain")
+STRUCTURES = ("ring", "chain", "bodies:N")
 
 EXIT_STATUS = """\
 exit status:
@@ -194,7 +194,7 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
         "out, and S learns what it leaves over",
     )  # fmt: skip
     command.add_argument(
-        "--structure", choices=STRUCTURES,
+        "--structure", type=_structure, metavar="|".join(STRUCTURES),
         help="of many degrees of freedom: H is a sum over equal sites, whose --terms are text in "
         "q1, p1 of a site and q2, p2, … of the next ones",
     )  # fmt: skip
@@ -262,6 +262,13 @@ def _check_exists(path: Path) -> None:
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(","))
+
+
+def _structure(text: str) -> str:
+    kind, _, number = text.partition(":")
+    if text in STRUCTURES[:2] or (kind == "bodies" and number.isdecimal() and int(number) > 1):
+        return text
+    raise argparse.ArgumentTypeError(f"expected {', '.join(STRUCTURES)}; got '{text}'")
 
 
 def _texts(text: str) -> tuple[str, ...]:

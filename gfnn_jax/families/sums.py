@@ -134,6 +134,7 @@ class Groups:
             (momentum_squared(self.space), f"|p_{bodies[0]}|²"),
         ):
             text = text.replace(written, short)
+        text = re.sub(r"\(1/(\|[^|]*\|)\)", r"1/\1", text)
         every = "Σ_{i<j} " if len(self.members[0]) == 2 else "Σ_i "
         return text if one else every + text
 

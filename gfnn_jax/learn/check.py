@@ -84,7 +84,7 @@ def check_request(
     if any(not (isinstance(term, str) or callable(term)) for term in terms):
         raise FitError(f"expected terms as texts or functions of z, got {terms!r}")
     if structure is not None:
-        _check_structured(scene, learn, terms, base, family, chart, angles, pairs)
+        _check_structured(structure, scene, learn, terms, base, family, chart, angles, pairs)
     try:
         given_terms(pairs.dim, () if structure else terms, tuple(pairs.args or ()))
     except (InputError, jax.errors.ConcretizationTypeError) as error:
@@ -128,12 +128,16 @@ def check_number(pairs: Pairs) -> None:
         )
 
 
-def _check_structured(scene, learn, terms, base, family, chart, angles, pairs: Pairs) -> None:
+def _check_structured(
+    structure, scene, learn, terms, base, family, chart, angles, pairs: Pairs
+) -> None:
     """Raises FitError for what does not go with a structure."""
     if learn == "map" or (family, chart, base) != ("auto", "auto", None):
         raise FitError("a structure is that of H: expected no learn='map', family, chart or base")
     if angles or pairs.args or (scene is not None and scene.coordinates != CARTESIAN):
         raise FitError("a structure goes with plain q and p: expected no angles and no parameters")
+    if terms and str(structure).startswith("bodies"):
+        raise FitError("terms go with a ring or a chain: those of bodies are powers of distances")
     for term in terms:
         if not isinstance(term, str):
             raise FitError(

@@ -11,7 +11,7 @@ from gfnn_jax.learn.check import check_number
 from gfnn_jax.learn.diagnose import outliers
 from gfnn_jax.learn.held_out import first_occurrences
 from gfnn_jax.learn.prepare import Prepared, prepare
-from gfnn_jax.learn.structures import Sites
+from gfnn_jax.learn.structures import Structure
 from gfnn_jax.learn.varied import given_by
 from gfnn_jax.phase_space import Pairs
 
@@ -26,7 +26,7 @@ class Taken(NamedTuple):
     messages: list[str]
 
 
-def clean(pairs: Pairs, coordinates: Coordinates, structure: Sites | None = None) -> Taken:
+def clean(pairs: Pairs, coordinates: Coordinates, structure: Structure | None = None) -> Taken:
     """The pairs without copies and, where they are few, without outliers.
 
     Raises FitError where too few are left, or states have no inner coordinates.

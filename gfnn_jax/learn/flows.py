@@ -86,7 +86,6 @@ _ROUNDOFF = 1e-12  # of the spread: above it the pairs carry noise, and every on
 _FREQUENCY_STATES = 500
 _NEAR_ROUNDOFF = 3e-15  # of the spread
 _HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
-_FEWEST_STRUCTURED = 4  # pairs, each of many rows
 _NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
 _NAMED = 5  # terms in a message
 # Libraries in a row that do not help end the search; with given terms; of a structure, whose
@@ -390,7 +389,9 @@ def _libraries(prepared, judges, scene, terms, options: Options) -> Iterator[Ter
     """Families by rising size, of as many terms as the training rows tell apart."""
     dim, coordinates = prepared.dim, prepared.coordinates
     if prepared.structure is not None:
-        yield from prepared.structure.libraries(dim, terms)
+        libraries = prepared.structure.libraries(dim, terms)
+        most = len(judges.training) * 2 * dim / options.rows_per_term
+        yield from (library for library in libraries if library.num_parameters <= most)
         return
     reversor = scene.reversor if scene is not None else None
     features = scene.features if scene is not None else None
@@ -422,7 +423,9 @@ def _fitted(problem, family, prepared, judges, last: _Fitted | None, options, sa
     """The library fitted to as many training pairs as tell its terms, from the best start."""
     names = family.term_names
     z = prepared.y0[judges.training]
-    least = 1 if prepared.structure else 200
+    least, fewest = 200, 100
+    if prepared.structure is not None:
+        least = fewest = prepared.structure.fewest
     enough = z[: max(least, -(-4 * family.num_parameters // z.shape[1]))]
     args = prepared.given(judges.training[: len(enough)])[1]
     kept, null = null_terms(family, enough, args=args)
@@ -430,7 +433,7 @@ def _fitted(problem, family, prepared, judges, last: _Fitted | None, options, sa
     undetermined = tuple(names[j] for j in null if j in elsewhere)
     family = family.take(kept)
     count = int(np.ceil(options.judged_rows * family.num_parameters / z.shape[1]))
-    rows = judges.training[: max(count, _FEWEST_STRUCTURED if prepared.structure else 100)]
+    rows = judges.training[: max(count, fewest)]
     fit = problem.fit(family, _start(problem, family, rows, last), rows, say=say)
     fit = _resolved(problem, family, fit, rows)
     error = _held_out_error(problem, family, fit, prepared, judges)

@@ -11,7 +11,7 @@ from gfnn_jax.coordinates import Coordinates, lift, to_inner
 from gfnn_jax.errors import FitError
 from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.flows.flow import Flow
-from gfnn_jax.learn.structures import Sites
+from gfnn_jax.learn.structures import Structure
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.domain import Domain, Ranges, covering
 from gfnn_jax.phase_space import Pairs, sizes
@@ -43,7 +43,7 @@ class Prepared:
     own_dt: np.ndarray | None = None
     args: np.ndarray | None = None
     parameters: tuple[str, ...] = ()
-    structure: Sites | None = None
+    structure: Structure | None = None
 
     @property
     def each_dt(self) -> Any:
@@ -92,7 +92,7 @@ class Prepared:
         return y
 
 
-def prepare(pairs: Pairs, coordinates: Coordinates, structure: Sites | None = None) -> Prepared:
+def prepare(pairs: Pairs, coordinates: Coordinates, structure: Structure | None = None) -> Prepared:
     """The pairs in the inner coordinates. Raises FitError where states have none."""
     before, after = (to_inner(coordinates, z) for z in (pairs.z0, pairs.z1))
     known = np.isfinite(before + after).all(axis=1)

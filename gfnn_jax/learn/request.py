@@ -12,7 +12,7 @@ from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.learn.candidates import Candidate, Tolerance
 from gfnn_jax.learn.check import check_request, coarse_tolerance, unlike_the_scene
 from gfnn_jax.learn.clock import Clock
-from gfnn_jax.learn.structures import Sites, structure_of
+from gfnn_jax.learn.structures import Structure, structure_of
 from gfnn_jax.learn.varied import as_varied
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
@@ -32,7 +32,7 @@ class Request:
     learn: str
     terms: Sequence[str | Callable]
     base: str | Callable | None
-    structure: Sites | None
+    structure: Structure | None
     family: str
     chart: str
     seed: int

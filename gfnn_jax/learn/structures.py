@@ -1,4 +1,4 @@
-"""What a user says of many degrees of freedom: equal sites in a ring or a chain.
+"""What a user says of many degrees of freedom: equal sites in a ring or a chain, or bodies.
 
 A structure tells which libraries of terms are tried, and by what the domain of the data is known.
 """
@@ -11,11 +11,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.sums import Part, Sums, Windows, site_terms
+from gfnn_jax.families.sums import Part, Sums, Windows, body_terms, site_terms
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.maps.domain import Ranges, ranges_of
+from gfnn_jax.phase_space import sizes
 
-NAMES = ("ring", "chain")
+NAMES = ("ring", "chain", "bodies:N")
 _ENDS = {"ring": ("ring",), "chain": ("free", "fixed")}
 # (reach, degree, whether functions are tried too) of the libraries, by rising size.
 _LIBRARIES = (
@@ -26,17 +27,21 @@ _FUNCTIONS = (
     "cos(q1)", "sin(q1)", "exp(q1)", "exp(-q1)",
     "cos(q2 - q1)", "sin(q2 - q1)", "exp(q2 - q1)", "exp(q1 - q2)",
 )  # fmt: skip
+# Powers of the distances of bodies, by rising size.
+_POWERS = ((-3, -2, -1, 1, 2), (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4))
 _FEWEST_SITES = 5  # a window of the longest reach meets itself in a smaller ring
 
 
 @dataclasses.dataclass(frozen=True)
 class Sites:
-    """Equal sites in a ring, or in a chain whose ends are free or held.
+    """Equal sites in a ring, or in a chain whose ends are free or held. kind: "ring" or "chain".
 
-    kind: "ring" or "chain". pooled: (..., 2d) statistics of q are those of all sites, and of p.
+    fewest: pairs that a library is fitted to, at least.
     """
 
     kind: str
+
+    fewest = 4  # each of many rows
 
     def libraries(self, dim: int, given: Sequence[str] = ()) -> Iterator[Sums]:
         """Sums by rising size. given: a user's own terms, as text in a site's q1, p1 and the next
@@ -67,16 +72,52 @@ class Sites:
         return ranges_of(Sums(dim, seen), z)
 
 
+@dataclasses.dataclass(frozen=True)
+class Bodies:
+    """Bodies in a space of one to three dimensions that attract or repel each other in pairs."""
+
+    count: int
+    space: int
+
+    fewest = 200
+
+    def libraries(self, dim: int, given: Sequence[str] = ()) -> Iterator[Sums]:
+        """Sums by rising size: of bodies that are all alike, then of bodies that are not."""
+        for powers in _POWERS:
+            for alike in (True, False):
+                yield body_terms(self.count, self.space, powers, alike=alike)
+
+    def sizes(self, z: np.ndarray) -> np.ndarray:
+        """(2d,) sizes of the coordinates."""
+        return sizes(z)
+
+    def domain(self, z: np.ndarray, uses_positions: bool = True) -> Ranges:
+        """Where the states z (N, 2d) were: each body's |p|² and each pair's distance."""
+        return ranges_of(body_terms(self.count, self.space, (1,), alike=False), z)
+
+
 def _units(count: int) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(int(k == j) for k in range(count)) for j in range(count))
 
 
-def structure_of(text: str | None, dim: int) -> Sites | None:
+Structure = Sites | Bodies
+
+
+def structure_of(text: str | None, dim: int) -> Structure | None:
     """The structure that this text names. Raises FitError where there is none, or it does not suit
     ``dim`` degrees of freedom."""
     if text is None:
         return None
-    if text not in NAMES:
+    kind, _, number = text.partition(":")
+    if kind == "bodies" and number.isdecimal() and int(number) > 1:
+        count = int(number)
+        if dim % count or not 1 <= dim // count <= 3:
+            raise FitError(
+                f"expected {count} bodies in 1 to 3 dimensions, which have {count}, {2 * count} or "
+                f"{3 * count} degrees of freedom; got {dim}"
+            )
+        return Bodies(count, dim // count)
+    if text not in _ENDS:
         raise FitError(f"expected a structure among {', '.join(NAMES)}; got {text!r}")
     if dim < _FEWEST_SITES:
         raise FitError(f"expected a {text} of at least {_FEWEST_SITES} sites, got {dim}")
