@@ -1,18 +1,20 @@
 """Many degrees of freedom: sums over sites, flows without matrices, fits of rings and chains."""
 
+from itertools import combinations
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax.families.sums import ENDS, Part, Sums, Windows, matrix_free, site_terms
+from gfnn_jax import scenes
+from gfnn_jax.families.sums import ENDS, Part, Sums, Windows, body_terms, matrix_free, site_terms
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import rates
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.phase_space import defect_of_pairs
-from gfnn_jax.scenes import fput
 
 RNG = np.random.default_rng(0)
 
@@ -61,9 +63,8 @@ def test_a_sum_is_what_is_written_out(ends):
     np.testing.assert_allclose(family.term_gradients(w) @ params, gradient, atol=1e-13)
     by_jax = family.gradient(jnp.asarray(params), jnp.asarray(w))
     np.testing.assert_allclose(by_jax, gradient, atol=1e-13)
-    assert sum(part.over.count(dim) for part in family.parts) == 6 + {"ring": 6}.get(
-        ends, 4 + 2 * (ends == "fixed")
-    )
+    rows = {"ring": dim, "free": dim - 2, "fixed": dim}[ends]
+    assert [part.over.count(dim) for part in family.parts] == [dim, rows]
 
 
 def test_terms_stand_in_the_shortest_window():
@@ -83,10 +84,9 @@ def test_without_matrices_as_with_them():
     assert not matrix_free(springs(16)[0])
     z, steps = 0.3 * RNG.normal(size=(2, 40)), Steps(4, 2)
     found = images(family, params, z, 0.2, steps, derivatives=True).by_coefficient
-    for j, step in enumerate(1e-6 * np.eye(3)):
-        ahead, behind = (
-            images(family, params + s, z, 0.2, steps).states for s in (step, -step)
-        )  # fmt: skip
+    for j, small in enumerate(1e-6 * np.eye(3)):
+        ahead = images(family, params + small, z, 0.2, steps).states
+        behind = images(family, params - small, z, 0.2, steps).states
         np.testing.assert_allclose(found[..., j], (ahead - behind) / 2e-6, atol=1e-8)
     _, hessian = family.gradient_and_hessian(params, z)
     form = np.block([[np.zeros((20, 20)), np.eye(20)], [-np.eye(20), np.zeros((20, 20))]])
@@ -147,7 +147,7 @@ def test_the_ends_of_a_chain_are_found(ends):
     family, params = springs(20, ends)
     fit = gfnn.fit(drawn(20, 12, family, params, 0.1), structure="chain", tolerance=1e-12)
     assert fit.met
-    assert "(q_{i+1} - q_i)⁴" in fit.formula
+    assert "(q_{i+1} - q_i)⁴" in (fit.formula or "")
     (bonds,) = (p.over for p in fit.map.pieces[0].family.parts if p.over.reach)
     assert bonds.ends == ends
 
@@ -165,19 +165,49 @@ def test_terms_of_a_site_that_a_user_knows():
 
 
 def test_a_scene_lends_its_structure():
-    scene = fput(dim=18)
+    scene = scenes.fput(dim=18)
     pairs = gfnn.sample_pairs(scene, 12, jax.random.key(0))
     assert gfnn.fit(pairs, scene, tolerance=1e-10).formula.startswith("Σ_i 0.5 p_i²")
+
+
+def test_bodies_in_space():
+    """Unequal masses: every coefficient; momentum and angular momentum to roundoff."""
+    scene = scenes.n_body()
+    pairs = gfnn.sample_pairs(scene, 300, jax.random.key(0))
+    fit = gfnn.fit(pairs, scene, tolerance=1e-12)
+    found = {term: coefficient for term, coefficient, _ in fit.hamiltonian.terms}
+    masses = (1.0, 0.01, 0.02, 0.005)
+    exact = {f"|p_{i + 1}|²": 0.5 / m for i, m in enumerate(masses)}
+    for i, j in combinations(range(4), 2):
+        exact[f"1/|q_{i + 1} - q_{j + 1}|"] = -masses[i] * masses[j]
+    assert found == pytest.approx(exact, rel=1e-10)
+    assert "- 0.01/|q_1 - q_2|" in (fit.formula or "")
+    states, _ = fit.map.rollout(pairs.z0[:5], 100)
+    for name, invariant in scene.invariants.items():
+        values = np.asarray(jax.vmap(jax.vmap(invariant))(np.asarray(states)))
+        np.testing.assert_allclose(values, values[:, :1] * np.ones(101), atol=1e-15, err_msg=name)
+
+
+def test_bodies_that_are_alike_share_their_coefficients():
+    family, corners = body_terms(3, 2, (-1,), alike=True), 2 * np.pi / 3 * np.arange(3)
+    around = np.stack([np.cos(corners), np.sin(corners)], axis=1).ravel()
+    z0 = np.concatenate([around, np.zeros(6)]) + 0.1 * RNG.normal(size=(320, 12))
+    z1 = images(family, np.array([0.5, -1.0]), z0, 0.2, Steps(8, 2)).states
+    fit = gfnn.fit(gfnn.Pairs(z0, z1, 0.2), structure="bodies:3", tolerance=1e-12)
+    assert fit.formula == "0.5 Σ_i |p_i|² - Σ_{i<j} 1/|q_i - q_j|"
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"structure": "torus"}, "expected a structure among ring, chain"),
+        ({"structure": "torus"}, "expected a structure among ring, chain, bodies:N"),
         ({"structure": "ring", "learn": "map"}, "a structure is that of H"),
         ({"structure": "ring", "angles": (0,)}, "plain q and p"),
         ({"structure": "ring", "terms": ["exp(q9)"]}, "q9"),
         ({"structure": "ring", "terms": [lambda z: z[0]]}, "as text"),
+        ({"structure": "bodies:3"}, "3 bodies in 1 to 3 dimensions"),
+        ({"structure": "bodies:1"}, "expected a structure among"),
+        ({"structure": "bodies:10", "terms": ["q1"]}, "powers of distances"),
     ],
 )
 def test_what_goes_with_no_structure_is_refused(options, said):

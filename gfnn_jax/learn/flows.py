@@ -684,6 +684,8 @@ def formula(terms: Sequence[Term]) -> str:
         digits = 12 if std <= 0 else int(np.clip(np.ceil(np.log10(size / std)) + 1, 2, 12))
         number = f"{size:.{digits}g}"
         factor = "" if number == "1" else f"{number} "
+        if factor and term.startswith("1/"):
+            factor, term = number, term[1:]
         text += (sign if text else sign.strip().removeprefix("+")) + factor + term
     return text or "0"
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # what is collected below
     from gfnn_jax.scenes.fput import fput
     from gfnn_jax.scenes.henon_heiles import henon_heiles
     from gfnn_jax.scenes.henon_heiles_section import henon_heiles_section
+    from gfnn_jax.scenes.n_body import n_body
     from gfnn_jax.scenes.pcr3bp import pcr3bp
     from gfnn_jax.scenes.pendulum_length import pendulum_length
     from gfnn_jax.scenes.standard_map import standard_map
@@ -85,6 +86,7 @@ __all__ = [
     "henon_heiles",
     "henon_heiles_section",
     "make",
+    "n_body",
     "names",
     "pcr3bp",
     "pendulum_length",
