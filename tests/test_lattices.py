@@ -1,5 +1,6 @@
 """Many degrees of freedom: sums over sites, flows without matrices, fits of rings and chains."""
 
+import json
 from itertools import combinations
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax import scenes
+from gfnn_jax import cli, scenes
 from gfnn_jax.families.sums import ENDS, Part, Sums, Windows, body_terms, matrix_free, site_terms
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import rates
@@ -214,6 +215,26 @@ def test_what_goes_with_no_structure_is_refused(options, said):
     pairs = gfnn.Pairs(*(RNG.normal(size=(2, 12, 40))), 0.1)
     with pytest.raises(gfnn.FitError, match=said):
         gfnn.fit(pairs, **options)
+
+
+def test_the_command_line_takes_a_structure(tmp_path):
+    """Fewer pairs than coordinates, in a file; a formula in the report; a prediction."""
+    family, params = springs(40)
+    pairs = drawn(40, 12, family, params, 0.1)
+    data, model = tmp_path / "data.npz", tmp_path / "model"
+    np.savez(data, z0=pairs.z0, z1=pairs.z1, dt=0.1)
+    fit = ["fit", str(data), "--out", str(model), "--tolerance", "1e-10"]
+    assert cli.main([*fit, "--structure", "torus"]) == 2
+    assert cli.main([*fit, "--structure", "bodies:7"]) == 2
+    assert not model.exists()
+    assert cli.main([*fit, "--structure", "ring"]) == 0
+    report = json.loads((model / "report.json").read_text(encoding="utf-8"))
+    assert report["hamiltonian"]["formula"].startswith("Σ_i 0.5 p_i²")
+    np.save(tmp_path / "z0.npy", pairs.z0[:2])
+    predict = ["predict", str(model), "--initial", str(tmp_path / "z0.npy"), "--num-steps", "1"]
+    assert cli.main([*predict, "--out", str(tmp_path / "out.npz")]) == 0
+    with np.load(tmp_path / "out.npz") as out:
+        np.testing.assert_allclose(out["trajectories"][:, 1], pairs.z1[:2], atol=1e-13)
 
 
 def test_too_few_sites_or_pairs_are_refused():

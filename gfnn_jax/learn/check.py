@@ -24,7 +24,7 @@ CHART_NAMES = ("auto", *CHARTS)
 
 _OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; those in other units do
 _COMPARED = 100
-_FEWEST = 8  # pairs of a structure: 4 train, 4 are held out
+FEWEST = 8  # pairs of a structure: 4 train, 4 are held out
 _COARSE = 0.01  # of what a step moves
 
 
@@ -115,8 +115,8 @@ def check_request(
             )
     if structure is None:
         check_number(pairs)
-    elif len(pairs) < _FEWEST:
-        raise FitError(f"expected at least {_FEWEST} pairs, got {len(pairs)}")
+    elif len(pairs) < FEWEST:
+        raise FitError(f"expected at least {FEWEST} pairs, got {len(pairs)}")
 
 
 def check_number(pairs: Pairs) -> None:

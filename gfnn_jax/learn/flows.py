@@ -167,6 +167,8 @@ def learn_hamiltonian(
     """
     basis = _modes(prepared, scene, terms)
     most = options.max_seconds if basis is None else options.mode_seconds
+    if prepared.structure is not None:  # nothing else is learned in the time that is left
+        most = np.inf
     clock = Clock(most if clock is None else min(most, clock.left))
     if prepared.before or prepared.after:
         raise FitError("expected pairs without a base map: it is no part of a flow")
@@ -425,7 +427,7 @@ def _fitted(problem, family, prepared, judges, last: _Fitted | None, options, sa
     z = prepared.y0[judges.training]
     least, fewest = 200, 100
     if prepared.structure is not None:
-        least = fewest = prepared.structure.fewest
+        least = fewest = prepared.structure.fewest(z.shape[1])
     enough = z[: max(least, -(-4 * family.num_parameters // z.shape[1]))]
     args = prepared.given(judges.training[: len(enough)])[1]
     kept, null = null_terms(family, enough, args=args)

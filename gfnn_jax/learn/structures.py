@@ -29,19 +29,21 @@ _FUNCTIONS = (
 )  # fmt: skip
 # Powers of the distances of bodies, by rising size.
 _POWERS = ((-3, -2, -1, 1, 2), (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4))
+# A library of sites is fitted to so many pairs, or to those that hold so many numbers; one of
+# bodies to so many pairs, of which the quiet ones come first.
+_FEWEST_PAIRS, _FEWEST_NUMBERS, _FEWEST_STATES = 4, 4_000, 200
 _FEWEST_SITES = 5  # a window of the longest reach meets itself in a smaller ring
 
 
 @dataclasses.dataclass(frozen=True)
 class Sites:
-    """Equal sites in a ring, or in a chain whose ends are free or held. kind: "ring" or "chain".
-
-    fewest: pairs that a library is fitted to, at least.
-    """
+    """Equal sites in a ring, or in a chain whose ends are free or held. kind: "ring" or "chain"."""
 
     kind: str
 
-    fewest = 4  # each of many rows
+    def fewest(self, width: int) -> int:
+        """Pairs of states (2d,) that a library is fitted to, at least."""
+        return max(1, min(_FEWEST_PAIRS, _FEWEST_NUMBERS // width))
 
     def libraries(self, dim: int, given: Sequence[str] = ()) -> Iterator[Sums]:
         """Sums by rising size. given: a user's own terms, as text in a site's q1, p1 and the next
@@ -79,7 +81,9 @@ class Bodies:
     count: int
     space: int
 
-    fewest = 200
+    def fewest(self, width: int) -> int:
+        """Pairs that a library is fitted to, at least."""
+        return _FEWEST_STATES
 
     def libraries(self, dim: int, given: Sequence[str] = ()) -> Iterator[Sums]:
         """Sums by rising size: of bodies that are all alike, then of bodies that are not."""
