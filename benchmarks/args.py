@@ -1,11 +1,11 @@
-"""One law for pairs that differ in their time step and in parameters of the system.
+"""One law for pairs that differ in their time step, in parameters, in the time of a drive.
 
     python benchmarks/args.py            every row (about a minute on two cores)
     python benchmarks/args.py --quick    two of them
 
 Each row learns H from pairs of a system whose H is known, and judges by states, parameters and time
-steps that no fit has seen: the one-step error, the error at step 1,000 beside that of the reference
-itself, and the time of a step in a batch of 1,000.
+steps that no fit has seen: the one-step error, the error at step 1,000 (driven: at step 1,600,
+after 100 periods) beside that of the reference itself, and the time of a step in a batch of 1,000.
 """
 
 from __future__ import annotations
@@ -22,8 +22,14 @@ import numpy as np
 from harness import SEED, TABLES, Numbers, between_markers, main, markdown, number, results, timed
 
 import gfnn_jax as gfnn
-from gfnn_jax.scenes import DrawnFrom, Scene, henon_heiles, pendulum_length
-from gfnn_jax.scenes.trajectories import sample_params
+from gfnn_jax.scenes import (
+    DrawnFrom,
+    Scene,
+    driven_pendulum_phase,
+    henon_heiles,
+    pendulum_length,
+)
+from gfnn_jax.scenes.trajectories import sample_params, sample_t0
 
 STEPS, ORBITS, BATCH = 1_000, 100, 1_000
 
@@ -162,6 +168,42 @@ def standard_map(quick: bool) -> Numbers:
     }  # fmt: skip
 
 
+def driven(quick: bool, num_pairs: int = 4_000, **options) -> Numbers:
+    """A driven pendulum at any phase, 16 steps a period, over 100 periods."""
+    scene, periods = driven_pendulum_phase(), 100
+    steps = 16 * periods
+    key, fresh, test = jax.random.split(jax.random.key(SEED), 3)
+    pairs = gfnn.sample_pairs(scene, num_pairs, key)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)
+        fit = gfnn.fit(pairs, tolerance=1e-12, seed=SEED, **options)
+    new = gfnn.sample_pairs(scene, 1_000, fresh)
+    states, info = fit.map.step(new.z0, t0=new.t0)
+    angles = fit.map.coordinates.angles
+    one = gfnn.metrics.one_step_rms(np.asarray(states), new.z1, angles)
+    z0, t0 = gfnn.sample_test_states(scene, ORBITS, test), sample_t0(scene, ORBITS, test)
+    halved = dataclasses.replace(scene, dt=0.5 * scene.dt)
+    reference, again = (
+        gfnn.reference_trajectories(s, z0, n, save_every=n, t0=t0)[:, -1:]
+        for s, n in ((scene, steps), (halved, 2 * steps))
+    )
+    predicted, ended = fit.map.rollout(z0, steps, t0=t0, save_every=steps)
+    error = gfnn.metrics.position_error(np.asarray(predicted)[:, -1:], reference, angles)
+    own = gfnn.metrics.position_error(again, reference, angles)
+    begun, at = np.resize(z0, (BATCH, 2)), np.resize(np.asarray(t0), BATCH)
+    timed_steps = 10 if quick else 100
+    rolled = timed(lambda: fit.map.rollout(begun, timed_steps, t0=at, save_every=timed_steps))
+    return {
+        "pairs": num_pairs, "judged_at_dt": scene.dt, "num_terms": fit.chosen.num_parameters,
+        "learns": fit.chosen.learns, "one_step_rms": one, "error_median": float(np.median(error)),
+        "error_largest": float(np.max(error)), "reference_error": float(np.max(own)),
+        "outside": int(np.sum(np.asarray(ended.status) > 0)), "fit_seconds": fit.chosen.fit_seconds,
+        "microseconds_per_step": 1e6 * rolled.seconds / (timed_steps * BATCH),
+        "symplecticity_defect": fit.symplecticity_defect, "formula": fit.formula,
+        "messages": list(fit.messages), "statuses": int(np.sum(np.asarray(info.status) > 0)),
+    }  # fmt: skip
+
+
 PIECES = {
     "irregular-henon-heiles": irregular,
     "pendulum-length": length,
@@ -169,13 +211,16 @@ PIECES = {
     "compound-pendulum": no_power,
     "kepler-mass-terms": partial(mass, terms=("1/sqrt(q1**2 + q2**2)",)),
     "standard-map-strength": standard_map,
+    "driven-pendulum": partial(driven, angles=(0,)),
+    "driven-pendulum-polynomials": partial(driven, learn="hamiltonian"),
+    "driven-pendulum-S": partial(driven, learn="map", chart="midpoint"),
 }
 
 
 def tables() -> None:
     """The table of RESULTS.md."""
     heads = (
-        "system", "pairs", "terms", "one-step RMS", "step 1,000, median", "largest",
+        "system", "pairs", "terms", "one-step RMS", "in the end, median", "largest",
         "of the reference", "outside", "fit, s", "µs a step", "defect",
     )  # fmt: skip
     rows = []
@@ -192,5 +237,5 @@ def tables() -> None:
 
 
 if __name__ == "__main__":
-    quick = ("irregular-henon-heiles", "pendulum-length-terms")
+    quick = ("irregular-henon-heiles", "pendulum-length-terms", "driven-pendulum")
     main(__doc__ or "", PIECES, "args", tables, None, quick)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from gfnn_jax.generating.charts import CHARTS, Chart
     from gfnn_jax.learn.fit import Fit, fit
     from gfnn_jax.maps.saved import load
+    from gfnn_jax.maps.stroboscopic import stroboscopic
     from gfnn_jax.maps.symplectic_map import SymplecticMap
     from gfnn_jax.phase_space import Pairs
     from gfnn_jax.scenes import Scene
@@ -54,6 +55,7 @@ _HOMES = {
     "sample_pairs": "scenes.trajectories",
     "sample_states": "scenes.trajectories",
     "sample_test_states": "scenes.trajectories",
+    "stroboscopic": "maps.stroboscopic",
 }
 
 __all__ = [
@@ -78,6 +80,7 @@ __all__ = [
     "sample_states",
     "sample_test_states",
     "scenes",
+    "stroboscopic",
 ]
 
 

@@ -21,6 +21,7 @@ from gfnn_jax.errors import FitError
 Scalar = Float[Array, ""]
 State = Float[Array, "phase"]
 States = Float[Array, "batch phase"]
+TIME = "t"  # the name, among args, of the time of a drive; it is the last of them
 
 
 def require_x64(what: str) -> None:
@@ -114,6 +115,8 @@ class Pairs:
     in the user's unit of time; 1 for a map that has no time. One number, or one of each pair (N,).
     args: parameters of the system in which each pair was measured, name -> (N,); an array (N, k) or
     (N,) stands for parameters of the names a1, a2, …
+    t0, period: of a driven system, the time of z0 (N,), or one of all pairs, and the drive's
+    period. t0 is one of the args too, by the name t.
 
     Raises FitError where these are no arrays of such shapes.
     """
@@ -122,6 +125,8 @@ class Pairs:
     z1: Any
     dt: Any
     args: Any = None
+    t0: Any = None
+    period: float | None = None
 
     def __post_init__(self):
         # JAX makes pairs of whatever it maps arrays to; a user's are lists or arrays.
@@ -143,6 +148,18 @@ class Pairs:
                 )
         if self.args is not None:
             self._set("args", _named(self.args, len(self)))
+        if self.t0 is not None or TIME in (self.args or {}):
+            self._set_time()
+
+    def _set_time(self) -> None:
+        """The time of the drive both as ``t0`` and as the last of the args."""
+        others = {name: values for name, values in (self.args or {}).items() if name != TIME}
+        t0: Any = (self.args or {})[TIME] if self.t0 is None else self.t0
+        if np.ndim(t0) == 0:
+            t0 = np.full(len(self), t0)
+        args = _named({**others, TIME: t0}, len(self))
+        self._set("args", args)
+        self._set("t0", args[TIME])
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -151,13 +168,13 @@ class Pairs:
         """Arrays are leaves; a dt of all pairs is not."""
         own = bool(np.ndim(self.dt))
         leaves = (self.z0, self.z1, self.args, *([self.dt] if own else []))
-        return leaves, None if own else self.dt
+        return leaves, (None if own else self.dt, self.period)
 
     @classmethod
-    def tree_unflatten(cls, dt, leaves) -> Pairs:
+    def tree_unflatten(cls, fixed, leaves) -> Pairs:
         """The inverse."""
-        z0, z1, args, *own = leaves
-        return cls(z0, z1, own[0] if own else dt, args)
+        (dt, period), (z0, z1, args, *own) = fixed, leaves
+        return cls(z0, z1, own[0] if own else dt, args, period=period)
 
     def __len__(self) -> int:
         return self.z0.shape[0]
@@ -171,7 +188,7 @@ class Pairs:
         """The pairs of these rows (an index array or a slice)."""
         dt = self.dt[rows] if np.ndim(self.dt) else self.dt
         args = self.args and {name: values[rows] for name, values in self.args.items()}
-        return Pairs(self.z0[rows], self.z1[rows], dt, args)
+        return Pairs(self.z0[rows], self.z1[rows], dt, args, period=self.period)
 
 
 def _named(args: Any, count: int) -> dict[str, Any]:

@@ -293,7 +293,7 @@ def test_a_new_scene_needs_its_own_file_only(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True
     )
-    assert done.stdout.split() == ["True", "4000", "1e-08", "11"]
+    assert done.stdout.split() == ["True", "4000", "1e-08", "12"]
 
 
 def test_the_same_scene_made_twice_has_the_same_functions():

@@ -191,8 +191,9 @@ def test_pairs_are_the_same_bits_for_the_same_seed_and_conserve_the_invariants(n
     np.testing.assert_array_equal(pairs.z0, again.z0)
     np.testing.assert_array_equal(pairs.z1, again.z1)
     assert not (pairs.z0 == other.z0).any()
-    params = np.stack([*pairs.args.values()], axis=-1) if pairs.args else None
-    found = tr.reference_trajectories(scene, pairs.z0, 1, params=params)
+    columns = [pairs.args[name] for name in scene.parameters]
+    params = np.stack(columns, axis=-1) if columns else None
+    found = tr.reference_trajectories(scene, pairs.z0, 1, params=params, t0=pairs.t0)
     np.testing.assert_array_equal(pairs.z1, found[:, 1])
     for invariant in scene.invariants.values():
         start, end = (jax.jit(jax.vmap(invariant))(z) for z in (pairs.z0, pairs.z1))

@@ -6,11 +6,12 @@ between them, one number where it is always the same:
 - ``.npz``: ``z0``, ``z1`` of shape (N, 2d) with ``dt``, a number or (N,); or ``trajectories`` of
   shape (M, L, 2d) with optional ``lengths`` (M,), rows beyond a length ignored, and ``dt`` or
   ``times`` (M, L). Optional ``params``, parameters of the system, (N, k) or (M, k), with
-  ``param_names``.
+  ``param_names``; and of a driven system its ``period``, with ``t0``, the time of the drive at each
+  z0 (N,) or at the begin of each sequence (M,), unless ``times`` say it.
 - ``.npy``: one array of shape (L, 2d) or (M, L, 2d).
 - ``.csv``: a header that names the columns ``t, q1..qd, p1..pd`` in any order, optionally
   ``sequence``; units as in ``q1 [km]`` or ``q1 (km)``. Every further column is a parameter, where
-  it is constant in each sequence.
+  it is constant in each sequence; one named ``period`` makes ``t`` the time of a drive.
 
 All are read as blocks of consecutive rows, so that a whole file and a file larger than memory go
 through the same checks. Every refusal is an `InputError`: one line that says what was expected
@@ -39,6 +40,7 @@ from gfnn_jax.errors import InputError
 TIME_TOLERANCE = 1e-5
 # A larger number overflows in the squares, products and sums of squares that a fit makes.
 LARGEST = 1e100
+_TIME = "t"  # `phase_space.TIME`, which brings JAX
 # Rows read at a time when no chunk is asked for; 16k rows of four numbers are 6 MB as text.
 BLOCK_ROWS = 16_384
 
@@ -60,7 +62,8 @@ class TrajectoryData:
     lengths:   (M,) the number of states in each sequence. Pairs z0, z1 are sequences of two.
     dt:        time between consecutive states, in the user's unit of time; one of each pair
                (num_pairs,) where it is not always the same.
-    args:      parameters, name -> (num_pairs,), or None.
+    args:      parameters, name -> (num_pairs,), or None; by the name t the time of a drive.
+    period:    of the drive.
     source:    the file it came from; digest: the SHA-256 of that file.
     precision: the dtype that the file stores, "float32" say; ``states`` is float64 always.
     units:     units by column name, as a CSV header gave them.
@@ -74,6 +77,7 @@ class TrajectoryData:
     precision: str = "float64"
     units: dict[str, str] = dataclasses.field(default_factory=dict)
     args: dict[str, np.ndarray] | None = None
+    period: float | None = None
 
     @property
     def dim(self) -> int:
@@ -96,7 +100,9 @@ class TrajectoryData:
         starts = np.ones(len(self.states), bool)
         starts[np.cumsum(self.lengths) - 1] = False
         rows = np.flatnonzero(starts)
-        return Pairs(self.states[rows], self.states[rows + 1], self.dt, self.args)
+        return Pairs(
+            self.states[rows], self.states[rows + 1], self.dt, self.args, period=self.period
+        )
 
     def last_states(self) -> np.ndarray:
         """The last state of each sequence, (M, 2d)."""
@@ -131,8 +137,9 @@ def read_trajectories(
         )
     _warn_of_odd_columns(path, states, sequence)
     return TrajectoryData(
-        states, lengths, dt, str(path), _digest(path), source.precision, source.units, args
-    )
+        states, lengths, dt, str(path), _digest(path), source.precision, source.units, args,
+        source.period,
+    )  # fmt: skip
 
 
 def read_sample(
@@ -162,10 +169,10 @@ def read_sample(
     lengths = np.full(len(kept), 2)
     same = np.ptp(dts) == 0
     with _open(path, dt) as source:
-        precision, units = source.precision, source.units
+        precision, units, period = source.precision, source.units, source.period
     return TrajectoryData(
         states, lengths, float(dts[0]) if same else dts, str(path), _digest(path), precision, units,
-        args or None,
+        args or None, period,
     )  # fmt: skip
 
 
@@ -187,7 +194,8 @@ def iterate_pairs(path, chunk: int, *, dt: float | None = None) -> Iterator[Any]
             own = joined([*last_own, block.own])
             rows = np.flatnonzero(sequence[1:] == sequence[:-1])
             if len(rows):
-                yield Pairs(states[rows], states[rows + 1], *source.of_pairs(own, rows))
+                z0, z1, given = states[rows], states[rows + 1], source.of_pairs(own, rows)
+                yield Pairs(z0, z1, *given, period=source.period)
             last_state, last_sequence = states[-1:], sequence[-1:]
             last_own = [None if own is None else own[-1:]]
 
@@ -211,14 +219,26 @@ def read_initial(
     path, dim: int, parameters: tuple[str, ...] = ()
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """(states, params) to predict from: as `read_initial_states`, with the values (B, k) of these
-    parameters, which the file must hold; None where there are none."""
-    with _open(path, None, initial=True) as source:
+    parameters, which the file must hold; None where there are none. t among them is the time of a
+    drive: t0 of the file, or the time of each sequence's last state."""
+    driven = _TIME in parameters
+    with _open(path, None, initial=True, driven=driven) as source:
         if source.dim != dim:
             raise InputError(
                 f"{path}: expected states of {2 * dim} columns (d = {dim}), found "
                 f"{2 * source.dim} columns (d = {source.dim})"
             )
-        missing = [name for name in parameters if name not in source.parameters]
+        columns = {name: 1 + i for i, name in enumerate(source.parameters)}
+        if driven and "t0" in columns:
+            columns[_TIME] = columns["t0"]
+        elif driven and source.timed:
+            columns[_TIME] = 0
+        if driven and _TIME not in columns:
+            raise InputError(
+                f"{path}: expected t0, the time of the drive that the model was learned with, "
+                "beside the states; found none"
+            )
+        missing = [name for name in parameters if name not in columns]
         if missing:
             raise InputError(
                 f"{path}: expected the parameter{'s' * (len(missing) > 1)} {', '.join(missing)}, "
@@ -241,7 +261,7 @@ def read_initial(
         return states, None
     own = joined([block.own for block in found])
     assert own is not None
-    return states, own[:, [1 + source.parameters.index(name) for name in parameters]]
+    return states, own[:, [columns[name] for name in parameters]]
 
 
 # ---------------------------------------------------------------------------------------------
@@ -287,7 +307,8 @@ class _Source:
     """An open file: what its header says, and its rows in blocks of at most so many.
 
     uneven: whether the times that were read so far are not dt apart. parameters: names of those
-    that the rows have.
+    that the rows have. period: of a drive, whose time the rows' times are. timed: whether they have
+    times at all.
     """
 
     dim: int
@@ -298,18 +319,26 @@ class _Source:
     blocks: Callable[[int], Iterator[_Block]]
     parameters: tuple[str, ...] = ()
     uneven: bool = False
+    period: float | None = None
+    timed: bool = False
 
     def of_pairs(self, own: np.ndarray | None, rows) -> tuple[Any, dict[str, np.ndarray] | None]:
         """(dt, args) of the pairs that begin in these rows."""
         if own is None:
             return self.dt, None
         dt = own[rows + 1, 0] - own[rows, 0] if self.uneven else self.dt
-        return dt, {name: own[rows, 1 + i] for i, name in enumerate(self.parameters)} or None
+        args = {name: own[rows, 1 + i] for i, name in enumerate(self.parameters)}
+        if self.period is not None:
+            args[_TIME] = own[rows, 0]
+        return dt, args or None
 
 
 @contextlib.contextmanager
-def _open(path, dt: float | None, *, initial: bool = False) -> Iterator[_Source]:
-    """Open a trajectory file, its header checked. ``initial``: only its last states are wanted."""
+def _open(
+    path, dt: float | None, *, initial: bool = False, driven: bool = False
+) -> Iterator[_Source]:
+    """Open a trajectory file, its header checked. ``initial``: only its last states are wanted, and
+    their times where ``driven``."""
     path = Path(path)
     kinds = {".npz": _open_npz, ".npy": _open_npy, ".csv": _open_csv}
     if path.suffix.lower() not in kinds:
@@ -327,7 +356,7 @@ def _open(path, dt: float | None, *, initial: bool = False) -> Iterator[_Source]
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     with stream:
-        source = kinds[path.suffix.lower()](path, stream, dt, initial)
+        source = kinds[path.suffix.lower()](path, stream, dt, initial, driven)
         unchecked = source.blocks
         if not initial:  # of initial states only the rows that are used are checked
             source.blocks = lambda rows: (block.checked(path) for block in unchecked(rows))
@@ -477,13 +506,13 @@ def _damage(path, name: str) -> Iterator[None]:
         raise InputError(f"{path}: {name} cannot be read: damaged? ({detail})") from error
 
 
-def _open_npy(path: Path, stream, dt, initial: bool) -> _Source:
+def _open_npy(path: Path, stream, dt, initial: bool, driven: bool) -> _Source:
     array = _StoredArray(path, "the array", stream, path.stat().st_size)
     dt = np.nan if initial else _agreed_dt(path, dt, None)
     return _array_source(path, array, None, dt, each_row=initial and len(array.shape) == 2)
 
 
-def _open_npz(path: Path, stream, dt, initial: bool) -> _Source:
+def _open_npz(path: Path, stream, dt, initial: bool, driven: bool) -> _Source:
     with _damage(path, "the archive"):
         archive = zipfile.ZipFile(stream)
     names = [name.removesuffix(".npy") for name in archive.namelist()]
@@ -494,16 +523,25 @@ def _open_npz(path: Path, stream, dt, initial: bool) -> _Source:
         return _StoredArray(path, name, opened, archive.getinfo(f"{name}.npy").file_size)
 
     if initial and "z0" in names:
-        params = _read_params(path, names, member)
-        return _array_source(path, member("z0"), None, np.nan, each_row=True, params=params)
+        params, z0 = _read_params(path, names, member), member("z0")
+        t0 = _read_t0(path, member, _rows_of(z0)) if driven and "t0" in names else None
+        times = None if t0 is None else t0[:, None]
+        return _array_source(path, z0, None, np.nan, each_row=True, params=params, times=times)
     is_pairs = "z0" in names and "z1" in names
     if is_pairs == ("trajectories" in names):
         raise InputError(
             f"{path}: expected either the arrays z0 and z1, or trajectories; found "
             f"{', '.join(names[:8]) or 'none'}{', ...' * (len(names) > 8)}"
         )
-    found, own_dt = None, None
-    if "dt" in names and not initial:
+    found, own_dt, period = None, None, None
+    if "period" in names and not initial:
+        period = _check_dt(member("period").whole(), f"{path}: period")
+    with_t0 = "t0" in names and (driven or not initial)
+    if period is not None and not (with_t0 or "times" in names):
+        raise InputError(f"{path}: expected t0, the time of the drive, beside its period; got none")
+    if with_t0 and not initial and period is None:
+        raise InputError(f"{path}: expected the drive's period beside t0, found none")
+    if "dt" in names and (driven or not initial):
         value = member("dt").whole()
         if is_pairs and value.size > 1:
             own_dt, found = value, np.nan
@@ -514,17 +552,44 @@ def _open_npz(path: Path, stream, dt, initial: bool) -> _Source:
         found *= _stride(path, trajectories.shape, member("steps").whole())
     params = _read_params(path, names, member)
     if trajectories is None:
-        dt = _agreed_dt(path, dt, found)
-        return _pairs_source(path, member("z0"), member("z1"), dt, own_dt, params)
+        dt, z0 = _agreed_dt(path, dt, found), member("z0")
+        t0 = None
+        if with_t0 and period is not None:
+            t0 = np.mod(_read_t0(path, member, _rows_of(z0)), period)
+        return _pairs_source(path, z0, member("z1"), dt, own_dt, params, t0, period)
     lengths = member("lengths").whole() if "lengths" in names else None
     times = None
-    if "times" in names and not initial:
+    if "times" in names and (driven or not initial):
         if found is not None:
             raise InputError(f"{path}: expected dt or times, found both")
         times = member("times").whole().astype(np.float64)
         found = _times_dt(path, times, trajectories.shape, lengths)
-    dt = np.nan if initial else _agreed_dt(path, dt, found)
-    return _array_source(path, trajectories, lengths, dt, times=times, params=params)
+    dt = found if initial else _agreed_dt(path, dt, found)
+    if with_t0:
+        if times is not None:
+            raise InputError(f"{path}: expected t0 or times, found both")
+        if dt is None:
+            raise InputError(f"{path}: holds no time step, by which t0 goes on")
+        count, length = (1, *trajectories.shape)[-3:-1]
+        times = _read_t0(path, member, count)[:, None] + dt * np.arange(length)
+    dt = np.nan if initial or dt is None else dt
+    return _array_source(path, trajectories, lengths, dt, times=times, params=params, period=period)
+
+
+def _rows_of(array: _StoredArray) -> int:
+    """Its rows."""
+    return array.shape[0] if array.shape else 0
+
+
+def _read_t0(path, member, count: int) -> np.ndarray:
+    """The times (count,) of a drive."""
+    t0 = np.atleast_1d(member("t0").whole().astype(np.float64))
+    if t0.shape != (count,) or not np.isfinite(t0).all():
+        raise InputError(
+            f"{path}: t0 must be finite, of shape ({count},), found {t0.shape}"
+            + ("" if np.isfinite(t0).all() else " with NaN or infinity")
+        )
+    return t0
 
 
 def _read_params(path, names: list[str], member) -> tuple[tuple[str, ...], np.ndarray] | None:
@@ -607,9 +672,11 @@ def _stride(path, shape: tuple[int, ...], steps: np.ndarray) -> float:
 
 
 def _pairs_source(
-    path, z0: _StoredArray, z1: _StoredArray, dt: float, own_dt=None, params=None
-) -> _Source:
-    """z0, z1 as sequences of two states. own_dt: of each pair; params: names and values."""
+    path, z0: _StoredArray, z1: _StoredArray, dt: float, own_dt=None, params=None, t0=None,
+    period: float | None = None,
+) -> _Source:  # fmt: skip
+    """z0, z1 as sequences of two states. own_dt: of each pair; params: names and values; t0 (N,):
+    the time of the drive at z0."""
     if len(z0.shape) != 2 or z0.shape != z1.shape:
         raise InputError(
             f"{path}: z0 and z1 must both have shape (N, 2d), found {z0.shape} and {z1.shape}"
@@ -630,6 +697,8 @@ def _pairs_source(
                 f"first dt[{row}] = {own_dt[row]:g}"
             )
         times = np.stack([np.zeros(len(own_dt)), own_dt], axis=1)
+    if t0 is not None:
+        times = t0[:, None] + (np.stack([0 * t0, 0 * t0 + dt], axis=1) if times is None else times)
     own = _own_columns(path, times, params, z0.shape[0], "pairs", 2)
 
     def blocks(rows: int) -> Iterator[_Block]:
@@ -646,12 +715,13 @@ def _pairs_source(
 
     precision = str(np.result_type(z0.dtype, z1.dtype))
     called = () if params is None else params[0]
-    return _Source(dim, dt, precision, {}, True, blocks, called, own_dt is not None)
+    uneven = own_dt is not None
+    return _Source(dim, dt, precision, {}, True, blocks, called, uneven, period, t0 is not None)
 
 
 def _array_source(
     path, array: _StoredArray, lengths: np.ndarray | None, dt: float, *, each_row: bool = False,
-    times: np.ndarray | None = None, params=None,
+    times: np.ndarray | None = None, params=None, period: float | None = None,
 ) -> _Source:  # fmt: skip
     """(L, 2d) or (M, L, 2d); with ``each_row`` every row is a sequence of its own."""
     shape = array.shape
@@ -684,7 +754,8 @@ def _array_source(
 
     uneven = times is not None and bool(np.isnan(dt))
     called = () if params is None else params[0]
-    return _Source(dim, dt, str(array.dtype), {}, True, blocks, called, uneven)
+    timed = times is not None
+    return _Source(dim, dt, str(array.dtype), {}, True, blocks, called, uneven, period, timed)
 
 
 def _check_lengths(path, lengths: np.ndarray, count: int, longest: int) -> np.ndarray:
@@ -721,7 +792,7 @@ def _parse_header(line: str) -> tuple[list[str], dict[str, str]] | None:
     return (names, units) if any(re.fullmatch(r"[qp]\d+", n) for n in names) else None
 
 
-def _open_csv(path: Path, stream, dt, initial: bool) -> _Source:
+def _open_csv(path: Path, stream, dt, initial: bool, driven: bool) -> _Source:
     stream = TextIOWrapper(stream, encoding="utf-8-sig")
     header, line, line_number = None, "", 0
     with _damage(path, "the header"):
@@ -767,9 +838,17 @@ def _open_csv(path: Path, stream, dt, initial: bool) -> _Source:
             f"{path}: columns ignored: {', '.join(moving)} (not constant in a sequence)",
             DataWarning, stacklevel=4,
         )  # fmt: skip
-    parameters = [n for n in further if n not in moving]
+    period = None
+    if "period" in further and not initial:
+        if "t" not in names:
+            raise InputError(f"{path}: expected a column t, the time of the drive of that period")
+        values = first[0][:, names.index("period")]
+        if "period" in moving or np.ptp(values) != 0:
+            raise InputError(f"{path}: the column period must hold the same number in all rows")
+        period = _check_dt(values[0], f"{path}: the column period")
+    parameters = [n for n in further if n not in (*moving, "period")]
     beside = [names.index(n) for n in parameters]
-    with_time = "t" in names and not initial
+    with_time = "t" in names and (driven or not initial)
 
     def blocks(rows: int) -> Iterator[_Block]:
         seen: set[float] = set()
@@ -794,6 +873,8 @@ def _open_csv(path: Path, stream, dt, initial: bool) -> _Source:
                 before = np.append(last[1], time), np.append(last[0], sequence)
                 _check_times_rise(path, *before, lines)
                 source.uneven |= not _even(*before, usual)
+            if period is not None and np.any(table[:, names.index("period")] != period):
+                raise InputError(f"{path}: the column period must hold the same number in all rows")
             values = table[:, beside]
             if not each_row:
                 _check_constant(path, parameters, values, sequence, lines)
@@ -806,7 +887,9 @@ def _open_csv(path: Path, stream, dt, initial: bool) -> _Source:
             )
 
     called = tuple(re.sub(r"\W+", "_", name) for name in parameters)
-    source = _Source(dim, float(dt), "float64", units, False, blocks, called)
+    source = _Source(
+        dim, float(dt), "float64", units, False, blocks, called, period=period, timed=with_time
+    )
     return source
 
 

@@ -37,13 +37,15 @@ _ASSEMBLY_BYTES = 64 * 2**20
 class PredictionWriter:
     """Writes one prediction file: ``trajectories`` (B, S, 2d), ``status`` (B,), ``left_at`` (B,),
     ``steps`` (S,) and ``dt``, all float64 or int64, ``params`` (B, k) and ``param_names`` (k,)
-    where the map has parameters, and ``job``, a digest of what was asked for.
+    where the map has parameters, ``t0`` (B,) and ``period`` where it is driven, and ``job``, a
+    digest of what was asked for.
 
     out:       the ``.npz`` to write; ``OUT.partial`` holds the chunks until `finish`.
     shape:     (B, 2d).
     num_steps, save_every: N and K; saved are the S = 1 + N // K states of steps 0, K, 2K, ...
     dt:        the time step of the map.
     params:    the names (k,) and values (B, k) of its parameters.
+    drive:     the time t0 (B,) of the drive at the initial states, and its period.
     identity:  a JSON-able dict that says which job this is (digests of the model and of the initial
                states, say): a job is resumed only if all of it agrees.
     resume:    go on with ``OUT.partial`` where there is one; else start. Where ``out`` is this very
@@ -68,6 +70,7 @@ class PredictionWriter:
         dt: float,
         identity: dict[str, Any],
         params: tuple[tuple[str, ...], np.ndarray] | None = None,
+        drive: tuple[np.ndarray, float] | None = None,
         resume: bool = False,
         overwrite: bool = False,
     ):
@@ -75,7 +78,7 @@ class PredictionWriter:
         self.partial = self.out.with_name(self.out.name + ".partial")
         self.steps = range(0, num_steps + 1, save_every)
         self.dt = float(dt)
-        self.params = params
+        self.params, self.drive = params, drive
         self.lanes, self.width = shape
         self.saved = 0
         self.carry: dict[str, np.ndarray] | None = None
@@ -164,6 +167,8 @@ class PredictionWriter:
         named: list[tuple[str, np.ndarray]] = []
         if self.params is not None:
             named = [("params", self.params[1]), ("param_names", np.array(self.params[0]))]
+        if self.drive is not None:
+            named += [("t0", self.drive[0]), ("period", np.asarray(self.drive[1]))]
         with atomic_file(self.out) as stream, zipfile.ZipFile(stream, "w") as archive:
             shape = (self.lanes, self.total, self.width)
             with _member(archive, "trajectories", shape, np.float64) as member:

@@ -42,5 +42,7 @@ def summary(data: TrajectoryData) -> list[str]:
         lines.append(f"{name}: {a} to {b}{unit}, spread {spread}, movement in a step {step}")
     for name, values in (data.args or {}).items():
         count = len(np.unique(values))
-        lines.append(f"parameter {name}: {values.min():.4g} to {values.max():.4g}, {count} values")
+        drive = f"time t of a drive of period {data.period}"
+        what = drive if name == "t" else f"parameter {name}"
+        lines.append(f"{what}: {values.min():.4g} to {values.max():.4g}, {count} values")
     return lines

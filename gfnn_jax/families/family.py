@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
-from gfnn_jax.arrays import matmul, namespace
+from gfnn_jax.arrays import as_row, matmul, namespace
+from gfnn_jax.phase_space import TIME
 
 
 @runtime_checkable
@@ -45,6 +46,20 @@ class Family(Protocol):
     def gradient_and_hessian(self, params: Any, w: Any, args: Any = None) -> tuple[Any, Any]:
         """∂f/∂w and ∂²f/∂w², shapes (..., 2d) and (..., 2d, 2d)."""
         ...
+
+
+def at_time(family: Any, args: Any, after: Any) -> Any:
+    """args (..., k) as they are a time ``after`` (...) later: the last of them is the time where
+    the family depends on it, the others stay. NumPy or JAX."""
+    if getattr(family, "parameters", ())[-1:] != (TIME,):
+        return args
+    xp = namespace(args, after)
+    time = args[..., -1]
+    if 0 < time.ndim < xp.ndim(after):  # of stages and lanes
+        time = as_row(time, after)
+    time = time + after
+    still = xp.broadcast_to(args[..., :-1], (*time.shape, args.shape[-1] - 1))
+    return xp.concatenate([still, time[..., None]], axis=-1)
 
 
 @runtime_checkable

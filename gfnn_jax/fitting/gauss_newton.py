@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
+from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.flows.collocation import Steps, images, of_lanes
 from gfnn_jax.phase_space import apply_j, symplectic_form
@@ -122,8 +123,10 @@ def null_terms(
 
 
 def midpoint_start(family, z0, z1, dt, scale, args=None) -> np.ndarray:
-    """The linear problem (z₁ − z₀)/h = J∇H(½(z₀ + z₁)): exact to O(h²). dt: a number or (N,)."""
+    """The linear problem (z₁ − z₀)/h = J∇H(½(z₀ + z₁), t + ½h): exact to O(h²). dt: a number or
+    (N,)."""
     h = dt[:, None] if np.ndim(dt) else dt
+    args = at_time(family, args, 0.5 * dt)
     return fitted_gradients(family, 0.5 * (z0 + z1), -apply_j(z1 - z0) / h, scale, args)
 
 
@@ -192,10 +195,8 @@ def rates(family, coefficients, z, args=None) -> np.ndarray:
     z = z[:: -(-len(z) // _RATED)]
     bends = family.curvatures(coefficients, z, args)
     v = np.random.default_rng(0).normal(size=z.shape)
-    before = v
     for _ in range(_POWERS):  # twice at a time: eigenvalues come in pairs ±λ
-        before = v / np.linalg.norm(v, axis=1, keepdims=True)
-        v = before
+        v = v / np.linalg.norm(v, axis=1, keepdims=True)
         for _ in range(2):
             v = apply_j(family.hessian_product(bends, v))
     return np.sqrt(np.linalg.norm(v, axis=1))

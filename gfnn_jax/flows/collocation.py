@@ -1,7 +1,7 @@
 """One step of Gauss collocation for a batch of states in NumPy: what fits through a flow run.
 
-Stage by stage, K_i = J∇H(z + h Σ_j a_ij K_j), then Z = z + h Σ_i b_i K_i. Arrays of stages have
-shape (s, B, 2d): a sum over stages is then one matrix product.
+Stage by stage, K_i = J∇H(z + h Σ_j a_ij K_j, t + c_i h), then Z = z + h Σ_i b_i K_i. Arrays of
+stages have shape (s, B, 2d): a sum over stages is then one matrix product.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.phase_space import apply_j, symplectic_form
@@ -58,7 +59,8 @@ def images(
 ):  # fmt: skip
     """Images of the states z (B, 2d) after dt, in NumPy. Lanes that fail are not finite.
 
-    dt: a number, or one of each lane (B,). args: of each lane, (B, k), or None.
+    dt: a number, or one of each lane (B,). args: of each lane, (B, k), or None; the time among
+    them is that of z.
     derivatives: the exact ones of the collocation, in the state and in the coefficients of a
     linear family. along: another one, in whose coefficients they are instead, these 0.
     on_substep: called before each substep; it may raise to stop.
@@ -86,6 +88,7 @@ def images(
                 by_state = by_z @ by_state
                 by_coefficient = by_z @ by_coefficient + by_c if np.ndim(by_coefficient) else by_c
             z = z + h * _summed(rule.weights[None, :], slopes)[0]
+            args = at_time(family, args, h[:, 0] if np.ndim(h) else h)
     z = np.where(solved[:, None], z, np.nan)
     return Images(z, solved, *((by_state, by_coefficient) if derivatives else ()))
 
@@ -93,6 +96,12 @@ def images(
 def _summed(matrix, slopes):
     """Σ_j matrix_ij slopes_j for slopes (s, B, 2d)."""
     return (matrix @ slopes.reshape(len(slopes), -1)).reshape(len(matrix), *slopes.shape[1:])
+
+
+def at_stages(family, args, h, rule):
+    """args of the stages (s, B, k), h a number or (B, 1): (B, k) where no time is among them."""
+    after = h[:, 0] if np.ndim(h) else h
+    return at_time(family, args, np.multiply.outer(rule.nodes, np.reshape(after, -1)))
 
 
 def solve_stages(family, params, z, h, rule, args=None, *, newton: bool = True):
@@ -110,6 +119,7 @@ def solve_stages(family, params, z, h, rule, args=None, *, newton: bool = True):
         lanes = np.flatnonzero(open_)
         step, given = of_lanes(h, lanes), of_lanes(args, lanes)
         inside = z[lanes] + step * _summed(rule.matrix, slopes[:, lanes])
+        given = at_stages(family, given, step, rule)
         new = apply_j(family.gradient(params, inside, given))
         moved = abs(step) * np.abs(new - slopes[:, lanes])
         slopes[:, lanes] = new
@@ -138,6 +148,7 @@ def _newton(family, params, z, h, rule, args):
     smaller."""
     count, (lanes, width) = len(rule.weights), z.shape
     slopes = np.repeat(apply_j(family.gradient(params, z, args))[None], count, axis=0)
+    args = at_stages(family, args, h, rule)
 
     def residual(slopes):
         inside = z + h * _summed(rule.matrix, slopes)
@@ -245,6 +256,7 @@ def _derivatives(family, params, inside, h, rule, args, along):
     """
     count, lanes, width = inside.shape
     form = symplectic_form(width // 2)
+    args = at_stages(family, args, h, rule)
     _, hessian = family.gradient_and_hessian(params, inside, args)
     transposed = stage_matrix(hessian, h, rule).swapaxes(1, 2)
     weights = np.kron(rule.weights[:, None], np.eye(width))

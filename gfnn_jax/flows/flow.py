@@ -1,6 +1,6 @@
 """The piece that a Hamiltonian makes: its flow over dt by Gauss collocation.
 
-    K_i = J∇H(z + h Σ_j a_ij K_j),      Z = z + h Σ_i b_i K_i
+    K_i = J∇H(z + h Σ_j a_ij K_j, t + c_i h),      Z = z + h Σ_i b_i K_i
 
 Symplectic for every H, separable or not, and symmetric in time: the inverse is the same method
 with −dt. The stages are solved to roundoff, by fixed point or, where h‖H''‖ is too large for that
@@ -21,6 +21,7 @@ from jax.core import Tracer
 
 from gfnn_jax.arrays import as_row, matmul
 from gfnn_jax.families import as_family
+from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.gauss import gauss
@@ -57,6 +58,7 @@ class StageEquation:
         (family, params, h, scale), (z, args, *own) = shared, lanes
         h = own[0] if own else h
         slopes, inside = self._inside(z, x)
+        args = _at_stages(family, args, h, self.stages)
         field = _beside(h, inside) * apply_j(family.gradient(params, inside, args))
         return self._evaluation(z, slopes, field, scale)
 
@@ -65,6 +67,7 @@ class StageEquation:
         (family, params, h, scale), (z, args, *own) = shared, lanes
         h = own[0] if own else h
         slopes, inside = self._inside(z, x)
+        args = _at_stages(family, args, h, self.stages)
         gradient, hessian = family.gradient_and_hessian(params, inside, args)
         field = _beside(h, inside) * apply_j(gradient)
         evaluation = self._evaluation(z, slopes, field, scale)
@@ -90,7 +93,8 @@ class StageEquation:
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Flow:
-    """The flow of H(params, ·) over dt. A piece: see `maps.symplectic_map`.
+    """The flow of H(params, ·) over dt. A piece: see `maps.symplectic_map`. Where H depends on the
+    time, the last of the args is that of the state at which a step begins.
 
     family:   H, a family or a plain ``H(params, z)``; what it holds of the data are leaves.
     dt:       the time of a step, of either sign; a number or a leaf, one for all lanes or (B,).
@@ -136,21 +140,21 @@ class Flow:
     def step(self, z, args=None, *, unrolled: bool | int = False):
         """(Z, Info) of the states z (B, 2d), by JAX."""
 
-        def substep(z):
+        def substep(z, args):
             moved, info = self._increment(z, args, unrolled)
             return z + moved, info
 
-        return self._repeated(substep, z)
+        return self._repeated(substep, z, args)
 
     def compensated_step(self, z, compensation, args=None):
         """(Z, compensation, Info) of z + compensation, which is what rounding has lost so far."""
 
-        def substep(both):
+        def substep(both, args):
             z, lost = both
             moved, info = self._increment(z, args, False)
             return two_sum(z, moved + lost), info
 
-        (z, compensation), info = self._repeated(substep, (z, compensation))
+        (z, compensation), info = self._repeated(substep, (z, compensation), args)
         return z, compensation, info
 
     def action(self, z, image, origin, args=None):
@@ -158,25 +162,34 @@ class Flow:
         Σ b_i of it, which is exact for a symplectic Runge–Kutta method."""
         weights = gauss(self.stages).weights[None, :]
 
-        def substep(both):
+        def substep(both, args):
             z, total = both
             slopes, info = self._slopes(z, args, False)
             inside = z[None] + _summed(gauss(self.stages).matrix, slopes)
-            energy = self.family.value(self.params, inside, args)
-            done = _beside(self.dt / self.substeps, energy) * energy
+            h = self.dt / self.substeps
+            at = _at_stages(self.family, args, h[:, None] if jnp.ndim(h) else h, self.stages)
+            energy = self.family.value(self.params, inside, at)
+            done = _beside(h, energy) * energy
             total = total + _summed(weights, area(inside - origin[None], slopes) - done)[0]
             return (z + _summed(weights, slopes)[0], total), info
 
-        return self._repeated(substep, (z, jnp.zeros(z.shape[:1], z.dtype)))[0][1]
+        return self._repeated(substep, (z, jnp.zeros(z.shape[:1], z.dtype)), args)[0][1]
 
     def inverse(self) -> Flow:
         """The inverse map: the same flow backwards."""
         return dataclasses.replace(self, dt=-self.dt)
 
-    def _repeated(self, substep, carry):
+    def _repeated(self, substep, carry, args):
+        """All substeps of carry, the time among the args going on with them."""
         if self.substeps == 1:
-            return substep(carry)
-        carry, infos = jax.lax.scan(lambda c, _: substep(c), carry, length=self.substeps)
+            return substep(carry, args)
+
+        def following(carry, number):
+            after = number * (self.dt / self.substeps)
+            return substep(carry, at_time(self.family, args, after))
+
+        numbers = jnp.arange(self.substeps, dtype=self.scale.dtype)
+        carry, infos = jax.lax.scan(following, carry, numbers)
         return carry, jax.tree.map(lambda a: jnp.max(a, axis=0), infos)
 
     def _increment(self, z, args, unrolled: bool | int):
@@ -218,13 +231,14 @@ def _fixed_point(stages: int, shared, z, args):
     matrix = gauss(stages).matrix
     size = jax.lax.stop_gradient(jnp.abs(z) + as_row(scale, z))[None]
     first = h * apply_j(family.gradient(params, z, args))
+    at = _at_stages(family, args, h, stages)
     slopes = jnp.broadcast_to(first[None], (stages, *z.shape))
     lanes = jnp.zeros(z.shape[0], jnp.int32)
 
     def improve(carry):
         slopes, change, open_, iterations = carry
         inside = z[None] + _summed(matrix, slopes)
-        new = _beside(h, inside) * apply_j(family.gradient(params, inside, args))
+        new = _beside(h, inside) * apply_j(family.gradient(params, inside, at))
         moved = jax.lax.stop_gradient(jnp.max(jnp.abs(new - slopes) / size, axis=(0, 2)))
         settled = (moved <= eps**_SETTLED) & (moved > 0.5 * change)
         goes_on = ~((moved <= _FLOOR_EPS * eps) | settled) & jnp.isfinite(moved)
@@ -260,12 +274,14 @@ def _stages_jvp(stages, primals, tangents):
     def field(shared, z, args):
         family, params, h, _ = shared
         inside = z[None] + _summed(gauss(stages).matrix, slopes)
-        return _beside(h, inside) * apply_j(family.gradient(params, inside, args))
+        at = _at_stages(family, args, h, stages)
+        return _beside(h, inside) * apply_j(family.gradient(params, inside, at))
 
     _, field_dot = jax.jvp(field, primals, tangents)
     inside = z[None] + _summed(gauss(stages).matrix, slopes)
+    at = _at_stages(family, args, h, stages)
     if matrix_free(family):
-        bends = family.curvatures(params, inside, args)
+        bends = family.curvatures(params, inside, at)
 
         def again(dot, _):
             turned = family.hessian_product(bends, _summed(gauss(stages).matrix, dot))
@@ -273,12 +289,18 @@ def _stages_jvp(stages, primals, tangents):
 
         slopes_dot, _ = jax.lax.scan(again, field_dot, length=_MOST_TANGENT)
     else:
-        _, hessian = family.gradient_and_hessian(params, inside, args)
+        _, hessian = family.gradient_and_hessian(params, inside, at)
         solved = small_solve(stage_matrix(hessian, h, stages), _flat(field_dot))
         slopes_dot = jnp.swapaxes(solved.reshape(len(z), stages, -1), 0, 1)
     integer_dot: Any = np.zeros(info.status.shape, jax.dtypes.float0)
     info_dot = Info(integer_dot, integer_dot, jnp.zeros_like(info.residual))
     return (slopes, info), (slopes_dot, info_dot)
+
+
+def _at_stages(family, args, h, stages: int):
+    """args of the stages (s, B, k), h a number or (B, 1): as they are where no time is in them."""
+    after = jnp.asarray(gauss(stages).nodes)[:, None] * jnp.reshape(h, (1, -1))
+    return at_time(family, args, after.astype(jnp.result_type(h)))
 
 
 def _beside(h, like):

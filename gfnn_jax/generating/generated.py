@@ -16,7 +16,11 @@ import numpy as np
 
 from gfnn_jax.arrays import namespace
 from gfnn_jax.families import as_family
-from gfnn_jax.families.family import symmetric_gradient, symmetric_gradient_and_hessian
+from gfnn_jax.families.family import (
+    at_time,
+    symmetric_gradient,
+    symmetric_gradient_and_hessian,
+)
 from gfnn_jax.generating.charts import AnyChart, Chart
 from gfnn_jax.phase_space import apply_j
 from gfnn_jax.solve import newton
@@ -65,7 +69,8 @@ class ImplicitStep:
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Generated:
-    """The map that S(params, ·) generates in a chart. A piece: see `maps.symplectic_map`.
+    """The map that S(params, ·) generates in a chart. A piece: see `maps.symplectic_map`. Where S
+    depends on the time, it does on that of the middle of the step, whichever way the step is made.
 
     family: S, a family or a plain ``S(params, w)``; what it holds of the data are leaves.
     dt:     the time step h, a number or a leaf of the map.
@@ -97,7 +102,7 @@ class Generated:
             guess = guess + self.predictor.forward(z)
         shared = (self.family, self.params, self.dt, self.scale)
         if args is not None:  # open lanes are taken out of the batch, with their own
-            args = jnp.broadcast_to(args, (z.shape[0], args.shape[-1]))
+            args = jnp.broadcast_to(self._midway(args), (z.shape[0], args.shape[-1]))
         equation, lanes = ImplicitStep(self.chart), (z, known, args)
         if unrolled:
             most = MOST_UPDATES if unrolled is True else unrolled
@@ -130,7 +135,7 @@ class Generated:
         dim = z.shape[1] // 2
         shared = (self.family, self.params, self.dt, self.scale)
         x = guess[:, self.chart.free(dim)]
-        known = self.chart.first_guess(z)
+        known, args = self.chart.first_guess(z), self._midway(args)
         x, gradient, error = newton.refine(ImplicitStep(self.chart), shared, (z, known, args), x)
         return self.chart.image(z, self.chart.complete(known, x), gradient, self.dt), error
 
@@ -138,7 +143,7 @@ class Generated:
         """The action (B,) of the step from z (B, 2d) to its image: S itself, at their w. NumPy or
         JAX."""
         w = self.chart.evaluation_point(z, image)
-        generated = self.dt * self.family.value(self.params, w, args)
+        generated = self.dt * self.family.value(self.params, w, self._midway(args))
         return self.chart.action(z, image, origin, generated)
 
     def inverse(self) -> Generated:
@@ -151,8 +156,12 @@ class Generated:
         """det ∂w/∂z (B,) at states z0 (B, 2d) with images z1, NumPy or JAX: it vanishes where the
         chart is singular."""
         w = self.chart.evaluation_point(z0, z1)
-        _, hessian = self.family.gradient_and_hessian(self.params, w, args)
+        _, hessian = self.family.gradient_and_hessian(self.params, w, self._midway(args))
         return self.chart.determinant_of(hessian, self.dt)
+
+    def _midway(self, args):
+        """args in the middle of the step that begins with them."""
+        return at_time(self.family, args, 0.5 * self.dt)
 
 
 def two_sum(a, b):

@@ -63,6 +63,8 @@ def compare(
     scene = scene_named(name)
     if scene.parameters:
         raise InputError(f"the scene {name} has parameters, which the other methods do not take")
+    if scene.any_phase:
+        raise InputError(f"the scene {name} is driven, and the other methods know no time")
     cap = (QUICK_CAP if quick else CAP) if cap is None else cap
     chosen = chosen_methods(methods, scene)
     job = {

@@ -16,6 +16,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.symplectic_map import Lanes, SymplecticMap
+from gfnn_jax.phase_space import TIME
 
 # A chunk of a prediction: what is held in memory at once, and how much work a kill may lose.
 _CHUNK_BYTES, _CHUNK_LANE_STEPS = 32 * 2**20, 400_000
@@ -71,9 +72,13 @@ def predict(
         "initial": digest.hexdigest(),
         "outside": "stop" if stop_outside else "continue",
     }
+    own, drive = None if params is None else (names, params), None
+    if params is not None and map_.parameters is not None and TIME in names:
+        drive = params[:, -1], float(np.asarray(map_.parameters.period))
+        own = (names[:-1], params[:, :-1]) if len(names) > 1 else None
     writer = PredictionWriter(
         out, shape=z0.shape, num_steps=num_steps, save_every=save_every, dt=dt,
-        identity=identity, params=None if params is None else (names, params),
+        identity=identity, params=own, drive=drive,
         overwrite=overwrite, resume=resume,
     )  # fmt: skip
     started = time.perf_counter()

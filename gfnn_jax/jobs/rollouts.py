@@ -26,10 +26,12 @@ class Rollouts(NamedTuple):
     seconds: float
 
 
-def map_rollouts(map_: SymplecticMap, z0, num_steps: int = NUM_STEPS, params=None) -> Rollouts:
-    """Rollouts of a symplectic map from z0 (B, 2d) with its params (B, k); predicted twice, as the
-    first time compiles."""
-    predict = partial(map_.rollout, params=params)
+def map_rollouts(
+    map_: SymplecticMap, z0, num_steps: int = NUM_STEPS, params=None, t0=None
+) -> Rollouts:
+    """Rollouts of a symplectic map from z0 (B, 2d) with its params (B, k), from the drive's time t0
+    (B,); predicted twice, as the first time compiles."""
+    predict = partial(map_.rollout, params=params, t0=t0)
     jax.block_until_ready(predict(z0, num_steps))
     (states, info), seconds = _timed(predict, z0, num_steps)
     return Rollouts(np.asarray(states), np.asarray(info.status), seconds)

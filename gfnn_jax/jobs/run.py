@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from gfnn_jax.scenes.trajectories import (
     reference_trajectories,
     sample_pairs,
     sample_params,
+    sample_t0,
     sample_test_states,
 )
 from gfnn_jax.storage.outputs import atomic_folder
@@ -84,16 +86,19 @@ def run(
         key_pairs, key_test = _keys(seed)
         pairs = _finite(sample_pairs(scene, num_pairs, key_pairs))
         z0 = np.asarray(sample_test_states(scene, num_trajectories, key_test))
-        params = sample_params(scene, num_trajectories, key_test, test=True)
+        given: dict[str, Any] = {
+            "params": sample_params(scene, num_trajectories, key_test, test=True),
+            "t0": sample_t0(scene, num_trajectories, key_test),
+        }
         fitted = search(
             pairs, scene, max_seconds=max_seconds, progress=progress, kept_in=kept_in, job=job,
             **options, **more,
         )  # fmt: skip
         progress.say(f"reference trajectories of {NUM_STEPS} steps")
-        reference = np.asarray(reference_trajectories(scene, z0, NUM_STEPS, params=params))
+        reference = np.asarray(reference_trajectories(scene, z0, NUM_STEPS, **given))
         progress.say(f"rollouts of {NUM_STEPS} steps")
-        rollouts = map_rollouts(fitted.map, z0, params=params)
-        measured = measure(rollouts, scene, reference, params)
+        rollouts = map_rollouts(fitted.map, z0, **given)
+        measured = measure(rollouts, scene, reference, given["params"])
         result = report.assemble(
             fitted, scene=name, dt=scene.dt, seed=seed, rollout=measured.report,
             data={"source": "reference data of the scene", "digest": pairs_digest(pairs)},
@@ -117,7 +122,7 @@ def _finite(pairs: Pairs) -> Pairs:
     """In NumPy, without those whose state collides: it has no image."""
     z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
     known = np.isfinite(z1).all(axis=1)
-    return Pairs(z0, z1, pairs.dt, pairs.args).take(known)
+    return dataclasses.replace(pairs, z0=z0, z1=z1).take(known)
 
 
 def _figures(fit: Fit, scene: Scene, measured: Measured, reference) -> dict[str, Any]:

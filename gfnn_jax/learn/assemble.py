@@ -14,7 +14,7 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
 from gfnn_jax.learn.candidates import Candidate, Judges, refined_images, with_error
 from gfnn_jax.learn.prepare import Prepared
-from gfnn_jax.maps.parameters import sampled
+from gfnn_jax.maps.parameters import Parameters, sampled
 from gfnn_jax.maps.symplectic_map import Piece, SymplecticMap
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.solve.status import LEFT_DOMAIN
@@ -82,10 +82,17 @@ def composed(piece: Piece, prepared: Prepared, judges: Judges) -> SymplecticMap:
         scale=sizes(judges.pairs.z0),
         angle_centre=prepared.angle_centre,
         dt=prepared.dt,
-        parameters=None if prepared.args is None else sampled(prepared.parameters, prepared.args),
+        parameters=_sampled(prepared),
     )
     # Not jnp.asarray, which compiles a copy for every new shape.
     return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_)
+
+
+def _sampled(prepared: Prepared) -> Parameters | None:
+    """What the map depends on beside the state, and where it was sampled."""
+    if prepared.args is None:
+        return None
+    return sampled(prepared.parameters, prepared.args, prepared.each_dt, prepared.period)
 
 
 def in_block(z: np.ndarray) -> np.ndarray:

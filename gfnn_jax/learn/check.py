@@ -75,8 +75,10 @@ def check_request(
         raise FitError(
             f"expected different angles among 0..{2 * pairs.dim - 1}, got {tuple(angles)}"
         )
-    if own_dt or pairs.args:
+    if own_dt or pairs.args or pairs.period is not None:
         check_varied(pairs)
+    if pairs.period is not None and chart == "type1":
+        raise FitError("expected another chart than type1, which a driven map has not")
     if not own_dt and not 0 < float(pairs.dt) < np.inf:
         raise FitError(f"expected a time step that is finite and above 0, got {pairs.dt}")
     if isinstance(terms, str):

@@ -46,7 +46,9 @@ def law_of(
         if learn == "hamiltonian":
             raise FitError(f"expected data of an autonomous flow to learn H from: {unfit}")
         return None
-    options = OPTIONS if learn == "hamiltonian" or terms else _BESIDE
+    # S of a driven system needs more harmonics than H, and is no map to wait for.
+    foremost = learn == "hamiltonian" or terms or prepared.period is not None
+    options = OPTIONS if foremost else _BESIDE
     if learn == "auto":  # the map, which every system has, is to have the better part of the time
         part = _PART * clock.left
         options = dataclasses.replace(
@@ -73,7 +75,7 @@ def _unfit(prepared: Prepared, scene: Scene | None) -> str | None:
     """Why the pairs are not those of an autonomous flow, where that is known."""
     if scene is not None and scene.timeless:
         return f"the scene {scene.name} is a map without time"
-    if scene is not None and scene.period is not None:
+    if scene is not None and scene.period is not None and prepared.period is None:
         return f"the Hamiltonian of the scene {scene.name} depends on time"
     if any(a >= prepared.dim for a in prepared.coordinates.angles):
         return "a momentum is an angle"

@@ -19,6 +19,7 @@ from gfnn_jax.learn.search import AS_FAR, MET, Entry
 from gfnn_jax.learn.searches import Searched
 
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
+_SHARE = 0.1  # of the residual, that a change of volume must explain
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 _RESIDUAL_PAIRS = 2_000  # whose residuals are looked at
 _NOISE_PAIRS = 1_024  # from which the noise of the states is measured
@@ -109,22 +110,36 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     if not stalled:
         return _LeftOver(None, [])
     change, error = volume_change(y0, residual)
-    if abs(change) > _CERTAIN * error:
+    # Friction shrinks every coordinate by a part of what is left over of it.
+    size = float(np.sqrt(np.mean((residual / scale) ** 2)))
+    if abs(change) > max(_CERTAIN * error, _SHARE * residual.shape[1] * size):
         message = (
             f"what is left over is no noise: phase-space volumes change by {change:.2g} "
             f"(± {error:.1g}) of themselves in a step, as by friction: no symplectic map does"
         )
         return _LeftOver(None, [message], "volumes of phase space change, as by friction")
+    if np.isfinite(error):
+        message = (
+            "what is left over is a smooth function of the states and no noise: a structure that "
+            "these functions cannot represent, or pairs of no symplectic map"
+        )
+        return _LeftOver(None, [message], "what is left over is smooth, and no noise")
     taken = candidate.num_parameters / (judges.training.size * 2 * judges.pairs.dim)
     noise = state_noise(candidate.map, judges.pairs.take(rows[:_NOISE_PAIRS]), taken)
     own = ""
     if candidate.learns == "map" and entry is not None:
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))
         own = f" (the map's own error is then about {part:.1g} of it)"
+    hidden = ""
+    if len(np.unique(sequence)) == len(sequence):
+        hidden = (
+            "or to depend on something that the states do not hold (a parameter, a drive), which "
+            "single pairs do not tell from noise, "
+        )
     message = (
         "larger models are no more accurate: the pairs seem to carry noise of about "
         f"{', '.join(f'{sigma:.1e}' for sigma in noise)} on the coordinates in their order{own}, "
-        "or a structure that these functions cannot represent"
+        f"{hidden}or to have a structure that these functions cannot represent"
     )
     return _LeftOver(noise, [message])
 

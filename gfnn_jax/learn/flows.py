@@ -266,7 +266,9 @@ def _walked(
         reversor=scene.reversor if scene is not None else None, own=own,
     )  # fmt: skip
     _, args = prepared.given(judges.training)
-    functions = functions_of_parameters(prepared.dim, prepared.parameters, args, own is not None)
+    functions = functions_of_parameters(
+        prepared.dim, prepared.parameters, args, own is not None, prepared.period
+    )
     most = len(judges.training) * 2 * prepared.dim / options.rows_per_term
     best: _Fitted | None = None
 
@@ -281,14 +283,16 @@ def _walked(
         ):  # fmt: skip
             if best is None or found.error.relative < best.error.relative:
                 best = found
+        stalled = best is not None and best.error.bound > judges.tolerance.bound
     except OutOfTime:
         if best is None:
             raise
+        stalled = False
     if best is None:
         raise FitError(
             f"expected more pairs: {len(prepared.y0)} are too few for any library of terms"
         )
-    return best._replace(stalled=best.error.bound > judges.tolerance.bound)
+    return best._replace(stalled=stalled)
 
 
 def _angles_and_others(prepared: Prepared) -> tuple[tuple[int, ...], tuple[str, ...]]:

@@ -17,6 +17,7 @@ import numpy as np
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.expressions import coordinate_names
+from gfnn_jax.families.family import at_time
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import fitted_gradients, significant
 from gfnn_jax.generating.charts import CHARTS, AnyChart
@@ -133,7 +134,9 @@ def _of_chart(chart: AnyChart, prepared: Prepared, judges: Judges, scene, clock:
         features=scene.features if scene is not None else None, reversor=None, own=None,
     )  # fmt: skip
     _, args = prepared.given(judges.training)
-    functions = functions_of_parameters(dim, prepared.parameters, args, own=False)
+    functions = functions_of_parameters(
+        dim, prepared.parameters, args, own=False, period=prepared.period
+    )
 
     def attempt(family: Terms) -> _Tried:
         clock.check()
@@ -147,16 +150,16 @@ def _of_chart(chart: AnyChart, prepared: Prepared, judges: Judges, scene, clock:
     )  # fmt: skip
 
 
-def _data(chart: AnyChart, prepared: Prepared, rows):
-    """(w, target gradient, args) of these rows."""
+def _data(chart: AnyChart, family: Terms, prepared: Prepared, rows):
+    """(w, target gradient, args in the middle of the step) of these rows."""
     y0, y1 = prepared.y0[rows], prepared.y1[rows]
     w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, prepared.dt)
-    return w, target, prepared.given(rows)[1]
+    return w, target, at_time(family, prepared.given(rows)[1], 0.5 * prepared.dt)
 
 
 def _fitted(chart: AnyChart, family: Terms, prepared: Prepared, judges: Judges) -> _Tried:
     """The library's S by least squares, and the error of its steps on the held-out pairs."""
-    w, target, args = _data(chart, prepared, judges.training)
+    w, target, args = _data(chart, family, prepared, judges.training)
     c = fitted_gradients(family, w, target, prepared.scale, args)
     return _judged(Generated(family, c, chart, prepared.dt, prepared.scale), prepared, judges)
 
@@ -164,14 +167,15 @@ def _fitted(chart: AnyChart, family: Terms, prepared: Prepared, judges: Judges) 
 def _judged(piece: Generated, prepared: Prepared, judges: Judges) -> _Tried:
     """With the errors of its steps; infinite where the chart folds over the held-out pairs."""
     rows, family, params = judges.held_out, piece.family, piece.params
-    w, _, args = _data(piece.chart, prepared, rows)
+    w = piece.chart.evaluation_point(prepared.y0[rows], prepared.y1[rows])
+    args = prepared.given(rows)[1]
     images, off = piece.refined_step(prepared.y0[rows], w, args)
     determinant = piece.determinant(prepared.y0[rows], prepared.y1[rows], args)
     folds = not (determinant > SINGULAR).all() and not (determinant < -SINGULAR).all()
     bad = ~(off < _SOLVED) | folds
     images = np.where(bad[:, None], np.nan, images)
     error = judges.error_of(to_user(prepared.coordinates, images), prepared.coordinates)
-    w, target, args = _data(piece.chart, prepared, judges.training)
+    w, target, args = _data(piece.chart, family, prepared, judges.training)
     left = (family.gradient(params, w, args) - target) * _weight(prepared)
     return _Tried(piece, error, float(np.sqrt(np.mean(left**2))))
 
@@ -184,7 +188,7 @@ def _weight(prepared: Prepared) -> np.ndarray:
 def _sparse(full: _Tried, prepared: Prepared, judges: Judges) -> _Tried:
     """Without the terms that the pairs do not ask for, as far as the held-out error allows."""
     piece = full.piece
-    w, target, args = _data(piece.chart, prepared, judges.training)
+    w, target, args = _data(piece.chart, piece.family, prepared, judges.training)
     weight = _weight(prepared)
     terms = (piece.family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
     residual = terms @ piece.params - (target * weight).ravel()

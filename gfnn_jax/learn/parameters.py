@@ -1,9 +1,11 @@
-"""Libraries of terms for an H that depends on parameters too: H = Σ c_jm φ_j(z) f_m(parameters).
+"""Libraries of terms for an H that depends on parameters, or on the time of a drive:
+H = Σ c_jm φ_j(z) f_m(parameters).
 
 φ_j are those of a library of the state. f_m are first the products of small whole powers of the
 parameters, which most laws are made of (p²/(m l²), g l cos q), then Chebyshev polynomials, which
 any smooth dependence is. A parameter that keeps its sign enters these by its logarithm: every power
 of it is entire in that, where a pole near the data would slow the series in the parameter itself.
+The time of a drive enters by the harmonics of its period.
 """
 
 from __future__ import annotations
@@ -17,12 +19,14 @@ import numpy as np
 
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms, joined, multiplied, polynomial_terms
+from gfnn_jax.phase_space import TIME
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Tuned on the pendulum of varied length and on Kepler's problem of varied mass.
+    """Tuned on pendulums of varied length, or driven, and on Kepler's problem of varied mass.
 
+    harmonics: of a drive, the largest, in turn.
     powers: the largest exponent of a parameter, total: of them all together. degrees: of the
     Chebyshev polynomials, in turn. boxes: (order, degree) of the libraries with angles;
     polynomials: degrees of those without; features: of a scene's. gained: a library that lowers
@@ -30,11 +34,12 @@ class Options:
     apart: the ratio of the largest to the smallest value from which on logarithms are taken.
     """
 
+    harmonics: tuple[int, ...] = (1, 2, 4)
     powers: int = 2
     total: int = 3
     degrees: tuple[int, ...] = (3, 6, 10, 15, 20, 26, 32)
-    boxes: tuple[tuple[int, int], ...] = ((1, 2), (2, 2), (2, 4), (4, 4))
-    polynomials: tuple[int, ...] = (2, 3, 4, 6, 8)
+    boxes: tuple[tuple[int, int], ...] = ((1, 2), (2, 2), (2, 4), (4, 4), (6, 6))
+    polynomials: tuple[int, ...] = (2, 3, 4, 6, 8, 10, 12, 14)
     features: tuple[int, ...] = (2, 3)
     gained: float = 0.5
     leap: float = 0.03
@@ -65,14 +70,44 @@ def state_libraries(
 
 
 def functions_of_parameters(
-    dim: int, parameters: tuple[str, ...], args: np.ndarray, own: bool, options: Options = OPTIONS
-) -> list[list[Terms]]:
+    dim: int, parameters: tuple[str, ...], args: np.ndarray, own: bool,
+    period: float | None = None, options: Options = OPTIONS,
+) -> list[list[Terms]]:  # fmt: skip
     """Rows of sets of functions of the parameters, whose values args are (N, k); in each row every
-    set spans those before it. own: whether none at all is the first."""
+    set spans those before it. own: whether none at all is the first. period: of a drive, whose
+    time is the last of them."""
     none = [_constant(dim, parameters)] if own else []
-    powers = _powers(dim, parameters, args, options)
-    series = [_chebyshev(dim, parameters, args, degree, options) for degree in options.degrees]
-    return [[*none, powers], series]
+    if period is None:
+        powers = _powers(dim, parameters, args, options)
+        series = [_chebyshev(dim, parameters, args, degree, options) for degree in options.degrees]
+        return [[*none, powers], series]
+    in_time = [_harmonics(dim, parameters, most, period) for most in options.harmonics]
+    if len(parameters) == 1:
+        return [[*none, *in_time]]
+    others = functions_of_parameters(dim, parameters[:-1], args[:, :-1], False, options=options)
+    of_all = [
+        [
+            multiplied(dataclasses.replace(functions, parameters=parameters), harmonics)
+            for functions, harmonics in _beside(row, in_time)
+        ]
+        for row in others
+    ]
+    return [[*none, *of_all[0]], *of_all[1:]]
+
+
+def _beside(row: list[Terms], harmonics: list[Terms]) -> Iterator[tuple[Terms, Terms]]:
+    """Functions of parameters with harmonics: both rise, the shorter row stays at its last."""
+    for i in range(max(len(row), len(harmonics))):
+        yield row[min(i, len(row) - 1)], harmonics[min(i, len(harmonics) - 1)]
+
+
+def _harmonics(dim: int, parameters: tuple[str, ...], most: int, period: float) -> Terms:
+    """1 and cos, sin of the drive's harmonics up to ``most``."""
+    rates = (2 * np.pi * m / period for m in range(1, most + 1))
+    turns = [TIME if rate == 1 else f"{rate!r}*{TIME}" for rate in map(float, rates)]
+    variables = tuple(f"{f}({turn})" for turn in turns for f in ("cos", "sin"))
+    rows = np.concatenate([np.zeros((1, len(variables)), int), np.eye(len(variables), dtype=int)])
+    return Terms(dim, variables, tuple(map(tuple, rows.tolist())), parameters)
 
 
 def _constant(dim: int, parameters: tuple[str, ...]) -> Terms:
@@ -132,7 +167,7 @@ def walked(
         level, here = 0, np.inf
         moves: list[tuple[int, int]] = [(0, 0)]
         while moves:
-            tried: list[tuple[float, tuple[int, int]]] = []
+            tried: list[tuple[int, float, tuple[int, int]]] = []
             for more, further in moves:
                 if at + more >= len(states) or level + further >= len(row):
                     continue
@@ -143,13 +178,19 @@ def walked(
                 yield found
                 error = error_of(found)
                 best = min(best, error)
-                tried.append((error, (more, further)))
+                tried.append((family.num_parameters, error, (more, further)))
                 if best <= bound:
                     return
                 if error < options.leap * here:
                     break
-            error, move = min(tried, default=(np.inf, (0, 0)))
-            if not error < options.gained * here:
-                break
-            at, level, here = at + move[0], level + move[1], error
-            moves = [(0, 1), (1, 0), (1, 1)]
+            # The smallest of those that are hardly worse than the best.
+            lowest = min((error for _, error, _ in tried), default=np.inf)
+            near = [entry for entry in tried if options.gained * entry[1] <= lowest]
+            _, error, move = min(near, default=(0, np.inf, (0, 0)))
+            if error < options.gained * here:
+                at, level, here = at + move[0], level + move[1], error
+                moves = [(0, 1), (1, 0), (1, 1)]
+                if move[0] and not move[1]:  # what has helped may help again
+                    moves = [(1, 0), (0, 1), (1, 1)]
+            else:  # of an even function no odd degree helps
+                moves = [(2, 0)] if moves != [(2, 0)] else []

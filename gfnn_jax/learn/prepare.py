@@ -26,8 +26,8 @@ class Prepared:
     cover their circle. before, after: pieces that were factored out, in the order in which they
     are applied around what is learned: R^½ on both sides for an affine base map R, the flow of a
     law. dt: of all pairs, or in the middle of those that differ, which are ``own_dt`` (N,). args:
-    (N, k) values of the ``parameters``, or None. structure: of many degrees of freedom, whose sizes
-    and domain are then those of its parts.
+    (N, k) values of the ``parameters``, or None. period: of a drive, whose time is their last.
+    structure: of many degrees of freedom, whose sizes and domain are then those of its parts.
     """
 
     y0: np.ndarray
@@ -44,6 +44,7 @@ class Prepared:
     args: np.ndarray | None = None
     parameters: tuple[str, ...] = ()
     structure: Structure | None = None
+    period: float | None = None
 
     @property
     def each_dt(self) -> Any:
@@ -112,7 +113,7 @@ def prepare(pairs: Pairs, coordinates: Coordinates, structure: Structure | None 
     return _sized(
         Prepared(
             y0, y1, np.ones(y0.shape[1]), empty, centres, whole, coordinates, dt, own_dt=own_dt,
-            args=args, parameters=names, structure=structure,
+            args=args, parameters=names, period=pairs.period, structure=structure,
         )
     )  # fmt: skip
 

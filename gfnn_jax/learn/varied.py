@@ -1,4 +1,5 @@
-"""Pairs that differ in more than their states: in the time between them, in parameters.
+"""Pairs that differ in more than their states: in the time between them, in parameters, in the
+time of a drive.
 
 A generating function is that of one map; a Hamiltonian serves any dt and, as a function of the
 parameters too, any system of the family.
@@ -13,7 +14,7 @@ import numpy as np
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.expressions import check_names
 from gfnn_jax.learn.prepare import Prepared
-from gfnn_jax.phase_space import Pairs, sizes
+from gfnn_jax.phase_space import TIME, Pairs, sizes
 
 _SAME = 1e-9  # of its size: a parameter, or a dt, that varies by less does not
 _PRINTED = 1e-5  # of dt: what printed times may differ by
@@ -23,8 +24,20 @@ _NEARLY_ALL = 0.9  # of the pairs
 def check_varied(pairs: Pairs) -> None:
     """Raises FitError, in one line, for a dt of each pair or args that cannot be used."""
     args = pairs.args or {}
+    if (TIME in args) != (pairs.period is not None):
+        came = "t0 without a period" if TIME in args else "a period without t0"
+        raise FitError(f"expected t0, the time of a drive, together with its period; got {came}")
+    if pairs.period is not None and not (
+        np.ndim(pairs.period) == 0
+        and np.asarray(pairs.period).dtype.kind in "fiu"
+        and 0 < float(pairs.period) < np.inf
+    ):
+        raise FitError(
+            f"expected a number that is finite and above 0 as the drive's period, got "
+            f"{pairs.period!r}"
+        )
     try:
-        check_names(pairs.dim, tuple(args))
+        check_names(pairs.dim, tuple(name for name in args if name != TIME))
     except InputError as error:
         raise FitError(str(error)) from error
     columns = {"dt": np.asarray(pairs.dt)} if np.ndim(pairs.dt) else {}
@@ -48,7 +61,8 @@ def as_varied(
 
     A dt that is the same in all is one number; so is one that is the same in nearly all, and the
     others, those across a gap, are left out unless only H is asked for. A parameter that is the
-    same in all is none. Pairs of different dt tell H alone: raises FitError where a map is asked
+    same in all is none; nor is a time of the drive, but for the message that it leaves. Pairs of
+    different dt tell H alone: raises FitError where a map is asked
     for, or a family or base of it where there are parameters.
     """
     pairs, messages = _without_constants(pairs)
@@ -80,13 +94,34 @@ def _without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
     one = float(np.mean(dt)) if dt.ndim and np.ptp(dt) <= _SAME * np.mean(dt) else pairs.dt
     args = {name: np.asarray(v, np.float64) for name, v in (pairs.args or {}).items()}
     still = [name for name, v in args.items() if np.ptp(v) <= _SAME * np.abs(v).max()]
+    period, own_time = pairs.period, []
+    if period is not None:
+        args[TIME] = np.mod(args[TIME], period)
+        still = [name for name in still if name != TIME]
+        if not np.ndim(one) and _same_phase(args[TIME], period):
+            own_time = [_one_phase(args.pop(TIME)[0], one, period)]
+            period = None
     kept = {name: v for name, v in args.items() if name not in still}
     messages = [
         f"the parameter {name} is {args[name][0]:g} in all pairs: it is left out, for its effect "
         "is not known"
         for name in still
     ]
-    return Pairs(pairs.z0, pairs.z1, one, kept or None), messages
+    return Pairs(pairs.z0, pairs.z1, one, kept or None, period=period), own_time + messages
+
+
+def _same_phase(t0: np.ndarray, period: float) -> bool:
+    """Whether all these times of a drive are one, but for whole periods."""
+    apart = np.mod(t0 - t0[0] + 0.5 * period, period) - 0.5 * period
+    return bool(np.ptp(apart) <= _SAME * period)
+
+
+def _one_phase(t0: float, dt: float, period: float) -> str:
+    told = f"all pairs begin at the drive's time t = {t0:g}: the map from there is learned"
+    turns = dt / period
+    if abs(turns - round(turns)) <= _SAME * max(turns, 1.0) and round(turns) > 0:
+        return f"{told}, that of {round(turns)} whole period{'s' * (round(turns) > 1)} of the drive"
+    return f"{told}; dt = {dt:g} is no whole number of periods: a second step is at another time"
 
 
 def given_by(prepared: Prepared) -> np.ndarray | None:

@@ -103,14 +103,15 @@ class SymplecticMap:
     domain:       where the data were, in the inner coordinates.
     scale:        (2d,) sizes of the user's coordinates.
     angle_centre: (a,) centre of the interval of length 2π in which each angle is kept.
-    dt:           the time one step takes.
+    dt:           the time one step takes; of a reversed map below 0.
     parameters:   what the system depends on beside its state, where it was learned with that.
 
     Methods take states z (2d,) or (B, 2d), NumPy or JAX, and answer with JAX arrays. A map that was
     learned with parameters takes their values too: name -> a number or (B,), or an array (k,) or
-    (B, k). They can be differentiated, in forward and reverse mode, in z, in the parameters' values
-    and in the map's own leaves, by the implicit-function theorem; ``jax.vmap`` and ``jax.jit`` work
-    over them.
+    (B, k); that of a driven system takes t0, the time of the drive at z, a number or (B,), which
+    goes on with the steps. They can be differentiated, in forward and reverse mode, in z, in the
+    parameters' values and in the map's own leaves, by the implicit-function theorem; ``jax.vmap``
+    and ``jax.jit`` work over them.
     """
 
     pieces: tuple
@@ -136,15 +137,18 @@ class SymplecticMap:
 
         saved.save(self, folder, **options)
 
-    def step(self, z, args=None, *, dt=None):
+    def step(self, z, args=None, *, dt=None, t0=None):
         """One step: (Z, Info); Info's leaves are () or (B,). dt: of `over`."""
         z = self._states(z)
         map_ = self if dt is None else self.over(dt, z.shape[:-1])
-        return _step(map_, z, self._args(args, z))
+        return _step(map_, z, self._args(args, z, t0))
 
-    def inverse(self, z, args=None):
-        """One step back: (z, Info) of Z."""
-        return self.reversed().step(z, args)
+    def inverse(self, z, args=None, *, t0=None):
+        """One step back: (z, Info) of Z. t0: the time of z, as that of the step to Z."""
+        args = self._args(args, z := self._states(z), t0)
+        if self.parameters is not None:
+            args = self.parameters.after(args, 1, self.dt)
+        return _step(self.reversed(), z, args)
 
     def over(self, dt, lanes: tuple[int, ...] = ()) -> SymplecticMap:
         """The map over another time than that of the data: of the flow of one Hamiltonian.
@@ -166,12 +170,24 @@ class SymplecticMap:
         dt = dt.astype(self.scale.dtype)
         return dataclasses.replace(self, pieces=(self.pieces[0].over(dt),), dt=dt)
 
+    def then(self, other: SymplecticMap) -> SymplecticMap:
+        """This map and the other one after it, as one map: sectors of a ring, phases of a period.
+
+        Its domain and its sizes are those of this map, its dt the sum of both. Raises ValueError
+        where the maps have different coordinates, or parameters.
+        """
+        if self.coordinates != other.coordinates or self.parameters or other.parameters:
+            raise ValueError("expected two maps of the same coordinates and without parameters")
+        return dataclasses.replace(
+            self, pieces=(*self.pieces, *other.pieces), dt=self.dt + other.dt
+        )
+
     def reversed(self) -> SymplecticMap:
         """The inverse map, as a map of its own."""
         pieces = tuple(piece.inverse() for piece in reversed(self.pieces))
-        return dataclasses.replace(self, pieces=pieces)
+        return dataclasses.replace(self, pieces=pieces, dt=-self.dt)
 
-    def defect(self, z, args=None):
+    def defect(self, z, args=None, *, t0=None):
         """Symplecticity defect () or (B,) of the step's unrolled derivative at z, in units of
         ``scale``; of many degrees of freedom by random pairs of tangent vectors.
 
@@ -179,25 +195,25 @@ class SymplecticMap:
         which would look symplectic however badly the solve had converged.
         """
         z = self._states(z)
-        args = self._args(args, z)
+        args = self._args(args, z, t0)
         ran = _step(self, z, args)[1].iterations
         # A single update is the usual case; its derivative compiles in half the time.
         once = not isinstance(ran, Tracer) and np.max(np.asarray(ran), initial=0) <= 1
         return _defect(self, z, args, 1 if once else True)
 
-    def determinant(self, z, args=None):
+    def determinant(self, z, args=None, *, t0=None):
         """Chart determinant () or (B,) at z, of the piece where it is smallest; NaN where no piece
         has a chart."""
         z = self._states(z)
-        return _determinant(self, z, self._args(args, z))
+        return _determinant(self, z, self._args(args, z, t0))
 
-    def hamiltonian(self, z, args=None):
+    def hamiltonian(self, z, args=None, *, t0=None):
         """H () or (B,) at z: what was learned where the map is the flow of one Hamiltonian; of any
         other map the modified Hamiltonian, of which ``modified_hamiltonian`` gives the error."""
         if len(self.pieces) != 1 or not isinstance(self.pieces[0], Flow):
             return self.modified_hamiltonian(z, args).value
         z = self._states(z)
-        return _hamiltonian(self, z, self._args(args, z))
+        return _hamiltonian(self, z, self._args(args, z, t0))
 
     def modified_hamiltonian(self, z, args=None) -> ModifiedHamiltonian:
         """The Hamiltonian H̃ whose flow over dt is this map, at z: its value and the error of that,
@@ -205,32 +221,36 @@ class SymplecticMap:
 
         From 32 steps to either side of z (`maps.modified_hamiltonian`). The error is small where
         the orbit turns slowly against a step (Hénon–Heiles: 1e-12 at dt 0.4, 1e-8 at 0.8), and of
-        the size of H̃ for a map that is near no flow. NaN where one of these steps fails.
+        the size of H̃ for a map that is near no flow. NaN where one of these steps fails. Raises
+        ValueError for a driven map, which keeps no energy.
         """
+        if self.parameters is not None and self.parameters.period is not None:
+            raise ValueError("expected a map without a drive: a driven one keeps no energy")
         z = self._states(z)
         return _modified(self, z, self._args(args, z))
 
-    def start(self, z0, *, params=None, stop_outside: bool = False) -> Lanes:
+    def start(self, z0, *, params=None, t0=None, stop_outside: bool = False) -> Lanes:
         """Lanes at step 0 from z0 (B, 2d). Initial states outside the domain have that status."""
         z0 = self._states(z0)
-        return _start(self, z0, self._args(params, z0), stop_outside)
+        return _start(self, z0, self._args(params, z0, t0), stop_outside)
 
     def advance(
-        self, lanes: Lanes, num_saved: int, *, params=None, save_every: int = 1,
+        self, lanes: Lanes, num_saved: int, *, params=None, t0=None, save_every: int = 1,
         stop_outside: bool = False,
     ) -> tuple[Lanes, Any]:  # fmt: skip
         """``num_saved`` blocks of ``save_every`` steps: the lanes after them, and the saved states
-        (B, num_saved, 2d). params: those that the lanes were started with."""
-        args = self._args(params, lanes.y)
+        (B, num_saved, 2d). params, t0: those that the lanes were started with."""
+        args = self._args(params, lanes.y, t0)
         return _advance(self, lanes, args, num_saved, save_every, stop_outside)
 
     def rollout(
-        self, z0, num_steps: int, *, params=None, dt=None, save_every: int = 1,
+        self, z0, num_steps: int, *, params=None, t0=None, dt=None, save_every: int = 1,
         stop_outside: bool = False,
     ) -> tuple[Any, RolloutInfo]:  # fmt: skip
         """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d).
 
-        params: the values of a map's parameters. dt: of `over`, for each step.
+        params: the values of a map's parameters. t0: the time of a drive at z0; it goes on with the
+        steps. dt: of `over`, for each step.
         Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first, and a
         RolloutInfo. A lane whose step fails, or that leaves the domain with ``stop_outside``,
         repeats NaN from there on. Raises ValueError where a number of steps or a shape is wrong.
@@ -249,11 +269,15 @@ class SymplecticMap:
             )
         z0 = self._states(z0)
         map_ = self if dt is None else self.over(dt, z0.shape[:-1])
-        args = self._args(params, z0)
+        args = self._args(params, z0, t0)
         return _rollout(map_, z0, args, num_steps // save_every, save_every, stop_outside)
 
-    def _args(self, given, z):
-        return as_args(self.parameters, given, z.shape, np.dtype(self.scale.dtype))
+    def _args(self, given, z, t0=None):
+        return as_args(self.parameters, given, z.shape, np.dtype(self.scale.dtype), t0)
+
+    def _after(self, args, steps):
+        """args that many steps (B,) later."""
+        return args if self.parameters is None else self.parameters.after(args, steps, self.dt)
 
     def _states(self, z):
         dtype = np.dtype(self.scale.dtype)
@@ -409,7 +433,7 @@ def _determinant(map_, z, args):
     for piece in map_.pieces:
         image, _ = piece.step(y, args)
         if isinstance(piece, Generated):
-            found.append(piece.determinant(y, image))
+            found.append(piece.determinant(y, image, args))
         y = image
     if not found:
         return jnp.full(z.shape[0], jnp.nan, z.dtype)
@@ -443,13 +467,14 @@ def _advanced(map_, lanes, args, num_saved, save_every, stop_outside):
     def step(lanes: Lanes) -> Lanes:
         going = lanes.status <= LEFT_DOMAIN
         y, compensation = jnp.where(going[:, None], lanes.y, jnp.nan), lanes.compensation
+        now, then = map_._after(args, lanes.steps), map_._after(args, lanes.steps + 1)
         infos = []
         for piece in map_.pieces:
-            y, compensation, info = piece.compensated_step(y, compensation, args)
+            y, compensation, info = piece.compensated_step(y, compensation, now)
             infos.append(info)
         info = _worst(infos)
         y, compensation, turns = map_._reduce(y, compensation)
-        inside, finite = map_._contains(y, args), jnp.all(jnp.isfinite(y), axis=-1)
+        inside, finite = map_._contains(y, then), jnp.all(jnp.isfinite(y), axis=-1)
         failed = jnp.where(finite, info.status, NON_FINITE)
         status = jnp.where(failed == OK, _judge(lanes.status, inside, stop_outside), failed)
         status = jnp.where(going, status, lanes.status).astype(jnp.int32)

@@ -24,6 +24,7 @@ from gfnn_jax.scenes.scene import (
 
 if TYPE_CHECKING:  # what is collected below
     from gfnn_jax.scenes.driven_pendulum import driven_pendulum
+    from gfnn_jax.scenes.driven_pendulum_phase import driven_pendulum_phase
     from gfnn_jax.scenes.fput import fput
     from gfnn_jax.scenes.henon_heiles import henon_heiles
     from gfnn_jax.scenes.henon_heiles_section import henon_heiles_section
@@ -82,6 +83,7 @@ __all__ = [
     "Section",
     "UniformInEllipse",
     "driven_pendulum",
+    "driven_pendulum_phase",
     "fput",
     "henon_heiles",
     "henon_heiles_section",

@@ -106,7 +106,8 @@ class Scene:
     parameters:    names (k,) of what differs between systems: ``hamiltonian(z, t, args)`` takes
                    their values (k,), and ``sampling`` draws them beside the states.
     period:        of a hamiltonian that depends on t. ``dt`` is a whole number of periods, so that
-                   every step is the same map.
+                   every step is the same map, unless ``any_phase``.
+    any_phase:     whether pairs and trajectories begin at any time of the period, drawn uniformly.
     invariants:    name -> ``f(z)`` -> scalar, conserved exactly by the reference.
     coordinates:   the inner coordinates a fit uses (angles, cyclic coordinates, canonical change).
     features:      ``features(y)`` -> (k,): what S is a function of, in the inner coordinates,
@@ -133,6 +134,7 @@ class Scene:
     hamiltonian: Callable | None = None
     parameters: tuple[str, ...] = ()
     period: float | None = None
+    any_phase: bool = False
     invariants: Mapping[str, Callable] = dataclasses.field(default_factory=dict)
     coordinates: Coordinates = CARTESIAN
     features: Callable | None = None
@@ -149,7 +151,9 @@ class Scene:
                 raise ValueError(f"{name} must be finite and > 0, not {value}")
         if self.parameters and self.hamiltonian is None:
             raise ValueError(f"{self.name}: parameters need a hamiltonian that takes them")
-        if self.period is not None:
+        if self.any_phase and (self.period is None or self.hamiltonian is None):
+            raise ValueError(f"{self.name}: any_phase needs a hamiltonian and its period")
+        if self.period is not None and not self.any_phase:
             periods = self.dt / self.period
             if round(periods) < 1 or abs(periods - round(periods)) > 1e-9 * periods:
                 raise ValueError(

@@ -59,15 +59,19 @@ def _solve(field, start, end, z, until=None):
 @dataclasses.dataclass(frozen=True)
 class _WithArgs:
     """The vector field of a Hamiltonian with parameters: ``field(x, t)`` for x = (z, args), z of
-    ``width``, along which args stay as they are."""
+    ``width``, along which args stay as they are. begins: whether the last of them is the time at
+    which t = 0."""
 
     hamiltonian: Callable
     width: int
+    begins: bool = False
 
     def field(self, x, t=0.0):
         z, args = x[: self.width], x[self.width :]
-        along = hamiltonian_vector_field(lambda z, t: self.hamiltonian(z, t, args))
-        return jnp.concatenate([along(z, t), jnp.zeros_like(args)])
+        begin, own = (args[-1], args[:-1]) if self.begins else (0.0, args)
+        given = (own,) if own.size else ()
+        along = hamiltonian_vector_field(lambda z, t: self.hamiltonian(z, t, *given))
+        return jnp.concatenate([along(z, begin + t), jnp.zeros_like(args)])
 
 
 def _field(hamiltonian):
@@ -142,38 +146,45 @@ def _trajectories(z0, save_every, num_saved, dt, flow, step, section, hamiltonia
 def _reference(scene: Scene) -> tuple:
     """What a trajectory of the scene depends on."""
     hamiltonian = scene.hamiltonian
-    if scene.parameters:
+    if scene.parameters or scene.any_phase:
         assert hamiltonian is not None
-        hamiltonian = _WithArgs(hamiltonian, 2 * scene.dim)
-    return scene.dt, scene.flow, scene.step, scene.section, hamiltonian, scene.period
+        hamiltonian = _WithArgs(hamiltonian, 2 * scene.dim, scene.any_phase)
+    period = None if scene.any_phase else scene.period
+    return scene.dt, scene.flow, scene.step, scene.section, hamiltonian, period
 
 
 def reference_trajectories(
-    scene: Scene, z0: States, num_steps: int, *, save_every: int = 1, params=None
+    scene: Scene, z0: States, num_steps: int, *, save_every: int = 1, params=None, t0=None
 ) -> Float[np.ndarray, "batch saved phase"]:
     """Reference trajectories from ``z0`` (B, 2d): (B, 1 + num_steps // save_every, 2d), z0 first.
 
     The scene's exact flow or exact map where it has one, else Dopri8, to its section where it has
-    one. Time starts at 0. params: (k,) or (B, k), where the scene has parameters. Angles are not
-    reduced. From where a state escapes or collides its own row is NaN, and no other lane's.
+    one. Time starts at 0, or at t0 (B,) where the scene has any phase. params: (k,) or (B, k),
+    where the scene has parameters. Angles are not reduced. From where a state escapes or collides
+    its own row is NaN, and no other lane's.
     """
     require_x64("a reference trajectory")
     z0 = np.asarray(z0, np.float64)
-    x0 = _with_params(scene, z0, params)
+    x0 = _with_params(scene, z0, params, t0)
     saved = _trajectories(x0, save_every, num_steps // save_every, *_reference(scene))
     saved = np.moveaxis(np.asarray(saved), 0, 1)[..., : z0.shape[1]]
     return np.concatenate([z0[:, None], saved], axis=1)
 
 
-def _with_params(scene: Scene, z0, params):
-    """States and parameters beside each other (B, 2d + k)."""
+def _with_params(scene: Scene, z0, params, t0=None):
+    """States, parameters and the time at which they begin, beside each other (B, 2d + k)."""
+    if (t0 is not None) != scene.any_phase:
+        wanted = "t0, the time of the drive" if scene.any_phase else "no t0"
+        raise ValueError(f"expected {wanted} for the scene {scene.name}")
     count = len(scene.parameters)
     if (params is not None) != bool(count):
         wanted = f"params {', '.join(scene.parameters)}" if count else "no params"
         raise ValueError(f"expected {wanted} for the scene {scene.name}")
-    if not count:
-        return z0
-    return np.concatenate([z0, np.broadcast_to(params, (len(z0), count))], axis=1)
+    if count:
+        z0 = np.concatenate([z0, np.broadcast_to(params, (len(z0), count))], axis=1)
+    if t0 is not None:
+        z0 = np.concatenate([z0, np.broadcast_to(t0, len(z0))[:, None]], axis=1)
+    return z0
 
 
 def flow_step(field: Callable, dt: float, tolerance: float) -> Callable:
@@ -213,13 +224,16 @@ def reference_error(scene: Scene, z0: States, num_steps: int) -> float:
     For an integrated scene that second one takes every solve as two, so that both its steps and
     its roundoff differ. An exact flow or map errs by roundoff only, as does a return to a section:
     there the initial state is moved by one unit of it. Lanes that do not stay finite are left out;
-    NaN where none does.
+    NaN where none does. A scene of any phase begins at the drive's time 0.
     """
-    first = reference_trajectories(scene, z0, num_steps)
+    t0 = 0.0 if scene.any_phase else None
+    first = reference_trajectories(scene, z0, num_steps, t0=t0)
     if scene.flow is None and not scene.timeless:
-        halves = 2 if scene.period is None else 2 * round(scene.dt / scene.period)
-        halved = dataclasses.replace(scene, dt=scene.dt / halves, period=None)
-        second = reference_trajectories(halved, z0, halves * num_steps, save_every=halves)
+        period = None if scene.any_phase else scene.period
+        halves = 2 if period is None else 2 * round(scene.dt / period)
+        own = scene.period if scene.any_phase else None
+        halved = dataclasses.replace(scene, dt=scene.dt / halves, period=own)
+        second = reference_trajectories(halved, z0, halves * num_steps, save_every=halves, t0=t0)
     else:
         moved = np.asarray(z0, np.float64) * (1 + np.finfo(np.float64).eps)
         second = reference_trajectories(scene, moved, num_steps)
@@ -284,6 +298,15 @@ def sample_params(
     return _draw(scene, law, num, key)[:, 2 * scene.dim :]
 
 
+def sample_t0(scene: Scene, num: int, key) -> Float[np.ndarray, "num"] | None:
+    """Times of the drive (num,), uniform over its period, at which the states drawn with the same
+    key begin; None where the scene has not any phase."""
+    if not scene.any_phase:
+        return None
+    assert scene.period is not None
+    return scene.period * np.asarray(_uniform(jax.random.fold_in(key, 2), num=num))
+
+
 def sample_test_states(scene: Scene, num: int, key) -> Drawn:
     """``num`` states for rollouts to start from, (num, 2d): the training law unless declared."""
     return _draw(scene, scene.test_states or scene.sampling, num, key)[:, : 2 * scene.dim]
@@ -293,8 +316,10 @@ def sample_sequences(
     scene: Scene, num: int, length: int, key
 ) -> Float[np.ndarray, "num length phase"]:
     """``num`` reference sequences of ``length`` states each, from states of the training law."""
-    params = sample_params(scene, num, key)
-    return reference_trajectories(scene, sample_states(scene, num, key), length - 1, params=params)
+    return reference_trajectories(
+        scene, sample_states(scene, num, key), length - 1, params=sample_params(scene, num, key),
+        t0=sample_t0(scene, num, key),
+    )  # fmt: skip
 
 
 def sample_pairs(
@@ -307,11 +332,14 @@ def sample_pairs(
     """
     params = sample_params(scene, num_pairs, key)
     args = None if params is None else dict(zip(scene.parameters, params.T, strict=True))
+    t0 = sample_t0(scene, num_pairs, key)
+    period = None if t0 is None else scene.period
     if dt_range is None:
         z = sample_sequences(scene, num_pairs, 2, key)
-        return Pairs(z[:, 0], z[:, 1], scene.dt, args)
+        return Pairs(z[:, 0], z[:, 1], scene.dt, args, t0, period)
     low, high = dt_range
-    if scene.timeless or scene.period is not None or not 0 < low < high < np.inf:
+    stroboscopic = scene.period is not None and not scene.any_phase
+    if scene.timeless or stroboscopic or not 0 < low < high < np.inf:
         raise ValueError(
             f"expected 0 < shortest < longest dt, of an autonomous flow; got {low:g} and {high:g} "
             f"for the scene {scene.name}"
@@ -319,8 +347,9 @@ def sample_pairs(
     z0 = sample_states(scene, num_pairs, key)
     dt = low + (high - low) * np.asarray(_uniform(jax.random.fold_in(key, 1), num=num_pairs))
     reference = _reference(scene)
-    z1 = _after(_with_params(scene, z0, params), dt, flow=reference[1], hamiltonian=reference[4])
-    return Pairs(z0, np.asarray(z1)[:, : z0.shape[1]], dt, args)
+    x0 = _with_params(scene, z0, params, t0)
+    z1 = _after(x0, dt, flow=reference[1], hamiltonian=reference[4])
+    return Pairs(z0, np.asarray(z1)[:, : z0.shape[1]], dt, args, t0, period)
 
 
 @partial(jax.jit, static_argnames=("num",))

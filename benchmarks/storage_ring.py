@@ -1,0 +1,412 @@
+"""One-turn maps of storage rings, learned from a tracking code (PyAT) and compared with it.
+
+    python -m pip install '.[accelerator]'
+    python benchmarks/storage_ring.py            every piece that has no result yet (half an hour)
+    python benchmarks/storage_ring.py --quick    a small one
+
+The lattices are those that PyAT ships: `err.mat`, a whole ring with errors, and `hmba.mat`, a cell
+of ESRF-EBS. States are (x, y, p_x, p_y) about the closed orbit, in metres and radians, four
+dimensional: the energy deviation is fixed. Pairs are drawn from an ellipsoid whose half axes are
+amplitudes of 2 mm in x and in y at the point where a turn begins.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import time
+import warnings
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from harness import (
+    FIGURES,
+    SEED,
+    TABLES,
+    Numbers,
+    between_markers,
+    main,
+    markdown,
+    number,
+    provenance,
+    results,
+    timed,
+)
+from scipy.optimize import minimize_scalar
+
+import gfnn_jax as gfnn
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+
+AMPLITUDE = 2e-3  # metres, in x and in y
+NUM_PAIRS, FRESH, BATCH = 5_000, 1_000, 1_000
+TURNS, ORBITS = 300, 20  # compared with the tracking code
+TUNE_TURNS = 1_024
+# (x, p_x, y, p_y) of PyAT as (x, y, p_x, p_y), which is its own inverse.
+ORDER = [0, 2, 1, 3]
+
+
+class Ring(NamedTuple):
+    """A lattice without cavities and radiation; optics where a turn begins, beta and alpha (2,).
+    orbits: closed orbit (4,) in PyAT's order at the element of that number."""
+
+    lattice: Any
+    beta: np.ndarray
+    alpha: np.ndarray
+    orbits: dict[int, np.ndarray]
+
+    def track(self, z, points: tuple[int, ...] = (), turns: int = 1) -> np.ndarray:
+        """States (turns, points, N, 4) after these elements of each turn; the last one unless
+        told. NaN where a particle is lost."""
+        points = points or (len(self.lattice),)
+        start = np.zeros((6, len(z)), order="F")
+        start[:4] = (np.asarray(z)[:, ORDER] + self.orbit(0)).T
+        out, *_ = self.lattice.track(start, nturns=turns, refpts=list(points))
+        orbits = np.stack([self.orbit(i) for i in points])
+        return (out[:4].transpose(3, 2, 1, 0) - orbits[:, None])[..., ORDER]
+
+    def orbit(self, element: int) -> np.ndarray:
+        if element not in self.orbits:
+            _, found = self.lattice.find_orbit4(refpts=[element])
+            self.orbits[element] = found[0, :4]
+        return self.orbits[element]
+
+    def half_axes(self, x: float, y: float) -> np.ndarray:
+        """(4,) of the ellipsoid of these amplitudes."""
+        return np.array([x, y, x / self.beta[0], y / self.beta[1]])
+
+    def normalised(self, z) -> np.ndarray:
+        """Complex √(2J) exp(−iφ) of both planes (..., 2): Courant and Snyder's coordinates."""
+        q, p = z[..., :2], z[..., 2:]
+        return (q - 1j * (self.alpha * q + self.beta * p)) / np.sqrt(self.beta)
+
+    def boundaries(self, count: int) -> tuple[int, ...]:
+        """The elements after which the cells lie that cut the ring into so many equal parts."""
+        s = self.lattice.get_s_pos(range(len(self.lattice) + 1))
+        inner = (int(np.argmin(np.abs(s - s[-1] * k / count))) for k in range(1, count))
+        return (*inner, len(self.lattice))
+
+
+@cache
+def ring(name: str) -> Ring:
+    """A lattice of PyAT's machine_data."""
+    try:
+        import at
+        import machine_data
+    except ImportError as error:
+        raise SystemExit("expected PyAT: python -m pip install '.[accelerator]'") from error
+    folder = Path(next(iter(machine_data.__path__)))
+    logging.disable(logging.WARNING)
+    # Thousands of warnings of old element classes.
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        lattice = at.load_lattice(folder / name).disable_6d(copy=True)
+        optics, _, _ = lattice.get_optics()
+    return Ring(lattice, optics.beta, optics.alpha, {})
+
+
+def ellipsoid(half_axes, count: int, seed: int) -> np.ndarray:
+    """States (count, 4), uniform within it."""
+    rng = np.random.default_rng([SEED, seed])
+    u = rng.normal(size=(count, 4))
+    u *= rng.uniform(size=(count, 1)) ** 0.25 / np.linalg.norm(u, axis=1, keepdims=True)
+    return u * half_axes
+
+
+# One turn
+
+
+def learned(sectors: list[np.ndarray]) -> tuple[SymplecticMap, list[gfnn.Fit]]:
+    """The map of the sectors' maps in a row, from states at their ends (K + 1, N, 4)."""
+    fits = []
+    for before, after in pairwise(sectors):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", gfnn.FitWarning)
+            pairs = gfnn.Pairs(before[:NUM_PAIRS], after[:NUM_PAIRS], 1 / (len(sectors) - 1))
+            fits.append(gfnn.fit(pairs, learn="map", tolerance=1e-9, max_seconds=None, seed=SEED))
+    map_ = fits[0].map
+    for fit in fits[1:]:
+        map_ = map_.then(fit.map)
+    return map_, fits
+
+
+def polynomial(before, after, degree: int):
+    """z -> Z by an explicit polynomial of this degree, fitted to the same pairs: as accurate as a
+    truncated Taylor map and, like one, not symplectic."""
+    from numpy.polynomial import chebyshev
+
+    size = 1.05 * np.abs(before).max(axis=0)
+    powers = np.array(list(np.ndindex(*[degree + 1] * 4)))
+    powers = powers[powers.sum(axis=1) <= degree]
+
+    def design(z):
+        tables = [chebyshev.chebvander(z[:, i] / size[i], degree) for i in range(4)]
+        return np.prod([t[:, powers[:, i]] for i, t in enumerate(tables)], axis=0)
+
+    coefficients = np.linalg.lstsq(design(before), after, rcond=None)[0]
+    return lambda z: design(z) @ coefficients
+
+
+def turn(quick: bool) -> Numbers:
+    """One turn of the ring with errors, by one, two and four generated pieces."""
+    err = ring("err.mat")
+    half = err.half_axes(AMPLITUDE, AMPLITUDE)
+    count = 600 if quick else NUM_PAIRS + FRESH
+    z, points = ellipsoid(half, count, 0), err.boundaries(4)
+    started = time.perf_counter()
+    ends = [z, *err.track(z, points)[0]]
+    tracking = time.perf_counter() - started
+    few = ellipsoid(half, 4 if quick else ORBITS, 1)
+    turns = 20 if quick else TURNS
+    orbits = err.track(few, turns=turns)[:, 0]
+    spread, fresh = z.std(axis=0), slice(-FRESH // 10 if quick else -FRESH, None)
+
+    def errors(step, rollout) -> Numbers:
+        one = (step(z[fresh]) - ends[-1][fresh]) / spread
+        far = (rollout(few) - orbits[-1]) / spread
+        return {"one_turn": float(np.sqrt(np.mean(one**2))),
+                "after_turns": float(np.sqrt(np.nanmedian(np.mean(far**2, axis=1)))),
+                "lost": int(np.isnan(far).any(axis=1).sum())}  # fmt: skip
+
+    rows: list[Numbers] = []
+    for cuts in ((0, 4),) if quick else ((0, 4), (0, 2, 4), (0, 1, 2, 3, 4)):
+        started = time.perf_counter()
+        map_, fits = learned([ends[i] for i in cuts])
+        seconds = time.perf_counter() - started
+        batch = ellipsoid(half, BATCH, 2)
+        step = timed(lambda m=map_, b=batch: m.rollout(b, num_steps=100, save_every=100))
+        found = errors(
+            lambda x, m=map_: np.asarray(m.step(x)[0]),
+            lambda x, m=map_: np.asarray(m.rollout(x, num_steps=turns, save_every=turns)[0])[:, -1],
+        )
+        rows.append({
+            "map": f"{len(fits)} generated", "label": fits[0].chosen.label, **found,
+            "fit_seconds": seconds, "microseconds_per_turn": step.seconds / 100 / BATCH * 1e6,
+            "defect": float(np.max(np.asarray(map_.defect(few)))),
+        })  # fmt: skip
+    degree = 3 if quick else 9  # as many digits of a Taylor series as S of degree 10
+    explicit = polynomial(z[:NUM_PAIRS], ends[-1][:NUM_PAIRS], degree)
+
+    def repeated(x):
+        with np.errstate(all="ignore"):
+            for _ in range(turns):
+                x = explicit(x)
+        return x
+
+    rows.append({"map": "explicit polynomial", "label": f"degree {degree}",
+                 **errors(explicit, repeated)})  # fmt: skip
+    return {
+        "rows": rows, "num_pairs": min(count, NUM_PAIRS), "turns": turns,
+        "tracking_microseconds_per_turn": tracking / count * 1e6,
+        "num_elements": len(err.lattice), "spread": spread.tolist(),
+    }  # fmt: skip
+
+
+# Tunes
+
+
+def tune(signal) -> float:
+    """The frequency, in cycles per turn, of the largest line of a complex signal (N,): Laskar's
+    frequency analysis with a Hann window."""
+    n = np.arange(len(signal))
+    window = np.hanning(len(signal)) * signal
+
+    def power(frequency):
+        return -abs(window @ np.exp(-2j * np.pi * frequency * n))
+
+    coarse = np.argmax(np.abs(np.fft.fft(window))) / len(signal)
+    width = 1 / len(signal)
+    found = minimize_scalar(
+        power, bounds=(coarse - width, coarse + width), method="bounded", options={"xatol": 1e-12}
+    )
+    return float(found.x % 1.0)
+
+
+def tunes(quick: bool) -> Numbers:
+    """Tunes against amplitude, of the map in one piece and of the tracking code."""
+    err = ring("err.mat")
+    half = err.half_axes(AMPLITUDE, AMPLITUDE)
+    z, points = ellipsoid(half, 600 if quick else NUM_PAIRS, 0), err.boundaries(4)
+    ends = [z, *err.track(z, points)[0]]
+    amplitudes = np.linspace(0.1, 0.9, 2 if quick else 9) * AMPLITUDE
+    small = 0.05 * AMPLITUDE
+    start = np.zeros((2 * len(amplitudes), 4))
+    start[: len(amplitudes), 0], start[: len(amplitudes), 1] = amplitudes, small
+    start[len(amplitudes) :, 1], start[len(amplitudes) :, 0] = amplitudes, small
+    turns = 128 if quick else TUNE_TURNS
+    orbits = np.concatenate([start[None], err.track(start, turns=turns)[:, 0]])
+
+    def found(states) -> np.ndarray:
+        signals = err.normalised(states)  # (turns + 1, N, 2)
+        return np.array([[tune(signals[:, i, k]) for k in (0, 1)] for i in range(len(start))])
+
+    theirs, rows = found(orbits), {}
+    for cuts in ((0, 4),) if quick else ((0, 4), (0, 1, 2, 3, 4)):
+        map_, fits = learned([ends[i] for i in cuts])
+        states = np.asarray(map_.rollout(start, num_steps=turns)[0]).transpose(1, 0, 2)
+        rows[f"{len(fits)} generated"] = found(states)
+    return {
+        "amplitudes": amplitudes.tolist(), "tracked": theirs.tolist(), "turns": turns,
+        "learned": {name: ours.tolist() for name, ours in rows.items()},
+        "largest_difference": {
+            name: float(np.abs(ours - theirs).max()) for name, ours in rows.items()
+        },
+    }  # fmt: skip
+
+
+# A million turns
+
+
+def long(quick: bool) -> Numbers:
+    """Fifty particles over a million turns: what becomes of their action."""
+    err = ring("err.mat")
+    half = err.half_axes(AMPLITUDE, AMPLITUDE)
+    z = ellipsoid(half, 600 if quick else NUM_PAIRS, 0)
+    map_, _ = learned([z, err.track(z)[0, 0]])
+    turns, every, particles = (1_000, 10, 5) if quick else (1_000_000, 97, 50)
+    start = ellipsoid(0.6 * half, particles, 3)
+    started = time.perf_counter()
+    states, info = map_.rollout(start, num_steps=turns, save_every=every)
+    states = np.asarray(states)
+    seconds = time.perf_counter() - started
+    action = np.sum(np.abs(err.normalised(states)) ** 2, axis=-1) / 2  # (B, saved)
+    block = 5 if quick else 50
+    count = action.shape[1] // block
+    means = action[:, : block * count].reshape(len(action), count, block).mean(axis=2)
+    change = np.abs(means / means[:, :1] - 1)[:, 1:]
+    size, step = np.median(change, axis=0), every * block * np.arange(1, count)
+    exponent = float(np.polyfit(np.log(step), np.log(size), 1)[0])
+    return {
+        "turns": turns, "particles": particles, "seconds": seconds,
+        "status": np.bincount(np.asarray(info.status), minlength=5).tolist(),
+        "drift_exponent": exponent, "change_at_the_end": float(size[-count // 10 :].mean()),
+        "oscillation": float(np.median(action.std(axis=1) / action.mean(axis=1))),
+    }  # fmt: skip
+
+
+# The dynamic aperture
+
+
+def aperture(quick: bool) -> Numbers:
+    """Where orbits of one cell get lost within 1,000 passages, along nine rays: of the map and of
+    the tracking code, both by a scan in steps of 0.1 mm."""
+    cell = ring("hmba.mat")
+    half, turns = cell.half_axes(14e-3, 9e-3), 100 if quick else 1_000
+    z = ellipsoid(half, 800 if quick else NUM_PAIRS, 0)
+    map_, (fit,) = learned([z, cell.track(z)[0, 0]])
+    angles = np.linspace(0, np.pi, 3 if quick else 9)
+    radii = np.arange(4e-3, 14e-3, 1e-3 if quick else 1e-4)
+    start = np.zeros((len(angles), len(radii), 4))
+    start[..., 0] = radii * np.cos(angles)[:, None]
+    start[..., 1] = radii * np.sin(angles)[:, None]
+    flat = start.reshape(-1, 4)
+    began = time.perf_counter()
+    tracked = cell.track(flat, turns=turns)[-1, 0]
+    theirs = time.perf_counter() - began
+
+    def run():
+        return map_.rollout(flat, num_steps=turns, save_every=turns)[1]
+
+    info = timed(run, 1)
+    # A particle is lost where the domain of the data ends: the map knows nothing beyond.
+    lost = np.asarray(info.out.left_at) >= 0
+    lost |= np.asarray(info.out.status) > 1
+
+    def border(gone) -> np.ndarray:
+        gone = gone.reshape(start.shape[:2])
+        return np.where(gone.any(axis=1), radii[np.argmax(gone, axis=1)], np.nan)
+
+    of_map, of_tracking = border(lost), border(np.isnan(tracked).any(axis=1))
+    return {
+        "angles": angles.tolist(), "map": of_map.tolist(), "tracking": of_tracking.tolist(),
+        "turns": turns,
+        "largest_difference": float(np.max(np.abs(of_map / of_tracking - 1))),
+        "label": fit.chosen.label, "one_turn": fit.chosen.validation_relative,
+        "seconds": info.seconds, "tracking_seconds": theirs,
+    }  # fmt: skip
+
+
+PIECES = {"turn": turn, "tunes": tunes, "long": long, "aperture": aperture}
+
+
+def tables() -> None:
+    """The tables of RESULTS.md and the figure."""
+    found = results(PIECES, "ring")
+    text = []
+    if "turn" in found:
+        m = found["turn"]["measured"]
+        tracking = m["tracking_microseconds_per_turn"]
+        rows = [
+            [
+                row["map"], row["label"], number(row["one_turn"]), number(row["after_turns"]),
+                str(row["lost"]), number(row.get("defect")), number(row.get("fit_seconds")),
+                number(row.get("microseconds_per_turn")),
+                number(tracking / row["microseconds_per_turn"])
+                if "microseconds_per_turn" in row else "–",
+            ]
+            for row in m["rows"]
+        ]  # fmt: skip
+        heads = (
+            "`err.mat`, one turn", "largest", "one turn ÷ spread", f"after {m['turns']} turns",
+            "lost", "defect", "fit, all in, s", "µs a turn", "times faster than tracking",
+        )  # fmt: skip
+        text.append(markdown(heads, rows))
+    heads, rows = ("what", "measured", "asked"), []
+    if "tunes" in found:
+        difference = found["tunes"]["measured"]["largest_difference"]
+        told = ", ".join(f"{name} {number(value)}" for name, value in difference.items())
+        rows.append(["tunes of 18 orbits up to 1.8 mm, largest difference", told, "1e-6"])
+    if "long" in found:
+        m = found["long"]["measured"]
+        rows.append([
+            f"{m['particles']} particles, {m['turns']:,} turns: drift exponent of the mean action",
+            f"{number(m['drift_exponent'])} (change {number(m['change_at_the_end'])} of itself; "
+            f"{m['status'][0]} stayed in the domain; {number(m['seconds'])} s)", "0.6",
+        ])  # fmt: skip
+    if "aperture" in found:
+        m = found["aperture"]["measured"]
+        rows.append([
+            f"dynamic aperture of `hmba.mat`, {m['turns']:,} passages, nine rays: largest "
+            "difference",
+            f"{100 * m['largest_difference']:.1f} % ({number(m['seconds'])} s; tracking "
+            f"{number(m['tracking_seconds'])} s)", "5 %",
+        ])  # fmt: skip
+    if rows:
+        text.append(markdown(heads, rows))
+    if text:
+        between_markers(TABLES, "ring", "\n\n".join([*text, provenance(found)]))
+    if {"tunes", "aperture"} <= set(found):
+        figure(found["tunes"]["measured"], found["aperture"]["measured"])
+
+
+def figure(tunes_: Numbers, aperture_: Numbers) -> None:
+    """Tunes against amplitude, and the dynamic aperture, of map and tracking."""
+    import matplotlib.pyplot as plt
+
+    drawn, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+    amplitudes = 1e3 * np.asarray(tunes_["amplitudes"])
+    theirs = np.asarray(tunes_["tracked"])
+    ours = np.asarray(next(iter(tunes_["learned"].values())))
+    for plane, (name, colour) in enumerate((("x", "C0"), ("y", "C1"))):
+        rows = slice(plane * len(amplitudes), (plane + 1) * len(amplitudes))
+        for k, style in enumerate(("-", "--")):
+            label = f"$\\nu_{'xy'[k]}$ against {name}"
+            shift = theirs[rows, k] - theirs[rows, k][0]
+            left.plot(amplitudes, 1e3 * shift, style, color=colour, label=label)
+            left.plot(amplitudes, 1e3 * (ours[rows, k] - theirs[rows, k][0]), ".", color=colour)
+    left.set(xlabel="amplitude [mm]", ylabel="tune shift × 1,000", title="tracking, and map (dots)")
+    left.legend(fontsize=8)
+    angles = np.asarray(aperture_["angles"])
+    for name, style in (("tracking", "-"), ("map", "o")):
+        radii = 1e3 * np.asarray(aperture_[name], float)
+        right.plot(radii * np.cos(angles), radii * np.sin(angles), style, label=name)
+    right.set(xlabel="x [mm]", ylabel="y [mm]", title="dynamic aperture of a cell")
+    right.legend(fontsize=8)
+    drawn.savefig(FIGURES / "storage-ring.png", dpi=150)
+
+
+if __name__ == "__main__":
+    main(__doc__ or "", PIECES, "ring", tables, None, ("aperture",))

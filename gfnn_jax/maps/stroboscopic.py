@@ -1,0 +1,99 @@
+"""The stroboscopic map of a driven system: its steps at the phases of one period, composed.
+
+Each step is symplectic, and so is their product; seen once a period, the system is one map and the
+time is gone from it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.maps.parameters import Parameters
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+
+_WHOLE = 1e-9  # of a step: what a whole number of them may miss
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("piece", "parameters", "t0", "dt"),
+    meta_fields=("steps", "backward"),
+)
+@dataclasses.dataclass(frozen=True, eq=False)
+class OverPhases:
+    """A driven piece at the times t0 + n dt, n from 0 to ``steps`` − 1. A piece without args.
+
+    parameters: of the map, whose only one is the time. backward: whether it is the inverse of the
+    row, which is applied from its end.
+    """
+
+    piece: Any
+    parameters: Parameters
+    t0: Any
+    dt: Any
+    steps: int
+    backward: bool = False
+
+    def step(self, z, args=None, *, unrolled: bool | int = False):
+        """(Z, Info) of the states z (B, 2d), by JAX."""
+        return self._row(lambda z, at: self.piece.step(z, at, unrolled=unrolled), z)
+
+    def compensated_step(self, z, compensation, args=None):
+        """(Z, compensation, Info) of z + compensation."""
+
+        def step(both, at):
+            *both, info = self.piece.compensated_step(*both, at)
+            return tuple(both), info
+
+        (z, compensation), info = self._row(step, (z, compensation))
+        return z, compensation, info
+
+    def action(self, z, image, origin, args=None):
+        """The action (B,) of the row from z (B, 2d): the sum of its steps'."""
+
+        def step(both, at):
+            z, total = both
+            image, info = self.piece.step(z, at)
+            return (image, total + self.piece.action(z, image, origin, at)), info
+
+        return self._row(step, (z, jnp.zeros(z.shape[:1], z.dtype)))[0][1]
+
+    def inverse(self) -> OverPhases:
+        """The inverse steps from the last to the first."""
+        return dataclasses.replace(self, piece=self.piece.inverse(), backward=not self.backward)
+
+    def _row(self, step, carry):
+        def following(carry, number):
+            # Backward, a piece begins where its step forward ends.
+            n = self.steps - number if self.backward else number
+            return step(carry, self.parameters.after(jnp.reshape(self.t0, (1, 1)), n, self.dt))
+
+        carry, infos = jax.lax.scan(following, carry, jnp.arange(self.steps))
+        return carry, jax.tree.map(lambda a: jnp.max(a, axis=0), infos)
+
+
+def stroboscopic(map_: SymplecticMap, t0: float = 0.0) -> SymplecticMap:
+    """The map over one period of the drive, from its time ``t0``: of a map that is one driven
+    piece, the time its only parameter, and dt a whole part of the period.
+
+    Raises ValueError for any other map.
+    """
+    known = map_.parameters
+    if known is None or known.period is None or len(known.names) > 1 or len(map_.pieces) != 1:
+        raise ValueError("expected a driven map of one piece and no parameter but the time")
+    dt, period = float(np.asarray(map_.dt)), float(np.asarray(known.period))
+    steps = round(period / dt)
+    if steps < 1 or abs(period / dt - steps) > _WHOLE * steps:
+        raise ValueError(
+            f"expected a dt that is a whole part of the period {period:g}, got {dt:g}: choose it "
+            "by map.over(dt)"
+        )
+    dtype = np.dtype(map_.scale.dtype)
+    piece = OverPhases(map_.pieces[0], known, np.asarray(t0, dtype), np.asarray(dt, dtype), steps)
+    return dataclasses.replace(map_, pieces=(piece,), dt=np.asarray(period, dtype), parameters=None)
