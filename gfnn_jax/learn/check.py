@@ -136,8 +136,11 @@ def _check_structured(
     """Raises FitError for what does not go with a structure."""
     if learn == "map" or (family, chart, base) != ("auto", "auto", None):
         raise FitError("a structure is that of H: expected no learn='map', family, chart or base")
-    if angles or pairs.args or (scene is not None and scene.coordinates != CARTESIAN):
-        raise FitError("a structure goes with plain q and p: expected no angles and no parameters")
+    varied = pairs.args or pairs.period is not None
+    if angles or varied or (scene is not None and scene.coordinates != CARTESIAN):
+        raise FitError(
+            "a structure goes with plain q and p: expected no angles, parameters or drive"
+        )
     if terms and str(structure).startswith("bodies"):
         raise FitError("terms go with a ring or a chain: those of bodies are powers of distances")
     for term in terms:

@@ -199,8 +199,9 @@ def fit(
     terms:     of H that the user knows: text such as "1/sqrt(q1**2 + q2**2)", or functions of z.
     base:      a Hamiltonian that the user knows a part of the map by, as such text or a function:
                its flow is factored out, and S learns what it leaves over.
-    structure: "ring" or "chain" of equal sites: H is a sum over them, whose ``terms`` are text in a
-               site's q1, p1 and the next ones' q2, p2, …; None: the scene's own.
+    structure: "ring" or "chain" of equal sites, whose ``terms`` are text in a site's q1, p1 and the
+               next ones' q2, p2, …; "bodies:N", q body by body: H is a sum over sites, or over
+               bodies and pairs. None: the scene's own.
     family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp".
     chart:     "auto" or one of type1, type2, type3, midpoint.
     angles:    without a scene, the indices of z that have period 2π.

@@ -112,7 +112,7 @@ def structure_of(text: str | None, dim: int) -> Structure | None:
     ``dim`` degrees of freedom."""
     if text is None:
         return None
-    kind, _, number = text.partition(":")
+    kind, _, number = str(text).partition(":")
     if kind == "bodies" and number.isdecimal() and int(number) > 1:
         count = int(number)
         if dim % count or not 1 <= dim // count <= 3:
