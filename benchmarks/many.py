@@ -37,7 +37,7 @@ from gfnn_jax.families.terms import Terms
 from gfnn_jax.flows.collocation import Steps, images
 
 FRESH = 4  # states that a row is judged by; of bodies more
-SIZES = (10, 100, 1_000, 10_000)
+SIZES = (10, 100, 1_000, 3_000, 10_000)
 CLOSE = 32  # parts of a step of three bodies, whose close passages one step does not resolve
 
 
