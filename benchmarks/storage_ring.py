@@ -94,8 +94,8 @@ class Ring(NamedTuple):
 def ring(name: str) -> Ring:
     """A lattice of PyAT's machine_data."""
     try:
-        import at
         import machine_data
+        from at import load_lattice
     except ImportError as error:
         raise SystemExit("expected PyAT: python -m pip install '.[accelerator]'") from error
     folder = Path(next(iter(machine_data.__path__)))
@@ -103,7 +103,7 @@ def ring(name: str) -> Ring:
     # Thousands of warnings of old element classes.
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
-        lattice = at.load_lattice(folder / name).disable_6d(copy=True)
+        lattice: Any = load_lattice(folder / name).disable_6d(copy=True)
         optics, _, _ = lattice.get_optics()
     return Ring(lattice, optics.beta, optics.alpha, {})
 

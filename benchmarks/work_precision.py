@@ -32,6 +32,7 @@ from harness import (
     in_float32,
     markdown,
     number,
+    one_step_rms,
     provenance,
     results,
     timed,
@@ -60,6 +61,13 @@ SCENES = {
     "standard-map-chaotic": (1_000, 10, 1_000),
 }
 QUICK = ("standard-map-regular", "henon-heiles-regular")
+# Scenes whose law is learned too: few pairs, and the terms of H that are told, in the scene's own
+# coordinates. A flow for each error asked for, and a map made from the law for each.
+LAWS = {
+    "two-body": (200, ("1/q1", "p2**2/q1**2", "p1**2")),
+    "henon-heiles-regular": (100, ()),
+}
+LAW_TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 SINGLE_STEPS, STRIDE, MOST_SIZES = 1_000, 10, 5
 FLOAT32_FLOOR = 1e-7  # of the data's spread: a larger map is no more accurate in float32
 CHARTS = ("midpoint", "type2")
@@ -214,6 +222,39 @@ def our_maps(bench: Bench, num_pairs: int, quick: bool, omit) -> Iterator[Number
             at_floor = candidate.validation_relative < FLOAT32_FLOOR
 
 
+def our_laws(bench: Bench, quick: bool) -> Iterator[Numbers]:
+    """The flow of a law that was learned from few pairs, at rising precision, and maps that are
+    made from the law."""
+    scene, (num_pairs, terms) = bench.scene, LAWS[bench.scene.name]
+    pairs, fresh = drawn(scene, num_pairs, quick=True)
+    shown: set[str] = set()
+    for tolerance in LAW_TOLERANCES[-1:] if quick else LAW_TOLERANCES:
+        law = gfnn.fit(pairs, scene, learn="hamiltonian", terms=terms, seed=SEED,
+                       tolerance=0.1 * tolerance)  # fmt: skip
+        assert law.hamiltonian is not None
+        flow = law.hamiltonian.flow
+        print(f"  law: {flow.stages} stages in {flow.substeps} substeps", flush=True)
+        found = [
+            ("flow of a law", law, f"{num_pairs} pairs, stages: {flow.stages * flow.substeps}")
+        ]
+        if tolerance == LAW_TOLERANCES[-1]:
+            found += [
+                ("map of a law", fast, f"{fast.chosen.label}")
+                for fast in (law.accelerate(tolerance=t) for t in LAW_TOLERANCES)
+            ]
+        for method, fit, label in found:
+            if f"{method} {label}" in shown:
+                continue
+            shown.add(f"{method} {label}")
+            yield {
+                "group": OURS, "method": method, "label": label, "chart": fit.chosen.chart,
+                "num_parameters": fit.chosen.num_parameters, "base_map": fit.base_map,
+                "one_step_rms": one_step_rms(fit.map, fresh, angles_of(scene)),
+                "fit_seconds": fit.seconds - fit.compile_seconds, "dtype": "float64",
+                "pairs": num_pairs, **map_point(bench, fit.map, alone=True),
+            }  # fmt: skip
+
+
 def integrated(bench: Bench, quick: bool, omit) -> Iterator[Numbers]:
     """Integrators that are told H, at rising precision."""
     scene, z0, one = bench.scene, bench.z0, bench.z0[:1]
@@ -265,7 +306,18 @@ def scene_piece(name: str) -> Callable[[bool], Numbers]:
     return measure
 
 
-PIECES = {name: scene_piece(name) for name in SCENES}
+def law_piece(name: str) -> Callable[[bool], Numbers]:
+    def measure(quick: bool) -> Numbers:
+        _, num_steps, lanes = SCENES[name]
+        bench = Bench(gfnn.scenes.make(name), num_steps, lanes, quick)
+        return {"points": list(our_laws(bench, quick))}
+
+    return measure
+
+
+OF_SCENES = {name: scene_piece(name) for name in SCENES}
+OF_LAWS = {f"{name}-laws": law_piece(name) for name in LAWS}
+PIECES = {**OF_SCENES, **OF_LAWS}
 
 
 # Figures and tables
@@ -426,12 +478,34 @@ def failures(name: str, result: Numbers) -> str:
     return "Left out, lost or failed: " + ("; ".join(said) or "nothing") + "."
 
 
+def law_table(result: Numbers) -> str:
+    """What was learned as a law, by rising error."""
+    rows = [
+        [p["method"], p["label"], number(p["num_parameters"]), number(p["pairs"]),
+         number(p["one_step_rms"]), number(p["error_median"]), pair_of(p, p)]
+        for p in sorted(result["measured"]["points"], key=lambda p: -p["error_median"])
+    ]  # fmt: skip
+    heads = (
+        "learned",
+        "size",
+        "parameters",
+        "pairs",
+        "one-step RMS",
+        "error",
+        "µs together, alone",
+    )
+    return markdown(heads, rows)
+
+
 def tables() -> None:
-    found = results(PIECES, "work-precision")
+    found, laws = results(OF_SCENES, "work-precision"), results(OF_LAWS, "work-precision")
     if not found:
         return
     parts = []
     for name, result in found.items():
+        law = laws.get(f"{name}-laws")
+        if law:
+            result["measured"]["points"] += law["measured"]["points"]
         draw(name, result)
         m = result["measured"]
         compiling = [p["compile_seconds_batch"] for p in m["points"] if p["group"] == OURS]
@@ -442,12 +516,13 @@ def tables() -> None:
             f"{in_words(name, result)}\n\n"
             f"![Work and precision: {name}](figures/work_precision_{name}.png)\n\n"
             f"{advice(name, result)}\n\n{failures(name, result)}"
+            + (f"\n\nLaws, and maps made from them:\n\n{law_table(law)}" if law else "")
         )
     versions = {k: v for r in found.values() for k, v in
                 {**r["versions"], **r["measured"]["versions"]}.items()}  # fmt: skip
     names = ("jaxlib", "diffrax", "scipy", "numpy", "heyoka")
     shown = ", ".join(f"{k} {versions[k]}" for k in names if k in versions)
-    parts.append(f"{provenance(found)} Also {shown}.")
+    parts.append(f"{provenance(found | laws)} Also {shown}.")
     between_markers(TABLES, "work-precision", "\n\n".join(parts))
 
 

@@ -149,6 +149,14 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument("--out", type=Path, metavar="FILE", required=True, help=".npz to write")
     command.add_argument(
+        "--samples", type=_count, metavar="N",
+        help="maps drawn from the model's posterior: adds std and quantiles to FILE",
+    )  # fmt: skip
+    command.add_argument(
+        "--horizon", type=_positive, metavar="SIZE",
+        help="with --samples: adds the step at which the band of the position passes SIZE",
+    )  # fmt: skip
+    command.add_argument(
         "--outside", choices=("continue", "stop"), default="continue",
         help="what to do where a trajectory leaves the data's domain (default %(default)s)",
     )  # fmt: skip
@@ -360,6 +368,7 @@ def _predict(arguments: argparse.Namespace) -> None:
         predicted = predict(
             arguments.model, arguments.initial, num_steps=arguments.num_steps,
             save_every=arguments.save_every, out=arguments.out, dt=arguments.dt,
+            samples=arguments.samples, horizon_size=arguments.horizon,
             stop_outside=arguments.outside == "stop", overwrite=arguments.overwrite,
             resume=arguments.resume, progress=shown,
         )  # fmt: skip
@@ -367,6 +376,10 @@ def _predict(arguments: argparse.Namespace) -> None:
     print(f"{arguments.out}: {num_lanes} trajectories of {arguments.num_steps} steps, "
           f"{predicted.seconds:.1f} s")  # fmt: skip
     _print_status(predicted.status, predicted.left_at)
+    if predicted.horizon is not None:
+        passed = predicted.horizon[predicted.horizon >= 0]
+        first = f", the first at step {passed.min()}" if passed.size else ""
+        print(f"{passed.size} of {num_lanes} bands pass {arguments.horizon:g}{first}")
 
 
 def _compare(arguments: argparse.Namespace) -> None:

@@ -34,7 +34,7 @@ def map_of(piece, dt=0.5):
 
 @pytest.mark.parametrize("stages", [1, 2, 5, 12])
 def test_coefficients(stages):
-    matrix, weights, nodes = gauss(stages)
+    matrix, weights, nodes, coupling = gauss(stages)
     for k in range(1, 2 * stages + 1):  # the rule's order
         np.testing.assert_allclose(weights @ nodes ** (k - 1), 1 / k, rtol=1e-15)
     for k in range(1, stages + 1):  # collocation
@@ -43,6 +43,11 @@ def test_coefficients(stages):
     np.testing.assert_allclose(
         symplectic + symplectic.T, np.outer(weights, weights), rtol=0, atol=2e-17
     )
+
+    np.testing.assert_allclose(coupling * weights, matrix, rtol=0, atol=2e-16)
+    # To the last bit: what rounding makes of these is a drift of the energy.
+    np.testing.assert_array_equal(coupling + coupling.T, np.ones((stages, stages)))
+    np.testing.assert_array_equal(coupling, coupling[::-1, ::-1].T)
 
 
 def test_known_coefficients():

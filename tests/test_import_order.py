@@ -18,7 +18,7 @@ ORDER = (
     "baselines", "evaluate", "jobs", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
-SHORTHANDS = {("maps.symplectic_map", "maps.saved")}
+SHORTHANDS = {("maps.symplectic_map", "maps.saved"), ("maps.symplectic_map", "maps.samples")}
 HOMES = {
     "argparse": "cli",
     "diffrax": "scenes.trajectories",

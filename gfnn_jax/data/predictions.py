@@ -32,13 +32,14 @@ from gfnn_jax.storage.outputs import (
 _FORMAT = 2
 # Memory for assembling the output.
 _ASSEMBLY_BYTES = 64 * 2**20
+_BAND_PARTS = 4  # beside a state: its std and three quantiles
 
 
 class PredictionWriter:
     """Writes one prediction file: ``trajectories`` (B, S, 2d), ``status`` (B,), ``left_at`` (B,),
     ``steps`` (S,) and ``dt``, all float64 or int64, ``params`` (B, k) and ``param_names`` (k,)
-    where the map has parameters, ``t0`` (B,) and ``period`` where it is driven, and ``job``, a
-    digest of what was asked for.
+    where the map has parameters, ``t0`` (B,) and ``period`` where it is driven, with ``bands`` also
+    ``std`` (B, S, 2d) and ``quantiles`` (3, B, S, 2d), and ``job``, a digest of what was asked for.
 
     out:       the ``.npz`` to write; ``OUT.partial`` holds the chunks until `finish`.
     shape:     (B, 2d).
@@ -46,6 +47,7 @@ class PredictionWriter:
     dt:        the time step of the map.
     params:    the names (k,) and values (B, k) of its parameters.
     drive:     the time t0 (B,) of the drive at the initial states, and its period.
+    bands:     whether states come with their std and three quantiles: (B, c, 5 · 2d).
     identity:  a JSON-able dict that says which job this is (digests of the model and of the initial
                states, say): a job is resumed only if all of it agrees.
     resume:    go on with ``OUT.partial`` where there is one; else start. Where ``out`` is this very
@@ -71,6 +73,7 @@ class PredictionWriter:
         identity: dict[str, Any],
         params: tuple[tuple[str, ...], np.ndarray] | None = None,
         drive: tuple[np.ndarray, float] | None = None,
+        bands: bool = False,
         resume: bool = False,
         overwrite: bool = False,
     ):
@@ -79,14 +82,16 @@ class PredictionWriter:
         self.steps = range(0, num_steps + 1, save_every)
         self.dt = float(dt)
         self.params, self.drive = params, drive
-        self.lanes, self.width = shape
+        self.lanes, self._state = shape
+        self.width = self._state * (1 + _BAND_PARTS if bands else 1)
         self.saved = 0
         self.carry: dict[str, np.ndarray] | None = None
         self._chunks: list[dict[str, Any]] = []  # the journal's entries: file, start, stop, sha256
         job = {
             **identity,
             "format": _FORMAT,
-            "shape": [self.lanes, len(self.steps), self.width],
+            "shape": [self.lanes, len(self.steps), self._state],
+            **({"bands": True} if bands else {}),
             "num_steps": num_steps,
             "save_every": save_every,
             "dt": self.dt,
@@ -154,25 +159,32 @@ class PredictionWriter:
         self._chunks.append(entry)
         self.saved, self.carry = stop, carry
 
-    def finish(self, status: Any, left_at: Any) -> None:
+    def finish(self, status: Any, left_at: Any, **more: Any) -> None:
         """Assemble the output from the chunks, put it in place at once, and remove the chunks.
 
         status:  (B,) integers, 0 = ok.
         left_at: (B,) the first step at which a lane was outside the domain, or −1.
+        more:    further arrays of the file, by their names.
         """
         if self.saved != self.total:
             raise ValueError(f"{self.saved} of {self.total} states are there")
         status = np.asarray(status).astype(np.int64).reshape(self.lanes)
         left_at = np.asarray(left_at).astype(np.int64).reshape(self.lanes)
-        named: list[tuple[str, np.ndarray]] = []
+        named = [(name, np.asarray(value)) for name, value in more.items()]
         if self.params is not None:
-            named = [("params", self.params[1]), ("param_names", np.array(self.params[0]))]
+            named += [("params", self.params[1]), ("param_names", np.array(self.params[0]))]
         if self.drive is not None:
             named += [("t0", self.drive[0]), ("period", np.asarray(self.drive[1]))]
         with atomic_file(self.out) as stream, zipfile.ZipFile(stream, "w") as archive:
-            shape = (self.lanes, self.total, self.width)
+            shape = (self.lanes, self.total, self._state)
             with _member(archive, "trajectories", shape, np.float64) as member:
-                self._assemble(member)
+                self._assemble(member, 0)
+            if self.width > self._state:
+                with _member(archive, "std", shape, np.float64) as member:
+                    self._assemble(member, 1)
+                with _member(archive, "quantiles", (3, *shape), np.float64) as member:
+                    for part in (2, 3, 4):
+                        self._assemble(member, part)
             for name, array in (
                 ("status", status),
                 ("left_at", left_at),
@@ -207,13 +219,17 @@ class PredictionWriter:
         if self.partial.exists():
             self.partial.rmdir()
 
-    def _assemble(self, member) -> None:
-        """(B, S, 2d) from chunks of (B, c, 2d), a few lanes at a time."""
+    def _assemble(self, member, part: int) -> None:
+        """One part (B, S, 2d) of the chunks (B, c, parts · 2d), a few lanes at a time."""
+        columns = slice(part * self._state, (part + 1) * self._state)
         lane = self.total * self.width * 8
         together = max(1, _ASSEMBLY_BYTES // (2 * max(lane, 1)))
         for first in range(0, self.lanes, together):
             lanes = min(together, self.lanes - first)
-            pieces = (self._read_chunk(entry, first, lanes) for entry in self._chunks)
+            pieces = (
+                np.ascontiguousarray(self._read_chunk(entry, first, lanes)[..., columns])
+                for entry in self._chunks
+            )
             if lanes == 1:  # a lane may be larger than memory: piece after piece
                 for piece in pieces:
                     member.write(piece.data)

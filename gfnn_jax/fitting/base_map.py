@@ -56,7 +56,7 @@ def fit_half_map(
     for i in angles:  # the quadratic Hamiltonian must not depend on an angle
         symmetric[i, :] = symmetric[:, i] = 0.0
     generator = form @ symmetric
-    field = _field_for(generator, shift)
+    field = field_for(generator, shift)
     if reversor is not None:
         generator = 0.5 * (generator - signs[:, None] * generator * signs[None, :])
         field = 0.5 * (field - signs * field)
@@ -73,7 +73,7 @@ def _flow(generator, field, time):
     return exponential[:width, :width], exponential[:width, width]
 
 
-def _field_for(generator, shift):
+def field_for(generator, shift):
     """The b whose time-1 flow moves the centre by ``shift``: the flow's shift is linear in b."""
     width = len(generator)
     response = np.column_stack([_flow(generator, unit, 1.0)[1] for unit in np.eye(width)])

@@ -20,6 +20,8 @@ import scipy.linalg
 
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import matrix_free
+from gfnn_jax.fitting.base_map import field_for
+from gfnn_jax.fitting.turns import backwards, forward_logarithm, tangent, turns
 from gfnn_jax.flows.collocation import Steps, images, of_lanes
 from gfnn_jax.phase_space import apply_j, symplectic_form
 
@@ -149,6 +151,21 @@ def log_start(family, z0, z1, dt: float, scale) -> np.ndarray | None:
     offset = -apply_j(scale * generator[:width, width])
     gradient = (z0 - centre) @ (0.5 * (matrix + matrix.T)) + offset
     return fitted_gradients(family, z0, gradient, scale)
+
+
+def forward_start(family, z0, z1, dt: float, scale) -> tuple[float, np.ndarray] | None:
+    """(angle, the quadratic H) where a plane around the centre turns backwards by this angle: the H
+    that turns it forwards instead, by more than π in a step. None where none does."""
+    centre, image, jacobian = tangent(z0, z1, scale)
+    angle = backwards(turns(jacobian, scale)[0])
+    logarithm = forward_logarithm(jacobian, scale) if angle > 0 else None
+    if logarithm is None:
+        return None
+    form = symplectic_form(z0.shape[1] // 2)
+    matrix = -form @ logarithm
+    generator = form @ (0.5 * (matrix + matrix.T))
+    velocity = ((z0 - centre) @ generator.T + field_for(generator, image - centre)) / dt
+    return angle, fitted_gradients(family, z0, -apply_j(velocity), scale)
 
 
 def fitted_gradients(family, z, gradient, scale, args=None) -> np.ndarray:

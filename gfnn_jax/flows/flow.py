@@ -1,6 +1,6 @@
 """The piece that a Hamiltonian makes: its flow over dt by Gauss collocation.
 
-    K_i = J∇H(z + h Σ_j a_ij K_j, t + c_i h),      Z = z + h Σ_i b_i K_i
+    L_i = h b_i J∇H(z + Σ_j μ_ij L_j, t + c_i h),      Z = z + Σ_i L_i,      μ_ij = a_ij / b_j
 
 Symplectic for every H, separable or not, and symmetric in time: the inverse is the same method
 with −dt. The stages are solved to roundoff, by fixed point or, where h‖H''‖ is too large for that
@@ -45,7 +45,7 @@ _WHOLE = 1e-12  # of a number of substeps: what rounding adds to a whole one
 
 @dataclasses.dataclass(frozen=True)
 class StageEquation:
-    """The stages' equation as Newton's method wants it: x is h K, (B, s·2d).
+    """The stages' equation as Newton's method wants it: x is L, (B, s·2d).
 
     shared = (family, params, h, scale); lanes = (z, args), or (z, args, h (B, 1)) where every lane
     has its own h. Residuals are in units of ``scale``.
@@ -59,7 +59,7 @@ class StageEquation:
         h = own[0] if own else h
         slopes, inside = self._inside(z, x)
         args = _at_stages(family, args, h, self.stages)
-        field = _beside(h, inside) * apply_j(family.gradient(params, inside, args))
+        field = _weighted(h, inside) * apply_j(family.gradient(params, inside, args))
         return self._evaluation(z, slopes, field, scale)
 
     def linearise(self, shared, lanes, x) -> tuple[Evaluation, Any]:
@@ -69,20 +69,21 @@ class StageEquation:
         slopes, inside = self._inside(z, x)
         args = _at_stages(family, args, h, self.stages)
         gradient, hessian = family.gradient_and_hessian(params, inside, args)
-        field = _beside(h, inside) * apply_j(gradient)
+        field = _weighted(h, inside) * apply_j(gradient)
         evaluation = self._evaluation(z, slopes, field, scale)
-        unit = jnp.tile(scale, self.stages)
+        unit = jnp.tile(scale, self.stages) / self.stages
         return evaluation, stage_matrix(hessian, h, self.stages) / unit[None, :, None]
 
     def _inside(self, z, x):
-        """The slopes h K (s, B, 2d), and the states of the stages."""
+        """The slopes L (s, B, 2d), and the states of the stages."""
         slopes = jnp.swapaxes(x.reshape(len(z), self.stages, -1), 0, 1)
-        return slopes, z[None] + _summed(gauss(self.stages).matrix, slopes)
+        return slopes, z[None] + _coupled(slopes)
 
     def _evaluation(self, z, slopes, field, scale):
-        unit = jax.lax.stop_gradient(as_row(scale, slopes))
-        size = jax.lax.stop_gradient((jnp.abs(z)[None] + jnp.abs(field)) / unit + 1.0)
-        flat = (_flat((slopes - field) / unit), _flat(size))
+        # As of h K, of which L is about an s-th.
+        unit = jax.lax.stop_gradient(as_row(scale, slopes)) / self.stages
+        size = jnp.abs(z)[None] / (self.stages * unit) + jnp.abs(field) / unit + 1.0
+        flat = (_flat((slopes - field) / unit), _flat(jax.lax.stop_gradient(size)))
         return Evaluation(*flat, jnp.zeros((len(z), 0), z.dtype))
 
 
@@ -160,18 +161,17 @@ class Flow:
     def action(self, z, image, origin, args=None):
         """The action (B,) of the step from z (B, 2d) to its image: the method's own sum
         Σ b_i of it, which is exact for a symplectic Runge–Kutta method."""
-        weights = gauss(self.stages).weights[None, :]
 
         def substep(both, args):
             z, total = both
             slopes, info = self._slopes(z, args, False)
-            inside = z[None] + _summed(gauss(self.stages).matrix, slopes)
+            inside = z[None] + _coupled(slopes)
             h = self.dt / self.substeps
             at = _at_stages(self.family, args, h[:, None] if jnp.ndim(h) else h, self.stages)
             energy = self.family.value(self.params, inside, at)
-            done = _beside(h, energy) * energy
-            total = total + _summed(weights, area(inside - origin[None], slopes) - done)[0]
-            return (z + _summed(weights, slopes)[0], total), info
+            done = _weighted(h, energy) * energy
+            total = total + jnp.sum(area(inside - origin[None], slopes) - done, axis=0)
+            return (z + jnp.sum(slopes, axis=0), total), info
 
         return self._repeated(substep, (z, jnp.zeros(z.shape[:1], z.dtype)), args)[0][1]
 
@@ -195,10 +195,10 @@ class Flow:
     def _increment(self, z, args, unrolled: bool | int):
         """(Z − z, Info) of one substep."""
         slopes, info = self._slopes(z, args, unrolled)
-        return _summed(gauss(self.stages).weights[None, :], slopes)[0], info
+        return jnp.sum(slopes, axis=0), info
 
     def _slopes(self, z, args, unrolled: bool | int):
-        """(h K (s, B, 2d), Info) of one substep."""
+        """(L (s, B, 2d), Info) of one substep."""
         h = self.dt / self.substeps
         h = h[:, None] if jnp.ndim(h) else h
         shared = (self.family, self.params, h, self.scale)
@@ -208,7 +208,8 @@ class Flow:
                 args = jnp.broadcast_to(args, (z.shape[0], args.shape[-1]))
             lanes = (z, args, h) if jnp.ndim(h) else (z, args)
             first = h * apply_j(self.family.gradient(self.params, z, args))
-            guess = jnp.tile(first, self.stages)
+            weights = np.repeat(gauss(self.stages).weights, first.shape[-1])
+            guess = jnp.tile(first, self.stages) * jnp.asarray(weights, first.dtype)[None]
             if unrolled:
                 x, _, info = newton.iterate(
                     equation, shared, lanes, guess, most=_MOST_NEWTON, gather=False
@@ -222,23 +223,23 @@ class Flow:
 
 
 def _fixed_point(stages: int, shared, z, args):
-    """h K (s, B, 2d) and Info, by iterating K_i = J∇H(z + h Σ_j a_ij K_j) from K_i = J∇H(z).
+    """L (s, B, 2d) and Info, by iterating L_i = h b_i J∇H(z + Σ_j μ_ij L_j) from h b_i J∇H(z).
 
     A lane that is at roundoff keeps its stages: a slow or bad lane changes no other.
     """
     family, params, h, scale = shared
     eps = float(jnp.finfo(z.dtype).eps)
-    matrix = gauss(stages).matrix
-    size = jax.lax.stop_gradient(jnp.abs(z) + as_row(scale, z))[None]
-    first = h * apply_j(family.gradient(params, z, args))
     at = _at_stages(family, args, h, stages)
-    slopes = jnp.broadcast_to(first[None], (stages, *z.shape))
+    # Of h K, of which L is about an s-th.
+    size = jax.lax.stop_gradient(jnp.abs(z) + as_row(scale, z))[None] / stages
+    like = jnp.broadcast_to(z[None], (stages, *z.shape))
+    slopes = _weighted(h, like) * apply_j(family.gradient(params, z, args))[None]
     lanes = jnp.zeros(z.shape[0], jnp.int32)
 
     def improve(carry):
         slopes, change, open_, iterations = carry
-        inside = z[None] + _summed(matrix, slopes)
-        new = _beside(h, inside) * apply_j(family.gradient(params, inside, at))
+        inside = z[None] + _coupled(slopes)
+        new = _weighted(h, inside) * apply_j(family.gradient(params, inside, at))
         moved = jax.lax.stop_gradient(jnp.max(jnp.abs(new - slopes) / size, axis=(0, 2)))
         settled = (moved <= eps**_SETTLED) & (moved > 0.5 * change)
         goes_on = ~((moved <= _FLOOR_EPS * eps) | settled) & jnp.isfinite(moved)
@@ -273,19 +274,19 @@ def _stages_jvp(stages, primals, tangents):
 
     def field(shared, z, args):
         family, params, h, _ = shared
-        inside = z[None] + _summed(gauss(stages).matrix, slopes)
+        inside = z[None] + _coupled(slopes)
         at = _at_stages(family, args, h, stages)
-        return _beside(h, inside) * apply_j(family.gradient(params, inside, at))
+        return _weighted(h, inside) * apply_j(family.gradient(params, inside, at))
 
     _, field_dot = jax.jvp(field, primals, tangents)
-    inside = z[None] + _summed(gauss(stages).matrix, slopes)
+    inside = z[None] + _coupled(slopes)
     at = _at_stages(family, args, h, stages)
     if matrix_free(family):
         bends = family.curvatures(params, inside, at)
 
         def again(dot, _):
-            turned = family.hessian_product(bends, _summed(gauss(stages).matrix, dot))
-            return field_dot + _beside(h, dot) * apply_j(turned), None
+            turned = family.hessian_product(bends, _coupled(dot))
+            return field_dot + _weighted(h, dot) * apply_j(turned), None
 
         slopes_dot, _ = jax.lax.scan(again, field_dot, length=_MOST_TANGENT)
     else:
@@ -303,14 +304,15 @@ def _at_stages(family, args, h, stages: int):
     return at_time(family, args, after.astype(jnp.result_type(h)))
 
 
-def _beside(h, like):
-    """h, a number or one of each lane, as it multiplies an array of stages."""
-    return as_row(h, like) if jnp.ndim(h) else h
+def _weighted(h, like):
+    """h b_i as it multiplies an array of stages (s, B, …); h: a number, or one of each lane."""
+    weights = jnp.asarray(gauss(len(like)).weights, like.dtype).reshape(-1, *[1] * (like.ndim - 1))
+    return weights * (as_row(h, like) if jnp.ndim(h) else h)
 
 
-def _summed(matrix, slopes):
-    """Σ_j matrix_ij slopes_j for slopes (s, B, 2d)."""
-    matrix = jnp.asarray(matrix, slopes.dtype)
+def _coupled(slopes):
+    """Σ_j μ_ij slopes_j for slopes (s, B, 2d)."""
+    matrix = jnp.asarray(gauss(len(slopes)).coupling, slopes.dtype)
     return matmul(matrix, slopes.reshape(len(slopes), -1)).reshape(-1, *slopes.shape[1:])
 
 
@@ -320,11 +322,13 @@ def _flat(slopes):
 
 
 def stage_matrix(hessian, h, stages: int):
-    """I − h A ⊗ JH'' (B, s·2d, s·2d), from the stages' Hessians (s, B, 2d, 2d); h: a number or
-    (B, 1)."""
+    """1 − h b_i μ_ij JH''_i (B, s·2d, s·2d), from the stages' Hessians (s, B, 2d, 2d).
+
+    h: a number or (B, 1)."""
     _, lanes, width, _ = hessian.shape
     form = jnp.asarray(symplectic_form(width // 2), hessian.dtype)
-    matrix = jnp.asarray(gauss(stages).matrix, hessian.dtype)
+    rule = gauss(stages)
+    matrix = jnp.asarray(rule.weights[:, None] * rule.coupling, hessian.dtype)
     # Row (i, a), column (j, b): what a change of the slope j adds to stage i, seen by its field.
     turned = jnp.einsum("ac,ilcb->liab", form, hessian, precision="highest")
     coupled = jnp.einsum("ij,liab->liajb", matrix, turned, precision="highest")

@@ -5,16 +5,19 @@ from __future__ import annotations
 import hashlib
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from gfnn_jax.data.files import read_initial
+from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.data.files import read_initial, read_initial_noise
 from gfnn_jax.data.predictions import PredictionWriter
 from gfnn_jax.errors import InputError
+from gfnn_jax.evaluate.bands import bands, horizon
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.maps import saved
+from gfnn_jax.maps.samples import Samples
 from gfnn_jax.maps.symplectic_map import Lanes, SymplecticMap
 from gfnn_jax.phase_space import TIME
 
@@ -23,12 +26,25 @@ _CHUNK_BYTES, _CHUNK_LANE_STEPS = 32 * 2**20, 400_000
 
 
 class Predicted(NamedTuple):
-    """How a prediction ended: status and left_at (B,), the map's dt, seconds of computing."""
+    """How a prediction ended: status and left_at (B,), the map's dt, seconds of computing; horizon
+    (B,) where one was asked for."""
 
     status: np.ndarray
     left_at: np.ndarray
     dt: float
     seconds: float
+    horizon: np.ndarray | None = None
+
+
+class _Drawn(NamedTuple):
+    """Samples and their initial states (n, B, 2d), the angles of a state, the size of the horizon,
+    and what the band is of."""
+
+    samples: Samples
+    z0: np.ndarray
+    angles: tuple[int, ...]
+    size: float | None
+    of: str
 
 
 def predict(
@@ -39,6 +55,8 @@ def predict(
     save_every: int = 1,
     out: Path,
     dt: float | None = None,
+    samples: int | None = None,
+    horizon_size: float | None = None,
     stop_outside: bool = False,
     overwrite: bool = False,
     resume: bool = False,
@@ -47,6 +65,11 @@ def predict(
     """Predict from the initial states in a file, in chunks along the steps, into ``out``.
 
     dt: of a step, where it is not that of the data: of a map that is the flow of a Hamiltonian.
+    samples: maps drawn from the model's posterior, whose spread becomes ``std`` and ``quantiles``;
+    the noise of the initial states, ``z0_std``, is in it where their file has that, and ``band``
+    says so. horizon_size: of the position, in the user's units; ``horizon`` (B,) is the first saved
+    step at which the band of two standard deviations passes it, −1 where it never does.
+
     Memory: one chunk of saved states, 32 MiB at most where a saved state of all lanes is no more
     than that, whatever ``num_steps``. A job that was killed goes on with ``resume`` where its last
     chunk ended, to the very bits that an uninterrupted one gives.
@@ -55,6 +78,8 @@ def predict(
         raise InputError(
             f"expected --save-every of at most --num-steps, {num_steps}; got {save_every}"
         )
+    if horizon_size is not None and samples is None:
+        raise InputError("expected --samples beside --horizon: the band is of samples")
     map_ = saved.load(model)
     if dt is not None:
         try:
@@ -67,10 +92,15 @@ def predict(
     digest = hashlib.sha256(np.ascontiguousarray(z0).data)
     if params is not None:
         digest.update(np.ascontiguousarray(params).data)
+    drawn = None
+    if samples is not None:
+        drawn = _drawn(map_, samples, z0, read_initial_noise(initial, z0.shape), horizon_size)
+        digest.update(np.ascontiguousarray(drawn.z0).data)
     identity = {
         "model": saved.digest(model),
         "initial": digest.hexdigest(),
         "outside": "stop" if stop_outside else "continue",
+        **({} if drawn is None else {"samples": samples, "horizon_size": horizon_size}),
     }
     own, drive = None if params is None else (names, params), None
     if params is not None and map_.parameters is not None and TIME in names:
@@ -78,18 +108,27 @@ def predict(
         own = (names[:-1], params[:, :-1]) if len(names) > 1 else None
     writer = PredictionWriter(
         out, shape=z0.shape, num_steps=num_steps, save_every=save_every, dt=dt,
-        identity=identity, params=own, drive=drive,
+        identity=identity, params=own, drive=drive, bands=drawn is not None,
         overwrite=overwrite, resume=resume,
     )  # fmt: skip
     started = time.perf_counter()
     if writer.finished:
         with np.load(out, allow_pickle=False) as done:
-            return Predicted(done["status"], done["left_at"], dt, 0.0)
+            passed = done.get("horizon")
+            return Predicted(done["status"], done["left_at"], dt, 0.0, passed)
     try:
-        lanes = _go_on(map_, z0, params, writer, num_steps, save_every, stop_outside, progress)
+        lanes = _go_on(
+            map_, z0, params, writer, num_steps, save_every, stop_outside, drawn, progress
+        )
         progress.say(f"writing {out}")
         status, left_at = np.asarray(lanes.status), np.asarray(lanes.left_at)
-        writer.finish(status, left_at)
+        more: dict[str, Any] = {} if drawn is None else {"band": drawn.of}
+        passed = None
+        if horizon_size is not None:
+            assert writer.carry is not None
+            passed = writer.carry["horizon"]
+            more |= {"horizon": passed, "horizon_size": horizon_size}
+        writer.finish(status, left_at, **more)
     except KeyboardInterrupt as stop:
         if not writer.finished:
             done = max(0, writer.saved - 1) * save_every
@@ -97,28 +136,77 @@ def predict(
                 f"{writer.partial} keeps {done} of {num_steps} steps: --resume goes on with it"
             )
         raise
-    return Predicted(status, left_at, dt, time.perf_counter() - started)
+    return Predicted(status, left_at, dt, time.perf_counter() - started, passed)
+
+
+def _drawn(map_: SymplecticMap, count: int, z0, std, size: float | None) -> _Drawn:
+    """The samples of a prediction, the same for the same model and initial states."""
+    try:
+        samples = map_.sample(jax.random.key(0), count)
+    except ValueError as error:
+        raise InputError(f"--samples: {error}") from error
+    begun = np.broadcast_to(z0, (count, *z0.shape))
+    of = "model"
+    if std is not None:
+        begun = begun + std * np.random.default_rng(1).normal(size=begun.shape)
+        of = "model and initial state"
+    coordinates = map_.coordinates
+    angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
+    return _Drawn(samples, begun, angles, size, of)
 
 
 def _go_on(
     map_: SymplecticMap, z0, params, writer: PredictionWriter, num_steps, save_every, stop_outside,
-    progress,
+    drawn: _Drawn | None, progress,
 ) -> Lanes:  # fmt: skip
     """All chunks that are not yet written; returns the lanes after the last step."""
+    of_samples = None
+    passed = np.full(len(z0), -1)
     if writer.carry is None:
         lanes = map_.start(z0, params=params, stop_outside=stop_outside)
-        writer.append(z0[:, None], lanes._asdict())
+        states = z0[:, None]
+        if drawn is not None:
+            of_samples = drawn.samples.start(drawn.z0, params=params, stop_outside=stop_outside)
+            states, passed = _with_bands(drawn, states, drawn.z0[:, :, None], [0], passed)
+        writer.append(states, _carry(lanes, of_samples, passed))
     else:
-        lanes = Lanes(**{name: jax.device_put(value) for name, value in writer.carry.items()})
-    chunk = _chunk_length(z0.shape[0], z0.shape[1], save_every)
+        carry = {name: jax.device_put(value) for name, value in writer.carry.items()}
+        lanes = Lanes(**{name: carry[name] for name in Lanes._fields})
+        if drawn is not None:
+            of_samples = Lanes(**{name: carry[_OF_SAMPLES + name] for name in Lanes._fields})
+            passed = writer.carry["horizon"]
+    many = 1 if drawn is None else 1 + len(drawn.samples)
+    chunk = _chunk_length(z0.shape[0] * many, z0.shape[1], save_every)
+    options = {"params": params, "save_every": save_every, "stop_outside": stop_outside}
     while writer.saved < writer.total:
         progress.say(f"step {(writer.saved - 1) * save_every} of {num_steps}")
         count = min(chunk, writer.total - writer.saved)
-        lanes, states = map_.advance(
-            lanes, count, params=params, save_every=save_every, stop_outside=stop_outside
-        )
-        writer.append(states, lanes._asdict())
+        lanes, states = map_.advance(lanes, count, **options)
+        if drawn is not None and of_samples is not None:
+            of_samples, others = drawn.samples.advance(of_samples, count, **options)
+            steps = writer.steps[writer.saved : writer.saved + count]
+            states, passed = _with_bands(drawn, states, others, steps, passed)
+        writer.append(states, _carry(lanes, of_samples, passed))
     return lanes
+
+
+_OF_SAMPLES = "samples_"  # before the names of their lanes in a carry
+
+
+def _carry(lanes: Lanes, of_samples: Lanes | None, passed) -> dict[str, Any]:
+    """What a prediction goes on from."""
+    if of_samples is None:
+        return lanes._asdict()
+    others = {_OF_SAMPLES + name: value for name, value in of_samples._asdict().items()}
+    return {**lanes._asdict(), **others, "horizon": passed}
+
+
+def _with_bands(drawn: _Drawn, states, others, steps, passed) -> tuple[np.ndarray, np.ndarray]:
+    """States with their std and quantiles (B, c, 5 · 2d), and the horizons so far (B,)."""
+    found = bands(others, states, drawn.angles)
+    if drawn.size is not None:
+        passed = np.where(passed < 0, horizon(found.std, steps, drawn.size), passed)
+    return np.concatenate([states, found.std, *found.quantiles], axis=-1), passed
 
 
 def _chunk_length(num_lanes: int, width: int, save_every: int) -> int:

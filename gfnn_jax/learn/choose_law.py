@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.errors import FitError
+from gfnn_jax.fitting.turns import backwards, tangent, turns
 from gfnn_jax.learn.candidates import Candidate, Judges
 from gfnn_jax.learn.clock import Clock, OutOfTime
 from gfnn_jax.learn.flows import OPTIONS, LearnedHamiltonian, learn_hamiltonian
@@ -21,6 +22,7 @@ _BESIDE = dataclasses.replace(
 )
 # A law holds outside the data and at any time step: so much dearer a step it may be.
 DEARER = 4.0
+_TURNED = 0.2  # radians backwards that are worth a word
 _PART = 0.3  # of the time that is left, for H beside a map
 
 
@@ -33,14 +35,11 @@ def law_of(
     clock: Clock,
     say: Callable[[str], Any],
 ) -> LearnedHamiltonian | None:
-    """The Hamiltonian of these pairs, or None where none is asked for or, with "auto", none is
-    found.
+    """The Hamiltonian of these pairs, or None where "auto" finds none.
 
     prepared: without a base map. Raises FitError where a Hamiltonian is asked for and there is none
     to learn.
     """
-    if learn == "map":
-        return None
     unfit = _unfit(prepared, scene)
     if unfit is not None:
         if learn == "hamiltonian":
@@ -69,6 +68,24 @@ def law_of(
         if learn == "hamiltonian" or terms:
             raise FitError(str(error)) from error
     return None
+
+
+def long_step(prepared: Prepared, scene: Scene | None) -> list[str]:
+    """A warning where no H was found and the states turn backwards around their centre.
+
+    prepared: without a base map.
+    """
+    if prepared.varied or prepared.coordinates.angles or _unfit(prepared, scene) is not None:
+        return []
+    _, _, jacobian = tangent(prepared.y0, prepared.y1, prepared.scale)
+    angle = backwards(turns(jacobian, prepared.scale)[0])
+    if angle < _TURNED:
+        return []
+    return [
+        f"around their centre a step of {prepared.dt:g} turns the states by {angle:.2g} radians "
+        f"backwards, or by {2 * np.pi - angle:.2g} forwards (ωh > π): pairs of one dt may then not "
+        "determine H; sample with a smaller dt, or with several"
+    ]
 
 
 def _unfit(prepared: Prepared, scene: Scene | None) -> str | None:

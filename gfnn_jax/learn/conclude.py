@@ -11,6 +11,7 @@ from gfnn_jax.learn.assemble import stepped
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance, refined_images
 from gfnn_jax.learn.check import not_radians
 from gfnn_jax.learn.choose import Chosen
+from gfnn_jax.learn.choose_law import long_step
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.diagnose import differs_between_sequences, sequences_of, volume_change
 from gfnn_jax.learn.noise import state_noise
@@ -56,6 +57,8 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
             ended = f"larger models are no more accurate: {reason}"
         elif reason:
             ended = f"{ended}; {reason}"
+    if request.seeks_law and not searched.met_by_law:
+        diagnosis += long_step(searched.plain, request.scene)
     messages += not_radians(chosen.judges.pairs, request.coordinates)
     messages += [not_met(candidate, request.tolerance, ended), *diagnosis]
     return Conclusion(ended, noise, messages)

@@ -30,6 +30,7 @@ from gfnn_jax.learn.diagnosed import diagnose_request
 from gfnn_jax.learn.draw import NUM_PAIRS, drawn
 from gfnn_jax.learn.flows import LearnedHamiltonian
 from gfnn_jax.learn.held_out import split_rows
+from gfnn_jax.learn.posterior import with_posterior
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.maps.domain import Ranges
@@ -111,6 +112,15 @@ class Fit:
             angles=() if self.scene is not None else coordinates.angles, on_progress=on_progress,
             tolerance=self.relative_tolerance if tolerance is None else tolerance,
         )  # fmt: skip
+
+    def sample(self, key, num: int):
+        """``num`` maps drawn from the posterior of the chosen map's coefficients, as one pytree,
+        each exactly symplectic: `maps.samples.Samples`. key: of ``jax.random``.
+
+        Raises ValueError where the map has no posterior: a network, a map of pairs that were drawn
+        from a law, an S with parameters.
+        """
+        return self.map.sample(key, num)
 
     @property
     def relative_tolerance(self) -> float:
@@ -248,7 +258,7 @@ def fit(
     judged = min(_JUDGED, block_of(2 * pairs.dim))
     test = chosen.judges.pairs.take(chosen.judges.held_out[:judged])
     return Fit(
-        map=chosen.candidate.map,
+        map=with_posterior(chosen, found),
         candidates=_all_candidates(chosen, found),
         asked=request.tolerance,
         num_pairs=len(pairs),

@@ -8,6 +8,7 @@ go while the held-out error does not rise.
 from __future__ import annotations
 
 import dataclasses
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -17,13 +18,17 @@ import numpy as np
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.expressions import coordinate_names
+from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.modes import Modes
+from gfnn_jax.families.products import Products
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms, given_terms, joined, multiplied, polynomial_terms
+from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.gauss_newton import (
     MOST_SUBSTEPS,
     FlowFit,
     Problem,
+    forward_start,
     log_start,
     midpoint_start,
     null_terms,
@@ -31,6 +36,7 @@ from gfnn_jax.fitting.gauss_newton import (
     significant_terms,
 )
 from gfnn_jax.fitting.growth import grow
+from gfnn_jax.fitting.least_squares import Reduced
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.gauss import gauss
@@ -40,7 +46,7 @@ from gfnn_jax.learn.clock import Clock, OutOfTime
 from gfnn_jax.learn.held_out import outermost
 from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
 from gfnn_jax.learn.prepare import Prepared
-from gfnn_jax.phase_space import symplectic_form
+from gfnn_jax.phase_space import apply_j, symplectic_form
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,10 +60,14 @@ class Options:
     judged_rows: per term, from which a library is judged; all pairs only count in the last fit.
     thresholds: standard errors below which terms go, tried in turn.
     rise: of the held-out error that dropping terms may cost; rounding: below which it is roundoff.
+    flat: libraries one after the other whose errors differ by less have met the pairs' noise;
+    certain: standard errors below which a term is then noise (one in 16,000 by chance).
     gained: a library that lowers the error by less has not helped; twice in a row ends the search.
     truncation: a flow's own error, as a part of the tolerance. contracting: a fixed point's factor
     up to which it is preferred to Newton's method. goal: residual that modes grow to, as a part of
-    the tolerance. max_seconds: of the search; mode_seconds: where modes grow, growth_part: the part
+    the tolerance. generators: degrees of those that look for misfit; sampled_rows: per term, where
+    what is left over is looked at.
+    max_seconds: of the search; mode_seconds: where modes grow, growth_part: the part
     of them in which they may.
     """
 
@@ -72,10 +82,14 @@ class Options:
     thresholds: tuple[float, ...] = (1e4, 1e3, 100.0, 30.0, 10.0, 5.0, 3.0)
     rise: float = 1.1
     rounding: float = 1e-15
+    flat: float = 1.2
+    certain: float = 4.0
     gained: float = 0.5
     truncation: float = 0.1
     contracting: float = 0.8
     goal: float = 0.3
+    generators: tuple[int, ...] = (2, 3, 4, 5, 6)
+    sampled_rows: int = 6
     max_seconds: float = 30.0
     mode_seconds: float = 60.0
     growth_part: float = 0.7
@@ -87,10 +101,13 @@ _FREQUENCY_STATES = 500
 _NEAR_ROUNDOFF = 3e-15  # of the spread
 _HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
 _NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
+_FEWEST_SAMPLED = 1_000  # pairs that tell noise from misfit
 _NAMED = 5  # terms in a message
 # Libraries in a row that do not help end the search; with given terms; of a structure, whose
 # libraries differ in kind.
 _POOR, _POOR_GIVEN, _POOR_STRUCTURED = 2, 3, 5
+_TURNING = 2_000  # pairs that tell how far a step turns the states
+_EXPLAINED = 0.05  # of the spread: an error below it is that of the right branch of the turns
 _FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
 
 
@@ -112,7 +129,7 @@ class LearnedHamiltonian:
     median over the data; beyond π pairs of one dt may not tell H. contraction: the fixed point's
     factor where it is largest. condition: of the terms' columns. null_terms: that the data do not
     tell from the others. left_out: pairs that the flow does not resolve. stalled: whether larger
-    libraries were no more accurate.
+    libraries were no more accurate. root: (m, m), rootᵀ root is the coefficients' covariance.
     """
 
     candidate: Candidate
@@ -127,6 +144,7 @@ class LearnedHamiltonian:
     left_out: int
     messages: tuple[str, ...]
     stalled: bool
+    root: np.ndarray
 
     @property
     def fast(self) -> bool:
@@ -137,7 +155,8 @@ class LearnedHamiltonian:
 class _Fitted(NamedTuple):
     """rows: that the fit was given; it has left out those that the flow does not resolve.
     undetermined: of the null terms, those that other states would tell from the rest. ended: why a
-    library that grew did so no longer. stalled: whether larger libraries were no better."""
+    library that grew did so no longer. stalled: whether larger libraries were no better. noisy:
+    whether their errors were the same, which is that of the pairs."""
 
     family: Terms | Sums
     fit: FlowFit
@@ -147,6 +166,7 @@ class _Fitted(NamedTuple):
     undetermined: tuple[str, ...] = ()
     ended: str = ""
     stalled: bool = False
+    noisy: bool = False
 
 
 def learn_hamiltonian(
@@ -196,6 +216,8 @@ def learn_hamiltonian(
         raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
     outside = None
     try:
+        if best.noisy:
+            best = _refitted(problem, best, judges.training, prepared, judges)
         best = _sparse(problem, best, prepared, judges, options, say)
         there = dataclasses.replace(everywhere, held_out=everywhere.training[outer])
         if outer.any():
@@ -220,7 +242,8 @@ def _searched(
     best: _Fitted | None = None
     structured = prepared.structure is not None
     most_poor = _POOR_STRUCTURED if structured else _POOR_GIVEN if terms else _POOR
-    last, poor, errors = None, 0, []
+    tried: list[_Fitted] = []
+    poor, errors = 0, []
     libraries = list(_libraries(prepared, judges, scene, terms, options))
     if len(libraries) > 1 and libraries[0].quadratic and not prepared.varied:
         affine = _affine_error(prepared, judges).bound
@@ -230,12 +253,14 @@ def _searched(
     try:
         for family in libraries:
             say(f"H: {family.num_parameters} terms")
-            found = _fitted(problem, family, prepared, judges, last, options, say)
+            found = _fitted(
+                problem, family, prepared, judges, tried[-1] if tried else None, options, say
+            )
             better = best is None or found.error.relative < options.gained * best.error.relative
             poor = 0 if better else poor + 1
             if best is None or found.error.relative < best.error.relative:
                 best = found
-            last = found
+            tried.append(found)
             errors.append(found.error.bound)
             if best.error.bound <= bound or poor == most_poor:
                 break
@@ -251,7 +276,12 @@ def _searched(
         raise FitError(
             f"expected more pairs: {len(prepared.y0)} are too few for any library of terms"
         )
-    return best._replace(stalled=poor == most_poor), options
+    stalled = poor == most_poor
+    near = [f for f in tried if f.error.relative <= options.flat * best.error.relative]
+    if len(near) > 1 and best.error.bound > bound:  # noise: the fewest terms leave no more of it
+        best = near[0]._replace(noisy=True)
+        stalled, options = True, dataclasses.replace(options, thresholds=(options.certain,))
+    return best._replace(stalled=stalled), options
 
 
 def _walked(
@@ -440,10 +470,16 @@ def _fitted(problem, family, prepared, judges, last: _Fitted | None, options, sa
     family = family.take(kept)
     count = int(np.ceil(options.judged_rows * family.num_parameters / z.shape[1]))
     rows = judges.training[: max(count, fewest)]
-    fit = problem.fit(family, _start(problem, family, rows, last), rows, say=say)
-    fit = _resolved(problem, family, fit, rows)
-    error = _held_out_error(problem, family, fit, prepared, judges)
-    return _Fitted(family, fit, rows, error, tuple(names[j] for j in null), undetermined)
+    null_names, best = tuple(names[j] for j in null), None
+    for start in _starts(problem, family, rows, judges.training[:_TURNING], last):
+        fit = _resolved(problem, family, problem.fit(family, start, rows, say=say), rows)
+        error = _held_out_error(problem, family, fit, prepared, judges)
+        if best is None or error.relative < best.error.relative:
+            best = _Fitted(family, fit, rows, error, null_names, undetermined)
+        if error.relative <= _EXPLAINED:
+            break
+    assert best is not None
+    return best
 
 
 def _scattered(z) -> np.ndarray:
@@ -451,6 +487,21 @@ def _scattered(z) -> np.ndarray:
     size = z.std(axis=0)
     size = np.where(size > 0, size, np.maximum(np.abs(z).max(axis=0), size.max()))
     return z + size * np.random.default_rng(0).normal(size=z.shape)
+
+
+def _starts(problem, family, rows, many, last: _Fitted | None) -> Iterator[np.ndarray]:
+    """The start whose flow is nearest to the pairs; and the one that turns forwards what seems to
+    turn backwards, before it where that is by more than a quarter. many: rows that tell turns."""
+    dt, args = problem.given(many)
+    turned = None
+    known = len(many) > problem.z0.shape[1] and not matrix_free(family)
+    if args is None and np.ndim(dt) == 0 and known:
+        turned = forward_start(family, problem.z0[many], problem.z1[many], dt, problem.scale)
+    if turned is not None and turned[0] > _FAST:
+        yield turned[1]
+    yield _start(problem, family, rows, last)
+    if turned is not None and turned[0] <= _FAST:
+        yield turned[1]
 
 
 def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
@@ -568,8 +619,49 @@ def _learned(
         float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(error, omega_h, prepared, judges, found, left_out)),
-        stalled=found.stalled,
+        stalled=found.stalled, root=_root(found, problem, prepared, steps),
     )  # fmt: skip
+
+
+def _root(found: _Fitted, problem: Problem, prepared: Prepared, steps: Steps) -> np.ndarray:
+    """(m, m): rootᵀ root is the covariance of the coefficients. What is noise, a generator of
+    polynomials tells, which does not explain it; what it explains is misfit, of these steps too."""
+    fit, count = found.fit, found.family.num_parameters
+    pairs = max(_FEWEST_SAMPLED, OPTIONS.sampled_rows * count // prepared.y0.shape[1])
+    structure = prepared.structure
+    if structure is not None:
+        pairs = structure.fewest(prepared.y0.shape[1])
+    rows = fit.used[:pairs]
+    images = problem.images(found.family, fit.coefficients, rows, steps, derivatives=True)
+    residual = images.states - prepared.y1[rows]
+    if not np.isfinite(residual).all():  # of a flow that runs away from some of the states
+        return np.full((count, count), np.nan)
+    # A generator of so many coordinates has too many terms.
+    noise = unexplained(prepared, rows, residual, count) if structure is None else None
+    slopes = (images.by_coefficient / problem.scale[:, None]).reshape(-1, count)
+    left = np.hypot(residual / problem.scale, _NEAR_ROUNDOFF).ravel()
+    train = Reduced(np.asfortranarray(fit.factor), fit.rows)
+    return uncertainty.root(train, count, slopes, left, noise=noise)
+
+
+def unexplained(prepared: Prepared, rows, residual, taken: int) -> float | None:
+    """Of the mean square of what a map leaves over (n, 2d) on these rows, the part that no
+    generator K explains, residual = J∇K at the images: K of as high a degree as the rows tell.
+    taken: coefficients that the map itself was given. None where they are too few."""
+    z, coordinates, width = prepared.y1[rows], prepared.coordinates, residual.shape[1]
+    inputs = box_inputs(
+        z, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+        cyclic=coordinates.cyclic,
+    )  # fmt: skip
+    sizes = [Products(inputs, degree) for degree in OPTIONS.generators]
+    most = min(len(rows) * width // OPTIONS.sampled_rows, OPTIONS.most_terms)
+    known = [family for family in sizes if family.num_parameters <= most]
+    if not known:
+        return None
+    weight = 1.0 / np.roll(prepared.scale, prepared.dim)
+    reduced = least_squares.reduce(known[-1], [(z, -apply_j(residual))], weight)
+    left = np.sum(reduced.factor[:, -1] ** 2) / max(reduced.rows - taken, 1)
+    return float(uncertainty.variance(reduced, known[-1].num_parameters) / left) if left else 1.0
 
 
 def _cheapest(problem, family, fit: FlowFit, fastest, judges: Judges, options: Options) -> Steps:
@@ -664,9 +756,14 @@ def _messages(
         )
     elif omega_h > _FAST:
         yield (
-            f"H oscillates by {omega_h:.2g} radians in a step (ωh, its median over the states): "
-            "any H whose frequencies differ by 2π per step gives the same pairs; this is the "
-            "slowest"
+            f"H oscillates by {omega_h:.2g} radians in a step (ωh, its median over the states"
+            f"{', beyond π' if omega_h > np.pi else ''}): an H whose frequencies differ by 2π per "
+            "step gives the same pairs, or nearly; this is the "
+            + (
+                "simplest; a smaller dt, or several, would settle it"
+                if omega_h > np.pi
+                else "slowest"
+            )
         )
     if found.undetermined:
         names = found.undetermined
@@ -692,8 +789,16 @@ def formula(terms: Sequence[Term]) -> str:
         factor = "" if number == "1" else f"{number} "
         if factor and term.startswith("1/"):
             factor, term = number, term[1:]
-        text += (sign if text else sign.strip().removeprefix("+")) + factor + term
+        shown = f"({term})" if factor and _is_sum(term) else term
+        text += (sign if text else sign.strip().removeprefix("+")) + factor + shown
     return text or "0"
+
+
+def _is_sum(term: str) -> bool:
+    """Whether a user's term is a sum, which a coefficient before it would not multiply."""
+    term = re.sub(r"\|[^|]*\|", "r", term)  # a distance holds its own difference
+    depth = np.cumsum([(c in "(") - (c in ")") for c in term])
+    return any(depth[i] == 0 and term[i : i + 3] in (" + ", " - ") for i in range(len(term)))
 
 
 def assembled(learned: LearnedHamiltonian, prepared: Prepared, judges: Judges) -> Assembled:

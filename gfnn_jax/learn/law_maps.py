@@ -49,7 +49,7 @@ def search_of_law(
     coordinates: Coordinates, dearest: float, clock: Clock, say, tell, seed: int,
 ) -> LawMaps | None:  # fmt: skip
     """Maps fitted to pairs that are drawn from the law's flow, and judged by the user's held-out
-    pairs; None where none of them meets the tolerance."""
+    pairs; None where none of them meets the tolerance, or no chart covers the drawn pairs."""
     more = drawn(law.flow, coordinates, pairs.z0, float(pairs.dt), seed=seed)
     held = pairs.take(judges.held_out)
     both = Pairs(
@@ -57,7 +57,11 @@ def search_of_law(
     )
     rows = np.arange(len(both))
     judges = Judges(both, rows[: len(more)], rows[len(more) :], judges.tolerance)
-    seen = diagnosed(prepare(both, coordinates), "auto", scene.reversor if scene else None, seed)
+    reversor = scene.reversor if scene else None
+    try:
+        seen = diagnosed(prepare(both, coordinates), "auto", reversor, seed)
+    except FitError:  # drawn ones go further than the user's; the law itself is left
+        return None
     sweeps = list(sweeps_for("auto", seen.charts.charts, seen.prepared, scene, judges))
     found = search(sweeps, judges.tolerance.bound, clock, say, tell, None, dearest)
     if not found.ranking:

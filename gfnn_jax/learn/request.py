@@ -49,6 +49,12 @@ class Request:
         """The scene's, or None."""
         return self.scene.reversor if self.scene is not None else None
 
+    @property
+    def seeks_law(self) -> bool:
+        """Whether H is looked for."""
+        free = (self.family, self.chart, self.base) == ("auto", "auto", None)
+        return free and self.learn != "map"
+
 
 def checked(
     pairs: Pairs, scene: Scene | None, *, tolerance, absolute_tolerance, learn, terms, base,

@@ -90,11 +90,11 @@ def _law(
     request: Request, plain: Prepared, judges: Judges, better: _Better | None
 ) -> LearnedHamiltonian | None:
     """H, where one is looked for and found."""
-    free = (request.family, request.chart, request.base) == ("auto", "auto", None)
+    if not request.seeks_law:
+        return None
     law = law_of(
-        plain, judges, request.scene, request.learn if free else "map", request.terms,
-        request.clock, request.say,
-    )  # fmt: skip
+        plain, judges, request.scene, request.learn, request.terms, request.clock, request.say
+    )
     if law is not None:
         if better is not None:
             better.offer(law.candidate, lambda: composed(law.flow, plain, judges))

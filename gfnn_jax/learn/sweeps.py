@@ -14,7 +14,7 @@ from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.families.products import Products, number_of_terms
 from gfnn_jax.families.sines import Sines
-from gfnn_jax.fitting import least_squares
+from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.levenberg_marquardt import LMState, levenberg_marquardt
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.learn.candidates import Candidate, Judges, validated
@@ -43,6 +43,8 @@ _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
 # Pairs of a block that goes to one of two halves: long beside the noise that neighbours share.
 _HALVES_BLOCK = 50
 _CHECKPOINT_SECONDS = 10.0
+# Rows per term of a larger size, by which noise is told from misfit.
+_SAMPLE_ROWS = 6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,6 +202,39 @@ class LinearSweep:
         )  # fmt: skip
         missed = np.linalg.norm(train.factor[:count, :count] @ (one - other))
         return float(missed) / (2 * np.sqrt(train.rows))
+
+    def root(self, size: Size) -> np.ndarray:
+        """(m, m): rootᵀ root is the covariance of the size's coefficients.
+
+        What of the residual is noise, a larger size tells: it leaves that too.
+        """
+        train = self._factor(size.group, Clock(), lambda message: None).train
+        family, solved = size.family, self.solve(size, Clock(), lambda message: None)[0]
+        larger = self._larger(size)
+        most = family if larger is None else larger
+        pairs = -(-_SAMPLE_ROWS * most.num_parameters // self._train[0].shape[1])
+        w, target = (a[:pairs] for a in self._train)
+        rows = (family.term_gradients(w) * self._weight[:, None]).reshape(-1, family.num_parameters)
+        residual = rows @ solved.coefficients - (target * self._weight).ravel()
+        noise = None
+        if larger is not None:
+            left, less = (
+                uncertainty.variance(
+                    least_squares.reduce(f, [(w, target)], self._weight), f.num_parameters
+                )
+                for f in (family, larger)
+            )
+            noise = less / left if left > 0 else 1.0
+        return uncertainty.root(
+            train, family.num_parameters, rows, residual, noise=noise, ridge=solved.ridge
+        )
+
+    def _larger(self, size: Size) -> Any:
+        """The family two sizes further, as a symmetric map gains nothing from the odd degrees; the
+        next, or None, where there is none."""
+        place = self.sizes.index(size)
+        further = self.sizes[place + 1 : place + 3]
+        return further[-1].family if further else None
 
     def _factor(self, group, clock: Clock, say) -> _Factors:
         if group not in self._factors:

@@ -32,6 +32,7 @@ from gfnn_jax.generating.predictor import PolynomialModel, Predictor
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.domain import Domain, Ranges
 from gfnn_jax.maps.parameters import Parameters
+from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.stroboscopic import OverPhases
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.scenes import SCENES
@@ -43,8 +44,8 @@ _TYPES: dict[str, type] = {
     kind.__name__: kind
     for kind in (
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
-        Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Sums, Part, Windows,
-        Groups, Ranges,
+        Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
+        Windows, Groups, Ranges,
     )
 }  # fmt: skip
 # Names that were used before, in models that may still be about.

@@ -27,6 +27,7 @@ from gfnn_jax.generating.generated import Generated, two_sum
 from gfnn_jax.maps.domain import Domain, Ranges
 from gfnn_jax.maps.modified_hamiltonian import NUM_STEPS, Cells, ModifiedHamiltonian, of_cells
 from gfnn_jax.maps.parameters import Parameters, as_args
+from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.rollout import scan_steps
 from gfnn_jax.phase_space import defect_of_pairs, require_x64, symplecticity_defect
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, Info
@@ -93,6 +94,7 @@ class RolloutInfo(NamedTuple):
     jax.tree_util.register_dataclass,
     data_fields=("pieces", "domain", "scale", "angle_centre", "dt", "parameters"),
     meta_fields=("coordinates",),
+    drop_fields=("posterior",),
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class SymplecticMap:
@@ -105,6 +107,8 @@ class SymplecticMap:
     angle_centre: (a,) centre of the interval of length 2π in which each angle is kept.
     dt:           the time one step takes; of a reversed map below 0.
     parameters:   what the system depends on beside its state, where it was learned with that.
+    posterior:    how well the coefficients are known, where that is; no leaf: what makes another
+                  map of the leaves (``jit``, ``jax.tree.map``) leaves it out.
 
     Methods take states z (2d,) or (B, 2d), NumPy or JAX, and answer with JAX arrays. A map that was
     learned with parameters takes their values too: name -> a number or (B,), or an array (k,) or
@@ -121,6 +125,7 @@ class SymplecticMap:
     angle_centre: Any
     dt: Any
     parameters: Parameters | None = None
+    posterior: Posterior | None = None
 
     def __post_init__(self):
         if isinstance(self.dt, (int, float)):
@@ -136,6 +141,12 @@ class SymplecticMap:
         from gfnn_jax.maps import saved  # stands after this module: a shorthand for its function
 
         saved.save(self, folder, **options)
+
+    def sample(self, key, num: int):
+        """``num`` maps drawn from the posterior, each symplectic: `maps.samples.Samples`."""
+        from gfnn_jax.maps import samples  # stands after this module: a shorthand for its function
+
+        return samples.sampled(self, key, num)
 
     def step(self, z, args=None, *, dt=None, t0=None):
         """One step: (Z, Info); Info's leaves are () or (B,). dt: of `over`."""
@@ -185,7 +196,11 @@ class SymplecticMap:
     def reversed(self) -> SymplecticMap:
         """The inverse map, as a map of its own."""
         pieces = tuple(piece.inverse() for piece in reversed(self.pieces))
-        return dataclasses.replace(self, pieces=pieces, dt=-self.dt)
+        posterior = self.posterior
+        if posterior is not None:
+            last = len(pieces) - 1
+            posterior = dataclasses.replace(posterior, piece=last - posterior.piece)
+        return dataclasses.replace(self, pieces=pieces, dt=-self.dt, posterior=posterior)
 
     def defect(self, z, args=None, *, t0=None):
         """Symplecticity defect () or (B,) of the step's unrolled derivative at z, in units of
@@ -448,7 +463,8 @@ def _judge(status, inside, stop_outside: bool):
     return jnp.where((status <= LEFT_DOMAIN) & ~inside, outside, status)
 
 
-def _begun(map_, z, args, stop_outside):
+def begun(map_, z, args, stop_outside) -> Lanes:
+    """`SymplecticMap.start` of states z (B, 2d), inside ``jit``."""
     y, compensation, turns = map_._inner(z)
     inside, finite = map_._contains(y, args), jnp.all(jnp.isfinite(y), axis=-1)
     status = _judge(jnp.where(finite, OK, NON_FINITE), inside, stop_outside)
@@ -460,10 +476,12 @@ def _begun(map_, z, args, stop_outside):
     )  # fmt: skip
 
 
-_start = compiled_sooner(_begun, (3,))
+_start = compiled_sooner(begun, (3,))
 
 
-def _advanced(map_, lanes, args, num_saved, save_every, stop_outside):
+def advanced(map_, lanes, args, num_saved, save_every, stop_outside) -> tuple[Lanes, Any]:
+    """`SymplecticMap.advance` inside ``jit``."""
+
     def step(lanes: Lanes) -> Lanes:
         going = lanes.status <= LEFT_DOMAIN
         y, compensation = jnp.where(going[:, None], lanes.y, jnp.nan), lanes.compensation
@@ -497,13 +515,15 @@ def _advanced(map_, lanes, args, num_saved, save_every, stop_outside):
     return lanes, jnp.moveaxis(saved, 0, 1)
 
 
-_advance = compiled_sooner(_advanced, (3, 4, 5))
+_advance = compiled_sooner(advanced, (3, 4, 5))
 
 
-@partial(compiled_sooner, static_argnums=(3, 4, 5))
-@_or_one_state
-def _rollout(map_, z, args, num_saved, save_every, stop_outside):
-    lanes = _begun(map_, z, args, stop_outside)
-    lanes, saved = _advanced(map_, lanes, args, num_saved, save_every, stop_outside)
+def predicted(map_, z, args, num_saved, save_every, stop_outside) -> tuple[Any, RolloutInfo]:
+    """`SymplecticMap.rollout` of states z (B, 2d), inside ``jit``."""
+    lanes = begun(map_, z, args, stop_outside)
+    lanes, saved = advanced(map_, lanes, args, num_saved, save_every, stop_outside)
     info = RolloutInfo(lanes.status, lanes.left_at, lanes.iterations)
     return jnp.concatenate([z[:, None], saved], axis=1), info
+
+
+_rollout = compiled_sooner(_or_one_state(predicted), (3, 4, 5))

@@ -1,0 +1,269 @@
+"""How sure: whether bands hold the true error, what samples cost, and fits to noisy sequences.
+
+    python benchmarks/bands.py                       pieces that have no result yet, tables, figure
+    python benchmarks/bands.py --only cost --overwrite
+    python benchmarks/bands.py --quick               small sizes, into runs/bands
+
+Bands are twice the standard deviation of rollouts of maps drawn from the posterior, about that of
+the fitted map; the true error is that map's own, against the reference, from clean states that no
+fit has seen. σ is the noise on every number of both states of a pair, ÷ the coordinate's spread.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from harness import (
+    FIGURES,
+    TABLES,
+    Numbers,
+    angles_of,
+    between_markers,
+    main,
+    markdown,
+    number,
+    results,
+    timed,
+)
+
+import gfnn_jax as gfnn
+from gfnn_jax.coordinates import nearest_image
+from gfnn_jax.scenes import DrawnFrom, Scene, henon_heiles, two_body
+
+SIGMAS, SIZES, STEPS = (0.0, 1e-6, 1e-4, 1e-2), (100, 1_000, 10_000), (1, 10, 100)
+SEEDS, STATES, SAMPLES = 1, 40, 50
+# Coverage that a band of two standard deviations is to have, and its width over the RMS error.
+COVERED, WIDEST = (0.90, 0.995), 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Librations:
+    """``draw(key, num)``: a disc of radius 2 around a pendulum's rest."""
+
+    def __call__(self, key, num):
+        u = jax.random.uniform(key, (2, num), jnp.float64)
+        r, turn = 2.0 * jnp.sqrt(u[0]), 2 * jnp.pi * u[1]
+        return jnp.stack([r * jnp.cos(turn), r * jnp.sin(turn)]).T
+
+
+def swinging(z, t=0.0, args=()):
+    """A pendulum."""
+    return z[1] ** 2 / 2 - jnp.cos(z[0])
+
+
+def pendulum() -> Scene:
+    """Librations, learned without being told of the angle."""
+    return Scene("pendulum", "librations", 1, 0.2, DrawnFrom(Librations()), hamiltonian=swinging)
+
+
+def quietly(*args, **options):
+    """`gfnn.fit` without its warnings, which the fit keeps."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)
+        return gfnn.fit(*args, max_seconds=None, **options)
+
+
+def noisy(pairs, sigma: float, seed: int):
+    """The pairs with noise on both states."""
+    rng, spread = np.random.default_rng(seed), np.std(pairs.z0, axis=0)
+    z0, z1 = (
+        np.asarray(z) + sigma * spread * rng.normal(size=z.shape) for z in (pairs.z0, pairs.z1)
+    )
+    return gfnn.Pairs(z0, z1, pairs.dt)
+
+
+def errors_and_bands(fit, z0, reference, seed: int, angles) -> tuple[np.ndarray, np.ndarray]:
+    """The error and half the band (B, steps, 2d) at STEPS."""
+    mean = np.asarray(fit.map.rollout(z0, STEPS[-1])[0])[:, STEPS]
+    drawn = fit.sample(jax.random.key(seed), SAMPLES).rollout(z0, STEPS[-1])[0]
+    drawn = np.asarray(drawn)[:, :, STEPS]
+
+    def between(a, b):
+        difference = a - b
+        return nearest_image(
+            difference.reshape(-1, difference.shape[-1]), angles
+        ).reshape(difference.shape)  # fmt: skip
+
+    spread = np.sqrt(np.nanmean(between(drawn, mean) ** 2, axis=0))
+    return between(mean, reference[:, STEPS]), 2 * spread
+
+
+def calibrated(make, quick: bool, *, lend: bool, **options) -> Numbers:
+    """Coverage and width for every σ and number of pairs, all test states and seeds together."""
+    scene = make()
+    angles = angles_of(scene)
+    z0 = np.asarray(gfnn.sample_test_states(scene, STATES, jax.random.key(99)))
+    reference = np.asarray(gfnn.reference_trajectories(scene, z0, STEPS[-1]))
+    rows = []
+    for sigma in SIGMAS[2:] if quick else SIGMAS:
+        for size in SIZES[1:2] if quick else SIZES:
+            found, labels = [], []
+            for seed in range(1 if quick else SEEDS):
+                pairs = gfnn.sample_pairs(scene, size, jax.random.key(seed))
+                pairs = noisy(pairs, sigma, seed)
+                fit = quietly(pairs, scene if lend else None, seed=seed, **options)
+                labels.append(f"{fit.chosen.chart} {fit.chosen.label}")
+                if fit.map.posterior is not None:
+                    found.append(errors_and_bands(fit, z0, reference, seed, angles))
+            rows.append({"sigma": sigma, "pairs": size, "labels": labels, **_judged(found)})
+            print(f"  {sigma:g} {size}: {rows[-1]}", flush=True)
+    return {"rows": rows}
+
+
+def _judged(found) -> Numbers:
+    """At each of STEPS, None where no fit had a posterior."""
+    if not found:
+        return {"coverage": None, "width": None, "rms": None}
+    error, band = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    rms = np.sqrt(np.nanmean(error**2, axis=(0, 2)))
+    return {
+        "coverage": np.mean(np.abs(error) <= band, axis=(0, 2)).tolist(),
+        "width": (np.nanmedian(band, axis=(0, 2)) / rms).tolist(),
+        "rms": rms.tolist(),
+    }
+
+
+def sequences(dt: float, quick: bool) -> Numbers:
+    """Forty sequences of fifty states of Hénon–Heiles with noise of 1e-3 on every number."""
+    scene = dataclasses.replace(henon_heiles(), dt=dt)
+    test = np.asarray(gfnn.sample_test_states(scene, 100, jax.random.key(99)))
+    reference = np.asarray(gfnn.reference_trajectories(scene, test, 100))
+    runs = []
+    for seed in range(1 if quick else 3):
+        z0 = np.asarray(gfnn.sample_test_states(scene, 40, jax.random.key(seed)))
+        states = np.asarray(gfnn.reference_trajectories(scene, z0, 49))
+        states = states + 1e-3 * np.random.default_rng(seed).normal(size=states.shape)
+        pairs = gfnn.Pairs(states[:, :-1].reshape(-1, 4), states[:, 1:].reshape(-1, 4), dt)
+        fit = quietly(pairs, learn="hamiltonian", seed=seed)
+        error = np.asarray(fit.map.rollout(test, 100)[0]) - reference
+        rms = np.sqrt(np.mean(error**2, axis=(0, 2)))
+        runs.append({
+            "terms": fit.chosen.num_parameters, "formula": fit.formula,
+            "noise": None if fit.noise is None else fit.noise.tolist(),
+            "rms": rms[[1, 10, 100]].tolist(),
+        })  # fmt: skip
+    return {"dt": dt, "runs": runs}
+
+
+def cost(quick: bool) -> Numbers:
+    """A hundred samples of a thousand states beside as many lanes of one map."""
+    samples, lanes, steps = (10, 100, 10) if quick else (100, 1_000, 100)
+    scene = henon_heiles()
+    pairs = gfnn.sample_pairs(scene, 3_000, jax.random.key(0))
+    z0 = np.asarray(gfnn.sample_test_states(scene, lanes, jax.random.key(1)))
+    found: dict[str, Any] = {"samples": samples, "lanes": lanes, "steps": steps}
+    for learn in ("map", "hamiltonian"):
+        fit = quietly(pairs, scene, learn=learn, tolerance=1e-8)
+        drawn, all_lanes = fit.sample(jax.random.key(2), samples), np.tile(z0, (samples, 1))
+        one = timed(lambda m=fit.map, z=all_lanes: m.rollout(z, steps, save_every=steps), 2)
+        many = timed(lambda s=drawn: s.rollout(z0, steps, save_every=steps), 2)
+        found[learn] = {
+            "label": f"{fit.chosen.chart} {fit.chosen.label}",
+            "lanes_seconds": one.seconds, "samples_seconds": many.seconds,
+            "ratio": many.seconds / one.seconds,
+        }  # fmt: skip
+    return found
+
+
+PIECES = {
+    "henon-heiles-map": partial(
+        calibrated, henon_heiles, lend=False, learn="map", family="polynomial", chart="midpoint"
+    ),
+    "henon-heiles": partial(calibrated, henon_heiles, lend=False, learn="hamiltonian"),
+    "two-body": partial(calibrated, two_body, lend=True, learn="map"),
+    "pendulum": partial(calibrated, pendulum, lend=False, learn="map"),
+    "noise-dt-0.5": partial(sequences, 0.5),
+    "noise-dt-0.05": partial(sequences, 0.05),
+    "cost": cost,
+}
+CALIBRATED = tuple(PIECES)[:4]
+
+
+def _calibration_table(found: dict[str, Numbers]) -> str:
+    head = ["case", "σ ÷ spread", "pairs", "chosen (seed 0)"]
+    head += [f"step {k}: covered, width ÷ RMS, RMS" for k in STEPS]
+    rows = []
+    for name in CALIBRATED:
+        for row in found[name]["measured"]["rows"] if name in found else ():
+            cells = [
+                "–"
+                if row["coverage"] is None
+                else f"{_marked(100 * c, 100 * COVERED[0], 100 * COVERED[1], '.0f')} %, "
+                f"{_marked(w, 0.0, WIDEST, '.2g')}, {r:.0e}"
+                for c, w, r in zip(
+                    *(row[k] or [0] * len(STEPS) for k in ("coverage", "width", "rms")),
+                    strict=True,
+                )
+            ]
+            rows.append([name, f"{row['sigma']:g}", f"{row['pairs']:,}", row["labels"][0], *cells])
+    return markdown(head, rows)
+
+
+def _marked(value: float, low: float, high: float, form: str) -> str:
+    """In bold where it misses its target."""
+    text = format(value, form)
+    return text if low <= value <= high else f"**{text}**"
+
+
+def _noise_table(found: dict[str, Numbers]) -> str:
+    head = ["dt", "terms of H", "noise measured ÷ true", "RMS at step 1", "10", "100"]
+    rows = []
+    for name in ("noise-dt-0.5", "noise-dt-0.05"):
+        for run in found[name]["measured"]["runs"] if name in found else ():
+            noise = ", ".join(f"{1e3 * s:.2f}" for s in run["noise"] or ()) or "–"
+            rows.append([str(found[name]["measured"]["dt"]), str(run["terms"]), noise,
+                         *(f"{r:.1e}" for r in run["rms"])])  # fmt: skip
+    return markdown(head, rows)
+
+
+def _cost_table(found: dict[str, Numbers]) -> str:
+    m = found["cost"]["measured"] if "cost" in found else {}
+    head = ["map", "samples × states × steps", "as samples, s", "as lanes of one map, s", "ratio"]
+    size = f"{m.get('samples')} × {m.get('lanes')} × {m.get('steps')}"
+    rows = [
+        [m[k]["label"], size, *(number(m[k][c]) for c in
+         ("samples_seconds", "lanes_seconds", "ratio"))]
+        for k in ("map", "hamiltonian") if k in m
+    ]  # fmt: skip
+    return markdown(head, rows)
+
+
+def tables() -> None:
+    """The section of RESULTS.md, and the figure."""
+    found = results(PIECES, "bands")
+    text = "\n\n".join((_calibration_table(found), _noise_table(found), _cost_table(found)))
+    between_markers(TABLES, "bands", text)
+    figure(found)
+
+
+def figure(found: dict[str, Numbers]) -> None:
+    """Coverage against width, a panel for each step."""
+    from matplotlib import pyplot
+
+    drawn, panels = pyplot.subplots(1, len(STEPS), figsize=(10, 3.4), sharey=True)
+    for k, (panel, step) in enumerate(zip(panels, STEPS, strict=True)):
+        panel.axhspan(100 * COVERED[0], 100 * COVERED[1], color="0.92")
+        for name, marker in zip(CALIBRATED, "osD^", strict=True):
+            rows = found[name]["measured"]["rows"] if name in found else []
+            rows = [r for r in rows if r["coverage"]]
+            panel.plot(
+                [r["width"][k] for r in rows], [100 * r["coverage"][k] for r in rows], marker,
+                label=name, alpha=0.7,
+            )  # fmt: skip
+        panel.axvline(WIDEST, color="0.7", linewidth=1)
+        panel.set(xscale="log", title=f"step {step}", xlabel="median 2σ band ÷ RMS error")
+    panels[0].set(ylabel="true errors inside, %", ylim=(40, 102))
+    panels[0].legend(fontsize=7)
+    drawn.tight_layout()
+    drawn.savefig(FIGURES / "bands.png", dpi=110)
+    pyplot.close(drawn)
+
+
+if __name__ == "__main__":
+    main(__doc__ or "", PIECES, "bands", tables, None)

@@ -1,0 +1,177 @@
+"""How sure: the posterior of the coefficients, maps drawn from it, bands of predictions."""
+
+import jax
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax.data.files import read_initial_noise
+from gfnn_jax.errors import InputError
+from gfnn_jax.evaluate.bands import bands, horizon
+from gfnn_jax.fitting import uncertainty
+from gfnn_jax.fitting.least_squares import Reduced
+from gfnn_jax.jobs.predict import predict
+from gfnn_jax.scenes import henon_heiles
+
+NOISE = 1e-3
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """Forty sequences of fifty states with noise, and the law that is learned of them."""
+    scene = henon_heiles()
+    z0 = np.asarray(gfnn.sample_test_states(scene, 40, jax.random.key(0)))
+    states = np.asarray(gfnn.reference_trajectories(scene, z0, 49))
+    states = states + NOISE * np.random.default_rng(0).normal(size=states.shape)
+    pairs = gfnn.Pairs(states[:, :-1].reshape(-1, 4), states[:, 1:].reshape(-1, 4), scene.dt)
+    with pytest.warns(gfnn.FitWarning):
+        return scene, gfnn.fit(pairs, learn="hamiltonian")
+
+
+def factored(rows, target):
+    matrix = np.linalg.qr(np.column_stack([rows, target]), mode="r")
+    return Reduced(np.asfortranarray(matrix), len(rows))
+
+
+def test_covariance_is_that_of_the_textbook_where_all_rows_are_alike():
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(20_000, 3)) * [1.0, 10.0, 0.1]
+    residual = 0.2 * rng.choice([-1.0, 1.0], size=len(rows))
+    train = factored(rows, residual)
+    root = uncertainty.root(train, 3, rows, residual, noise=1.0)
+    expected = 0.04 * np.linalg.inv(rows.T @ rows)
+    np.testing.assert_allclose(root.T @ root, expected, rtol=2e-3)
+    misfit = uncertainty.root(train, 3, rows, residual, noise=0.0)
+    np.testing.assert_allclose(misfit, root * np.sqrt(2 * len(rows) / 3), rtol=1e-9, atol=1e-12)
+
+
+def test_directions_that_no_row_tells_are_not_sampled():
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(500, 2))[:, [0, 1, 1]]
+    residual = rng.normal(size=500)
+    root = uncertainty.root(factored(rows, residual), 3, rows, residual, noise=1.0)
+    assert np.abs(root @ [0.0, 1.0, -1.0]).max() < 1e-12
+    assert np.linalg.norm(root @ [0.0, 1.0, 1.0]) > 0.01
+
+
+def test_noise_leaves_the_six_terms_of_the_law(noisy):
+    scene, fit = noisy
+    assert fit.chosen.num_parameters == 6
+    np.testing.assert_allclose(fit.noise, NOISE, rtol=0.1)
+    z0 = np.asarray(gfnn.sample_test_states(scene, 50, jax.random.key(9)))
+    reference = np.asarray(gfnn.reference_trajectories(scene, z0, 100))
+    error = np.asarray(fit.map.rollout(z0, 100)[0]) - reference
+    rms = np.sqrt(np.mean(error**2, axis=(0, 2)))
+    assert rms[1] < 3e-5
+    assert rms[100] < 6e-4
+
+
+def test_bands_hold_the_true_error_of_a_noisy_law(noisy):
+    scene, fit = noisy
+    z0 = np.asarray(gfnn.sample_test_states(scene, 50, jax.random.key(9)))
+    reference = np.asarray(gfnn.reference_trajectories(scene, z0, 100))
+    samples = fit.sample(jax.random.key(1), 50)
+    states, info = samples.rollout(z0, 100)
+    mean = np.asarray(fit.map.rollout(z0, 100)[0])
+    assert states.shape == (50, 50, 101, 4)
+    assert (np.asarray(info.status) <= 1).all()
+    band = 2 * bands(states, mean).std
+    for step in (1, 10, 100):
+        error = np.abs(mean - reference)[:, step]
+        assert np.mean(error <= band[:, step]) > 0.75  # six coefficients: errors go together
+        # Neighbours in a sequence share a state's noise, which the rows do not know: too wide.
+        assert np.median(band[:, step]) < 12 * np.sqrt(np.mean(error**2))
+
+
+def test_every_sample_is_a_symplectic_map_and_rolls_out_as_it(noisy):
+    scene, fit = noisy
+    z0 = np.asarray(gfnn.sample_test_states(scene, 3, jax.random.key(9)))
+    samples = fit.sample(jax.random.key(1), 4)
+    together = np.asarray(samples.rollout(z0, 5)[0])
+    for i in (0, 3):
+        alone = np.asarray(samples[i].rollout(z0, 5)[0])
+        np.testing.assert_allclose(together[i], alone, rtol=0, atol=1e-14)
+        assert float(np.max(np.asarray(samples[i].defect(z0)))) < 1e-13
+    assert np.abs(together[0] - together[3]).max() > 1e-6
+    again = np.asarray(fit.sample(jax.random.key(1), 4).params)
+    np.testing.assert_array_equal(again, np.asarray(samples.params))
+
+
+def test_a_map_without_posterior_says_so(noisy):
+    bare = jax.tree.map(lambda leaf: leaf, noisy[1].map)
+    with pytest.raises(ValueError, match="with a posterior"):
+        bare.sample(jax.random.key(0), 3)
+
+
+def test_the_posterior_of_s_covers_the_held_out_misfit():
+    pairs = gfnn.sample_pairs(henon_heiles(), 400, jax.random.key(0))
+    fit = gfnn.fit(pairs, learn="map", family="polynomial", chart="midpoint", tolerance=1e-3)
+    fresh = gfnn.sample_pairs(henon_heiles(), 200, jax.random.key(1))
+    states = np.asarray(fit.sample(jax.random.key(1), 50).rollout(fresh.z0, 1)[0])[:, :, 1]
+    mean = np.asarray(fit.map.step(fresh.z0)[0])
+    error = np.abs(mean - np.asarray(fresh.z1))
+    inside = error <= 2 * np.sqrt(np.mean((states - mean) ** 2, axis=0))
+    assert 0.88 < inside.mean() <= 1
+
+
+def test_bands_compare_angles_modulo_turns():
+    rng = np.random.default_rng(0)
+    off = 0.1 * rng.normal(size=(4_000, 1, 1, 2))
+    states = np.array([[[1.0, 2.0]]])
+    turned = off + [2 * np.pi, 0.0] * rng.integers(-2, 3, size=(4_000, 1, 1, 1))
+    found = bands(states + turned, states, angles=(0,))
+    np.testing.assert_allclose(found.std, 0.1, rtol=0.05)
+    np.testing.assert_allclose(found.quantiles[:, 0, 0] - states[0, 0],
+                               np.outer([-0.1645, 0, 0.1645], [1, 1]), atol=0.01)  # fmt: skip
+
+
+def test_horizon_is_the_first_step_beyond():
+    std = np.zeros((3, 4, 2))
+    std[0, 2:, 0] = 1.0
+    std[2, 3, 0] = np.nan
+    np.testing.assert_array_equal(horizon(std, [0, 10, 20, 30], 1.5), [20, -1, 30])
+
+
+def test_predictions_hold_bands(noisy, tmp_path, monkeypatch):
+    scene, fit = noisy
+    fit.map.save(tmp_path / "model")
+    loaded = gfnn.load(tmp_path / "model")
+    np.testing.assert_array_equal(
+        np.asarray(loaded.sample(jax.random.key(3), 2).params),
+        np.asarray(fit.sample(jax.random.key(3), 2).params),
+    )
+    z0 = np.asarray(gfnn.sample_test_states(scene, 5, jax.random.key(9)))
+    np.save(tmp_path / "z0.npy", z0)
+    np.savez(tmp_path / "noisy.npz", z0=z0, z0_std=np.full(z0.shape, 0.01))
+
+    def predicted(initial, out, **options):
+        predict(
+            tmp_path / "model", tmp_path / initial, num_steps=20, out=tmp_path / out, samples=8,
+            horizon_size=0.02, **options,
+        )  # fmt: skip
+        with np.load(tmp_path / out) as file:
+            return dict(file)
+
+    clean, with_start = predicted("z0.npy", "a.npz"), predicted("noisy.npz", "b.npz")
+    assert clean["std"].shape == clean["trajectories"].shape == (5, 21, 4)
+    assert clean["quantiles"].shape == (3, 5, 21, 4)
+    assert (np.diff(clean["quantiles"], axis=0) >= 0).all()
+    assert str(clean["band"]) == "model"
+    assert str(with_start["band"]) == "model and initial state"
+    assert (clean["std"][:, 0] == 0).all()
+    assert np.median(with_start["std"][:, 0]) == pytest.approx(0.01, rel=0.3)
+    assert (clean["horizon"] == -1).all()
+    assert (with_start["horizon"] >= 0).all()
+    monkeypatch.setattr("gfnn_jax.jobs.predict._CHUNK_LANE_STEPS", 9 * 5 * 6)  # six steps a chunk
+    np.testing.assert_array_equal(predicted("z0.npy", "c.npz")["std"], clean["std"])
+
+
+def test_what_is_no_noise_of_initial_states_is_refused(noisy, tmp_path):
+    path = tmp_path / "z0.npz"
+    for bad in (np.zeros((2, 3)), np.full((2, 4), -1.0), np.full((2, 4), np.nan)):
+        np.savez(path, z0=np.zeros((2, 4)), z0_std=bad)
+        with pytest.raises(InputError, match="z0_std"):
+            read_initial_noise(path, (2, 4))
+    noisy[1].map.save(tmp_path / "model")
+    with pytest.raises(InputError, match="--samples beside --horizon"):
+        predict(tmp_path / "model", path, num_steps=2, out=tmp_path / "out.npz", horizon_size=1.0)
