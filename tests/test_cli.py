@@ -26,7 +26,7 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.jobs import fit as jobs_fit
 from gfnn_jax.jobs import predict as predict_job
 from gfnn_jax.jobs import progress, search
-from gfnn_jax.learn import check
+from gfnn_jax.learn import check, structures
 from gfnn_jax.learn import fit as learn_fit
 from gfnn_jax.learn.candidates import Tolerance
 from gfnn_jax.maps import saved as models
@@ -113,6 +113,7 @@ def test_choices_are_those_of_the_fit():
     assert cli.CHARTS == check.CHART_NAMES
     assert cli.FAMILIES == check.FAMILIES
     assert set(cli.LEARN) == set(check.LEARNS)
+    assert cli.STRUCTURES == structures.NAMES
 
 
 def test_scenes(capsys):

@@ -109,10 +109,13 @@ class TrajectoryData:
         return self.states[np.cumsum(self.lengths) - 1]
 
 
-def read_trajectories(path, *, dt: float | None = None) -> TrajectoryData:
+def read_trajectories(
+    path, *, dt: float | None = None, fewest: int | None = None
+) -> TrajectoryData:
     """Read and check a trajectory file.
 
     dt: the time step for a file that holds none; it must agree with one that a file holds.
+    fewest: pairs that are needed at least; None: those that determine an affine map.
     Raises InputError where the file cannot be used; warns (DataWarning) about constant or
     duplicated columns and about states that never move.
     """
@@ -126,7 +129,7 @@ def read_trajectories(path, *, dt: float | None = None) -> TrajectoryData:
     ends = np.flatnonzero(sequence[1:] != sequence[:-1]) + 1
     lengths = np.diff(np.concatenate([[0], ends, [len(sequence)]])) if len(sequence) else ends
     pairs = len(states) - len(lengths)
-    needed = 2 * source.dim + 1  # what determines an affine map
+    needed = 2 * source.dim + 1 if fewest is None else fewest
     if pairs < needed:
         raise InputError(
             f"{path}: {pairs} pair{'s' * (pairs != 1)} of consecutive states found, at least "
