@@ -164,6 +164,22 @@ def lift(y0, y1, coordinates: Coordinates):
     return y0, y1, np.array(centres), np.array(covered, dtype=bool)
 
 
+def lift_sites(y0, y1, coordinates: Coordinates):
+    """As `lift`, of states of equal sites whose q are all angles, and whose p are all or none: one
+    pair is one of each site, which moves much as others do that are near it in its own (q, p)."""
+    count, dim = y0.shape[0], y0.shape[1] // 2
+    own = Coordinates("site", angles=tuple(sorted({a // dim for a in coordinates.angles})))
+
+    def of_sites(y):
+        return np.reshape(y, (count, 2, dim)).swapaxes(1, 2).reshape(-1, 2)
+
+    def of_states(y):
+        return y.reshape(count, dim, 2).swapaxes(1, 2).reshape(count, -1)
+
+    y0, y1, centres, covered = lift(of_sites(y0), of_sites(y1), own)
+    return of_states(y0), of_states(y1), np.repeat(centres, dim), np.repeat(covered, dim)
+
+
 def _embedded(y, coordinates: Coordinates):
     """States as points of a plain space: unit-sized, angles of a q as points of a circle."""
     dim, unit = y.shape[1] // 2, sizes(y)

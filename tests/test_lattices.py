@@ -1,5 +1,6 @@
 """Many degrees of freedom: sums over sites, flows without matrices, fits of rings and chains."""
 
+import dataclasses
 import json
 from itertools import combinations
 
@@ -15,7 +16,10 @@ from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import rates
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.generating.charts import CHARTS
+from gfnn_jax.generating.generated import Generated
 from gfnn_jax.phase_space import defect_of_pairs
+from gfnn_jax.solve.status import NOT_CONVERGED
 
 RNG = np.random.default_rng(0)
 
@@ -198,12 +202,76 @@ def test_bodies_that_are_alike_share_their_coefficients():
     assert fit.formula == "0.5 Σ_i |p_i|² - Σ_{i<j} 1/|q_i - q_j|"
 
 
+def test_a_generated_step_without_matrices():
+    """Images, derivatives and the inverse as Newton's method with matrices has them."""
+    family, params = springs(20)
+    scale, z, v = np.ones(40), *(0.4 * jnp.asarray(RNG.normal(size=(2, 3, 40))))
+    sides = [
+        Generated(f, params, CHARTS["midpoint"], 0.3, scale)
+        for f in (family, gfnn.from_function(lambda c, w: family.value(c, w)))
+    ]
+    found = []
+    for piece in sides:
+        image, along = jax.jvp(lambda z, piece=piece: piece.step(z)[0], (z,), (v,))
+        back = jax.vjp(lambda z, piece=piece: piece.step(z)[0], z)[1](v)[0]
+        found.append((image, along, back))
+    for own, dense in zip(*found, strict=True):
+        np.testing.assert_allclose(own, dense, atol=1e-13)
+    image, along, _ = found[0]
+    unrolled = jax.jvp(lambda z: sides[0].step(z, unrolled=True)[0], (z,), (v,))[1]
+    np.testing.assert_allclose(unrolled, along, atol=1e-13)
+    np.testing.assert_allclose(sides[0].inverse().step(image)[0], z, atol=1e-14)
+    refined, error = sides[0].refined_step(np.asarray(z), np.asarray(z))
+    np.testing.assert_allclose(refined, image, atol=1e-14)
+    assert (error < 1e-14).all()
+    far = dataclasses.replace(sides[0], dt=np.asarray(9.0))  # does not contract
+    assert (np.asarray(far.step(z)[1].status) >= NOT_CONVERGED).all()
+
+
+@pytest.mark.parametrize("reduced", [False, True])
+def test_coupled_standard_maps(tmp_path, reduced):
+    """No flow: S of every site, whichever turns the images of the angles are given with."""
+    scene = scenes.froeschle(dim=24)
+    pairs = gfnn.sample_pairs(scene, 60, jax.random.key(0))
+    z0, exact = np.asarray(pairs.z0), np.asarray(pairs.z1)
+    z1 = np.mod(exact, 2 * np.pi) if reduced else exact
+    fit = gfnn.fit(gfnn.Pairs(z0[:50], z1[:50], 1.0), scene, tolerance=1e-12)
+    assert (fit.met, fit.chosen.chart, fit.chosen.num_parameters) == (True, "type2", 3)
+    assert fit.symplecticity_defect < 1e-14
+    for _ in range(9):
+        exact = np.asarray(jax.vmap(scene.step)(exact))
+    states, info = fit.map.rollout(z0[50:], 10)
+    assert (np.asarray(info.status) == 0).all()
+    off = np.remainder(states[:, -1] - exact[50:] + np.pi, 2 * np.pi) - np.pi
+    np.testing.assert_allclose(off, 0, atol=1e-11)
+    back, _ = fit.map.inverse(states[:, 1])
+    off = np.remainder(back - z0[50:] + np.pi, 2 * np.pi) - np.pi
+    np.testing.assert_allclose(off, 0, atol=1e-13)
+    fit.map.save(tmp_path / "model")
+    again, _ = gfnn.load(tmp_path / "model").rollout(z0[50:], 10)
+    np.testing.assert_array_equal(again, states)
+
+
+def test_kicked_sites_of_plain_coordinates():
+    dim, z0 = 20, 0.3 * RNG.normal(size=(24, 40))
+    r = np.roll(z0[:, :dim], -1, axis=1) - z0[:, :dim]
+    bond = 0.2 * r + 0.1 * r**3
+    p = z0[:, dim:] - 0.5 * z0[:, :dim] - 0.3 * z0[:, :dim] ** 2 + bond - np.roll(bond, 1, axis=1)
+    pairs = gfnn.Pairs(z0, np.concatenate([z0[:, :dim] + p, p], axis=1), 1.0)
+    fit = gfnn.fit(pairs, structure="ring", learn="map", tolerance=1e-12)
+    assert (fit.met, fit.chosen.chart, fit.chosen.num_parameters) == (True, "type2", 5)
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         ({"structure": "torus"}, "expected a structure among ring, chain, bodies:N"),
-        ({"structure": "ring", "learn": "map"}, "a structure is that of H"),
-        ({"structure": "ring", "angles": (0,)}, "plain q and p"),
+        ({"structure": "ring", "family": "sines"}, "its own terms"),
+        ({"structure": "ring", "chart": "type1"}, "another chart"),
+        ({"structure": "ring", "angles": (0,)}, "all q of the sites"),
+        ({"structure": "ring", "angles": tuple(range(20)), "learn": "hamiltonian"}, "S is learned"),
+        ({"structure": "bodies:10", "learn": "map"}, "is that of H"),
+        ({"structure": "bodies:10", "angles": (0,)}, "plain q and p"),
         ({"structure": "ring", "terms": ["exp(q9)"]}, "q9"),
         ({"structure": "ring", "terms": [lambda z: z[0]]}, "as text"),
         ({"structure": "bodies:3"}, "3 bodies in 1 to 3 dimensions"),

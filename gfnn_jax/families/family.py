@@ -160,9 +160,10 @@ def symmetric_gradient(family: Family, params: Any, w: Any, args: Any = None) ->
     """∂f/∂w (..., 2d), whose own derivative in w is the family's Hessian.
 
     A derivative of ``gradient`` by JAX is symmetric only up to the rounding of its terms, and a
-    step is only as symplectic as S'' is symmetric; the Hessian is so to the last bit.
+    step is only as symplectic as S'' is symmetric; the Hessian is so to the last bit. A family
+    that does without matrices has that of JAX.
     """
-    if namespace(w) is np:
+    if namespace(w) is np or getattr(family, "matrix_free", False):
         return family.gradient(params, w, args)
     return _gradient(family, params, w, args)
 

@@ -13,7 +13,7 @@ import dataclasses
 import re
 from collections.abc import Sequence
 from functools import partial
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import jax
@@ -303,6 +303,35 @@ def site_terms(dim: int, ends: str, reach: int, degree: int, functions: Sequence
         if terms.powers:
             parts.append(Part(terms, Windows(ends, near)))
     return Sums(dim, tuple(parts))
+
+
+def periodic_site_terms(dim: int, ends: str, degree: int, *, products: bool) -> Sums:
+    """Powers of p_i, harmonics of the angle q_i and of q_{i+1} − q_i, up to ``degree``; and their
+    products of this total degree, where ``products``."""
+    own, bond = _harmonics("q1", degree), _harmonics("q2 - q1", degree)
+    rows: tuple[list, list] = ([], [])  # of one site, of two
+    for a, (i, k), (j, m) in product(range(degree + 1), _numbered(degree), _numbered(degree)):
+        one = products or (a > 0) + (k > 0) + (m > 0) == 1
+        if one and 0 < a + k + m <= degree:
+            row = (a, *(int(n == i) for n in range(2 * degree)))
+            rows[m > 0].append(row if m == 0 else (*row, *(int(n == j) for n in range(2 * degree))))
+    count = range(sum(map(len, rows)))
+    variables = ("p1", *own), ("p1", *own, *bond)
+    parts = tuple(
+        Part(Terms(k + 1, variables[k], tuple(rows[k])), Windows(ends, k)) for k in (0, 1)
+    )
+    return Sums(dim, parts).take(count)
+
+
+def _harmonics(angle: str, degree: int) -> tuple[str, ...]:
+    """cos and sin of the angle, of twice the angle, …"""
+    multiples = [angle, *(f"{k}*({angle})" for k in range(2, degree + 1))]
+    return tuple(f"{function}({a})" for a in multiples for function in ("cos", "sin"))
+
+
+def _numbered(degree: int) -> list[tuple[int, int]]:
+    """(place, harmonic) of each of `_harmonics`, and (-1, 0) of none."""
+    return [(-1, 0), *((n, n // 2 + 1) for n in range(2 * degree))]
 
 
 def body_terms(bodies: int, space: int, powers: Sequence[int], *, alike: bool) -> Sums:

@@ -1,7 +1,8 @@
 """The piece that a generating function makes: Z − z = h J ∇S(w) (paper, eq. (4)).
 
-The implicit equation for w is solved by Newton's method to roundoff; derivatives in the state, the
-parameters and dt come from the implicit function theorem.
+The implicit equation for w is solved to roundoff by Newton's method, or by fixed point where S has
+too many degrees of freedom for matrices; derivatives in the state, the parameters and dt come from
+the implicit function theorem.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from gfnn_jax.families.family import (
     symmetric_gradient,
     symmetric_gradient_and_hessian,
 )
+from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.generating.charts import AnyChart, Chart
 from gfnn_jax.phase_space import apply_j
-from gfnn_jax.solve import newton
+from gfnn_jax.solve import fixed_point, newton
 from gfnn_jax.solve.newton import Evaluation
 
 MOST_UPDATES = 40
@@ -53,6 +55,12 @@ class ImplicitStep:
         gradient, hessian = symmetric_gradient_and_hessian(family, params, w, args)
         evaluation, unit = self._evaluation(z, w, gradient, dt, scale)
         return evaluation, self.chart.residual_jacobian(hessian, dt) / unit[..., None]
+
+    def unit(self, shared, lanes):
+        """The residual's units (B, n), by which it is the change of a fixed-point iteration."""
+        (_, _, dt, scale), (z, *_) = shared, lanes
+        unit, _ = self.chart.sizes(scale, z, namespace(z).zeros_like(z), dt)
+        return jax.lax.stop_gradient(unit) if namespace(z) is jnp else unit
 
     def _evaluation(self, z, w, gradient, dt, scale):
         unit, size = self.chart.sizes(scale, z, gradient, dt)
@@ -104,7 +112,9 @@ class Generated:
         if args is not None:  # open lanes are taken out of the batch, with their own
             args = jnp.broadcast_to(self._midway(args), (z.shape[0], args.shape[-1]))
         equation, lanes = ImplicitStep(self.chart), (z, known, args)
-        if unrolled:
+        if matrix_free(self.family):
+            x, gradient, info = self._by_fixed_point(equation, shared, lanes, guess, unrolled)
+        elif unrolled:
             most = MOST_UPDATES if unrolled is True else unrolled
             x, gradient, info = newton.iterate(
                 equation, shared, lanes, guess, most=most, gather=False
@@ -114,6 +124,12 @@ class Generated:
                 equation, shared, lanes, jax.lax.stop_gradient(guess), MOST_UPDATES
             )
         return self.chart.complete(known, x), gradient, info
+
+    def _by_fixed_point(self, equation, shared, lanes, guess, unrolled: bool | int):
+        if unrolled:
+            most = fixed_point.MOST if unrolled is True else unrolled
+            return fixed_point.iterate(equation, shared, lanes, guess, most=most)
+        return fixed_point.root(equation, shared, lanes, jax.lax.stop_gradient(guess))
 
     def step(self, z, args=None, *, unrolled: bool | int = False):
         """(Z, Info) of the states z (B, 2d), by JAX."""
@@ -132,11 +148,12 @@ class Generated:
     def refined_step(self, z, guess, args=None):
         """(Z, error (B,)) of the states z (B, 2d) in NumPy, from evaluation points w (B, 2d) that
         are known to be close: see `solve.newton.refine`. Nothing is compiled."""
+        refine = fixed_point.refine if matrix_free(self.family) else newton.refine
         dim = z.shape[1] // 2
         shared = (self.family, self.params, self.dt, self.scale)
         x = guess[:, self.chart.free(dim)]
         known, args = self.chart.first_guess(z), self._midway(args)
-        x, gradient, error = newton.refine(ImplicitStep(self.chart), shared, (z, known, args), x)
+        x, gradient, error = refine(ImplicitStep(self.chart), shared, (z, known, args), x)
         return self.chart.image(z, self.chart.complete(known, x), gradient, self.dt), error
 
     def action(self, z, image, origin, args=None):
@@ -154,7 +171,9 @@ class Generated:
 
     def determinant(self, z0, z1, args=None):
         """det ∂w/∂z (B,) at states z0 (B, 2d) with images z1, NumPy or JAX: it vanishes where the
-        chart is singular."""
+        chart is singular. NaN where S does without matrices."""
+        if matrix_free(self.family):
+            return namespace(z0).full(z0.shape[0], np.nan, z0.dtype)
         w = self.chart.evaluation_point(z0, z1)
         _, hessian = self.family.gradient_and_hessian(self.params, w, self._midway(args))
         return self.chart.determinant_of(hessian, self.dt)

@@ -134,14 +134,27 @@ def _check_structured(
     structure, scene, learn, terms, base, family, chart, angles, pairs: Pairs
 ) -> None:
     """Raises FitError for what does not go with a structure."""
-    if learn == "map" or (family, chart, base) != ("auto", "auto", None):
-        raise FitError("a structure is that of H: expected no learn='map', family, chart or base")
-    varied = pairs.args or pairs.period is not None
-    if angles or varied or (scene is not None and scene.coordinates != CARTESIAN):
+    if (family, base) != ("auto", None):
+        raise FitError("a structure has its own terms: expected no family or base")
+    if chart == "type1":
+        raise FitError("expected another chart than type1, which has no structure")
+    bodies = str(structure).startswith("bodies")
+    if bodies and (learn == "map" or chart != "auto"):
+        raise FitError("a structure of bodies is that of H: expected no learn='map' or chart")
+    coordinates = scene.coordinates if scene is not None else CARTESIAN
+    if bodies and (angles or coordinates.angles):
+        raise FitError("bodies go with plain q and p: expected no angles")
+    own = coordinates.forward is not CARTESIAN.forward or coordinates.cyclic
+    if own or pairs.args or pairs.period is not None:
         raise FitError(
-            "a structure goes with plain q and p: expected no angles, parameters or drive"
+            "a structure goes with q and p of the sites: expected no other coordinates, no "
+            "parameters or drive"
         )
-    if terms and str(structure).startswith("bodies"):
+    if learn == "hamiltonian" and (angles or coordinates.angles):
+        raise FitError("a structure's H goes with plain q and p: with angles, S is learned")
+    if learn == "map" and np.ndim(pairs.dt):
+        raise FitError("expected pairs of one dt, as those of a map are; got several")
+    if terms and bodies:
         raise FitError("terms go with a ring or a chain: those of bodies are powers of distances")
     for term in terms:
         if not isinstance(term, str):

@@ -11,7 +11,7 @@ from gfnn_jax.learn.candidates import Candidate, Judges
 from gfnn_jax.learn.choose_law import preferred
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.flows import assembled as flow_assembled
-from gfnn_jax.learn.map_of_parameters import assembled as map_assembled
+from gfnn_jax.learn.map_of_terms import assembled as map_assembled
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import Entry
@@ -35,8 +35,8 @@ class Chosen(NamedTuple):
 def choose(searched: Searched, request: Request) -> Chosen:
     """The candidate that is taken, its error and its time measured by the steps that users run."""
     law, judges = searched.law, searched.judges
-    if searched.of_parameters is not None:
-        candidate, seconds = map_assembled(searched.of_parameters, searched.plain, judges)
+    if searched.of_terms is not None:
+        candidate, seconds = map_assembled(searched.of_terms, searched.plain, judges)
         return Chosen(candidate, searched.plain, judges, seconds)
     ranking, bound = searched.found.ranking, judges.tolerance.bound
     best = ranking[0].candidate if ranking else None

@@ -24,6 +24,7 @@ _BESIDE = dataclasses.replace(
 DEARER = 4.0
 _TURNED = 0.2  # radians backwards that are worth a word
 _PART = 0.3  # of the time that is left, for H beside a map
+_PART_STRUCTURED = 0.6  # the same where S is a sum over sites
 
 
 def law_of(
@@ -46,9 +47,14 @@ def law_of(
             raise FitError(f"expected data of an autonomous flow to learn H from: {unfit}")
         return None
     # S of a driven system needs more harmonics than H, and is no map to wait for.
-    foremost = learn == "hamiltonian" or terms or prepared.period is not None
+    structured = prepared.structure is not None
+    foremost = learn == "hamiltonian" or terms or prepared.period is not None or structured
     options = OPTIONS if foremost else _BESIDE
-    if learn == "auto":  # the map, which every system has, is to have the better part of the time
+    if structured:  # nothing else is learned of bodies, and of sites S in a few seconds
+        beside = learn == "auto" and prepared.of_terms
+        most = _PART_STRUCTURED * clock.left if beside else np.inf
+        options = dataclasses.replace(options, max_seconds=most)
+    elif learn == "auto":  # the map, which every system has, is to have the better part of the time
         part = _PART * clock.left
         options = dataclasses.replace(
             options, max_seconds=min(options.max_seconds, part),

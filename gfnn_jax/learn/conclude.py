@@ -43,7 +43,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         ended = MET if met else "no larger library of terms promised to meet it"
     if ended.startswith(MET) and not met:
         ended = "the steps of a map that was to meet it do not converge from some of the states"
-    if law is not None and searched.of_parameters is None:
+    if law is not None and searched.of_terms is None:
         on_law = chosen.entry is None or searched.met_by_law
         messages += law.messages if on_law or (law.fast and not met) else ()
     if met:
@@ -57,7 +57,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
             ended = f"larger models are no more accurate: {reason}"
         elif reason:
             ended = f"{ended}; {reason}"
-    if request.seeks_law and not searched.met_by_law:
+    if request.seeks_law and not structured and not searched.met_by_law:
         diagnosis += long_step(searched.plain, request.scene)
     messages += not_radians(chosen.judges.pairs, request.coordinates)
     messages += [not_met(candidate, request.tolerance, ended), *diagnosis]

@@ -187,8 +187,6 @@ def learn_hamiltonian(
     """
     basis = _modes(prepared, scene, terms)
     most = options.max_seconds if basis is None else options.mode_seconds
-    if prepared.structure is not None:  # nothing else is learned in the time that is left
-        most = np.inf
     clock = Clock(most if clock is None else min(most, clock.left))
     if prepared.before or prepared.after:
         raise FitError("expected pairs without a base map: it is no part of a flow")

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.coordinates import Coordinates, lift, to_inner
+from gfnn_jax.coordinates import Coordinates, lift, lift_sites, to_inner
 from gfnn_jax.errors import FitError
 from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.flows.flow import Flow
-from gfnn_jax.learn.structures import Structure
+from gfnn_jax.learn.structures import Sites, Structure
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.domain import Domain, Ranges, covering
 from gfnn_jax.phase_space import Pairs, sizes
@@ -55,6 +55,12 @@ class Prepared:
     def varied(self) -> bool:
         """Whether pairs differ in their dt or in parameters."""
         return self.own_dt is not None or self.args is not None
+
+    @property
+    def of_terms(self) -> bool:
+        """Whether S, where it is learned, is a sum of terms: with parameters, or over sites."""
+        sites = isinstance(self.structure, Sites) and self.own_dt is None
+        return sites or self.args is not None
 
     def given(self, rows) -> tuple[Any, Any]:
         """(dt, args) of these rows."""
@@ -102,7 +108,8 @@ def prepare(pairs: Pairs, coordinates: Coordinates, structure: Structure | None 
             f"expected states that have {coordinates.name} coordinates, got "
             f"{int((~known).sum())} pairs without, the first is row {int(np.argmin(known))}"
         )
-    y0, y1, centres, covered = lift(before, after, coordinates)
+    lifted = lift if structure is None or not structure.angles else lift_sites
+    y0, y1, centres, covered = lifted(before, after, coordinates)
     whole = tuple(i for i, c in zip(coordinates.angles, covered, strict=True) if c)
     empty = covering(y0[:0], ignore=tuple(range(y0.shape[1])))
     own_dt = np.asarray(pairs.dt, np.float64) if np.ndim(pairs.dt) else None

@@ -53,7 +53,14 @@ class Request:
     def seeks_law(self) -> bool:
         """Whether H is looked for."""
         free = (self.family, self.chart, self.base) == ("auto", "auto", None)
-        return free and self.learn != "map"
+        angles = self.structure is not None and bool(self.structure.angles)
+        return free and self.learn != "map" and not angles
+
+
+def lent(scene: Scene, learn: str, chart: str) -> str | None:
+    """The structure that the scene lends: that of bodies is one of H alone."""
+    of_bodies = str(scene.structure).startswith("bodies")
+    return None if of_bodies and (learn == "map" or chart != "auto") else scene.structure
 
 
 def checked(
@@ -64,9 +71,8 @@ def checked(
 
     Raises FitError, in one line, where it or the pairs cannot give a map.
     """
-    free = (family, chart, base) == ("auto", "auto", None) and learn != "map"
-    if structure is None and scene is not None and free:
-        structure = scene.structure
+    if structure is None and scene is not None and (family, base) == ("auto", None):
+        structure = lent(scene, learn, chart)
     bound = Tolerance(tolerance)
     if absolute_tolerance is not None:
         bound = Tolerance(absolute_tolerance, relative=False)
@@ -74,16 +80,14 @@ def checked(
         pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, angles=angles,
         terms=terms, base=base, structure=structure, seed=seed,
     )  # fmt: skip
-    found = structure_of(structure, pairs.dim)
-    if found is not None:
-        learn = "hamiltonian"
+    coordinates = scene.coordinates if scene else Coordinates("cartesian", angles=tuple(angles))
+    found = structure_of(structure, pairs.dim, coordinates)
     z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
     pairs = dataclasses.replace(pairs, z0=z0, z1=z1)
     pairs, learn, messages = as_varied(pairs, learn=learn, family=family, chart=chart, base=base)
     if scene is not None and scene.features is not None and family in ("auto", "features"):
         messages += unlike_the_scene(pairs, scene)
     messages += coarse_tolerance(pairs, bound)
-    coordinates = scene.coordinates if scene else Coordinates("cartesian", angles=tuple(angles))
     return Request(
         pairs, scene, coordinates, bound, learn, terms, base, found, family, chart, seed, clock,
         messages=messages, **others,

@@ -23,7 +23,7 @@ from gfnn_jax.learn.law_maps import (
     search_around,
     search_of_law,
 )
-from gfnn_jax.learn.map_of_parameters import LearnedMap, map_of
+from gfnn_jax.learn.map_of_terms import LearnedMap, map_of
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import Entry, Found, search
@@ -34,12 +34,12 @@ OnBetter = Callable[[SymplecticMap, Candidate], Any]
 
 
 class Searched(NamedTuple):
-    """law: H, or None. of_parameters: S with parameters, or None. found: the generated maps.
+    """law: H, or None. of_terms: S with parameters or of a structure, or None. found: the generated maps.
     swept: whether any were looked for. charts: theirs. plain: the pairs as prepared, without a base
     map or law factored out. judges: of the user's pairs."""
 
     law: LearnedHamiltonian | None
-    of_parameters: LearnedMap | None
+    of_terms: LearnedMap | None
     found: Found
     swept: bool
     charts: Charts
@@ -60,10 +60,10 @@ def searched(
     scene, prepared, charts = request.scene, seen.prepared, seen.charts
     better = _Better(on_better) if on_better is not None else None
     law = _law(request, plain, judges, better)
-    of_parameters = None
+    of_terms = None
     met_by_law = law is not None and judges.met_by(law.candidate)
-    if prepared.args is not None and request.learn != "hamiltonian" and not met_by_law:
-        of_parameters = map_of(prepared, judges, scene, request.chart, law, clock, say)
+    if prepared.of_terms and request.learn != "hamiltonian" and not met_by_law:
+        of_terms = map_of(prepared, judges, scene, request.chart, law, clock, say)
     sweeps = _sweeps(request, seen, judges)
     dearest = law.candidate.operations if law is not None and met_by_law else np.inf
     found = search(sweeps, bound.bound, clock, say, tell, better, dearest)
@@ -81,9 +81,9 @@ def searched(
         around = search_around(law, plain, judges, scene, clock, say, tell, better, request.seed)
         if around is not None and better_than(around.found, found, law):
             found, charts = around
-    if not found.ranking and law is None and of_parameters is None:
+    if not found.ranking and law is None and of_terms is None:
         raise FitError(_nothing_found(len(judges.pairs), clock))
-    return Searched(law, of_parameters, found, bool(sweeps), charts, plain, judges)
+    return Searched(law, of_terms, found, bool(sweeps), charts, plain, judges)
 
 
 def _law(

@@ -10,8 +10,16 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.sums import Part, Sums, Windows, body_terms, site_terms
+from gfnn_jax.families.sums import (
+    Part,
+    Sums,
+    Windows,
+    body_terms,
+    periodic_site_terms,
+    site_terms,
+)
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.maps.domain import Ranges, ranges_of
 from gfnn_jax.phase_space import sizes
@@ -27,6 +35,9 @@ _FUNCTIONS = (
     "cos(q1)", "sin(q1)", "exp(q1)", "exp(-q1)",
     "cos(q2 - q1)", "sin(q2 - q1)", "exp(q2 - q1)", "exp(q1 - q2)",
 )  # fmt: skip
+# (degree, whether products of p, of modes of q and of modes of the difference are tried) of the
+# libraries where q is an angle, by rising size.
+_FOURIER = ((2, False), (4, False), (2, True), (6, False), (3, True), (4, True))
 # Powers of the distances of bodies, by rising size.
 _POWERS = ((-3, -2, -1, 1, 2), (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4))
 # A library of sites is fitted to so many pairs, or to those that hold so many numbers; one of
@@ -37,9 +48,11 @@ _FEWEST_SITES = 5  # a window of the longest reach meets itself in a smaller rin
 
 @dataclasses.dataclass(frozen=True)
 class Sites:
-    """Equal sites in a ring, or in a chain whose ends are free or held. kind: "ring" or "chain"."""
+    """Equal sites in a ring, or in a chain whose ends are free or held. kind: "ring" or "chain".
+    angles: those of a site, "" or "q" or "qp"."""
 
     kind: str
+    angles: str = ""
 
     def fewest(self, width: int) -> int:
         """Pairs of states (2d,) that a library is fitted to, at least."""
@@ -49,6 +62,12 @@ class Sites:
         """Sums by rising size. given: a user's own terms, as text in a site's q1, p1 and the next
         sites' q2, p2, …"""
         ends = _ENDS[self.kind]
+        if self.angles:
+            for degree, products in _FOURIER:
+                yield from (
+                    periodic_site_terms(dim, end, degree, products=products) for end in ends
+                )
+            return
         if given:
             yield from (site_terms(dim, end, 0, 0, given) for end in ends)
         for reach, degree, with_functions in _LIBRARIES:
@@ -66,11 +85,12 @@ class Sites:
         its differences are used."""
         dim = z.shape[1] // 2
         ends = "ring" if self.kind == "ring" else "free"
-        own = ("q1", "p1") if uses_positions else ("p1",)
+        own = tuple(x for x in ("q", "p") if x not in self.angles and (x == "p" or uses_positions))
+        variables = tuple(f"{x}1" for x in own), () if self.angles else ("q2 - q1",)
         seen = tuple(
             Part(Terms(k + 1, names, _units(len(names))), Windows(ends, k))
-            for k, names in enumerate((own, ("q2 - q1",)))
-        )
+            for k, names in enumerate(variables) if names
+        )  # fmt: skip
         return ranges_of(Sums(dim, seen), z)
 
 
@@ -80,6 +100,7 @@ class Bodies:
 
     count: int
     space: int
+    angles = ""
 
     def fewest(self, width: int) -> int:
         """Pairs that a library is fitted to, at least."""
@@ -107,9 +128,11 @@ def _units(count: int) -> tuple[tuple[int, ...], ...]:
 Structure = Sites | Bodies
 
 
-def structure_of(text: str | None, dim: int) -> Structure | None:
+def structure_of(
+    text: str | None, dim: int, coordinates: Coordinates = CARTESIAN
+) -> Structure | None:
     """The structure that this text names. Raises FitError where there is none, or it does not suit
-    ``dim`` degrees of freedom."""
+    ``dim`` degrees of freedom, or the angles are not those of every site."""
     if text is None:
         return None
     kind, _, number = str(text).partition(":")
@@ -125,4 +148,9 @@ def structure_of(text: str | None, dim: int) -> Structure | None:
         raise FitError(f"expected a structure among {', '.join(NAMES)}; got {text!r}")
     if dim < _FEWEST_SITES:
         raise FitError(f"expected a {text} of at least {_FEWEST_SITES} sites, got {dim}")
-    return Sites(text)
+    known = {(): "", tuple(range(dim)): "q", tuple(range(2 * dim)): "qp"}
+    if coordinates.angles not in known:
+        raise FitError(
+            f"expected no angles, or all q of the sites, or all q and p; got {coordinates.angles}"
+        )
+    return Sites(text, known[coordinates.angles])

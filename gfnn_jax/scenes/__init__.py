@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # what is collected below
     from gfnn_jax.scenes.driven_pendulum import driven_pendulum
     from gfnn_jax.scenes.driven_pendulum_phase import driven_pendulum_phase
     from gfnn_jax.scenes.fput import fput
+    from gfnn_jax.scenes.froeschle import froeschle
     from gfnn_jax.scenes.henon_heiles import henon_heiles
     from gfnn_jax.scenes.henon_heiles_section import henon_heiles_section
     from gfnn_jax.scenes.n_body import n_body
@@ -85,6 +86,7 @@ __all__ = [
     "driven_pendulum",
     "driven_pendulum_phase",
     "fput",
+    "froeschle",
     "henon_heiles",
     "henon_heiles_section",
     "make",

@@ -82,7 +82,7 @@ class _Iterate(NamedTuple):
     @property
     def merit(self):
         """The largest residual."""
-        return _largest(self.residual)
+        return largest(self.residual)
 
 
 def iterate(
@@ -103,8 +103,7 @@ def iterate(
     most: updates, 1 or more. gather: whether open lanes are taken out of the batch; else all wait
     for the slowest.
     """
-    eps = float(jnp.finfo(guess.dtype).eps)
-    settled = eps**-0.25  # in floors: 3e-12 of the size in float64, 1e-5 in float32
+    settled = settled_floors(guess.dtype)
     size = guess.shape[0]
     ones, zeros = jnp.ones(size, guess.dtype), jnp.zeros(size, jnp.int32)
     newton = partial(_newton, equation, most=most, settled=settled)
@@ -112,13 +111,13 @@ def iterate(
     evaluation, matrix = equation.linearise(shared, lanes, guess)
     step, sign = solve_and_sign(matrix, evaluation.residual)
     first = _Iterate(
-        guess, evaluation.residual, evaluation.aux, _error(evaluation), sign, step, ones, zeros,
+        guess, evaluation.residual, evaluation.aux, floors(evaluation), sign, step, ones, zeros,
         open=zeros < 1,
     )  # fmt: skip
     x = guess - step
     evaluation = equation.evaluate(shared, lanes, x)
     second = first._replace(
-        x=x, residual=evaluation.residual, aux=evaluation.aux, error=_error(evaluation)
+        x=x, residual=evaluation.residual, aux=evaluation.aux, error=floors(evaluation)
     )  # fmt: skip
 
     before, after = first.merit, second.merit
@@ -126,7 +125,7 @@ def iterate(
     done = smaller & ~_goes_on(second.error, after, before, settled)
     begun = ~done & (smaller | (first.error > settled)) & (most > 1)
     straight = (second.error <= settled) | (after <= _STRAIGHT * before)
-    state = _where(smaller & ~begun, second, first)._replace(
+    state = where(smaller & ~begun, second, first)._replace(
         factor=jnp.where(straight, ones, _BEGIN * ones),
         iterations=jnp.where(begun, 0, 1).astype(jnp.int32),  # the loop makes the first one again
         open=begun,
@@ -140,14 +139,25 @@ def iterate(
         )
     finite = jnp.isfinite(state.error)
     status = jnp.where(state.error <= settled, OK, jnp.where(finite, NOT_CONVERGED, NON_FINITE))
-    residual = state.error * (_FLOOR_EPS * eps)
+    residual = relative(state.error)
     return state.x, state.aux, Info(status.astype(jnp.int32), state.iterations, residual)
 
 
-def _error(evaluation: Evaluation):
+def settled_floors(dtype) -> float:
+    """The error in floors up to which a lane is solved: 3e-12 of the size in float64, 1e-5 in
+    float32."""
+    return float(jnp.finfo(dtype).eps) ** -0.25
+
+
+def floors(evaluation: Evaluation):
     """The largest residual of each lane, in units of its roundoff floor."""
     eps = float(jnp.finfo(evaluation.residual.dtype).eps)
-    return _largest(evaluation.residual / evaluation.size) / (_FLOOR_EPS * eps)
+    return largest(evaluation.residual / evaluation.size) / (_FLOOR_EPS * eps)
+
+
+def relative(error):
+    """An error in floors as a part of the residual's terms."""
+    return error * (_FLOOR_EPS * float(jnp.finfo(error.dtype).eps))
 
 
 def _goes_on(error, merit, merit_before, settled: float):
@@ -162,13 +172,13 @@ def _newton(equation, shared, lanes, state: _Iterate, *, most, settled) -> _Iter
     evaluation, matrix = equation.linearise(shared, lanes, x)
     residual = evaluation.residual
     step, sign_here = solve_and_sign(matrix, residual)
-    error, new_merit = _error(evaluation), _largest(residual)
+    error, new_merit = floors(evaluation), largest(residual)
     # The residual's slope along the step at its end; at its beginning it is -state.residual.
     slope = -jnp.sum(matrix * state.step[:, None, :], axis=-1)
-    bent = _largest(slope + state.residual) / jnp.maximum(_largest(slope), merit)
+    bent = largest(slope + state.residual) / jnp.maximum(largest(slope), merit)
     told = state.residual + 0.5 * part * (slope - state.residual)
     floor = _FLOOR_EPS * float(jnp.finfo(x.dtype).eps) * jnp.max(evaluation.size, axis=-1)
-    near = _largest(residual - told) <= _OFF_PATH * state.factor * merit + 4 * floor
+    near = largest(residual - told) <= _OFF_PATH * state.factor * merit + 4 * floor
     by_the_path = (bent <= _BENT) & near & (sign_here == state.sign)
     settled_here = state.error <= settled
     better = state.open & (by_the_path | (settled_here & (new_merit < merit)))
@@ -186,14 +196,15 @@ def _newton(equation, shared, lanes, state: _Iterate, *, most, settled) -> _Iter
         factor=jnp.where(state.open, 0.5 * state.factor, state.factor),
         open=state.open & (state.factor > shortest),
     )
-    return _where(better, new, halved)
+    return where(better, new, halved)
 
 
-def _largest(rows):
-    return jnp.max(jnp.abs(rows), axis=-1)
+def largest(rows):
+    """The largest entry of each row in magnitude. NumPy or JAX."""
+    return abs(rows).max(axis=-1)
 
 
-def _where(chosen, one, other):
+def where(chosen, one, other):
     """Of each lane, the leaves of one where ``chosen`` (B,), else of the other."""
 
     xp = namespace(chosen)
@@ -209,7 +220,7 @@ def _gathered(newton, shared, lanes, state: _Iterate, few: int) -> _Iterate:
     given, lanes_of = _packed(lanes, state.x.dtype)
     packed, state_of = _packed(state, state.x.dtype)
 
-    def goes_on(carry):
+    def busy(carry):
         return jnp.any(carry[0].open) & (carry[1] < _VISIT)
 
     def visit(packed):
@@ -222,7 +233,7 @@ def _gathered(newton, shared, lanes, state: _Iterate, few: int) -> _Iterate:
 
         own = lanes_of(gather(given))
         part, _ = jax.lax.while_loop(
-            goes_on,
+            busy,
             lambda carry: (newton(shared, own, carry[0]), carry[1] + 1),
             (state_of(gather(packed)), 0),
         )
@@ -292,7 +303,7 @@ def refine(equation: Equation, shared: Any, lanes: Any, guess: Any, updates: int
             before, after = (np.abs(s[1].residual).max(axis=-1) for s in (state, new))
             better = after < before
             if better.any():
-                state = _where(better, new, state)
+                state = where(better, new, state)
             if not (better & (before > _QUADRATIC)).any():
                 break  # what was so small is roundoff now
         x, evaluation, _ = state

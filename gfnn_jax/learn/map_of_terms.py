@@ -1,15 +1,15 @@
-"""Learn S(w; parameters): the generating function of maps that differ in parameters.
+"""Learn S as a sum of terms: of maps that differ in parameters, and of equal sites.
 
 For kicked maps and return maps, which have no flow, and wherever no H is found. S = Σ c_jm φ_j(w)
-f_m(parameters) is linear in its coefficients; its libraries are those of an H with parameters, its
-data those of any S: target gradients at evaluation points.
+f_m(parameters), or Σ_sites Σ_j c_j φ_j(w), is linear in its coefficients; its libraries are those
+of an H, its data those of any S: target gradients at evaluation points.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,8 +18,9 @@ from gfnn_jax.coordinates import to_user
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.family import at_time
+from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.fitting.gauss_newton import fitted_gradients, significant
+from gfnn_jax.fitting.gauss_newton import fitted_gradients, null_terms, significant
 from gfnn_jax.generating.charts import CHARTS, AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.assemble import Assembled, composed, stepped
@@ -33,6 +34,9 @@ _CHARTS = ("type2", "midpoint", "type3")  # that are tried, in this order
 _MOST_TERMS, _ROWS_PER_TERM = 500, 3
 _THRESHOLDS = (1e4, 1e3, 100.0, 30.0, 10.0)  # standard errors below which terms go, tried in turn
 _RISE, _ROUNDING = 1.1, 1e-15  # of the held-out error that this may cost
+_STRUCTURED_ROWS = 50_000  # numbers of training pairs that sites are fitted to: no more are needed
+_NULL_ROWS = 4_000  # of them, which tell whose gradients are combinations of others
+_BETTER = 0.5  # of the error of an H, that S of a structure must have to be taken in its stead
 _SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved
 
 
@@ -53,8 +57,8 @@ def learn_map(
     prepared: Prepared, judges: Judges, scene: Any = None, *, chart: str = "auto",
     clock: Clock | None = None, say: Callable[[str], Any] = lambda message: None,
 ) -> LearnedMap:  # fmt: skip
-    """The map of these pairs of one dt and several systems: of the first chart that meets the
-    tolerance, else of the best.
+    """The map of these pairs of one dt and several systems, or of many sites: of the first chart
+    that meets the tolerance, else of the best.
 
     Raises FitError where no chart covers the data, or the pairs are too few.
     """
@@ -72,9 +76,11 @@ def learn_map(
             raise
     if best is None or not np.isfinite(best.error.bound):
         raise FitError(
-            "expected pairs that tell an S with parameters: they are too few, or no chart covers "
-            "them for all values of the parameters"
+            "expected pairs that tell an S of such terms: they are too few, or no chart covers "
+            f"them{' for all values of the parameters' if prepared.args is not None else ''}"
         )
+    if prepared.structure is not None:
+        judges = _fewer(prepared, judges)
     best = _sparse(best, prepared, judges)
     piece = best.piece
     gradient, with_hessian = piece.family.operations
@@ -101,7 +107,9 @@ def map_of(
         if law is None:
             raise
         return None
-    if law is not None and not found.candidate.validation_bound < law.candidate.validation_bound:
+    better = 1.0 if prepared.structure is None else _BETTER
+    error = found.candidate.validation_bound
+    if law is not None and not error < better * law.candidate.validation_bound:
         return None
     return found
 
@@ -122,6 +130,16 @@ def assembled(learned: LearnedMap, prepared: Prepared, judges: Judges) -> Assemb
 
 def _of_chart(chart: AnyChart, prepared: Prepared, judges: Judges, scene, clock: Clock, say):
     """What is tried in this chart, in turn."""
+
+    def attempt(family: Any) -> _Tried:
+        clock.check()
+        say(f"S in {chart.name}: {family.num_parameters} terms")
+        return _fitted(chart, family, prepared, judges)
+
+    if prepared.structure is not None:
+        judges = _fewer(prepared, judges)
+        yield from _of_sites(prepared, judges, attempt)
+        return
     coordinates, dim = prepared.coordinates, prepared.dim
     angles = tuple(i for i in coordinates.angles if i < dim and i not in coordinates.cyclic)
     plain = tuple(
@@ -138,11 +156,6 @@ def _of_chart(chart: AnyChart, prepared: Prepared, judges: Judges, scene, clock:
         dim, prepared.parameters, args, own=False, period=prepared.period
     )
 
-    def attempt(family: Terms) -> _Tried:
-        clock.check()
-        say(f"S in {chart.name}: {family.num_parameters} terms")
-        return _fitted(chart, family, prepared, judges)
-
     yield from walked(
         states, functions, attempt, lambda tried: tried.error.bound,
         bound=judges.tolerance.bound,
@@ -150,14 +163,35 @@ def _of_chart(chart: AnyChart, prepared: Prepared, judges: Judges, scene, clock:
     )  # fmt: skip
 
 
-def _data(chart: AnyChart, family: Terms, prepared: Prepared, rows):
+def _fewer(prepared: Prepared, judges: Judges) -> Judges:
+    """With as many training pairs as the terms of a site need."""
+    most = max(1, _STRUCTURED_ROWS // prepared.y0.shape[1])
+    return dataclasses.replace(judges, training=judges.training[:most])
+
+
+def _of_sites(prepared: Prepared, judges: Judges, attempt) -> Iterator[_Tried]:
+    """The libraries of a structure by rising size, until one meets the tolerance."""
+    assert prepared.structure is not None
+    width = prepared.y0.shape[1]
+    rows = judges.training[: max(1, _NULL_ROWS // width)]
+    most = min(len(judges.training) * width / _ROWS_PER_TERM, _MOST_TERMS)
+    for library in prepared.structure.libraries(prepared.dim):
+        family = library.take(null_terms(library, prepared.y0[rows])[0])
+        if family.num_parameters <= most:
+            tried = attempt(family)
+            yield tried
+            if tried.error.bound <= judges.tolerance.bound:
+                return
+
+
+def _data(chart: AnyChart, family: Terms | Sums, prepared: Prepared, rows):
     """(w, target gradient, args in the middle of the step) of these rows."""
     y0, y1 = prepared.y0[rows], prepared.y1[rows]
     w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, prepared.dt)
     return w, target, at_time(family, prepared.given(rows)[1], 0.5 * prepared.dt)
 
 
-def _fitted(chart: AnyChart, family: Terms, prepared: Prepared, judges: Judges) -> _Tried:
+def _fitted(chart: AnyChart, family: Terms | Sums, prepared: Prepared, judges: Judges) -> _Tried:
     """The library's S by least squares, and the error of its steps on the held-out pairs."""
     w, target, args = _data(chart, family, prepared, judges.training)
     c = fitted_gradients(family, w, target, prepared.scale, args)
@@ -170,8 +204,10 @@ def _judged(piece: Generated, prepared: Prepared, judges: Judges) -> _Tried:
     w = piece.chart.evaluation_point(prepared.y0[rows], prepared.y1[rows])
     args = prepared.given(rows)[1]
     images, off = piece.refined_step(prepared.y0[rows], w, args)
-    determinant = piece.determinant(prepared.y0[rows], prepared.y1[rows], args)
-    folds = not (determinant > SINGULAR).all() and not (determinant < -SINGULAR).all()
+    folds = False  # a fixed point that contracts is none
+    if not matrix_free(family):
+        determinant = piece.determinant(prepared.y0[rows], prepared.y1[rows], args)
+        folds = not (determinant > SINGULAR).all() and not (determinant < -SINGULAR).all()
     bad = ~(off < _SOLVED) | folds
     images = np.where(bad[:, None], np.nan, images)
     error = judges.error_of(to_user(prepared.coordinates, images), prepared.coordinates)
