@@ -154,6 +154,37 @@ def toda(quick: bool) -> Numbers:
     return judged(law, z[:200], 0.05, "ring", z[200:], 2_000)
 
 
+def froeschle(quick: bool) -> Numbers:
+    """A ring of 64 coupled standard maps, 100 pairs: a map without a flow, judged modulo 2π."""
+    scene = gfnn.scenes.froeschle()
+    pairs = gfnn.sample_pairs(scene, 110, jax.random.key(SEED))
+    started = time.perf_counter()
+    fit = gfnn.fit(
+        gfnn.Pairs(pairs.z0[:100], pairs.z1[:100], 1.0), structure="ring", learn="map",
+        angles=scene.coordinates.angles, tolerance=1e-12, max_seconds=None,
+    )  # fmt: skip
+    seconds, fresh, steps = time.perf_counter() - started, pairs.z0[100:], 10
+    exact = np.asarray(gfnn.reference_trajectories(scene, fresh, steps))
+    states = np.asarray(fit.map.rollout(fresh, steps)[0])
+    error = np.remainder(states - exact + np.pi, 2 * np.pi) - np.pi
+    off = np.linalg.norm(error[:, -1], axis=1)
+    alone = timed(lambda: fit.map.rollout(fresh[0], 100, save_every=100))
+    (piece,) = fit.map.pieces
+    kicks = {"p_i²": 0.5, "cos(q_i)": 0.5, "cos(q_{i+1} - q_i)": -0.1}
+    found = dict(zip(piece.family.term_names, np.asarray(piece.params).tolist(), strict=True))
+    return {
+        "structure": "ring", "dim": 64, "dt": 1.0, "pairs": 100, "formula": None,
+        "terms": fit.chosen.num_parameters, "fit_seconds": seconds,
+        "one_step_rms": float(np.sqrt(np.mean(error[:, 1] ** 2))),
+        "coefficients_off": max(abs(found.get(t, 0.0) - c) / abs(c) for t, c in kicks.items()),
+        "steps": steps, "error_median": float(np.median(off)),
+        "error_90": float(np.sort(off)[int(0.9 * len(off))]),
+        "symplecticity_defect": fit.symplecticity_defect,
+        "microseconds_per_step_alone": 1e6 * alone.seconds / 100,
+        "gigabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+    }  # fmt: skip
+
+
 def three_bodies(quick: bool) -> Numbers:
     """Equal bodies in the plane, nearly on a circle and falling out of it: to t = 5."""
     rng, num = np.random.default_rng(SEED), 2_200
@@ -179,12 +210,13 @@ def four_bodies(quick: bool) -> Numbers:
 
 PIECES = {
     **{f"fput-{dim}": partial(fput, dim) for dim in SIZES},
-    "toda": toda, "three-bodies": three_bodies, "four-bodies": four_bodies, "leapfrog": leapfrog,
+    "toda": toda, "froeschle": froeschle, "three-bodies": three_bodies,
+    "four-bodies": four_bodies, "leapfrog": leapfrog,
 }  # fmt: skip
 _TITLES = {
     **{f"fput-{dim}": f"FPUT-β ring, d = {dim:,}" for dim in SIZES},
-    "toda": "Toda's ring, d = 32", "three-bodies": "three equal bodies in the plane",
-    "four-bodies": "four bodies in space",
+    "toda": "Toda's ring, d = 32", "froeschle": "64 coupled standard maps",
+    "three-bodies": "three equal bodies in the plane", "four-bodies": "four bodies in space",
 }  # fmt: skip
 
 

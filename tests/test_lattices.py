@@ -11,13 +11,16 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax import cli, scenes
+from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.families.sums import ENDS, Part, Sums, Windows, body_terms, matrix_free, site_terms
-from gfnn_jax.families.terms import Terms
+from gfnn_jax.families.terms import Terms, given_terms
 from gfnn_jax.fitting.gauss_newton import rates
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.generating.generated import Generated
+from gfnn_jax.learn.prepare import prepare
+from gfnn_jax.learn.propose import proposed
 from gfnn_jax.phase_space import defect_of_pairs
 from gfnn_jax.solve.status import NOT_CONVERGED
 
@@ -210,22 +213,27 @@ def test_a_generated_step_without_matrices():
         Generated(f, params, CHARTS["midpoint"], 0.3, scale)
         for f in (family, gfnn.from_function(lambda c, w: family.value(c, w)))
     ]
-    found = []
-    for piece in sides:
-        image, along = jax.jvp(lambda z, piece=piece: piece.step(z)[0], (z,), (v,))
-        back = jax.vjp(lambda z, piece=piece: piece.step(z)[0], z)[1](v)[0]
-        found.append((image, along, back))
-    for own, dense in zip(*found, strict=True):
-        np.testing.assert_allclose(own, dense, atol=1e-13)
-    image, along, _ = found[0]
-    unrolled = jax.jvp(lambda z: sides[0].step(z, unrolled=True)[0], (z,), (v,))[1]
-    np.testing.assert_allclose(unrolled, along, atol=1e-13)
-    np.testing.assert_allclose(sides[0].inverse().step(image)[0], z, atol=1e-14)
+
+    @jax.jit
+    def both(piece, z):
+        def step(z, unrolled=False):
+            return piece.step(z, unrolled=unrolled)[0]
+
+        image, along = jax.jvp(step, (z,), (v,))
+        _, unrolled = jax.jvp(lambda z: step(z, True), (z,), (v,))
+        return image, along, unrolled, jax.vjp(step, z)[1](v)[0], piece.inverse().step(image)[0]
+
+    own, dense = (both(piece, z) for piece in sides)
+    for one, other in zip(own, dense, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-13)
+    image, *_, back = own
+    np.testing.assert_allclose(back, z, atol=1e-14)
     refined, error = sides[0].refined_step(np.asarray(z), np.asarray(z))
     np.testing.assert_allclose(refined, image, atol=1e-14)
     assert (error < 1e-14).all()
     far = dataclasses.replace(sides[0], dt=np.asarray(9.0))  # does not contract
-    assert (np.asarray(far.step(z)[1].status) >= NOT_CONVERGED).all()
+    status = jax.jit(lambda piece: piece.step(z)[1].status)(far)
+    assert (np.asarray(status) >= NOT_CONVERGED).all()
 
 
 @pytest.mark.parametrize("reduced", [False, True])
@@ -303,6 +311,23 @@ def test_the_command_line_takes_a_structure(tmp_path):
     assert cli.main([*predict, "--out", str(tmp_path / "out.npz")]) == 0
     with np.load(tmp_path / "out.npz") as out:
         np.testing.assert_allclose(out["trajectories"][:, 1], pairs.z1[:2], atol=1e-13)
+
+
+def test_a_structure_is_proposed_and_not_used():
+    def best_of(family, params, dt=0.1):
+        pairs = drawn(6, 60, family, params, dt)
+        return " ".join(proposed(prepare(pairs, CARTESIAN)))
+
+    assert "--structure ring explains" in best_of(*springs(6))
+    assert "--structure chain explains" in best_of(*springs(6, "free"))
+    apart = body_terms(3, 2, (2, -1), alike=True)  # distances at random: near collisions apart
+    assert "--structure bodies:3 explains" in best_of(apart, np.array([0.5, 0.3, 1e-3]), 0.02)
+    bent = given_terms(6, [*(f"p{i}**2" for i in range(1, 7)), "q1*q3*q6", "q2**4*q5", "q1**2"])
+    assert best_of(bent, np.array([0.5] * 6 + [3.0, 5.0, 1.0])) == ""
+    pairs = drawn(6, 60, *springs(6), 0.1)
+    with pytest.warns(gfnn.FitWarning, match="--structure ring explains these pairs"):
+        fit = gfnn.fit(pairs, learn="map", chart="type2", tolerance=1e-12, max_seconds=10)
+    assert not fit.met
 
 
 def test_too_few_sites_or_pairs_are_refused():

@@ -15,6 +15,7 @@ from gfnn_jax.learn.choose_law import long_step
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.diagnose import differs_between_sequences, sequences_of, volume_change
 from gfnn_jax.learn.noise import state_noise
+from gfnn_jax.learn.propose import proposed
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import AS_FAR, MET, Entry
 from gfnn_jax.learn.searches import Searched
@@ -60,6 +61,8 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     if request.seeks_law and not structured and not searched.met_by_law:
         diagnosis += long_step(searched.plain, request.scene)
     messages += not_radians(chosen.judges.pairs, request.coordinates)
+    if not structured:
+        diagnosis += proposed(searched.plain)
     messages += [not_met(candidate, request.tolerance, ended), *diagnosis]
     return Conclusion(ended, noise, messages)
 

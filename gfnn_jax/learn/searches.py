@@ -34,9 +34,9 @@ OnBetter = Callable[[SymplecticMap, Candidate], Any]
 
 
 class Searched(NamedTuple):
-    """law: H, or None. of_terms: S with parameters or of a structure, or None. found: the generated maps.
-    swept: whether any were looked for. charts: theirs. plain: the pairs as prepared, without a base
-    map or law factored out. judges: of the user's pairs."""
+    """law: H, or None. of_terms: S with parameters or of a structure, or None. found: the generated
+    maps. swept: whether any were looked for. charts: theirs. plain: the pairs as prepared, without
+    a base map or law factored out. judges: of the user's pairs."""
 
     law: LearnedHamiltonian | None
     of_terms: LearnedMap | None

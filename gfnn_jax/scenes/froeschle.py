@@ -1,4 +1,4 @@
-"""A ring of coupled standard maps (Froeschlé, Astron. Astrophys. 16 (1972), 172): no flow, S local."""
+"""Standard maps coupled in a ring, without a flow (Froeschlé, Astron. Astrophys. 16 (1972))."""
 
 from __future__ import annotations
 

@@ -1,0 +1,71 @@
+"""What a fit of many degrees of freedom proposes where it met nothing: a structure to be told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from gfnn_jax.errors import FitError
+from gfnn_jax.families.sums import Sums
+from gfnn_jax.fitting.gauss_newton import fitted_gradients
+from gfnn_jax.generating.charts import CHARTS
+from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.learn.structures import structure_of
+
+_FEWEST_DIM = 6  # below it a fit needs no structure
+_CHARTS = ("midpoint", "type2")  # of flows, to O(h²), and of kicked maps
+_SAMPLE = 50  # pairs that a structure is fitted to; as many judge it
+_MOST_TERMS = 60
+_EXPLAINED = 0.1  # of the forces or of the velocities, that the midpoint's error may leave over
+
+
+def proposed(prepared: Prepared) -> list[str]:
+    """One line that names the structure which explains a sample of the pairs best, to O(h²); none
+    where none does. prepared: without a base map or a structure."""
+    if prepared.dim < _FEWEST_DIM or prepared.varied or prepared.coordinates.angles:
+        return []
+    left = {text: _left_over(text, prepared) for text in _possible(prepared.dim)}
+    best = min(left, key=lambda text: left[text])
+    if not left[best] < _EXPLAINED:
+        return []
+    return [
+        f"--structure {best} explains these pairs: a sample leaves {left[best]:.1g} of forces and "
+        f"velocities over, to second order in dt; fit with structure='{best}'"
+    ]
+
+
+def _possible(dim: int) -> Iterator[str]:
+    """The structures that so many degrees of freedom may have."""
+    yield from ("ring", "chain")
+    yield from (f"bodies:{dim // k}" for k in (3, 2, 1) if dim % k == 0 and dim // k > 1)
+
+
+def _left_over(text: str, prepared: Prepared) -> float:
+    """The least part of the held-out target gradients that a library of the structure leaves."""
+    structure = structure_of(text, prepared.dim)
+    assert structure is not None
+    libraries = list(structure.libraries(prepared.dim))
+    small = [family for family in libraries if family.num_parameters <= _MOST_TERMS]
+    return min((_of_library(f, prepared) for f in small), default=np.inf)
+
+
+def _of_library(family: Sums, prepared: Prepared) -> float:
+    half, found = min(_SAMPLE, len(prepared.y0) // 2), []
+    for chart in (CHARTS[name] for name in _CHARTS):
+        y0, y1 = prepared.y0[: 2 * half], prepared.y1[: 2 * half]
+        w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, prepared.dt)
+        try:
+            c = fitted_gradients(family, w[:half], target[:half], prepared.scale)
+        except (FitError, np.linalg.LinAlgError):  # functions that overflow at these states
+            continue
+        off = family.gradient(c, w[half:]) - target[half:]
+        found.append(_part(off, target[half:]))
+    return min(found, default=np.inf)
+
+
+def _part(off: np.ndarray, target: np.ndarray) -> float:
+    """RMS of off ÷ RMS of target, of the forces or of the velocities, whichever is larger."""
+    squares = [np.sum(np.reshape(x, (len(x), 2, -1)) ** 2, axis=(0, 2)) for x in (off, target)]
+    part = float(np.sqrt(np.max(squares[0] / np.maximum(squares[1], np.finfo(float).tiny))))
+    return part if np.isfinite(part) else np.inf
