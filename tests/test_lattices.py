@@ -278,6 +278,7 @@ def test_kicked_sites_of_plain_coordinates():
         ({"structure": "ring", "chart": "type1"}, "another chart"),
         ({"structure": "ring", "angles": (0,)}, "all q of the sites"),
         ({"structure": "ring", "angles": tuple(range(20)), "learn": "hamiltonian"}, "S is learned"),
+        ({"structure": "ring", "angles": tuple(range(20)), "terms": ["p1**2"]}, "those of H"),
         ({"structure": "bodies:10", "learn": "map"}, "is that of H"),
         ({"structure": "bodies:10", "angles": (0,)}, "plain q and p"),
         ({"structure": "ring", "terms": ["exp(q9)"]}, "q9"),

@@ -154,6 +154,8 @@ def _check_structured(
         raise FitError("a structure's H goes with plain q and p: with angles, S is learned")
     if learn == "map" and np.ndim(pairs.dt):
         raise FitError("expected pairs of one dt, as those of a map are; got several")
+    if terms and (angles or coordinates.angles):
+        raise FitError("terms are those of H: expected none where sites have angles")
     if terms and bodies:
         raise FitError("terms go with a ring or a chain: those of bodies are powers of distances")
     for term in terms:

@@ -211,7 +211,8 @@ def fit(
                its flow is factored out, and S learns what it leaves over.
     structure: "ring" or "chain" of equal sites, whose ``terms`` are text in a site's q1, p1 and the
                next ones' q2, p2, …; "bodies:N", q body by body: H is a sum over sites, or over
-               bodies and pairs. None: the scene's own.
+               bodies and pairs; of sites, S where learn is "map" or no H meets the tolerance.
+               None: the scene's own.
     family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp".
     chart:     "auto" or one of type1, type2, type3, midpoint.
     angles:    without a scene, the indices of z that have period 2π.
