@@ -49,6 +49,7 @@ the table of candidates:
 class _Terminated(KeyboardInterrupt):
     """SIGTERM, as clean a stop as Ctrl-C."""
 
+
 _TO_BEGIN = (
     "try `gfnn run two-body --quick`, or with your own pairs `gfnn fit DATA.npz --out MODEL`; "
     "`gfnn --help` says more"
