@@ -50,6 +50,12 @@ class _Terminated(KeyboardInterrupt):
     """SIGTERM, as clean a stop as Ctrl-C."""
 
 
+_TO_BEGIN = (
+    "try `gfnn run two-body --quick`, or with your own pairs `gfnn fit DATA.npz --out MODEL`; "
+    "`gfnn --help` says more"
+)
+
+
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message} (see {self.prog} --help)")
@@ -57,8 +63,10 @@ class _Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line ``argv`` (without the program's name) and return the exit status."""
-    arguments = argparse.Namespace()
+    arguments, argv = argparse.Namespace(), sys.argv[1:] if argv is None else argv
     try:
+        if not argv:
+            raise InputError(f"expected a command, got none: {_TO_BEGIN}")
         arguments = _parser().parse_args(argv)
         with _sigterm(), _warnings_in_one_line():
             arguments.command(arguments)

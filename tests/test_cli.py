@@ -238,6 +238,12 @@ def test_refusals(arguments, message, tmp_path, model, capsys, monkeypatch):
     assert files(tmp_path) == before
 
 
+def test_no_command_says_what_to_try(capsys):
+    assert gfnn() == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "gfnn run two-body --quick" in line
+
+
 def test_usage_is_refused_in_a_moment():
     started = time.perf_counter()
     command = [sys.executable, "-m", "gfnn_jax", "fit", "nowhere.npz", "--out", "m"]

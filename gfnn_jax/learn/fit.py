@@ -253,13 +253,13 @@ def fit(
     warn(seen.messages)
     judges = Judges(pairs, *split_rows(pairs, seed), request.tolerance)
     found = searched(request, plain, seen, judges, on_better)
-    chosen = choose(found, request)
+    chosen = with_posterior(choose(found, request), found)
     conclusion = conclude(chosen, found, request)
     warn(conclusion.messages)
     judged = min(_JUDGED, block_of(2 * pairs.dim))
     test = chosen.judges.pairs.take(chosen.judges.held_out[:judged])
     return Fit(
-        map=with_posterior(chosen, found),
+        map=chosen.candidate.map,
         candidates=_all_candidates(chosen, found),
         asked=request.tolerance,
         num_pairs=len(pairs),

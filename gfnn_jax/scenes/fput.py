@@ -43,7 +43,6 @@ def fput(dim: int = 32, alpha: float = 0.0, beta: float = 1.0, dt: float = 0.1) 
         hamiltonian=energy,
         invariants={"energy": energy, "momentum": momentum},
         structure="ring",
-        regular=False,
         num_pairs=40,
         tolerance=1e-12,
     )
