@@ -16,6 +16,7 @@ from gfnn_jax.learn.structures import structure_of
 _FEWEST_DIM = 6  # below it a fit needs no structure
 _CHARTS = ("midpoint", "type2")  # of flows, to O(h²), and of kicked maps
 _SAMPLE = 50  # pairs that a structure is fitted to; as many judge it
+_QUIET = 0.75  # of the sample, that moves least
 _MOST_TERMS = 60
 _EXPLAINED = 0.1  # of the forces or of the velocities, that the midpoint's error may leave over
 
@@ -51,9 +52,9 @@ def _left_over(text: str, prepared: Prepared) -> float:
 
 
 def _of_library(family: Sums, prepared: Prepared) -> float:
-    half, found = min(_SAMPLE, len(prepared.y0) // 2), []
+    y0, y1 = _quiet(prepared)
+    half, found = len(y0) // 2, []
     for chart in (CHARTS[name] for name in _CHARTS):
-        y0, y1 = prepared.y0[: 2 * half], prepared.y1[: 2 * half]
         w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, prepared.dt)
         try:
             c = fitted_gradients(family, w[:half], target[:half], prepared.scale)
@@ -64,8 +65,18 @@ def _of_library(family: Sums, prepared: Prepared) -> float:
     return min(found, default=np.inf)
 
 
+def _quiet(prepared: Prepared) -> tuple[np.ndarray, np.ndarray]:
+    """A sample of the pairs without those that move most, as close passages do."""
+    y0, y1 = prepared.y0[: 2 * _SAMPLE], prepared.y1[: 2 * _SAMPLE]
+    moved = np.abs((y1 - y0) / prepared.scale).max(axis=1)
+    quiet = moved <= np.quantile(moved, _QUIET)
+    return y0[quiet], y1[quiet]
+
+
 def _part(off: np.ndarray, target: np.ndarray) -> float:
-    """RMS of off ÷ RMS of target, of the forces or of the velocities, whichever is larger."""
-    squares = [np.sum(np.reshape(x, (len(x), 2, -1)) ** 2, axis=(0, 2)) for x in (off, target)]
-    part = float(np.sqrt(np.max(squares[0] / np.maximum(squares[1], np.finfo(float).tiny))))
+    """Size of off ÷ that of target in the median over pairs, of the forces or of the velocities,
+    whichever is larger."""
+    sizes = [np.linalg.norm(np.reshape(x, (len(x), 2, -1)), axis=2) for x in (off, target)]
+    left, whole = (np.median(size, axis=0) for size in sizes)
+    part = float(np.max(left / np.maximum(whole, np.finfo(float).tiny)))
     return part if np.isfinite(part) else np.inf
