@@ -1,5 +1,6 @@
 """Rollouts shared out among devices and processes: the same bits on any number of them."""
 
+import dataclasses
 import os
 import socket
 import subprocess
@@ -9,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic import generated as generated_by
-from analytic import map_of, pendulum
+from analytic import map_of
 
 from gfnn_jax import processes
 from gfnn_jax.cli import main
@@ -20,10 +20,13 @@ from gfnn_jax.data.predictions import PredictionWriter, job_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.parameters import sampled
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.processes import Share
@@ -111,7 +114,8 @@ def test_parameters_go_with_their_lanes():
     """Of one block and a part of the next, as the map itself makes all of them."""
     rng = np.random.default_rng(1)
     z, args = rng.uniform(-1, 1, (300, 2)), rng.uniform(0.5, 1.5, (300, 1))
-    piece = Flow(Terms.of(["p1**2", "k*q1**2"], 1, ("k",)), np.full(2, 0.5), DT, np.ones(2))
+    piece = Flow(Terms(1, ("p1", "q1", "k"), ((2, 0, 0), (0, 2, 1)), ("k",)), np.full(2, 0.5), DT,
+                 np.ones(2))  # fmt: skip
     map_ = dataclasses.replace(map_of(piece, z), parameters=sampled(("k",), args))
     states, info = map_.sharded().rollout(z, 5, params=args[:, 0])
     expected, how = map_.rollout(z, 5, params=args[:, 0])
