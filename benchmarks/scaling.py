@@ -3,9 +3,9 @@
     python benchmarks/scaling.py             both maps (about three minutes on two cores), table
     python benchmarks/scaling.py --quick     few steps, into runs/scaling
 
-Every number of devices has a process of its own, with so many virtual CPU devices; the digest of all
-states says whether the bits are the same. More devices than cores gain nothing: the table says how many
-there are. Beside them the map itself, all lanes in one batch, and blocks of other sizes.
+Every number of devices has a process of its own, with so many virtual CPU devices; the digest of
+all states says whether the bits are the same. More devices than cores gain nothing: the table says
+how many there are. Beside them the map itself, all lanes in one batch, and blocks of other sizes.
 """
 
 from __future__ import annotations
