@@ -29,6 +29,7 @@ from harness import (
     main,
     markdown,
     number,
+    provenance,
     results,
     timed,
 )
@@ -95,8 +96,8 @@ def tables() -> None:
         "learned", "cores", "one batch, no blocks", *(f"1 device, blocks of {b}" for b in BLOCKS),
         *(f"{n} devices" for n in DEVICES[1:]), "same bits",
     )  # fmt: skip
-    rows = []
-    for name, result in results(PIECES, "scaling").items():
+    rows, found = [], results(PIECES, "scaling")
+    for name, result in found.items():
         m = result["measured"]
         one = m["rows"][0]
         rows.append([
@@ -105,7 +106,8 @@ def tables() -> None:
             *(number(row["microseconds"]) for row in m["rows"][1:]),
             "yes" if m["same_bits"] else "no",
         ])  # fmt: skip
-    between_markers(TABLES, "scaling", markdown(heads, rows))
+    text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
+    between_markers(TABLES, "scaling", text)
 
 
 if __name__ == "__main__":

@@ -505,7 +505,8 @@ def _set_up_jax(devices: int | str | None = None) -> None:
     told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if devices is not None and not told:
         with contextlib.suppress(RuntimeError):  # in a session that has its devices already
-            jax.config.update("jax_num_cpu_devices", _cores() if devices == "all" else devices)
+            most = _cores() if isinstance(devices, str) else min(devices, _cores())
+            jax.config.update("jax_num_cpu_devices", most)
     enable_compile_cache()
 
 

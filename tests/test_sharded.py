@@ -269,6 +269,13 @@ def test_nobody_says_where_the_others_are(told, line, monkeypatch):
         processes.join()
 
 
+def test_more_devices_than_cores(folder, capsys):
+    command = ["predict", folder / "m", "--initial", folder / "z0.npy", "--num-steps", 5, "--out",
+               folder / "s.npz", "--devices", 10_000]  # fmt: skip
+    assert main([str(part) for part in command]) == 2
+    assert "--devices: expected 1 to 1 devices" in capsys.readouterr().err
+
+
 def test_samples_stay_on_one_device(folder, capsys):
     command = ["predict", folder / "m", "--initial", folder / "z0.npy", "--num-steps", 5, "--out",
                folder / "s.npz", "--samples", 3, "--devices", "all"]  # fmt: skip
