@@ -18,8 +18,9 @@ import numpy as np
 
 from gfnn_jax.maps.symplectic_map import Lanes, RolloutInfo, SymplecticMap
 
-# Lanes of a block. On a CPU neither 64 nor 1,024 were faster beyond what the measurement scatters
-# (benchmarks/scaling.py); an accelerator wants many, and was not at hand to tell how many.
+# Lanes of a block. On a CPU 64 and 1,024 are no faster for a generated map, 64 perhaps for a law
+# (benchmarks/scaling.py, on a busy machine); an accelerator wants many, and was not at hand to tell
+# how many.
 _ON_CPU, _ON_ACCELERATORS = 256, 16_384
 
 
