@@ -677,9 +677,11 @@ def unexplained(prepared: Prepared, rows, residual, taken: int, states) -> float
     count, freedom = family.num_parameters, None
     if states is not None:
         to_target = -weight[:, None] * symplectic_form(prepared.dim)
-        slopes, (*effects, goes_on) = family.term_gradients(z) * weight[:, None], states
-        of_k = weight * target, *(to_target @ effect for effect in effects), goes_on
-        freedom = shared_noise.freedom(slopes, of_k[0], shared_noise.scores(slopes, *of_k))
+        slopes, (first, second, goes_on) = family.term_gradients(z) * weight[:, None], states
+        scores = shared_noise.scores(
+            slopes, weight * target, to_target @ first, to_target @ second, goes_on
+        )
+        freedom = shared_noise.freedom(slopes, weight * target, scores)
     left = np.sum(reduced.factor[:, -1] ** 2) / max(reduced.rows - taken, 1)
     if left == 0:
         return 1.0
