@@ -5,12 +5,17 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
+from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.data.files import read_initial_noise
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate.bands import bands, horizon
 from gfnn_jax.fitting import shared_noise, uncertainty
 from gfnn_jax.fitting.least_squares import Reduced
+from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.jobs.predict import predict
+from gfnn_jax.learn.candidates import Judges, Tolerance
+from gfnn_jax.learn.prepare import prepare
+from gfnn_jax.learn.sweeps import LinearSweep
 from gfnn_jax.scenes import henon_heiles
 
 NOISE = 1e-3
@@ -129,6 +134,30 @@ def test_the_posterior_of_s_covers_the_held_out_misfit():
     error = np.abs(mean - np.asarray(fresh.z1))
     inside = error <= 2 * np.sqrt(np.mean((states - mean) ** 2, axis=0))
     assert 0.88 < inside.mean() <= 1
+
+
+def test_residual_of_s_moves_with_the_states_as_its_derivatives_say():
+    pairs = gfnn.sample_pairs(henon_heiles(), 100, jax.random.key(0))
+    prepared = prepare(pairs, CARTESIAN)
+    for chart in (MIDPOINT, TYPE2):
+        judges = Judges(pairs, np.arange(80), np.arange(80, 100), Tolerance(1e-6))
+        sweep = LinearSweep(prepared, chart, judges, "polynomial", None, None)
+        family = sweep.sizes[0].family
+        drawn = np.random.default_rng(0).normal(size=family.num_parameters)
+        params = family.unflatten(drawn)
+
+        def residual(y0, y1, sweep=sweep, chart=chart, family=family, params=params):
+            gradient = family.gradient(params, chart.evaluation_point(y0, y1))
+            return sweep._weight * (gradient - chart.target_gradient(y0, y1, pairs.dt))
+
+        y0, y1, scale = prepared.y0[:5], prepared.y1[:5], prepared.scale
+        found = sweep._by_states(family, params, chart.evaluation_point(y0, y1))
+        off = 1e-5 * np.diag(scale)
+        for j in range(4):
+            by = [(residual(y0 + off[j], y1) - residual(y0 - off[j], y1)) / 2e-5,
+                  (residual(y0, y1 + off[j]) - residual(y0, y1 - off[j])) / 2e-5]  # fmt: skip
+            for whole, column in zip(found, by, strict=True):
+                np.testing.assert_allclose(whole[:, :, j], column, rtol=0, atol=1e-7)
 
 
 def test_bands_compare_angles_modulo_turns():
