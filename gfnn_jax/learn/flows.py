@@ -23,7 +23,7 @@ from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms, given_terms, joined, multiplied, polynomial_terms
-from gfnn_jax.fitting import least_squares, uncertainty
+from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
 from gfnn_jax.fitting.gauss_newton import (
     MOST_SUBSTEPS,
     FlowFit,
@@ -33,6 +33,7 @@ from gfnn_jax.fitting.gauss_newton import (
     midpoint_start,
     null_terms,
     rates,
+    significant,
     significant_terms,
 )
 from gfnn_jax.fitting.growth import grow
@@ -43,10 +44,10 @@ from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.learn.assemble import Assembled, composed, stepped
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
 from gfnn_jax.learn.clock import Clock, OutOfTime
-from gfnn_jax.learn.held_out import outermost
+from gfnn_jax.learn.held_out import looked_at, outermost
 from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
 from gfnn_jax.learn.prepare import Prepared
-from gfnn_jax.phase_space import apply_j, symplectic_form
+from gfnn_jax.phase_space import Pairs, apply_j, symplectic_form
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +63,7 @@ class Options:
     rise: of the held-out error that dropping terms may cost; rounding: below which it is roundoff.
     flat: libraries one after the other whose errors differ by less have met the pairs' noise;
     certain: standard errors below which a term is then noise (one in 16,000 by chance).
+    explained: standard errors of the part of a residual that is noise, within which all of it is.
     gained: a library that lowers the error by less has not helped; twice in a row ends the search.
     truncation: a flow's own error, as a part of the tolerance. contracting: a fixed point's factor
     up to which it is preferred to Newton's method. goal: residual that modes grow to, as a part of
@@ -84,6 +86,7 @@ class Options:
     rounding: float = 1e-15
     flat: float = 1.2
     certain: float = 4.0
+    explained: float = 2.0
     gained: float = 0.5
     truncation: float = 0.1
     contracting: float = 0.8
@@ -101,7 +104,7 @@ _FREQUENCY_STATES = 500
 _NEAR_ROUNDOFF = 3e-15  # of the spread
 _HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
 _NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
-_FEWEST_SAMPLED = 1_000  # pairs that tell noise from misfit
+_FEWEST_SAMPLED = 2_000  # pairs that tell noise from misfit
 _NAMED = 5  # terms in a message
 # Libraries in a row that do not help end the search; with given terms; of a structure, whose
 # libraries differ in kind.
@@ -189,7 +192,8 @@ def learn_hamiltonian(
     most = options.max_seconds if basis is None else options.mode_seconds
     if prepared.structure is not None:  # nothing else is learned in the time that is left
         most = np.inf
-    clock = Clock(most if clock is None else min(most, clock.left))
+    clock = clock or Clock()
+    searching = Clock(min(most, clock.left))
     if prepared.before or prepared.after:
         raise FitError("expected pairs without a base map: it is no part of a flow")
     started = time.perf_counter()
@@ -197,7 +201,7 @@ def learn_hamiltonian(
         _check_finite(_own_terms(prepared, terms), prepared, judges.training)
     problem = Problem(
         prepared.y0, prepared.y1, prepared.each_dt, prepared.scale, args=prepared.args,
-        check=clock.check,
+        check=searching.check,
     )  # fmt: skip
     everywhere, free = judges, (*prepared.coordinates.cyclic, *prepared.whole)
     if prepared.structure is None:
@@ -208,7 +212,7 @@ def learn_hamiltonian(
     if prepared.args is not None:
         best = _walked(problem, prepared, judges, scene, terms, options, say)
     elif basis is not None:
-        best = _grown(problem, basis, prepared, judges, clock, options, say)
+        best = _grown(problem, basis, prepared, judges, searching, options, say)
     else:
         best, options = _searched(problem, prepared, judges, scene, terms, options, say)
     everyone = np.arange(len(prepared.y0))
@@ -217,7 +221,8 @@ def learn_hamiltonian(
     outside = None
     try:
         if best.noisy:
-            best = _refitted(problem, best, judges.training, prepared, judges)
+            problem.check = clock.check  # what is pruned is soon fitted: the search is over
+            best = _pruned(problem, best, judges.training, prepared, judges, options)
         best = _sparse(problem, best, prepared, judges, options, say)
         there = dataclasses.replace(everywhere, held_out=everywhere.training[outer])
         if outer.any():
@@ -548,6 +553,25 @@ def _error_of(family, coefficients, steps: Steps, prepared, judges: Judges) -> O
     return judges.error_of(to_user(prepared.coordinates, found), prepared.coordinates)
 
 
+def _pruned(problem, full: _Fitted, rows, prepared, judges, options: Options) -> _Fitted:
+    """The terms that all of these pairs tell from noise, fitted to them: one Gauss–Newton problem
+    of all terms says which, so that only a few are fitted to many pairs."""
+    resolved = np.setdiff1d(rows, np.setdiff1d(full.rows, full.fit.used))
+    found = problem.factor(full.family, full.fit.coefficients, full.fit.steps, resolved)
+    if np.isfinite(found.cost):
+        kept, start = significant(
+            found.matrix, full.fit.coefficients, found.rows, options.certain
+        )  # fmt: skip
+        few = full._replace(
+            family=full.family.take(tuple(kept.tolist())), fit=full.fit._replace(coefficients=start)
+        )
+        if len(kept):
+            few = _refitted(problem, few, rows, prepared, judges)
+            if few.error.relative <= options.rise * full.error.relative:
+                return few
+    return _refitted(problem, full, rows, prepared, judges)
+
+
 def _sparse(problem, full: _Fitted, prepared, judges, options: Options, say) -> _Fitted:
     """Without the terms that the pairs do not ask for, as far as the held-out error allows."""
     seen: set[tuple[int, ...]] = set()
@@ -619,35 +643,52 @@ def _learned(
         float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(error, omega_h, prepared, judges, found, left_out)),
-        stalled=found.stalled, root=_root(found, problem, prepared, steps),
+        stalled=found.stalled, root=_root(found, problem, prepared, steps, judges.pairs),
     )  # fmt: skip
 
 
-def _root(found: _Fitted, problem: Problem, prepared: Prepared, steps: Steps) -> np.ndarray:
+def _root(
+    found: _Fitted, problem: Problem, prepared: Prepared, steps: Steps, pairs: Pairs
+) -> np.ndarray:
     """(m, m): rootᵀ root is the covariance of the coefficients. What is noise, a generator of
     polynomials tells, which does not explain it; what it explains is misfit, of these steps too."""
     fit, count = found.fit, found.family.num_parameters
-    pairs = max(_FEWEST_SAMPLED, OPTIONS.sampled_rows * count // prepared.y0.shape[1])
+    most = max(_FEWEST_SAMPLED, OPTIONS.sampled_rows * count // prepared.y0.shape[1])
     structure = prepared.structure
     if structure is not None:
-        pairs = structure.fewest(prepared.y0.shape[1])
-    rows = fit.used[:pairs]
+        most = structure.fewest(prepared.y0.shape[1])
+    places, goes_on = looked_at(pairs, fit.used, most)
+    rows, scale = fit.used[places], problem.scale
     images = problem.images(found.family, fit.coefficients, rows, steps, derivatives=True)
     residual = images.states - prepared.y1[rows]
     if not np.isfinite(residual).all():  # of a flow that runs away from some of the states
         return np.full((count, count), np.nan)
-    # A generator of so many coordinates has too many terms.
-    noise = unexplained(prepared, rows, residual, count) if structure is None else None
-    slopes = (images.by_coefficient / problem.scale[:, None]).reshape(-1, count)
-    left = np.hypot(residual / problem.scale, _NEAR_ROUNDOFF).ravel()
+    slopes = images.by_coefficient / scale[:, None]
+    left, scores, states, noise = residual / scale, None, None, None
+    if structure is None:  # of many coordinates both would take too much
+        if goes_on.any():
+            first = images.by_state * scale
+            second = np.broadcast_to(-np.diag(scale), first.shape)
+            scores = shared_noise.scores(
+                slopes, left, first / scale[:, None], second / scale[:, None], goes_on
+            )
+            states = first, second, goes_on
+        noise = unexplained(prepared, rows, residual, count, states)
     train = Reduced(np.asfortranarray(fit.factor), fit.rows)
-    return uncertainty.root(train, count, slopes, left, noise=noise)
+    return uncertainty.root(
+        train, count, slopes.reshape(-1, count), np.hypot(left, _NEAR_ROUNDOFF).ravel(),
+        noise=noise, scores=scores,
+    )  # fmt: skip
 
 
-def unexplained(prepared: Prepared, rows, residual, taken: int) -> float | None:
+def unexplained(prepared: Prepared, rows, residual, taken: int, states) -> float | None:
     """Of the mean square of what a map leaves over (n, 2d) on these rows, the part that no
     generator K explains, residual = J∇K at the images: K of as high a degree as the rows tell.
-    taken: coefficients that the map itself was given. None where they are too few."""
+    taken: coefficients that the map itself was given. states: the residual's derivatives and which
+    pairs go on, as `shared_noise.scores` takes them, or None. None where the rows are too few.
+
+    1 where K explains no more than it would of noise, by ``explained`` standard errors: an F test.
+    """
     z, coordinates, width = prepared.y1[rows], prepared.coordinates, residual.shape[1]
     inputs = box_inputs(
         z, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
@@ -658,10 +699,23 @@ def unexplained(prepared: Prepared, rows, residual, taken: int) -> float | None:
     known = [family for family in sizes if family.num_parameters <= most]
     if not known:
         return None
-    weight = 1.0 / np.roll(prepared.scale, prepared.dim)
-    reduced = least_squares.reduce(known[-1], [(z, -apply_j(residual))], weight)
+    family, weight = known[-1], 1.0 / np.roll(prepared.scale, prepared.dim)
+    target = -apply_j(residual)
+    reduced = least_squares.reduce(family, [(z, target)], weight)
+    count, freedom = family.num_parameters, None
+    if states is not None:
+        to_target = -weight[:, None] * symplectic_form(prepared.dim)
+        slopes, (first, second, goes_on) = family.term_gradients(z) * weight[:, None], states
+        scores = shared_noise.scores(
+            slopes, weight * target, to_target @ first, to_target @ second, goes_on
+        )
+        freedom = shared_noise.freedom(slopes, weight * target, scores)
     left = np.sum(reduced.factor[:, -1] ** 2) / max(reduced.rows - taken, 1)
-    return float(uncertainty.variance(reduced, known[-1].num_parameters) / left) if left else 1.0
+    if left == 0:
+        return 1.0
+    part = float(uncertainty.variance(reduced, count, freedom) / left)
+    by_chance = OPTIONS.explained * np.sqrt(2 * count) / reduced.rows
+    return part if part < 1 - by_chance else 1.0
 
 
 def _cheapest(problem, family, fit: FlowFit, fastest, judges: Judges, options: Options) -> Steps:
