@@ -91,6 +91,8 @@ class Fit:
         Raises FitError where no Hamiltonian was learned that meets the tolerance or was chosen, or
         its flow fails in the region, InputError for a region that is none.
         """
+        if self.hamiltonian is not None and self.hamiltonian.formula is None:
+            raise FitError("expected an H of terms to draw pairs from, got a network")
         if self.hamiltonian is None or self.formula is None:
             raise FitError("expected a fit with a Hamiltonian that meets its tolerance, got none")
         assert self.pairs is not None
@@ -204,7 +206,8 @@ def fit(
     terms:     of H that the user knows: text such as "1/sqrt(q1**2 + q2**2)", or functions of z.
     base:      a Hamiltonian that the user knows a part of the map by, as such text or a function:
                its flow is factored out, and S learns what it leaves over.
-    family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp".
+    family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp";
+               with learn="hamiltonian" H is a sum of terms, or a network with "mlp".
     chart:     "auto" or one of type1, type2, type3, midpoint.
     angles:    without a scene, the indices of z that have period 2π.
     max_seconds: for all of it; the search ends with the best map so far while there is time to

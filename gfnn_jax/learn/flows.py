@@ -119,18 +119,19 @@ class LearnedHamiltonian:
     """H as learned, in the inner coordinates.
 
     candidate: as the others of a fit, its error measured by steps in NumPy. flow: the piece.
-    terms, formula: what H is. truncation: largest error of the flow's own steps on the held-out
-    states, ÷ scale. omega_h: the fastest oscillation of the linearised flow, times dt, in the
-    median over the data; beyond π pairs of one dt may not tell H. contraction: the fixed point's
-    factor where it is largest. condition: of the terms' columns. null_terms: that the data do not
-    tell from the others. left_out: pairs that the flow does not resolve. stalled: whether larger
-    libraries were no more accurate. root: (m, m), rootᵀ root is the coefficients' covariance.
+    terms, formula: what H is; () and None of a network. truncation: largest error of the flow's
+    own steps on the held-out states, ÷ scale. omega_h: the fastest oscillation of the linearised
+    flow, times dt, in the median over the data; beyond π pairs of one dt may not tell H.
+    contraction: the fixed point's factor where it is largest. condition: of the terms' columns.
+    null_terms: that the data do not tell from the others. left_out: pairs that the flow does not
+    resolve. stalled: whether larger libraries were no more accurate. root: (m, m), rootᵀ root is
+    the coefficients' covariance; None of a network.
     """
 
     candidate: Candidate
     flow: Flow
     terms: tuple[Term, ...]
-    formula: str
+    formula: str | None
     truncation: float
     omega_h: float
     contraction: float
@@ -139,7 +140,7 @@ class LearnedHamiltonian:
     left_out: int
     messages: tuple[str, ...]
     stalled: bool
-    root: np.ndarray
+    root: np.ndarray | None
 
     @property
     def fast(self) -> bool:
@@ -576,7 +577,7 @@ def _learned(
         problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, args=prepared.args)
     steps = _cheapest(problem, family, fit, rates, judges, options)
     steps = _resolving(family, fit.coefficients, steps, prepared, judges)
-    contraction = _contraction(rates, prepared.dt, steps)
+    contraction = contraction_of(rates, prepared.dt, steps)
     by_newton = contraction > options.contracting
     off = truncation(family, fit.coefficients, z, prepared.dt, steps, args=args) / prepared.scale
     flow = Flow(
@@ -589,7 +590,7 @@ def _learned(
     candidate = Candidate(
         label=f"H, {family.num_parameters} terms", family=family.name, chart="flow",
         num_parameters=family.num_parameters,
-        operations=_operations(family, rates, prepared.dt, steps),
+        operations=operations_of(family, 2 * family.dim, rates, prepared.dt, steps),
         validation_rms=error.rms, validation_relative=error.relative,
         validation_bound=error.bound, deviations=error.deviations, train_rms=fit.rms,
         fit_seconds=seconds, condition=fit.condition, rank=family.num_parameters,
@@ -601,7 +602,7 @@ def _learned(
             family.term_names, fit.coefficients.tolist(), fit.standard_errors.tolist(), strict=True
         )
     )
-    omega_h = _omega_h(hessian, prepared.dt)
+    omega_h = omega_h_of(hessian, prepared.dt)
     left_out = len(np.setdiff1d(found.rows, fit.used))
     resolved = np.abs(off).max(axis=1) <= _bound(judges, prepared.scale)
     return LearnedHamiltonian(
@@ -654,7 +655,7 @@ def _cheapest(problem, family, fit: FlowFit, rates, judges: Judges, options: Opt
     twice as dear."""
 
     def cost(steps: Steps) -> float:
-        return _operations(family, rates, problem.dt, steps)
+        return operations_of(family, 2 * family.dim, rates, problem.dt, steps)
 
     bound = max(options.truncation * _bound(judges, problem.scale), 0.3 * fit.rms)
     tolerances = (bound, min(bound, _NEAR_ROUNDOFF), None)
@@ -671,7 +672,7 @@ def flow_of(family: Terms, params, prepared: Prepared) -> Flow:
     problem = Problem(y0, y1, dt, scale)
     (steps,) = problem.fine_steps(family, params, np.arange(len(y0)))
     _, hessian = family.gradient_and_hessian(params, y0[:_FREQUENCY_STATES])
-    by_newton = not _contraction(frequencies(hessian), dt, steps) <= OPTIONS.contracting
+    by_newton = not contraction_of(frequencies(hessian), dt, steps) <= OPTIONS.contracting
     flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, by_newton)
     failed = ~np.isfinite(np.concatenate([flow.image(y0), flow.inverse().image(y1)])).all(axis=1)
     if failed.any():
@@ -693,20 +694,23 @@ def flow_operations(flow: Flow, prepared: Prepared) -> float:
     """Floating-point operations per step of the flow."""
     _, hessian = flow.family.gradient_and_hessian(flow.params, prepared.y0[:_FREQUENCY_STATES])
     steps = Steps(flow.stages, flow.substeps)
-    return _operations(flow.family, frequencies(hessian), float(flow.dt), steps)
+    return operations_of(
+        flow.family, len(prepared.scale), frequencies(hessian), float(flow.dt), steps
+    )
 
 
-def _contraction(rates, dt: float, steps: Steps) -> float:
+def contraction_of(rates, dt: float, steps: Steps) -> float:
     """The factor by which the stages' fixed point contracts in the end, where it is largest."""
     radius = np.abs(np.linalg.eigvals(gauss(steps.stages).matrix)).max()
     return float(dt / steps.substeps * rates.max() * radius)
 
 
-def _operations(family: Terms, rates, dt: float, steps: Steps) -> float:
-    """Floating-point operations per step: as many iterations as roundoff takes at this factor."""
+def operations_of(family, width: int, rates, dt: float, steps: Steps) -> float:
+    """Floating-point operations per step of states (2d,), width 2d: as many iterations as roundoff
+    takes at this factor."""
     gradient, with_hessian = family.operations
-    width, s = 2 * family.dim, steps.stages
-    factor = _contraction(rates, dt, steps)
+    s = steps.stages
+    factor = contraction_of(rates, dt, steps)
     if factor > OPTIONS.contracting:
         one = s * with_hessian + (s * width) ** 3 * 2 / 3
         return float(steps.substeps * 4 * one)
@@ -714,7 +718,7 @@ def _operations(family: Terms, rates, dt: float, steps: Steps) -> float:
     return float(steps.substeps * iterations * s * (gradient + 2 * width * s))
 
 
-def _omega_h(hessian, dt: float) -> float:
+def omega_h_of(hessian, dt: float) -> float:
     """The fastest oscillation of the linearised flow, radians per step, its median over states."""
     turned = symplectic_form(hessian.shape[-1] // 2) @ hessian
     rates = np.abs(np.linalg.eigvals(turned).imag).max(axis=-1)

@@ -22,7 +22,7 @@ def with_posterior(chosen: Chosen, searched: Searched) -> SymplecticMap:
         if not (own and isinstance(entry.sweep, LinearSweep)):
             return map_
         kind, root = Generated, entry.sweep.root(entry.size)
-    elif law is not None and chosen.candidate.learns == "hamiltonian":
+    elif law is not None and law.root is not None and chosen.candidate.learns == "hamiltonian":
         kind, root = Flow, law.root
     else:
         return map_
