@@ -27,6 +27,7 @@ from gfnn_jax.storage.partial import told_of
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
 FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
 LEARN = ("auto", "map", "hamiltonian")
+STRUCTURES = ("ring", "chain", "bodies:N")
 
 EXIT_STATUS = """\
 exit status:
@@ -49,6 +50,12 @@ class _Terminated(KeyboardInterrupt):
     """SIGTERM, as clean a stop as Ctrl-C."""
 
 
+_TO_BEGIN = (
+    "try `gfnn run two-body --quick`, or with your own pairs `gfnn fit DATA.npz --out MODEL`; "
+    "`gfnn --help` says more"
+)
+
+
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message} (see {self.prog} --help)")
@@ -56,8 +63,10 @@ class _Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line ``argv`` (without the program's name) and return the exit status."""
-    arguments = argparse.Namespace()
+    arguments, argv = argparse.Namespace(), sys.argv[1:] if argv is None else argv
     try:
+        if not argv:
+            raise InputError(f"expected a command, got none: {_TO_BEGIN}")
         arguments = _parser().parse_args(argv)
         with _sigterm(), _warnings_in_one_line():
             arguments.command(arguments)
@@ -200,6 +209,11 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
         help='an H that you know a part of the map by: "p1**2/2 - cos(q1)"; its flow is factored '
         "out, and S learns what it leaves over",
     )  # fmt: skip
+    command.add_argument(
+        "--structure", type=_structure, metavar="|".join(STRUCTURES),
+        help="of many degrees of freedom: H is a sum over equal sites, whose --terms are text in "
+        "q1, p1 of a site and q2, p2, … of the next ones",
+    )  # fmt: skip
     command.add_argument("--chart", choices=CHARTS, default="auto", help="default %(default)s")
     command.add_argument(
         "--family", choices=FAMILIES, default="auto",
@@ -266,6 +280,13 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(","))
 
 
+def _structure(text: str) -> str:
+    kind, _, number = text.partition(":")
+    if text in STRUCTURES[:2] or (kind == "bodies" and number.isdecimal() and int(number) > 1):
+        return text
+    raise argparse.ArgumentTypeError(f"expected {', '.join(STRUCTURES)}; got '{text}'")
+
+
 def _texts(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(";") if part.strip())
 
@@ -303,7 +324,7 @@ def _run(arguments: argparse.Namespace) -> None:
             arguments.scene, out=out, quick=arguments.quick, seed=arguments.seed, dt=arguments.dt,
             tolerance=arguments.tolerance, max_seconds=arguments.max_seconds,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
-            base=arguments.base,
+            base=arguments.base, structure=arguments.structure,
             family=arguments.family, overwrite=arguments.overwrite, resume=arguments.resume,
             progress=shown,
         )  # fmt: skip
@@ -326,7 +347,7 @@ def _fit(arguments: argparse.Namespace) -> None:
             tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
             absolute_tolerance=arguments.absolute_tolerance, max_seconds=arguments.max_seconds,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
-            base=arguments.base,
+            base=arguments.base, structure=arguments.structure,
             family=arguments.family, scene_name=arguments.scene, angles=arguments.angles,
             seed=arguments.seed, overwrite=arguments.overwrite, resume=arguments.resume,
             progress=shown,

@@ -85,6 +85,18 @@ def symplecticity_defect(jacobian, scale=None):
     return xp.max(xp.abs(defect), axis=(-2, -1)) / xp.max(xp.abs(weighted))
 
 
+def defect_of_pairs(before, after, scale):
+    """The largest |after_uᵀ J after_v − before_uᵀ J before_v| (...) over pairs of tangent vectors,
+    the first half with the second: (2k, ..., 2d) each, ÷ the largest of scale_q scale_p (2d,).
+
+    For random signs of length 1 in units of ``scale`` it is about ‖MᵀJM − J‖ ÷ √(2d), Frobenius'
+    norm: what the entries of a row come to. NumPy or JAX.
+    """
+    xp, half, dim = namespace(after), len(before) // 2, len(scale) // 2
+    form = [xp.sum(t[:half] * apply_j(t[half:]), axis=-1) for t in (after, before)]
+    return xp.max(xp.abs(form[0] - form[1]), axis=0) / xp.max(scale[:dim] * scale[dim:])
+
+
 def hamiltonian_vector_field(hamiltonian: Callable) -> Callable:
     """``field(z, t=0.0)`` = J ∇H(z, t) of shape (2d,), the right-hand side of the paper's (1)."""
 

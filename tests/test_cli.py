@@ -26,7 +26,7 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.jobs import fit as jobs_fit
 from gfnn_jax.jobs import predict as predict_job
 from gfnn_jax.jobs import progress, search
-from gfnn_jax.learn import check
+from gfnn_jax.learn import check, structures
 from gfnn_jax.learn import fit as learn_fit
 from gfnn_jax.learn.candidates import Tolerance
 from gfnn_jax.maps import saved as models
@@ -113,6 +113,7 @@ def test_choices_are_those_of_the_fit():
     assert cli.CHARTS == check.CHART_NAMES
     assert cli.FAMILIES == check.FAMILIES
     assert set(cli.LEARN) == set(check.LEARNS)
+    assert cli.STRUCTURES == structures.NAMES
 
 
 def test_scenes(capsys):
@@ -235,6 +236,12 @@ def test_refusals(arguments, message, tmp_path, model, capsys, monkeypatch):
     assert lines[0].startswith("gfnn: ")
     assert message in lines[0]
     assert files(tmp_path) == before
+
+
+def test_no_command_says_what_to_try(capsys):
+    assert gfnn() == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "gfnn run two-body --quick" in line
 
 
 def test_usage_is_refused_in_a_moment():

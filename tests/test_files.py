@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from gfnn_jax.data import files
+from gfnn_jax.data.blocks import LARGEST
 from gfnn_jax.data.files import DataWarning
 from gfnn_jax.data.summary import summary
 from gfnn_jax.errors import InputError
@@ -98,7 +99,7 @@ def test_sequences_of_any_length(tmp_path, lengths, dim, chunk, dtype, compresse
     assert np.array_equal(np.concatenate([c.z1 for c in chunks]), pairs.z1)
 
 
-FINITE = st.floats(-files.LARGEST, files.LARGEST)
+FINITE = st.floats(-LARGEST, LARGEST)
 
 
 @QUICK

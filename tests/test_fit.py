@@ -438,6 +438,13 @@ def test_the_standard_map_is_found_to_roundoff():
     assert rms(fit.map, fresh.z0, fresh.z1) < 1e-13
 
 
+def test_states_that_cover_the_torus_have_no_outside():
+    scene = gfnn.scenes.standard_map(1.2)
+    fit = quiet_fit(gfnn.sample_pairs(scene, 600, jax.random.key(0)), scene, tolerance=1e-12)
+    assert fit.met
+    assert fit.chosen.outside is None
+
+
 def test_a_degree_of_freedom_at_rest_does_no_harm():
     z = np.random.default_rng(0).uniform(-1, 1, (200, 2))
     q, p = z.T

@@ -45,6 +45,17 @@ def test_reversing_twice_gives_the_map():
     np.testing.assert_array_equal(again, PENDULUM.step(Z)[0])
 
 
+def test_one_map_after_another_is_a_map():
+    other = with_numbers(PENDULUM, 2.0, 0.1)
+    both = PENDULUM.then(other)
+    first, _ = PENDULUM.step(Z)
+    np.testing.assert_allclose(both.step(Z)[0], other.step(first)[0], rtol=0, atol=1e-15)
+    assert float(both.dt) == pytest.approx(0.4)
+    np.testing.assert_allclose(both.inverse(both.step(Z)[0])[0], Z, rtol=0, atol=1e-14)
+    with pytest.raises(ValueError, match="the same coordinates"):
+        PENDULUM.then(ROTATING)
+
+
 def with_numbers(map_, strength, dt):
     """A map of the same kind, with another S and another time step."""
     (piece,) = map_.pieces

@@ -190,15 +190,16 @@ def test_pairs_are_the_same_bits_for_the_same_seed_and_conserve_the_invariants(n
     assert pairs.dt == scene.dt
     np.testing.assert_array_equal(pairs.z0, again.z0)
     np.testing.assert_array_equal(pairs.z1, again.z1)
-    assert not (pairs.z0 == other.z0).any()
+    assert not (pairs.z0 == other.z0).all(axis=1).any()
     columns = [pairs.args[name] for name in scene.parameters]
     params = np.stack(columns, axis=-1) if columns else None
     found = tr.reference_trajectories(scene, pairs.z0, 1, params=params, t0=pairs.t0)
     np.testing.assert_array_equal(pairs.z1, found[:, 1])
     for invariant in scene.invariants.values():
         start, end = (jax.jit(jax.vmap(invariant))(z) for z in (pairs.z0, pairs.z1))
-        np.testing.assert_allclose(end, start, atol=1e-14, rtol=0)
-        assert np.ptp(start) > 1e-4
+        np.testing.assert_allclose(end, start, atol=1e-14, rtol=1e-15)
+        # It tells states apart, or is that of a centre of mass at rest.
+        assert np.ptp(start) > 1e-4 or np.abs(start).max() < 1e-15
 
 
 def test_a_scene_with_a_parameter():

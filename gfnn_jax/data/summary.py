@@ -6,6 +6,8 @@ import numpy as np
 
 from gfnn_jax.data.files import TrajectoryData
 
+_MOST_COLUMNS = 40  # lines; of more columns those of the first degrees of freedom
+
 
 def summary(data: TrajectoryData) -> list[str]:
     """Lines of text: how many pairs, of each column its range, spread and movement in a step, of
@@ -29,7 +31,12 @@ def summary(data: TrajectoryData) -> list[str]:
     move = np.sqrt(np.mean((pairs.z1 - pairs.z0) ** 2, axis=0))
     low, high = data.states.min(axis=0), data.states.max(axis=0)
     names = [f"{letter}{i + 1}" for letter in "qp" for i in range(data.dim)]
-    for name, *numbers in zip(names, low, high, data.states.std(axis=0), move, strict=True):
+    columns = list(zip(names, low, high, data.states.std(axis=0), move, strict=True))
+    if len(columns) > _MOST_COLUMNS:
+        some = _MOST_COLUMNS // 4
+        columns = columns[:some] + columns[data.dim : data.dim + some]
+        lines.append(f"the first {some} of {data.dim} degrees of freedom:")
+    for name, *numbers in columns:
         unit = f" {data.units[name]}" if name in data.units else ""
         a, b, spread, step = (f"{x:.4g}" for x in numbers)
         lines.append(f"{name}: {a} to {b}{unit}, spread {spread}, movement in a step {step}")

@@ -149,7 +149,8 @@ class Terms:
         return len(self.powers)
 
     @cached_property
-    def _trees(self) -> list[Expression]:
+    def trees(self) -> list[Expression]:
+        """The variables as expressions."""
         return [parse(text, self.dim, self.parameters) for text in self.variables]
 
     @property
@@ -164,14 +165,14 @@ class Terms:
 
     @cached_property
     def _still(self) -> tuple[int, ...]:
-        return tuple(k for k, tree in enumerate(self._trees) if not depends_on(tree))
+        return tuple(k for k, tree in enumerate(self.trees) if not depends_on(tree))
 
     @property
     def term_names(self) -> tuple[str, ...]:
         """Each term as it stands in a formula: "q1² q2"."""
         named = [
             text if tree.operation not in ("+", "*", "/", "power", "number") else f"({text})"
-            for text, tree in zip(self.variables, self._trees, strict=True)
+            for text, tree in zip(self.variables, self.trees, strict=True)
         ]
         names = []
         for row in self.powers:
@@ -188,7 +189,7 @@ class Terms:
     def operations(self) -> tuple[int, int]:
         """Floating-point operations of a gradient, and of a gradient with its Hessian."""
         plan = self._plan
-        variables = sum(count_operations(t) * (1 + 2 * len(depends_on(t))) for t in self._trees)
+        variables = sum(count_operations(t) * (1 + 2 * len(depends_on(t))) for t in self.trees)
         gradient = plan.size + sum(2 * len(c[0]) for c in plan.slopes) + variables
         more = sum(2 * len(c[0]) for c in plan.curvatures.values()) + 2 * variables
         return gradient, gradient + more + 4 * self.dim * self.dim
@@ -273,7 +274,7 @@ class Terms:
         return out
 
     def _variables(self, w, order: int, args) -> list:
-        return jets(self._trees, w, order, args)
+        return jets(self.trees, w, order, args)
 
     def _products(self, variables, w) -> list:
         xp, zero = namespace(w), namespace(w).zeros_like(w[..., 0])
@@ -352,7 +353,7 @@ def polynomial_terms(
         trees = [coordinate(i) for i in range(2 * dim) if i not in cyclic]
     odd = _odd(trees, dim, reversor)
     rows = tuple(
-        row for row in _rows(len(trees), degree) if sum(row[k] for k in odd) % 2 == 0
+        row for row in exponents(len(trees), degree) if sum(row[k] for k in odd) % 2 == 0
     )  # fmt: skip
     return Terms(dim, tuple(to_text(tree, dim) for tree in trees), rows)
 
@@ -385,7 +386,7 @@ def _over_both(first: Terms, second: Terms):
     return (variables, *rows)
 
 
-def _rows(variables: int, degree: int) -> list[tuple[int, ...]]:
+def exponents(variables: int, degree: int) -> list[tuple[int, ...]]:
     """Exponents of all products of total degree 1 to ``degree``, by rising degree."""
     rows = []
     for total in range(1, degree + 1):

@@ -19,6 +19,7 @@ import numpy as np
 import scipy.linalg
 
 from gfnn_jax.families.family import at_time
+from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting.base_map import field_for
 from gfnn_jax.fitting.turns import backwards, forward_logarithm, tangent, turns
 from gfnn_jax.flows.collocation import Steps, images, of_lanes, truncation
@@ -40,7 +41,8 @@ class Options:
     block_bytes: of the arrays that a block of pairs takes.
     reach: h‖H''‖ of one substep. coarse_stages: of the early rounds.
     early_rows: rows per term that the early rounds look at; fewest: pairs at least.
-    judged: pairs at which a step's own error is measured.
+    judged: pairs at which a step's own error is measured; judged_free: of a family that does
+    without matrices, every pair of which has many coordinates.
     misfits, errors: a pair is resolved whose own error is below so many times what is left over in
     the median, or the median of these errors. selections: of resolved pairs in the end, at most.
     """
@@ -60,6 +62,7 @@ class Options:
     early_rows: float = 6.0
     fewest: int = 60
     judged: int = 48
+    judged_free: int = 2
     misfits: float = 10.0
     errors: float = 100.0
     selections: int = 4
@@ -182,6 +185,10 @@ def fitted_gradients(family, z, gradient, scale, args=None) -> np.ndarray:
     return np.linalg.lstsq(rows / size, (gradient * weight).ravel(), rcond=1e-12)[0] / size
 
 
+# States and iterations by which the fastest rate of a large system is estimated.
+_RATED, _POWERS = 4, 30
+
+
 # A flow that needs more is dearer than any map, and its linear start is seldom right.
 MOST_SUBSTEPS = 64
 
@@ -189,18 +196,32 @@ MOST_SUBSTEPS = 64
 def substeps_for(family, coefficients, z, dt, reach: float = OPTIONS.reach, *, args=None) -> int:
     """Substeps so that h‖H''‖ is within reach for nearly all of the states z (N, 2d), at the
     longest dt."""
-    _, hessian = family.gradient_and_hessian(coefficients, z, args)
-    finite = np.isfinite(hessian).all(axis=(1, 2))
-    if not finite.any():
+    found = rates(family, coefficients, z, args)
+    finite = found[np.isfinite(found)]
+    if not len(finite):
         return 1
-    rates = frequencies(hessian[finite])
-    return int(np.clip(np.ceil(np.max(dt) * np.quantile(rates, 0.95) / reach), 1, MOST_SUBSTEPS))
+    return int(np.clip(np.ceil(np.max(dt) * np.quantile(finite, 0.95) / reach), 1, MOST_SUBSTEPS))
 
 
-def frequencies(hessian) -> np.ndarray:
-    """The largest |eigenvalue| of JH'' (N,): the fastest rate of the linearised flow."""
-    turned = symplectic_form(hessian.shape[-1] // 2) @ hessian
-    return np.abs(np.linalg.eigvals(turned)).max(axis=-1)
+def rates(family, coefficients, z, args=None) -> np.ndarray:
+    """The largest |eigenvalue| of JH'' (N,) at states z (N, 2d): the fastest rate of the linearised
+    flow; not finite where H'' is not. Without matrices its estimate by power iteration, from below.
+    """
+    if not matrix_free(family):
+        _, hessian = family.gradient_and_hessian(coefficients, z, args)
+        finite = np.isfinite(hessian).all(axis=(1, 2))
+        turned = symplectic_form(z.shape[1] // 2) @ hessian[finite]
+        found = np.full(len(z), np.nan)
+        found[finite] = np.abs(np.linalg.eigvals(turned)).max(axis=-1, initial=0.0)
+        return found
+    z = z[:: -(-len(z) // _RATED)]
+    bends = family.curvatures(coefficients, z, args)
+    v = np.random.default_rng(0).normal(size=z.shape)
+    for _ in range(_POWERS):  # twice at a time: eigenvalues come in pairs ±λ
+        v = v / np.linalg.norm(v, axis=1, keepdims=True)
+        for _ in range(2):
+            v = apply_j(family.hessian_product(bends, v))
+    return np.sqrt(np.linalg.norm(v, axis=1))
 
 
 # The fit.
@@ -237,7 +258,7 @@ class Problem:
         """(Φ(z₀) − z₁) ÷ scale of these rows (n, 2d); not finite where the flow fails."""
         parts = [
             (self.images(family, coefficients, b, steps).states - self.z1[b]) / self.scale
-            for b in self._blocks(rows, 0)
+            for b in self._blocks(rows, 0, matrix_free(family))
         ]
         return np.concatenate(parts) if parts else np.zeros((0, self.z0.shape[1]))
 
@@ -245,7 +266,7 @@ class Problem:
         """The Gauss–Newton problem of these rows; its cost is infinite where a flow fails."""
         count = family.num_parameters
         matrix, seen, failed = np.zeros((0, count + 1)), 0, not np.isfinite(coefficients).all()
-        for block in self._blocks(rows, count * steps.stages):
+        for block in self._blocks(rows, count * steps.stages, matrix_free(family)):
             if failed:
                 break
             found = self.images(family, coefficients, block, steps, derivatives=True)
@@ -261,10 +282,10 @@ class Problem:
         cost = np.inf if failed else float(np.linalg.norm(matrix[:, -1]))
         return Factor(matrix, seen, cost)
 
-    def _blocks(self, rows, columns: int):
+    def _blocks(self, rows, columns: int, free: bool):
         width = self.z0.shape[1]
-        pair = 8 * width * (columns + 40 * width)
-        size = max(16, self.options.block_bytes // pair)
+        pair = 8 * width * (columns + 40 * (1 if free else width))
+        size = max(1 if free else 16, self.options.block_bytes // pair)
         for first in range(0, len(rows), size):
             self.check()
             yield rows[first : first + size]
@@ -376,7 +397,9 @@ class Problem:
     ) -> tuple[Steps, ...]:
         """For each tolerance the cheapest steps whose own error, ÷ scale, is within it at nearly
         all of these rows; None: at roundoff."""
-        sample = rows[:: -(-len(rows) // self.options.judged)]
+        options = self.options
+        judged = options.judged_free if matrix_free(family) else options.judged
+        sample = rows[:: -(-len(rows) // judged)]
         substeps = self.substeps_for(family, c, sample)
         reference = self.images(family, c, sample, Steps(12, 4 * substeps)).states
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.families.family import at_time
+from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.phase_space import apply_j, symplectic_form
 
@@ -23,6 +24,8 @@ _SETTLED = 1e-12  # of it: what no longer shrinks below this is roundoff too
 # iteration of which costs as much as ten to thirty of these.
 _MOST, _SLOW, _FIRST = 60, 0.8, 4
 _MOST_NEWTON = 12
+# Of a derivative without matrices: Gauss–Newton steps need no more of it.
+_DERIVATIVE = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,8 +39,8 @@ class Steps:
 
 
 class Images(NamedTuple):
-    """Z (B, 2d); whether the stages were solved (B,); and, where asked for, ∂Z/∂z (B, 2d, 2d) and
-    ∂Z/∂c (B, 2d, terms)."""
+    """Z (B, 2d); whether the stages were solved (B,); and, where asked for, ∂Z/∂z (B, 2d, 2d), or
+    None where the family does without matrices, and ∂Z/∂c (B, 2d, terms)."""
 
     states: np.ndarray
     solved: np.ndarray
@@ -66,15 +69,21 @@ def images(
     h = h[:, None] if np.ndim(h) else h  # (B, 1) beside coordinates
     width = z.shape[1]
     solved = np.ones(len(z), bool)
-    by_state: Any = np.broadcast_to(np.eye(width), (len(z), width, width))
+    free = matrix_free(family)
+    by_state: Any = None if free else np.broadcast_to(np.eye(width), (len(z), width, width))
     by_coefficient: Any = 0.0
     with np.errstate(all="ignore"):
         for _ in range(steps.substeps):
             on_substep()
-            slopes, done = solve_stages(family, params, z, h, rule, args, newton=steps.newton)
+            newton = steps.newton and not free
+            slopes, done = solve_stages(family, params, z, h, rule, args, newton=newton)
             solved = solved & done
-            if derivatives:
-                inside = z + h * _summed(rule.matrix, slopes)
+            inside = z + h * _summed(rule.matrix, slopes) if derivatives else z
+            if derivatives and free:
+                by_coefficient = _carried(
+                    family, params, inside, h, rule, args, along or family, by_coefficient
+                )
+            elif derivatives:
                 by_z, by_c = _derivatives(family, params, inside, h, rule, args, along or family)
                 by_state = by_z @ by_state
                 by_coefficient = by_z @ by_coefficient + by_c if np.ndim(by_coefficient) else by_c
@@ -103,7 +112,8 @@ def solve_stages(family, params, z, h, rule, args=None, *, newton: bool = True):
     """
     size = np.abs(z) + np.abs(z).mean(axis=1, keepdims=True)  # of each coordinate's lane
     slopes = np.repeat(apply_j(family.gradient(params, z, args))[None], len(rule.weights), axis=0)
-    change = np.full(len(z), np.inf)
+    change, earlier = np.full((2, len(z)), np.inf)
+    free = matrix_free(family)
     open_, slow = np.ones(len(z), bool), np.zeros(len(z), bool)
     for n in range(_MOST):
         lanes = np.flatnonzero(open_)
@@ -116,8 +126,10 @@ def solve_stages(family, params, z, h, rule, args=None, *, newton: bool = True):
         relative = np.max(moved / (size[lanes] + abs(step) * np.abs(new)), axis=(0, 2))
         ratio = relative / change[lanes]
         closed = (relative <= _FLOOR) | ((relative <= _SETTLED) & (ratio > 0.5))
+        if free:  # q moves p and p moves q: changes shrink two iterations at a time
+            ratio = np.sqrt(relative / earlier[lanes])
         given_up = ~closed & ~(ratio < _SLOW) & (n > _FIRST)
-        change[lanes] = relative
+        earlier[lanes], change[lanes] = change[lanes], relative
         slow[lanes[given_up]] = True
         open_[lanes[closed | given_up]] = False
         if not open_.any():
@@ -213,6 +225,27 @@ def truncation(
         for s in (steps, finer)
     )
     return one - other
+
+
+def _carried(family, params, inside, h, rule, args, along, before):
+    """∂Z/∂c (B, 2d, terms) of one step from its stage states (s, B, 2d) and ∂z/∂c before it, 0 or
+    of the same shape: by fixed point, with products H'' v alone.
+
+    dK = JH'' (dz + h A dK) + J∇φ dc. The iteration ends at a relative change of 1e-6.
+    """
+    bends = family.curvatures(params, inside, args)
+    before = np.moveaxis(before, -1, 0)[:, None] if np.ndim(before) else 0.0
+    explicit = apply_j(np.moveaxis(along.term_gradients(inside, args), -1, 0))
+    slopes = explicit
+    for _ in range(_MOST):
+        turned = np.stack([_summed(rule.matrix, of_term) for of_term in slopes])
+        new = explicit + apply_j(family.hessian_product(bends, before + h * turned))
+        change = np.abs(new - slopes).max(initial=0.0)
+        slopes = new
+        if not change > _DERIVATIVE * np.abs(new).max(initial=0.0):
+            break
+    moved = np.stack([_summed(rule.weights[None, :], of_term) for of_term in slopes])
+    return np.moveaxis((before + h * moved)[:, 0], 0, -1)
 
 
 def _derivatives(family, params, inside, h, rule, args, along):

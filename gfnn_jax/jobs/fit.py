@@ -12,6 +12,7 @@ from gfnn_jax.evaluate import report
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.search import BEST, failures_of_arithmetic, scene_named, search
 from gfnn_jax.jobs.written import Ran, already_done, publish, write
+from gfnn_jax.learn.check import FEWEST
 from gfnn_jax.learn.refit import refit
 from gfnn_jax.storage.outputs import atomic_folder
 from gfnn_jax.storage.partial import unfinished
@@ -33,6 +34,7 @@ def fit(
     learn: str = "auto",
     terms: tuple[str, ...] = (),
     base: str | None = None,
+    structure: str | None = None,
     family: str = "auto",
     scene_name: str | None = None,
     angles: tuple[int, ...] = (),
@@ -48,12 +50,17 @@ def fit(
     """
     scene = scene_named(scene_name) if scene_name is not None else None
     large = data.is_file() and data.stat().st_size > _LARGE_BYTES
-    trajectories = (read_sample if large else read_trajectories)(data, dt=dt)
+    structured = structure is not None or (scene is not None and scene.structure is not None)
+    fewest = FEWEST if structured else None
+    trajectories = (
+        read_sample(data, dt=dt) if large else read_trajectories(data, dt=dt, fewest=fewest)
+    )
     for line in summary(trajectories):
         progress.tell(line)
     options = {
         "tolerance": tolerance, "absolute_tolerance": absolute_tolerance, "chart": chart,
-        "learn": learn, "terms": list(terms), "base": base, "family": family, "seed": seed,
+        "learn": learn, "terms": list(terms), "base": base, "structure": structure,
+        "family": family, "seed": seed,
     }  # fmt: skip
     job = {
         "command": "fit", "data": trajectories.digest,

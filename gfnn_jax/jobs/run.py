@@ -48,6 +48,7 @@ def run(
     learn: str = "auto",
     terms: tuple[str, ...] = (),
     base: str | None = None,
+    structure: str | None = None,
     family: str = "auto",
     overwrite: bool = False,
     resume: bool = False,
@@ -70,7 +71,7 @@ def run(
         num_pairs, default = min(num_pairs, QUICK_PAIRS), max(default, QUICK_TOLERANCE)
     options = {
         "tolerance": default if tolerance is None else tolerance, "chart": chart, "learn": learn,
-        "terms": list(terms), "base": base, "family": family, "seed": seed,
+        "terms": list(terms), "base": base, "structure": structure, "family": family, "seed": seed,
     }  # fmt: skip
     num_trajectories = QUICK_TRAJECTORIES if quick else NUM_TRAJECTORIES
     job = {

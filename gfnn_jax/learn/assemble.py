@@ -21,7 +21,8 @@ from gfnn_jax.solve.status import LEFT_DOMAIN
 
 _PREDICTOR_PAIRS = 2_000
 # States are stepped in blocks of one shape, whatever their number: compiled once for a kind of map.
-_BLOCK = 512
+# A block of wide states is of so many numbers.
+_BLOCK, _BLOCK_NUMBERS = 512, 2**16
 _REPEATS = 5  # of a timed block; the best counts
 
 
@@ -97,7 +98,12 @@ def _sampled(prepared: Prepared) -> Parameters | None:
 def in_block(z: np.ndarray) -> np.ndarray:
     """States z (N, 2d), N no more than a block holds, repeated so that they fill it: for them the
     step is compiled."""
-    return np.resize(z, (_BLOCK, z.shape[1]))
+    return np.resize(z, (block_of(z.shape[1]), z.shape[1]))
+
+
+def block_of(width: int) -> int:
+    """The number of states (2d,) of this width that are stepped together."""
+    return max(1, min(_BLOCK, _BLOCK_NUMBERS // width))
 
 
 class Steps(NamedTuple):
@@ -116,7 +122,8 @@ def stepped(
 ) -> Steps:
     """One step of the states z (N, 2d), in blocks of one shape; times are 0 unless ``timed``. dt:
     of each state (N,), or that of the map. args: name -> (N,), as those of `Pairs`."""
-    rows = np.resize(np.arange(len(z)), -(-len(z) // _BLOCK) * _BLOCK).reshape(-1, _BLOCK)
+    size = block_of(z.shape[1])
+    rows = np.resize(np.arange(len(z)), -(-len(z) // size) * size).reshape(-1, size)
     longest = map_.over(np.max(dt)) if np.ndim(dt) else map_  # as many substeps in every block
 
     def run(block) -> tuple[Any, float]:
@@ -136,4 +143,4 @@ def stepped(
         for parts in zip(*((i, f.status, f.iterations) for i, f in blocks), strict=True)
     )
     compiling = first - seconds if timed else 0.0
-    return Steps(images, iterations, status > LEFT_DOMAIN, 1e6 * seconds / _BLOCK, compiling)
+    return Steps(images, iterations, status > LEFT_DOMAIN, 1e6 * seconds / size, compiling)

@@ -9,6 +9,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.sums import site_terms
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.learn.candidates import Tolerance
@@ -23,6 +24,7 @@ CHART_NAMES = ("auto", *CHARTS)
 
 _OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; those in other units do
 _COMPARED = 100
+FEWEST = 8  # pairs of a structure: 4 train, 4 are held out
 _COARSE = 0.01  # of what a step moves
 
 
@@ -37,6 +39,7 @@ def check_request(
     angles,
     terms=(),
     base=None,
+    structure=None,
     seed=0,
 ) -> None:
     """Raises FitError where the request or the pairs cannot give a map."""
@@ -82,8 +85,10 @@ def check_request(
         raise FitError(f"expected a sequence of terms, got the text '{terms}'")
     if any(not (isinstance(term, str) or callable(term)) for term in terms):
         raise FitError(f"expected terms as texts or functions of z, got {terms!r}")
+    if structure is not None:
+        _check_structured(structure, scene, learn, terms, base, family, chart, angles, pairs)
     try:
-        given_terms(pairs.dim, terms, tuple(pairs.args or ()))
+        given_terms(pairs.dim, () if structure else terms, tuple(pairs.args or ()))
     except (InputError, jax.errors.ConcretizationTypeError) as error:
         raise FitError(str(error)) from error
     if terms and (learn == "map" or (family, chart) != ("auto", "auto")):
@@ -113,7 +118,10 @@ def check_request(
                 f"expected finite states, got {int((~finite).sum())} rows of {name} with NaN or "
                 f"infinity, the first is row {int(np.argmin(finite))}"
             )
-    check_number(pairs)
+    if structure is None:
+        check_number(pairs)
+    elif len(pairs) < FEWEST:
+        raise FitError(f"expected at least {FEWEST} pairs, got {len(pairs)}")
 
 
 def check_number(pairs: Pairs) -> None:
@@ -123,6 +131,31 @@ def check_number(pairs: Pairs) -> None:
             f"expected at least {8 * pairs.dim} different pairs for d = {pairs.dim}, "
             f"got {len(pairs)}"
         )
+
+
+def _check_structured(
+    structure, scene, learn, terms, base, family, chart, angles, pairs: Pairs
+) -> None:
+    """Raises FitError for what does not go with a structure."""
+    if learn == "map" or (family, chart, base) != ("auto", "auto", None):
+        raise FitError("a structure is that of H: expected no learn='map', family, chart or base")
+    varied = pairs.args or pairs.period is not None
+    if angles or varied or (scene is not None and scene.coordinates != CARTESIAN):
+        raise FitError(
+            "a structure goes with plain q and p: expected no angles, parameters or drive"
+        )
+    if terms and str(structure).startswith("bodies"):
+        raise FitError("terms go with a ring or a chain: those of bodies are powers of distances")
+    for term in terms:
+        if not isinstance(term, str):
+            raise FitError(
+                "expected terms of a structure as text in q1, p1 of a site and q2, p2, … of the "
+                "next ones"
+            )
+        try:
+            site_terms(pairs.dim, "ring", 0, 0, (term,))
+        except InputError as error:
+            raise FitError(str(error)) from error
 
 
 def unlike_the_scene(pairs: Pairs, scene: Scene) -> list[str]:

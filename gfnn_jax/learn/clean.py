@@ -11,6 +11,7 @@ from gfnn_jax.learn.check import check_number
 from gfnn_jax.learn.diagnose import outliers
 from gfnn_jax.learn.held_out import first_occurrences
 from gfnn_jax.learn.prepare import Prepared, prepare
+from gfnn_jax.learn.structures import Structure
 from gfnn_jax.learn.varied import given_by
 from gfnn_jax.phase_space import Pairs
 
@@ -25,7 +26,7 @@ class Taken(NamedTuple):
     messages: list[str]
 
 
-def clean(pairs: Pairs, coordinates: Coordinates) -> Taken:
+def clean(pairs: Pairs, coordinates: Coordinates, structure: Structure | None = None) -> Taken:
     """The pairs without copies and, where they are few, without outliers.
 
     Raises FitError where too few are left, or states have no inner coordinates.
@@ -35,8 +36,11 @@ def clean(pairs: Pairs, coordinates: Coordinates) -> Taken:
     if copies:
         messages.append(f"{copies} of {len(pairs)} pairs are copies of others: each counts once")
         pairs = pairs.take(first)
-        check_number(pairs)
-    prepared = prepare(pairs, coordinates)
+        if structure is None:
+            check_number(pairs)
+    prepared = prepare(pairs, coordinates, structure)
+    if structure is not None:  # too few pairs for so many dimensions to have neighbours
+        return Taken(pairs, prepared, messages)
     found = outliers(prepared.y0, prepared.y1, prepared.scale, given_by(prepared))
     if len(found):
         few = len(found) <= _MOST_OUTLIERS * len(pairs)

@@ -53,7 +53,8 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     if met:
         return Conclusion(ended, None, messages)
     diagnosis: list[str] = []
-    if candidate.validation_relative > _ROUNDOFF:
+    structured = request.structure is not None  # too few pairs to look at their neighbours
+    if candidate.validation_relative > _ROUNDOFF and not structured:
         stalled = _stalled(chosen, searched)
         noise, diagnosis, reason = _what_is_left(chosen, searched, stalled)
         if reason and stalled:

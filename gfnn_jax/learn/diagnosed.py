@@ -32,7 +32,7 @@ def diagnose_request(request: Request, plain: Prepared) -> Diagnosis:
 
     Raises FitError where no chart covers the data.
     """
-    if plain.varied:  # of more than one map: neighbours tell no Jacobian
+    if plain.varied or plain.structure is not None:  # neighbours tell no Jacobian
         return Diagnosis(plain, Charts([], None, {}, []), float("nan"), [])
     prepared = plain
     if request.base is not None:

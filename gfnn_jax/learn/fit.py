@@ -19,6 +19,7 @@ import numpy as np
 
 from gfnn_jax.errors import FitError, FitWarning
 from gfnn_jax.generating.generated import Generated
+from gfnn_jax.learn.assemble import block_of
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance
 from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.clean import clean
@@ -32,6 +33,7 @@ from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.posterior import with_posterior
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
+from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
@@ -98,6 +100,8 @@ class Fit:
         assert self.pairs is not None
         if self.map.parameters is not None:
             raise FitError("expected a fit without parameters: a generated map has none")
+        if isinstance(self.map.domain, Ranges):
+            raise FitError("expected a fit without a structure: a generated map has none")
         flow, coordinates = self.hamiltonian.flow, self.map.coordinates
         dt = float(np.asarray(self.map.dt)) if dt is None else dt
         if not (isinstance(dt, (int, float)) and 0 < dt < np.inf):
@@ -180,6 +184,7 @@ def fit(
     learn: str = "auto",
     terms: Sequence[str | Callable] = (),
     base: str | Callable | None = None,
+    structure: str | None = None,
     family: str = "auto",
     chart: str = "auto",
     angles: tuple[int, ...] = (),
@@ -206,6 +211,9 @@ def fit(
     terms:     of H that the user knows: text such as "1/sqrt(q1**2 + q2**2)", or functions of z.
     base:      a Hamiltonian that the user knows a part of the map by, as such text or a function:
                its flow is factored out, and S learns what it leaves over.
+    structure: "ring" or "chain" of equal sites, whose ``terms`` are text in a site's q1, p1 and the
+               next ones' q2, p2, …; "bodies:N", q body by body: H is a sum over sites, or over
+               bodies and pairs. None: the scene's own.
     family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp";
                with learn="hamiltonian" H is a sum of terms, or a network with "mlp".
     chart:     "auto" or one of type1, type2, type3, midpoint.
@@ -235,24 +243,25 @@ def fit(
 
     request = checked(
         pairs, scene, tolerance=tolerance, absolute_tolerance=absolute_tolerance, learn=learn,
-        terms=terms, base=base, family=family, chart=chart, angles=angles, seed=seed, clock=clock,
-        max_iterations=max_iterations, checkpoints=checkpoints, factors=factors, say=on_progress,
-        tell=on_candidate,
+        terms=terms, base=base, structure=structure, family=family, chart=chart, angles=angles,
+        seed=seed, clock=clock, max_iterations=max_iterations, checkpoints=checkpoints,
+        factors=factors, say=on_progress, tell=on_candidate,
     )  # fmt: skip
     warn(request.messages)
     on_progress("looking at the map's local Jacobians")
-    pairs, plain, about_pairs = clean(request.pairs, request.coordinates)
+    pairs, plain, about_pairs = clean(request.pairs, request.coordinates, request.structure)
     warn(about_pairs)
     seen = diagnose_request(request, plain)
     warn(seen.messages)
     judges = Judges(pairs, *split_rows(pairs, seed), request.tolerance)
     found = searched(request, plain, seen, judges, on_better)
-    chosen = choose(found, request)
+    chosen = with_posterior(choose(found, request), found)
     conclusion = conclude(chosen, found, request)
     warn(conclusion.messages)
-    test = chosen.judges.pairs.take(chosen.judges.held_out[:_JUDGED])
+    judged = min(_JUDGED, block_of(2 * pairs.dim))
+    test = chosen.judges.pairs.take(chosen.judges.held_out[:judged])
     return Fit(
-        map=with_posterior(chosen, found),
+        map=chosen.candidate.map,
         candidates=_all_candidates(chosen, found),
         asked=request.tolerance,
         num_pairs=len(pairs),

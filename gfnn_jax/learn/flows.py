@@ -8,6 +8,7 @@ go while the held-out error does not rise.
 from __future__ import annotations
 
 import dataclasses
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.products import Products
+from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms, given_terms, joined, multiplied, polynomial_terms
 from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.gauss_newton import (
@@ -27,10 +29,10 @@ from gfnn_jax.fitting.gauss_newton import (
     FlowFit,
     Problem,
     forward_start,
-    frequencies,
     log_start,
     midpoint_start,
     null_terms,
+    rates,
     significant_terms,
 )
 from gfnn_jax.fitting.growth import grow
@@ -98,9 +100,12 @@ _ROUNDOFF = 1e-12  # of the spread: above it the pairs carry noise, and every on
 _FREQUENCY_STATES = 500
 _NEAR_ROUNDOFF = 3e-15  # of the spread
 _HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
+_NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
 _FEWEST_SAMPLED = 1_000  # pairs that tell noise from misfit
 _NAMED = 5  # terms in a message
-_POOR, _POOR_GIVEN = 2, 3  # libraries in a row that do not help end the search; with given terms
+# Libraries in a row that do not help end the search; with given terms; of a structure, whose
+# libraries differ in kind.
+_POOR, _POOR_GIVEN, _POOR_STRUCTURED = 2, 3, 5
 _TURNING = 2_000  # pairs that tell how far a step turns the states
 _EXPLAINED = 0.05  # of the spread: an error below it is that of the right branch of the turns
 _FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
@@ -154,7 +159,7 @@ class _Fitted(NamedTuple):
     library that grew did so no longer. stalled: whether larger libraries were no better. noisy:
     whether their errors were the same, which is that of the pairs."""
 
-    family: Terms
+    family: Terms | Sums
     fit: FlowFit
     rows: np.ndarray
     error: OneStepError
@@ -183,18 +188,23 @@ def learn_hamiltonian(
     """
     basis = _modes(prepared, scene, terms)
     most = options.max_seconds if basis is None else options.mode_seconds
+    if prepared.structure is not None:  # nothing else is learned in the time that is left
+        most = np.inf
     clock = Clock(most if clock is None else min(most, clock.left))
     if prepared.before or prepared.after:
         raise FitError("expected pairs without a base map: it is no part of a flow")
     started = time.perf_counter()
-    if terms:
+    if terms and prepared.structure is None:
         _check_finite(_own_terms(prepared, terms), prepared, judges.training)
     problem = Problem(
         prepared.y0, prepared.y1, prepared.each_dt, prepared.scale, args=prepared.args,
         check=clock.check,
     )  # fmt: skip
     everywhere, free = judges, (*prepared.coordinates.cyclic, *prepared.whole)
-    outer = outermost(prepared.y0[judges.training], free)
+    if prepared.structure is None:
+        outer = outermost(prepared.y0[judges.training], free)
+    else:  # a state of many sites is in the middle and far out at once
+        outer = np.zeros(len(judges.training), bool)
     judges = dataclasses.replace(everywhere, training=everywhere.training[~outer])
     if prepared.args is not None:
         best = _walked(problem, prepared, judges, scene, terms, options, say)
@@ -211,7 +221,8 @@ def learn_hamiltonian(
             best = _refitted(problem, best, judges.training, prepared, judges)
         best = _sparse(problem, best, prepared, judges, options, say)
         there = dataclasses.replace(everywhere, held_out=everywhere.training[outer])
-        outside = _held_out_error(best.family, best.fit, prepared, there).relative
+        if outer.any():
+            outside = _held_out_error(best.family, best.fit, prepared, there).relative
         if best.error.relative > _ROUNDOFF and len(best.fit.used) < len(everywhere.training):
             best = _refitted(problem, best, everywhere.training, prepared, judges)
     except OutOfTime:
@@ -230,6 +241,8 @@ def _searched(
     fewer terms where the tolerance is out of reach."""
     bound = judges.tolerance.bound
     best: _Fitted | None = None
+    structured = prepared.structure is not None
+    most_poor = _POOR_STRUCTURED if structured else _POOR_GIVEN if terms else _POOR
     tried: list[_Fitted] = []
     poor, errors = 0, []
     libraries = list(_libraries(prepared, judges, scene, terms, options))
@@ -250,9 +263,11 @@ def _searched(
                 best = found
             tried.append(found)
             errors.append(found.error.bound)
-            if best.error.bound <= bound or poor == (_POOR_GIVEN if terms else _POOR):
+            if best.error.bound <= bound or poor == most_poor:
                 break
-            if _out_of_reach(errors, len(libraries) - 1 - libraries.index(family), bound):
+            if not structured and _out_of_reach(
+                errors, len(libraries) - 1 - libraries.index(family), bound
+            ):
                 options = dataclasses.replace(options, thresholds=())  # no law: nothing to read
                 break
     except OutOfTime:
@@ -262,7 +277,7 @@ def _searched(
         raise FitError(
             f"expected more pairs: {len(prepared.y0)} are too few for any library of terms"
         )
-    stalled = poor == (_POOR_GIVEN if terms else _POOR)
+    stalled = poor == most_poor
     near = [f for f in tried if f.error.relative <= options.flat * best.error.relative]
     if len(near) > 1 and best.error.bound > bound:  # noise: the fewest terms leave no more of it
         best = near[0]._replace(noisy=True)
@@ -404,9 +419,14 @@ def _out_of_reach(errors: list[float], left: int, bound: float) -> bool:
     return errors[-1] * gain**left > bound
 
 
-def _libraries(prepared, judges, scene, terms, options: Options) -> Iterator[Terms]:
+def _libraries(prepared, judges, scene, terms, options: Options) -> Iterator[Terms | Sums]:
     """Families by rising size, of as many terms as the training rows tell apart."""
     dim, coordinates = prepared.dim, prepared.coordinates
+    if prepared.structure is not None:
+        libraries = prepared.structure.libraries(dim, terms)
+        most = len(judges.training) * 2 * dim / options.rows_per_term
+        yield from (library for library in libraries if library.num_parameters <= most)
+        return
     reversor = scene.reversor if scene is not None else None
     features = scene.features if scene is not None else None
     most = len(judges.training) * 2 * dim / options.rows_per_term
@@ -437,14 +457,17 @@ def _fitted(problem, family, prepared, judges, last: _Fitted | None, options, sa
     """The library fitted to as many training pairs as tell its terms, from the best start."""
     names = family.term_names
     z = prepared.y0[judges.training]
-    enough = z[: max(200, 4 * family.num_parameters // z.shape[1])]
+    least, fewest = 200, 100
+    if prepared.structure is not None:
+        least = fewest = prepared.structure.fewest(z.shape[1])
+    enough = z[: max(least, -(-4 * family.num_parameters // z.shape[1]))]
     args = prepared.given(judges.training[: len(enough)])[1]
     kept, null = null_terms(family, enough, args=args)
     elsewhere = null_terms(family, _scattered(enough), args=args)[0] if null else []
     undetermined = tuple(names[j] for j in null if j in elsewhere)
     family = family.take(kept)
     count = int(np.ceil(options.judged_rows * family.num_parameters / z.shape[1]))
-    rows = judges.training[: max(count, 100)]
+    rows = judges.training[: max(count, fewest)]
     null_names, best = tuple(names[j] for j in null), None
     for start in _starts(problem, family, rows, judges.training[:_TURNING], last):
         fit = problem.fit(family, start, rows, say=say)
@@ -469,7 +492,8 @@ def _starts(problem, family, rows, many, last: _Fitted | None) -> Iterator[np.nd
     turn backwards, before it where that is by more than a quarter. many: rows that tell turns."""
     dt, args = problem.given(many)
     turned = None
-    if args is None and np.ndim(dt) == 0:
+    known = len(many) > problem.z0.shape[1] and not matrix_free(family)
+    if args is None and np.ndim(dt) == 0 and known:
         turned = forward_start(family, problem.z0[many], problem.z1[many], dt, problem.scale)
     if turned is not None and turned[0] > _FAST:
         yield turned[1]
@@ -491,7 +515,8 @@ def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
     moved = np.linalg.norm((z1 - z0) / problem.scale, axis=1)
     quieter = moved <= np.median(moved)  # the midpoint says little of a step that goes far
     starts = [midpoint(slice(None)), midpoint(quieter)]
-    alike = args is None and np.ndim(dt) == 0  # pairs of one affine regression
+    # Pairs of one affine regression, more of them than it has unknowns.
+    alike = args is None and np.ndim(dt) == 0 and len(z0) > z0.shape[1]
     logarithm = log_start(family, z0, z1, dt, problem.scale) if alike else None
     if logarithm is not None:
         starts.append(logarithm)
@@ -568,17 +593,14 @@ def _learned(
     family, fit = found.family, found.fit
     rows = judges.held_out
     z, args = prepared.y0[rows], prepared.given(rows)[1]
-    _, hessian = family.gradient_and_hessian(
-        fit.coefficients, prepared.y0[:_FREQUENCY_STATES],
-        prepared.given(slice(_FREQUENCY_STATES))[1],
-    )  # fmt: skip
-    rates = frequencies(hessian)
+    some = slice(_FREQUENCY_STATES)
+    fastest = rates(family, fit.coefficients, prepared.y0[some], prepared.given(some)[1])
     if prepared.own_dt is not None:  # the map's own dt, from which others follow
         problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, args=prepared.args)
-    steps = _cheapest(problem, family, fit, rates, judges, options)
+    steps = _cheapest(problem, family, fit, fastest, judges, options)
     steps = _resolving(family, fit.coefficients, steps, prepared, judges)
-    contraction = contraction_of(rates, prepared.dt, steps)
-    by_newton = contraction > options.contracting
+    contraction = contraction_of(fastest, prepared.dt, steps)
+    by_newton = contraction > options.contracting and not matrix_free(family)
     off = truncation(family, fit.coefficients, z, prepared.dt, steps, args=args) / prepared.scale
     flow = Flow(
         family, fit.coefficients, prepared.dt, prepared.scale, steps.stages, steps.substeps,
@@ -590,7 +612,7 @@ def _learned(
     candidate = Candidate(
         label=f"H, {family.num_parameters} terms", family=family.name, chart="flow",
         num_parameters=family.num_parameters,
-        operations=operations_of(family, 2 * family.dim, rates, prepared.dt, steps),
+        operations=operations_of(family, 2 * family.dim, fastest, prepared.dt, steps),
         validation_rms=error.rms, validation_relative=error.relative,
         validation_bound=error.bound, deviations=error.deviations, train_rms=fit.rms,
         fit_seconds=seconds, condition=fit.condition, rank=family.num_parameters,
@@ -602,11 +624,12 @@ def _learned(
             family.term_names, fit.coefficients.tolist(), fit.standard_errors.tolist(), strict=True
         )
     )
-    omega_h = omega_h_of(hessian, prepared.dt)
+    omega_h = omega_h_of(family, fit.coefficients, prepared, fastest)
     left_out = len(np.setdiff1d(found.rows, fit.used))
     resolved = np.abs(off).max(axis=1) <= _bound(judges, prepared.scale)
     return LearnedHamiltonian(
-        with_error(candidate, error), flow, terms, formula(terms), float(np.abs(off).max()),
+        with_error(candidate, error), flow, terms, getattr(family, "prefix", "") + formula(terms),
+        float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(error, omega_h, prepared, judges, found, left_out, int((~resolved).sum()))),
         stalled=found.stalled, root=_root(found, problem, prepared, steps),
@@ -618,12 +641,16 @@ def _root(found: _Fitted, problem: Problem, prepared: Prepared, steps: Steps) ->
     polynomials tells, which does not explain it; what it explains is misfit, of these steps too."""
     fit, count = found.fit, found.family.num_parameters
     pairs = max(_FEWEST_SAMPLED, OPTIONS.sampled_rows * count // prepared.y0.shape[1])
+    structure = prepared.structure
+    if structure is not None:
+        pairs = structure.fewest(prepared.y0.shape[1])
     rows = fit.used[:pairs]
     images = problem.images(found.family, fit.coefficients, rows, steps, derivatives=True)
     residual = images.states - prepared.y1[rows]
     if not np.isfinite(residual).all():  # of a flow that runs away from some of the states
         return np.full((count, count), np.nan)
-    noise = unexplained(prepared, rows, residual, count)
+    # A generator of so many coordinates has too many terms.
+    noise = unexplained(prepared, rows, residual, count) if structure is None else None
     slopes = (images.by_coefficient / problem.scale[:, None]).reshape(-1, count)
     left = np.hypot(residual / problem.scale, _NEAR_ROUNDOFF).ravel()
     train = Reduced(np.asfortranarray(fit.factor), fit.rows)
@@ -650,12 +677,12 @@ def unexplained(prepared: Prepared, rows, residual, taken: int) -> float | None:
     return float(uncertainty.variance(reduced, known[-1].num_parameters) / left) if left else 1.0
 
 
-def _cheapest(problem, family, fit: FlowFit, rates, judges: Judges, options: Options) -> Steps:
+def _cheapest(problem, family, fit: FlowFit, fastest, judges: Judges, options: Options) -> Steps:
     """Steps whose own error is a tenth of the tolerance; near roundoff, or at it, where that is not
     twice as dear."""
 
     def cost(steps: Steps) -> float:
-        return operations_of(family, 2 * family.dim, rates, problem.dt, steps)
+        return operations_of(family, 2 * family.dim, fastest, problem.dt, steps)
 
     bound = max(options.truncation * _bound(judges, problem.scale), 0.3 * fit.rms)
     tolerances = (bound, min(bound, _NEAR_ROUNDOFF), None)
@@ -671,8 +698,8 @@ def flow_of(family: Terms, params, prepared: Prepared) -> Flow:
     y0, y1, dt, scale = prepared.y0, prepared.y1, prepared.dt, prepared.scale
     problem = Problem(y0, y1, dt, scale)
     (steps,) = problem.fine_steps(family, params, np.arange(len(y0)))
-    _, hessian = family.gradient_and_hessian(params, y0[:_FREQUENCY_STATES])
-    by_newton = not contraction_of(frequencies(hessian), dt, steps) <= OPTIONS.contracting
+    fastest = rates(family, params, y0[:_FREQUENCY_STATES])
+    by_newton = not contraction_of(fastest, dt, steps) <= OPTIONS.contracting
     flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, by_newton)
     failed = ~np.isfinite(np.concatenate([flow.image(y0), flow.inverse().image(y1)])).all(axis=1)
     if failed.any():
@@ -692,37 +719,39 @@ def around(flow: Flow) -> list[tuple[Flow | None, Flow | None]]:
 
 def flow_operations(flow: Flow, prepared: Prepared) -> float:
     """Floating-point operations per step of the flow."""
-    _, hessian = flow.family.gradient_and_hessian(flow.params, prepared.y0[:_FREQUENCY_STATES])
+    fastest = rates(flow.family, flow.params, prepared.y0[:_FREQUENCY_STATES])
     steps = Steps(flow.stages, flow.substeps)
-    return operations_of(
-        flow.family, len(prepared.scale), frequencies(hessian), float(flow.dt), steps
-    )
+    return operations_of(flow.family, len(prepared.scale), fastest, float(flow.dt), steps)
 
 
-def contraction_of(rates, dt: float, steps: Steps) -> float:
+def contraction_of(fastest, dt: float, steps: Steps) -> float:
     """The factor by which the stages' fixed point contracts in the end, where it is largest."""
     radius = np.abs(np.linalg.eigvals(gauss(steps.stages).matrix)).max()
-    return float(dt / steps.substeps * rates.max() * radius)
+    return float(dt / steps.substeps * fastest.max() * radius)
 
 
-def operations_of(family, width: int, rates, dt: float, steps: Steps) -> float:
+def operations_of(family, width: int, fastest, dt: float, steps: Steps) -> float:
     """Floating-point operations per step of states (2d,), width 2d: as many iterations as roundoff
     takes at this factor."""
     gradient, with_hessian = family.operations
     s = steps.stages
-    factor = contraction_of(rates, dt, steps)
-    if factor > OPTIONS.contracting:
+    factor = contraction_of(fastest, dt, steps)
+    if factor > OPTIONS.contracting and not matrix_free(family):
         one = s * with_hessian + (s * width) ** 3 * 2 / 3
         return float(steps.substeps * 4 * one)
-    iterations = 2 + np.log(1e-16) / np.log(max(factor, 1e-3))
+    iterations = 2 + np.log(1e-16) / np.log(np.clip(factor, 1e-3, OPTIONS.contracting))
     return float(steps.substeps * iterations * s * (gradient + 2 * width * s))
 
 
-def omega_h_of(hessian, dt: float) -> float:
+def omega_h_of(family, coefficients, prepared: Prepared, fastest) -> float:
     """The fastest oscillation of the linearised flow, radians per step, its median over states."""
-    turned = symplectic_form(hessian.shape[-1] // 2) @ hessian
-    rates = np.abs(np.linalg.eigvals(turned).imag).max(axis=-1)
-    return float(dt * np.median(rates))
+    if not matrix_free(family):
+        some = slice(_FREQUENCY_STATES)
+        z, args = prepared.y0[some], prepared.given(some)[1]
+        _, hessian = family.gradient_and_hessian(coefficients, z, args)
+        turned = symplectic_form(prepared.dim) @ hessian
+        fastest = np.abs(np.linalg.eigvals(turned).imag).max(axis=-1)
+    return float(prepared.dt * np.median(fastest))
 
 
 def _messages(
@@ -778,6 +807,8 @@ def formula(terms: Sequence[Term]) -> str:
         digits = 12 if std <= 0 else int(np.clip(np.ceil(np.log10(size / std)) + 1, 2, 12))
         number = f"{size:.{digits}g}"
         factor = "" if number == "1" else f"{number} "
+        if factor and term.startswith("1/"):
+            factor, term = number, term[1:]
         shown = f"({term})" if factor and _is_sum(term) else term
         text += (sign if text else sign.strip().removeprefix("+")) + factor + shown
     return text or "0"
@@ -785,12 +816,14 @@ def formula(terms: Sequence[Term]) -> str:
 
 def _is_sum(term: str) -> bool:
     """Whether a user's term is a sum, which a coefficient before it would not multiply."""
+    term = re.sub(r"\|[^|]*\|", "r", term)  # a distance holds its own difference
     depth = np.cumsum([(c in "(") - (c in ")") for c in term])
     return any(depth[i] == 0 and term[i : i + 3] in (" + ", " - ") for i in range(len(term)))
 
 
 def assembled(learned: LearnedHamiltonian, prepared: Prepared, judges: Judges) -> Assembled:
     """The candidate's map, its error and its time per step measured by the steps that users run."""
+    prepared = _in_relative_domain(learned.flow, prepared)
     map_ = composed(learned.flow, prepared, judges)
     held = judges.pairs.take(judges.held_out)
     steps = stepped(map_, np.asarray(held.z0), held.dt, held.args)
@@ -802,3 +835,14 @@ def assembled(learned: LearnedHamiltonian, prepared: Prepared, judges: Judges) -
         microseconds_per_step=steps.microseconds_per_step,
     )  # fmt: skip
     return Assembled(candidate, steps.compile_seconds)
+
+
+def _in_relative_domain(flow: Flow, prepared: Prepared) -> Prepared:
+    """With a domain that leaves out where the whole is, if no force depends on that."""
+    if prepared.structure is None:
+        return prepared
+    force = flow.family.gradient(flow.params, prepared.y0)[:, : prepared.dim]
+    moves = np.abs(force.sum(axis=1)).max() > _NO_FORCE * np.abs(force).sum(axis=1).max()
+    return dataclasses.replace(
+        prepared, domain=prepared.structure.domain(prepared.y0, uses_positions=bool(moves))
+    )

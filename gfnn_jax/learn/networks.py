@@ -21,7 +21,7 @@ from gfnn_jax.coordinates import to_user
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
-from gfnn_jax.fitting.gauss_newton import frequencies, substeps_for
+from gfnn_jax.fitting.gauss_newton import rates, substeps_for
 from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
@@ -130,17 +130,18 @@ def _learned(
     flow, error, dt = best.flow, best.error, prepared.dt
     family = flow.family
     finer = _images(dataclasses.replace(flow, substeps=2 * flow.substeps), y0)
-    _, hessian = family.gradient_and_hessian(flow.params, y0[:_STATES])
-    rates, steps = frequencies(hessian), Steps(flow.stages, flow.substeps)
+    fastest = rates(family, flow.params, y0[:_STATES])
+    steps = Steps(flow.stages, flow.substeps)
     candidate = Candidate(
         label=label, family=family.name, chart="flow", num_parameters=family.num_parameters,
-        operations=operations_of(family, y0.shape[1], rates, dt, steps), validation_rms=error.rms,
+        operations=operations_of(family, y0.shape[1], fastest, dt, steps), validation_rms=error.rms,
         validation_relative=error.relative, validation_bound=error.bound,
         deviations=error.deviations, train_rms=best.train_rms, fit_seconds=seconds,
         learns="hamiltonian",
     )  # fmt: skip
     off = best.images - np.asarray(finer)[-len(best.images) :]
-    truncation, omega_h = float(np.abs(off / prepared.scale).max()), omega_h_of(hessian, dt)
+    truncation = float(np.abs(off / prepared.scale).max())
+    omega_h = omega_h_of(family, flow.params, prepared, fastest)
     messages = ()
     if error.bound > judges.tolerance.bound and omega_h > _SHORT:
         messages = (
@@ -149,7 +150,7 @@ def _learned(
         )
     return LearnedHamiltonian(
         with_error(candidate, error), flow, (), None, truncation, omega_h,
-        contraction_of(rates, dt, steps), float("nan"), (), 0, messages, stalled=False, root=None,
+        contraction_of(fastest, dt, steps), float("nan"), (), 0, messages, stalled=False, root=None,
     )  # fmt: skip
 
 

@@ -10,21 +10,21 @@ from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.learn.sweeps import LinearSweep
 from gfnn_jax.maps.posterior import Posterior
-from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 
-def with_posterior(chosen: Chosen, searched: Searched) -> SymplecticMap:
-    """The chosen map with its posterior, where it was fitted to the user's pairs and is linear in
-    its coefficients, or is the flow of a learned H; without, where neither holds."""
+def with_posterior(chosen: Chosen, searched: Searched) -> Chosen:
+    """The choice with the posterior of its map, where that was fitted to the user's pairs and is
+    linear in its coefficients, or is the flow of a learned H; as it is, where neither holds."""
     map_, entry, law = chosen.candidate.map, chosen.entry, searched.law
     if entry is not None:
         own = entry.sweep.judges.pairs is searched.judges.pairs
         if not (own and isinstance(entry.sweep, LinearSweep)):
-            return map_
+            return chosen
         kind, root = Generated, entry.sweep.root(entry.size)
     elif law is not None and law.root is not None and chosen.candidate.learns == "hamiltonian":
         kind, root = Flow, law.root
     else:
-        return map_
+        return chosen
     piece = next(i for i, p in enumerate(map_.pieces) if isinstance(p, kind))
-    return dataclasses.replace(map_, posterior=Posterior(piece, root))
+    map_ = dataclasses.replace(map_, posterior=Posterior(piece, root))
+    return chosen._replace(candidate=dataclasses.replace(chosen.candidate, map=map_))

@@ -11,8 +11,9 @@ from gfnn_jax.coordinates import Coordinates, lift, to_inner
 from gfnn_jax.errors import FitError
 from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.learn.structures import Structure
 from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.domain import Domain, covering
+from gfnn_jax.maps.domain import Domain, Ranges, covering
 from gfnn_jax.phase_space import Pairs, sizes
 
 
@@ -26,12 +27,13 @@ class Prepared:
     are applied around what is learned: R^½ on both sides for an affine base map R, the flow of a
     law. dt: of all pairs, or in the middle of those that differ, which are ``own_dt`` (N,). args:
     (N, k) values of the ``parameters``, or None. period: of a drive, whose time is their last.
+    structure: of many degrees of freedom, whose sizes and domain are then those of its parts.
     """
 
     y0: np.ndarray
     y1: np.ndarray
     scale: np.ndarray
-    domain: Domain
+    domain: Domain | Ranges
     angle_centre: np.ndarray
     whole: tuple[int, ...]
     coordinates: Coordinates
@@ -41,6 +43,7 @@ class Prepared:
     own_dt: np.ndarray | None = None
     args: np.ndarray | None = None
     parameters: tuple[str, ...] = ()
+    structure: Structure | None = None
     period: float | None = None
 
     @property
@@ -90,7 +93,7 @@ class Prepared:
         return y
 
 
-def prepare(pairs: Pairs, coordinates: Coordinates) -> Prepared:
+def prepare(pairs: Pairs, coordinates: Coordinates, structure: Structure | None = None) -> Prepared:
     """The pairs in the inner coordinates. Raises FitError where states have none."""
     before, after = (to_inner(coordinates, z) for z in (pairs.z0, pairs.z1))
     known = np.isfinite(before + after).all(axis=1)
@@ -110,12 +113,17 @@ def prepare(pairs: Pairs, coordinates: Coordinates) -> Prepared:
     return _sized(
         Prepared(
             y0, y1, np.ones(y0.shape[1]), empty, centres, whole, coordinates, dt, own_dt=own_dt,
-            args=args, parameters=names, period=pairs.period,
+            args=args, parameters=names, period=pairs.period, structure=structure,
         )
     )  # fmt: skip
 
 
 def _sized(prepared: Prepared) -> Prepared:
+    structure = prepared.structure
+    if structure is not None:
+        return dataclasses.replace(
+            prepared, scale=structure.sizes(prepared.y0), domain=structure.domain(prepared.y0)
+        )
     ignore = (*prepared.coordinates.cyclic, *prepared.whole)
     return dataclasses.replace(
         prepared, scale=sizes(prepared.y0), domain=covering(prepared.y0, ignore=ignore)

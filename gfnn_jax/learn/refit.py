@@ -69,8 +69,7 @@ def refit(fitted: Fit, chunks: Iterable[Pairs], held: Pairs) -> Fit:
     candidates = tuple(chosen if c.chosen else c for c in fitted.candidates)
     seconds = fitted.seconds + time.perf_counter() - started
     return dataclasses.replace(
-        fitted, map=dataclasses.replace(chosen.map, posterior=fitted.map.posterior),
-        candidates=candidates, num_pairs=num_pairs, seconds=seconds,
+        fitted, map=chosen.map, candidates=candidates, num_pairs=num_pairs, seconds=seconds,
         messages=tuple(messages),
     )  # fmt: skip
 

@@ -12,6 +12,7 @@ from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.learn.candidates import Candidate, Tolerance
 from gfnn_jax.learn.check import check_request, coarse_tolerance, unlike_the_scene
 from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.structures import Structure, structure_of
 from gfnn_jax.learn.varied import as_varied
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
@@ -31,6 +32,7 @@ class Request:
     learn: str
     terms: Sequence[str | Callable]
     base: str | Callable | None
+    structure: Structure | None
     family: str
     chart: str
     seed: int
@@ -60,20 +62,26 @@ class Request:
 
 
 def checked(
-    pairs: Pairs, scene: Scene | None, *, tolerance, absolute_tolerance, learn, terms, base, family,
-    chart, angles, seed, clock: Clock, **others: Any,
+    pairs: Pairs, scene: Scene | None, *, tolerance, absolute_tolerance, learn, terms, base,
+    structure, family, chart, angles, seed, clock: Clock, **others: Any,
 ) -> Request:  # fmt: skip
     """The request, with what is constant in the pairs as a constant.
 
     Raises FitError, in one line, where it or the pairs cannot give a map.
     """
+    free = (family, chart, base) == ("auto", "auto", None) and learn != "map"
+    if structure is None and scene is not None and free:
+        structure = scene.structure
     bound = Tolerance(tolerance)
     if absolute_tolerance is not None:
         bound = Tolerance(absolute_tolerance, relative=False)
     check_request(
         pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, angles=angles,
-        terms=terms, base=base, seed=seed,
+        terms=terms, base=base, structure=structure, seed=seed,
     )  # fmt: skip
+    found = structure_of(structure, pairs.dim)
+    if found is not None:
+        learn = "hamiltonian"
     z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
     pairs = dataclasses.replace(pairs, z0=z0, z1=z1)
     pairs, learn, messages = as_varied(pairs, learn=learn, family=family, chart=chart, base=base)
@@ -82,6 +90,6 @@ def checked(
     messages += coarse_tolerance(pairs, bound)
     coordinates = scene.coordinates if scene else Coordinates("cartesian", angles=tuple(angles))
     return Request(
-        pairs, scene, coordinates, bound, learn, terms, base, family, chart, seed, clock,
+        pairs, scene, coordinates, bound, learn, terms, base, found, family, chart, seed, clock,
         messages=messages, **others,
     )  # fmt: skip

@@ -151,9 +151,11 @@ class LinearSweep:
         started = time.perf_counter()
         solved, params = self.solve(size, clock, say)
         factors = self._factor(size.group, clock, say)
-        ((_, outside),) = least_squares.residuals(
-            factors.inner, factors.outer, [size.family.num_parameters]
-        )
+        outside = None
+        if factors.outer.rows:  # none where every coordinate covers its circle
+            ((_, outside),) = least_squares.residuals(
+                factors.inner, factors.outer, [size.family.num_parameters]
+            )
         candidate = dataclasses.replace(
             judged, train_rms=solved.train_rms, condition=solved.condition, rank=solved.rank,
             outside=outside,

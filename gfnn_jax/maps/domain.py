@@ -17,10 +17,13 @@ import jax
 import numpy as np
 
 from gfnn_jax.arrays import as_row, matmul, namespace
+from gfnn_jax.families.expressions import jets
+from gfnn_jax.families.sums import Sums
 from gfnn_jax.phase_space import sizes
 
 # κ is of degree 4 in y: a factor 2 is a margin of about a fifth of the region's size.
 _MARGIN = 2.0
+_RANGE_MARGIN = 0.25  # of a range's width, on either side
 
 
 @partial(
@@ -79,3 +82,42 @@ def covering(y, *, ignore: tuple[int, ...] = ()) -> Domain:
     factor = vectors.T / np.sqrt(values)[:, None]
     limit = _MARGIN * np.max(np.sum((v @ factor.T) ** 2, axis=1))
     return Domain(keep, centre, scale, factor, np.asarray(limit))
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=("low", "high"), meta_fields=("seen",))
+@dataclasses.dataclass(frozen=True, eq=False)
+class Ranges:
+    """Where every neighbourhood's variables are within the range that the data's had, of all
+    neighbourhoods together: what a sum over neighbourhoods knows, however many there are.
+
+    seen: whose variables they are. low, high: (variables of all parts,).
+    """
+
+    seen: Sums
+    low: Any
+    high: Any
+
+    def contains(self, y):
+        """Whether the states y (..., 2d) lie where data were; False for non-finite ones. NumPy or
+        JAX."""
+        xp = namespace(y)
+        inside, n = xp.all(xp.isfinite(y), axis=-1), 0
+        for values in variables_of(self.seen, y):
+            good = (values >= self.low[n]) & (values <= self.high[n])
+            inside, n = inside & xp.all(good, axis=-1), n + 1
+        return inside
+
+
+def variables_of(seen: Sums, y) -> list:
+    """The variables (..., neighbourhoods) of all parts at the states y (..., 2d)."""
+    return [
+        jet.value for part in seen.parts for jet in jets(part.terms.trees, part.over.gather(y), 0)
+    ]
+
+
+def ranges_of(seen: Sums, y) -> Ranges:
+    """The ranges over the states y (N, 2d), with a margin."""
+    values = variables_of(seen, np.asarray(y, np.float64))
+    low, high = (np.array([f(v) for v in values]) for f in (np.min, np.max))
+    margin = _RANGE_MARGIN * (high - low)
+    return Ranges(seen, low - margin, high + margin)

@@ -23,13 +23,14 @@ from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.mlp import Mlp
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
+from gfnn_jax.families.sums import Groups, Part, Sums, Windows
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import Chart, TypeOne
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import PolynomialModel, Predictor
 from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.domain import Domain
+from gfnn_jax.maps.domain import Domain, Ranges
 from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.stroboscopic import OverPhases
@@ -43,7 +44,8 @@ _TYPES: dict[str, type] = {
     kind.__name__: kind
     for kind in (
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
-        Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior,
+        Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
+        Windows, Groups, Ranges,
     )
 }  # fmt: skip
 # Names that were used before, in models that may still be about.

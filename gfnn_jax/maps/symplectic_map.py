@@ -24,14 +24,16 @@ from gfnn_jax.compiling import compiled_sooner
 from gfnn_jax.coordinates import TWO_PI, Coordinates
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated, two_sum
-from gfnn_jax.maps.domain import Domain
+from gfnn_jax.maps.domain import Domain, Ranges
 from gfnn_jax.maps.modified_hamiltonian import NUM_STEPS, Cells, ModifiedHamiltonian, of_cells
 from gfnn_jax.maps.parameters import Parameters, as_args
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.rollout import scan_steps
-from gfnn_jax.phase_space import require_x64, symplecticity_defect
+from gfnn_jax.phase_space import defect_of_pairs, require_x64, symplecticity_defect
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, Info
 
+# 2d up to which a defect is that of all tangent vectors; random pairs of them beyond.
+_WIDEST, _TANGENT_PAIRS = 64, 4
 _TWO_PI_REST = 2.4492935982947064e-16  # what float64 leaves out of 2π
 
 
@@ -118,7 +120,7 @@ class SymplecticMap:
 
     pieces: tuple
     coordinates: Coordinates
-    domain: Domain
+    domain: Domain | Ranges
     scale: Any
     angle_centre: Any
     dt: Any
@@ -202,7 +204,7 @@ class SymplecticMap:
 
     def defect(self, z, args=None, *, t0=None):
         """Symplecticity defect () or (B,) of the step's unrolled derivative at z, in units of
-        ``scale``.
+        ``scale``; of many degrees of freedom by random pairs of tangent vectors.
 
         By forward differentiation through the iterations that ran, never by the implicit rule,
         which would look symplectic however badly the solve had converged.
@@ -398,6 +400,11 @@ def _defect(map_, z, args, unrolled):
         step = partial(map_._apply, args=args, unrolled=unrolled)
         return jax.jvp(lambda y: step(y)[0], (z,), (jnp.broadcast_to(unit, z.shape),))[1]
 
+    width = z.shape[1]
+    if width > _WIDEST:
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (2 * _TANGENT_PAIRS, width))
+        before = jnp.asarray(signs / np.sqrt(width), z.dtype) * map_.scale[None]
+        return defect_of_pairs(before[:, None], jax.vmap(tangent)(before), map_.scale)
     jacobian = jax.vmap(tangent, out_axes=-1)(jnp.eye(z.shape[1], dtype=z.dtype))
     return symplecticity_defect(jacobian, map_.scale)
 

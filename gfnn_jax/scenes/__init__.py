@@ -13,16 +13,26 @@ import pkgutil
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from gfnn_jax.scenes.scene import AroundOrbit, DrawnFrom, Scene, Section, UniformInEllipse
+from gfnn_jax.scenes.scene import (
+    AroundOrbit,
+    DrawnFrom,
+    NormalSites,
+    Scene,
+    Section,
+    UniformInEllipse,
+)
 
 if TYPE_CHECKING:  # what is collected below
     from gfnn_jax.scenes.driven_pendulum import driven_pendulum
     from gfnn_jax.scenes.driven_pendulum_phase import driven_pendulum_phase
+    from gfnn_jax.scenes.fput import fput
     from gfnn_jax.scenes.henon_heiles import henon_heiles
     from gfnn_jax.scenes.henon_heiles_section import henon_heiles_section
+    from gfnn_jax.scenes.n_body import n_body
     from gfnn_jax.scenes.pcr3bp import pcr3bp
     from gfnn_jax.scenes.pendulum_length import pendulum_length
     from gfnn_jax.scenes.standard_map import standard_map
+    from gfnn_jax.scenes.toda import toda
     from gfnn_jax.scenes.two_body import two_body
 
 _OTHER_MODULES = ("scene", "trajectories")
@@ -68,17 +78,21 @@ __all__ = [
     "SCENES",
     "AroundOrbit",
     "DrawnFrom",
+    "NormalSites",
     "Scene",
     "Section",
     "UniformInEllipse",
     "driven_pendulum",
     "driven_pendulum_phase",
+    "fput",
     "henon_heiles",
     "henon_heiles_section",
     "make",
+    "n_body",
     "names",
     "pcr3bp",
     "pendulum_length",
     "standard_map",
+    "toda",
     "two_body",
 ]

@@ -38,6 +38,19 @@ class UniformInEllipse:
 
 
 @dataclasses.dataclass(frozen=True)
+class NormalSites:
+    """``draw(key, num)``: independent normal q and p (num, 2·dim) around 0."""
+
+    dim: int
+    sigma_q: float
+    sigma_p: float
+
+    def __call__(self, key, num):
+        unit = jax.random.normal(key, (2, num, self.dim), jnp.float64)
+        return jnp.concatenate([self.sigma_q * unit[0], self.sigma_p * unit[1]], axis=-1)
+
+
+@dataclasses.dataclass(frozen=True)
 class AroundOrbit:
     """States of one orbit, perturbed by a centred Gaussian (paper, "Experimental Details").
 
@@ -101,6 +114,8 @@ class Scene:
                    where it is not y itself: invariants of a symmetry, inverse distances.
     reversor:      signs (2d,) of a linear reversor ρ in the inner coordinates (ρᵀJρ = −J and
                    φ∘ρ∘φ = ρ, φ the map), where there is one; it halves a midpoint basis.
+    structure:     of many degrees of freedom, as `gfnn.fit` takes it: what a fit learns by unless
+                   it is told otherwise.
     regular:       True where the orbits are regular, so that error growth has an exponent.
     num_pairs:     pairs that `gfnn run` draws.
     tolerance:     relative one-step error that `gfnn run` asks for: RMS over coordinates of the
@@ -124,6 +139,7 @@ class Scene:
     coordinates: Coordinates = CARTESIAN
     features: Callable | None = None
     reversor: tuple[int, ...] | None = None
+    structure: str | None = None
     regular: bool = True
     num_pairs: int = 4_000
     tolerance: float = 1e-8

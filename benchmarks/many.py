@@ -1,0 +1,218 @@
+"""Many degrees of freedom: laws of rings of sites and of bodies, from few pairs.
+
+    python benchmarks/many.py            every row (about five minutes on two cores)
+    python benchmarks/many.py --quick    one of them, small
+
+Each row is told the structure and nothing else, and judged by states that no fit has seen, against
+the flow of the true H by 12-stage Gauss collocation.
+"""
+
+from __future__ import annotations
+
+import resource
+import time
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from harness import (
+    SEED,
+    TABLES,
+    Numbers,
+    between_markers,
+    main,
+    markdown,
+    number,
+    provenance,
+    results,
+    timed,
+)
+
+import gfnn_jax as gfnn
+from gfnn_jax.families.sums import Part, Sums, Windows, body_terms
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.flows.collocation import Steps, images
+
+FRESH = 4  # states that a row is judged by; of bodies more
+SIZES = (10, 100, 1_000, 3_000, 10_000)
+CLOSE = 32  # parts of a step of three bodies, whose close passages one step does not resolve
+
+
+def ring(dim: int, bonds: Terms) -> Sums:
+    """½ Σ p² and a ring's bonds."""
+    kinetic = Part(Terms(1, ("p1",), ((2,),)), Windows("ring", 0))
+    return Sums(dim, (kinetic, Part(bonds, Windows("ring", 1))))
+
+
+def fput_ring(dim: int) -> tuple[Sums, np.ndarray]:
+    """The β ring of the scene fput and its coefficients."""
+    return ring(dim, Terms(2, ("q2 - q1",), ((2,), (4,)))), np.array([0.5, 0.5, 0.25])
+
+
+def moved(law, z, dt: float, steps: int = 1, substeps: int = 1) -> np.ndarray:
+    """States z (B, 2d) after so many steps of the true law."""
+    family, params = law
+    for _ in range(steps):
+        z = images(family, params, z, dt, Steps(12, substeps)).states
+    return z
+
+
+def judged(
+    law, z0, dt: float, structure: str, fresh, num_steps: int, *, substeps: int = 1, parts: int = 1
+) -> Numbers:
+    """A fit of pairs drawn at z0, and its errors from fresh states (B, 2d). parts: of a step of
+    the rollout."""
+    family, params = law
+    pairs = gfnn.Pairs(z0, moved(law, z0, dt, substeps=substeps), dt)
+    started = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)
+        fit = gfnn.fit(pairs, structure=structure, tolerance=1e-12, max_seconds=None)
+    seconds = time.perf_counter() - started
+    one = moved(law, fresh, dt, substeps=substeps)
+    every = num_steps * parts
+    rollout: Callable[[], Any] = partial(
+        fit.map.rollout, fresh, every, dt=dt / parts if parts > 1 else None, save_every=every
+    )
+    states = np.asarray(rollout()[0])
+    alone = timed(lambda: fit.map.rollout(fresh[0], 100, save_every=100))
+    off = np.linalg.norm(states[:, -1] - moved(law, fresh, dt, num_steps, substeps), axis=1)
+    off = np.where(np.isfinite(off), off, np.inf)
+    coefficients = {t: c for t, c, _ in fit.hamiltonian.terms} if fit.hamiltonian else {}
+    exact = dict(zip(family.term_names, params.tolist(), strict=True))
+    wrong = max(abs(coefficients.get(t, 0.0) - c) / abs(c) for t, c in exact.items())
+    energy = np.asarray(fit.map.hamiltonian(states[:, -1])) / fit.map.hamiltonian(fresh) - 1
+    return {
+        "structure": structure, "dim": family.dim, "dt": dt, "pairs": len(pairs),
+        "formula": fit.formula, "terms": fit.chosen.num_parameters, "fit_seconds": seconds,
+        "one_step_rms": float(np.sqrt(np.mean((np.asarray(fit.map.step(fresh)[0]) - one) ** 2))),
+        "coefficients_off": wrong, "steps": num_steps,
+        "error_median": float(np.median(off)), "error_90": float(np.sort(off)[int(0.9 * len(off))]),
+        "energy_off": float(np.nanmedian(np.abs(energy))),
+        "symplecticity_defect": fit.symplecticity_defect,
+        "microseconds_per_step_alone": 1e6 * alone.seconds / 100,
+        "gigabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+    }  # fmt: skip
+
+
+def normal(dim: int, num: int, sigma_q: float, sigma_p: float) -> np.ndarray:
+    """States (num, 2·dim)."""
+    unit = np.random.default_rng(SEED).normal(size=(num, 2, dim))
+    return (unit * np.array([[sigma_q], [sigma_p]])).reshape(num, -1)
+
+
+def fput(dim: int, quick: bool) -> Numbers:
+    """The β ring, 40 pairs."""
+    z = normal(dim, 40 + FRESH, 0.2, 0.28)
+    return judged(fput_ring(dim), z[:40], 0.1, "ring", z[40:], 10 if dim > 1_000 else 1_000)
+
+
+def leapfrog(quick: bool) -> Numbers:
+    """1,000 sites, one trajectory: microseconds per dt of leapfrogs of the same H, written by hand,
+    of 10 steps per dt."""
+    z, h = normal(1_000, 1, 0.2, 0.28)[0], 0.01
+
+    def stepped(xp, q, p, loop):
+        def force(q):
+            r = xp.roll(q, -1) - q
+            bond = r + r**3
+            return bond - xp.roll(bond, 1)
+
+        def one(_, state):
+            q, p = state
+            p = p + 0.5 * h * force(q)
+            q = q + h * p
+            return q, p + 0.5 * h * force(q)
+
+        return loop(1_000, one, (q, p))
+
+    def plain(n, one, state):
+        for i in range(n):
+            state = one(i, state)
+        return state
+
+    by_jax = jax.jit(
+        lambda q, p: stepped(jax.numpy, q, p, lambda n, f, s: jax.lax.fori_loop(0, n, f, s))
+    )
+    half = z[:1_000], z[1_000:]
+    by_numpy = timed(lambda: stepped(np, *half, plain))
+    after = np.concatenate(by_numpy.out) - moved(fput_ring(1_000), z[None], 10 * h, 100)[0]
+    return {
+        "numpy_microseconds": 1e4 * by_numpy.seconds,
+        "jax_microseconds": 1e4 * timed(lambda: by_jax(*half)).seconds,
+        "error_at_step_100": float(np.linalg.norm(after)),
+    }
+
+
+def toda(quick: bool) -> Numbers:
+    """Toda's ring of 32 sites, 200 pairs."""
+    law = ring(32, Terms(2, ("exp(q1 - q2)",), ((1,),))), np.array([0.5, 1.0])
+    z = normal(32, 210, 0.3, 0.3)
+    return judged(law, z[:200], 0.05, "ring", z[200:], 2_000)
+
+
+def three_bodies(quick: bool) -> Numbers:
+    """Equal bodies in the plane, nearly on a circle and falling out of it: to t = 5."""
+    rng, num = np.random.default_rng(SEED), 2_200
+    r = rng.uniform(0.9, 1.2, (num, 1))
+    turn = rng.uniform(0, 2 * np.pi, (num, 1)) + 2 * np.pi / 3 * np.arange(3)
+    speed = (1 + 0.2 * rng.normal(size=(num, 3))) / np.sqrt(np.sqrt(3) * r)
+    q = r[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    p = speed[..., None] * np.stack([-np.sin(turn), np.cos(turn)], axis=-1)
+    z = np.concatenate([q.reshape(num, -1), p.reshape(num, -1)], axis=1)
+    law = body_terms(3, 2, (-1,), alike=True), np.array([0.5, -1.0])
+    return judged(law, z[:2_000], 0.5, "bodies:3", z[2_000:], 10, substeps=CLOSE, parts=CLOSE)
+
+
+def four_bodies(quick: bool) -> Numbers:
+    """A star and three companions in space."""
+    scene = gfnn.scenes.n_body()
+    masses = scene.hamiltonian.masses  # pyright: ignore[reportOptionalMemberAccess]
+    pulls = [-masses[i] * masses[j] for i in range(4) for j in range(i + 1, 4)]
+    law = body_terms(4, 3, (-1,), alike=False), np.array([*(0.5 / m for m in masses), *pulls])
+    z = gfnn.sample_states(scene, 1_030, jax.random.key(SEED))
+    return judged(law, z[:1_000], scene.dt, "bodies:4", z[1_000:], 1_000)
+
+
+PIECES = {
+    **{f"fput-{dim}": partial(fput, dim) for dim in SIZES},
+    "toda": toda, "three-bodies": three_bodies, "four-bodies": four_bodies, "leapfrog": leapfrog,
+}  # fmt: skip
+_TITLES = {
+    **{f"fput-{dim}": f"FPUT-β ring, d = {dim:,}" for dim in SIZES},
+    "toda": "Toda's ring, d = 32", "three-bodies": "three equal bodies in the plane",
+    "four-bodies": "four bodies in space",
+}  # fmt: skip
+
+
+def tables() -> None:
+    """The table of RESULTS.md."""
+    found = results(PIECES, "many")
+    heads = ("task", "dt", "pairs", "fit s", "terms", "coefficients off by", "one-step RMS",
+             "at step", "error, median", "error, 90 %", "µs per step alone", "GB")  # fmt: skip
+    rows = []
+    for name, title in _TITLES.items():
+        if name not in found:
+            continue
+        m = found[name]["measured"]
+        keys = ("fit_seconds", "terms", "coefficients_off", "one_step_rms", "steps", "error_median",
+                "error_90", "microseconds_per_step_alone", "gigabytes")  # fmt: skip
+        rows.append((title, f"{m['dt']:g}", str(m["pairs"]), *(number(m[key]) for key in keys)))
+    text = markdown(heads, rows)
+    if "leapfrog" in found:
+        m = found["leapfrog"]["measured"]
+        text += (
+            "\n\nA leapfrog of the same ring of 1,000 sites, written by hand, ten steps per dt, "
+            f"takes {number(m['numpy_microseconds'])} µs in NumPy and "
+            f"{number(m['jax_microseconds'])} µs in JAX, and is off by "
+            f"{number(m['error_at_step_100'])} at step 100."
+        )
+    text += f"\n\n{provenance(found)}" if found else ""
+    between_markers(TABLES, "many", text)
+
+
+if __name__ == "__main__":
+    main(str(__doc__), PIECES, "many", tables, None, quick_pieces=("fput-10",))

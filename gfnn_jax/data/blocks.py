@@ -1,0 +1,139 @@
+"""Rows of states as they come out of a file: what every kind of file is turned into."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.errors import InputError
+
+# Times in text files carry few digits: relative agreement asked of time steps.
+TIME_TOLERANCE = 1e-5
+# A larger number overflows in the squares, products and sums of squares that a fit makes.
+LARGEST = 1e100
+# Rows read at a time when no chunk is asked for; 16k rows of four numbers are 6 MB as text.
+BLOCK_ROWS = 16_384
+TIME = "t"  # `phase_space.TIME`, which brings JAX
+
+
+class DataWarning(UserWarning):
+    """Data that can be used but look odd: constant, duplicated or unknown columns."""
+
+
+@dataclasses.dataclass
+class Block:
+    """Consecutive rows. ``sequence`` (n,) changes where one sequence ends and the next begins;
+    ``locate(row, column)`` says where in the file a number stands. ``own`` (n, 1 + k): the row's
+    time and parameters, where the file has these."""
+
+    states: np.ndarray
+    sequence: np.ndarray
+    locate: Callable[[int, int], str]
+    own: np.ndarray | None = None
+
+    def rows(self, index: np.ndarray) -> Block:
+        return Block(
+            self.states[index], self.sequence[index], lambda r, c: self.locate(int(index[r]), c),
+            None if self.own is None else self.own[index],
+        )  # fmt: skip
+
+    def checked(self, path) -> Block:
+        """Itself, if every number is finite and not too large; else InputError."""
+        for bad, what in (
+            (~np.isfinite(self.states), "not finite (NaN or infinity)"),
+            (np.abs(self.states) > LARGEST, f"too large (above {LARGEST:.0e})"),
+        ):
+            if bad.any():
+                row, column = (int(i) for i in np.argwhere(bad)[0])
+                count = int(bad.sum())
+                raise InputError(
+                    f"{path}: {count} value{'s' * (count != 1)} {what}, first "
+                    f"{self.locate(row, column)} = {self.states[row, column]}"
+                )
+        return self
+
+
+@dataclasses.dataclass
+class Source:
+    """An open file: what its header says, and its rows in blocks of at most so many.
+
+    uneven: whether the times that were read so far are not dt apart. parameters: names of those
+    that the rows have. period: of a drive, whose time the rows' times are. timed: whether they have
+    times at all.
+    """
+
+    dim: int
+    dt: float  # NaN where initial states need none, or the times say it
+    precision: str
+    units: dict[str, str]
+    is_array: bool
+    blocks: Callable[[int], Iterator[Block]]
+    parameters: tuple[str, ...] = ()
+    uneven: bool = False
+    period: float | None = None
+    timed: bool = False
+
+    def of_pairs(self, own: np.ndarray | None, rows) -> tuple[Any, dict[str, np.ndarray] | None]:
+        """(dt, args) of the pairs that begin in these rows."""
+        if own is None:
+            return self.dt, None
+        dt = own[rows + 1, 0] - own[rows, 0] if self.uneven else self.dt
+        args = {name: own[rows, 1 + i] for i, name in enumerate(self.parameters)}
+        if self.period is not None:
+            args[TIME] = own[rows, 0]
+        return dt, args or None
+
+
+def check_dt(dt: Any, what: str) -> float:
+    array = np.asarray(dt)
+    if array.size != 1 or array.dtype.kind not in "fiu":
+        raise InputError(f"{what} must be one number, got {array.dtype} of shape {array.shape}")
+    value = float(array.reshape(())[()])
+    if not (np.isfinite(value) and value > 0):
+        raise InputError(f"{what} must be finite and above 0, got {value}")
+    return value
+
+
+def agreed_dt(path, given: float | None, found: float | None) -> float:
+    if found is not None and np.isnan(found):
+        if given is not None:
+            raise InputError(f"{path}: the given dt = {given} disagrees with times that are uneven")
+        return found
+    if given is None and found is None:
+        raise InputError(f"{path}: holds no time step and none was given (dt)")
+    if given is None or found is None:
+        return given if found is None else found  # pyright: ignore[reportReturnType]
+    if abs(given - found) > TIME_TOLERANCE * found:
+        raise InputError(f"{path}: the given dt = {given} disagrees with the file's dt = {found}")
+    return given
+
+
+def check_width(path, name: str, shape: tuple[int, ...]) -> int:
+    """d of an array of shape (..., 2d)."""
+    width = shape[-1]
+    if width == 0 or width % 2:
+        raise InputError(
+            f"{path}: {name} of shape {shape} must have an even last dimension 2d (q first, then "
+            f"p), found {width}"
+        )
+    return width // 2
+
+
+def column(index: int, dim: int) -> str:
+    return f"q{index + 1}" if index < dim else f"p{index - dim + 1}"
+
+
+@contextlib.contextmanager
+def damage(path, name: str) -> Iterator[None]:
+    """Whatever a damaged file makes zipfile, zlib or NumPy raise, in one line."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        detail = (str(error) or type(error).__name__)[:120]
+        raise InputError(f"{path}: {name} cannot be read: damaged? ({detail})") from error

@@ -1,0 +1,334 @@
+"""One function summed over neighbourhoods: of the sites of a ring or a chain, of bodies and pairs.
+
+    f(c, w) = Σ_parts Σ_neighbourhoods Σ_j c_j φ_j(w in the neighbourhood)
+
+All neighbourhoods of a part share its coefficients, so that one state of a ring of 1,000 sites is
+1,000 rows of data for a function of a few variables. A gradient, and a product with the Hessian,
+cost as many operations as there are neighbourhoods: nothing is a dense matrix.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Sequence
+from functools import partial
+from itertools import combinations
+from typing import Any
+
+import jax
+import numpy as np
+
+from gfnn_jax.arrays import matmul, namespace
+from gfnn_jax.families.expressions import depends_on, parse
+from gfnn_jax.families.terms import Terms, exponents, given_terms, joined
+from gfnn_jax.phase_space import split
+
+ENDS = ("ring", "free", "fixed")
+_LONGEST = 4  # sites of a window that a user's own terms may name
+_DENSE = 32  # 2d up to which matrices (2d, 2d) are cheaper than products with them
+
+
+@dataclasses.dataclass(frozen=True)
+class Windows:
+    """``reach`` + 1 sites in a row, wherever such a row fits.
+
+    ends: "ring", where the last site's neighbour is the first; "free"; or "fixed", between two
+    sites that stay at q = p = 0.
+    """
+
+    ends: str
+    reach: int
+
+    prefix = "Σ_i "  # of a formula
+
+    def gather(self, w):
+        """w (..., 2d) as states (..., windows, 2·(reach + 1)) of the windows."""
+        xp = namespace(w)
+        columns = [c for x in split(w) for c in self._shifted(x)]
+        return xp.moveaxis(xp.stack(columns), 0, -1)
+
+    def scatter(self, g):
+        """The transpose of ``gather``: (..., windows, 2·(reach + 1)) -> (..., 2d)."""
+        xp, count = namespace(g), self.reach + 1
+        sides = (g[..., :count], g[..., count:])
+        return xp.concatenate([self._summed(side) for side in sides], axis=-1)
+
+    def _shifted(self, x) -> list:
+        xp = namespace(x)
+        if self.ends == "ring":
+            return [xp.roll(x, -j, axis=-1) for j in range(self.reach + 1)]
+        if self._held:
+            wall = xp.zeros_like(x[..., :1])
+            x = xp.concatenate([wall, x, wall], axis=-1)
+        last = x.shape[-1] - self.reach
+        return [x[..., j : j + last] for j in range(self.reach + 1)]
+
+    def _summed(self, g):
+        xp, count = namespace(g), self.reach + 1
+        if self.ends == "ring":
+            return sum(xp.roll(g[..., j], j, axis=-1) for j in range(count))
+        nothing = [(0, 0)] * (g.ndim - 2)
+        places = [[*nothing, (j, self.reach - j)] for j in range(count)]
+        total: Any = sum(xp.pad(g[..., j], place) for j, place in enumerate(places))
+        return total[..., 1:-1] if self._held else total
+
+    @property
+    def _held(self) -> bool:
+        return self.ends == "fixed" and self.reach > 0
+
+    def count(self, dim: int) -> int:
+        """The number of windows among ``dim`` sites."""
+        return dim if self.ends == "ring" else dim - self.reach + 2 * self._held
+
+    def named(self, text: str) -> str:
+        """A term of the window's own q1, q2, … as one of a general site: q_i, q_{i+1}, …"""
+        return re.sub(r"\b([qp])([0-9]+)", lambda m: f"{m[1]}_{_site(int(m[2]) - 1)}", text)
+
+
+@dataclasses.dataclass(frozen=True)
+class Groups:
+    """Groups of one or two bodies in a space of ``space`` dimensions, q body by body.
+
+    members: the bodies of each group. size: of all bodies.
+    """
+
+    members: tuple[tuple[int, ...], ...]
+    size: int
+    space: int
+
+    prefix = ""
+
+    def gather(self, w):
+        """w (..., 2d) as states (..., groups, 2k) of the groups, their bodies one after another."""
+        places = np.array(self.members)
+        sides = []
+        for x in split(w):
+            bodies = x.reshape(*x.shape[:-1], self.size, self.space)[..., places, :]
+            sides.append(bodies.reshape(*x.shape[:-1], len(places), -1))
+        return namespace(w).concatenate(sides, axis=-1)
+
+    def scatter(self, g):
+        """The transpose of ``gather``: (..., groups, 2k) -> (..., 2d)."""
+        count, lanes = len(self.members[0]), g.shape[:-2]
+        sides = g.reshape(*lanes, len(self.members), 2, count, self.space)
+        total: Any = 0.0
+        for m in range(count):
+            chosen = np.eye(self.size, dtype=g.dtype)[:, [group[m] for group in self.members]]
+            own = namespace(g).moveaxis(sides[..., m, :], -2, -3)  # (..., 2, groups, space)
+            total = total + matmul(chosen, own)
+        return total.reshape(*lanes, -1)
+
+    def count(self, dim: int) -> int:
+        """The number of groups."""
+        return len(self.members)
+
+    def named(self, text: str) -> str:
+        """A term of a group's own q1, q2, … in the positions and momenta of bodies."""
+        one = len(self.members) == 1
+        bodies = [str(b + 1) for b in self.members[0]] if one else ["i", "j"]
+        pair = f"|q_{bodies[0]} - q_{bodies[-1]}|"
+        for written, short in (
+            (distance(self.space), pair),
+            (f"({momentum_squared(self.space)})", f"|p_{bodies[0]}|²"),
+            (momentum_squared(self.space), f"|p_{bodies[0]}|²"),
+        ):
+            text = text.replace(written, short)
+        text = re.sub(r"\(1/(\|[^|]*\|)\)", r"1/\1", text)
+        every = "Σ_{i<j} " if len(self.members[0]) == 2 else "Σ_i "
+        return text if one else every + text
+
+
+def momentum_squared(space: int) -> str:
+    """|p|² of a body as text."""
+    return " + ".join(f"p{k}**2" for k in range(1, space + 1))
+
+
+def distance(space: int) -> str:
+    """|q − q'| of two bodies as text."""
+    squares = (f"(q{k} - q{k + space})**2" for k in range(1, space + 1))
+    return f"sqrt({' + '.join(squares)})"
+
+
+def _site(ahead: int) -> str:
+    return f"{{i+{ahead}}}" if ahead else "i"
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """``terms`` of a neighbourhood's own state, summed over all of its kind."""
+
+    terms: Terms
+    over: Any
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=(), meta_fields=("dim", "parts"))
+@dataclasses.dataclass(frozen=True)
+class Sums:
+    """The sum of its parts. params: the coefficients (N,) of all parts, one after another."""
+
+    dim: int
+    parts: tuple[Part, ...]
+
+    name = "sums"
+    quadratic = False  # no affine map is tried in its stead: a dense matrix
+
+    @property
+    def label(self) -> str:
+        return f"{self.name} {self.num_parameters}"
+
+    @property
+    def num_parameters(self) -> int:
+        return sum(part.terms.num_parameters for part in self.parts)
+
+    @property
+    def prefix(self) -> str:
+        """What stands before the formula."""
+        return self.parts[0].over.prefix
+
+    @property
+    def matrix_free(self) -> bool:
+        """Whether solvers are to use products with the Hessian instead of the Hessian."""
+        return 2 * self.dim > _DENSE
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """Each term as it stands in the formula of a general neighbourhood."""
+        return tuple(part.over.named(n) for part in self.parts for n in part.terms.term_names)
+
+    @property
+    def operations(self) -> tuple[int, int]:
+        """Floating-point operations of a gradient, and of a gradient with its Hessian."""
+        counted = [(p.over.count(self.dim), p.terms.operations) for p in self.parts]
+        gradient, with_hessian = (sum(n * own[k] for n, own in counted) for k in (0, 1))
+        return gradient, with_hessian
+
+    def take(self, rows: Sequence[int]) -> Sums:
+        """The family of these terms alone."""
+        parts, first = [], 0
+        for part in self.parts:
+            last = first + part.terms.num_parameters
+            own = [row - first for row in rows if first <= row < last]
+            if own:
+                parts.append(Part(part.terms.take(own), part.over))
+            first = last
+        return Sums(self.dim, tuple(parts))
+
+    def unflatten(self, coefficients):
+        """The parameters are the coefficients (N,) themselves."""
+        return coefficients
+
+    def __call__(self, params, w, args=None):
+        return self.value(params, w, args)
+
+    def value(self, params, w, args=None):
+        """f, shape (...): params (N,), w (..., 2d)."""
+        return sum(
+            namespace(w).sum(part.terms.value(own, part.over.gather(w), args), axis=-1)
+            for part, own in self._with_params(params)
+        )
+
+    def gradient(self, params, w, args=None):
+        """∂f/∂w (..., 2d)."""
+        return sum(
+            part.over.scatter(part.terms.gradient(own, part.over.gather(w), args))
+            for part, own in self._with_params(params)
+        )
+
+    def curvatures(self, params, w, args=None) -> list:
+        """Of each part the Hessians (..., neighbourhoods, k, k) of its terms, which
+        ``hessian_product`` takes."""
+        return [
+            part.terms.gradient_and_hessian(own, part.over.gather(w), args)[1]
+            for part, own in self._with_params(params)
+        ]
+
+    def hessian_product(self, curvatures, v):
+        """∂²f/∂w² v (..., 2d) of the curvatures at w (..., 2d); v may have further axes before."""
+        xp = namespace(v)
+        return sum(
+            part.over.scatter(xp.sum(bend * part.over.gather(v)[..., None, :], axis=-1))
+            for part, bend in zip(self.parts, curvatures, strict=True)
+        )
+
+    def gradient_and_hessian(self, params, w, args=None):
+        """∂f/∂w (..., 2d) and ∂²f/∂w² (..., 2d, 2d), a product for every column: for small d."""
+        xp, width = namespace(w), w.shape[-1]
+        units = np.eye(width, dtype=w.dtype).reshape(width, *(1,) * (w.ndim - 1), width)
+        columns = self.hessian_product(
+            self.curvatures(params, w, args), xp.broadcast_to(units, (width, *w.shape))
+        )
+        return self.gradient(params, w, args), xp.moveaxis(columns, 0, -1)
+
+    def term_gradients(self, w, args=None):
+        """∇ of every term at w (..., 2d): (..., 2d, N). NumPy."""
+        found = []
+        for part in self.parts:
+            local = part.terms.term_gradients(part.over.gather(w), args)
+            found.append(part.over.scatter(np.moveaxis(local, -1, 0)))
+        return np.moveaxis(np.concatenate(found), 0, -1)
+
+    def _with_params(self, params):
+        first = 0
+        for part in self.parts:
+            last = first + part.terms.num_parameters
+            yield part, params[first:last]
+            first = last
+
+
+def matrix_free(family) -> bool:
+    """Whether the family's solvers are to do without (2d, 2d) matrices."""
+    return bool(getattr(family, "matrix_free", False))
+
+
+def site_terms(dim: int, ends: str, reach: int, degree: int, functions: Sequence[str] = ()) -> Sums:
+    """Products of total degree 1 to ``degree`` of q_i, p_i and the differences q_{i+k} − q_i up to
+    ``reach``, and ``functions`` as text in a site's q1, p1 and the next sites' q2, p2, … to q4, p4.
+
+    Powers of one variable come first: of combinations that are equal when summed, they are kept.
+    Each term goes to the shortest window that holds it. Raises InputError for a function that is
+    not understood.
+    """
+    variables = ("q1", "p1", *(f"q{k + 1} - q1" for k in range(1, reach + 1)))
+    rows = exponents(len(variables), degree)
+    rows.sort(key=lambda row: sum(a > 0 for a in row) > 1)
+    reaches = [_reach_of(text) for text in functions]
+    parts = []
+    for near in range(max([reach, *reaches]) + 1):
+        own = [row[: near + 2] for row in rows if _furthest(row) == near]
+        terms = Terms(near + 1, variables[: near + 2], tuple(own))
+        given = [t for t, r in zip(functions, reaches, strict=True) if r == near]
+        if given:
+            terms = joined(given_terms(near + 1, given), terms)
+        if terms.powers:
+            parts.append(Part(terms, Windows(ends, near)))
+    return Sums(dim, tuple(parts))
+
+
+def body_terms(bodies: int, space: int, powers: Sequence[int], *, alike: bool) -> Sums:
+    """|p_i|² of every body, and ``powers`` of the distances of every pair.
+
+    alike: whether all bodies share their coefficients; else each body and each pair has its own.
+    """
+    r = distance(space)
+    rows = tuple((max(n, 0), max(-n, 0)) for n in powers)
+    local = (
+        (Terms(space, (momentum_squared(space),), ((1,),)), [(i,) for i in range(bodies)]),
+        (Terms(2 * space, (r, f"1/{r}"), rows), list(combinations(range(bodies), 2))),
+    )
+    parts = []
+    for terms, groups in local:
+        for members in [groups] if alike else [[group] for group in groups]:
+            parts.append(Part(terms, Groups(tuple(members), bodies, space)))
+    return Sums(bodies * space, tuple(parts))
+
+
+def _furthest(row: tuple[int, ...]) -> int:
+    """How far the last variable is that enters a product of q1, p1 and differences."""
+    return max(max((k for k, a in enumerate(row) if a), default=0) - 1, 0)
+
+
+def _reach_of(text: str) -> int:
+    """How far a function of a site and those after it reaches."""
+    used = depends_on(parse(text, _LONGEST))
+    return max((i % _LONGEST for i in used), default=0)

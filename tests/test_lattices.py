@@ -1,0 +1,244 @@
+"""Many degrees of freedom: sums over sites, flows without matrices, fits of rings and chains."""
+
+import json
+from itertools import combinations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax import cli, scenes
+from gfnn_jax.families.sums import ENDS, Part, Sums, Windows, body_terms, matrix_free, site_terms
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.fitting.gauss_newton import rates
+from gfnn_jax.flows.collocation import Steps, images
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.phase_space import defect_of_pairs
+
+RNG = np.random.default_rng(0)
+
+
+def springs(dim, ends="ring"):
+    """½ Σ p² + ½ Σ r² + ¼ Σ r⁴ and its coefficients."""
+    kinetic = Part(Terms(1, ("p1",), ((2,),)), Windows(ends, 0))
+    bonds = Part(Terms(2, ("q2 - q1",), ((2,), (4,))), Windows(ends, 1))
+    return Sums(dim, (kinetic, bonds)), np.array([0.5, 0.5, 0.25])
+
+
+def drawn(dim, num, family, params, dt):
+    z0 = 0.3 * RNG.normal(size=(num, 2 * dim))
+    return gfnn.Pairs(z0, images(family, params, z0, dt, Steps(8, 2)).states, dt)
+
+
+@pytest.mark.parametrize("ends", ENDS)
+def test_a_sum_is_what_is_written_out(ends):
+    dim, w = 6, RNG.normal(size=(2, 12))
+    family = Sums(
+        dim,
+        (
+            Part(Terms(1, ("q1", "p1"), ((1, 2),)), Windows(ends, 0)),
+            Part(Terms(3, ("q3 - q1", "p2"), ((3, 1),)), Windows(ends, 2)),
+        ),
+    )
+
+    def written(z):
+        q, p = z[:dim], z[dim:]
+        at = range(dim)
+        sites = sum(q[i] * p[i] ** 2 for i in at)
+        if ends == "fixed":
+            q, p = (jnp.concatenate([jnp.zeros(1), x, jnp.zeros(1)]) for x in (q, p))
+            at = range(dim + 2)
+        if ends != "ring":
+            at = range(len(at) - 2)
+        size = len(q)
+        rows = sum((q[(i + 2) % size] - q[i]) ** 3 * p[(i + 1) % size] for i in at)
+        return 0.5 * sites - 2.0 * rows
+
+    params = np.array([0.5, -2.0])
+    gradient, hessian = family.gradient_and_hessian(params, w)
+    np.testing.assert_allclose(family.value(params, w), jax.vmap(written)(w), rtol=1e-13)
+    np.testing.assert_allclose(gradient, jax.vmap(jax.grad(written))(w), atol=1e-13)
+    np.testing.assert_allclose(hessian, jax.vmap(jax.hessian(written))(w), atol=1e-13)
+    np.testing.assert_allclose(family.term_gradients(w) @ params, gradient, atol=1e-13)
+    by_jax = family.gradient(jnp.asarray(params), jnp.asarray(w))
+    np.testing.assert_allclose(by_jax, gradient, atol=1e-13)
+    rows = {"ring": dim, "free": dim - 2, "fixed": dim}[ends]
+    assert [part.over.count(dim) for part in family.parts] == [dim, rows]
+
+
+def test_terms_stand_in_the_shortest_window():
+    family = site_terms(8, "ring", 1, 2, ("exp(q1 - q3)",))
+    assert family.term_names == (
+        "q_i", "p_i", "q_i²", "p_i²", "q_i p_i",
+        "q_{i+1} - q_i", "(q_{i+1} - q_i)²", "q_i (q_{i+1} - q_i)", "p_i (q_{i+1} - q_i)",
+        "exp(q_i - q_{i+2})",
+    )  # fmt: skip
+    assert family.take([3, 9]).term_names == ("p_i²", "exp(q_i - q_{i+2})")
+
+
+def test_without_matrices_as_with_them():
+    """Coefficients' derivatives, rates and tangents of 20 sites; matrices serve up to 16."""
+    family, params = springs(20)
+    assert matrix_free(family)
+    assert not matrix_free(springs(16)[0])
+    z, steps = 0.3 * RNG.normal(size=(2, 40)), Steps(4, 2)
+    found = images(family, params, z, 0.2, steps, derivatives=True).by_coefficient
+    for j, small in enumerate(1e-6 * np.eye(3)):
+        ahead = images(family, params + small, z, 0.2, steps).states
+        behind = images(family, params - small, z, 0.2, steps).states
+        np.testing.assert_allclose(found[..., j], (ahead - behind) / 2e-6, atol=1e-8)
+    _, hessian = family.gradient_and_hessian(params, z)
+    form = np.block([[np.zeros((20, 20)), np.eye(20)], [-np.eye(20), np.zeros((20, 20))]])
+    exact = np.abs(np.linalg.eigvals(form @ hessian)).max(axis=1)
+    np.testing.assert_allclose(rates(family, params, z), exact, rtol=0.05)
+
+    flow, v = Flow(family, params, 0.2, np.ones(40), 4), RNG.normal(size=z.shape)
+
+    def step(z):
+        return flow.step(z)[0]
+
+    moved, along = jax.jvp(step, (z,), (v,))
+    _, unrolled = jax.jvp(lambda z: flow.step(z, unrolled=True)[0], (z,), (v,))
+    np.testing.assert_allclose(
+        moved, images(family, params, z, 0.2, Steps(4, 1)).states, atol=1e-14
+    )
+    np.testing.assert_allclose(along, unrolled, atol=1e-13)
+    back = jax.vjp(step, z)[1](jnp.asarray(v))[0]
+    np.testing.assert_allclose(np.sum(back * v), np.sum(along * v), rtol=1e-12)
+
+
+def test_pairs_of_tangents_see_what_is_not_symplectic():
+    scale = np.repeat([0.1, 3.0], 50)
+    u = RNG.choice([-1.0, 1.0], (8, 100)) / 10 * scale
+    shear = u.copy()
+    shear[:, :50] += 0.3 * u[:, 50:]
+    assert defect_of_pairs(u, shear, scale) < 1e-15
+    shear[:, 50:] *= 1.001
+    assert defect_of_pairs(u, shear, scale) > 1e-4
+
+
+def test_a_ring_of_many_sites(tmp_path):
+    """The formula, roundoff, a defect, the domain, and the same bits from a saved model."""
+    family, params = springs(60)
+    pairs = drawn(60, 24, family, params, 0.1)
+    fit = gfnn.fit(pairs.take(slice(16)), structure="ring", tolerance=1e-12)
+    assert fit.formula == "Σ_i 0.5 p_i² + 0.5 (q_{i+1} - q_i)² + 0.25 (q_{i+1} - q_i)⁴"
+    assert fit.met
+    assert fit.symplecticity_defect < 1e-14
+    z = pairs.z0[16:]
+    np.testing.assert_allclose(fit.map.step(z)[0], pairs.z1[16:], atol=1e-13)
+    energy = fit.map.hamiltonian(z)
+    states, _ = fit.map.rollout(z, 50)
+    np.testing.assert_allclose(fit.map.hamiltonian(states[:, -1]), energy, rtol=1e-13)
+    fit.map.save(tmp_path / "model")
+    again, _ = gfnn.load(tmp_path / "model").rollout(z, 50)
+    np.testing.assert_array_equal(again, states)
+    # Where the ring is as a whole matters to no force: it is no part of the domain.
+    moved = z + np.repeat([100.0, 0.0], 60)
+    np.testing.assert_array_equal(fit.map.step(moved)[1].status, 0)
+    far = z.copy()
+    far[:, 5] += 5.0
+    assert (np.asarray(fit.map.step(far)[1].status) == 1).all()
+
+
+@pytest.mark.parametrize("ends", ["free", "fixed"])
+def test_the_ends_of_a_chain_are_found(ends):
+    family, params = springs(20, ends)
+    fit = gfnn.fit(drawn(20, 12, family, params, 0.1), structure="chain", tolerance=1e-12)
+    assert fit.met
+    assert "(q_{i+1} - q_i)⁴" in (fit.formula or "")
+    (bonds,) = (p.over for p in fit.map.pieces[0].family.parts if p.over.reach)
+    assert bonds.ends == ends
+
+
+def test_terms_of_a_site_that_a_user_knows():
+    pinned = Part(Terms(1, ("p1", "1/(1 + q1**2)"), ((2, 0), (0, 1))), Windows("ring", 0))
+    bond = Part(Terms(2, ("q2 - q1",), ((2,),)), Windows("ring", 1))
+    family = Sums(20, (pinned, bond))
+    pairs = drawn(20, 12, family, np.array([0.5, -1.0, 0.1]), 0.2)
+    fit = gfnn.fit(pairs, structure="ring", terms=["1/(1 + q1**2)"], tolerance=1e-12)
+    assert fit.met
+    assert {term for term, *_ in fit.hamiltonian.terms} == {
+        "1/(1 + q_i**2)", "p_i²", "(q_{i+1} - q_i)²",
+    }  # fmt: skip
+
+
+def test_a_scene_lends_its_structure():
+    scene = scenes.fput(dim=18)
+    pairs = gfnn.sample_pairs(scene, 12, jax.random.key(0))
+    assert gfnn.fit(pairs, scene, tolerance=1e-10).formula.startswith("Σ_i 0.5 p_i²")
+
+
+def test_bodies_in_space():
+    """Unequal masses: every coefficient; momentum and angular momentum to roundoff."""
+    scene = scenes.n_body()
+    pairs = gfnn.sample_pairs(scene, 300, jax.random.key(0))
+    fit = gfnn.fit(pairs, scene, tolerance=1e-12)
+    found = {term: coefficient for term, coefficient, _ in fit.hamiltonian.terms}
+    masses = (1.0, 0.01, 0.02, 0.005)
+    exact = {f"|p_{i + 1}|²": 0.5 / m for i, m in enumerate(masses)}
+    for i, j in combinations(range(4), 2):
+        exact[f"1/|q_{i + 1} - q_{j + 1}|"] = -masses[i] * masses[j]
+    assert found == pytest.approx(exact, rel=1e-10)
+    assert "- 0.01/|q_1 - q_2|" in (fit.formula or "")
+    states, _ = fit.map.rollout(pairs.z0[:5], 100)
+    for name, invariant in scene.invariants.items():
+        values = np.asarray(jax.vmap(jax.vmap(invariant))(np.asarray(states)))
+        np.testing.assert_allclose(values, values[:, :1] * np.ones(101), atol=1e-15, err_msg=name)
+
+
+def test_bodies_that_are_alike_share_their_coefficients():
+    family, corners = body_terms(3, 2, (-1,), alike=True), 2 * np.pi / 3 * np.arange(3)
+    around = np.stack([np.cos(corners), np.sin(corners)], axis=1).ravel()
+    z0 = np.concatenate([around, np.zeros(6)]) + 0.1 * RNG.normal(size=(320, 12))
+    z1 = images(family, np.array([0.5, -1.0]), z0, 0.2, Steps(8, 2)).states
+    fit = gfnn.fit(gfnn.Pairs(z0, z1, 0.2), structure="bodies:3", tolerance=1e-12)
+    assert fit.formula == "0.5 Σ_i |p_i|² - Σ_{i<j} 1/|q_i - q_j|"
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"structure": "torus"}, "expected a structure among ring, chain, bodies:N"),
+        ({"structure": "ring", "learn": "map"}, "a structure is that of H"),
+        ({"structure": "ring", "angles": (0,)}, "plain q and p"),
+        ({"structure": "ring", "terms": ["exp(q9)"]}, "q9"),
+        ({"structure": "ring", "terms": [lambda z: z[0]]}, "as text"),
+        ({"structure": "bodies:3"}, "3 bodies in 1 to 3 dimensions"),
+        ({"structure": "bodies:1"}, "expected a structure among"),
+        ({"structure": "bodies:10", "terms": ["q1"]}, "powers of distances"),
+    ],
+)
+def test_what_goes_with_no_structure_is_refused(options, said):
+    pairs = gfnn.Pairs(*(RNG.normal(size=(2, 12, 40))), 0.1)
+    with pytest.raises(gfnn.FitError, match=said):
+        gfnn.fit(pairs, **options)
+
+
+def test_the_command_line_takes_a_structure(tmp_path):
+    """Fewer pairs than coordinates, in a file; a formula in the report; a prediction."""
+    family, params = springs(40)
+    pairs = drawn(40, 12, family, params, 0.1)
+    data, model = tmp_path / "data.npz", tmp_path / "model"
+    np.savez(data, z0=pairs.z0, z1=pairs.z1, dt=0.1)
+    fit = ["fit", str(data), "--out", str(model), "--tolerance", "1e-10"]
+    assert cli.main([*fit, "--structure", "torus"]) == 2
+    assert cli.main([*fit, "--structure", "bodies:7"]) == 2
+    assert not model.exists()
+    assert cli.main([*fit, "--structure", "ring"]) == 0
+    report = json.loads((model / "report.json").read_text(encoding="utf-8"))
+    assert report["hamiltonian"]["formula"].startswith("Σ_i 0.5 p_i²")
+    np.save(tmp_path / "z0.npy", pairs.z0[:2])
+    predict = ["predict", str(model), "--initial", str(tmp_path / "z0.npy"), "--num-steps", "1"]
+    assert cli.main([*predict, "--out", str(tmp_path / "out.npz")]) == 0
+    with np.load(tmp_path / "out.npz") as out:
+        np.testing.assert_allclose(out["trajectories"][:, 1], pairs.z1[:2], atol=1e-13)
+
+
+def test_too_few_sites_or_pairs_are_refused():
+    with pytest.raises(gfnn.FitError, match="at least 5 sites, got 2"):
+        gfnn.fit(gfnn.Pairs(*(RNG.normal(size=(2, 20, 4))), 0.1), structure="ring")
+    with pytest.raises(gfnn.FitError, match="at least 8 pairs, got 3"):
+        gfnn.fit(gfnn.Pairs(*(RNG.normal(size=(2, 3, 40))), 0.1), structure="ring")
