@@ -38,7 +38,7 @@ from gfnn_jax.fitting.gauss_newton import (
 )
 from gfnn_jax.fitting.growth import grow
 from gfnn_jax.fitting.least_squares import Reduced
-from gfnn_jax.flows.collocation import Steps, images, truncation
+from gfnn_jax.flows.collocation import Steps, images, of_lanes, truncation
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.learn.assemble import Assembled, composed, stepped
@@ -127,18 +127,19 @@ class LearnedHamiltonian:
     """H as learned, in the inner coordinates.
 
     candidate: as the others of a fit, its error measured by steps in NumPy. flow: the piece.
-    terms, formula: what H is. truncation: largest error of the flow's own steps on the held-out
-    states, ÷ scale. omega_h: the fastest oscillation of the linearised flow, times dt, in the
-    median over the data; beyond π pairs of one dt may not tell H. contraction: the fixed point's
-    factor where it is largest. condition: of the terms' columns. null_terms: that the data do not
-    tell from the others. left_out: pairs that the flow does not resolve. stalled: whether larger
-    libraries were no more accurate. root: (m, m), rootᵀ root is the coefficients' covariance.
+    terms, formula: what H is; () and None of a network. truncation: largest error of the flow's
+    own steps on the held-out states, ÷ scale. omega_h: the fastest oscillation of the linearised
+    flow, times dt, in the median over the data; beyond π pairs of one dt may not tell H.
+    contraction: the fixed point's factor where it is largest. condition: of the terms' columns.
+    null_terms: that the data do not tell from the others. left_out: pairs that the flow does not
+    resolve. stalled: whether larger libraries were no more accurate. root: (m, m), rootᵀ root is
+    the coefficients' covariance; None of a network.
     """
 
     candidate: Candidate
     flow: Flow
     terms: tuple[Term, ...]
-    formula: str
+    formula: str | None
     truncation: float
     omega_h: float
     contraction: float
@@ -147,7 +148,7 @@ class LearnedHamiltonian:
     left_out: int
     messages: tuple[str, ...]
     stalled: bool
-    root: np.ndarray
+    root: np.ndarray | None
 
     @property
     def fast(self) -> bool:
@@ -226,7 +227,7 @@ def learn_hamiltonian(
         best = _sparse(problem, best, prepared, judges, options, say)
         there = dataclasses.replace(everywhere, held_out=everywhere.training[outer])
         if outer.any():
-            outside = _held_out_error(problem, best.family, best.fit, prepared, there).relative
+            outside = _held_out_error(best.family, best.fit, prepared, there).relative
         if best.error.relative > _ROUNDOFF and len(best.fit.used) < len(everywhere.training):
             best = _refitted(problem, best, everywhere.training, prepared, judges)
     except OutOfTime:
@@ -359,9 +360,7 @@ def _grown(
     problem, basis: Modes, prepared, judges: Judges, clock: Clock, options: Options, say
 ) -> _Fitted:
     """The library that has grown to the tolerance, or as far as the time and the pairs allow."""
-    goal = options.goal * judges.tolerance.bound
-    if not judges.tolerance.relative:
-        goal = goal / float(problem.scale.max())
+    goal = options.goal * _bound(judges, problem.scale)
     most = int(len(judges.training) * 2 * prepared.dim / options.rows_per_term)
     problem.check = Clock(options.growth_part * clock.left).check
     grown, ended = None, "the time is over"
@@ -381,8 +380,7 @@ def _grown(
     count = int(np.ceil(options.judged_rows * len(grown.coefficients) / (2 * prepared.dim)))
     rows = judges.training[: max(count, 500)]
     fit = problem.fit(grown.family, grown.coefficients, rows, rounds=False, say=say)
-    fit = _resolved(problem, grown.family, fit, rows)
-    error = _held_out_error(problem, grown.family, fit, prepared, judges)
+    error = _held_out_error(grown.family, fit, prepared, judges)
     return _Fitted(grown.family, fit, rows, error, (), ended=ended)
 
 
@@ -477,8 +475,8 @@ def _fitted(problem, family, prepared, judges, last: _Fitted | None, options, sa
     rows = judges.training[: max(count, fewest)]
     null_names, best = tuple(names[j] for j in null), None
     for start in _starts(problem, family, rows, judges.training[:_TURNING], last):
-        fit = _resolved(problem, family, problem.fit(family, start, rows, say=say), rows)
-        error = _held_out_error(problem, family, fit, prepared, judges)
+        fit = problem.fit(family, start, rows, say=say)
+        error = _held_out_error(family, fit, prepared, judges)
         if best is None or error.relative < best.error.relative:
             best = _Fitted(family, fit, rows, error, null_names, undetermined)
         if error.relative <= _EXPLAINED:
@@ -510,10 +508,18 @@ def _starts(problem, family, rows, many, last: _Fitted | None) -> Iterator[np.nd
 
 
 def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
-    """The start whose flow is nearest to the pairs: midpoint, logarithm, or the last library's."""
+    """The start whose flow is nearest to the pairs: midpoint, of all of them or of those that move
+    least, logarithm, or the last library's."""
     z0, z1 = problem.z0[rows], problem.z1[rows]
     dt, args = problem.given(rows)
-    starts = [midpoint_start(family, z0, z1, dt, problem.scale, args)]
+
+    def midpoint(part):
+        own = of_lanes(dt, part), problem.scale, of_lanes(args, part)
+        return midpoint_start(family, z0[part], z1[part], *own)
+
+    moved = np.linalg.norm((z1 - z0) / problem.scale, axis=1)
+    quieter = moved <= np.median(moved)  # the midpoint says little of a step that goes far
+    starts = [midpoint(slice(None)), midpoint(quieter)]
     # Pairs of one affine regression, more of them than it has unknowns.
     alike = args is None and np.ndim(dt) == 0 and len(z0) > z0.shape[1]
     logarithm = log_start(family, z0, z1, dt, problem.scale) if alike else None
@@ -526,25 +532,31 @@ def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
     return min(starts, key=lambda c: problem.distance(family, c, some))
 
 
-def _resolved(problem, family, fit: FlowFit, rows) -> FlowFit:
-    """The fit without the pairs that the flow's own steps do not resolve."""
-    if not len(fit.used):  # none of the flows that were tried has an image
-        return fit
-    z = problem.z0[fit.used]
-    dt, args = problem.given(fit.used)
-    off = truncation(
-        family, fit.coefficients, z, dt, fit.steps, args=args, on_substep=problem.check
-    )
-    off = np.abs(off / problem.scale).max(axis=1)
-    limit = max(10 * fit.rms, 100 * float(np.median(off)), 1e-13)
-    good = off <= limit
-    if good.all() or good.sum() < 0.5 * len(rows):
-        return fit
-    return problem.fit(family, fit.coefficients, fit.used[good], rounds=False)
+def _held_out_error(family, fit: FlowFit, prepared, judges: Judges) -> OneStepError:
+    """By steps that resolve the held-out pairs: an unresolved passage says nothing of the law."""
+    steps = _resolving(family, fit.coefficients, fit.steps, prepared, judges)
+    return _error_of(family, fit.coefficients, steps, prepared, judges)
 
 
-def _held_out_error(problem, family, fit: FlowFit, prepared, judges: Judges) -> OneStepError:
-    return _error_of(family, fit.coefficients, fit.steps, prepared, judges)
+def _resolving(family, coefficients, steps: Steps, prepared, judges: Judges) -> Steps:
+    """These steps, or, where the law misses the tolerance by them, finer ones: halved until they
+    resolve the held-out pairs, or there are as many as a flow may have."""
+    bound, states = _bound(judges, prepared.scale), prepared.y0[judges.held_out]
+    if _error_of(family, coefficients, steps, prepared, judges).bound <= judges.tolerance.bound:
+        return steps
+    dt, args = prepared.given(judges.held_out)
+    while 2 * steps.substeps <= MOST_SUBSTEPS:
+        off = truncation(family, coefficients, states, dt, steps, args=args) / prepared.scale
+        if np.sqrt(np.mean(off**2)) <= OPTIONS.truncation * bound:
+            break
+        steps = dataclasses.replace(steps, substeps=2 * steps.substeps)
+    return steps
+
+
+def _bound(judges: Judges, scale) -> float:
+    """The tolerance as a part of the coordinates' scale."""
+    bound = judges.tolerance.bound
+    return bound if judges.tolerance.relative else bound / float(scale.max())
 
 
 def _error_of(family, coefficients, steps: Steps, prepared, judges: Judges) -> OneStepError:
@@ -586,7 +598,7 @@ def _sparse(problem, full: _Fitted, prepared, judges, options: Options, say) -> 
         say(f"H: {len(kept)} of {full.family.num_parameters} terms")
         start = full.fit.coefficients[list(kept)]
         fit = problem.fit(family, start, full.fit.used, rounds=False, steps=full.fit.steps)
-        error = _held_out_error(problem, family, fit, prepared, judges)
+        error = _held_out_error(family, fit, prepared, judges)
         if error.relative <= max(options.rise * full.error.relative, options.rounding):
             return full._replace(family=family, fit=fit, error=error)
     return full
@@ -594,9 +606,8 @@ def _sparse(problem, full: _Fitted, prepared, judges, options: Options, say) -> 
 
 def _refitted(problem, found: _Fitted, rows, prepared, judges) -> _Fitted:
     """Fitted to all training pairs: each of them averages the noise."""
-    rows = np.setdiff1d(rows, np.setdiff1d(found.rows, found.fit.used))
     fit = problem.fit(found.family, found.fit.coefficients, rows, rounds=False)
-    error = _held_out_error(problem, found.family, fit, prepared, judges)
+    error = _held_out_error(found.family, fit, prepared, judges)
     return found._replace(fit=fit, rows=rows, error=error)
 
 
@@ -611,7 +622,8 @@ def _learned(
     if prepared.own_dt is not None:  # the map's own dt, from which others follow
         problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, args=prepared.args)
     steps = _cheapest(problem, family, fit, fastest, judges, options)
-    contraction = _contraction(fastest, prepared.dt, steps)
+    steps = _resolving(family, fit.coefficients, steps, prepared, judges)
+    contraction = contraction_of(fastest, prepared.dt, steps)
     by_newton = contraction > options.contracting and not matrix_free(family)
     off = truncation(family, fit.coefficients, z, prepared.dt, steps, args=args) / prepared.scale
     flow = Flow(
@@ -624,7 +636,7 @@ def _learned(
     candidate = Candidate(
         label=f"H, {family.num_parameters} terms", family=family.name, chart="flow",
         num_parameters=family.num_parameters,
-        operations=_operations(family, fastest, prepared.dt, steps),
+        operations=operations_of(family, 2 * family.dim, fastest, prepared.dt, steps),
         validation_rms=error.rms, validation_relative=error.relative,
         validation_bound=error.bound, deviations=error.deviations, train_rms=fit.rms,
         fit_seconds=seconds, condition=fit.condition, rank=family.num_parameters,
@@ -636,13 +648,14 @@ def _learned(
             family.term_names, fit.coefficients.tolist(), fit.standard_errors.tolist(), strict=True
         )
     )
-    omega_h = _omega_h(family, fit.coefficients, prepared, fastest)
+    omega_h = omega_h_of(family, fit.coefficients, prepared, fastest)
     left_out = len(np.setdiff1d(found.rows, fit.used))
+    resolved = np.abs(off).max(axis=1) <= _bound(judges, prepared.scale)
     return LearnedHamiltonian(
         with_error(candidate, error), flow, terms, getattr(family, "prefix", "") + formula(terms),
         float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
-        tuple(_messages(error, omega_h, prepared, judges, found, left_out)),
+        tuple(_messages(error, omega_h, prepared, judges, found, left_out, int((~resolved).sum()))),
         stalled=found.stalled, root=_root(found, problem, prepared, steps, judges.pairs),
     )  # fmt: skip
 
@@ -723,12 +736,9 @@ def _cheapest(problem, family, fit: FlowFit, fastest, judges: Judges, options: O
     twice as dear."""
 
     def cost(steps: Steps) -> float:
-        return _operations(family, fastest, problem.dt, steps)
+        return operations_of(family, 2 * family.dim, fastest, problem.dt, steps)
 
-    bound = options.truncation * judges.tolerance.bound
-    if not judges.tolerance.relative:
-        bound = bound / float(problem.scale.max())
-    bound = max(bound, 0.3 * fit.rms)
+    bound = max(options.truncation * _bound(judges, problem.scale), 0.3 * fit.rms)
     tolerances = (bound, min(bound, _NEAR_ROUNDOFF), None)
     found = problem.fine_steps(family, fit.coefficients, judges.training, tolerances)
     return next(s for s in reversed(found) if s == found[0] or cost(s) < 2 * cost(found[0]))
@@ -743,7 +753,7 @@ def flow_of(family: Terms, params, prepared: Prepared) -> Flow:
     problem = Problem(y0, y1, dt, scale)
     (steps,) = problem.fine_steps(family, params, np.arange(len(y0)))
     fastest = rates(family, params, y0[:_FREQUENCY_STATES])
-    by_newton = not _contraction(fastest, dt, steps) <= OPTIONS.contracting
+    by_newton = not contraction_of(fastest, dt, steps) <= OPTIONS.contracting
     flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, by_newton)
     failed = ~np.isfinite(np.concatenate([flow.image(y0), flow.inverse().image(y1)])).all(axis=1)
     if failed.any():
@@ -765,20 +775,21 @@ def flow_operations(flow: Flow, prepared: Prepared) -> float:
     """Floating-point operations per step of the flow."""
     fastest = rates(flow.family, flow.params, prepared.y0[:_FREQUENCY_STATES])
     steps = Steps(flow.stages, flow.substeps)
-    return _operations(flow.family, fastest, float(flow.dt), steps)
+    return operations_of(flow.family, len(prepared.scale), fastest, float(flow.dt), steps)
 
 
-def _contraction(fastest, dt: float, steps: Steps) -> float:
+def contraction_of(fastest, dt: float, steps: Steps) -> float:
     """The factor by which the stages' fixed point contracts in the end, where it is largest."""
     radius = np.abs(np.linalg.eigvals(gauss(steps.stages).matrix)).max()
     return float(dt / steps.substeps * fastest.max() * radius)
 
 
-def _operations(family: Terms | Sums, fastest, dt: float, steps: Steps) -> float:
-    """Floating-point operations per step: as many iterations as roundoff takes at this factor."""
+def operations_of(family, width: int, fastest, dt: float, steps: Steps) -> float:
+    """Floating-point operations per step of states (2d,), width 2d: as many iterations as roundoff
+    takes at this factor."""
     gradient, with_hessian = family.operations
-    width, s = 2 * family.dim, steps.stages
-    factor = _contraction(fastest, dt, steps)
+    s = steps.stages
+    factor = contraction_of(fastest, dt, steps)
     if factor > OPTIONS.contracting and not matrix_free(family):
         one = s * with_hessian + (s * width) ** 3 * 2 / 3
         return float(steps.substeps * 4 * one)
@@ -786,7 +797,7 @@ def _operations(family: Terms | Sums, fastest, dt: float, steps: Steps) -> float
     return float(steps.substeps * iterations * s * (gradient + 2 * width * s))
 
 
-def _omega_h(family, coefficients, prepared: Prepared, fastest) -> float:
+def omega_h_of(family, coefficients, prepared: Prepared, fastest) -> float:
     """The fastest oscillation of the linearised flow, radians per step, its median over states."""
     if not matrix_free(family):
         some = slice(_FREQUENCY_STATES)
@@ -798,8 +809,9 @@ def _omega_h(family, coefficients, prepared: Prepared, fastest) -> float:
 
 
 def _messages(
-    error: OneStepError, omega_h: float, prepared, judges, found: _Fitted, left_out: int
-) -> Iterator[str]:
+    error: OneStepError, omega_h: float, prepared, judges, found: _Fitted, left_out: int,
+    unresolved: int,
+) -> Iterator[str]:  # fmt: skip
     if error.bound > judges.tolerance.bound:
         yield (
             f"no H of the terms tried meets the tolerance (best {error.relative:.2e} of the "
@@ -827,7 +839,15 @@ def _messages(
             "out, and H is known only where the pairs are"
         )
     if left_out:
-        yield f"{left_out} pairs are not resolved by the flow's own steps: they are left out"
+        yield (
+            f"{left_out} of {len(found.rows)} pairs, as of close passages, are not resolved by the "
+            "steps of the fit: they are left out of it"
+        )
+    if unresolved:
+        yield (
+            f"{unresolved} of {len(judges.held_out)} held-out pairs are not resolved to the "
+            "tolerance by the flow's own steps: there the map is in error, and not the law"
+        )
 
 
 def formula(terms: Sequence[Term]) -> str:

@@ -53,7 +53,12 @@ class Request:
     def seeks_law(self) -> bool:
         """Whether H is looked for."""
         free = (self.family, self.chart, self.base) == ("auto", "auto", None)
-        return free and self.learn != "map"
+        return (free or self.of_network) and self.learn != "map"
+
+    @property
+    def of_network(self) -> bool:
+        """Whether H is to be a network."""
+        return (self.learn, self.family) == ("hamiltonian", "mlp")
 
 
 def checked(
