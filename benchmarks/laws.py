@@ -273,6 +273,21 @@ def kicked_pendulum(quick: bool) -> Numbers:
     return {**found, **alone, "one_step_rms_base": known["one_step_rms"]}
 
 
+def network_pendulum(quick: bool) -> Numbers:
+    """A pendulum of any angle whose H is a network, told nothing but the angle."""
+
+    def hamiltonian(_, z):
+        return 0.5 * z[1] ** 2 - jnp.cos(z[0])
+
+    def draw(rng, num):
+        return rng.uniform([-np.pi, -1.5], [np.pi, 1.5], (num, 2))
+
+    pairs, fresh = pairs_by_flow(hamiltonian, draw, 500, 0.3)
+    options = {"learn": "hamiltonian", "family": "mlp", "angles": (0,), "tolerance": 1e-6}
+    fit, found = learned(pairs, fresh, **options)
+    return {**found, "chosen": "network H", "num_terms": fit.chosen.num_parameters}
+
+
 def accelerated(name: str, quick: bool) -> Numbers:
     """A law from few pairs, and a generated map from the law; both stepped in a batch of 1,000."""
     scene = gfnn.scenes.make(name)
@@ -451,6 +466,7 @@ PIECES = {
     "two-body-derivatives": partial(derivative_matching, "two-body-cartesian"),
     **{f"two-body-{m}": partial(of_others, "two-body-cartesian", m) for m in OTHERS},
     "kicked-pendulum": kicked_pendulum,
+    "network-pendulum": network_pendulum,
     **{f"map-of-law-{name}": partial(accelerated, name)
        for name in ("henon-heiles-regular", "two-body")},
     **{

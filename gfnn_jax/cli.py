@@ -17,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from gfnn_jax import processes
 from gfnn_jax.compiling import enable_compile_cache
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
@@ -35,6 +36,7 @@ exit status:
   1    a failure during the work (a full disk); with --strict also a missed tolerance
   2    bad usage or bad input, before any long work
   130  stopped by Ctrl-C
+  134  with --distributed: another process of the job was lost
   143  stopped by SIGTERM"""
 WORDS = """\
 the table of candidates:
@@ -44,6 +46,12 @@ the table of candidates:
              that coordinate's spread
   95 % bound the tolerance is met where this upper bound of the relative error is within it
   outside    relative error at the outermost twentieth of the states, of a fit without them"""
+
+
+_LOST = (
+    "this process or another one of the job was lost: what they had done is kept, --resume with as "
+    "many processes goes on"
+)
 
 
 class _Terminated(KeyboardInterrupt):
@@ -91,6 +99,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _fail(status: int, why: object) -> int:
     print(f"gfnn: {why}", file=sys.stderr)
+    processes.abandon(status)
     return status
 
 
@@ -167,6 +176,14 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--outside", choices=("continue", "stop"), default="continue",
         help="what to do where a trajectory leaves the data's domain (default %(default)s)",
+    )  # fmt: skip
+    command.add_argument(
+        "--devices", type=_devices, metavar="all|N",
+        help="share the trajectories out among so many devices; on a CPU these are its cores",
+    )  # fmt: skip
+    command.add_argument(
+        "--distributed", action="store_true",
+        help="this is one of several processes that srun or another launcher has started",
     )  # fmt: skip
     _add_output_options(command)
 
@@ -261,6 +278,10 @@ def _whole(text: str, low: int, high: int, what: str) -> int:
 
 def _count(text: str) -> int:
     return _whole(text, 1, 2**53, "from 1 to 2**53 - 1")
+
+
+def _devices(text: str) -> int | str:
+    return text if text == "all" else _whole(text, 1, 2**31, "from 1 to 2**31 - 1, or all")
 
 
 def _seed(text: str) -> int:
@@ -369,7 +390,17 @@ def _predict(arguments: argparse.Namespace) -> None:
         ensure_new(arguments.out, arguments.overwrite)
     for path in (arguments.model, arguments.initial):
         _check_exists(path)
-    _set_up_jax()
+    with contextlib.ExitStack() as stack:
+        share = None
+        if arguments.distributed:
+            stack.enter_context(processes.watched(f"gfnn: {_LOST}"))
+        _set_up_jax(arguments.devices)
+        if arguments.distributed:
+            share = processes.join()
+        _predict_and_tell(arguments, share)
+
+
+def _predict_and_tell(arguments: argparse.Namespace, share: processes.Share | None) -> None:
     from gfnn_jax.jobs.predict import predict
 
     with progress.on_stderr() as shown:
@@ -377,10 +408,14 @@ def _predict(arguments: argparse.Namespace) -> None:
             arguments.model, arguments.initial, num_steps=arguments.num_steps,
             save_every=arguments.save_every, out=arguments.out, dt=arguments.dt,
             samples=arguments.samples, horizon_size=arguments.horizon,
-            stop_outside=arguments.outside == "stop", overwrite=arguments.overwrite,
-            resume=arguments.resume, progress=shown,
+            stop_outside=arguments.outside == "stop", devices=arguments.devices, share=share,
+            overwrite=arguments.overwrite, resume=arguments.resume, progress=shown,
         )  # fmt: skip
     num_lanes = len(predicted.status)
+    if share is not None and share.index:
+        print(f"process {share.index} of {share.count}: {num_lanes} trajectories, "
+              f"{predicted.seconds:.1f} s")  # fmt: skip
+        return
     print(f"{arguments.out}: {num_lanes} trajectories of {arguments.num_steps} steps, "
           f"{predicted.seconds:.1f} s")  # fmt: skip
     _print_status(predicted.status, predicted.left_at)
@@ -461,12 +496,25 @@ def _print_status(status, left_at) -> None:
 # The surroundings.
 
 
-def _set_up_jax() -> None:
-    """Float64, and compiled programs kept between runs in the user's cache folder."""
+def _set_up_jax(devices: int | str | None = None) -> None:
+    """Float64, and compiled programs kept between runs in the user's cache folder. devices: of a
+    CPU that are asked for; it has a single one unless told otherwise."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if devices is not None and not told:
+        with contextlib.suppress(RuntimeError):  # in a session that has its devices already
+            most = _cores() if isinstance(devices, str) else min(devices, _cores())
+            jax.config.update("jax_num_cpu_devices", most)
     enable_compile_cache()
+
+
+def _cores() -> int:
+    """Processor cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @contextlib.contextmanager

@@ -136,7 +136,7 @@ def test_help(command, capsys):
 
 WHOLE = "expected a whole number from 1 to 2**53 - 1, got "
 BAD_USAGE = [
-    ((), "required: COMMAND"),
+    ((), "expected a command, got none"),
     (("rum",), "invalid choice: 'rum'"),
     (("run",), "required: SCENE"),
     (("run", "two-bdy"), "unknown scene 'two-bdy', did you mean 'two-body'?"),

@@ -94,6 +94,19 @@ def test_volume_change_tells_friction_from_noise_and_from_a_hamiltonian_residual
     assert abs(change) < 5 * error
 
 
+def test_a_misfit_that_is_concentrated_is_no_friction():
+    """Near the edge of the states alone it has a divergence that no rate of friction has."""
+    z = np.random.default_rng(5).standard_normal((2_000, 2))
+    misfit = -1e-2 * z**3 * [0, 1]
+    change, error = volume_change(z, misfit)
+    assert change == 0.0
+    assert np.isfinite(error)  # a smooth function all the same
+    friction = -1e-2 * z * [0, 1]
+    assert abs(volume_change(z, friction)[0] + 1e-2) < 1e-12
+    drag = friction * np.abs(z[:, 1:])
+    assert volume_change(z, drag)[0] < -1e-2
+
+
 def test_many_degrees_of_freedom_are_diagnosed_in_seconds():
     """22 oscillators that turn by 0.5 each: linear, so that the local fits are exact."""
     dim = 22

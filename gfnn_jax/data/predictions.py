@@ -35,6 +35,37 @@ _ASSEMBLY_BYTES = 64 * 2**20
 _BAND_PARTS = 4  # beside a state: its std and three quantiles
 
 
+def job_of(
+    identity: dict[str, Any], shape: tuple[int, int], *, num_steps: int, save_every: int = 1,
+    dt: float, bands: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """What was asked for, as a file can hold it; the arguments are those of `PredictionWriter`."""
+    job = {
+        **identity,
+        "format": _FORMAT,
+        "shape": [shape[0], 1 + num_steps // save_every, shape[1]],
+        **({"bands": True} if bands else {}),
+        "num_steps": num_steps,
+        "save_every": save_every,
+        "dt": float(dt),
+    }
+    return json.loads(json.dumps(job))  # as it will be read back
+
+
+def digest_of(job: dict[str, Any]) -> str:
+    """By which a finished prediction tells its job."""
+    return hashlib.sha256(json.dumps(job, sort_keys=True).encode()).hexdigest()
+
+
+def is_done(out: Path, job: dict[str, Any]) -> bool:
+    """Whether ``out`` is the finished prediction of this job."""
+    try:
+        with np.load(out, allow_pickle=False) as file:
+            return str(file["job"]) == digest_of(job)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return False
+
+
 class PredictionWriter:
     """Writes one prediction file: ``trajectories`` (B, S, 2d), ``status`` (B,), ``left_at`` (B,),
     ``steps`` (S,) and ``dt``, all float64 or int64, ``params`` (B, k) and ``param_names`` (k,)
@@ -87,25 +118,18 @@ class PredictionWriter:
         self.saved = 0
         self.carry: dict[str, np.ndarray] | None = None
         self._chunks: list[dict[str, Any]] = []  # the journal's entries: file, start, stop, sha256
-        job = {
-            **identity,
-            "format": _FORMAT,
-            "shape": [self.lanes, len(self.steps), self._state],
-            **({"bands": True} if bands else {}),
-            "num_steps": num_steps,
-            "save_every": save_every,
-            "dt": self.dt,
-        }
-        self._job = json.loads(json.dumps(job))  # as it will be read back
+        self._job = job_of(
+            identity, shape, num_steps=num_steps, save_every=save_every, dt=dt, bands=bands
+        )
         if self.out.suffix != ".npz":
             raise InputError(f"{out}: a prediction is written as .npz")
         self.finished = False
         self._overwrite = overwrite
         if resume and self._journal.exists() and self._read_journal():
-            if not self._is_done():  # what stands there is another's
+            if not is_done(self.out, self._job):  # what stands there is another's
                 ensure_new(self.out, self._overwrite)
             return
-        if resume and not overwrite and self._is_done():
+        if resume and not overwrite and is_done(self.out, self._job):
             self.finished, self.saved = True, self.total
             with failures_as_work_errors(self.out):
                 self._discard()  # what a kill at the very end may have left
@@ -177,40 +201,29 @@ class PredictionWriter:
             named += [("t0", self.drive[0]), ("period", np.asarray(self.drive[1]))]
         with atomic_file(self.out) as stream, zipfile.ZipFile(stream, "w") as archive:
             shape = (self.lanes, self.total, self._state)
-            with _member(archive, "trajectories", shape, np.float64) as member:
+            with member_of(archive, "trajectories", shape, np.float64) as member:
                 self._assemble(member, 0)
             if self.width > self._state:
-                with _member(archive, "std", shape, np.float64) as member:
+                with member_of(archive, "std", shape, np.float64) as member:
                     self._assemble(member, 1)
-                with _member(archive, "quantiles", (3, *shape), np.float64) as member:
+                with member_of(archive, "quantiles", (3, *shape), np.float64) as member:
                     for part in (2, 3, 4):
                         self._assemble(member, part)
             for name, array in (
                 ("status", status),
                 ("left_at", left_at),
                 ("dt", np.asarray(self.dt)),
-                ("job", np.asarray(self._job_digest)),
+                ("job", np.asarray(digest_of(self._job))),
                 *named,
             ):
-                with _member(archive, name, array.shape, array.dtype) as member:
+                with member_of(archive, name, array.shape, array.dtype) as member:
                     member.write(np.ascontiguousarray(array).tobytes())
-            with _member(archive, "steps", (self.total,), np.int64) as member:
+            with member_of(archive, "steps", (self.total,), np.int64) as member:
                 for first in range(0, self.total, 2**20):
                     part = self.steps[first : first + 2**20]
                     member.write(np.arange(part.start, part.stop, part.step, dtype=np.int64).data)
         self.finished = True
         self._discard()
-
-    @property
-    def _job_digest(self) -> str:
-        return hashlib.sha256(json.dumps(self._job, sort_keys=True).encode()).hexdigest()
-
-    def _is_done(self) -> bool:
-        try:
-            with np.load(self.out, allow_pickle=False) as file:
-                return str(file["job"]) == self._job_digest
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-            return False
 
     def _discard(self) -> None:
         """Remove the folder of chunks, the journal first, and nothing in it that is not ours."""
@@ -305,7 +318,7 @@ class PredictionWriter:
             return None
 
 
-def _member(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: Any):
+def member_of(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: Any):
     """An open ``.npy`` member, its header written; ZipInfo's fixed date makes it repeatable."""
     member = archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True)
     header = {

@@ -22,7 +22,7 @@ from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting.base_map import field_for
 from gfnn_jax.fitting.turns import backwards, forward_logarithm, tangent, turns
-from gfnn_jax.flows.collocation import Steps, images, of_lanes
+from gfnn_jax.flows.collocation import Steps, images, of_lanes, truncation
 from gfnn_jax.phase_space import apply_j, symplectic_form
 
 
@@ -43,6 +43,8 @@ class Options:
     early_rows: rows per term that the early rounds look at; fewest: pairs at least.
     judged: pairs at which a step's own error is measured; judged_free: of a family that does
     without matrices, every pair of which has many coordinates.
+    misfits, errors: a pair is resolved whose own error is below so many times what is left over in
+    the median, or the median of these errors. selections: of resolved pairs in the end, at most.
     """
 
     fractions: tuple[float, ...] = (0.1, 0.3, 0.6, 0.9, 1.0)
@@ -61,6 +63,9 @@ class Options:
     fewest: int = 60
     judged: int = 48
     judged_free: int = 2
+    misfits: float = 10.0
+    errors: float = 100.0
+    selections: int = 4
 
 
 OPTIONS = Options()
@@ -292,7 +297,8 @@ class Problem:
         """Levenberg–Marquardt from ``start`` (terms,) over these rows.
 
         rounds: quiet pairs first, with coarse steps; else all at once, from a start that is known
-        to be close. steps: of the flow in the end; None: the cheapest whose error is roundoff.
+        to be close. steps: of the flow in the end, which are to resolve these rows; None: the
+        cheapest whose error is roundoff, and without the rows that they do not resolve.
         """
         options = self.options
         rows = np.arange(len(self.z0)) if rows is None else np.asarray(rows)
@@ -316,19 +322,31 @@ class Problem:
             say(f"H of {family.num_parameters} terms: {len(quiet)} of {len(rows)} pairs")
         if rounds:
             coarse = self._coarse(family, c, sample)
-            quiet = self._quietest(family, c, coarse, sample, len(sample))
+            quiet = self._resolved(family, c, coarse, sample)
             c, _, made = self._descend(family, c, coarse, quiet, options.most)
             iterations += made
-        steps = self.fine_steps(family, c, rows)[0] if steps is None else steps
-        used = self._quietest(family, c, steps, rows, len(rows))
-        c, factor, made = self._descend(family, c, steps, used, options.most)
-        return _summary(c, factor, used, iterations + made, steps)
+        if steps is not None:
+            used = self._quietest(family, c, steps, rows, len(rows))
+            c, factor, made = self._descend(family, c, steps, used, options.most)
+            return _summary(c, factor, used, iterations + made, steps)
+        steps = self.fine_steps(family, c, rows)[0]
+        used = self._resolved(family, c, steps, rows)
+        for _ in range(options.selections):
+            c, factor, made = self._descend(family, c, steps, used, options.most)
+            iterations += made
+            summary = _summary(c, factor, used, iterations, steps)
+            still = self._resolved(family, c, steps, used)
+            if len(still) == len(used):
+                break
+            used = still
+        return summary
 
     def _near(self, family, c, rows) -> np.ndarray | None:
         """c after one Gauss–Newton step over all of these rows, where the linearised problem
         foretells the residual that is left: then the start is close. Else None."""
         coarse = self._coarse(family, c, rows)
-        here = self.factor(family, c, coarse, self._quietest(family, c, coarse, rows, len(rows)))
+        rows = self._resolved(family, c, coarse, rows)
+        here = self.factor(family, c, coarse, rows)
         if not np.isfinite(here.cost) or here.rows < family.num_parameters:
             return None
         step = _Steps(here.matrix)
@@ -343,6 +361,20 @@ class Problem:
         size = np.linalg.norm(self.residuals(family, c, steps, rows), axis=1)
         order = np.argsort(np.where(np.isfinite(size), size, np.inf), kind="stable")[:count]
         return rows[order[np.isfinite(size[order])]]
+
+    def _resolved(self, family, c, steps: Steps, rows):
+        """Those of these rows that the steps resolve: whose own error is not what is left over of
+        them. One unresolved passage would outweigh all pairs that tell the coefficients."""
+        size = np.abs(self.residuals(family, c, steps, rows)).max(axis=1, initial=0.0)
+        dt, args = self.given(rows)
+        off = truncation(family, c, self.z0[rows], dt, steps, args=args, on_substep=self.check)
+        off = np.abs(off / self.scale).max(axis=1, initial=0.0)
+        known = np.isfinite(size) & np.isfinite(off)
+        if not known.any():
+            return rows[:0]
+        o = self.options
+        limit = max(o.misfits * np.median(size[known]), o.errors * np.median(off[known]), _ROUNDED)
+        return rows[known & (off <= limit)]
 
     def distance(self, family, c, rows) -> float:
         """Median of ‖r‖ over these rows, by coarse steps: what starts are compared by."""

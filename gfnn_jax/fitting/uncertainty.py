@@ -6,6 +6,9 @@ row their covariance is (AᵀA)⁻¹ (Aᵀ diag(r²) A) (AᵀA)⁻¹: each row c
 worse, and no other. A row that the coefficients have bent towards themselves, of leverage h, has a
 residual of r / (1 − h) (MacKinnon & White, J. Econometrics 29 (1985) 305).
 
+Rows of a sequence share the noise of their states: `fitting.shared_noise` says what that does to
+Aᵀ r, in the place of the rows' own residuals.
+
 What the terms cannot represent is not independent: it stays, however many pairs there are. Of
 ``rows`` such residuals only as many count as there are terms, each in its own part of phase space.
 """
@@ -24,22 +27,27 @@ _MOST_LEVERAGE = 0.9
 _ALIKE = 2.0
 
 
-def variance(reduced: Reduced, size: int) -> float:
-    """Mean square per degree of freedom that the leading ``size`` terms leave of these rows."""
+def variance(reduced: Reduced, size: int, freedom: float | None = None) -> float:
+    """Mean square per degree of freedom that the leading ``size`` terms leave of these rows.
+
+    freedom: degrees that noise takes of them, `shared_noise.freedom`; None: it is independent from
+    row to row, and takes ``size``.
+    """
     left = float(np.sum(reduced.factor[size:, -1] ** 2))
-    return left / max(reduced.rows - size, 1)
+    return left / max(reduced.rows - (size if freedom is None else freedom), 1.0)
 
 
 def root(
     train: Reduced, size: int, sample: np.ndarray, residual: np.ndarray, *,
-    noise: float | None, ridge: float = 0.0,
+    noise: float | None, ridge: float = 0.0, scores: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
     """(size, size): rootᵀ root is the covariance of the coefficients of the leading terms.
 
     sample, residual: rows of A (n, size) among those of ``train``, and of what is left over (n,).
-    noise: the part of its mean square that is independent from row to row; None: not known, and
-    then none of it is. ridge: of `least_squares.solve`. Directions that are not told, of columns
-    scaled to one, are 0, as in the solution.
+    noise: the part of its mean square that is noise; None: not known, and then none of it is.
+    ridge: of `least_squares.solve`. scores: (k, size) of these rows' noise, from
+    `shared_noise.scores`; None: it is independent from row to row. Directions that are not told, of
+    columns scaled to one, are 0, as in the solution.
     """
     a = train.factor[:size, :size]
     column = np.linalg.norm(a, axis=0)
@@ -50,10 +58,12 @@ def root(
     told = max(float(np.sum(filters * s**2)), 1.0)
     along = vt.T / column[:, None] * np.sqrt(filters)
     leverage = np.minimum(np.sum((sample @ along) ** 2, axis=1), _MOST_LEVERAGE)
-    weighted = np.linalg.qr((residual / (1 - leverage))[:, None] * sample, mode="r")
+    rows = np.linalg.qr((residual / (1 - leverage))[:, None] * sample, mode="r")
     share = 0.0 if noise is None else min(noise, 1.0)
-    inflation = share + (1 - share) * _ALIKE * max(train.rows / told, 1.0)
-    scale = np.sqrt(inflation * train.rows / len(sample))
+    misfit = (1 - share) * _ALIKE * max(train.rows / told, 1.0)
+    of_noise = rows if scores is None else np.linalg.qr(scores, mode="r")
+    both = np.concatenate([np.sqrt(share) * of_noise, np.sqrt(misfit) * rows])
+    weighted = np.linalg.qr(np.sqrt(train.rows / len(sample)) * both, mode="r")
     found = np.zeros((size, size))
-    found[: len(weighted)] = scale * (weighted @ along) @ along.T
+    found[: len(weighted)] = (weighted @ along) @ along.T
     return found

@@ -12,14 +12,18 @@ import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.data.files import read_initial, read_initial_noise
-from gfnn_jax.data.predictions import PredictionWriter
+from gfnn_jax.data.parts import check_count, part_of, put_together
+from gfnn_jax.data.predictions import PredictionWriter, is_done, job_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate.bands import bands, horizon
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.samples import Samples
+from gfnn_jax.maps.sharded import Sharded
 from gfnn_jax.maps.symplectic_map import Lanes, SymplecticMap
 from gfnn_jax.phase_space import TIME
+from gfnn_jax.processes import Share, wait_for_all
+from gfnn_jax.storage.outputs import ensure_new
 
 # A chunk of a prediction: what is held in memory at once, and how much work a kill may lose.
 _CHUNK_BYTES, _CHUNK_LANE_STEPS = 32 * 2**20, 400_000
@@ -27,7 +31,7 @@ _CHUNK_BYTES, _CHUNK_LANE_STEPS = 32 * 2**20, 400_000
 
 class Predicted(NamedTuple):
     """How a prediction ended: status and left_at (B,), the map's dt, seconds of computing; horizon
-    (B,) where one was asked for."""
+    (B,) where one was asked for. Of several processes the first has all lanes, others their own."""
 
     status: np.ndarray
     left_at: np.ndarray
@@ -47,6 +51,18 @@ class _Drawn(NamedTuple):
     of: str
 
 
+class _Request(NamedTuple):
+    """The map, what steps it (itself, or the same over several devices), and how far."""
+
+    map: SymplecticMap
+    stepped: SymplecticMap | Sharded
+    num_steps: int
+    save_every: int
+    stop_outside: bool
+    overwrite: bool
+    resume: bool
+
+
 def predict(
     model: Path,
     initial: Path,
@@ -58,6 +74,8 @@ def predict(
     samples: int | None = None,
     horizon_size: float | None = None,
     stop_outside: bool = False,
+    devices: int | str | None = None,
+    share: Share | None = None,
     overwrite: bool = False,
     resume: bool = False,
     progress: Progress = SILENT,
@@ -69,6 +87,10 @@ def predict(
     the noise of the initial states, ``z0_std``, is in it where their file has that, and ``band``
     says so. horizon_size: of the position, in the user's units; ``horizon`` (B,) is the first saved
     step at which the band of two standard deviations passes it, −1 where it never does.
+    devices: among which the lanes are shared out, "all" of this process or the first so many; the
+    same bits on any number, and after a resume on another number. share: of the lanes, that this
+    process predicts; it writes a part of its own, and the first process puts the parts together
+    when all are there.
 
     Memory: one chunk of saved states, 32 MiB at most where a saved state of all lanes is no more
     than that, whatever ``num_steps``. A job that was killed goes on with ``resume`` where its last
@@ -80,6 +102,8 @@ def predict(
         )
     if horizon_size is not None and samples is None:
         raise InputError("expected --samples beside --horizon: the band is of samples")
+    if samples is not None and (devices is not None or share is not None):
+        raise InputError("expected --samples without --devices and --distributed")
     map_ = saved.load(model)
     if dt is not None:
         try:
@@ -96,47 +120,94 @@ def predict(
     if samples is not None:
         drawn = _drawn(map_, samples, z0, read_initial_noise(initial, z0.shape), horizon_size)
         digest.update(np.ascontiguousarray(drawn.z0).data)
+    stepped: SymplecticMap | Sharded = map_
+    if devices is not None or share is not None:
+        try:
+            stepped = map_.sharded(devices or "all")
+        except ValueError as error:
+            raise InputError(f"--devices: {error}") from error
     identity = {
         "model": saved.digest(model),
         "initial": digest.hexdigest(),
         "outside": "stop" if stop_outside else "continue",
         **({} if drawn is None else {"samples": samples, "horizon_size": horizon_size}),
+        **({"block": stepped.block} if isinstance(stepped, Sharded) else {}),
     }
-    own, drive = None if params is None else (names, params), None
-    if params is not None and map_.parameters is not None and TIME in names:
-        drive = params[:, -1], float(np.asarray(map_.parameters.period))
-        own = (names[:-1], params[:, :-1]) if len(names) > 1 else None
+    request = _Request(map_, stepped, num_steps, save_every, stop_outside, overwrite, resume)
+    if share is None or not isinstance(stepped, Sharded):
+        return _written(request, out, z0, params, identity, drawn, progress)
+    job = job_of(identity, z0.shape, num_steps=num_steps, save_every=save_every, dt=dt)
+    if not overwrite and resume and is_done(out, job):
+        wait_for_all()
+        return _finished(out, dt)
+    ensure_new(out, overwrite)
+    check_count(out, share)
+    shares = [Share(i, share.count).of(len(z0), stepped.block) for i in range(share.count)]
+    parts = [part_of(out, Share(i, share.count)) for i in range(share.count)]
+    own = shares[share.index]
+    predicted = Predicted(np.zeros(0, int), np.zeros(0, int), dt, 0.0)
+    if own.stop > own.start:
+        identity |= {"lanes": [own.start, own.stop]}
+        own_params = None if params is None else params[own]
+        part = parts[share.index]
+        predicted = _written(request, part, z0[own], own_params, identity, None, progress)
+    progress.say("waiting for the other processes")
+    wait_for_all()
+    if share.index == 0:
+        there = [part for part, own in zip(parts, shares, strict=True) if own.stop > own.start]
+        progress.say(f"writing {out}")
+        put_together(there, out, job)
+        return _finished(out, dt)._replace(seconds=predicted.seconds)
+    return predicted
+
+
+def _written(
+    request: _Request, out: Path, z0, params, identity, drawn: _Drawn | None, progress
+) -> Predicted:
+    """The prediction of these lanes, in one file."""
+    map_ = request.map
+    dt, parameters = float(map_.dt), map_.parameters
+    own, drive = None, None
+    if parameters is not None and params is not None:
+        names = parameters.names
+        own = names, params
+        if TIME in names:
+            drive = params[:, -1], float(np.asarray(parameters.period))
+            own = (names[:-1], params[:, :-1]) if len(names) > 1 else None
     writer = PredictionWriter(
-        out, shape=z0.shape, num_steps=num_steps, save_every=save_every, dt=dt,
+        out, shape=z0.shape, num_steps=request.num_steps, save_every=request.save_every, dt=dt,
         identity=identity, params=own, drive=drive, bands=drawn is not None,
-        overwrite=overwrite, resume=resume,
+        overwrite=request.overwrite, resume=request.resume,
     )  # fmt: skip
     started = time.perf_counter()
     if writer.finished:
-        with np.load(out, allow_pickle=False) as done:
-            passed = done.get("horizon")
-            return Predicted(done["status"], done["left_at"], dt, 0.0, passed)
+        return _finished(out, dt)
     try:
-        lanes = _go_on(
-            map_, z0, params, writer, num_steps, save_every, stop_outside, drawn, progress
-        )
+        lanes = _go_on(request, z0, params, writer, drawn, progress)
         progress.say(f"writing {out}")
         status, left_at = np.asarray(lanes.status), np.asarray(lanes.left_at)
         more: dict[str, Any] = {} if drawn is None else {"band": drawn.of}
         passed = None
-        if horizon_size is not None:
+        if drawn is not None and drawn.size is not None:
             assert writer.carry is not None
             passed = writer.carry["horizon"]
-            more |= {"horizon": passed, "horizon_size": horizon_size}
+            more |= {"horizon": passed, "horizon_size": drawn.size}
         writer.finish(status, left_at, **more)
     except KeyboardInterrupt as stop:
         if not writer.finished:
-            done = max(0, writer.saved - 1) * save_every
+            done = max(0, writer.saved - 1) * request.save_every
             stop.add_note(
-                f"{writer.partial} keeps {done} of {num_steps} steps: --resume goes on with it"
+                f"{writer.partial} keeps {done} of {request.num_steps} steps: --resume goes on "
+                "with it"
             )
         raise
     return Predicted(status, left_at, dt, time.perf_counter() - started, passed)
+
+
+def _finished(out: Path, dt: float) -> Predicted:
+    """What a prediction that is there already says."""
+    with np.load(out, allow_pickle=False) as done:
+        return Predicted(done["status"], done["left_at"], dt, 0.0, done.get("horizon"))
 
 
 def _drawn(map_: SymplecticMap, count: int, z0, std, size: float | None) -> _Drawn:
@@ -156,10 +227,10 @@ def _drawn(map_: SymplecticMap, count: int, z0, std, size: float | None) -> _Dra
 
 
 def _go_on(
-    map_: SymplecticMap, z0, params, writer: PredictionWriter, num_steps, save_every, stop_outside,
-    drawn: _Drawn | None, progress,
-) -> Lanes:  # fmt: skip
+    request: _Request, z0, params, writer: PredictionWriter, drawn: _Drawn | None, progress
+) -> Lanes:
     """All chunks that are not yet written; returns the lanes after the last step."""
+    map_, save_every, stop_outside = request.stepped, request.save_every, request.stop_outside
     of_samples = None
     passed = np.full(len(z0), -1)
     if writer.carry is None:
@@ -179,7 +250,7 @@ def _go_on(
     chunk = _chunk_length(z0.shape[0] * many, z0.shape[1], save_every)
     options = {"params": params, "save_every": save_every, "stop_outside": stop_outside}
     while writer.saved < writer.total:
-        progress.say(f"step {(writer.saved - 1) * save_every} of {num_steps}")
+        progress.say(f"step {(writer.saved - 1) * save_every} of {request.num_steps}")
         count = min(chunk, writer.total - writer.saved)
         lanes, states = map_.advance(lanes, count, **options)
         if drawn is not None and of_samples is not None:

@@ -104,8 +104,11 @@ def check_request(
             given_terms(pairs.dim, (base,))
         except (InputError, jax.errors.ConcretizationTypeError) as error:
             raise FitError(str(error)) from error
-    if learn == "hamiltonian" and (family != "auto" or chart != "auto"):
-        raise FitError("family and chart are those of S: learn='hamiltonian' has none")
+    if learn == "hamiltonian" and (family not in ("auto", "mlp") or chart != "auto"):
+        raise FitError(
+            "family and chart are those of S: learn='hamiltonian' has no chart, and no family but "
+            "'mlp'"
+        )
     if family == "features" and (scene is None or scene.features is None):
         raise FitError("family 'features' needs a scene that declares features")
     for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):

@@ -41,7 +41,7 @@ def law_of(
     prepared: without a base map. Raises FitError where a Hamiltonian is asked for and there is none
     to learn.
     """
-    unfit = _unfit(prepared, scene)
+    unfit = unfit_for_law(prepared, scene)
     if unfit is not None:
         if learn == "hamiltonian":
             raise FitError(f"expected data of an autonomous flow to learn H from: {unfit}")
@@ -81,7 +81,7 @@ def long_step(prepared: Prepared, scene: Scene | None) -> list[str]:
 
     prepared: without a base map.
     """
-    if prepared.varied or prepared.coordinates.angles or _unfit(prepared, scene) is not None:
+    if prepared.varied or prepared.coordinates.angles or unfit_for_law(prepared, scene) is not None:
         return []
     _, _, jacobian = tangent(prepared.y0, prepared.y1, prepared.scale)
     angle = backwards(turns(jacobian, prepared.scale)[0])
@@ -94,7 +94,7 @@ def long_step(prepared: Prepared, scene: Scene | None) -> list[str]:
     ]
 
 
-def _unfit(prepared: Prepared, scene: Scene | None) -> str | None:
+def unfit_for_law(prepared: Prepared, scene: Scene | None) -> str | None:
     """Why the pairs are not those of an autonomous flow, where that is known."""
     if scene is not None and scene.timeless:
         return f"the scene {scene.name} is a map without time"

@@ -20,6 +20,10 @@ from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import AS_FAR, MET, Entry
 from gfnn_jax.learn.searches import Searched
 
+_NO_MORE = {
+    False: "no larger library of terms promised to meet it",
+    True: "the training of the network gained no more, or its budget is spent",
+}
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _SHARE = 0.1  # of the residual, that a change of volume must explain
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
@@ -41,7 +45,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     met = searched.judges.met_by(candidate)
     ended, noise, messages = found.ended, None, []
     if not searched.swept:
-        ended = MET if met else "no larger library of terms promised to meet it"
+        ended = MET if met else _NO_MORE[request.of_network]
     if ended.startswith(MET) and not met:
         ended = "the steps of a map that was to meet it do not converge from some of the states"
     if law is not None and searched.of_terms is None:

@@ -43,6 +43,9 @@ _THIN = 0.05
 _EXPLAINED, _SEQUENCE_NEIGHBOURS = 0.25, 50
 # A cubic law is fitted where there are so many pairs for each of its terms.
 _PAIRS_PER_TERM = 10
+# The changes of volume of the inner half of the states and of the outer: within a factor, or by so
+# many standard errors, they are the same.
+_ALIKE, _HALVES_APART = 3.0, 2.0
 # A determinant this far from zero is safe; below the lower figure the chart folds inside the data.
 SAFE, SINGULAR = 0.2, 0.03
 
@@ -216,8 +219,27 @@ def volume_change(z, residual) -> tuple[float, float]:
     volumes shrink. The fit takes up a part of it, by a field without divergence that is not linear:
     the divergence is the mean of a cubic law's over the states, or a linear law's where the pairs
     are few. (0, inf) where the law explains less than half of the residual.
+
+    Friction holds everywhere; a misfit may be concentrated where states are few, and a law fitted
+    to it then has any divergence. The change is 0 where the inner half of the states and the outer
+    one, by their distance from the mean in units of the spread, do not agree on it.
     """
-    z, residual, width = np.asarray(z), np.asarray(residual), np.shape(z)[1]
+    z, residual = np.asarray(z), np.asarray(residual)
+    change, error = _divergence(z, residual)
+    if not np.isfinite(error):
+        return change, error
+    distance = np.linalg.norm((z - z.mean(axis=0)) / sizes(z), axis=1)
+    inside = distance <= np.median(distance)
+    (one, its), (other, others) = (_divergence(z[h], residual[h]) for h in (inside, ~inside))
+    alike = 1 / _ALIKE <= one / other <= _ALIKE if other else False
+    agree = alike or abs(one - other) <= _HALVES_APART * np.hypot(its, others)
+    return (change if agree else 0.0), error
+
+
+def _divergence(z, residual) -> tuple[float, float]:
+    """The mean divergence of the law that explains these residuals, and its standard error; (0,
+    inf) where it explains less than half of them."""
+    width = z.shape[1]
     size = sizes(z)
     x = (z - z.mean(axis=0)) / size
     few = len(z) < _PAIRS_PER_TERM * math.comb(width + 3, 3)

@@ -93,6 +93,8 @@ class Fit:
         Raises FitError where no Hamiltonian was learned that meets the tolerance or was chosen, or
         its flow fails in the region, InputError for a region that is none.
         """
+        if self.hamiltonian is not None and self.hamiltonian.formula is None:
+            raise FitError("expected an H of terms to draw pairs from, got a network")
         if self.hamiltonian is None or self.formula is None:
             raise FitError("expected a fit with a Hamiltonian that meets its tolerance, got none")
         assert self.pairs is not None
@@ -213,7 +215,8 @@ def fit(
                next ones' q2, p2, …; "bodies:N", q body by body: H is a sum over sites, or over
                bodies and pairs; of sites, S where learn is "map" or no H meets the tolerance.
                None: the scene's own.
-    family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp".
+    family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp";
+               with learn="hamiltonian" H is a sum of terms, or a network with "mlp".
     chart:     "auto" or one of type1, type2, type3, midpoint.
     angles:    without a scene, the indices of z that have period 2π.
     max_seconds: for all of it; the search ends with the best map so far while there is time to

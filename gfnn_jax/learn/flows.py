@@ -23,7 +23,7 @@ from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms, given_terms, joined, multiplied, polynomial_terms
-from gfnn_jax.fitting import least_squares, uncertainty
+from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
 from gfnn_jax.fitting.gauss_newton import (
     MOST_SUBSTEPS,
     FlowFit,
@@ -33,20 +33,21 @@ from gfnn_jax.fitting.gauss_newton import (
     midpoint_start,
     null_terms,
     rates,
+    significant,
     significant_terms,
 )
 from gfnn_jax.fitting.growth import grow
 from gfnn_jax.fitting.least_squares import Reduced
-from gfnn_jax.flows.collocation import Steps, images, truncation
+from gfnn_jax.flows.collocation import Steps, images, of_lanes, truncation
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.learn.assemble import Assembled, composed, stepped
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
 from gfnn_jax.learn.clock import Clock, OutOfTime
-from gfnn_jax.learn.held_out import outermost
+from gfnn_jax.learn.held_out import looked_at, outermost
 from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
 from gfnn_jax.learn.prepare import Prepared
-from gfnn_jax.phase_space import apply_j, symplectic_form
+from gfnn_jax.phase_space import Pairs, apply_j, symplectic_form
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +63,7 @@ class Options:
     rise: of the held-out error that dropping terms may cost; rounding: below which it is roundoff.
     flat: libraries one after the other whose errors differ by less have met the pairs' noise;
     certain: standard errors below which a term is then noise (one in 16,000 by chance).
+    explained: standard errors of the part of a residual that is noise, within which all of it is.
     gained: a library that lowers the error by less has not helped; twice in a row ends the search.
     truncation: a flow's own error, as a part of the tolerance. contracting: a fixed point's factor
     up to which it is preferred to Newton's method. goal: residual that modes grow to, as a part of
@@ -84,6 +86,7 @@ class Options:
     rounding: float = 1e-15
     flat: float = 1.2
     certain: float = 4.0
+    explained: float = 2.0
     gained: float = 0.5
     truncation: float = 0.1
     contracting: float = 0.8
@@ -101,7 +104,7 @@ _FREQUENCY_STATES = 500
 _NEAR_ROUNDOFF = 3e-15  # of the spread
 _HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
 _NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
-_FEWEST_SAMPLED = 1_000  # pairs that tell noise from misfit
+_FEWEST_SAMPLED = 2_000  # pairs that tell noise from misfit
 _NAMED = 5  # terms in a message
 # Libraries in a row that do not help end the search; with given terms; of a structure, whose
 # libraries differ in kind.
@@ -124,18 +127,19 @@ class LearnedHamiltonian:
     """H as learned, in the inner coordinates.
 
     candidate: as the others of a fit, its error measured by steps in NumPy. flow: the piece.
-    terms, formula: what H is. truncation: largest error of the flow's own steps on the held-out
-    states, ÷ scale. omega_h: the fastest oscillation of the linearised flow, times dt, in the
-    median over the data; beyond π pairs of one dt may not tell H. contraction: the fixed point's
-    factor where it is largest. condition: of the terms' columns. null_terms: that the data do not
-    tell from the others. left_out: pairs that the flow does not resolve. stalled: whether larger
-    libraries were no more accurate. root: (m, m), rootᵀ root is the coefficients' covariance.
+    terms, formula: what H is; () and None of a network. truncation: largest error of the flow's
+    own steps on the held-out states, ÷ scale. omega_h: the fastest oscillation of the linearised
+    flow, times dt, in the median over the data; beyond π pairs of one dt may not tell H.
+    contraction: the fixed point's factor where it is largest. condition: of the terms' columns.
+    null_terms: that the data do not tell from the others. left_out: pairs that the flow does not
+    resolve. stalled: whether larger libraries were no more accurate. root: (m, m), rootᵀ root is
+    the coefficients' covariance; None of a network.
     """
 
     candidate: Candidate
     flow: Flow
     terms: tuple[Term, ...]
-    formula: str
+    formula: str | None
     truncation: float
     omega_h: float
     contraction: float
@@ -144,7 +148,7 @@ class LearnedHamiltonian:
     left_out: int
     messages: tuple[str, ...]
     stalled: bool
-    root: np.ndarray
+    root: np.ndarray | None
 
     @property
     def fast(self) -> bool:
@@ -187,7 +191,8 @@ def learn_hamiltonian(
     """
     basis = _modes(prepared, scene, terms)
     most = options.max_seconds if basis is None else options.mode_seconds
-    clock = Clock(most if clock is None else min(most, clock.left))
+    clock = clock or Clock()
+    searching = Clock(min(most, clock.left))
     if prepared.before or prepared.after:
         raise FitError("expected pairs without a base map: it is no part of a flow")
     started = time.perf_counter()
@@ -195,7 +200,7 @@ def learn_hamiltonian(
         _check_finite(_own_terms(prepared, terms), prepared, judges.training)
     problem = Problem(
         prepared.y0, prepared.y1, prepared.each_dt, prepared.scale, args=prepared.args,
-        check=clock.check,
+        check=searching.check,
     )  # fmt: skip
     everywhere, free = judges, (*prepared.coordinates.cyclic, *prepared.whole)
     if prepared.structure is None:
@@ -206,7 +211,7 @@ def learn_hamiltonian(
     if prepared.args is not None:
         best = _walked(problem, prepared, judges, scene, terms, options, say)
     elif basis is not None:
-        best = _grown(problem, basis, prepared, judges, clock, options, say)
+        best = _grown(problem, basis, prepared, judges, searching, options, say)
     else:
         best, options = _searched(problem, prepared, judges, scene, terms, options, say)
     everyone = np.arange(len(prepared.y0))
@@ -215,11 +220,12 @@ def learn_hamiltonian(
     outside = None
     try:
         if best.noisy:
-            best = _refitted(problem, best, judges.training, prepared, judges)
+            problem.check = clock.check  # what is pruned is soon fitted: the search is over
+            best = _pruned(problem, best, judges.training, prepared, judges, options)
         best = _sparse(problem, best, prepared, judges, options, say)
         there = dataclasses.replace(everywhere, held_out=everywhere.training[outer])
         if outer.any():
-            outside = _held_out_error(problem, best.family, best.fit, prepared, there).relative
+            outside = _held_out_error(best.family, best.fit, prepared, there).relative
         if best.error.relative > _ROUNDOFF and len(best.fit.used) < len(everywhere.training):
             best = _refitted(problem, best, everywhere.training, prepared, judges)
     except OutOfTime:
@@ -352,9 +358,7 @@ def _grown(
     problem, basis: Modes, prepared, judges: Judges, clock: Clock, options: Options, say
 ) -> _Fitted:
     """The library that has grown to the tolerance, or as far as the time and the pairs allow."""
-    goal = options.goal * judges.tolerance.bound
-    if not judges.tolerance.relative:
-        goal = goal / float(problem.scale.max())
+    goal = options.goal * _bound(judges, problem.scale)
     most = int(len(judges.training) * 2 * prepared.dim / options.rows_per_term)
     problem.check = Clock(options.growth_part * clock.left).check
     grown, ended = None, "the time is over"
@@ -374,8 +378,7 @@ def _grown(
     count = int(np.ceil(options.judged_rows * len(grown.coefficients) / (2 * prepared.dim)))
     rows = judges.training[: max(count, 500)]
     fit = problem.fit(grown.family, grown.coefficients, rows, rounds=False, say=say)
-    fit = _resolved(problem, grown.family, fit, rows)
-    error = _held_out_error(problem, grown.family, fit, prepared, judges)
+    error = _held_out_error(grown.family, fit, prepared, judges)
     return _Fitted(grown.family, fit, rows, error, (), ended=ended)
 
 
@@ -470,8 +473,8 @@ def _fitted(problem, family, prepared, judges, last: _Fitted | None, options, sa
     rows = judges.training[: max(count, fewest)]
     null_names, best = tuple(names[j] for j in null), None
     for start in _starts(problem, family, rows, judges.training[:_TURNING], last):
-        fit = _resolved(problem, family, problem.fit(family, start, rows, say=say), rows)
-        error = _held_out_error(problem, family, fit, prepared, judges)
+        fit = problem.fit(family, start, rows, say=say)
+        error = _held_out_error(family, fit, prepared, judges)
         if best is None or error.relative < best.error.relative:
             best = _Fitted(family, fit, rows, error, null_names, undetermined)
         if error.relative <= _EXPLAINED:
@@ -503,10 +506,18 @@ def _starts(problem, family, rows, many, last: _Fitted | None) -> Iterator[np.nd
 
 
 def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
-    """The start whose flow is nearest to the pairs: midpoint, logarithm, or the last library's."""
+    """The start whose flow is nearest to the pairs: midpoint, of all of them or of those that move
+    least, logarithm, or the last library's."""
     z0, z1 = problem.z0[rows], problem.z1[rows]
     dt, args = problem.given(rows)
-    starts = [midpoint_start(family, z0, z1, dt, problem.scale, args)]
+
+    def midpoint(part):
+        own = of_lanes(dt, part), problem.scale, of_lanes(args, part)
+        return midpoint_start(family, z0[part], z1[part], *own)
+
+    moved = np.linalg.norm((z1 - z0) / problem.scale, axis=1)
+    quieter = moved <= np.median(moved)  # the midpoint says little of a step that goes far
+    starts = [midpoint(slice(None)), midpoint(quieter)]
     # Pairs of one affine regression, more of them than it has unknowns.
     alike = args is None and np.ndim(dt) == 0 and len(z0) > z0.shape[1]
     logarithm = log_start(family, z0, z1, dt, problem.scale) if alike else None
@@ -519,31 +530,56 @@ def _start(problem, family, rows, last: _Fitted | None) -> np.ndarray:
     return min(starts, key=lambda c: problem.distance(family, c, some))
 
 
-def _resolved(problem, family, fit: FlowFit, rows) -> FlowFit:
-    """The fit without the pairs that the flow's own steps do not resolve."""
-    if not len(fit.used):  # none of the flows that were tried has an image
-        return fit
-    z = problem.z0[fit.used]
-    dt, args = problem.given(fit.used)
-    off = truncation(
-        family, fit.coefficients, z, dt, fit.steps, args=args, on_substep=problem.check
-    )
-    off = np.abs(off / problem.scale).max(axis=1)
-    limit = max(10 * fit.rms, 100 * float(np.median(off)), 1e-13)
-    good = off <= limit
-    if good.all() or good.sum() < 0.5 * len(rows):
-        return fit
-    return problem.fit(family, fit.coefficients, fit.used[good], rounds=False)
+def _held_out_error(family, fit: FlowFit, prepared, judges: Judges) -> OneStepError:
+    """By steps that resolve the held-out pairs: an unresolved passage says nothing of the law."""
+    steps = _resolving(family, fit.coefficients, fit.steps, prepared, judges)
+    return _error_of(family, fit.coefficients, steps, prepared, judges)
 
 
-def _held_out_error(problem, family, fit: FlowFit, prepared, judges: Judges) -> OneStepError:
-    return _error_of(family, fit.coefficients, fit.steps, prepared, judges)
+def _resolving(family, coefficients, steps: Steps, prepared, judges: Judges) -> Steps:
+    """These steps, or, where the law misses the tolerance by them, finer ones: halved until they
+    resolve the held-out pairs, or there are as many as a flow may have."""
+    bound, states = _bound(judges, prepared.scale), prepared.y0[judges.held_out]
+    if _error_of(family, coefficients, steps, prepared, judges).bound <= judges.tolerance.bound:
+        return steps
+    dt, args = prepared.given(judges.held_out)
+    while 2 * steps.substeps <= MOST_SUBSTEPS:
+        off = truncation(family, coefficients, states, dt, steps, args=args) / prepared.scale
+        if np.sqrt(np.mean(off**2)) <= OPTIONS.truncation * bound:
+            break
+        steps = dataclasses.replace(steps, substeps=2 * steps.substeps)
+    return steps
+
+
+def _bound(judges: Judges, scale) -> float:
+    """The tolerance as a part of the coordinates' scale."""
+    bound = judges.tolerance.bound
+    return bound if judges.tolerance.relative else bound / float(scale.max())
 
 
 def _error_of(family, coefficients, steps: Steps, prepared, judges: Judges) -> OneStepError:
     states, (dt, args) = prepared.y0[judges.held_out], prepared.given(judges.held_out)
     found = images(family, coefficients, states, dt, steps, args=args).states
     return judges.error_of(to_user(prepared.coordinates, found), prepared.coordinates)
+
+
+def _pruned(problem, full: _Fitted, rows, prepared, judges, options: Options) -> _Fitted:
+    """The terms that all of these pairs tell from noise, fitted to them: one Gauss–Newton problem
+    of all terms says which, so that only a few are fitted to many pairs."""
+    resolved = np.setdiff1d(rows, np.setdiff1d(full.rows, full.fit.used))
+    found = problem.factor(full.family, full.fit.coefficients, full.fit.steps, resolved)
+    if np.isfinite(found.cost):
+        kept, start = significant(
+            found.matrix, full.fit.coefficients, found.rows, options.certain
+        )  # fmt: skip
+        few = full._replace(
+            family=full.family.take(tuple(kept.tolist())), fit=full.fit._replace(coefficients=start)
+        )
+        if len(kept):
+            few = _refitted(problem, few, rows, prepared, judges)
+            if few.error.relative <= options.rise * full.error.relative:
+                return few
+    return _refitted(problem, full, rows, prepared, judges)
 
 
 def _sparse(problem, full: _Fitted, prepared, judges, options: Options, say) -> _Fitted:
@@ -560,7 +596,7 @@ def _sparse(problem, full: _Fitted, prepared, judges, options: Options, say) -> 
         say(f"H: {len(kept)} of {full.family.num_parameters} terms")
         start = full.fit.coefficients[list(kept)]
         fit = problem.fit(family, start, full.fit.used, rounds=False, steps=full.fit.steps)
-        error = _held_out_error(problem, family, fit, prepared, judges)
+        error = _held_out_error(family, fit, prepared, judges)
         if error.relative <= max(options.rise * full.error.relative, options.rounding):
             return full._replace(family=family, fit=fit, error=error)
     return full
@@ -568,9 +604,8 @@ def _sparse(problem, full: _Fitted, prepared, judges, options: Options, say) -> 
 
 def _refitted(problem, found: _Fitted, rows, prepared, judges) -> _Fitted:
     """Fitted to all training pairs: each of them averages the noise."""
-    rows = np.setdiff1d(rows, np.setdiff1d(found.rows, found.fit.used))
     fit = problem.fit(found.family, found.fit.coefficients, rows, rounds=False)
-    error = _held_out_error(problem, found.family, fit, prepared, judges)
+    error = _held_out_error(found.family, fit, prepared, judges)
     return found._replace(fit=fit, rows=rows, error=error)
 
 
@@ -585,7 +620,8 @@ def _learned(
     if prepared.own_dt is not None:  # the map's own dt, from which others follow
         problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, args=prepared.args)
     steps = _cheapest(problem, family, fit, fastest, judges, options)
-    contraction = _contraction(fastest, prepared.dt, steps)
+    steps = _resolving(family, fit.coefficients, steps, prepared, judges)
+    contraction = contraction_of(fastest, prepared.dt, steps)
     by_newton = contraction > options.contracting and not matrix_free(family)
     off = truncation(family, fit.coefficients, z, prepared.dt, steps, args=args) / prepared.scale
     flow = Flow(
@@ -598,7 +634,7 @@ def _learned(
     candidate = Candidate(
         label=f"H, {family.num_parameters} terms", family=family.name, chart="flow",
         num_parameters=family.num_parameters,
-        operations=_operations(family, fastest, prepared.dt, steps),
+        operations=operations_of(family, 2 * family.dim, fastest, prepared.dt, steps),
         validation_rms=error.rms, validation_relative=error.relative,
         validation_bound=error.bound, deviations=error.deviations, train_rms=fit.rms,
         fit_seconds=seconds, condition=fit.condition, rank=family.num_parameters,
@@ -610,42 +646,60 @@ def _learned(
             family.term_names, fit.coefficients.tolist(), fit.standard_errors.tolist(), strict=True
         )
     )
-    omega_h = _omega_h(family, fit.coefficients, prepared, fastest)
+    omega_h = omega_h_of(family, fit.coefficients, prepared, fastest)
     left_out = len(np.setdiff1d(found.rows, fit.used))
+    resolved = np.abs(off).max(axis=1) <= _bound(judges, prepared.scale)
     return LearnedHamiltonian(
         with_error(candidate, error), flow, terms, getattr(family, "prefix", "") + formula(terms),
         float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
-        tuple(_messages(error, omega_h, prepared, judges, found, left_out)),
-        stalled=found.stalled, root=_root(found, problem, prepared, steps),
+        tuple(_messages(error, omega_h, prepared, judges, found, left_out, int((~resolved).sum()))),
+        stalled=found.stalled, root=_root(found, problem, prepared, steps, judges.pairs),
     )  # fmt: skip
 
 
-def _root(found: _Fitted, problem: Problem, prepared: Prepared, steps: Steps) -> np.ndarray:
+def _root(
+    found: _Fitted, problem: Problem, prepared: Prepared, steps: Steps, pairs: Pairs
+) -> np.ndarray:
     """(m, m): rootᵀ root is the covariance of the coefficients. What is noise, a generator of
     polynomials tells, which does not explain it; what it explains is misfit, of these steps too."""
     fit, count = found.fit, found.family.num_parameters
-    pairs = max(_FEWEST_SAMPLED, OPTIONS.sampled_rows * count // prepared.y0.shape[1])
+    most = max(_FEWEST_SAMPLED, OPTIONS.sampled_rows * count // prepared.y0.shape[1])
     structure = prepared.structure
     if structure is not None:
-        pairs = structure.fewest(prepared.y0.shape[1])
-    rows = fit.used[:pairs]
+        most = structure.fewest(prepared.y0.shape[1])
+    places, goes_on = looked_at(pairs, fit.used, most)
+    rows, scale = fit.used[places], problem.scale
     images = problem.images(found.family, fit.coefficients, rows, steps, derivatives=True)
     residual = images.states - prepared.y1[rows]
     if not np.isfinite(residual).all():  # of a flow that runs away from some of the states
         return np.full((count, count), np.nan)
-    # A generator of so many coordinates has too many terms.
-    noise = unexplained(prepared, rows, residual, count) if structure is None else None
-    slopes = (images.by_coefficient / problem.scale[:, None]).reshape(-1, count)
-    left = np.hypot(residual / problem.scale, _NEAR_ROUNDOFF).ravel()
+    slopes = images.by_coefficient / scale[:, None]
+    left, scores, states, noise = residual / scale, None, None, None
+    if structure is None:  # of many coordinates both would take too much
+        if goes_on.any():
+            first = images.by_state * scale
+            second = np.broadcast_to(-np.diag(scale), first.shape)
+            scores = shared_noise.scores(
+                slopes, left, first / scale[:, None], second / scale[:, None], goes_on
+            )
+            states = first, second, goes_on
+        noise = unexplained(prepared, rows, residual, count, states)
     train = Reduced(np.asfortranarray(fit.factor), fit.rows)
-    return uncertainty.root(train, count, slopes, left, noise=noise)
+    return uncertainty.root(
+        train, count, slopes.reshape(-1, count), np.hypot(left, _NEAR_ROUNDOFF).ravel(),
+        noise=noise, scores=scores,
+    )  # fmt: skip
 
 
-def unexplained(prepared: Prepared, rows, residual, taken: int) -> float | None:
+def unexplained(prepared: Prepared, rows, residual, taken: int, states) -> float | None:
     """Of the mean square of what a map leaves over (n, 2d) on these rows, the part that no
     generator K explains, residual = J∇K at the images: K of as high a degree as the rows tell.
-    taken: coefficients that the map itself was given. None where they are too few."""
+    taken: coefficients that the map itself was given. states: the residual's derivatives and which
+    pairs go on, as `shared_noise.scores` takes them, or None. None where the rows are too few.
+
+    1 where K explains no more than it would of noise, by ``explained`` standard errors: an F test.
+    """
     z, coordinates, width = prepared.y1[rows], prepared.coordinates, residual.shape[1]
     inputs = box_inputs(
         z, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
@@ -656,10 +710,23 @@ def unexplained(prepared: Prepared, rows, residual, taken: int) -> float | None:
     known = [family for family in sizes if family.num_parameters <= most]
     if not known:
         return None
-    weight = 1.0 / np.roll(prepared.scale, prepared.dim)
-    reduced = least_squares.reduce(known[-1], [(z, -apply_j(residual))], weight)
+    family, weight = known[-1], 1.0 / np.roll(prepared.scale, prepared.dim)
+    target = -apply_j(residual)
+    reduced = least_squares.reduce(family, [(z, target)], weight)
+    count, freedom = family.num_parameters, None
+    if states is not None:
+        to_target = -weight[:, None] * symplectic_form(prepared.dim)
+        slopes, (first, second, goes_on) = family.term_gradients(z) * weight[:, None], states
+        scores = shared_noise.scores(
+            slopes, weight * target, to_target @ first, to_target @ second, goes_on
+        )
+        freedom = shared_noise.freedom(slopes, weight * target, scores)
     left = np.sum(reduced.factor[:, -1] ** 2) / max(reduced.rows - taken, 1)
-    return float(uncertainty.variance(reduced, known[-1].num_parameters) / left) if left else 1.0
+    if left == 0:
+        return 1.0
+    part = float(uncertainty.variance(reduced, count, freedom) / left)
+    by_chance = OPTIONS.explained * np.sqrt(2 * count) / reduced.rows
+    return part if part < 1 - by_chance else 1.0
 
 
 def _cheapest(problem, family, fit: FlowFit, fastest, judges: Judges, options: Options) -> Steps:
@@ -667,12 +734,9 @@ def _cheapest(problem, family, fit: FlowFit, fastest, judges: Judges, options: O
     twice as dear."""
 
     def cost(steps: Steps) -> float:
-        return _operations(family, fastest, problem.dt, steps)
+        return operations_of(family, 2 * family.dim, fastest, problem.dt, steps)
 
-    bound = options.truncation * judges.tolerance.bound
-    if not judges.tolerance.relative:
-        bound = bound / float(problem.scale.max())
-    bound = max(bound, 0.3 * fit.rms)
+    bound = max(options.truncation * _bound(judges, problem.scale), 0.3 * fit.rms)
     tolerances = (bound, min(bound, _NEAR_ROUNDOFF), None)
     found = problem.fine_steps(family, fit.coefficients, judges.training, tolerances)
     return next(s for s in reversed(found) if s == found[0] or cost(s) < 2 * cost(found[0]))
@@ -687,7 +751,7 @@ def flow_of(family: Terms, params, prepared: Prepared) -> Flow:
     problem = Problem(y0, y1, dt, scale)
     (steps,) = problem.fine_steps(family, params, np.arange(len(y0)))
     fastest = rates(family, params, y0[:_FREQUENCY_STATES])
-    by_newton = not _contraction(fastest, dt, steps) <= OPTIONS.contracting
+    by_newton = not contraction_of(fastest, dt, steps) <= OPTIONS.contracting
     flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, by_newton)
     failed = ~np.isfinite(np.concatenate([flow.image(y0), flow.inverse().image(y1)])).all(axis=1)
     if failed.any():
@@ -709,20 +773,21 @@ def flow_operations(flow: Flow, prepared: Prepared) -> float:
     """Floating-point operations per step of the flow."""
     fastest = rates(flow.family, flow.params, prepared.y0[:_FREQUENCY_STATES])
     steps = Steps(flow.stages, flow.substeps)
-    return _operations(flow.family, fastest, float(flow.dt), steps)
+    return operations_of(flow.family, len(prepared.scale), fastest, float(flow.dt), steps)
 
 
-def _contraction(fastest, dt: float, steps: Steps) -> float:
+def contraction_of(fastest, dt: float, steps: Steps) -> float:
     """The factor by which the stages' fixed point contracts in the end, where it is largest."""
     radius = np.abs(np.linalg.eigvals(gauss(steps.stages).matrix)).max()
     return float(dt / steps.substeps * fastest.max() * radius)
 
 
-def _operations(family: Terms | Sums, fastest, dt: float, steps: Steps) -> float:
-    """Floating-point operations per step: as many iterations as roundoff takes at this factor."""
+def operations_of(family, width: int, fastest, dt: float, steps: Steps) -> float:
+    """Floating-point operations per step of states (2d,), width 2d: as many iterations as roundoff
+    takes at this factor."""
     gradient, with_hessian = family.operations
-    width, s = 2 * family.dim, steps.stages
-    factor = _contraction(fastest, dt, steps)
+    s = steps.stages
+    factor = contraction_of(fastest, dt, steps)
     if factor > OPTIONS.contracting and not matrix_free(family):
         one = s * with_hessian + (s * width) ** 3 * 2 / 3
         return float(steps.substeps * 4 * one)
@@ -730,7 +795,7 @@ def _operations(family: Terms | Sums, fastest, dt: float, steps: Steps) -> float
     return float(steps.substeps * iterations * s * (gradient + 2 * width * s))
 
 
-def _omega_h(family, coefficients, prepared: Prepared, fastest) -> float:
+def omega_h_of(family, coefficients, prepared: Prepared, fastest) -> float:
     """The fastest oscillation of the linearised flow, radians per step, its median over states."""
     if not matrix_free(family):
         some = slice(_FREQUENCY_STATES)
@@ -742,8 +807,9 @@ def _omega_h(family, coefficients, prepared: Prepared, fastest) -> float:
 
 
 def _messages(
-    error: OneStepError, omega_h: float, prepared, judges, found: _Fitted, left_out: int
-) -> Iterator[str]:
+    error: OneStepError, omega_h: float, prepared, judges, found: _Fitted, left_out: int,
+    unresolved: int,
+) -> Iterator[str]:  # fmt: skip
     if error.bound > judges.tolerance.bound:
         yield (
             f"no H of the terms tried meets the tolerance (best {error.relative:.2e} of the "
@@ -771,7 +837,15 @@ def _messages(
             "out, and H is known only where the pairs are"
         )
     if left_out:
-        yield f"{left_out} pairs are not resolved by the flow's own steps: they are left out"
+        yield (
+            f"{left_out} of {len(found.rows)} pairs, as of close passages, are not resolved by the "
+            "steps of the fit: they are left out of it"
+        )
+    if unresolved:
+        yield (
+            f"{unresolved} of {len(judges.held_out)} held-out pairs are not resolved to the "
+            "tolerance by the flow's own steps: there the map is in error, and not the law"
+        )
 
 
 def formula(terms: Sequence[Term]) -> str:

@@ -6,6 +6,7 @@ import numpy as np
 
 _FRACTION, _FEWEST, _MOST = 0.1, 4, 2_000
 _OUTSIDE = 0.05  # of the training pairs, by which errors outside the data are measured
+_TOGETHER = 50  # pairs of a sequence that are looked at or left out as one
 
 
 def first_occurrences(pairs) -> np.ndarray:
@@ -45,6 +46,26 @@ def split_rows(pairs, seed: int) -> tuple[np.ndarray, np.ndarray]:
     apart[1:] &= ~border
     held_out = rng.permutation(np.flatnonzero(held))[:_MOST]
     return rng.permutation(np.flatnonzero(apart)), held_out
+
+
+def looked_at(pairs, rows: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """About ``most`` of these rows, as places among them (n,), the rows there in rising order; and
+    (n − 1,) whether the image of one is the state of the next.
+
+    Drawn at random, of sequences by blocks of consecutive pairs.
+    """
+    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
+
+    def goes_on(places) -> np.ndarray:
+        return np.all(z1[rows[places[:-1]]] == z0[rows[places[1:]]], axis=1)
+
+    places = np.argsort(rows)
+    if len(rows) > most:
+        together = _TOGETHER if goes_on(places).any() else 1
+        block = np.arange(len(rows)) // together
+        drawn = np.random.default_rng(0).permutation(block[-1] + 1)[: -(-most // together)]
+        places = places[np.isin(block, drawn)]
+    return places, goes_on(places)
 
 
 def outermost(y: np.ndarray, free: tuple[int, ...] = ()) -> np.ndarray:

@@ -21,7 +21,7 @@ def with_posterior(chosen: Chosen, searched: Searched) -> Chosen:
         if not (own and isinstance(entry.sweep, LinearSweep)):
             return chosen
         kind, root = Generated, entry.sweep.root(entry.size)
-    elif law is not None and chosen.candidate.learns == "hamiltonian":
+    elif law is not None and law.root is not None and chosen.candidate.learns == "hamiltonian":
         kind, root = Flow, law.root
     else:
         return chosen

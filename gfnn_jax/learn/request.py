@@ -54,7 +54,12 @@ class Request:
         """Whether H is looked for."""
         free = (self.family, self.chart, self.base) == ("auto", "auto", None)
         angles = self.structure is not None and bool(self.structure.angles)
-        return free and self.learn != "map" and not angles
+        return (free or self.of_network) and self.learn != "map" and not angles
+
+    @property
+    def of_network(self) -> bool:
+        """Whether H is to be a network."""
+        return (self.learn, self.family) == ("hamiltonian", "mlp")
 
 
 def lent(scene: Scene, learn: str, chart: str) -> str | None:

@@ -24,6 +24,7 @@ from gfnn_jax.learn.law_maps import (
     search_of_law,
 )
 from gfnn_jax.learn.map_of_terms import LearnedMap, map_of
+from gfnn_jax.learn.networks import learn_network
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import Entry, Found, search
@@ -92,9 +93,15 @@ def _law(
     """H, where one is looked for and found."""
     if not request.seeks_law:
         return None
-    law = law_of(
-        plain, judges, request.scene, request.learn, request.terms, request.clock, request.say
-    )
+    if request.of_network:
+        law = learn_network(
+            plain, judges, request.scene, seed=request.seed, clock=request.clock, say=request.say,
+            max_iterations=request.max_iterations,
+        )  # fmt: skip
+    else:
+        law = law_of(
+            plain, judges, request.scene, request.learn, request.terms, request.clock, request.say
+        )
     if law is not None:
         if better is not None:
             better.offer(law.candidate, lambda: composed(law.flow, plain, judges))

@@ -14,12 +14,12 @@ from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.families.products import Products, number_of_terms
 from gfnn_jax.families.sines import Sines
-from gfnn_jax.fitting import least_squares, uncertainty
+from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
 from gfnn_jax.fitting.levenberg_marquardt import LMState, levenberg_marquardt
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.learn.candidates import Candidate, Judges, validated
 from gfnn_jax.learn.clock import Clock
-from gfnn_jax.learn.held_out import outermost
+from gfnn_jax.learn.held_out import looked_at, outermost
 from gfnn_jax.learn.prepare import Prepared
 
 # Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
@@ -213,30 +213,65 @@ class LinearSweep:
         train = self._factor(size.group, Clock(), lambda message: None).train
         family, solved = size.family, self.solve(size, Clock(), lambda message: None)[0]
         larger = self._larger(size)
-        most = family if larger is None else larger
-        pairs = -(-_SAMPLE_ROWS * most.num_parameters // self._train[0].shape[1])
-        w, target = (a[:pairs] for a in self._train)
-        rows = (family.term_gradients(w) * self._weight[:, None]).reshape(-1, family.num_parameters)
-        residual = rows @ solved.coefficients - (target * self._weight).ravel()
-        noise = None
-        if larger is not None:
-            left, less = (
-                uncertainty.variance(
-                    least_squares.reduce(f, [(w, target)], self._weight), f.num_parameters
-                )
-                for f in (family, larger)
-            )
-            noise = less / left if left > 0 else 1.0
+        most = family if larger is None else larger.family
+        width = self._train[0].shape[1]
+        pairs = -(-_SAMPLE_ROWS * most.num_parameters // width)
+        places, goes_on = looked_at(self.judges.pairs, self.judges.training, pairs)
+        w, target = (a[places] for a in self._train)
+        params = family.unflatten(solved.coefficients)
+        slopes = self._slopes(family, w)
+        residual = slopes @ solved.coefficients - target * self._weight
+        states = None
+        if goes_on.any() and not (self.prepared.before or self.prepared.after):
+            states = (residual, *self._by_states(family, params, w), goes_on)
+        scores = shared_noise.scores(slopes, *states) if states else None
+        noise = self._noise(size, larger, w, target, states) if larger is not None else None
         return uncertainty.root(
-            train, family.num_parameters, rows, residual, noise=noise, ridge=solved.ridge
-        )
+            train, family.num_parameters, slopes.reshape(-1, family.num_parameters),
+            residual.ravel(), noise=noise, ridge=solved.ridge, scores=scores,
+        )  # fmt: skip
 
-    def _larger(self, size: Size) -> Any:
-        """The family two sizes further, as a symmetric map gains nothing from the odd degrees; the
-        next, or None, where there is none."""
+    def _slopes(self, family, w) -> np.ndarray:
+        return family.term_gradients(w) * self._weight[:, None]
+
+    def _by_states(self, family, params, w) -> tuple[np.ndarray, np.ndarray]:
+        """The residual's derivatives in z₀ and z₁ (n, 2d, 2d), those ÷ their scale."""
+        eye, chart = np.eye(w.shape[1]), self.chart
+        none, dt, scale = np.zeros_like(eye), self.prepared.dt, self.prepared.scale
+        hessian = family.gradient_and_hessian(params, w)[1]
+
+        def by(y0, y1):
+            point, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, dt)
+            return self._weight[:, None] * (hessian @ point.T - target.T) * scale
+
+        return by(eye, none), by(none, eye)
+
+    def _noise(self, size: Size, larger: Size, w, target, states) -> float:
+        """The part of the residual's mean square that a larger size leaves too: of all rows where
+        that one was judged by all of them, else of these. states: residual, its derivatives and
+        which pairs go on, as `shared_noise.scores` takes them, or None."""
+
+        def left(of: Size) -> float:
+            reduced = (
+                self._factors[of.group].train if larger.group in self._factors
+                else least_squares.reduce(of.family, [(w, target)], self._weight)
+            )  # fmt: skip
+            freedom = None
+            if states is not None:
+                slopes = self._slopes(of.family, w)
+                scores = shared_noise.scores(slopes, *states)
+                freedom = shared_noise.freedom(slopes, states[0], scores)
+            return uncertainty.variance(reduced, of.family.num_parameters, freedom)
+
+        all_of_it = left(size)
+        return left(larger) / all_of_it if all_of_it > 0 else 1.0
+
+    def _larger(self, size: Size) -> Size | None:
+        """The size two further, as a symmetric map gains nothing from the odd degrees; the next, or
+        None, where there is none."""
         place = self.sizes.index(size)
         further = self.sizes[place + 1 : place + 3]
-        return further[-1].family if further else None
+        return further[-1] if further else None
 
     def _factor(self, group, clock: Clock, say) -> _Factors:
         if group not in self._factors:

@@ -148,6 +148,13 @@ class SymplecticMap:
 
         return samples.sampled(self, key, num)
 
+    def sharded(self, devices: int | str = "all"):
+        """This map with its rollouts shared out among devices of this process, "all" or the first
+        so many: `maps.sharded.Sharded`."""
+        from gfnn_jax.maps import sharded  # stands after this module: a shorthand for its class
+
+        return sharded.Sharded(self, sharded.local_devices(devices))
+
     def step(self, z, args=None, *, dt=None, t0=None):
         """One step: (Z, Info); Info's leaves are () or (B,). dt: of `over`."""
         z = self._states(z)

@@ -1,0 +1,118 @@
+"""Rollouts over several devices: lanes in blocks of one size, the blocks shared out.
+
+Each device runs the program that one device runs, on blocks of one shape, so that a lane's bits
+depend neither on how many devices there are nor on how many lanes. No loop waits for another
+device, and nothing is sent from one to another. (``jax.shard_map`` is compiled in another way for
+several devices than for one: the last digits then differ.)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import numpy as np
+
+from gfnn_jax.maps.symplectic_map import Lanes, RolloutInfo, SymplecticMap
+
+# Lanes of a block. On a CPU 64 and 1,024 are no faster for a generated map, 64 perhaps for a law
+# (benchmarks/scaling.py, on a busy machine); an accelerator wants many, and was not at hand to tell
+# how many.
+_ON_CPU, _ON_ACCELERATORS = 256, 16_384
+
+
+def local_devices(devices: int | str = "all") -> tuple[Any, ...]:
+    """Devices of this process: "all", or the first so many. Raises ValueError where there are not
+    so many."""
+    own = jax.local_devices()
+    count = len(own) if isinstance(devices, str) else devices
+    if not 1 <= count <= len(own):
+        raise ValueError(f"expected 1 to {len(own)} devices, which there are; got {count}")
+    return tuple(own[:count])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sharded:
+    """A map whose rollouts are shared out among devices of this process.
+
+    ``start``, ``advance`` and ``rollout`` take and mean what those of the map do, for batches of
+    states. They answer with NumPy arrays, put together from what each device has found. The last
+    block is filled up with copies of the last lane.
+    """
+
+    map: SymplecticMap
+    devices: tuple[Any, ...]
+
+    @property
+    def block(self) -> int:
+        """Lanes that are stepped together."""
+        return _ON_CPU if self.devices[0].platform == "cpu" else _ON_ACCELERATORS
+
+    def start(self, z0, *, params=None, t0=None, stop_outside: bool = False) -> Lanes:
+        """Lanes at step 0 from z0 (B, 2d)."""
+
+        def start(map_, z, args):
+            return map_.start(z, params=args, stop_outside=stop_outside)
+
+        return self._shared_out(start, *self._given(z0, params, t0))
+
+    def advance(
+        self, lanes: Lanes, num_saved: int, *, params=None, t0=None, save_every: int = 1,
+        stop_outside: bool = False,
+    ) -> tuple[Lanes, Any]:  # fmt: skip
+        """``num_saved`` blocks of ``save_every`` steps: the lanes after them, and the saved states
+        (B, num_saved, 2d)."""
+        options = {"save_every": save_every, "stop_outside": stop_outside}
+
+        def advance(map_, lanes, args):
+            return map_.advance(lanes, num_saved, params=args, **options)
+
+        return self._shared_out(advance, lanes, self._args(params, lanes.y, t0))
+
+    def rollout(
+        self, z0, num_steps: int, *, params=None, t0=None, save_every: int = 1,
+        stop_outside: bool = False,
+    ) -> tuple[Any, RolloutInfo]:  # fmt: skip
+        """Predict ``num_steps`` steps from z0 (B, 2d): the states
+        (B, 1 + num_steps // save_every, 2d), and a RolloutInfo. Raises what the map's does."""
+        options = {"save_every": save_every, "stop_outside": stop_outside}
+
+        def rollout(map_, z, args):
+            return map_.rollout(z, num_steps, params=args, **options)
+
+        return self._shared_out(rollout, *self._given(z0, params, t0))
+
+    def _given(self, z0, params, t0) -> tuple[np.ndarray, Any]:
+        z0 = np.asarray(self.map._states(z0))
+        if z0.ndim != 2 or not len(z0):
+            raise ValueError(f"expected states (B, {2 * self.map.dim}), B > 0; got {z0.shape}")
+        return z0, self._args(params, z0, t0)
+
+    def _args(self, params, z, t0) -> Any:
+        """Those of each lane, (B, k), or None."""
+        args = self.map._args(params, z, t0)
+        return args if args is None else np.broadcast_to(args, (len(z), np.shape(args)[-1]))
+
+    def _shared_out(self, function: Callable, lanes: Any, args: Any) -> Any:
+        """``function(map, lanes, args)`` of all lanes, whose leaves are (B, ...)."""
+        own = jax.tree.map(np.asarray, (lanes, args))
+        count, size = len(jax.tree.leaves(own)[0]), self.block
+        firsts, num = range(0, count, size), len(self.devices)
+
+        def on(index: int) -> list[Any]:
+            """What the device of this index finds of its blocks."""
+            map_ = jax.device_put(self.map, self.devices[index])
+            found = []
+            for first in firsts[index::num]:
+                rows = np.minimum(np.arange(first, first + size), count - 1)
+                block = jax.tree.map(lambda a, rows=rows: a[rows], own)
+                found.append(jax.tree.map(np.asarray, function(map_, *block)))
+            return found
+
+        with ThreadPoolExecutor(num) as pool:  # they wait for their devices
+            by_device = [*pool.map(on, range(num))]
+        blocks = [by_device[i % num][i // num] for i in range(len(firsts))]
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)

@@ -1,0 +1,74 @@
+"""A network H through its flow: a pendulum, told nothing but the angle."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax.families.terms import given_terms
+from gfnn_jax.flows.collocation import Steps, images
+
+PENDULUM, TRUE = given_terms(1, ["p**2", "cos(q)"]), np.array([0.5, -1.0])
+DT, TOLERANCE = 0.3, 1e-3
+
+
+def states(count, seed):
+    return np.random.default_rng(seed).uniform([-3.1, -1.5], [3.1, 1.5], (count, 2))
+
+
+def moved(z, dt=DT):
+    return images(PENDULUM, TRUE, z, dt, Steps(10, 1)).states
+
+
+@pytest.fixture(scope="module")
+def fit():
+    z = states(400, 0)
+    return gfnn.fit(
+        gfnn.Pairs(z, moved(z), DT), angles=(0,), learn="hamiltonian", family="mlp",
+        tolerance=TOLERANCE,
+    )  # fmt: skip
+
+
+def test_the_flow_of_the_network_is_that_of_the_pendulum(fit):
+    """The midpoint rule alone errs by 1e-3 of the spread here: the flow has been fitted."""
+    assert fit.met
+    assert fit.chosen.family == "mlp"
+    assert fit.chosen.learns == "hamiltonian"
+    assert fit.symplecticity_defect < 1e-13
+    z = states(300, 1)
+    error = np.asarray(fit.map.step(z)[0]) - moved(z)
+    assert np.sqrt(np.mean(error**2)) < TOLERANCE
+
+
+def test_the_network_is_h_up_to_a_constant_and_holds_at_any_dt(fit):
+    z = states(300, 2) * [1, 0.9]
+    off = np.asarray(fit.map.hamiltonian(z)) - PENDULUM.value(TRUE, z)
+    assert np.std(off) < 3 * TOLERANCE
+    error = np.asarray(fit.map.over(0.1).step(z)[0]) - moved(z, 0.1)
+    assert np.sqrt(np.mean(error**2)) < TOLERANCE
+
+
+def test_energy_stays(fit):
+    rolled, info = fit.map.rollout(jnp.array([[1.0, 0.5]]), 300, save_every=300)
+    assert not info.status.any()
+    energy = np.asarray(fit.map.hamiltonian(rolled[0]))
+    assert abs(energy[-1] - energy[0]) < 1e-10
+
+
+def test_it_has_no_formula_and_is_saved_to_the_bit(fit, tmp_path):
+    assert fit.formula is None
+    with pytest.raises(gfnn.FitError, match="got a network"):
+        fit.accelerate()
+    fit.map.save(tmp_path / "m")
+    again, z = gfnn.load(tmp_path / "m"), states(50, 3)
+    np.testing.assert_array_equal(again.step(z)[0], fit.map.step(z)[0])
+
+
+def test_what_it_cannot_be_learned_from_is_refused():
+    z = states(100, 4)
+    options = {"learn": "hamiltonian", "tolerance": TOLERANCE}
+    with pytest.raises(gfnn.FitError, match="no family but 'mlp'"):
+        gfnn.fit(gfnn.Pairs(z, moved(z), DT), family="sines", **options)
+    several = gfnn.Pairs(z, moved(z), np.linspace(0.1, 0.3, 100))
+    with pytest.raises(gfnn.FitError, match="family"):
+        gfnn.fit(several, family="mlp", **options)

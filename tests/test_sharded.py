@@ -1,0 +1,284 @@
+"""Rollouts shared out among devices and processes: the same bits on any number of them."""
+
+import dataclasses
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic import map_of
+
+from gfnn_jax import processes
+from gfnn_jax.cli import main
+from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.data import parts
+from gfnn_jax.data.predictions import PredictionWriter, job_of
+from gfnn_jax.errors import InputError
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.products import Products
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.generating.charts import MIDPOINT
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.maps import saved
+from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.parameters import sampled
+from gfnn_jax.maps.sharded import local_devices
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.processes import Share
+
+DT, LANES, STEPS = 0.3, 700, 60
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A model of no fit, a near-identity map of many terms, and 700 initial states."""
+    folder = tmp_path_factory.mktemp("sharded")
+    rng = np.random.default_rng(0)
+    z = rng.uniform(-1, 1, (100, 2))
+    family = Products(box_inputs(z), 6)
+    params = family.unflatten(rng.normal(size=family.num_parameters) / 1000)
+    generated = Generated(family, params, MIDPOINT, DT, np.ones(2))
+    map_ = SymplecticMap((generated,), CARTESIAN, covering(z), np.ones(2), np.zeros(0), DT)
+    saved.save(map_, folder / "m")
+    np.save(folder / "z0.npy", rng.uniform(-0.5, 0.5, (LANES, 2)))
+    return folder
+
+
+ON_DEVICES = """
+import sys
+from pathlib import Path
+import jax
+jax.config.update("jax_enable_x64", True)
+import numpy as np
+from gfnn_jax.data.predictions import PredictionWriter
+from gfnn_jax.jobs import predict as job
+from gfnn_jax.maps import saved
+
+folder = Path(sys.argv[1])
+map_, z0 = saved.load(folder / "m"), np.load(folder / "z0.npy")
+assert len(jax.devices()) == 8
+found = []
+for count in (1, 2, 4, 8):
+    states, info = map_.sharded(count).rollout(z0, 60, save_every=20)
+    found.append((states.tobytes(), *(a.tobytes() for a in info)))
+assert len(set(found)) == 1, "bits depend on the number of devices"
+block, _ = map_.rollout(z0[:256], 60, save_every=20)
+np.testing.assert_array_equal(block, states[:256], "a block is what the map itself makes of it")
+few, _ = map_.sharded(1).rollout(z0[:3], 60, save_every=20)
+np.testing.assert_array_equal(few, states[:3], "bits depend on the number of lanes")
+
+def predicted(name, devices, **more):
+    job.predict(folder / "m", folder / "z0.npy", num_steps=60, out=folder / name, devices=devices,
+                **more)
+    return (folder / name).read_bytes()
+
+job._CHUNK_LANE_STEPS = 7_000
+whole = predicted("one.npz", 1)
+append = PredictionWriter.append
+
+def stopping(self, states, carry):
+    append(self, states, carry)
+    if self.saved > 20:
+        raise KeyboardInterrupt
+
+PredictionWriter.append = stopping
+try:
+    predicted("stopped.npz", 8)
+except KeyboardInterrupt:
+    PredictionWriter.append = append
+assert predicted("stopped.npz", 2, resume=True) == whole, "resumed on other devices"
+"""
+
+
+def environment(**more):
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    cache = {k: v for k, v in os.environ.items() if "CACHE" in k}
+    return {**kept, **cache, "PYTHONPATH": os.pathsep.join(sys.path), **more}
+
+
+def test_the_same_bits_on_any_number_of_devices(folder):
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
+    ran = subprocess.run(
+        [sys.executable, "-c", ON_DEVICES, str(folder)], capture_output=True, text=True,
+        check=False, env=environment(XLA_FLAGS=flags),
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+
+
+def test_parameters_go_with_their_lanes():
+    """Of one block and a part of the next, as the map itself makes all of them."""
+    rng = np.random.default_rng(1)
+    z, args = rng.uniform(-1, 1, (300, 2)), rng.uniform(0.5, 1.5, (300, 1))
+    piece = Flow(Terms(1, ("p1", "q1", "k"), ((2, 0, 0), (0, 2, 1)), ("k",)), np.full(2, 0.5), DT,
+                 np.ones(2))  # fmt: skip
+    map_ = dataclasses.replace(map_of(piece, z), parameters=sampled(("k",), args))
+    states, info = map_.sharded().rollout(z, 5, params=args[:, 0])
+    expected, how = map_.rollout(z, 5, params=args[:, 0])
+    np.testing.assert_allclose(states, expected, rtol=0, atol=1e-14)
+    assert (info.status == np.asarray(how.status)).all()
+
+
+def test_more_devices_than_there_are():
+    with pytest.raises(ValueError, match="expected 1 to 1 devices, which there are; got 2"):
+        local_devices(2)
+
+
+@pytest.mark.parametrize(("number", "count"), [(0, 2), (1, 3), (700, 2), (700, 5), (5_000, 8)])
+def test_shares_are_all_lanes_in_whole_blocks(number, count):
+    shares = [Share(i, count).of(number, 256) for i in range(count)]
+    assert [i for s in shares for i in range(number)[s]] == [*range(number)]
+    assert all(s.start % 256 == 0 for s in shares if s.start < s.stop)
+
+
+# Several processes
+
+
+def port():
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+def started(folder, out, *more, num_steps=STEPS, count=2):
+    """So many processes of one prediction."""
+    address = f"127.0.0.1:{port()}"
+    return [
+        subprocess.Popen(
+            [sys.executable, "-m", "gfnn_jax", "predict", str(folder / "m"), "--initial",
+             str(folder / "z0.npy"), "--num-steps", str(num_steps), "--out", str(out),
+             "--distributed", *more],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            env=environment(JAX_COORDINATOR_ADDRESS=address, JAX_NUM_PROCESSES=str(count),
+                            JAX_PROCESS_ID=str(i)),
+        )
+        for i in range(count)
+    ]  # fmt: skip
+
+
+def ended(running):
+    """(status, stdout, stderr) of each."""
+    told = [process.communicate(timeout=100) for process in running]
+    return [(p.returncode, *texts) for p, texts in zip(running, told, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def alone(folder):
+    assert main(
+        ["predict", str(folder / "m"), "--initial", str(folder / "z0.npy"), "--num-steps",
+         str(STEPS), "--out", str(folder / "alone.npz"), "--devices", "all"]
+    ) == 0  # fmt: skip
+    return (folder / "alone.npz").read_bytes()
+
+
+def test_two_processes_write_one_result(folder, alone):
+    found = ended(started(folder, folder / "two.npz"))
+    assert [status for status, *_ in found] == [0, 0], found
+    assert "700 trajectories" in found[0][1]
+    assert "process 1 of 2: 444 trajectories" in found[1][1]
+    assert (folder / "two.npz").read_bytes() == alone
+    assert not [*folder.glob("two.part*")]
+
+
+# JAX tells others that the first process is gone at once, and of another after ten seconds.
+@pytest.mark.parametrize("killed", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_killed_process_ends_the_others(killed, folder):
+    steps, out = 200_000, folder / f"killed{killed}.npz"
+    running = started(folder, out, "--save-every", "1000", num_steps=steps)
+    journals = [folder / f"{out.stem}.part{i}of2.npz.partial/journal.jsonl" for i in (0, 1)]
+    limit = time.monotonic() + 60
+    while not all(j.exists() and j.read_bytes().count(b"\n") > 3 for j in journals):
+        assert time.monotonic() < limit, [p.poll() for p in running]
+        time.sleep(0.05)
+    running[killed].kill()
+    found = ended(running)
+    status, _, told = found[1 - killed]
+    assert status != 0
+    lines = [line for line in told.splitlines() if not line.startswith("[")]  # but progress
+    assert len(lines) == 1, told
+    assert lines[0].startswith("gfnn: this process or another one of the job was lost: what they")
+    for journal in journals:
+        assert journal.read_bytes().count(b"\n") > 3
+    with pytest.raises(InputError, match="of another number of processes than 3"):
+        parts.check_count(out, Share(0, 3))
+
+
+def test_a_killed_job_resumes_to_the_same_bits(folder, alone, monkeypatch):
+    """Of one of two parts only the beginning is there."""
+    from gfnn_jax.jobs import predict as job
+
+    append = PredictionWriter.append
+
+    def stopping(self, states, carry):
+        append(self, states, carry)
+        if self.saved > 20:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(job, "_CHUNK_LANE_STEPS", 7_000)
+        patch.setattr(PredictionWriter, "append", stopping)
+        with pytest.raises(KeyboardInterrupt):
+            job.predict(folder / "m", folder / "z0.npy", num_steps=STEPS,
+                        out=folder / "again.npz", share=Share(0, 2))  # fmt: skip
+    found = ended(started(folder, folder / "again.npz", "--resume"))
+    assert [status for status, *_ in found] == [0, 0], found
+    assert (folder / "again.npz").read_bytes() == alone
+
+
+def test_parts_of_everything_that_a_prediction_can_hold(tmp_path):
+    """Put together as if one process had written it."""
+    rng = np.random.default_rng(0)
+    states, z0 = rng.normal(size=(5, 3, 10)), rng.normal(size=(5, 1))
+    job = {"num_steps": 2, "dt": 0.5, "bands": True}
+
+    def written(path, lanes, identity):
+        writer = PredictionWriter(
+            path, shape=(len(range(5)[lanes]), 2), identity=identity, params=(("a",), z0[lanes]),
+            drive=(z0[lanes, 0], 2.0), **job,
+        )  # fmt: skip
+        writer.append(states[lanes], {})
+        writer.finish(np.arange(5)[lanes], np.arange(5)[lanes], band="model",
+                      horizon=np.arange(5)[lanes])  # fmt: skip
+        return path
+
+    whole = written(tmp_path / "whole.npz", slice(0, 5), {"m": 1})
+    own = [
+        written(tmp_path / f"{i}.npz", lanes, {"m": 1, "part": i})
+        for i, lanes in enumerate((slice(0, 2), slice(2, 5)))
+    ]
+    parts.put_together(own, tmp_path / "p.npz", job_of({"m": 1}, (5, 2), **job))
+    assert (tmp_path / "p.npz").read_bytes() == whole.read_bytes()
+    assert not any(path.exists() for path in own)
+
+
+@pytest.mark.parametrize(
+    ("told", "line"),
+    [
+        ({}, "expected a launcher that JAX knows, as srun and mpirun, or JAX_COORDINATOR_ADDRESS"),
+        ({"JAX_PROCESS_ID": "one"}, "expected a whole number as JAX_PROCESS_ID, got 'one'"),
+    ],
+)
+def test_nobody_says_where_the_others_are(told, line, monkeypatch):
+    for name, value in told.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(InputError, match=line):
+        processes.join()
+
+
+def test_more_devices_than_cores(folder, capsys):
+    command = ["predict", folder / "m", "--initial", folder / "z0.npy", "--num-steps", 5, "--out",
+               folder / "s.npz", "--devices", 10_000]  # fmt: skip
+    assert main([str(part) for part in command]) == 2
+    assert "--devices: expected 1 to 1 devices" in capsys.readouterr().err
+
+
+def test_samples_stay_on_one_device(folder, capsys):
+    command = ["predict", folder / "m", "--initial", folder / "z0.npy", "--num-steps", 5, "--out",
+               folder / "s.npz", "--samples", 3, "--devices", "all"]  # fmt: skip
+    assert main([str(part) for part in command]) == 2
+    assert "expected --samples without --devices" in capsys.readouterr().err
+    assert not Path(folder / "s.npz").exists()
