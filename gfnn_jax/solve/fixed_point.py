@@ -8,7 +8,7 @@ the residual at it; status is data; a lane that is done is frozen.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ _CLOSE = 1e-15  # in NumPy, of the residual's terms: roundoff
 _STALE = 4  # updates in NumPy that make no lane better: the end
 
 
+@runtime_checkable
 class Contraction(Protocol):
     """r(shared, lanes, x) = 0 as x = x − unit · r: a hashable constant."""
 
