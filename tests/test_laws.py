@@ -17,7 +17,7 @@ from gfnn_jax.evaluate import report
 from gfnn_jax.learn import choose_law, searches
 from gfnn_jax.learn.choose_law import preferred
 from gfnn_jax.learn.draw import drawn
-from gfnn_jax.learn.flows import Term, formula
+from gfnn_jax.learn.formula import Term, formula
 
 FORMULA = "0.5 q1² + 0.5 q2² + 0.5 p1² + 0.5 p2² + q1² q2 - 0.333333333333 q2³"
 

@@ -14,8 +14,7 @@ from gfnn_jax.learn.diagnose import (
     look_symplectic,
     sampled_dimension,
 )
-from gfnn_jax.learn.factor_out import factored_out
-from gfnn_jax.learn.flows import flow_of
+from gfnn_jax.learn.factor_out import factored_out, flow_of
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
 

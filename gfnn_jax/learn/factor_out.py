@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
+from gfnn_jax.errors import FitError
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.fitting.gauss_newton import Problem, rates
 from gfnn_jax.flows.flow import Flow
-from gfnn_jax.learn.flows import around
+from gfnn_jax.learn.cost_of_flow import CONTRACTING, FREQUENCY_STATES, contraction_of
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.sweeps import trial_residual
 
@@ -25,3 +29,30 @@ def factored_out(flows: Sequence[Flow], plain: Prepared, seed: int) -> tuple[Flo
     tried = [(flow, plain.without(*pieces)) for flow in flows for pieces in around(flow)]
     errors = [left_over(prepared) for _, prepared in tried]
     return tried[0] if errors[0] <= 2 * min(errors) else tried[int(np.argmin(errors))]
+
+
+def flow_of(family: Terms, params, prepared: Prepared) -> Flow:
+    """The flow of a law over dt, to roundoff: to be factored out.
+
+    prepared: without a base map. Raises FitError where it has no image of some of the states.
+    """
+    y0, y1, dt, scale = prepared.y0, prepared.y1, prepared.dt, prepared.scale
+    problem = Problem(y0, y1, dt, scale)
+    (steps,) = problem.fine_steps(family, params, np.arange(len(y0)))
+    fastest = rates(family, params, y0[:FREQUENCY_STATES])
+    by_newton = not contraction_of(fastest, dt, steps) <= CONTRACTING
+    flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, by_newton)
+    failed = ~np.isfinite(np.concatenate([flow.image(y0), flow.inverse().image(y1)])).all(axis=1)
+    if failed.any():
+        raise FitError(
+            "expected a law whose flow takes every state a step on and back, got "
+            f"{int(failed.sum())} of {len(y0) + len(y1)} without an image"
+        )
+    return flow
+
+
+def around(flow: Flow) -> list[tuple[Flow | None, Flow | None]]:
+    """(before, after) what is learned: half of the flow on either side, which keeps the symmetry in
+    time, or all of it on one, which suits a kick."""
+    half = dataclasses.replace(flow, dt=0.5 * flow.dt)
+    return [(half, half), (flow, None), (None, flow)]

@@ -8,7 +8,6 @@ go while the held-out error does not rise.
 from __future__ import annotations
 
 import dataclasses
-import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -40,10 +39,17 @@ from gfnn_jax.fitting.growth import grow
 from gfnn_jax.fitting.least_squares import Reduced
 from gfnn_jax.flows.collocation import Steps, images, of_lanes, truncation
 from gfnn_jax.flows.flow import Flow
-from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.learn.assemble import Assembled, composed, stepped
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
 from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.cost_of_flow import (
+    CONTRACTING,
+    FREQUENCY_STATES,
+    contraction_of,
+    omega_h_of,
+    operations_of,
+)
+from gfnn_jax.learn.formula import Term, formula
 from gfnn_jax.learn.held_out import looked_at, outermost
 from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
 from gfnn_jax.learn.prepare import Prepared
@@ -65,9 +71,8 @@ class Options:
     certain: standard errors below which a term is then noise (one in 16,000 by chance).
     explained: standard errors of the part of a residual that is noise, within which all of it is.
     gained: a library that lowers the error by less has not helped; twice in a row ends the search.
-    truncation: a flow's own error, as a part of the tolerance. contracting: a fixed point's factor
-    up to which it is preferred to Newton's method. goal: residual that modes grow to, as a part of
-    the tolerance. generators: degrees of those that look for misfit; sampled_rows: per term, where
+    truncation: a flow's own error, as a part of the tolerance. goal: residual that modes grow to,
+    as a part of the tolerance. generators: degrees of those that look for misfit; sampled_rows: per term, where
     what is left over is looked at.
     max_seconds: of the search; mode_seconds: where modes grow, growth_part: the part
     of them in which they may.
@@ -89,7 +94,6 @@ class Options:
     explained: float = 2.0
     gained: float = 0.5
     truncation: float = 0.1
-    contracting: float = 0.8
     goal: float = 0.3
     generators: tuple[int, ...] = (2, 3, 4, 5, 6)
     sampled_rows: int = 6
@@ -100,7 +104,6 @@ class Options:
 
 OPTIONS = Options()
 _ROUNDOFF = 1e-12  # of the spread: above it the pairs carry noise, and every one of them counts
-_FREQUENCY_STATES = 500
 _NEAR_ROUNDOFF = 3e-15  # of the spread
 _HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
 _NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
@@ -112,14 +115,6 @@ _POOR, _POOR_GIVEN, _POOR_STRUCTURED = 2, 3, 5
 _TURNING = 2_000  # pairs that tell how far a step turns the states
 _EXPLAINED = 0.05  # of the spread: an error below it is that of the right branch of the turns
 _FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
-
-
-class Term(NamedTuple):
-    """One term of the formula, its coefficient and that one's standard error."""
-
-    term: str
-    coefficient: float
-    std: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -615,14 +610,14 @@ def _learned(
     family, fit = found.family, found.fit
     rows = judges.held_out
     z, args = prepared.y0[rows], prepared.given(rows)[1]
-    some = slice(_FREQUENCY_STATES)
+    some = slice(FREQUENCY_STATES)
     fastest = rates(family, fit.coefficients, prepared.y0[some], prepared.given(some)[1])
     if prepared.own_dt is not None:  # the map's own dt, from which others follow
         problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, args=prepared.args)
     steps = _cheapest(problem, family, fit, fastest, judges, options)
     steps = _resolving(family, fit.coefficients, steps, prepared, judges)
     contraction = contraction_of(fastest, prepared.dt, steps)
-    by_newton = contraction > options.contracting and not matrix_free(family)
+    by_newton = contraction > CONTRACTING and not matrix_free(family)
     off = truncation(family, fit.coefficients, z, prepared.dt, steps, args=args) / prepared.scale
     flow = Flow(
         family, fit.coefficients, prepared.dt, prepared.scale, steps.stages, steps.substeps,
@@ -742,70 +737,6 @@ def _cheapest(problem, family, fit: FlowFit, fastest, judges: Judges, options: O
     return next(s for s in reversed(found) if s == found[0] or cost(s) < 2 * cost(found[0]))
 
 
-def flow_of(family: Terms, params, prepared: Prepared) -> Flow:
-    """The flow of a law over dt, to roundoff: to be factored out.
-
-    prepared: without a base map. Raises FitError where it has no image of some of the states.
-    """
-    y0, y1, dt, scale = prepared.y0, prepared.y1, prepared.dt, prepared.scale
-    problem = Problem(y0, y1, dt, scale)
-    (steps,) = problem.fine_steps(family, params, np.arange(len(y0)))
-    fastest = rates(family, params, y0[:_FREQUENCY_STATES])
-    by_newton = not contraction_of(fastest, dt, steps) <= OPTIONS.contracting
-    flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, by_newton)
-    failed = ~np.isfinite(np.concatenate([flow.image(y0), flow.inverse().image(y1)])).all(axis=1)
-    if failed.any():
-        raise FitError(
-            "expected a law whose flow takes every state a step on and back, got "
-            f"{int(failed.sum())} of {len(y0) + len(y1)} without an image"
-        )
-    return flow
-
-
-def around(flow: Flow) -> list[tuple[Flow | None, Flow | None]]:
-    """(before, after) what is learned: half of the flow on either side, which keeps the symmetry in
-    time, or all of it on one, which suits a kick."""
-    half = dataclasses.replace(flow, dt=0.5 * flow.dt)
-    return [(half, half), (flow, None), (None, flow)]
-
-
-def flow_operations(flow: Flow, prepared: Prepared) -> float:
-    """Floating-point operations per step of the flow."""
-    fastest = rates(flow.family, flow.params, prepared.y0[:_FREQUENCY_STATES])
-    steps = Steps(flow.stages, flow.substeps)
-    return operations_of(flow.family, len(prepared.scale), fastest, float(flow.dt), steps)
-
-
-def contraction_of(fastest, dt: float, steps: Steps) -> float:
-    """The factor by which the stages' fixed point contracts in the end, where it is largest."""
-    radius = np.abs(np.linalg.eigvals(gauss(steps.stages).matrix)).max()
-    return float(dt / steps.substeps * fastest.max() * radius)
-
-
-def operations_of(family, width: int, fastest, dt: float, steps: Steps) -> float:
-    """Floating-point operations per step of states (2d,), width 2d: as many iterations as roundoff
-    takes at this factor."""
-    gradient, with_hessian = family.operations
-    s = steps.stages
-    factor = contraction_of(fastest, dt, steps)
-    if factor > OPTIONS.contracting and not matrix_free(family):
-        one = s * with_hessian + (s * width) ** 3 * 2 / 3
-        return float(steps.substeps * 4 * one)
-    iterations = 2 + np.log(1e-16) / np.log(np.clip(factor, 1e-3, OPTIONS.contracting))
-    return float(steps.substeps * iterations * s * (gradient + 2 * width * s))
-
-
-def omega_h_of(family, coefficients, prepared: Prepared, fastest) -> float:
-    """The fastest oscillation of the linearised flow, radians per step, its median over states."""
-    if not matrix_free(family):
-        some = slice(_FREQUENCY_STATES)
-        z, args = prepared.y0[some], prepared.given(some)[1]
-        _, hessian = family.gradient_and_hessian(coefficients, z, args)
-        turned = symplectic_form(prepared.dim) @ hessian
-        fastest = np.abs(np.linalg.eigvals(turned).imag).max(axis=-1)
-    return float(prepared.dt * np.median(fastest))
-
-
 def _messages(
     error: OneStepError, omega_h: float, prepared, judges, found: _Fitted, left_out: int,
     unresolved: int,
@@ -846,31 +777,6 @@ def _messages(
             f"{unresolved} of {len(judges.held_out)} held-out pairs are not resolved to the "
             "tolerance by the flow's own steps: there the map is in error, and not the law"
         )
-
-
-def formula(terms: Sequence[Term]) -> str:
-    """H as text: "0.5 p1² + 0.5 p2² - 0.333333333333 q2³"."""
-    text = ""
-    for term, coefficient, std in terms:
-        if coefficient == 0:
-            continue
-        sign = " - " if coefficient < 0 else " + "
-        size = abs(coefficient)
-        digits = 12 if std <= 0 else int(np.clip(np.ceil(np.log10(size / std)) + 1, 2, 12))
-        number = f"{size:.{digits}g}"
-        factor = "" if number == "1" else f"{number} "
-        if factor and term.startswith("1/"):
-            factor, term = number, term[1:]
-        shown = f"({term})" if factor and _is_sum(term) else term
-        text += (sign if text else sign.strip().removeprefix("+")) + factor + shown
-    return text or "0"
-
-
-def _is_sum(term: str) -> bool:
-    """Whether a user's term is a sum, which a coefficient before it would not multiply."""
-    term = re.sub(r"\|[^|]*\|", "r", term)  # a distance holds its own difference
-    depth = np.cumsum([(c in "(") - (c in ")") for c in term])
-    return any(depth[i] == 0 and term[i : i + 3] in (" + ", " - ") for i in range(len(term)))
 
 
 def assembled(learned: LearnedHamiltonian, prepared: Prepared, judges: Judges) -> Assembled:

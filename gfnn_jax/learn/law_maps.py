@@ -15,10 +15,11 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.choose_charts import Charts
 from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.cost_of_flow import flow_operations
 from gfnn_jax.learn.diagnosed import diagnosed
 from gfnn_jax.learn.draw import drawn
-from gfnn_jax.learn.factor_out import TRIAL_PAIRS, factored_out
-from gfnn_jax.learn.flows import LearnedHamiltonian, flow_of, flow_operations
+from gfnn_jax.learn.factor_out import TRIAL_PAIRS, factored_out, flow_of
+from gfnn_jax.learn.flows import LearnedHamiltonian
 from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.search import Entry, Found, search
 from gfnn_jax.learn.sweeps import sweeps_for

@@ -29,7 +29,8 @@ from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
 from gfnn_jax.learn.choose_law import unfit_for_law
 from gfnn_jax.learn.clock import Clock
-from gfnn_jax.learn.flows import LearnedHamiltonian, contraction_of, omega_h_of, operations_of
+from gfnn_jax.learn.cost_of_flow import contraction_of, omega_h_of, operations_of
+from gfnn_jax.learn.flows import LearnedHamiltonian
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.sweeps import residual_weight
 from gfnn_jax.scenes.scene import Scene
