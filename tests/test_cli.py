@@ -477,6 +477,38 @@ def test_an_interrupted_fit_publishes_the_best_of_all_its_runs(
     assert "unfinished" not in models.record(tmp_path / "m")
 
 
+@pytest.mark.parametrize("family", ["polynomial", "sines", "mlp"])
+def test_a_fit_survives_two_of_each_signal(family, tmp_path, monkeypatch):
+    """At different moments of a fit that is resumed each time: the map of one that nothing met."""
+    data = pairs_file(tmp_path / "d.npz", oscillator(300, [0, 1.0]), dt=1.0)
+    # Tolerances that take several sizes, and a training that ends in seconds.
+    tolerance = {"polynomial": 1e-14, "sines": 1e-14, "mlp": 1e-2}[family]
+    fit = ("fit", data, "--family", family, "--chart", "midpoint", "--tolerance", tolerance)
+    assert gfnn(*fit, "--out", tmp_path / "whole") == 0
+    say, count = progress._Lines.say, 0
+    signals = [(signal.SIGINT, 2), (signal.SIGTERM, 3), (signal.SIGINT, 4), (signal.SIGTERM, 5)]
+    for number, moment in signals:
+        count = 0
+
+        def counting(self, message, number=number, moment=moment):
+            nonlocal count
+            say(self, message)
+            count += 1
+            if count == moment:
+                signal.raise_signal(number)
+
+        monkeypatch.setattr(progress._Lines, "say", counting)
+        status = gfnn(*fit, "--out", tmp_path / "m", "--resume")
+        assert status == (130 if number == signal.SIGINT else 143)
+        if (tmp_path / "m").exists():
+            assert np.isfinite(models.load(tmp_path / "m").step(np.full(2, 0.1))[0]).all()
+    monkeypatch.setattr(progress._Lines, "say", say)
+    assert gfnn(*fit, "--out", tmp_path / "m", "--resume") == 0
+    z = np.random.default_rng(1).uniform(-0.5, 0.5, (5, 2))
+    images = [models.load(tmp_path / name).step(z)[0] for name in ("m", "whole")]
+    np.testing.assert_array_equal(*images)
+
+
 def test_an_interrupted_fit_leaves_an_older_model_as_it_is(fitted, tmp_path, capsys, monkeypatch):
     fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m", "--overwrite")
     monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
