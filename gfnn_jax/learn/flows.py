@@ -72,10 +72,9 @@ class Options:
     explained: standard errors of the part of a residual that is noise, within which all of it is.
     gained: a library that lowers the error by less has not helped; twice in a row ends the search.
     truncation: a flow's own error, as a part of the tolerance. goal: residual that modes grow to,
-    as a part of the tolerance. generators: degrees of those that look for misfit; sampled_rows: per term, where
-    what is left over is looked at.
-    max_seconds: of the search; mode_seconds: where modes grow, growth_part: the part
-    of them in which they may.
+    as a part of the tolerance. generators: degrees of those that look for misfit; sampled_rows: per
+    term, where what is left over is looked at. max_seconds: of the search; mode_seconds: where
+    modes grow, growth_part: the part of them in which they may.
     """
 
     degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 8)
