@@ -170,7 +170,7 @@ def test_a_map_without_a_flow_has_parameters_too():
     assert fit.chosen.learns == "map"
     assert set(fit.map.pieces[0].family.term_names) == {"p1²", "cos(q1) k"}
     z, strength = rng.uniform(0, 2 * np.pi, (50, 2)), rng.uniform(0.5, 2, 50)
-    found, _ = fit.map.step(z, {"k": strength})
+    found, _ = fit.map.step(z, {"k": strength}, dt=1.0)  # its own dt
     error = np.asarray(found) - kicked(z, strength)
     assert np.abs(error - 2 * np.pi * np.round(error / (2 * np.pi))).max() < 1e-13
     with pytest.raises(ValueError, match="a map of dt = 1 only: fit with learn='hamiltonian'"):

@@ -172,8 +172,11 @@ class SymplecticMap:
         """The map over another time than that of the data: of the flow of one Hamiltonian.
 
         dt: a number, or one of each lane where that many ``lanes`` are to be stepped; above 0.
-        Raises ValueError for any other map: it is known at one dt only.
+        Raises ValueError for any other map, unless dt is its own: it is known at one dt only.
         """
+        known = not any(isinstance(value, jax.core.Tracer) for value in (dt, self.dt))
+        if known and np.ndim(dt) == 0 and dt == self.dt:
+            return self
         if len(self.pieces) != 1 or not isinstance(self.pieces[0], Flow):
             raise ValueError(
                 f"expected the flow of a Hamiltonian to step another dt, got a map of dt = "
