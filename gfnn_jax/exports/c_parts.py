@@ -86,9 +86,11 @@ static void to_user(const double y[4], double z[4])
 
 def newton_solver(unknowns: int, width: int) -> str:
     """Newton's method for up to so many unknowns of states (width,)."""
+    bend = newton._BENT
     return f"""\
 enum {{ MOST = {MOST_UPDATES}, N = {unknowns}, WIDTH = {width} }};
-static const double FLOOR = {literal(newton._FLOOR_EPS * _EPS)}, SETTLED = {literal(newton.settled_floors(np.float64))};
+static const double FLOOR = {literal(newton._FLOOR_EPS * _EPS)};
+static const double SETTLED = {literal(newton.settled_floors(np.float64))};
 
 struct point {{
     double residual[N], size[N], gradient[WIDTH];
@@ -156,7 +158,8 @@ static int newton(const struct equation *of, const double *z, double *x, double 
     const int smaller = after < merit;
     const int done = smaller && !goes_on(error_there, after, merit);
     int open = !done && (smaller || error > SETTLED);
-    double factor = error_there <= SETTLED || after <= {literal(newton._STRAIGHT)}*merit ? 1.0 : {literal(newton._BEGIN)};
+    const int straight = error_there <= SETTLED || after <= {literal(newton._STRAIGHT)}*merit;
+    double factor = straight ? 1.0 : {literal(newton._BEGIN)};
     if (smaller && !open) {{
         here = there;
         error = error_there;
@@ -181,13 +184,13 @@ static int newton(const struct equation *of, const double *z, double *x, double 
         }}
         const double floor = FLOOR*largest(n, there.size);
         const int near = largest(n, off) <= {literal(newton._OFF_PATH)}*factor*merit + 4.0*floor;
-        const int by_the_path = bent <= {literal(newton._BENT)} && near && sign_there == sign;
+        const int by_the_path = bent <= {literal(bend)} && near && sign_there == sign;
         const int settled = error <= SETTLED;
         if (by_the_path || (settled && new_merit < merit)) {{
             iterations++;
             open = goes_on(new_error, new_merit, merit) && iterations < MOST;
-            factor *= {literal(0.95 * newton._BENT)}/clip(bent, {literal(0.25 * newton._BENT)}, {literal(2 * newton._BENT)});
-            factor = fmin(factor, 1.0);
+            const double bend = clip(bent, {literal(0.25 * bend)}, {literal(2 * bend)});
+            factor = fmin({literal(0.95 * bend)}/bend*factor, 1.0);
             here = there;
             error = new_error;
             merit = new_merit;
@@ -291,6 +294,8 @@ static int collocated(void (*gradient)(const double *, double *), int stages,
             sum += slopes[i][a];
         z[a] += sum;
     }}
-    return change <= {literal(_EPS**flow._SETTLED)} ? OK : isfinite(change) ? NOT_CONVERGED : NON_FINITE;
+    if (change <= {literal(_EPS**flow._SETTLED)})
+        return OK;
+    return isfinite(change) ? NOT_CONVERGED : NON_FINITE;
 }}
 """

@@ -1,4 +1,4 @@
-"""The pieces of a map in C: ``static int PIECE_step(double *z)`` and ``PIECE_back``, its inverse."""
+"""The pieces of a map in C: ``int PIECE_step(double *z)``, and ``PIECE_back``, its inverse."""
 
 from __future__ import annotations
 

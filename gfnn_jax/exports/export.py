@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gfnn_jax.errors import InputError
 from gfnn_jax.exports.c_source import c_source
 from gfnn_jax.exports.stablehlo import stablehlo
@@ -53,7 +55,9 @@ def export(
     if to == "c":
         atomic_write(out, c_source(map_, _identifier(out), about))
     else:
-        atomic_write(out, stablehlo(map_, about))
+        known = {"dim": map_.dim, "dt": float(np.asarray(map_.dt))}
+        names = map_.parameters.names if map_.parameters is not None else ()
+        atomic_write(out, stablehlo(map_, {**known, "parameters": list(names), **about}))
     return out
 
 
