@@ -199,7 +199,7 @@ def test_the_file_tells_where_it_comes_from_and_keeps_nothing(tmp_path):
     plain.save(tmp_path / "mine", record={"fit": {"tolerance": 1e-6}, "data": {"source": "*/ x"}})
     text = gfnn.export(tmp_path / "mine", "c").read_text()
     comment, code = text.split("*/", 1)
-    for told in ("dt = 0.29999", "q1 0.6, p1 0.6", "0 ok; 1 left", "cc -O3 -std=c99", "1e-06",
+    for told in ("dt = 0.3 in", "q1 0.6, p1 0.6", "0 ok; 1 left", "cc -O3 -std=c99", "1e-06",
                  "SHA-256", "gfnn_jax 0", "* / x"):  # fmt: skip
         assert told in comment
     assert "malloc" not in code

@@ -53,7 +53,8 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
             "stablehlo takes any map)"
         )
     map_ = jax.tree.map(np.asarray, map_)
-    pieces, width = map_.pieces, 2 * map_.dim
+    pieces, width, domain = map_.pieces, 2 * map_.dim, map_.domain
+    assert isinstance(domain, Domain)
     parts = [_comment(map_, name, about), c_parts.INCLUDES, c_parts.COMMON]
     if map_.coordinates.angles:
         parts.append(c_parts.ANGLES)
@@ -66,10 +67,10 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
         parts.append(c_parts.ELIMINATION)
     if stages := max((p.stages for p in pieces if isinstance(p, Flow)), default=0):
         parts.append(c_parts.fixed_point_solver(width, stages))
-    if map_.domain.keep:
+    if domain.keep:
         tape = Tape()
         y = tape.inputs("y", width)
-        parts.append(tape.function("christoffel", {"kappa": map_.domain.christoffel(y)}))
+        parts.append(tape.function("christoffel", {"kappa": domain.christoffel(y)}))
     for i, (piece, back) in enumerate(zip(pieces, map_.reversed().pieces[::-1], strict=True)):
         parts += piece_functions(f"piece{i}", piece, back, width)
     order = range(len(pieces))
@@ -130,7 +131,7 @@ def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
 
    z = ({", ".join(names)}), in the units of the data; z and Z may be the same array.{turned}
    Sizes of the coordinates in the data: {sizes}.
-   A step is dt = {float(np.asarray(map_.dt)):.17g} in the data's unit of time.
+   A step is dt = {literal(np.asarray(map_.dt))} in the data's unit of time.
 
    Answer: {c_parts.STATUSES}.
    1: z lies outside the data's domain; its image is in Z all the same. 3, 4: Z is of no use.

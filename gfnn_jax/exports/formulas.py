@@ -37,6 +37,7 @@ def on_symbols(family: Any) -> Any:
     if not isinstance(family, Products) or family.inputs.features is None:
         return family
     inputs = family.inputs
+    assert inputs.features is not None
     traced(inputs.features, inputs.width // 2)
     fields = {f.name: getattr(inputs, f.name) for f in dataclasses.fields(inputs)}
     return dataclasses.replace(family, inputs=Formulas(**fields))
