@@ -23,7 +23,6 @@ from gfnn_jax.solve import newton
 from gfnn_jax.solve.linear import small_solve
 
 LANES = 1_000
-
 # scene, absolute tolerance, pairs, and how many microseconds a step may take: of a batch, alone.
 STEPS = {
     "henon-heiles-regular": (1e-10, 4_000, 2.0, 12.0),
@@ -31,7 +30,6 @@ STEPS = {
     "standard-map-regular": (1e-12, 1_000, None, 5.0),
     "pcr3bp": (1e-6, 10_000, None, None),
 }
-
 FEWER_STEPS = {"pcr3bp": 50}  # a batch of it has a solve that fails at nearly every step
 
 
