@@ -19,7 +19,7 @@ def measured(name: str) -> Numbers:
 
 
 def accuracy() -> str:
-    ours, paper = measured("two-body"), measured("paper-recipe")
+    ours, paper = measured("targets-two-body"), measured("targets-paper-recipe")
     return (
         f"{number(ours['one_step_rms'])}; the paper's network and training, from "
         f"{paper['pairs']:,} pairs, {number(paper['one_step_rms'])}"
@@ -27,7 +27,7 @@ def accuracy() -> str:
 
 
 def million_steps() -> str:
-    methods = measured("kepler")["methods"]
+    methods = measured("kepler-million-steps")["methods"]
     ours, known = methods["learned map"], methods["integrator, H known"]
     return (
         f"position off by {number(ours['error_end'])}, semi-major axis by "
