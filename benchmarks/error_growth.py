@@ -4,8 +4,8 @@
     python benchmarks/error_growth.py --only vfnn --overwrite  one piece again
     python benchmarks/error_growth.py --quick                  small sizes, into runs/growth
 
-A piece's result is one JSON file, growth-*.json in benchmarks/results; the section of benchmarks/RESULTS.md and
-the figures are made from these files alone.
+A piece's result is one JSON file, growth-*.json in benchmarks/results; the section of
+benchmarks/RESULTS.md and the figures are made from these files alone.
 
 The knob on the one-step error ε is the s of S + s g: S a fitted polynomial, accurate to 1e-10 or
 better, and g a random one of low degree, the same for all s. Each such map is symplectic and wrong
