@@ -79,8 +79,13 @@ static int {name}(double *z)
 class _Given:
     """A family whose derivatives at w are inputs of a C function, whatever w is."""
 
+    operations = (0, 0)
+
     def __init__(self, gradient, hessian=None):
         self._gradient, self._hessian = gradient, hessian
+
+    def value(self, params, w, args=None):
+        raise NotImplementedError  # an implicit step asks for derivatives only
 
     def gradient(self, params, w, args=None):
         return self._gradient

@@ -177,8 +177,8 @@ class Tape:
         return uses
 
 
-def literal(value: float) -> str:
-    """A float64 as C reads it back, to the last bit."""
+def literal(value: Any) -> str:
+    """A number as C reads it back, a float64 to the last bit."""
     return repr(float(value))
 
 
