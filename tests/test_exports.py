@@ -94,7 +94,7 @@ def featured():
 def in_polar():
     z = states(2) * 0.1 + np.array([1.0, 0.0, 0.0, 1.0])
     y = to_inner(coordinates := polar(cyclic=True), z)
-    family = Products(box_inputs(y, cyclic=(1,)), 3)
+    family = Products(box_inputs(y, cyclic=(1,)), 2)
     params = family.unflatten(0.005 * np.random.default_rng(1).normal(size=family.num_parameters))
     piece = Generated(family, params, TYPE2, DT, np.full(4, 0.1))
     return map_of(piece, y, coordinates=coordinates, scale=np.full(4, 0.1)), z
