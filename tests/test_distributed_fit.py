@@ -203,7 +203,7 @@ def test_files_that_differ_or_cannot_be_shared(tmp_path):
         read_sample([tmp_path / "a.npz", tmp_path / "b.npz"])
     (tmp_path / "a.csv").write_text("t,q1,p1\n0,1,2\n1,2,3\n")
     with pytest.raises(InputError, match="or as many files as processes"):
-        [*iterate_pairs(tmp_path / "a.csv", 10, share=Share(0, 2))]
+        next(iterate_pairs(tmp_path / "a.csv", 10, share=Share(0, 2)))
 
 
 # Real processes, on this machine
