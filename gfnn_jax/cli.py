@@ -392,7 +392,7 @@ def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) 
             print(f"process {group.share.index} of {group.share.count}: {sent}")
             return
     _summarise(ran, arguments.out)
-    print(f"next: gfnn predict {arguments.out} --initial {arguments.data} --num-steps 1000 "
+    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
           "--out prediction.npz")  # fmt: skip
     _hold_to(arguments.strict, arguments.out)
 

@@ -25,8 +25,8 @@ from gfnn_jax.errors import InputError, WorkError
 # first to finish waits for the last.
 _HEARTBEAT, _PATIENCE = 10, 14 * 24 * 3600
 LOST = (
-    "this process or another one of the job was lost: what they had done is kept, --resume goes on, "
-    "with any number of processes"
+    "this process or another one of the job was lost: what they had done is kept, --resume goes on "
+    "with it, in any number of processes"
 )
 
 
