@@ -49,12 +49,6 @@ the table of candidates:
   outside    relative error at the outermost twentieth of the states, of a fit without them"""
 
 
-_LOST = (
-    "this process or another one of the job was lost: what they had done is kept, --resume with as "
-    "many processes goes on"
-)
-
-
 class _Terminated(KeyboardInterrupt):
     """SIGTERM, as clean a stop as Ctrl-C."""
 
@@ -135,7 +129,9 @@ def _parser() -> argparse.ArgumentParser:
         **fitting,
     )  # fmt: skip
     command.set_defaults(command=_fit)
-    command.add_argument("data", type=Path, metavar="DATA")
+    command.add_argument(
+        "data", type=Path, metavar="DATA", nargs="+", help="one file, or several with the same dt"
+    )
     command.add_argument("--out", type=Path, metavar="MODEL", required=True, help="folder to write")
     command.add_argument("--dt", type=_positive, metavar="H", help="time step, if DATA has none")
     command.add_argument(
@@ -146,6 +142,11 @@ def _parser() -> argparse.ArgumentParser:
         "--angles", type=_indices, default=(), metavar="0,2", help="indices in z with period 2π"
     )
     _add_fit_options(command, "1e-6")
+    command.add_argument(
+        "--distributed", action="store_true",
+        help="this is one of several processes that srun or another launcher has started: each "
+        "reads its own rows of DATA, or its own files",
+    )  # fmt: skip
     command.add_argument(
         "--absolute-tolerance", type=_positive, metavar="E",
         help="instead of --tolerance: bound on the RMS per component, in the data's units",
@@ -376,8 +377,19 @@ def _fit(arguments: argparse.Namespace) -> None:
         raise InputError("expected --tolerance or --absolute-tolerance, not both")
     if not arguments.resume:
         ensure_new(arguments.out, arguments.overwrite, folder=True)
-    _check_exists(arguments.data)
-    _set_up_jax()
+    for path in arguments.data:
+        _check_exists(path)
+    with contextlib.ExitStack() as stack:
+        group = None
+        if arguments.distributed:
+            stack.enter_context(processes.watched(f"gfnn: {processes.LOST}"))
+        _set_up_jax()
+        if arguments.distributed:
+            group = processes.Group(processes.join())
+        _fit_and_tell(arguments, group)
+
+
+def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) -> None:
     from gfnn_jax.jobs.fit import fit
 
     with progress.on_stderr() as shown:
@@ -389,10 +401,16 @@ def _fit(arguments: argparse.Namespace) -> None:
             base=arguments.base, structure=arguments.structure,
             family=arguments.family, scene_name=arguments.scene, angles=arguments.angles,
             seed=arguments.seed, overwrite=arguments.overwrite, resume=arguments.resume,
-            progress=shown,
+            group=group, progress=shown,
         )  # fmt: skip
+    if group is not None:
+        processes.wait_for_all()
+        if not group.first:
+            sent = f"{group.sent / 1e6:.3g} MB sent"
+            print(f"process {group.share.index} of {group.share.count}: {sent}")
+            return
     _summarise(ran, arguments.out)
-    print(f"next: gfnn predict {arguments.out} --initial {arguments.data} --num-steps 1000 "
+    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
           "--out prediction.npz")  # fmt: skip
     _hold_to(arguments.strict, arguments.out)
 
@@ -413,7 +431,7 @@ def _predict(arguments: argparse.Namespace) -> None:
     with contextlib.ExitStack() as stack:
         share = None
         if arguments.distributed:
-            stack.enter_context(processes.watched(f"gfnn: {_LOST}"))
+            stack.enter_context(processes.watched(f"gfnn: {processes.LOST}"))
         _set_up_jax(arguments.devices)
         if arguments.distributed:
             share = processes.join()

@@ -3,7 +3,11 @@
 import dataclasses
 import functools
 import math
+import os
+import subprocess
+import sys
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -297,3 +301,56 @@ def test_a_cap_ends_the_training_and_its_rate():
 def test_a_batch_is_never_more_than_the_pairs():
     result = fit(dataclasses.replace(SHORT, batch_size=10_000, epochs=2))
     assert result.epochs == 2
+
+
+ON_DEVICES = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+import numpy as np
+from test_adam import NETWORK, WEIGHT, gradient_data, start
+from gfnn_jax.fitting.adam import Recipe, adam
+from gfnn_jax.storage.checkpoints import TrainingCheckpoints
+
+train, held = gradient_data(230, 0), gradient_data(50, 1)
+recipe = Recipe(batch_size=40, epochs=4, rate=0.01, schedule="cosine", dtype="float64")
+
+def trained(count, **more):
+    devices = jax.devices()[:count] if count else ()
+    return adam(NETWORK, start(), train, held, WEIGHT, recipe=recipe, key=jax.random.key(0),
+                devices=devices, **more)
+
+def close(one, other):
+    for a, b in zip(jax.tree.leaves(one.params), jax.tree.leaves(other.params), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(one.validation_rms, other.validation_rms, rtol=1e-12)
+
+kept = TrainingCheckpoints(sys.argv[1], {})
+
+def keep(epoch, state):
+    if epoch == 2:
+        kept.save(epoch, state)
+
+alone = trained(0)
+for count in (1, 2, 4):
+    close(trained(count, checkpoint=keep if count == 4 else None), alone)
+for count in (0, 2):
+    close(trained(count, resume=kept.latest()[1]), alone)
+try:
+    trained(3)
+except ValueError as error:
+    assert "divides the 40 rows" in str(error)
+else:
+    raise SystemExit("a batch of 40 on 3 devices")
+"""
+
+
+def test_batches_shared_out_among_devices(tmp_path):
+    """Also gone on with, out of a checkpoint, on another number of devices."""
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=4"
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    ran = subprocess.run(
+        [sys.executable, "-c", ON_DEVICES, str(tmp_path / "kept")], capture_output=True, text=True,
+        check=False, env={**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": path},
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr

@@ -1,5 +1,7 @@
 """Files larger than memory: a sample chooses the candidate, all pairs fit it."""
 
+import functools
+
 import jax
 import numpy as np
 import pytest
@@ -48,7 +50,8 @@ def test_a_sample_is_of_the_files_own_pairs_each_once(file):
 @pytest.mark.slow
 def test_all_pairs_fit_better_than_the_sample(file, tmp_path, monkeypatch):
     monkeypatch.setattr(fit_job, "_LARGE_BYTES", 0)
-    monkeypatch.setattr(fit_job, "read_sample", lambda p, dt: read_sample(p, dt=dt, num_pairs=200))
+    few = functools.partial(read_sample, num_pairs=200)
+    monkeypatch.setattr(fit_job, "read_sample", few)
     ran = fit_job.fit(file, out=tmp_path / "m", scene_name="standard-map-regular", tolerance=1e-3,
                        chart="type2")  # fmt: skip
     assert ran is not None

@@ -6,7 +6,6 @@ import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +26,7 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.parameters import sampled
+from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.processes import Share
@@ -58,6 +58,8 @@ import numpy as np
 from gfnn_jax.data.predictions import PredictionWriter
 from gfnn_jax.jobs import predict as job
 from gfnn_jax.maps import saved
+from gfnn_jax.maps.samples import Samples
+from gfnn_jax.maps.sharded import Sharded, local_devices
 
 folder = Path(sys.argv[1])
 map_, z0 = saved.load(folder / "m"), np.load(folder / "z0.npy")
@@ -71,6 +73,11 @@ block, _ = map_.rollout(z0[:256], 60, save_every=20)
 np.testing.assert_array_equal(block, states[:256], "a block is what the map itself makes of it")
 few, _ = map_.sharded(1).rollout(z0[:3], 60, save_every=20)
 np.testing.assert_array_equal(few, states[:3], "bits depend on the number of lanes")
+
+params = np.asarray(map_.pieces[0].params)
+samples = Samples(map_, jax.device_put(np.stack([params, 1.1 * params])), 0)
+of = [Sharded(samples, local_devices(n)).rollout(z0, 20, save_every=10)[0] for n in (1, 8)]
+assert of[0].tobytes() == of[1].tobytes(), "bits of samples depend on the number of devices"
 
 def predicted(name, devices, **more):
     job.predict(folder / "m", folder / "z0.npy", num_steps=60, out=folder / name, devices=devices,
@@ -203,8 +210,9 @@ def test_a_killed_process_ends_the_others(killed, folder):
     assert lines[0].startswith("gfnn: this process or another one of the job was lost: what they")
     for journal in journals:
         assert journal.read_bytes().count(b"\n") > 3
-    with pytest.raises(InputError, match="of another number of processes than 3"):
-        parts.check_count(out, Share(0, 3))
+    assert parts.number_of_parts(out, Share(0, 3), resume=True) == 2
+    with pytest.raises(InputError, match="parts of 2 are there, 3 are wanted"):
+        parts.number_of_parts(out, Share(0, 3), resume=False)
 
 
 def test_a_killed_job_resumes_to_the_same_bits(folder, alone, monkeypatch):
@@ -276,9 +284,39 @@ def test_more_devices_than_cores(folder, capsys):
     assert "--devices: expected 1 to 1 devices" in capsys.readouterr().err
 
 
-def test_samples_stay_on_one_device(folder, capsys):
-    command = ["predict", folder / "m", "--initial", folder / "z0.npy", "--num-steps", 5, "--out",
-               folder / "s.npz", "--samples", 3, "--devices", "all"]  # fmt: skip
-    assert main([str(part) for part in command]) == 2
-    assert "expected --samples without --devices" in capsys.readouterr().err
-    assert not Path(folder / "s.npz").exists()
+@pytest.fixture(scope="module")
+def sampled_folder(folder, tmp_path_factory):
+    """The model with a posterior, and 300 of its initial states with noise of their own."""
+    more = tmp_path_factory.mktemp("sampled")
+    map_ = saved.load(folder / "m")
+    count = map_.pieces[0].family.num_parameters
+    saved.save(dataclasses.replace(map_, posterior=Posterior(0, 1e-5 * np.eye(count))), more / "m")
+    z0 = np.load(folder / "z0.npy")[:300]
+    np.savez(more / "z0.npz", z0=z0, z0_std=np.full(z0.shape, 1e-3))
+    return more
+
+
+def test_samples_of_any_number_of_processes(sampled_folder):
+    """And of one that stopped, on fewer processes than began it."""
+    from gfnn_jax.jobs import predict as job
+
+    def predicted(name, **more):
+        job.predict(sampled_folder / "m", sampled_folder / "z0.npz", num_steps=20, save_every=10,
+                    out=sampled_folder / name, samples=3, horizon_size=1e-3, **more)  # fmt: skip
+        return sampled_folder / name
+
+    whole = predicted("whole.npz", devices=1)
+    plain = np.load(predicted("plain.npz"))
+    found = np.load(whole)
+    for name in ("trajectories", "std", "quantiles"):
+        assert found[name].shape == plain[name].shape
+        np.testing.assert_allclose(found[name], plain[name], rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(found["horizon"], plain["horizon"])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(job, "wait_for_all", lambda: None)
+        predicted("parts.npz", share=Share(1, 2))
+        with pytest.raises(InputError, match="--resume goes on with them"):
+            predicted("parts.npz", share=Share(0, 1))
+        there = predicted("parts.npz", share=Share(0, 1), resume=True)
+    assert there.read_bytes() == whole.read_bytes()
+    assert not [*sampled_folder.glob("parts.part*")]

@@ -59,7 +59,8 @@ class Block:
 
 @dataclasses.dataclass
 class Source:
-    """An open file: what its header says, and its rows in blocks of at most so many.
+    """An open file: what its header says, and its rows, or those of a process's share of the pairs,
+    in blocks of at most so many.
 
     uneven: whether the times that were read so far are not dt apart. parameters: names of those
     that the rows have. period: of a drive, whose time the rows' times are. timed: whether they have
@@ -71,7 +72,7 @@ class Source:
     precision: str
     units: dict[str, str]
     is_array: bool
-    blocks: Callable[[int], Iterator[Block]]
+    blocks: Callable[..., Iterator[Block]]
     parameters: tuple[str, ...] = ()
     uneven: bool = False
     period: float | None = None

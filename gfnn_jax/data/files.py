@@ -35,6 +35,7 @@ from gfnn_jax.data.blocks import BLOCK_ROWS, TIME, Block, DataWarning, Source, c
 from gfnn_jax.data.csv_files import open_csv
 from gfnn_jax.data.npz_files import open_npy, open_npz
 from gfnn_jax.errors import InputError
+from gfnn_jax.processes import WHOLE, Group, Share
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,61 +127,149 @@ def read_trajectories(
 
 
 def read_sample(
-    path, *, dt: float | None = None, num_pairs: int = 200_000, seed: int = 0
-) -> TrajectoryData:
-    """As `read_trajectories`, of a file larger than memory: a random sample of its pairs.
+    paths, *, dt: float | None = None, num_pairs: int = 200_000, seed: int = 0,
+    group: Group | None = None,
+) -> TrajectoryData:  # fmt: skip
+    """As `read_trajectories`, of data larger than memory: a random sample of their pairs.
 
-    The file is read once, block by block, and checked all through; each pair is kept with the
+    paths: a file, or several. group: the processes that each read their own pairs of them, as
+    `iterate_pairs` shares them out; the sample, the same for any number, is the first one's, and
+    the others get what they have sent.
+    The files are read once, block by block, and checked all through; each pair is kept with the
     same probability, as a sequence of two states. Memory is that of the sample and a few blocks.
+    Which pairs are kept is told by a hash of their numbers. ``digest`` is that of the one file, or
+    of several or of a group's the sum of the hashes of all pairs, whatever their order.
     """
-    rng = np.random.default_rng(seed)
-    kept, priority, dts = None, np.empty(0), np.empty(0)
-    args: dict[str, np.ndarray] = {}
-    for pairs in iterate_pairs(path, BLOCK_ROWS, dt=dt):
-        rows = np.stack([pairs.z0, pairs.z1], axis=1)
-        kept = rows if kept is None else np.concatenate([kept, rows])
-        priority = np.concatenate([priority, rng.random(len(rows))])
-        dts = np.concatenate([dts, np.broadcast_to(pairs.dt, len(rows))])
-        args = {n: np.append(args.get(n, []), v) for n, v in (pairs.args or {}).items()}
-        if len(kept) > num_pairs:
-            first = np.argpartition(priority, num_pairs)[:num_pairs]
-            kept, priority, dts = kept[first], priority[first], dts[first]
-            args = {name: values[first] for name, values in args.items()}
-    if kept is None:
-        raise InputError(f"{path}: no pair of consecutive states found")
-    states = kept.reshape(-1, kept.shape[-1])
-    lengths = np.full(len(kept), 2)
-    same = np.ptp(dts) == 0
-    with _open(path, dt) as source:
+    alone, group = group is None, group or Group()
+    found, checksum, count, seen = None, np.zeros(1, np.uint64), 0, [np.inf, 0.0]
+    for pairs in iterate_pairs(paths, BLOCK_ROWS, dt=dt, share=group.share):
+        new = _table(pairs, seed)
+        checksum, count = checksum + new["hash"].sum(), count + len(pairs)
+        seen = [min(seen[0], new["dt"].min()), max(seen[1], new["dt"].max())]
+        found = _smallest(_both(found, new), num_pairs)
+    if found is None and group.share.count == 1:
+        raise InputError(f"{_named(paths)}: no pair of consecutive states found")
+    told = {"count": [count], "hash": checksum, "low": [seen[0]], "high": [seen[1]]}
+    all_told = group.folded({n: np.array(v) for n, v in told.items()}, _both)
+    total = group.told({"count": all_told["count"].sum()} if group.first else None)["count"]
+    if group.share.count > 1:  # those that the first will want, and a few more
+        part = (num_pairs + _MORE * np.sqrt(num_pairs)) / max(int(total), 1)
+        if found is not None and part < 1:
+            found = _taken(found, found["hash"] < np.uint64(part * 2.0**64))
+        found = group.folded(found or {}, _both)
+    if not found:
+        raise InputError(f"{_named(paths)}: no pair of consecutive states found")
+    if total > num_pairs or not alone:
+        found = _taken(found, np.argsort(found["hash"], kind="stable")[:num_pairs])
+    alone = alone and len(_listed(paths)) == 1
+    digest = _digest(_listed(paths)[0]) if alone else f"{all_told['hash'].sum():016x}"
+    same = all_told["low"].min() == all_told["high"].max()
+    with _open(_own(paths, group.share)[0][0], dt) as source:
         precision, units, period = source.precision, source.units, source.period
+    states = found["pairs"].reshape(-1, found["pairs"].shape[-1])
+    args = {n.removeprefix(_ARG): v for n, v in found.items() if n.startswith(_ARG)}
     return TrajectoryData(
-        states, lengths, float(dts[0]) if same else dts, str(path), _digest(path), precision, units,
-        args or None, period,
+        states, np.full(len(found["pairs"]), 2), float(found["dt"][0]) if same else found["dt"],
+        _named(paths), digest, precision, units, args or None, period,
     )  # fmt: skip
 
 
-def iterate_pairs(path, chunk: int, *, dt: float | None = None) -> Iterator[Any]:
-    """The pairs of a file larger than memory, as `Pairs` of at most ``chunk`` pairs each.
+_ARG = "arg "  # before the name of a parameter in a table
+_MORE = 10  # standard deviations of the number of pairs that fall below a bound
 
-    Memory stays within a few chunks, whatever the file's size, except for arrays stored in
-    Fortran order, which are read whole. The same checks as in `read_trajectories`, block by
-    block: a NaN far into the file is found only when it is reached.
+
+def _table(pairs: Any, seed: int) -> dict[str, np.ndarray]:
+    """Pairs as arrays by name, with a hash of all numbers of each (N,)."""
+    rows = np.stack([pairs.z0, pairs.z1], axis=1)
+    each = np.broadcast_to(np.asarray(pairs.dt, np.float64), len(rows))
+    args = {_ARG + name: np.asarray(v, np.float64) for name, v in (pairs.args or {}).items()}
+    columns = [*rows.reshape(len(rows), -1).T, each, *args.values()]
+    mixed = np.full(len(rows), seed, np.uint64)
+    for numbers in columns:  # Steele, Lea & Flood, OOPSLA 2014: SplitMix64's finaliser
+        mixed = mixed + np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= np.ascontiguousarray(numbers, np.float64).view(np.uint64)
+        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+            mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
+        mixed ^= mixed >> np.uint64(31)
+    return {"pairs": rows, "dt": each, "hash": mixed, **args}
+
+
+def _both(one: dict[str, np.ndarray] | None, other: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The rows of both tables, either of which may have none. Raises InputError where they differ
+    in what they hold."""
+    if not one or not other:
+        return one or other
+    shapes = [{name: column.shape[1:] for name, column in table.items()} for table in (one, other)]
+    if shapes[0] != shapes[1]:
+        raise InputError(
+            "expected files with the same coordinates and parameters, found "
+            f"{' and '.join(str(s) for s in shapes)}"
+        )
+    return {name: np.concatenate([column, other[name]]) for name, column in one.items()}
+
+
+def _taken(table: dict[str, np.ndarray], rows) -> dict[str, np.ndarray]:
+    return {name: column[rows] for name, column in table.items()}
+
+
+def _smallest(table: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
+    """At most so many rows, those with the smallest hashes."""
+    if len(table["hash"]) <= most:
+        return table
+    return _taken(table, np.argpartition(table["hash"], most)[:most])
+
+
+def _listed(paths) -> list[Path]:
+    return [Path(paths)] if isinstance(paths, (str, Path)) else [Path(path) for path in paths]
+
+
+def _named(paths) -> str:
+    return ", ".join(str(path) for path in _listed(paths))
+
+
+def _own(paths, share: Share) -> tuple[list[Path], Share]:
+    """The files of a process, and its share of each of them."""
+    listed = _listed(paths)
+    if len(listed) >= share.count:
+        return listed[share.of(len(listed), 1)], WHOLE
+    return listed, share
+
+
+def iterate_pairs(
+    paths, chunk: int, *, dt: float | None = None, share: Share = WHOLE
+) -> Iterator[Any]:
+    """The pairs of files larger than memory, as `Pairs` of at most ``chunk`` pairs each.
+
+    paths: a file, or several. share: of them that are wanted: whole files where there are enough of
+    them, else rows of each file. Rows of a compressed array are unpacked from its beginning on;
+    those of a .csv cannot be shared out.
+
+    Memory stays within a few chunks, whatever the files' size, except for arrays stored in
+    Fortran order, which are read whole, as are times and parameters. The same checks as in
+    `read_trajectories`, block by block: a NaN far into the file is found only when it is reached.
     """
     from gfnn_jax.phase_space import Pairs
 
-    with _open(path, dt) as source:
-        last_state, last_sequence = np.empty((0, 2 * source.dim)), np.empty(0)
-        last_own: list[np.ndarray | None] = []
-        for block in source.blocks(chunk):
-            states = np.concatenate([last_state, block.states])
-            sequence = np.concatenate([last_sequence, block.sequence])
-            own = joined([*last_own, block.own])
-            rows = np.flatnonzero(sequence[1:] == sequence[:-1])
-            if len(rows):
-                z0, z1, given = states[rows], states[rows + 1], source.of_pairs(own, rows)
-                yield Pairs(z0, z1, *given, period=source.period)
-            last_state, last_sequence = states[-1:], sequence[-1:]
-            last_own = [None if own is None else own[-1:]]
+    own, of_rows = _own(paths, share)
+    for path in own:
+        if of_rows.count > 1 and path.suffix.lower() == ".csv":
+            raise InputError(
+                f"{path}: expected .npz or .npy, whose rows {share.count} processes can share, or "
+                "as many files as processes"
+            )
+        with _open(path, dt) as source:
+            last_state, last_sequence = np.empty((0, 2 * source.dim)), np.empty(0)
+            last_own: list[np.ndarray | None] = []
+            for block in source.blocks(chunk, *([of_rows] if of_rows.count > 1 else [])):
+                states = np.concatenate([last_state, block.states])
+                sequence = np.concatenate([last_sequence, block.sequence])
+                beside = joined([*last_own, block.own])
+                rows = np.flatnonzero(sequence[1:] == sequence[:-1])
+                if len(rows):
+                    z0, z1, given = states[rows], states[rows + 1], source.of_pairs(beside, rows)
+                    yield Pairs(z0, z1, *given, period=source.period)
+                last_state, last_sequence = states[-1:], sequence[-1:]
+                last_own = [None if beside is None else beside[-1:]]
 
 
 def joined(parts: list[np.ndarray | None]) -> np.ndarray | None:
@@ -290,7 +379,7 @@ def _open(
         source = kinds[path.suffix.lower()](path, stream, dt, initial, driven)
         unchecked = source.blocks
         if not initial:  # of initial states only the rows that are used are checked
-            source.blocks = lambda rows: (block.checked(path) for block in unchecked(rows))
+            source.blocks = lambda *given: (block.checked(path) for block in unchecked(*given))
         yield source
 
 

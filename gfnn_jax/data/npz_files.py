@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,16 +20,21 @@ from gfnn_jax.data.blocks import (
     damage,
 )
 from gfnn_jax.errors import InputError
+from gfnn_jax.processes import WHOLE, Share
+
+_LOCAL_HEADER = 30  # bytes before the name of a member of a .zip
+_SKIPPED = 2**20  # bytes at a time
 
 
 class _StoredArray:
     """An array in an ``.npy`` stream: its header now, its rows in order when asked for.
 
     The header is checked against the stream's size first, so that a damaged one allocates nothing.
+    begin: of the stream, in the file; None where that holds it compressed.
     """
 
-    def __init__(self, path, name: str, stream, size: int):
-        self.path, self.name, self.stream = path, name, stream
+    def __init__(self, path, name: str, stream, size: int, begin: int | None):
+        self.path, self.name, self.stream, self.begin = path, name, stream, begin
         with damage(path, name):
             version = np.lib.format.read_magic(stream)
             read_header = {
@@ -54,28 +61,50 @@ class _StoredArray:
             data = np.frombuffer(self.stream.read(), self.dtype)
         return data.reshape(self.shape, order="F" if self.fortran_order else "C")
 
-    def read_rows(self, rows: int) -> Iterator[np.ndarray]:
-        """The array as (-1, 2d) float64, in blocks of at most so many rows."""
-        width = self.shape[-1]
+    def read_rows(self, rows: int, part: slice = slice(None)) -> Iterator[np.ndarray]:
+        """The array as (-1, 2d) float64, or a part of its rows, in blocks of at most so many."""
+        width, number = self.shape[-1], int(np.prod(self.shape[:-1], dtype=object))
+        first, last, _ = part.indices(number)
         if self.fortran_order:
-            everything = self.whole().reshape(-1, width)
+            everything = self.whole().reshape(-1, width)[first:last]
             for start in range(0, len(everything), rows):
                 yield everything[start : start + rows].astype(np.float64)
             return
-        left = int(np.prod(self.shape[:-1], dtype=object))
-        while left:
-            count = min(rows, left)
+        size = width * self.dtype.itemsize
+        with self._from(first * size) as stream:
+            while first < last:
+                count = min(rows, last - first)
+                with damage(self.path, self.name):
+                    block = np.frombuffer(stream.read(count * size), self.dtype)
+                    block = block.reshape(count, width)
+                first += count
+                yield block.astype(np.float64, copy=False)
+            if last == number:
+                with damage(self.path, self.name):
+                    stream.read(1)  # the end of an archive's member: its checksum is compared
+
+    @contextlib.contextmanager
+    def _from(self, offset: int) -> Iterator[Any]:
+        """The data from this byte on: the file itself, or what is left after unpacking the rest."""
+        if not offset:
+            yield self.stream
+        elif self.begin is None:
             with damage(self.path, self.name):
-                data = self.stream.read(count * width * self.dtype.itemsize)
-                block = np.frombuffer(data, self.dtype).reshape(count, width)
-            left -= count
-            yield block.astype(np.float64, copy=False)
-        with damage(self.path, self.name):
-            self.stream.read(1)  # the end of an archive's member, where its checksum is compared
+                while offset:
+                    offset -= len(self.stream.read(min(offset, _SKIPPED)) or self._short())
+            yield self.stream
+        else:
+            begin = self.begin + self.stream.tell()  # after the header
+            with open(self.path, "rb") as own:
+                own.seek(begin + offset)
+                yield own
+
+    def _short(self):
+        raise InputError(f"{self.path}: {self.name} is damaged: it ends before its rows do")
 
 
 def open_npy(path: Path, stream, dt, initial: bool, driven: bool) -> Source:
-    array = _StoredArray(path, "the array", stream, path.stat().st_size)
+    array = _StoredArray(path, "the array", stream, path.stat().st_size, 0)
     dt = np.nan if initial else agreed_dt(path, dt, None)
     return _array_source(path, array, None, dt, each_row=initial and len(array.shape) == 2)
 
@@ -88,7 +117,9 @@ def open_npz(path: Path, stream, dt, initial: bool, driven: bool) -> Source:
     def member(name: str) -> _StoredArray:
         with damage(path, name):
             opened = archive.open(f"{name}.npy")
-        return _StoredArray(path, name, opened, archive.getinfo(f"{name}.npy").file_size)
+            info = archive.getinfo(f"{name}.npy")
+            begin = _begin_of(path, info)
+        return _StoredArray(path, name, opened, info.file_size, begin)
 
     if initial and "z0" in names:
         params, z0 = _read_params(path, names, member), member("z0")
@@ -142,6 +173,17 @@ def open_npz(path: Path, stream, dt, initial: bool, driven: bool) -> Source:
         times = _read_t0(path, member, count)[:, None] + dt * np.arange(length)
     dt = np.nan if initial or dt is None else dt
     return _array_source(path, trajectories, lengths, dt, times=times, params=params, period=period)
+
+
+def _begin_of(path: Path, info: zipfile.ZipInfo) -> int | None:
+    """The byte of the file at which a member begins; None where it is compressed."""
+    if info.compress_type != zipfile.ZIP_STORED:
+        return None
+    with open(path, "rb") as own:
+        own.seek(info.header_offset)
+        header = own.read(_LOCAL_HEADER)
+    lengths = (int.from_bytes(header[i : i + 2], "little") for i in (26, 28))  # name, extra field
+    return info.header_offset + _LOCAL_HEADER + sum(lengths)
 
 
 def _rows_of(array: _StoredArray) -> int:
@@ -269,10 +311,11 @@ def _pairs_source(
         times = t0[:, None] + (np.stack([0 * t0, 0 * t0 + dt], axis=1) if times is None else times)
     own = _own_columns(path, times, params, z0.shape[0], "pairs", 2)
 
-    def blocks(rows: int) -> Iterator[Block]:
-        pair = 0
+    def blocks(rows: int, share: Share = WHOLE) -> Iterator[Block]:
+        part = share.of(z0.shape[0], 1)
+        pair = part.start
         # Two rows a pair, and at most ``rows`` pairs a block.
-        for a, b in zip(z0.read_rows(rows), z1.read_rows(rows), strict=True):
+        for a, b in zip(z0.read_rows(rows, part), z1.read_rows(rows, part), strict=True):
             states = np.stack([a, b], axis=1).reshape(-1, 2 * dim)
             sequence = np.repeat(np.arange(pair, pair + len(a)), 2)
             beside = None if own is None else own[2 * pair : 2 * (pair + len(a))]
@@ -307,9 +350,11 @@ def _array_source(
         index = (row, column) if len(shape) == 2 else (*divmod(row, length), column)
         return f"{array.name}[{', '.join(map(str, index))}]"
 
-    def blocks(rows: int) -> Iterator[Block]:
-        start = 0
-        for states in array.read_rows(rows):
+    def blocks(rows: int, share: Share = WHOLE) -> Iterator[Block]:
+        part = share.of(count * length, 1)
+        start = part.start
+        # The pair that begins in the last row ends in the next.
+        for states in array.read_rows(rows, slice(start, min(part.stop + 1, count * length))):
             row = np.arange(start, start + len(states))
             sequence = row if each_row else row // length
             beside = None if own is None else own[start : start + len(states)]

@@ -6,6 +6,7 @@ The parts, ``NAME.part0of2.npz`` and so on beside ``NAME.npz``, are predictions 
 from __future__ import annotations
 
 import contextlib
+import re
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,14 +32,24 @@ def part_of(out: Path, share: Share) -> Path:
     return out.with_name(f"{out.stem}.part{share.index}of{share.count}{out.suffix}")
 
 
-def check_count(out: Path, share: Share) -> None:
-    """Raises InputError where parts of another number of processes are there."""
-    for path in out.parent.glob(f"{out.stem}.part*of*{out.suffix}*"):
-        if f"of{share.count}{out.suffix}" not in path.name:
-            raise InputError(
-                f"{path}: of another number of processes than {share.count}: go on with as many as "
-                "before, or delete it"
-            )
+def number_of_parts(out: Path, share: Share, *, resume: bool) -> int:
+    """In how many parts the prediction is: one of each process, or as many as an interrupted job
+    has begun, whatever its number of processes.
+
+    Raises InputError where parts of another number are there and are not to be gone on with.
+    """
+    names = [path.name for path in out.parent.glob(f"{out.stem}.part*of*{out.suffix}*")]
+    pattern = re.compile(re.escape(out.stem) + r"\.part\d+of(\d+)" + re.escape(out.suffix))
+    there = {int(found[1]) for found in map(pattern.match, names) if found}
+    if not there or (resume and len(there) == 1):
+        return there.pop() if there else share.count
+    if there == {share.count}:
+        return share.count
+    found = " and of ".join(map(str, sorted(there)))
+    raise InputError(
+        f"{out}: parts of {found} are there, {share.count} are wanted: "
+        + ("delete those of one kind" if resume else "--resume goes on with them, or delete them")
+    )
 
 
 def put_together(parts: Sequence[Path], out: Path, job: dict[str, Any]) -> None:

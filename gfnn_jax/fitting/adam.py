@@ -18,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -125,6 +125,7 @@ def adam(
     checkpoint: Callable[[int, dict[str, Any]], Any] | None = None,
     resume: dict[str, Any] | None = None,
     cap: float | None = None,
+    devices: Sequence[Any] = (),
 ) -> AdamFit:
     """Minimise L over train = (w, target_gradient), each (N, 2d).
 
@@ -141,6 +142,7 @@ def adam(
     return _minimise(
         _gradient_loss, (family, weight), params, train, validation, components=weight.size,
         recipe=recipe, key=key, on_epoch=on_epoch, checkpoint=checkpoint, resume=resume, cap=cap,
+        devices=devices,
     )  # fmt: skip
 
 
@@ -221,6 +223,7 @@ def minimise(
     checkpoint: Callable[[int, dict[str, Any]], Any] | None = None,
     resume: dict[str, Any] | None = None,
     cap: float | None = None,
+    devices: Sequence[Any] = (),
 ) -> AdamFit:
     """Minimise ``loss(params, *batch)``, a mean over the rows of a batch, over all rows of train.
 
@@ -236,6 +239,10 @@ def minimise(
     cap:        seconds after which no epoch is begun, compilation apart. The rate then goes through
                 its whole schedule in the time there is: what the schedule sees is the larger of the
                 share of the epochs and the share of the time that has passed.
+    devices:    JAX's, of this process, among which the rows of each batch are shared out; their
+                number divides that of the rows. Batches are the same, so that the results differ by
+                rounding from those of one device, and a state may be gone on with on another
+                number. Every device holds all rows of train.
 
     An interrupt (Ctrl-C) passes through; the last state given to ``checkpoint`` is whole.
     Raises ValueError where the loss is not finite at the start, RuntimeError where float64 is asked
@@ -244,13 +251,13 @@ def minimise(
     """
     return _minimise(
         _LossOfRows(loss), None, params, train, validation, components=components, recipe=recipe,
-        key=key, on_epoch=on_epoch, checkpoint=checkpoint, resume=resume, cap=cap,
+        key=key, on_epoch=on_epoch, checkpoint=checkpoint, resume=resume, cap=cap, devices=devices,
     )  # fmt: skip
 
 
 def _minimise(
     loss, given, params, train, validation, *, components, recipe, key, on_epoch, checkpoint,
-    resume, cap,
+    resume, cap, devices,
 ) -> AdamFit:  # fmt: skip
     """`minimise` of ``loss(given, params, *batch)``: what is given, a pytree, may change without
     another compilation."""
@@ -260,6 +267,19 @@ def _minimise(
         lambda a: jnp.asarray(np.asarray(a, recipe.dtype)), (params, train, validation)
     )
     num_rows, batch_size = len(train[0]), min(recipe.batch_size, len(train[0]))
+    everywhere, among = None, None
+    if devices:
+        if batch_size % len(devices):
+            raise ValueError(
+                f"expected a number of devices that divides the {batch_size} rows of a batch, got "
+                f"{len(devices)}"
+            )
+        mesh = jax.sharding.Mesh(np.array(devices), ("rows",))
+        everywhere = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
+        among = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(None, "rows"))
+        params, train, validation, given = jax.device_put(
+            (params, train, validation, given), everywhere
+        )
     length = recipe.epoch_length or num_rows // batch_size
 
     def rates(epoch, seconds):
@@ -278,7 +298,8 @@ def _minimise(
             random.permutation(num_rows)[: in_pass * batch_size].reshape(in_pass, batch_size)
             for _ in range(-(-length // in_pass))
         ]
-        return np.concatenate(passes)[:length].astype(np.int32)
+        batches = np.concatenate(passes)[:length].astype(np.int32)
+        return jax.device_put(batches, among) if devices else batches
 
     started = time.perf_counter()
     carry = _first_carry(params)
@@ -301,6 +322,7 @@ def _minimise(
         history = {name: np.asarray(column).tolist() for name, column in resume["history"].items()}
         structure = jax.tree.structure(carry)
         carry = structure.unflatten([jnp.array(leaf) for leaf in resume["carry"]])
+        carry = jax.device_put(carry, everywhere) if devices else carry
 
     stopped_because = "epochs"
     while epoch < recipe.epochs:

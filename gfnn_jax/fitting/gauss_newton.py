@@ -328,13 +328,13 @@ class Problem:
         if steps is not None:
             used = self._quietest(family, c, steps, rows, len(rows))
             c, factor, made = self._descend(family, c, steps, used, options.most)
-            return _summary(c, factor, used, iterations + made, steps)
+            return summarised(c, factor, used, iterations + made, steps)
         steps = self.fine_steps(family, c, rows)[0]
         used = self._resolved(family, c, steps, rows)
         for _ in range(options.selections):
             c, factor, made = self._descend(family, c, steps, used, options.most)
             iterations += made
-            summary = _summary(c, factor, used, iterations, steps)
+            summary = summarised(c, factor, used, iterations, steps)
             still = self._resolved(family, c, steps, used)
             if len(still) == len(used):
                 break
@@ -365,16 +365,22 @@ class Problem:
     def _resolved(self, family, c, steps: Steps, rows):
         """Those of these rows that the steps resolve: whose own error is not what is left over of
         them. One unresolved passage would outweigh all pairs that tell the coefficients."""
+        known, off, limit = self.resolution(family, c, steps, rows)
+        return rows[known & (off <= limit)]
+
+    def resolution(self, family, c, steps: Steps, rows) -> tuple[np.ndarray, np.ndarray, float]:
+        """Of these rows whether the flow is known (n,), the steps' own error (n,) ÷ scale, and the
+        error up to which a row counts as resolved among them."""
         size = np.abs(self.residuals(family, c, steps, rows)).max(axis=1, initial=0.0)
         dt, args = self.given(rows)
         off = truncation(family, c, self.z0[rows], dt, steps, args=args, on_substep=self.check)
         off = np.abs(off / self.scale).max(axis=1, initial=0.0)
         known = np.isfinite(size) & np.isfinite(off)
         if not known.any():
-            return rows[:0]
+            return known, off, _ROUNDED
         o = self.options
         limit = max(o.misfits * np.median(size[known]), o.errors * np.median(off[known]), _ROUNDED)
-        return rows[known & (off <= limit)]
+        return known, off, float(limit)
 
     def distance(self, family, c, rows) -> float:
         """Median of ‖r‖ over these rows, by coarse steps: what starts are compared by."""
@@ -417,29 +423,43 @@ class Problem:
 
     def _descend(self, family, c, steps: Steps, rows, most: int):
         """Gauss–Newton steps until nothing is gained: (coefficients, their factor, steps taken)."""
-        here = self.factor(family, c, steps, rows)
-        floor = _ROUNDOFF * np.sqrt(rows.size * self.z0.shape[1])
-        first_damping, made = 0, 0
-        while made < most and floor < here.cost < np.inf:
-            found, step = None, _Steps(here.matrix)
-            promised = 1 - step.cost / here.cost
-            for n in range(first_damping, len(self.options.dampings)):
-                tried = c - step.damped(self.options.dampings[n])
-                there = self.factor(family, tried, steps, rows)
-                if there.cost < here.cost:
-                    found = n
-                    break
-                if promised < self.options.promised and there.cost < 2 * here.cost:
-                    break
-            if found is None:
+        return descended(lambda c: self.factor(family, c, steps, rows), c, most, self.options)
+
+
+def descended(
+    factor: Callable[[np.ndarray], Factor], c, most: int, options: Options = OPTIONS
+) -> tuple[np.ndarray, Factor, int]:
+    """Gauss–Newton steps from c until nothing is gained, at most so many: (coefficients, their
+    factor, steps taken). ``factor(c)`` is the problem at c, of rows wherever they are."""
+    here = factor(c)
+    floor = _ROUNDOFF * np.sqrt(here.rows)
+    first_damping, made = 0, 0
+    while made < most and floor < here.cost < np.inf:
+        found, step = None, _Steps(here.matrix)
+        promised = 1 - step.cost / here.cost
+        for n in range(first_damping, len(options.dampings)):
+            tried = c - step.damped(options.dampings[n])
+            there = factor(tried)
+            if there.cost < here.cost:
+                found = n
                 break
-            made += 1
-            gained = 1 - there.cost / here.cost
-            c, here = tried, there
-            first_damping = max(0, found - 2)
-            if gained < self.options.gained:
+            if promised < options.promised and there.cost < 2 * here.cost:
                 break
-        return c, here, made
+        if found is None:
+            break
+        made += 1
+        gained = 1 - there.cost / here.cost
+        c, here = tried, there
+        first_damping = max(0, found - 2)
+        if gained < options.gained:
+            break
+    return c, here, made
+
+
+def merged(one: Factor, other: Factor) -> Factor:
+    """The problem of the rows of both."""
+    matrix: Any = np.linalg.qr(np.concatenate([one.matrix, other.matrix]), mode="r")
+    return Factor(matrix, one.rows + other.rows, float(np.hypot(one.cost, other.cost)))
 
 
 def _cheapest(error: Callable[[Steps], float], substeps: int, tolerance: float) -> Steps:
@@ -493,7 +513,8 @@ class _Steps:
         return self._vt.T @ (filters * self._along) / self._size
 
 
-def _summary(c, found: Factor, used, iterations: int, steps: Steps) -> FlowFit:
+def summarised(c, found: Factor, used, iterations: int, steps: Steps) -> FlowFit:
+    """The fit that ends at c, with the factor that was found there."""
     count, factor, seen = len(c), found.matrix, found.rows
     size, s, vt, _ = _scaled(factor)
     rms = float(np.linalg.norm(factor[:, count])) / np.sqrt(max(seen, 1))

@@ -1,7 +1,8 @@
-"""What ``gfnn fit`` does: a trajectory file in, a model folder with its report out."""
+"""What ``gfnn fit`` does: trajectory files in, a model folder with its report out."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,17 +14,20 @@ from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.search import BEST, failures_of_arithmetic, scene_named, search
 from gfnn_jax.jobs.written import Ran, already_done, publish, write
 from gfnn_jax.learn.check import FEWEST
-from gfnn_jax.learn.refit import refit
+from gfnn_jax.learn.refit import can_be_refitted, help_refit, refit
+from gfnn_jax.phase_space import Pairs
+from gfnn_jax.processes import Group, Share
 from gfnn_jax.storage.outputs import atomic_folder
 from gfnn_jax.storage.partial import unfinished
 
-# A larger file is never in memory whole: candidates are chosen on a sample of its pairs, and the
-# chosen one is fitted to all of them chunk by chunk.
-_LARGE_BYTES, _FIT_CHUNK, _HELD = 2**29, 50_000, 2_000
+# A larger file is never in memory whole, nor are several: candidates are chosen on a sample of the
+# pairs, and the chosen one is fitted to all of them chunk by chunk.
+_LARGE_BYTES, _FIT_CHUNK = 2**29, 50_000
+_HELD, _HELD_PART = 2_000, 5  # pairs of the sample that judge, at most; at most a fifth
 
 
 def fit(
-    data: Path,
+    data: Path | Sequence[Path],
     *,
     out: Path,
     dt: float | None = None,
@@ -41,20 +45,35 @@ def fit(
     seed: int = 0,
     overwrite: bool = False,
     resume: bool = False,
+    group: Group | None = None,
     progress: Progress = SILENT,
 ) -> Ran | None:
-    """Learn the map of a trajectory file, and write it with its report into the model folder out.
+    """Learn the map of trajectory files, and write it with its report into the model folder out.
 
     scene_name: lends its coordinates and features. resume: None where ``out`` is this very job,
-    done. The other options are those of ``gfnn.fit``.
+    done. group: the processes that do this job, each with its own rows or files; all but the first
+    answer None. The other options are those of ``gfnn.fit``.
     """
     scene = scene_named(scene_name) if scene_name is not None else None
-    large = data.is_file() and data.stat().st_size > _LARGE_BYTES
+    data = [data] if isinstance(data, Path) else list(data)
+    processes, group = group, group or Group()
+    pairs = _Pairs(data, dt, group.share)
     structured = structure is not None or (scene is not None and scene.structure is not None)
     fewest = FEWEST if structured else None
+    size = sum(path.stat().st_size for path in data if path.is_file())
+    large = processes is not None or len(data) > 1 or size > _LARGE_BYTES
     trajectories = (
-        read_sample(data, dt=dt) if large else read_trajectories(data, dt=dt, fewest=fewest)
+        read_sample(data, dt=dt, group=processes)
+        if large
+        else read_trajectories(data[0], dt=dt, fewest=fewest)
     )
+    if not group.first:
+        progress.say("waiting for the map of a sample")
+        told = group.told()
+        progress.say("own pairs, for the chosen candidate")
+        with failures_of_arithmetic():
+            help_refit(told, pairs, group, scene=scene)
+        return None
     for line in summary(trajectories):
         progress.tell(line)
     options = {
@@ -68,6 +87,7 @@ def fit(
         "angles": list(angles), **options,
     }  # fmt: skip
     if already_done(out, job, resume):
+        group.told({})
         return None
     with unfinished(out, job, what="fit", overwrite=overwrite, resume=resume) as kept_in:
         try:
@@ -75,12 +95,14 @@ def fit(
                 trajectories.pairs(), scene, angles=angles, max_seconds=max_seconds,
                 progress=progress, kept_in=kept_in, job=job, **options,
             )  # fmt: skip
-            linear = family != "mlp" and fitted.chosen.learns == "map"
-            if large and linear and fitted.map.parameters is None:
-                progress.say("all pairs of the file, for the chosen candidate")
-                held = trajectories.pairs().take(slice(_HELD))
+            if large and can_be_refitted(fitted.map):
+                progress.say("all pairs, for the chosen candidate")
+                sampled = trajectories.pairs()
+                held = sampled.take(slice(min(_HELD, len(sampled) // _HELD_PART)))
                 with failures_of_arithmetic():
-                    fitted = refit(fitted, iterate_pairs(data, _FIT_CHUNK, dt=dt), held)
+                    fitted = refit(fitted, pairs, held, scene=scene, group=group)
+            else:
+                group.told({})
             progress.say("the report: compiling the derivative of a step")
             result = report.assemble(
                 fitted, scene=scene_name, dt=float(np.asarray(fitted.map.dt)), seed=seed,
@@ -101,6 +123,16 @@ def fit(
         with atomic_folder(out) as folder:
             write(folder, folder, fitted, result, job)
     return Ran(fitted, out, result)
+
+
+class _Pairs:
+    """The pairs of a process, read anew each time that they are gone through."""
+
+    def __init__(self, paths: Sequence[Path], dt: float | None, share: Share):
+        self.paths, self.dt, self.share = paths, dt, share
+
+    def __iter__(self) -> Iterator[Pairs]:
+        return iterate_pairs(self.paths, _FIT_CHUNK, dt=self.dt, share=self.share)
 
 
 def _range(values) -> list[float]:

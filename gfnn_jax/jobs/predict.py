@@ -12,7 +12,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.data.files import read_initial, read_initial_noise
-from gfnn_jax.data.parts import check_count, part_of, put_together
+from gfnn_jax.data.parts import number_of_parts, part_of, put_together
 from gfnn_jax.data.predictions import PredictionWriter, is_done, job_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate.bands import bands, horizon
@@ -44,7 +44,7 @@ class _Drawn(NamedTuple):
     """Samples and their initial states (n, B, 2d), the angles of a state, the size of the horizon,
     and what the band is of."""
 
-    samples: Samples
+    samples: Samples | Sharded
     z0: np.ndarray
     angles: tuple[int, ...]
     size: float | None
@@ -90,7 +90,7 @@ def predict(
     devices: among which the lanes are shared out, "all" of this process or the first so many; the
     same bits on any number, and after a resume on another number. share: of the lanes, that this
     process predicts; it writes a part of its own, and the first process puts the parts together
-    when all are there.
+    when all are there. A resumed job has the parts that it began with, shared out anew.
 
     Memory: one chunk of saved states, 32 MiB at most where a saved state of all lanes is no more
     than that, whatever ``num_steps``. A job that was killed goes on with ``resume`` where its last
@@ -102,8 +102,6 @@ def predict(
         )
     if horizon_size is not None and samples is None:
         raise InputError("expected --samples beside --horizon: the band is of samples")
-    if samples is not None and (devices is not None or share is not None):
-        raise InputError("expected --samples without --devices and --distributed")
     map_ = saved.load(model)
     if dt is not None:
         try:
@@ -126,6 +124,8 @@ def predict(
             stepped = map_.sharded(devices or "all")
         except ValueError as error:
             raise InputError(f"--devices: {error}") from error
+        if drawn is not None and isinstance(drawn.samples, Samples):
+            drawn = drawn._replace(samples=Sharded(drawn.samples, stepped.devices))
     identity = {
         "model": saved.digest(model),
         "initial": digest.hexdigest(),
@@ -136,29 +136,38 @@ def predict(
     request = _Request(map_, stepped, num_steps, save_every, stop_outside, overwrite, resume)
     if share is None or not isinstance(stepped, Sharded):
         return _written(request, out, z0, params, identity, drawn, progress)
-    job = job_of(identity, z0.shape, num_steps=num_steps, save_every=save_every, dt=dt)
+    job = job_of(
+        identity, z0.shape, num_steps=num_steps, save_every=save_every, dt=dt,
+        bands=drawn is not None,
+    )  # fmt: skip
     if not overwrite and resume and is_done(out, job):
         wait_for_all()
         return _finished(out, dt)
     ensure_new(out, overwrite)
-    check_count(out, share)
-    shares = [Share(i, share.count).of(len(z0), stepped.block) for i in range(share.count)]
-    parts = [part_of(out, Share(i, share.count)) for i in range(share.count)]
-    own = shares[share.index]
-    predicted = Predicted(np.zeros(0, int), np.zeros(0, int), dt, 0.0)
-    if own.stop > own.start:
-        identity |= {"lanes": [own.start, own.stop]}
-        own_params = None if params is None else params[own]
-        part = parts[share.index]
-        predicted = _written(request, part, z0[own], own_params, identity, None, progress)
+    many = number_of_parts(out, share, resume=resume and not overwrite)
+    lanes = [Share(i, many).of(len(z0), stepped.block) for i in range(many)]
+    parts = [part_of(out, Share(i, many)) for i in range(many)]
+    predicted = [Predicted(np.zeros(0, int), np.zeros(0, int), dt, 0.0)]
+    for own, part in [*zip(lanes, parts, strict=True)][share.index :: share.count]:
+        if own.stop > own.start:
+            own_params = None if params is None else params[own]
+            own_drawn = None if drawn is None else drawn._replace(z0=drawn.z0[:, own])
+            of_part = identity | {"lanes": [own.start, own.stop]}
+            predicted.append(
+                _written(request, part, z0[own], own_params, of_part, own_drawn, progress)
+            )
     progress.say("waiting for the other processes")
     wait_for_all()
     if share.index == 0:
-        there = [part for part, own in zip(parts, shares, strict=True) if own.stop > own.start]
+        there = [part for part, own in zip(parts, lanes, strict=True) if own.stop > own.start]
         progress.say(f"writing {out}")
         put_together(there, out, job)
-        return _finished(out, dt)._replace(seconds=predicted.seconds)
-    return predicted
+        return _finished(out, dt)._replace(seconds=sum(part.seconds for part in predicted))
+    status, left_at = (
+        np.concatenate([getattr(part, name) for part in predicted])
+        for name in ("status", "left_at")
+    )
+    return Predicted(status, left_at, dt, sum(part.seconds for part in predicted))
 
 
 def _written(
@@ -246,7 +255,7 @@ def _go_on(
         if drawn is not None:
             of_samples = Lanes(**{name: carry[_OF_SAMPLES + name] for name in Lanes._fields})
             passed = writer.carry["horizon"]
-    many = 1 if drawn is None else 1 + len(drawn.samples)
+    many = 1 if drawn is None else 1 + len(drawn.z0)
     chunk = _chunk_length(z0.shape[0] * many, z0.shape[1], save_every)
     options = {"params": params, "save_every": save_every, "stop_outside": stop_outside}
     while writer.saved < writer.total:

@@ -1,4 +1,9 @@
-"""The chosen map of a fit, fitted anew to more pairs than fit into memory."""
+"""The chosen map of a fit, fitted anew to more pairs than fit into memory, of many processes.
+
+Each process folds its own rows into one triangular factor (local QR); factors are merged in pairs
+up a tree, a TSQR (Demmel, Grigori, Hoemmen & Langou, SIAM J. Sci. Comput. 34, 2012), one tree for
+S and one for each Gauss–Newton problem of H. The first process solves, and decides alone.
+"""
 
 from __future__ import annotations
 
@@ -6,39 +11,69 @@ import dataclasses
 import time
 import warnings
 from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_inner, whole_turns
 from gfnn_jax.errors import FitWarning
-from gfnn_jax.fitting import least_squares
+from gfnn_jax.fitting import gauss_newton, least_squares
+from gfnn_jax.fitting.gauss_newton import FlowFit
+from gfnn_jax.flows.collocation import Steps
+from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.assemble import stepped
 from gfnn_jax.learn.candidates import Candidate, Tolerance, one_step_error, with_error
 from gfnn_jax.learn.conclude import not_met
 from gfnn_jax.learn.fit import Fit
+from gfnn_jax.learn.flows import LearnedHamiltonian
+from gfnn_jax.learn.formula import Term, formula
 from gfnn_jax.learn.sweeps import residual_weight
+from gfnn_jax.maps.saved import packed, unpacked
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
+from gfnn_jax.processes import Group
+from gfnn_jax.scenes import Scene
 
 _BLOCK = 20_000  # pairs at a time
 # A pair is an outlier that is missed by so many deviations, which are no smaller than roundoff. A
 # million pairs with one at this limit have no worse a fit for it.
 _OUTLYING, _ROUNDOFF = 100.0, 1e-14
+_OF_TASK = "task "  # before the names of a task, in what processes are told
+_COUNTED = ("count", "outliers", "unresolved")  # pairs that are close or not, and of the first
 _NO_WORSE = 1.1  # a refit whose error is larger by this factor than that of its sample is not kept
 
 
-def refit(fitted: Fit, chunks: Iterable[Pairs], held: Pairs) -> Fit:
+def can_be_refitted(map_: SymplecticMap) -> bool:
+    """Whether `refit` knows what to do: S or H is linear in its coefficients, and nothing but the
+    state matters."""
+    index = _fitted_piece(map_.pieces)
+    return (
+        map_.parameters is None
+        and index is not None
+        and hasattr(map_.pieces[index].family, "term_gradients")
+    )
+
+
+def refit(
+    fitted: Fit, chunks: Iterable[Pairs], held: Pairs, *, scene: Scene | None = None,
+    group: Group | None = None,
+) -> Fit:  # fmt: skip
     """The chosen map of a fit, of a linear family, with its coefficients from all of these pairs.
 
-    fitted: of a sample of them. chunks: all of the pairs, which need never be in memory together.
-    held: pairs that choose the ridge and judge the result; they are left out of the fit, as are
-    outliers, which the sample's map misses by far. Charts, domain and noise remain those that the
-    sample gave, and so does the map where all pairs give a worse one. Warns (FitWarning) of both,
-    and where the tolerance is missed.
+    fitted: of a sample of them. chunks: all of the pairs, which need never be in memory together;
+    of a law they are gone through once for each Gauss–Newton step. held: pairs that choose the
+    ridge and judge the result; they are left out of the fit, as are outliers, which the sample's
+    map misses by far, and what the steps of a law do not resolve. Charts, domain and noise remain
+    those that the sample gave, and so does the map where all pairs give a worse one. Warns
+    (FitWarning) of both, and where the tolerance is missed.
+
+    group: the processes that have the pairs. This one is the first, with chunks of its own; the
+    others call `help_refit`. scene: as `maps.saved.save` takes it.
     """
     started = time.perf_counter()
+    group = group or Group()
     tolerance = fitted.asked
     messages = [m for m in fitted.messages if m != not_met(fitted.chosen, tolerance, fitted.ended)]
 
@@ -46,98 +81,258 @@ def refit(fitted: Fit, chunks: Iterable[Pairs], held: Pairs) -> Fit:
         messages.append(message)
         warnings.warn(message, FitWarning, stacklevel=3)
 
-    old = fitted.chosen
-    worker = _Refit(old, tolerance)
+    old, law = fitted.chosen, fitted.hamiltonian
+    most = _OUTLYING * np.maximum(old.deviations, _ROUNDOFF * np.asarray(old.map.scale))
+    worker = _Refit(old.map, {"most": most, "held": np.asarray(held.z0)})
     held = held.take(np.flatnonzero(worker.close(held)))
     chosen, num_pairs, before = None, fitted.num_pairs, old.validation_rms
     if len(held):
-        reduced = worker.reduce(chunks, held)
-        before = worker.error(old.map, held).rms
-        if worker.outliers:
+        before = worker.error(old.map, held, tolerance).rms
+        worker.task["held"] = np.asarray(held.z0)
+        worker.task |= worker.resolving(held)
+        bare = dataclasses.replace(old.map, posterior=None)
+        group.told({**packed(bare, scene), **{_OF_TASK + n: v for n, v in worker.task.items()}})
+        found = worker.solved(chunks, held, group)
+        if found.outliers:
             warn(
-                f"{worker.outliers} of {worker.count + worker.outliers} pairs are far from what "
+                f"{found.outliers} of {found.count + found.outliers} pairs are far from what "
                 "the others tell: outliers, they are left out"
             )
-        if reduced[0].rows:
-            chosen, num_pairs = worker.solved(*reduced, held), worker.count
+        if found.unresolved:
+            warn(
+                f"{found.unresolved} of {found.count} pairs, as of close passages, are not "
+                "resolved by the steps of the law: they are left out"
+            )
+        if found.map is not None:
+            candidate = with_error(old, worker.error(found.map, held, tolerance))
+            chosen = dataclasses.replace(candidate, map=found.map, train_rms=found.train_rms)
+            num_pairs = found.count
+    else:
+        group.told({})
     if chosen is None or not chosen.validation_rms <= _NO_WORSE * before:
-        found = "no map" if chosen is None else f"a worse map ({chosen.validation_rms:.2e})"
-        warn(f"all pairs give {found} than the sample ({before:.2e}), whose map is kept")
+        found_map = "no map" if chosen is None else f"a worse map ({chosen.validation_rms:.2e})"
+        warn(f"all pairs give {found_map} than the sample ({before:.2e}), whose map is kept")
         chosen, num_pairs = old, fitted.num_pairs
+    elif law is not None and found.law is not None and old.learns == "hamiltonian":
+        law = _with_coefficients(law, found.law, chosen)
     if chosen.validation_bound > fitted.tolerance:
         warn(not_met(chosen, tolerance, fitted.ended))
     candidates = tuple(chosen if c.chosen else c for c in fitted.candidates)
     seconds = fitted.seconds + time.perf_counter() - started
     return dataclasses.replace(
         fitted, map=chosen.map, candidates=candidates, num_pairs=num_pairs, seconds=seconds,
-        messages=tuple(messages),
+        hamiltonian=law, messages=tuple(messages),
     )  # fmt: skip
 
 
-class _Refit:
-    """The rows of a candidate's map from any number of pairs; counts pairs and outliers."""
+def help_refit(
+    told: dict[str, Any], chunks: Iterable[Pairs], group: Group, *, scene: Scene | None = None
+) -> int:
+    """The part of another process than the first in `refit`: how many pairs it has given.
 
-    def __init__(self, candidate: Candidate, tolerance: Tolerance):
-        self.candidate, self.tolerance, self.map = candidate, tolerance, candidate.map
-        pieces = jax.tree.map(np.asarray, self.map).pieces
-        self.index = next(i for i, p in enumerate(pieces) if isinstance(p, Generated))
-        self.before, self.generated = pieces[: self.index], pieces[self.index]
-        self.after = pieces[self.index + 1 :]
-        self.spread = np.asarray(self.map.scale)
-        self.most = _OUTLYING * np.maximum(candidate.deviations, _ROUNDOFF * self.spread)
-        self.count = self.outliers = 0
+    told: what `refit` says to begin with; empty where there is nothing to be done. chunks: of the
+    pairs that are this process's own.
+    """
+    if not told:
+        return 0
+    task = {n.removeprefix(_OF_TASK): v for n, v in told.items() if n.startswith(_OF_TASK)}
+    rest = {n: v for n, v in told.items() if not n.startswith(_OF_TASK)}
+    worker = _Refit(jax.device_put(unpacked(rest, scene)), task)
+    own = worker.answer(chunks, group.told())
+    while True:
+        group.folded(own, worker.merged)
+        wanted = group.told()
+        if not wanted:
+            return int(own["count"])
+        own = worker.answer(chunks, wanted)
+
+
+def _fitted_piece(pieces: tuple) -> int | None:
+    """The piece whose coefficients are fitted: S, else H."""
+    for kind in (Generated, Flow):
+        for index, piece in enumerate(pieces):
+            if isinstance(piece, kind):
+                return index
+    return None
+
+
+def _with_coefficients(
+    law: LearnedHamiltonian, fit: FlowFit, candidate: Candidate
+) -> LearnedHamiltonian:
+    """The law with the coefficients of this fit."""
+    names = [term.term for term in law.terms]
+    errors = fit.standard_errors.tolist()
+    terms = tuple(
+        Term(*entry) for entry in zip(names, fit.coefficients.tolist(), errors, strict=True)
+    )
+    flow = dataclasses.replace(law.flow, params=fit.coefficients)
+    text = getattr(flow.family, "prefix", "") + formula(terms)
+    return dataclasses.replace(
+        law, flow=flow, terms=terms, formula=text, candidate=candidate, condition=fit.condition
+    )
+
+
+class _Solved(NamedTuple):
+    """The map with its new coefficients, None where there were no rows; of a law its fit too.
+    count, outliers, unresolved: of pairs that were close, that were not, and that were close but
+    are not resolved."""
+
+    map: SymplecticMap | None
+    train_rms: float
+    law: FlowFit | None
+    count: int
+    outliers: int
+    unresolved: int
+
+
+class _Refit:
+    """The rows of a map from any number of pairs.
+
+    task: what all processes of the refit must agree on. most (2d,): by which the map may miss a
+    pair; held (n, 2d): states that are left out; of a law also its steps (stages, substeps, newton)
+    and ``limit``, up to which their own error is resolved.
+    """
+
+    def __init__(self, map_: SymplecticMap, task: dict[str, Any]):
+        self.map, self.task = map_, task
+        pieces = jax.tree.map(np.asarray, map_).pieces
+        index = _fitted_piece(pieces)
+        assert index is not None  # `can_be_refitted`
+        self.index = index
+        self.before, self.piece, self.after = pieces[:index], pieces[index], pieces[index + 1 :]
+        self.spread = np.asarray(map_.scale)
 
     def close(self, pairs: Pairs) -> np.ndarray:
         """Which pairs (N,) the old map does not miss by far."""
         return self._close(np.asarray(pairs.z1), self._images(self.map, pairs.z0))
 
     def _close(self, z1, images) -> np.ndarray:
-        return np.all(np.abs(self._difference(images - z1)) <= self.most, axis=1)
+        return np.all(np.abs(self._difference(images - z1)) <= self.task["most"], axis=1)
 
-    def error(self, map_: SymplecticMap, pairs: Pairs):
+    def error(self, map_: SymplecticMap, pairs: Pairs, tolerance: Tolerance):
         """The one-step error of a map on pairs."""
         images = self._images(map_, pairs.z0)
         return one_step_error(
-            self._difference(images - np.asarray(pairs.z1)), self.spread, self.tolerance
+            self._difference(images - np.asarray(pairs.z1)), self.spread, tolerance
         )
 
-    def reduce(
-        self, chunks: Iterable[Pairs], held: Pairs
-    ) -> tuple[least_squares.Reduced, least_squares.Reduced]:
-        """The factors of all pairs but outliers and those held out, and of those held out."""
-        family, chart, dt = self.generated.family, self.generated.chart, float(self.map.dt)
-        weight = residual_weight(chart, self.generated.scale, dt)
-        judges = _keys(held.z0)
+    def resolving(self, held: Pairs) -> dict[str, Any]:
+        """Steps of the law that resolve the pairs held out, and the error up to which others count
+        as resolved. Nothing of S."""
+        if isinstance(self.piece, Generated):
+            return {}
+        problem, rows = self._problem(*self._inner(held)), np.arange(len(held))
+        family, c = self.piece.family, self.piece.params
+        steps = problem.fine_steps(family, c, rows)[0]
+        limit = problem.resolution(family, c, steps, rows)[2]
+        return {**dataclasses.asdict(steps), "limit": limit}
 
-        def rows(y0, y1):
-            return chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, dt)
+    # What a process answers, and how two answers become one.
 
-        def kept() -> Iterator[tuple]:
-            for chunk in chunks:
-                for first in range(0, len(chunk), _BLOCK):
-                    part = chunk.take(slice(first, first + _BLOCK))
-                    z0, z1 = np.asarray(part.z0), np.asarray(part.z1)
-                    images = self._images(self.map, z0)
-                    close = self._close(z1, images)
-                    self.count += int(close.sum())
-                    self.outliers += int((~close).sum())
-                    taken = close & ~np.isin(_keys(z0), judges)
-                    yield rows(*self._as_generated(z0[taken], z1[taken], images[taken]))
+    def answer(self, chunks: Iterable[Pairs], wanted: dict[str, Any]) -> dict[str, Any]:
+        """The factor of the rows of these pairs but outliers and those held out, and how many there
+        are; of a law at the coefficients that are wanted."""
+        counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
+        kept = self._kept(chunks, counts)
+        if isinstance(self.piece, Generated):
+            reduced = self._reduced(kept)
+            found = {"factor": reduced.factor, "rows": reduced.rows}
+        else:
+            found = self._of_law(kept, wanted["c"], counts)._asdict()
+        return {**found, **counts}
 
-        train = least_squares.reduce(family, kept(), weight)
-        z0, z1 = np.asarray(held.z0), np.asarray(held.z1)
-        judged = rows(*self._as_generated(z0, z1, self._images(self.map, z0)))
-        return train, least_squares.reduce(family, [judged], weight)
+    def merged(self, one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+        """One answer of two."""
+        counts = {n: one[n] + other[n] for n in _COUNTED}
+        if isinstance(self.piece, Generated):
+            both = least_squares.merged(*(_as_reduced(answer) for answer in (one, other)))
+            return {"factor": both.factor, "rows": both.rows, **counts}
+        return {**gauss_newton.merged(_as_factor(one), _as_factor(other))._asdict(), **counts}
 
-    def solved(self, train, held_factor, held: Pairs) -> Candidate:
-        """The candidate with these coefficients, judged by the pairs held out."""
-        solved = least_squares.solve(train, held_factor, self.candidate.num_parameters)
-        params = jax.device_put(self.generated.family.unflatten(solved.coefficients))
+    def solved(self, chunks: Iterable[Pairs], held: Pairs, group: Group) -> _Solved:
+        """The map of the pairs of all processes."""
+        counts: dict[str, Any] = {}
+
+        def asked(c=()) -> dict[str, Any]:
+            wanted = group.told({"c": np.asarray(c)})
+            found = group.folded(self.answer(chunks, wanted), self.merged)
+            counts.update({n: int(found[n]) for n in _COUNTED})
+            return found
+
+        law = None
+        if isinstance(self.piece, Generated):
+            train = _as_reduced(asked())
+            held_factor = self._reduced([self._inner(held)])
+            size, rows = self.piece.family.num_parameters, train.rows
+            if rows:
+                solved = least_squares.solve(train, held_factor, size)
+                coefficients, train_rms = solved.coefficients, solved.train_rms
+        else:
+            c, factor, made = gauss_newton.descended(
+                lambda c: _as_factor(asked(c)), self.piece.params, gauss_newton.OPTIONS.most
+            )
+            rows = factor.rows
+            if rows:
+                law = gauss_newton.summarised(c, factor, None, made, self._steps)
+                coefficients, train_rms = law.coefficients, law.rms
+        group.told({})
+        if not rows:
+            return _Solved(None, np.inf, None, **counts)
+        params = jax.device_put(self.piece.family.unflatten(coefficients))
         pieces = list(self.map.pieces)
         pieces[self.index] = dataclasses.replace(pieces[self.index], params=params)
         map_ = dataclasses.replace(self.map, pieces=tuple(pieces))
-        candidate = with_error(self.candidate, self.error(map_, held))
-        return dataclasses.replace(candidate, map=map_, train_rms=solved.train_rms)
+        return _Solved(map_, train_rms, law, **counts)
+
+    def _reduced(self, kept: Iterable[tuple[np.ndarray, np.ndarray]]) -> least_squares.Reduced:
+        """The factor of S from pairs (y0, y1) as its piece sees them."""
+        chart, dt = self.piece.chart, float(self.map.dt)
+        weight = residual_weight(chart, self.piece.scale, dt)
+        rows = (
+            (chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, dt)) for y0, y1 in kept
+        )
+        return least_squares.reduce(self.piece.family, rows, weight)
+
+    def _of_law(self, kept, c, counts: dict[str, int]) -> gauss_newton.Factor:
+        """The Gauss–Newton problem of H at c, from pairs (y0, y1) that its steps resolve."""
+        family = self.piece.family
+        size = family.num_parameters + 1
+        whole = gauss_newton.Factor(np.zeros((size, size)), 0, 0.0)
+        for y0, y1 in kept:
+            problem, rows = self._problem(y0, y1), np.arange(len(y0))
+            known, off, _ = problem.resolution(family, self.piece.params, self._steps, rows)
+            resolved = rows[known & (off <= self.task["limit"])]
+            counts["unresolved"] += len(rows) - len(resolved)
+            part = problem.factor(family, c, self._steps, resolved)
+            whole = gauss_newton.merged(whole, part)
+        return whole
+
+    @property
+    def _steps(self) -> Steps:
+        names = (field.name for field in dataclasses.fields(Steps))
+        return Steps(**{name: np.asarray(self.task[name]).item() for name in names})
+
+    def _problem(self, y0, y1) -> gauss_newton.Problem:
+        return gauss_newton.Problem(y0, y1, float(self.map.dt), np.asarray(self.piece.scale))
+
+    def _kept(self, chunks: Iterable[Pairs], counts: dict[str, int]) -> Iterator[tuple]:
+        """Pairs but outliers and those held out, as the fitted piece sees them."""
+        judges = _keys(self.task["held"])
+        for chunk in chunks:
+            for first in range(0, len(chunk), _BLOCK):
+                part = chunk.take(slice(first, first + _BLOCK))
+                z0, z1 = np.asarray(part.z0), np.asarray(part.z1)
+                images = self._images(self.map, z0)
+                close = self._close(z1, images)
+                counts["count"] += int(close.sum())
+                counts["outliers"] += int((~close).sum())
+                taken = close & ~np.isin(_keys(z0), judges)
+                if taken.any():
+                    yield self._as_fitted(z0[taken], z1[taken], images[taken])
+
+    def _inner(self, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
+        z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
+        return self._as_fitted(z0, z1, self._images(self.map, z0))
 
     def _images(self, map_: SymplecticMap, z) -> np.ndarray:
         steps = stepped(map_, np.asarray(z), timed=False)
@@ -147,8 +342,8 @@ class _Refit:
         plain = self.map.coordinates.forward is CARTESIAN.forward
         return nearest_image(difference, self.map.coordinates.angles if plain else ())
 
-    def _as_generated(self, z0, z1, images) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs (N, 2d) as the generated piece sees them: inner coordinates, the angles of z1
+    def _as_fitted(self, z0, z1, images) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs (N, 2d) as the fitted piece sees them: inner coordinates, the angles of z1
         lifted to the nearest image of the map's own prediction, the base map factored out."""
         coordinates, angles = self.map.coordinates, list(self.map.coordinates.angles)
         y0, y1, predicted = (to_inner(coordinates, z) for z in (z0, z1, images))
@@ -161,6 +356,14 @@ class _Refit:
         for piece in reversed(self.after):
             y1 = piece.inverse().image(y1)
         return y0, y1
+
+
+def _as_reduced(answer: dict[str, Any]) -> least_squares.Reduced:
+    return least_squares.Reduced(np.asfortranarray(answer["factor"]), int(answer["rows"]))
+
+
+def _as_factor(answer: dict[str, Any]) -> gauss_newton.Factor:
+    return gauss_newton.Factor(answer["matrix"], int(answer["rows"]), float(answer["cost"]))
 
 
 def _keys(z) -> np.ndarray:

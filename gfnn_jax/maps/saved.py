@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,7 @@ _FORMER_FIELDS = {
 }
 # Stands in the description where a function of the scene belongs.
 _OF_SCENE = "of the scene"
+_DESCRIBED = "described"  # all that is no array
 _PACKAGES = ("gfnn_jax", "jax", "jaxlib", "flax", "optax", "diffrax", "numpy", "scipy")
 
 
@@ -110,6 +112,31 @@ def load(folder, scene: Scene | None = None) -> SymplecticMap:
         raise InputError(f"{folder}: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{folder}: does not describe a map of this release ({error})") from error
+
+
+def packed(map_: SymplecticMap, scene: Scene | None = None) -> dict[str, np.ndarray]:
+    """A map as arrays by name, to be sent to another process: `unpacked` makes it anew."""
+    text, arrays = _encode(map_)
+    named, _ = jax.tree_util.tree_flatten_with_path(arrays)
+    described = json.dumps({"scene": _lender(map_, scene), "map": text})
+    found = {jax.tree_util.keystr(n, simple=True, separator="/"): np.asarray(a) for n, a in named}
+    return {**found, _DESCRIBED: np.array(described)}
+
+
+def unpacked(arrays: dict[str, np.ndarray], scene: Scene | None = None) -> SymplecticMap:
+    """The map that `packed` took apart; ``scene`` as in `load`."""
+    described = json.loads(str(arrays[_DESCRIBED]))
+    if scene is None and described["scene"] is not None:
+        scene = SCENES[described["scene"]]()
+    tree: dict[str, Any] = {}
+    for name, array in arrays.items():
+        *folders, last = name.split("/")
+        inside = tree
+        for folder in folders:
+            inside = inside.setdefault(folder, {})
+        if name != _DESCRIBED:
+            inside[last] = array
+    return _decode(described["map"], tree, scene)
 
 
 def record(folder) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.maps.samples import Samples
 from gfnn_jax.maps.symplectic_map import Lanes, RolloutInfo, SymplecticMap
 
 # Lanes of a block. On a CPU 64 and 1,024 are no faster for a generated map, 64 perhaps for a law
@@ -36,14 +37,15 @@ def local_devices(devices: int | str = "all") -> tuple[Any, ...]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sharded:
-    """A map whose rollouts are shared out among devices of this process.
+    """A map whose rollouts are shared out among devices of this process, or samples of it, each
+    device stepping all of them.
 
-    ``start``, ``advance`` and ``rollout`` take and mean what those of the map do, for batches of
-    states. They answer with NumPy arrays, put together from what each device has found. The last
-    block is filled up with copies of the last lane.
+    ``start``, ``advance`` and ``rollout`` take and mean what those of the map or the samples do,
+    for batches of states. They answer with NumPy arrays, put together from what each device has
+    found. The last block is filled up with copies of the last lane.
     """
 
-    map: SymplecticMap
+    map: SymplecticMap | Samples
     devices: tuple[Any, ...]
 
     @property
@@ -86,6 +88,9 @@ class Sharded:
         return self._shared_out(rollout, *self._given(z0, params, t0))
 
     def _given(self, z0, params, t0) -> tuple[np.ndarray, Any]:
+        if isinstance(self.map, Samples):
+            z0, args = self.map._given(z0, params, t0)
+            return z0, self._args(args, z0, None)
         z0 = np.asarray(self.map._states(z0))
         if z0.ndim != 2 or not len(z0):
             raise ValueError(f"expected states (B, {2 * self.map.dim}), B > 0; got {z0.shape}")
@@ -93,13 +98,19 @@ class Sharded:
 
     def _args(self, params, z, t0) -> Any:
         """Those of each lane, (B, k), or None."""
-        args = self.map._args(params, z, t0)
+        if isinstance(self.map, Samples):
+            map_, z = self.map.map, z[0]
+        else:
+            map_ = self.map
+        args = map_._args(params, z, t0)
         return args if args is None else np.broadcast_to(args, (len(z), np.shape(args)[-1]))
 
     def _shared_out(self, function: Callable, lanes: Any, args: Any) -> Any:
-        """``function(map, lanes, args)`` of all lanes, whose leaves are (B, ...)."""
+        """``function(map, lanes, args)`` of all lanes, whose leaves are (B, ...), those of samples
+        (n, B, ...); the args are (B, k)."""
+        axis = 1 if isinstance(self.map, Samples) else 0
         own = jax.tree.map(np.asarray, (lanes, args))
-        count, size = len(jax.tree.leaves(own)[0]), self.block
+        count, size = jax.tree.leaves(own)[0].shape[axis], self.block
         firsts, num = range(0, count, size), len(self.devices)
 
         def on(index: int) -> list[Any]:
@@ -108,11 +119,15 @@ class Sharded:
             found = []
             for first in firsts[index::num]:
                 rows = np.minimum(np.arange(first, first + size), count - 1)
-                block = jax.tree.map(lambda a, rows=rows: a[rows], own)
+                block = (
+                    jax.tree.map(lambda a, rows=rows: a.take(rows, axis), own[0]),
+                    jax.tree.map(lambda a, rows=rows: a[rows], own[1]),
+                )
                 found.append(jax.tree.map(np.asarray, function(map_, *block)))
             return found
 
         with ThreadPoolExecutor(num) as pool:  # they wait for their devices
             by_device = [*pool.map(on, range(num))]
         blocks = [by_device[i % num][i // num] for i in range(len(firsts))]
-        return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
+        whole = jax.tree.map(lambda *parts: np.concatenate(parts, axis), *blocks)
+        return jax.tree.map(lambda a: a[:, :count] if axis else a[:count], whole)

@@ -212,7 +212,15 @@ def _any_stored(record: dict[str, Any]) -> bool:
 def _orbax():
     import orbax.checkpoint as ocp  # takes half a second
 
-    return ocp.PyTreeCheckpointer()
+    if jax.process_count() == 1:
+        return ocp.PyTreeCheckpointer()
+    # Else it would wait for all processes of a job, which know nothing of this folder.
+    own = jax.process_index()
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+    )
+    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone)
+    return ocp.Checkpointer(handler, multiprocessing_options=alone)
 
 
 def _verify_files(folder: Path) -> None:
