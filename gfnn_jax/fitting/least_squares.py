@@ -82,7 +82,7 @@ def reduce(
         if on_block is not None:
             on_block()
         # LAPACK works in place on columns that are contiguous.
-        block = np.empty((w.size, m + 1), order="F")
+        block = np.empty((target.size, m + 1), order="F")
         gradients = family.term_gradients(w) * weight[:, None]
         block[:, :m] = gradients.reshape(-1, m)
         block[:, m] = (target * weight).ravel()

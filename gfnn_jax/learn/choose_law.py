@@ -46,9 +46,11 @@ def law_of(
         if learn == "hamiltonian":
             raise FitError(f"expected data of an autonomous flow to learn H from: {unfit}")
         return None
-    # S of a driven system needs more harmonics than H, and is no map to wait for.
+    # S of a driven system needs more harmonics than H, and S of several dt many more terms: no maps
+    # to wait for.
     structured = prepared.structure is not None
-    foremost = learn == "hamiltonian" or terms or prepared.period is not None or structured
+    of_more = prepared.period is not None or prepared.own_dt is not None
+    foremost = learn == "hamiltonian" or terms or of_more or structured
     options = OPTIONS if foremost else _BESIDE
     if structured:  # nothing else is learned of bodies, and of sites S in a few seconds
         beside = learn == "auto" and prepared.of_terms
