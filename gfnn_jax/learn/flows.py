@@ -39,6 +39,7 @@ from gfnn_jax.fitting.growth import grow
 from gfnn_jax.fitting.least_squares import Reduced
 from gfnn_jax.flows.collocation import Steps, images, of_lanes, truncation
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.learn.arcs import arcs_of
 from gfnn_jax.learn.assemble import Assembled, composed, stepped
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
 from gfnn_jax.learn.clock import Clock, OutOfTime
@@ -192,6 +193,11 @@ def learn_hamiltonian(
     started = time.perf_counter()
     if terms and prepared.structure is None:
         _check_finite(_own_terms(prepared, terms), prepared, judges.training)
+    steps_of, judges_of_steps = prepared, judges
+    arcs = arcs_of(prepared, judges)
+    if arcs is not None:
+        say(f"H: arcs of {arcs.length} steps, in which the states move far against their noise")
+        prepared, judges = arcs.prepared, arcs.judges
     problem = Problem(
         prepared.y0, prepared.y1, prepared.each_dt, prepared.scale, args=prepared.args,
         check=searching.check,
@@ -226,7 +232,12 @@ def learn_hamiltonian(
         pass  # what was found stands
     problem.check = lambda: None
     seconds = time.perf_counter() - started
-    learned = _learned(best, problem, prepared, everywhere, seconds, options)
+    root = None
+    if arcs is not None:
+        root = _root(best, problem, prepared, best.fit.steps, everywhere.pairs)
+        prepared, everywhere = steps_of, judges_of_steps
+        problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale)
+    learned = _learned(best, problem, prepared, everywhere, seconds, options, root)
     candidate = dataclasses.replace(learned.candidate, outside=outside)
     return dataclasses.replace(learned, candidate=candidate)
 
@@ -604,8 +615,10 @@ def _refitted(problem, found: _Fitted, rows, prepared, judges) -> _Fitted:
 
 
 def _learned(
-    found: _Fitted, problem, prepared: Prepared, judges: Judges, seconds: float, options: Options
-) -> LearnedHamiltonian:
+    found: _Fitted, problem, prepared: Prepared, judges: Judges, seconds: float, options: Options,
+    root: np.ndarray | None,
+) -> LearnedHamiltonian:  # fmt: skip
+    """root: of the covariance, where the fit was not to these pairs but to arcs of them."""
     family, fit = found.family, found.fit
     rows = judges.held_out
     z, args = prepared.y0[rows], prepared.given(rows)[1]
@@ -648,7 +661,8 @@ def _learned(
         float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(error, omega_h, prepared, judges, found, left_out, int((~resolved).sum()))),
-        stalled=found.stalled, root=_root(found, problem, prepared, steps, judges.pairs),
+        stalled=found.stalled,
+        root=_root(found, problem, prepared, steps, judges.pairs) if root is None else root,
     )  # fmt: skip
 
 

@@ -180,7 +180,7 @@ class SymplecticMap:
         Raises ValueError for any other map, unless dt is its own: it is known at one dt only.
         """
         known = not any(isinstance(value, jax.core.Tracer) for value in (dt, self.dt))
-        if known and np.ndim(dt) == 0 and dt == self.dt:
+        if known and np.ndim(dt) == 0 and np.asarray(dt) == np.asarray(self.dt):
             return self
         if len(self.pieces) != 1 or not _serves_any_dt(self.pieces[0]):
             raise ValueError(
