@@ -108,9 +108,7 @@ def _strided(
     along = first[:, None] + np.arange(length)
     pairs, moved = judges.pairs, prepared.y1 - prepared.y0
     last = first + length - 1
-    strided = Pairs(
-        np.asarray(pairs.z0)[first], np.asarray(pairs.z1)[last], length * prepared.dt
-    )
+    strided = Pairs(np.asarray(pairs.z0)[first], np.asarray(pairs.z1)[last], length * prepared.dt)
     angles = np.isin(np.arange(moved.shape[1]), prepared.coordinates.angles)
     # Angles go on over turns; what is no angle is as measured, without a sum's rounding.
     y0 = prepared.y0[first]

@@ -42,7 +42,7 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.learn.arcs import arcs_of
 from gfnn_jax.learn.assemble import Assembled, composed, stepped
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
-from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.clock import Clock, Counted, OutOfTime
 from gfnn_jax.learn.cost_of_flow import (
     CONTRACTING,
     FREQUENCY_STATES,
@@ -75,7 +75,8 @@ class Options:
     truncation: a flow's own error, as a part of the tolerance. goal: residual that modes grow to,
     as a part of the tolerance. generators: degrees of those that look for misfit; sampled_rows: per
     term, where what is left over is looked at. max_seconds: of the search; mode_seconds: where
-    modes grow, growth_part: the part of them in which they may.
+    modes grow, growth_part: the part of them in which they may. max_operations, mode_operations: of
+    the flows that are evaluated on the way, counted.
     """
 
     degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 8)
@@ -99,6 +100,8 @@ class Options:
     sampled_rows: int = 6
     max_seconds: float = 30.0
     mode_seconds: float = 60.0
+    max_operations: float = np.inf
+    mode_operations: float = np.inf
     growth_part: float = 0.7
 
 
@@ -201,6 +204,7 @@ def learn_hamiltonian(
     problem = Problem(
         prepared.y0, prepared.y1, prepared.each_dt, prepared.scale, args=prepared.args,
         check=searching.check,
+        spend=Counted(options.max_operations if basis is None else options.mode_operations).spend,
     )  # fmt: skip
     everywhere, free = judges, (*prepared.coordinates.cyclic, *prepared.whole)
     if prepared.structure is None:
@@ -220,7 +224,8 @@ def learn_hamiltonian(
     outside = None
     try:
         if best.noisy:
-            problem.check = clock.check  # what is pruned is soon fitted: the search is over
+            # What is pruned is soon fitted: the search is over.
+            problem.check, problem.spend = clock.check, Counted(np.inf).spend
             best = _pruned(problem, best, judges.training, prepared, judges, options)
         best = _sparse(problem, best, prepared, judges, options, say)
         there = dataclasses.replace(everywhere, held_out=everywhere.training[outer])
@@ -230,7 +235,7 @@ def learn_hamiltonian(
             best = _refitted(problem, best, everywhere.training, prepared, judges)
     except OutOfTime:
         pass  # what was found stands
-    problem.check = lambda: None
+    problem.check, problem.spend = lambda: None, Counted(np.inf).spend
     seconds = time.perf_counter() - started
     root = None
     if arcs is not None:
@@ -366,6 +371,7 @@ def _grown(
     goal = options.goal * _bound(judges, problem.scale)
     most = int(len(judges.training) * 2 * prepared.dim / options.rows_per_term)
     problem.check = Clock(options.growth_part * clock.left).check
+    problem.spend = Counted(options.growth_part * options.mode_operations).spend
     grown, ended = None, "the time is over"
     try:
         for grown in grow(problem, basis, judges.training, goal, min(most, options.most_modes)):
@@ -380,6 +386,7 @@ def _grown(
             f"expected more pairs, or pairs of a flow: {len(prepared.y0)} tell no library of modes"
         )
     problem.check = clock.check
+    problem.spend = Counted((1 - options.growth_part) * options.mode_operations).spend
     count = int(np.ceil(options.judged_rows * len(grown.coefficients) / (2 * prepared.dim)))
     rows = judges.training[: max(count, 500)]
     fit = problem.fit(grown.family, grown.coefficients, rows, rounds=False, say=say)
