@@ -100,7 +100,7 @@ def _central(n: int) -> float:
 def _strided(
     prepared: Prepared, judges: Judges, starts, lengths, length: int, options: Options
 ) -> Arcs | None:
-    """The arcs of so many steps that are in the training pairs, or in those held out, as a whole."""
+    """The arcs of so many steps that are wholly in the training pairs, or in those held out."""
     first = np.concatenate([
         np.arange(begin + offset, begin + count - length + 1, length)
         for begin, count in zip(starts, lengths, strict=True) for offset in range(length)

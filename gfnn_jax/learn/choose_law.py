@@ -17,7 +17,7 @@ from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.scenes.scene import Scene
 
 # Beside a map only a law of few terms is looked for: a larger one is no shorter to say than S. Its
-# budget is counted, so that a busy machine chooses no other candidate: 20 and 30 seconds of one quiet
+# budget is counted, so that a busy machine chooses no other candidate: 20 and 30 seconds of a quiet
 # core, which makes 5e8 of these operations a second, of modes 7e8 (two bodies, PCR3BP, pendulums).
 _BESIDE = dataclasses.replace(
     OPTIONS, most_terms=60, most_modes=150, max_seconds=np.inf, mode_seconds=np.inf,
