@@ -78,11 +78,11 @@ def why(fit: Any) -> str:
     meeting = [c for c in maps if c.validation_bound <= fit.tolerance]
     law = fit.hamiltonian and fit.hamiltonian.candidate
     if law is None:
-        return "no H was looked for, or none found"
+        return "no H was found"
     if not law.validation_bound <= fit.tolerance:
         return f"H misses the tolerance ({law.validation_relative:.1e} of the spread)"
     if not meeting:
-        return "H meets the tolerance, and no S that is not dearer was looked for or does"
+        return "H meets the tolerance, and no cheaper S does"
     ratio = law.operations / min(c.operations for c in meeting)
     return f"H meets it at {ratio:.2g} times the cost of S; up to {DEARER:g} times is preferred"
 

@@ -122,5 +122,5 @@ def _strided(
         return None
     return Arcs(
         dataclasses.replace(prepared, y0=y0, y1=y1, dt=length * prepared.dt),
-        Judges(strided, *rows, judges.tolerance), length,
+        Judges(strided, rows[0], rows[1], judges.tolerance), length,
     )  # fmt: skip
