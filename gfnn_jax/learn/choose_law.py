@@ -49,11 +49,10 @@ def law_of(
         if learn == "hamiltonian":
             raise FitError(f"expected data of an autonomous flow to learn H from: {unfit}")
         return None
-    # S of a driven system needs more harmonics than H, and S of several dt many more terms: no maps
+    # S of a driven system, or of one with parameters or several dt, needs more terms than H: no map
     # to wait for.
     structured = prepared.structure is not None
-    of_more = prepared.period is not None or prepared.own_dt is not None
-    foremost = learn == "hamiltonian" or terms or of_more or structured
+    foremost = learn == "hamiltonian" or terms or prepared.varied or structured
     options = OPTIONS if foremost else _BESIDE
     if structured:  # nothing else is learned of bodies, and of sites S in a few seconds
         beside = learn == "auto" and prepared.of_terms
