@@ -3,9 +3,10 @@
     python benchmarks/args.py            every row (about a minute on two cores)
     python benchmarks/args.py --quick    two of them
 
-Each row learns H from pairs of a system whose H is known, and judges by states, parameters and time
-steps that no fit has seen: the one-step error, the error at step 1,000 (driven: at step 1,600,
-after 100 periods) beside that of the reference itself, and the time of a step in a batch of 1,000.
+Each row learns H, or with -S in its name S, from pairs of a system whose H is known, and judges by
+states, parameters and time steps that no fit has seen: the one-step error, the error at step 1,000
+(driven: at step 1,600, after 100 periods) beside that of the reference itself, and the time of a
+step in a batch of 1,000.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy as np
 from harness import SEED, TABLES, Numbers, between_markers, main, markdown, number, results, timed
 
 import gfnn_jax as gfnn
+from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.scenes import (
     DrawnFrom,
     Scene,
@@ -62,9 +64,33 @@ def compound(z, t=0.0, args=(1.0,)):
     return z[1] ** 2 / (2 * (0.3 + length**2)) - 9.81 * (0.2 + length) * jnp.cos(z[0])
 
 
+@dataclasses.dataclass(frozen=True)
+class Swings:
+    """``draw(key, num)``: swings by up to ``most`` radians."""
+
+    most: float
+
+    def __call__(self, key, num):
+        area, turn = jax.random.uniform(key, (2, num), jnp.float64)
+        half = jnp.sin(self.most / 2) * jnp.sqrt(area)
+        q, p = jnp.cos(2 * jnp.pi * turn), jnp.sin(2 * jnp.pi * turn)
+        return jnp.stack([2 * jnp.arcsin(half * q), 2 * half * p], axis=-1)
+
+
+def pendulum(z, t=0.0, args=None):
+    """p²/2 − cos q."""
+    return z[1] ** 2 / 2 - jnp.cos(z[0])
+
+
 KEPLER = Scene(
     "kepler-mass", "planets of stars of different masses", 2, 0.2, DrawnFrom(Ellipses()),
     hamiltonian=kepler_of_mass, parameters=("m",),
+)  # fmt: skip
+
+PENDULUM = Scene(
+    "pendulum", "a pendulum of unit length, mass and gravity", 1, 0.25,
+    DrawnFrom(Swings(2.6)), test_states=DrawnFrom(Swings(2.2)), hamiltonian=pendulum,
+    coordinates=Coordinates("cartesian", angles=(0,)), reversor=(1, -1),
 )  # fmt: skip
 
 
@@ -120,6 +146,13 @@ def learned(
 def irregular(quick: bool) -> Numbers:
     """Hénon–Heiles, dt uniform in (0.1, 1.2) per pair, predicted at 0.25."""
     return learned(henon_heiles(), 600, quick, dt_range=(0.1, 1.2), dt=0.25, tolerance=1e-12)
+
+
+def of_step(quick: bool, scene: Scene, num_pairs: int, dt_range, dt: float) -> Numbers:
+    """The same by S, a function of dt² too, with the scene's coordinates and reversor."""
+    return learned(
+        scene, num_pairs, quick, dt_range=dt_range, dt=dt, lend=True, learn="map", tolerance=1e-12
+    )
 
 
 def length(quick: bool, terms: Sequence[Any] = ()) -> Numbers:
@@ -206,6 +239,15 @@ def driven(quick: bool, num_pairs: int = 4_000, **options) -> Numbers:
 
 PIECES = {
     "irregular-henon-heiles": irregular,
+    "irregular-henon-heiles-S-600": partial(
+        of_step, scene=henon_heiles(), num_pairs=600, dt_range=(0.1, 1.2), dt=0.25
+    ),
+    "irregular-henon-heiles-S-4000": partial(
+        of_step, scene=henon_heiles(), num_pairs=4_000, dt_range=(0.1, 1.2), dt=0.25
+    ),
+    "irregular-pendulum-S": partial(
+        of_step, scene=PENDULUM, num_pairs=2_000, dt_range=(0.1, 1.2), dt=0.25
+    ),
     "pendulum-length": length,
     "pendulum-length-terms": partial(length, terms=("p**2/l**2", "l*cos(q)")),
     "compound-pendulum": no_power,

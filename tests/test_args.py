@@ -281,7 +281,7 @@ DT = np.linspace(0.1, 0.2, 40)
         (0.1, {"q1": DT}, {}, "a name for a parameter that has no meaning yet, got 'q1'"),
         (0.1, {"arm length": DT}, {}, "letters, digits and _ as a parameter's name"),
         (0.1, {"l": np.where(DT > 0.19, np.nan, DT)}, {}, "finite values of l, got 4 of 40"),
-        (DT, None, {"learn": "map"}, "the pairs differ in their dt: expected learn='auto'"),
+        (DT, {"l": DT}, {"learn": "map"}, "the pairs differ in their dt: expected learn='auto'"),
         (DT, {"l": DT}, {"chart": "type2"}, "the pairs differ in their dt: expected learn='auto'"),
         (0.1, {"l": DT}, {"family": "sines"}, "the pairs differ in their parameters"),
         (0.1, {"l": DT}, {"terms": ["m*p**2"]}, "has the name 'm'"),

@@ -22,7 +22,7 @@ from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting.base_map import field_for
 from gfnn_jax.fitting.turns import backwards, forward_logarithm, tangent, turns
-from gfnn_jax.flows.collocation import Steps, images, of_lanes, truncation
+from gfnn_jax.flows.collocation import Steps, images, of_lanes, operations, truncation
 from gfnn_jax.phase_space import apply_j, symplectic_form
 
 
@@ -232,15 +232,16 @@ class Problem:
 
     dt: a number, or one of each pair (N,). args: of each pair (N, k), or None.
     scale: (2d,) sizes of the coordinates, by which residuals are divided.
-    check: called between blocks; it may raise to stop.
+    check: called between blocks; it may raise to stop. spend: called with the floating-point
+    operations of each evaluation of the flow before it is made; it may too.
     """
 
     def __init__(
         self, z0, z1, dt, scale, *, args=None, options: Options = OPTIONS,
-        check: Callable[[], Any] = lambda: None,
+        check: Callable[[], Any] = lambda: None, spend: Callable[[float], Any] = lambda _: None,
     ):  # fmt: skip
         self.z0, self.z1, self.dt, self.scale, self.args = z0, z1, dt, scale, args
-        self.options, self.check = options, check
+        self.options, self.check, self.spend = options, check, spend
 
     def given(self, rows) -> tuple[Any, Any]:
         """(dt, args) of these rows."""
@@ -249,6 +250,8 @@ class Problem:
     def images(self, family, coefficients, rows, steps: Steps, **options):
         """`flows.collocation.images` of the states z0 of these rows, each after its own dt."""
         dt, args = self.given(rows)
+        along = (options.get("along") or family) if options.get("derivatives") else None
+        self.spend(len(rows) * operations(family, self.z0.shape[1], steps, along))
         return images(
             family, coefficients, self.z0[rows], dt, steps, args=args, on_substep=self.check,
             **options,

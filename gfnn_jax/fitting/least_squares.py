@@ -63,13 +63,14 @@ class Reduced(NamedTuple):
 
 def reduce(
     family: Any,
-    rows: Iterable[tuple[np.ndarray, np.ndarray]],
+    rows: Iterable[Sequence[np.ndarray]],
     weight: np.ndarray,
     on_block: Callable[[], Any] | None = None,
 ) -> Reduced:
     """The factor of [A b] of a linear family, from (w, target_gradient), each (N, 2d), in parts.
 
-    rows:     any number of such pairs of arrays, which need never be in memory together.
+    rows:     any number of such pairs of arrays, which need never be in memory together. w may have
+              more columns, which the family knows.
     weight:   (2d,), what a row of ∇S is multiplied by: h divided by the scale of the conjugate
               coordinate, so that the result does not depend on the units of q and p.
     on_block: called before each block of rows; it may raise to stop.
@@ -82,7 +83,7 @@ def reduce(
         if on_block is not None:
             on_block()
         # LAPACK works in place on columns that are contiguous.
-        block = np.empty((w.size, m + 1), order="F")
+        block = np.empty((target.size, m + 1), order="F")
         gradients = family.term_gradients(w) * weight[:, None]
         block[:, :m] = gradients.reshape(-1, m)
         block[:, m] = (target * weight).ravel()

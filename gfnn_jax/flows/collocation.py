@@ -24,6 +24,7 @@ _SETTLED = 1e-12  # of it: what no longer shrinks below this is roundoff too
 # iteration of which costs as much as ten to thirty of these.
 _MOST, _SLOW, _FIRST = 60, 0.8, 4
 _MOST_NEWTON = 12
+_USUAL = 25  # iterations, where their number is not known yet
 # Of a derivative without matrices: Gauss–Newton steps need no more of it.
 _DERIVATIVE = 1e-6
 
@@ -91,6 +92,20 @@ def images(
             args = at_time(family, args, h[:, 0] if np.ndim(h) else h)
     z = np.where(solved[:, None], z, np.nan)
     return Images(z, solved, *((by_state, by_coefficient) if derivatives else ()))
+
+
+def operations(family, width: int, steps: Steps, along: Any = None) -> float:
+    """Floating-point operations of the image of one state (2d,), width 2d, by iterations that
+    contract by a quarter. along: the family in whose coefficients it is differentiated, too."""
+    gradient, with_hessian = family.operations
+    s = steps.stages
+    count = _USUAL * s * (gradient + 2 * s * width)
+    if along is not None:
+        terms, size = along.num_parameters, s * width
+        count += s * (with_hessian + 2 * width * terms)
+        # By fixed point where there are no matrices: of each term at once.
+        count += 2 * size * (s * terms if matrix_free(family) else size * (size / 3 + terms))
+    return float(steps.substeps * count)
 
 
 def _summed(matrix, slopes):

@@ -23,6 +23,7 @@ from gfnn_jax.families.family import (
     symmetric_gradient_and_hessian,
 )
 from gfnn_jax.families.sums import matrix_free
+from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.generating.charts import AnyChart, Chart
 from gfnn_jax.phase_space import apply_j
 from gfnn_jax.solve import fixed_point, newton
@@ -35,26 +36,29 @@ MOST_UPDATES = 40
 class ImplicitStep:
     """The implicit equation of a chart as the solver wants it: x is the free part of w.
 
-    shared = (family, params, dt, scale); lanes = (z, w where it is known, args). A residual is in
-    units of the coordinates' sizes, so that its floor is one number.
+    shared = (family, params, dt, scale); lanes = (z, w where it is known, args), and (B, 1) a dt of
+    each lane where shared has none. A residual is in units of the coordinates' sizes, so that its
+    floor is one number.
     """
 
     chart: AnyChart
 
     def evaluate(self, shared, lanes, x) -> Evaluation:
         """The residual; aux is ∇S(w), (B, 2d)."""
-        (family, params, dt, scale), (z, known, args) = shared, lanes
+        (family, params, dt, scale), (z, known, args, *own_dt) = shared, lanes
         w = self.chart.complete(known, x)
         gradient = symmetric_gradient(family, params, w, args)
-        return self._evaluation(z, w, gradient, dt, scale)[0]
+        return self._evaluation(z, w, gradient, *(own_dt or [dt]), scale)[0]
 
     def linearise(self, shared, lanes, x) -> tuple[Evaluation, Any]:
         """The residual and its Jacobian ∂r/∂x (B, n, n)."""
-        (family, params, dt, scale), (z, known, args) = shared, lanes
+        (family, params, dt, scale), (z, known, args, *own_dt) = shared, lanes
         w = self.chart.complete(known, x)
         gradient, hessian = symmetric_gradient_and_hessian(family, params, w, args)
-        evaluation, unit = self._evaluation(z, w, gradient, dt, scale)
-        return evaluation, self.chart.residual_jacobian(hessian, dt) / unit[..., None]
+        h = own_dt[0] if own_dt else dt
+        evaluation, unit = self._evaluation(z, w, gradient, h, scale)
+        matrix = self.chart.residual_jacobian(hessian, h[..., None] if own_dt else h)
+        return evaluation, matrix / unit[..., None]
 
     def unit(self, shared, lanes):
         """The residual's units (B, n), by which it is the change of a fixed-point iteration."""
@@ -81,7 +85,7 @@ class Generated:
     depends on the time, it does on that of the middle of the step, whichever way the step is made.
 
     family: S, a family or a plain ``S(params, w)``; what it holds of the data are leaves.
-    dt:     the time step h, a number or a leaf of the map.
+    dt:     the time step h, a number or a leaf of the map; of an S of dt also (B,), each lane's.
     scale:  (2d,) sizes of the coordinates, for the roundoff floor.
     predictor: where the solves start; None: at the chart's own first guess.
     """
@@ -106,12 +110,14 @@ class Generated:
         """
         known = self.chart.first_guess(z)
         guess = known[:, self.chart.free(z.shape[1] // 2)]
-        if self.predictor is not None:
-            guess = guess + self.predictor.forward(z)
-        shared = (self.family, self.params, self.dt, self.scale)
+        args = self._midway(args)
         if args is not None:  # open lanes are taken out of the batch, with their own
-            args = jnp.broadcast_to(self._midway(args), (z.shape[0], args.shape[-1]))
-        equation, lanes = ImplicitStep(self.chart), (z, known, args)
+            args = jnp.broadcast_to(args, (z.shape[0], args.shape[-1]))
+        if self.predictor is not None:
+            given = jnp.concatenate([z, args], axis=-1) if self.serves_any_dt else z
+            guess = guess + self.predictor.forward(given)
+        shared, lanes = self._shared_and_lanes(z, known, args)
+        equation = ImplicitStep(self.chart)
         if matrix_free(self.family):
             x, gradient, info = self._by_fixed_point(equation, shared, lanes, guess, unrolled)
         elif unrolled:
@@ -134,7 +140,7 @@ class Generated:
     def step(self, z, args=None, *, unrolled: bool | int = False):
         """(Z, Info) of the states z (B, 2d), by JAX."""
         w, gradient, info = self.solve(z, args, unrolled=unrolled)
-        return self.chart.image(z, w, gradient, self.dt), info
+        return self.chart.image(z, w, gradient, self._by_lane), info
 
     def compensated_step(self, z, compensation, args=None):
         """(Z, compensation, Info) of z + compensation, which is what rounding has lost so far
@@ -143,18 +149,18 @@ class Generated:
         w, gradient, info = self.solve(z, args)
         if not isinstance(self.chart, Chart):  # Z is no sum
             return self.chart.image(z, w, gradient, self.dt), jnp.zeros_like(z), info
-        return *two_sum(z, self.dt * apply_j(gradient) + compensation), info
+        return *two_sum(z, self._by_lane * apply_j(gradient) + compensation), info
 
     def refined_step(self, z, guess, args=None):
         """(Z, error (B,)) of the states z (B, 2d) in NumPy, from evaluation points w (B, 2d) that
         are known to be close: see `solve.newton.refine`. Nothing is compiled."""
         refine = fixed_point.refine if matrix_free(self.family) else newton.refine
         dim = z.shape[1] // 2
-        shared = (self.family, self.params, self.dt, self.scale)
         x = guess[:, self.chart.free(dim)]
         known, args = self.chart.first_guess(z), self._midway(args)
-        x, gradient, error = refine(ImplicitStep(self.chart), shared, (z, known, args), x)
-        return self.chart.image(z, self.chart.complete(known, x), gradient, self.dt), error
+        shared, lanes = self._shared_and_lanes(z, known, args)
+        x, gradient, error = refine(ImplicitStep(self.chart), shared, lanes, x)
+        return self.chart.image(z, self.chart.complete(known, x), gradient, self._by_lane), error
 
     def action(self, z, image, origin, args=None):
         """The action (B,) of the step from z (B, 2d) to its image: S itself, at their w. NumPy or
@@ -176,10 +182,34 @@ class Generated:
             return namespace(z0).full(z0.shape[0], np.nan, z0.dtype)
         w = self.chart.evaluation_point(z0, z1)
         _, hessian = self.family.gradient_and_hessian(self.params, w, self._midway(args))
-        return self.chart.determinant_of(hessian, self.dt)
+        h = self._by_lane
+        return self.chart.determinant_of(hessian, h[..., None] if np.ndim(h) else h)
+
+    @property
+    def serves_any_dt(self) -> bool:
+        """Whether S was learned as a function of dt."""
+        return isinstance(self.family, OfTimeStep)
+
+    def over(self, dt) -> Generated:
+        """The map over another dt, a number or (B,), of an S of dt."""
+        return dataclasses.replace(self, dt=dt)
+
+    @property
+    def _by_lane(self):
+        """dt as it multiplies states: a number, or (B, 1)."""
+        return self.dt[:, None] if np.ndim(self.dt) else self.dt
+
+    def _shared_and_lanes(self, z, known, args) -> tuple[tuple, tuple]:
+        """Those of `ImplicitStep`."""
+        if np.ndim(self.dt):
+            return (self.family, self.params, None, self.scale), (z, known, args, self._by_lane)
+        return (self.family, self.params, self.dt, self.scale), (z, known, args)
 
     def _midway(self, args):
-        """args in the middle of the step that begins with them."""
+        """What S depends on beside w: args in the middle of the step that begins with them, or the
+        step itself."""
+        if self.serves_any_dt:
+            return self._by_lane if np.ndim(self.dt) else self.dt[None]
         return at_time(self.family, args, 0.5 * self.dt)
 
 

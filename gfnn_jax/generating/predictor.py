@@ -111,30 +111,34 @@ class Fitted(NamedTuple):
 
 
 def fit_predictors(
-    chart: AnyChart, y0, y1, dt: float, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
+    chart: AnyChart, y0, y1, dt: Any, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
     features=None,
 ) -> list[Fitted]:  # fmt: skip
     """Predictors of a chart's map and of its inverse, by rising degree.
 
-    y0, y1: (N, 2d) states and images, NumPy, angles lifted. angles, cyclic, features: as those of
-    ``box_inputs``. The degree rises until the model is as close as it need be, or no longer gains:
-    then noise, or the number of pairs, is the limit.
+    y0, y1: (N, 2d) states and images, NumPy, angles lifted. dt: a number, or one of each pair (N,),
+    which is then a variable of the models beside the state, of either sign. angles, cyclic,
+    features: as those of ``box_inputs``. The degree rises until the model is as close as it need
+    be, or no longer gains: then noise, or the number of pairs, is the limit.
     """
     rows = np.linspace(0, len(y0) - 1, min(_ROWS, len(y0))).astype(int)
     y0, y1 = y0[rows], y1[rows]
+    dts = dt[rows, None] if np.ndim(dt) else np.empty((len(rows), 0))
 
-    def fitted(chart: AnyChart, given, other) -> list[tuple[PolynomialModel, float]]:
+    def fitted(chart: AnyChart, given, other, dts) -> list[tuple[PolynomialModel, float]]:
         dim = given.shape[1] // 2
         free = chart.free(dim)
         unknown = chart.evaluation_point(given, other)[:, free]
         known = chart.first_guess(given)[:, free]
+        given = np.concatenate([given, dts], axis=1)
         inputs = box_inputs(
             given, angles=tuple(a for a in angles if a < dim), cyclic=tuple(cyclic),
             features=features,
         )  # fmt: skip
         return _by_degree(inputs, given, unknown - known, sizes(unknown))
 
-    forward, backward = fitted(chart, y0, y1), fitted(chart.reverse(dt)[0], y1, y0)
+    forward = fitted(chart, y0, y1, dts)
+    backward = fitted(chart.reverse(dt)[0], y1, y0, -dts)
     # The direction that is close first waits for the other.
     rising = range(max(len(forward), len(backward)))
     sides = ([side[min(i, len(side) - 1)] for i in rising] for side in (forward, backward))

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
@@ -43,7 +44,8 @@ def assemble(
         features,
     )  # fmt: skip
     map_ = composed(generated, prepared, judges)
-    steps = stepped(map_, np.asarray(judges.pairs.z0)[judges.held_out])
+    held = judges.pairs.take(judges.held_out)
+    steps = stepped(map_, np.asarray(held.z0), held.dt)
     error = judges.error_of(
         np.where(steps.failed[:, None], np.nan, steps.images), prepared.coordinates
     )
@@ -66,7 +68,8 @@ def with_predictor(generated: Generated, prepared: Prepared, rows, features=None
         images, solved = prepared.y1[rows], np.ones(len(rows), bool)
     coordinates = prepared.coordinates
     fitted = fit_predictors(
-        generated.chart, prepared.y0[rows][solved], images[solved], prepared.dt,
+        generated.chart, prepared.y0[rows][solved], images[solved],
+        of_lanes(prepared.given(rows)[0], solved),
         angles=coordinates.angles, cyclic=coordinates.cyclic, features=features,
     )  # fmt: skip
     chosen = affordable(fitted, generated.family)
@@ -83,6 +86,7 @@ def composed(piece: Piece, prepared: Prepared, judges: Judges) -> SymplecticMap:
         angle_centre=prepared.angle_centre,
         dt=prepared.dt,
         parameters=_sampled(prepared),
+        dt_range=_dt_range(piece, prepared),
     )
     # Not jnp.asarray, which compiles a copy for every new shape.
     return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_)
@@ -93,6 +97,13 @@ def _sampled(prepared: Prepared) -> Parameters | None:
     if prepared.args is None:
         return None
     return sampled(prepared.parameters, prepared.args, prepared.each_dt, prepared.period)
+
+
+def _dt_range(piece: Piece, prepared: Prepared) -> np.ndarray | None:
+    """Where dt was sampled, of an S that was learned with it."""
+    if prepared.own_dt is None or not isinstance(piece, Generated):
+        return None
+    return np.array([prepared.own_dt.min(), prepared.own_dt.max()])
 
 
 def in_block(z: np.ndarray) -> np.ndarray:

@@ -200,7 +200,7 @@ def fit(
     """Learn the map of these pairs: the cheapest candidate within the tolerance, else the best.
 
     pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order.
-               Pairs of different dt, or with parameters (args), are learned as H.
+               Of different dt, S is a function of dt too, in the midpoint chart.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
     tolerance: bound on the RMS over coordinates of the one-step error ÷ that coordinate's spread,
                at its upper 95 % bound; a pure number.
@@ -304,7 +304,8 @@ def _smallest_determinant(chosen: Chosen) -> float:
         return float("nan")
     piece = jax.tree.map(np.asarray, piece)
     rows = chosen.judges.held_out[:_JUDGED]
-    args = prepared.given(rows)[1]
+    dt, args = prepared.given(rows)
+    piece = dataclasses.replace(piece, dt=dt) if prepared.own_dt is not None else piece
     determinant = piece.determinant(prepared.y0[rows], prepared.y1[rows], args)
     return float(determinant[np.argmin(np.abs(determinant))])
 

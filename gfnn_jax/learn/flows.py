@@ -39,9 +39,10 @@ from gfnn_jax.fitting.growth import grow
 from gfnn_jax.fitting.least_squares import Reduced
 from gfnn_jax.flows.collocation import Steps, images, of_lanes, truncation
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.learn.arcs import arcs_of
 from gfnn_jax.learn.assemble import Assembled, composed, stepped
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
-from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.clock import Clock, Counted, OutOfTime
 from gfnn_jax.learn.cost_of_flow import (
     CONTRACTING,
     FREQUENCY_STATES,
@@ -74,7 +75,8 @@ class Options:
     truncation: a flow's own error, as a part of the tolerance. goal: residual that modes grow to,
     as a part of the tolerance. generators: degrees of those that look for misfit; sampled_rows: per
     term, where what is left over is looked at. max_seconds: of the search; mode_seconds: where
-    modes grow, growth_part: the part of them in which they may.
+    modes grow, growth_part: the part of them in which they may. max_operations, mode_operations: of
+    the flows that are evaluated on the way, counted.
     """
 
     degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 8)
@@ -98,6 +100,8 @@ class Options:
     sampled_rows: int = 6
     max_seconds: float = 30.0
     mode_seconds: float = 60.0
+    max_operations: float = np.inf
+    mode_operations: float = np.inf
     growth_part: float = 0.7
 
 
@@ -192,9 +196,15 @@ def learn_hamiltonian(
     started = time.perf_counter()
     if terms and prepared.structure is None:
         _check_finite(_own_terms(prepared, terms), prepared, judges.training)
+    steps_of, judges_of_steps = prepared, judges
+    arcs = arcs_of(prepared, judges)
+    if arcs is not None:
+        say(f"H: arcs of {arcs.length} steps, in which the states move far against their noise")
+        prepared, judges = arcs.prepared, arcs.judges
     problem = Problem(
         prepared.y0, prepared.y1, prepared.each_dt, prepared.scale, args=prepared.args,
         check=searching.check,
+        spend=Counted(options.max_operations if basis is None else options.mode_operations).spend,
     )  # fmt: skip
     everywhere, free = judges, (*prepared.coordinates.cyclic, *prepared.whole)
     if prepared.structure is None:
@@ -214,7 +224,8 @@ def learn_hamiltonian(
     outside = None
     try:
         if best.noisy:
-            problem.check = clock.check  # what is pruned is soon fitted: the search is over
+            # What is pruned is soon fitted: the search is over.
+            problem.check, problem.spend = clock.check, Counted(np.inf).spend
             best = _pruned(problem, best, judges.training, prepared, judges, options)
         best = _sparse(problem, best, prepared, judges, options, say)
         there = dataclasses.replace(everywhere, held_out=everywhere.training[outer])
@@ -224,9 +235,14 @@ def learn_hamiltonian(
             best = _refitted(problem, best, everywhere.training, prepared, judges)
     except OutOfTime:
         pass  # what was found stands
-    problem.check = lambda: None
+    problem.check, problem.spend = lambda: None, Counted(np.inf).spend
     seconds = time.perf_counter() - started
-    learned = _learned(best, problem, prepared, everywhere, seconds, options)
+    root = None
+    if arcs is not None:
+        root = _root(best, problem, prepared, best.fit.steps, everywhere.pairs)
+        prepared, everywhere = steps_of, judges_of_steps
+        problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale)
+    learned = _learned(best, problem, prepared, everywhere, seconds, options, root)
     candidate = dataclasses.replace(learned.candidate, outside=outside)
     return dataclasses.replace(learned, candidate=candidate)
 
@@ -355,6 +371,7 @@ def _grown(
     goal = options.goal * _bound(judges, problem.scale)
     most = int(len(judges.training) * 2 * prepared.dim / options.rows_per_term)
     problem.check = Clock(options.growth_part * clock.left).check
+    problem.spend = Counted(options.growth_part * options.mode_operations).spend
     grown, ended = None, "the time is over"
     try:
         for grown in grow(problem, basis, judges.training, goal, min(most, options.most_modes)):
@@ -369,6 +386,7 @@ def _grown(
             f"expected more pairs, or pairs of a flow: {len(prepared.y0)} tell no library of modes"
         )
     problem.check = clock.check
+    problem.spend = Counted((1 - options.growth_part) * options.mode_operations).spend
     count = int(np.ceil(options.judged_rows * len(grown.coefficients) / (2 * prepared.dim)))
     rows = judges.training[: max(count, 500)]
     fit = problem.fit(grown.family, grown.coefficients, rows, rounds=False, say=say)
@@ -604,8 +622,10 @@ def _refitted(problem, found: _Fitted, rows, prepared, judges) -> _Fitted:
 
 
 def _learned(
-    found: _Fitted, problem, prepared: Prepared, judges: Judges, seconds: float, options: Options
-) -> LearnedHamiltonian:
+    found: _Fitted, problem, prepared: Prepared, judges: Judges, seconds: float, options: Options,
+    root: np.ndarray | None,
+) -> LearnedHamiltonian:  # fmt: skip
+    """root: of the covariance, where the fit was not to these pairs but to arcs of them."""
     family, fit = found.family, found.fit
     rows = judges.held_out
     z, args = prepared.y0[rows], prepared.given(rows)[1]
@@ -648,7 +668,8 @@ def _learned(
         float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(error, omega_h, prepared, judges, found, left_out, int((~resolved).sum()))),
-        stalled=found.stalled, root=_root(found, problem, prepared, steps, judges.pairs),
+        stalled=found.stalled,
+        root=_root(found, problem, prepared, steps, judges.pairs) if root is None else root,
     )  # fmt: skip
 
 

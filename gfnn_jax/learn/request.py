@@ -89,7 +89,9 @@ def checked(
     found = structure_of(structure, pairs.dim, coordinates)
     z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
     pairs = dataclasses.replace(pairs, z0=z0, z1=z1)
-    pairs, learn, messages = as_varied(pairs, learn=learn, family=family, chart=chart, base=base)
+    pairs, learn, messages = as_varied(
+        pairs, learn=learn, family=family, chart=chart, base=base, structure=structure
+    )
     if scene is not None and scene.features is not None and family in ("auto", "features"):
         messages += unlike_the_scene(pairs, scene)
     messages += coarse_tolerance(pairs, bound)

@@ -28,7 +28,7 @@ from gfnn_jax.learn.networks import learn_network
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import Entry, Found, search
-from gfnn_jax.learn.sweeps import NetworkSweep, sweeps_for
+from gfnn_jax.learn.sweeps import NetworkSweep, sweep_of_dt, sweeps_for
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 OnBetter = Callable[[SymplecticMap, Candidate], Any]
@@ -69,7 +69,9 @@ def searched(
     dearest = law.candidate.operations if law is not None and met_by_law else np.inf
     found = search(sweeps, bound.bound, clock, say, tell, better, dearest)
     dearest /= DEARER  # of maps that would be chosen
-    if law is not None and met_by_law and more_pairs_would_help(sweeps, found, bound, dearest):
+    if plain.varied:  # pairs of a law's flow are drawn, and factored out, at one dt
+        pass
+    elif law is not None and met_by_law and more_pairs_would_help(sweeps, found, bound, dearest):
         say("drawing pairs from the flow of H")
         drawn = search_of_law(
             law, judges.pairs, judges, scene, request.coordinates, dearest, clock, say, tell,
@@ -113,8 +115,11 @@ def _sweeps(request: Request, seen: Diagnosis, judges: Judges) -> list[Any]:
     """The sweeps of S over the charts that cover the data; none where H alone is learned, or the
     pairs are of more than one map."""
     charts, prepared = seen.charts.charts, seen.prepared
-    if request.learn == "hamiltonian" or prepared.varied:
+    if request.learn == "hamiltonian" or prepared.args is not None:
         return []
+    if prepared.own_dt is not None:
+        structured = prepared.structure is not None
+        return [] if structured else [sweep_of_dt(prepared, request.scene, judges, request.factors)]
     if request.family == "mlp":
         return [
             NetworkSweep(

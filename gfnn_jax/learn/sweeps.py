@@ -14,6 +14,7 @@ from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.families.products import Products, number_of_terms
 from gfnn_jax.families.sines import Sines
+from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
 from gfnn_jax.fitting.levenberg_marquardt import LMState, levenberg_marquardt
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
@@ -87,6 +88,12 @@ def sweeps_for(
             yield LinearSweep(prepared, chart, judges, "sines", None, None, factors)
 
 
+def sweep_of_dt(prepared, scene, judges, factors=None) -> LinearSweep:
+    """The sweep of S(w; dt²), where each pair has its own dt."""
+    reversor = scene.reversor if scene is not None else None
+    return LinearSweep(prepared, MIDPOINT, judges, "polynomial", None, reversor, factors)
+
+
 class _Factors(NamedTuple):
     """Of the training rows, of those held out, and of the training rows without the outermost
     twentieth and of that twentieth alone."""
@@ -116,24 +123,28 @@ class LinearSweep:
         free = (*prepared.coordinates.cyclic, *prepared.whole)
         self._outermost = outermost(prepared.y0[judges.training], free)
         coordinates = prepared.coordinates
-        w = self._train[0]
+        w, seen, of = self._train[0], self._train[0], Products
+        if prepared.own_dt is not None:
+            of, seen = _of_time_step, np.column_stack([w[:, :-1], w[:, -1] ** 2])
+            reversor = (*reversor, 1) if reversor is not None else None
         inputs = box_inputs(
-            w, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+            seen, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
             cyclic=coordinates.cyclic, features=features, reversor=reversor,
         )  # fmt: skip
         if kind == "sines":
             groups: Iterable[Iterable[Any]] = ([Sines(inputs, count)] for count in _SINES)
         else:
-            signs = variable_signs(inputs, reversor, w) if reversor is not None else None
+            signs = variable_signs(inputs, reversor, seen) if reversor is not None else None
             degrees = _EVEN_DEGREES if even else _DEGREES
-            groups = ((Products(inputs, degree, signs) for degree in g) for g in degrees)
+            groups = ((of(inputs, degree, signs) for degree in g) for g in degrees)
         known = len(_SINES) if kind == "sines" else sum(map(len, degrees))
+        rows = self._train[1].size
         self.sizes = [
             Size(family, group[-1], _extent(family))
-            for group in _determined(groups, w.size) for family in group
+            for group in _determined(groups, rows) for family in group
         ]  # fmt: skip
         # Else the last size is the largest there is, or the most terms are reached.
-        self.short_of_pairs = len(self.sizes) < known and w.size < _ROWS_PER_TERM * _MOST_TERMS
+        self.short_of_pairs = len(self.sizes) < known and rows < _ROWS_PER_TERM * _MOST_TERMS
         self._factors: dict[Any, _Factors] = {}
 
     def judge(self, size: Size, clock: Clock, say: Callable[[str], Any]) -> Candidate:
@@ -175,7 +186,9 @@ class LinearSweep:
             degree = round(extent)
             label = f"{self._prefix}{family.name} {degree}"
             terms = number_of_terms(family.inputs.is_angle, degree, family.signs)
-        rows = self._train[0].shape
+            if isinstance(family, OfTimeStep):  # of dt alone
+                label, terms = f"{label} with dt²", terms - degree
+        rows = self._train[1].shape
         share = rows[0] / (rows[0] + len(self.judges.held_out))
         pairs = int(np.ceil(_ROWS_PER_TERM * terms / rows[1] / share))
         most = f", more than the {_MOST_TERMS:,} that are tried" if terms > _MOST_TERMS else ""
@@ -196,7 +209,7 @@ class LinearSweep:
         one, other = (
             least_squares.solve(
                 least_squares.reduce(
-                    size.family, [tuple(a[half == i] for a in self._train)], self._weight
+                    _of_rows(size.family), [tuple(a[half == i] for a in self._train)], self._weight
                 ),
                 held, count,
             ).coefficients
@@ -232,13 +245,17 @@ class LinearSweep:
         )  # fmt: skip
 
     def _slopes(self, family, w) -> np.ndarray:
-        return family.term_gradients(w) * self._weight[:, None]
+        return _of_rows(family).term_gradients(w) * self._weight[:, None]
 
     def _by_states(self, family, params, w) -> tuple[np.ndarray, np.ndarray]:
         """The residual's derivatives in z₀ and z₁ (n, 2d, 2d), those ÷ their scale."""
-        eye, chart = np.eye(w.shape[1]), self.chart
+        eye, chart = np.eye(2 * self.prepared.dim), self.chart
         none, dt, scale = np.zeros_like(eye), self.prepared.dt, self.prepared.scale
-        hessian = family.gradient_and_hessian(params, w)[1]
+        if self.prepared.own_dt is None:
+            hessian = family.gradient_and_hessian(params, w)[1]
+        else:
+            h, dt = w[:, -1:], 1.0
+            hessian = h[..., None] * family.gradient_and_hessian(params, w[:, :-1], h)[1]
 
         def by(y0, y1):
             point, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, dt)
@@ -254,7 +271,7 @@ class LinearSweep:
         def left(of: Size) -> float:
             reduced = (
                 self._factors[of.group].train if larger.group in self._factors
-                else least_squares.reduce(of.family, [(w, target)], self._weight)
+                else least_squares.reduce(_of_rows(of.family), [(w, target)], self._weight)
             )  # fmt: skip
             freedom = None
             if states is not None:
@@ -291,7 +308,7 @@ class LinearSweep:
 
     def _computed(self, group, clock: Clock, say) -> _Factors:
         # Shuffled rows: the first of them are a sample, where all would take too long.
-        count, width = len(self._train[0]), self._train[0].shape[1]
+        count, width = self._train[1].shape
         taken = min(count, max(1, int(_MOST_OPERATIONS / (group.num_parameters**2 * width))))
         seconds = 2 * taken * width * group.num_parameters**2 / _OPERATIONS_PER_SECOND
         say(
@@ -301,7 +318,7 @@ class LinearSweep:
         started = time.perf_counter()
         train, outermost = tuple(a[:taken] for a in self._train), self._outermost[:taken]
         inner, outer, held = (
-            least_squares.reduce(group, [rows], self._weight, on_block=clock.check)
+            least_squares.reduce(_of_rows(group), [rows], self._weight, on_block=clock.check)
             for rows in (
                 tuple(a[~outermost] for a in train), tuple(a[outermost] for a in train), self._held
             )
@@ -478,10 +495,37 @@ def trial_residual(prepared: Prepared) -> float:
 
 
 def _rows(prepared: Prepared, chart: AnyChart, rows):
-    """(w, target_gradient) of these rows, and the weight that makes a row of ∇S unit-free."""
+    """(w, target_gradient) of these rows, and the weight that makes a row of ∇S unit-free. Where
+    each pair has its own dt: ((w, dt), h times that), as `_Moves` has its terms."""
     y0, y1 = prepared.y0[rows], prepared.y1[rows]
-    data = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, prepared.dt)
-    return data, residual_weight(chart, prepared.scale, prepared.dt)
+    w, dt = chart.evaluation_point(y0, y1), prepared.dt
+    if prepared.own_dt is not None:
+        w, dt = np.column_stack([w, prepared.own_dt[rows]]), 1.0
+    return (w, chart.target_gradient(y0, y1, dt)), residual_weight(chart, prepared.scale, dt)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Moves:
+    """h ∇φ of the terms of an S of dt, at (w, dt)."""
+
+    family: OfTimeStep
+
+    @property
+    def num_parameters(self) -> int:
+        return self.family.num_parameters
+
+    def term_gradients(self, given):
+        w, dt = given[:, :-1], given[:, -1:]
+        return dt[..., None] * self.family.term_gradients(w, dt)
+
+
+def _of_rows(family: Any) -> Any:
+    """The family whose terms make the rows of `_rows`."""
+    return _Moves(family) if isinstance(family, OfTimeStep) else family
+
+
+def _of_time_step(inputs, degree: int, signs=None) -> OfTimeStep:
+    return OfTimeStep(Products(inputs, degree, signs))
 
 
 def residual_weight(chart: AnyChart, scale, dt: float) -> np.ndarray:

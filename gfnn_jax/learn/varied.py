@@ -1,8 +1,8 @@
 """Pairs that differ in more than their states: in the time between them, in parameters, in the
 time of a drive.
 
-A generating function is that of one map; a Hamiltonian serves any dt and, as a function of the
-parameters too, any system of the family.
+A Hamiltonian serves any dt and, as a function of the parameters too, any system of the family. A
+generating function is that of one map; in the midpoint chart it may be a function of dt as well.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from gfnn_jax.phase_space import TIME, Pairs, sizes
 
 _SAME = 1e-9  # of its size: a parameter, or a dt, that varies by less does not
 _PRINTED = 1e-5  # of dt: what printed times may differ by
+_OF_DT = ("auto", "polynomial")  # families of an S of dt
 _NEARLY_ALL = 0.9  # of the pairs
 
 
@@ -55,15 +56,15 @@ def check_varied(pairs: Pairs) -> None:
 
 
 def as_varied(
-    pairs: Pairs, *, learn: str, family: str, chart: str, base
+    pairs: Pairs, *, learn: str, family: str, chart: str, base, structure=None
 ) -> tuple[Pairs, str, list[str]]:
     """The pairs as they vary, what is learned of them, and what is to be said.
 
     A dt that is the same in all is one number; so is one that is the same in nearly all, and the
     others, those across a gap, are left out unless only H is asked for. A parameter that is the
     same in all is none; nor is a time of the drive, but for the message that it leaves. Pairs of
-    different dt tell H alone: raises FitError where a map is asked
-    for, or a family or base of it where there are parameters.
+    different dt tell H, or S of dt and w in the midpoint chart; of different dt and parameters, or
+    of sites, they tell H alone. Raises FitError where anything else is asked for.
     """
     pairs, messages = _without_constants(pairs)
     if np.ndim(pairs.dt) and learn != "hamiltonian":
@@ -81,6 +82,14 @@ def as_varied(
         return pairs, learn, messages
     if differs == "parameters" and (family, base) == ("auto", None):
         return pairs, "map" if chart != "auto" else learn, messages
+    of_dt = differs == "dt" and not pairs.args and structure is None and learn != "hamiltonian"
+    if of_dt and base is None and family in _OF_DT and chart in ("auto", "midpoint"):
+        return pairs, learn, messages
+    if of_dt and (learn == "map" or chart != "auto"):
+        raise FitError(
+            "the pairs differ in their dt: expected no base, the family auto or polynomial and "
+            f"the chart auto or midpoint, for S of dt; got {family} and {chart}"
+        )
     if learn == "map" or (family, chart) != ("auto", "auto") or base is not None:
         raise FitError(
             f"the pairs differ in their {differs}: expected learn='auto' or 'hamiltonian', and no "

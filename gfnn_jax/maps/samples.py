@@ -43,6 +43,9 @@ class Samples:
     def __len__(self) -> int:
         return self.params.shape[0]
 
+    def __iter__(self):  # an index of JAX's that is too large is no error, and would not end it
+        return (self[i] for i in range(len(self)))
+
     def __getitem__(self, index) -> SymplecticMap:
         return self.one(self.params[index])
 

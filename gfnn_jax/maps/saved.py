@@ -26,6 +26,7 @@ from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.sums import Groups, Part, Sums, Windows
 from gfnn_jax.families.terms import Terms
+from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import Chart, TypeOne
 from gfnn_jax.generating.generated import Generated
@@ -46,7 +47,7 @@ _TYPES: dict[str, type] = {
     for kind in (
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
         Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
-        Windows, Groups, Ranges,
+        Windows, Groups, Ranges, OfTimeStep,
     )
 }  # fmt: skip
 # Names that were used before, in models that may still be about.

@@ -34,6 +34,7 @@ from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, 
 
 # 2d up to which a defect is that of all tangent vectors; random pairs of them beyond.
 _WIDEST, _TANGENT_PAIRS = 64, 4
+_DT_EDGE = 1e-6  # of a dt: what a printed number may miss the end of its range by
 _TWO_PI_REST = 2.4492935982947064e-16  # what float64 leaves out of 2π
 
 
@@ -92,7 +93,7 @@ class RolloutInfo(NamedTuple):
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=("pieces", "domain", "scale", "angle_centre", "dt", "parameters"),
+    data_fields=("pieces", "domain", "scale", "angle_centre", "dt", "parameters", "dt_range"),
     meta_fields=("coordinates",),
     drop_fields=("posterior",),
 )
@@ -107,6 +108,8 @@ class SymplecticMap:
     angle_centre: (a,) centre of the interval of length 2π in which each angle is kept.
     dt:           the time one step takes; of a reversed map below 0.
     parameters:   what the system depends on beside its state, where it was learned with that.
+    dt_range:     (2,) the lowest and highest dt of the data, of a map that was learned with dt as a
+                  variable of S.
     posterior:    how well the coefficients are known, where that is; no leaf: what makes another
                   map of the leaves (``jit``, ``jax.tree.map``) leaves it out.
 
@@ -126,6 +129,7 @@ class SymplecticMap:
     dt: Any
     parameters: Parameters | None = None
     posterior: Posterior | None = None
+    dt_range: Any = None
 
     def __post_init__(self):
         if isinstance(self.dt, (int, float)):
@@ -169,15 +173,16 @@ class SymplecticMap:
         return _step(self.reversed(), z, args)
 
     def over(self, dt, lanes: tuple[int, ...] = ()) -> SymplecticMap:
-        """The map over another time than that of the data: of the flow of one Hamiltonian.
+        """The map over another time than that of the data: of the flow of one Hamiltonian, or of an
+        S that was learned from pairs of several dt. Beyond those the lanes' status is 1.
 
         dt: a number, or one of each lane where that many ``lanes`` are to be stepped; above 0.
         Raises ValueError for any other map, unless dt is its own: it is known at one dt only.
         """
         known = not any(isinstance(value, Tracer) for value in (dt, self.dt))
-        if known and np.ndim(dt) == 0 and dt == self.dt:
+        if known and np.ndim(dt) == 0 and np.asarray(dt) == np.asarray(self.dt):
             return self
-        if len(self.pieces) != 1 or not isinstance(self.pieces[0], Flow):
+        if len(self.pieces) != 1 or not _serves_any_dt(self.pieces[0]):
             raise ValueError(
                 f"expected the flow of a Hamiltonian to step another dt, got a map of dt = "
                 f"{float(np.asarray(self.dt)):g} only: fit with learn='hamiltonian'"
@@ -358,6 +363,9 @@ class SymplecticMap:
     def _contains(self, y, args):
         """Whether states and parameters lie where data were (B,)."""
         inside = self.domain.contains(y)
+        if self.dt_range is not None:
+            low, high = self.dt_range[0] * (1 - _DT_EDGE), self.dt_range[1] * (1 + _DT_EDGE)
+            inside = inside & (low <= abs(self.dt)) & (abs(self.dt) <= high)
         return inside if self.parameters is None else inside & self.parameters.contains(args)
 
     def _apply(self, z, args, *, unrolled: bool | int = False):
@@ -372,6 +380,11 @@ class SymplecticMap:
         status = jnp.where(info.status == OK, jnp.where(inside, OK, LEFT_DOMAIN), info.status)
         status = jnp.where(jnp.all(jnp.isfinite(y), axis=-1), status, NON_FINITE)
         return self._outer(y, turns), info._replace(status=status.astype(jnp.int32))
+
+
+def _serves_any_dt(piece: Any) -> bool:
+    """Whether a piece can be stepped over any time."""
+    return isinstance(piece, Flow) or (isinstance(piece, Generated) and piece.serves_any_dt)
 
 
 def parts_of_two_pi(dtype):

@@ -1,0 +1,126 @@
+"""Arcs of several steps, where one step of a sequence moves the states little against their noise.
+
+Of a pair that is noise for the most part, the noise stands on both sides of the flow: it is of the
+state at which the terms are evaluated, too. Over k steps the states move k times as far, and the
+noise is the same: H is then learned from the pairs (z_i, z_{i+k}), k dt apart.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.learn.candidates import Judges
+from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.phase_space import Pairs
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Tuned on Hénon–Heiles at dt 0.005 to 0.5 with noise of 1e-3 (`benchmarks/bands.py`).
+
+    quiet: displacements, in units of their noise, of a step that needs no arcs, and of those that
+    are made. part: of a sequence, that an arc may be as long as. short: displacement of a step, in
+    units of the coordinates' sizes, up to which the noise is told by the sequences' differences.
+    order: of these; alike: a factor within which those of the order before tell the same noise.
+    fewest: arcs for each set of pairs.
+    """
+
+    quiet: float = 100.0
+    part: float = 0.5
+    short: float = 0.2
+    order: int = 6
+    alike: float = 1.5
+    fewest: int = 50
+
+
+OPTIONS = Options()
+
+
+class Arcs(NamedTuple):
+    """The arcs as pairs, in chains whose images are the states of the next, and k."""
+
+    prepared: Prepared
+    judges: Judges
+    length: int
+
+
+def arcs_of(prepared: Prepared, judges: Judges, options: Options = OPTIONS) -> Arcs | None:
+    """The arcs that H is to be learned from; None where the pairs themselves serve: where no
+    sequences are, where a step is long against its noise, and for pairs of many dt or parameters,
+    or of a structure."""
+    if prepared.varied or prepared.structure is not None:
+        return None
+    starts, lengths = _runs(np.asarray(judges.pairs.z0), np.asarray(judges.pairs.z1))
+    usual = int(np.median(np.repeat(lengths, lengths)))  # that a pair stands in
+    if usual <= options.order:
+        return None
+    moved = (prepared.y1 - prepared.y0) / prepared.scale
+    displacement = float(np.sqrt(np.mean(moved**2)))
+    noise = _noise(moved, starts, lengths, options)
+    if noise is None or displacement > options.short:
+        return None
+    wanted = int(np.ceil(options.quiet * np.sqrt(2) * noise / displacement))
+    length = min(wanted, int(options.part * usual))
+    if length < 2:
+        return None
+    return _strided(prepared, judges, starts, lengths, length, options)
+
+
+def _runs(z0, z1) -> tuple[np.ndarray, np.ndarray]:
+    """First row and number of rows of each sequence."""
+    begins = np.concatenate([[True], np.any(z1[:-1] != z0[1:], axis=1)])
+    starts = np.flatnonzero(begins)
+    return starts, np.diff(np.append(starts, len(z0)))
+
+
+def _noise(moved, starts, lengths, options: Options) -> float | None:
+    """Standard deviation of the noise, in units of the sizes, by differences of the states along
+    sequences: a high one leaves nothing of a smooth orbit, and √C(2n, n) times the noise. None
+    where two orders disagree."""
+    found = []
+    for order in (options.order - 1, options.order):
+        differences = [
+            np.diff(moved[first : first + count], order - 1, axis=0)
+            for first, count in zip(starts, lengths, strict=True) if count > order
+        ]  # fmt: skip
+        size = np.sqrt(np.mean(np.concatenate(differences) ** 2))
+        found.append(float(size / np.sqrt(_central(order))))
+    low, high = min(found), max(found)
+    return found[-1] if 0 < high <= options.alike * low else None
+
+
+def _central(n: int) -> float:
+    """C(2n, n)."""
+    return float(np.prod([(n + i) / i for i in range(1, n + 1)]))
+
+
+def _strided(
+    prepared: Prepared, judges: Judges, starts, lengths, length: int, options: Options
+) -> Arcs | None:
+    """The arcs of so many steps that are wholly in the training pairs, or in those held out."""
+    first = np.concatenate([
+        np.arange(begin + offset, begin + count - length + 1, length)
+        for begin, count in zip(starts, lengths, strict=True) for offset in range(length)
+    ])  # fmt: skip
+    along = first[:, None] + np.arange(length)
+    pairs, moved = judges.pairs, prepared.y1 - prepared.y0
+    last = first + length - 1
+    strided = Pairs(np.asarray(pairs.z0)[first], np.asarray(pairs.z1)[last], length * prepared.dt)
+    angles = np.isin(np.arange(moved.shape[1]), prepared.coordinates.angles)
+    # Angles go on over turns; what is no angle is as measured, without a sum's rounding.
+    y0 = prepared.y0[first]
+    y1 = np.where(angles, y0 + moved[along].sum(axis=1), prepared.y1[last])
+    rows = []
+    for own in (judges.training, judges.held_out):
+        inside = np.zeros(len(moved), bool)
+        inside[own] = True
+        rows.append(np.random.default_rng(0).permutation(np.flatnonzero(inside[along].all(axis=1))))
+    if min(map(len, rows)) < options.fewest:
+        return None
+    return Arcs(
+        dataclasses.replace(prepared, y0=y0, y1=y1, dt=length * prepared.dt),
+        Judges(strided, rows[0], rows[1], judges.tolerance), length,
+    )  # fmt: skip
