@@ -1,6 +1,5 @@
 """Many degrees of freedom: sums over sites, flows without matrices, fits of rings and chains."""
 
-import dataclasses
 import json
 from itertools import combinations
 
@@ -22,7 +21,8 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.propose import proposed
 from gfnn_jax.phase_space import defect_of_pairs
-from gfnn_jax.solve.status import NOT_CONVERGED
+from gfnn_jax.solve import krylov
+from gfnn_jax.solve.status import NON_FINITE
 
 RNG = np.random.default_rng(0)
 
@@ -190,7 +190,7 @@ def test_bodies_in_space():
         exact[f"1/|q_{i + 1} - q_{j + 1}|"] = -masses[i] * masses[j]
     assert found == pytest.approx(exact, rel=1e-10)
     assert "- 0.01/|q_1 - q_2|" in (fit.formula or "")
-    states, _ = fit.map.rollout(pairs.z0[:5], 100)
+    states, _ = fit.map.rollout(gfnn.sample_test_states(scene, 5, jax.random.key(1)), 100)
     for name, invariant in scene.invariants.items():
         values = np.asarray(jax.vmap(jax.vmap(invariant))(np.asarray(states)))
         np.testing.assert_allclose(values, values[:, :1] * np.ones(101), atol=1e-15, err_msg=name)
@@ -231,9 +231,80 @@ def test_a_generated_step_without_matrices():
     refined, error = sides[0].refined_step(np.asarray(z), np.asarray(z))
     np.testing.assert_allclose(refined, image, atol=1e-14)
     assert (error < 1e-14).all()
-    far = dataclasses.replace(sides[0], dt=np.asarray(9.0))  # does not contract
-    status = jax.jit(lambda piece: piece.step(z)[1].status)(far)
-    assert (np.asarray(status) >= NOT_CONVERGED).all()
+
+
+def test_where_the_fixed_point_diverges():
+    """S of 1,000 sites at a long dt: its equation to roundoff, the inverse, NumPy's own solve; a
+    lane that is not finite says so; no array of (2d)² numbers."""
+    dim, dt = 1_000, 3.0
+    family, params = springs(dim)
+    z = 0.3 * RNG.normal(size=(3, 2 * dim))
+    z[2, 7] = np.nan
+
+    def moved(w):
+        gradient = family.gradient(params, w)
+        return dt * np.concatenate([gradient[:, dim:], -gradient[:, :dim]], axis=1)
+
+    w = z[:2]
+    with np.errstate(all="ignore"):
+        for _ in range(20):
+            w = z[:2] + 0.5 * moved(w)
+    assert not (np.abs(w) < 1e3).all()
+    piece = Generated(family, params, CHARTS["midpoint"], dt, np.ones(2 * dim))
+    step = jax.jit(lambda piece, z: piece.step(z)).lower(piece, z).compile()
+    image, info = step(piece, z)
+    np.testing.assert_array_equal(np.asarray(info.status)[:2], 0)
+    assert int(info.status[2]) == NON_FINITE
+    z, image = z[:2], np.asarray(image)[:2]
+    np.testing.assert_allclose(image - z, moved(0.5 * (z + image)), atol=1e-13)
+    refined, error = piece.refined_step(z, 0.5 * (z + image) + 1e-4 * RNG.normal(size=z.shape))
+    np.testing.assert_allclose(refined, image, atol=1e-12)
+    assert (error < 1e-13).all()
+    back = jax.jit(lambda piece, z: piece.inverse().step(z)[0])(piece, image)
+    np.testing.assert_allclose(back, z, atol=1e-13)
+    memory = step.memory_analysis()
+    assert memory is None or memory.temp_size_in_bytes < 8 * (2 * dim) ** 2
+
+
+def test_a_flow_whose_fixed_point_diverges():
+    """By Newton–Krylov as by Newton's method with matrices; tangents of both kinds agree."""
+    family, params = springs(20)
+    scale, (z, v) = np.ones(40), 0.4 * jnp.asarray(RNG.normal(size=(2, 2, 40)))
+    free = Flow(family, params, 2.0, scale, 3)
+    plain = gfnn.from_function(lambda c, w: family.value(c, w))
+    dense = Flow(plain, params, 2.0, scale, 3, newton=True)
+
+    @jax.jit
+    def both(flow):
+        image, along = jax.jvp(lambda z: flow.step(z)[0], (z,), (v,))
+        return image, along, flow.step(z)[1].status
+
+    assert not images(family, params, np.asarray(z), 2.0, Steps(3, 1)).solved.any()
+    (image, along, status), (exact, tangent, _) = both(free), both(dense)
+    np.testing.assert_array_equal(status, 0)
+    np.testing.assert_allclose(image, exact, atol=1e-13)
+    np.testing.assert_allclose(along, tangent, atol=1e-12)
+    _, unrolled = jax.jit(lambda z: jax.jvp(lambda z: free.step(z, unrolled=True)[0], (z,), (v,)))(
+        z
+    )
+    np.testing.assert_allclose(unrolled, along, atol=1e-12)
+
+
+def test_gmres_takes_any_matrix():
+    """Each lane as NumPy's dense solve has it; skew ones too, on which a plain residual method
+    breaks down."""
+    matrices = RNG.normal(size=(3, 12, 12))
+    matrices[1] -= matrices[1].T
+    rhs = RNG.normal(size=(3, 12))
+    rhs[2] = 0.0
+
+    def product(v):
+        return (matrices @ v[..., None])[..., 0]
+
+    exact = np.linalg.solve(matrices, rhs[..., None])[..., 0]
+    np.testing.assert_allclose(krylov.solve(product, rhs, 1e-14), exact, rtol=1e-9, atol=1e-12)
+    found = jax.jit(lambda rhs: krylov.solve_to_roundoff(product, rhs))(rhs)
+    np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("reduced", [False, True])
