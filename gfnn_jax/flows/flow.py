@@ -29,7 +29,7 @@ from gfnn_jax.generating.generated import two_sum
 from gfnn_jax.phase_space import apply_j, area, symplectic_form
 from gfnn_jax.solve import fixed_point, krylov, newton
 from gfnn_jax.solve.linear import small_solve
-from gfnn_jax.solve.newton import Evaluation, largest, where
+from gfnn_jax.solve.newton import Evaluation, largest
 from gfnn_jax.solve.status import NON_FINITE, NOT_CONVERGED, OK, Info
 
 _MOST, _MOST_NEWTON = 100, 40
@@ -274,15 +274,15 @@ def _fixed_point(stages: int, shared, z, args):
     )
     failed = jnp.where(jnp.isfinite(change), NOT_CONVERGED, NON_FINITE)
     status = jnp.where(change <= eps**_SETTLED, OK, failed).astype(jnp.int32)
-    if not matrix_free(family):
-        return slopes, Info(status, iterations, change)
-    left = status != OK
-    x, _, info = fixed_point.newton_krylov(
-        StageEquation(stages), shared, (z, args), _flat(begun[0]), left
-    )
-    solved = Info(info.status, iterations + info.iterations, info.residual)
-    slopes = jnp.where(left[None, :, None], _of_stages(x, stages), slopes)
-    return slopes, where(left, solved, Info(status, iterations, change))
+    info = Info(status, iterations, change)
+    if matrix_free(family):
+        nothing = jnp.zeros((len(z), 0), z.dtype)
+        x, _, info = fixed_point.newton_krylov(
+            StageEquation(stages), shared, (z, args), (_flat(slopes), nothing, info),
+            _flat(begun[0]),
+        )  # fmt: skip
+        slopes = _of_stages(x, stages)
+    return slopes, info
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

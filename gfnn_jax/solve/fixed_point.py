@@ -64,6 +64,17 @@ class _Iterate(NamedTuple):
     open: Any
 
 
+class _Damped(NamedTuple):
+    x: Any
+    residual: Any
+    aux: Any
+    error: Any
+    step: Any  # of Newton's method from x, and the part of it (B, 1) to be tried next
+    part: Any
+    iterations: Any
+    open: Any
+
+
 def iterate(
     equation: Contraction, shared: Any, lanes: Any, guess: Any, *, most: int
 ) -> tuple[Any, Any, Info]:
@@ -93,55 +104,50 @@ def iterate(
         return where(state.open, new, state)
 
     state = jax.lax.while_loop(lambda s: jnp.any(s.open), improve, begun)
-    left = ~(state.error <= settled)
-    again = begun._replace(open=left, iterations=state.iterations)
-    return _newton(equation, shared, lanes, where(left, again, state))
+    info = _info(state.error, state.iterations, settled)
+    return newton_krylov(equation, shared, lanes, (state.x, state.aux, info), guess)
 
 
 def newton_krylov(
-    equation: Contraction, shared: Any, lanes: Any, guess: Any, open_: Any
+    equation: Contraction, shared: Any, lanes: Any, done: tuple[Any, Any, Info], guess: Any
 ) -> tuple[Any, Any, Info]:
-    """Newton's method alone, from guess (B, n), on the lanes that are open (B,): (x, aux at x,
-    Info); the others keep their guess."""
-    evaluation = equation.evaluate(shared, lanes, guess)
-    error, count = floors(evaluation), jnp.zeros(guess.shape[0], jnp.int32)
-    begun = _Iterate(guess, evaluation.residual, evaluation.aux, error, error, count, open_)
-    return _newton(equation, shared, lanes, begun)
+    """``done``, (x, aux at x, Info), where it is ok; the other lanes by Newton's method from guess
+    (B, n), a step halved until the residual is smaller."""
+    unit, settled = equation.unit(shared, lanes), settled_floors(guess.dtype)
+    _, aux, info = done
+    most, infinite = info.iterations + _MOST_NEWTON, jnp.full_like(guess, jnp.inf)
+    begun = _Damped(  # the first step is none: it leads to the guess
+        guess, infinite, aux, infinite[:, 0], jnp.zeros_like(guess), jnp.ones_like(guess[:, :1]),
+        info.iterations, info.status != OK,
+    )  # fmt: skip
 
-
-def _newton(equation, shared, lanes, state: _Iterate) -> tuple[Any, Any, Info]:
-    unit, settled = equation.unit(shared, lanes), settled_floors(state.x.dtype)
-    most = state.iterations + _MOST_NEWTON
-
-    def improve(state: _Iterate) -> _Iterate:
-        product = equation.product(shared, lanes, state.x)
-        step = unit * krylov.differentiable(product, state.residual, _LINEAR)
-        before = norm_of(state.residual)
-        shortest = jnp.where(state.error <= settled, 1.0, _SHORTEST)  # what is left is roundoff
-
-        def tried(part):
-            x = state.x - part[:, None] * step
-            evaluation = equation.evaluate(shared, lanes, x)
-            return part, x, evaluation, norm_of(evaluation.residual) < before
-
-        _, x, evaluation, smaller = jax.lax.while_loop(
-            lambda made: jnp.any(state.open & ~made[3] & (made[0] > shortest)),
-            lambda made: tried(jnp.where(made[3], 1.0, 0.5) * made[0]),
-            tried(jnp.ones_like(before)),
-        )
+    def improve(state: _Damped) -> _Damped:
+        x = state.x - state.part * state.step
+        evaluation = equation.evaluate(shared, lanes, x)
         error, iterations = floors(evaluation), state.iterations + 1
+        better = state.open & (norm_of(evaluation.residual) < norm_of(state.residual))
         further = (error > settled) | ((error > 1.0) & (error < 0.5 * state.error))
-        new = _Iterate(
-            x, evaluation.residual, evaluation.aux, error, state.error, iterations,
-            further & (iterations < most),
+        further = better & further & (iterations < most)
+        rhs = jnp.where(further[:, None], evaluation.residual, 0.0)
+        step = krylov.differentiable(equation.product(shared, lanes, x), rhs, _LINEAR)
+        new = _Damped(
+            x, evaluation.residual, evaluation.aux, error, unit * step, jnp.ones_like(state.part),
+            iterations, further,
         )  # fmt: skip
-        return where(state.open & smaller, new, state._replace(open=state.open & smaller))
+        # Close to the floor only the full step makes sense: what is left is roundoff.
+        shortest = jnp.where(state.error <= settled, 1.0, _SHORTEST)
+        halved = state._replace(part=0.5 * state.part, open=state.part[:, 0] > shortest)
+        return where(better, new, where(state.open, halved, state))
 
-    state = jax.lax.while_loop(lambda s: jnp.any(s.open), improve, state)
-    finite = jnp.isfinite(state.error)
-    status = jnp.where(state.error <= settled, OK, jnp.where(finite, NOT_CONVERGED, NON_FINITE))
-    residual = relative(state.error)
-    return state.x, state.aux, Info(status.astype(jnp.int32), state.iterations, residual)
+    state = jax.lax.while_loop(lambda s: jnp.any(s.open), improve, begun)
+    found = state.x, state.aux, _info(state.error, state.iterations, settled)
+    return where(info.status == OK, done, found)
+
+
+def _info(error, iterations, settled: float) -> Info:
+    failed = jnp.where(jnp.isfinite(error), NOT_CONVERGED, NON_FINITE)
+    status = jnp.where(error <= settled, OK, failed)
+    return Info(status.astype(jnp.int32), iterations, relative(error))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

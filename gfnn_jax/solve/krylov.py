@@ -29,8 +29,7 @@ class _Search(NamedTuple):
     residual: Any
     norm: Any  # of the residual, (B,)
     begin: Any  # of the next direction, a unit vector (B, n)
-    directions: Any  # (SPACE, B, n), and A of them
-    images: Any
+    pairs: Any  # (SPACE, 2, B, n): directions, and A of them
     count: Any
 
 
@@ -41,32 +40,28 @@ def solve(product: Callable, rhs: Any, tolerance: float):
     """
     xp = namespace(rhs)
     start = norm_of(rhs)
-    none = xp.zeros((SPACE, *rhs.shape), rhs.dtype)
-    first = _Search(xp.zeros_like(rhs), rhs, start, _unit(rhs, start), none, none, 0)
+    none = xp.zeros((SPACE, 2, *rhs.shape), rhs.dtype)
+    first = _Search(xp.zeros_like(rhs), rhs, start, _unit(rhs, start), none, 0)
     goal = tolerance * start
 
     def goes_on(s: _Search):
         return (s.count < SPACE) & xp.any(s.norm > goal)
 
     def further(s: _Search) -> _Search:
-        direction, image = s.begin, product(s.begin)
+        pair = xp.stack([s.begin, product(s.begin)])
         for _ in range(2):  # twice is enough (Kahan)
-            along = xp.sum(s.images * image[None], axis=-1)[..., None]
-            image = image - xp.sum(along * s.images, axis=0)
-            direction = direction - xp.sum(along * s.directions, axis=0)
-        size = norm_of(image)
-        direction, image = _unit(direction, size), _unit(image, size)
-        there = (s.norm > goal)[:, None]
-        along = xp.where(there, xp.sum(s.residual * image, axis=-1)[:, None], 0.0)
-        residual = s.residual - along * image
+            along = xp.sum(s.pairs[:, 1] * pair[None, 1], axis=-1)
+            pair = pair - xp.sum(along[:, None, :, None] * s.pairs, axis=0)
+        pair = _unit(pair, norm_of(pair[1])[None])
+        along = xp.sum(s.residual * pair[1], axis=-1)
+        moved = xp.where(s.norm > goal, along, 0.0)[None, :, None] * pair
+        residual = s.residual - moved[1]
         norm = norm_of(residual)
-        here = (xp.arange(SPACE) == s.count).reshape(-1, 1, 1)
+        here = (xp.arange(SPACE) == s.count).reshape(-1, 1, 1, 1)
         shrunk = (norm < _SHRUNK * s.norm)[:, None]
         return _Search(
-            s.x + along * direction, residual, norm,
-            xp.where(shrunk, _unit(residual, norm), image),
-            xp.where(here, direction[None], s.directions), xp.where(here, image[None], s.images),
-            s.count + 1,
+            s.x + moved[0], residual, norm, xp.where(shrunk, _unit(residual, norm), pair[1]),
+            xp.where(here, pair[None], s.pairs), s.count + 1,
         )  # fmt: skip
 
     return _while(xp, goes_on, further, first).x
@@ -112,15 +107,15 @@ def solve_to_roundoff(product: Callable, rhs: Any):
 
 
 def norm_of(rows):
-    """Euclid's norm (B,) of each row."""
+    """Euclid's norm (...) of each row."""
     xp = namespace(rows)
     return xp.sqrt(xp.sum(rows * rows, axis=-1))
 
 
 def _unit(rows, size):
     """The rows by their size; 0 where that is 0."""
-    xp, some = namespace(rows), (size > 0)[:, None]
-    return xp.where(some, rows / xp.where(some, size[:, None], 1.0), 0.0)
+    xp, some = namespace(rows), (size > 0)[..., None]
+    return xp.where(some, rows / xp.where(some, size[..., None], 1.0), 0.0)
 
 
 def _while(xp, goes_on, further, state):
