@@ -63,13 +63,14 @@ def moved(law, z, dt: float, steps: int = 1) -> np.ndarray:
 
 
 def judged(
-    law, pairs: gfnn.Pairs, structure: str, fresh, exact, num_steps: int, *, parts: int = 1
-) -> Numbers:
+    law, pairs: gfnn.Pairs, structure: str, fresh, exact, num_steps: int, *, parts: int = 1,
+    tolerance: float = 1e-12,
+) -> Numbers:  # fmt: skip
     """A fit of these pairs, and its errors from fresh states (B, 2d). exact: their images, and
     where they are after all steps. parts: of a step of the rollout."""
     (family, params), (one, last), dt = law, exact, float(pairs.dt)
     started = time.perf_counter()
-    fit = fitted_to(pairs, structure)
+    fit = fitted_to(pairs, structure, tolerance)
     seconds = time.perf_counter() - started
     every = num_steps * parts
     rollout: Callable[[], Any] = partial(
@@ -99,11 +100,11 @@ def judged(
     }  # fmt: skip
 
 
-def fitted_to(pairs: gfnn.Pairs, structure: str) -> gfnn.Fit:
+def fitted_to(pairs: gfnn.Pairs, structure: str, tolerance: float = 1e-12) -> gfnn.Fit:
     """The fit of every row: told the structure and nothing else."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
-        return gfnn.fit(pairs, structure=structure, tolerance=1e-12, max_seconds=None)
+        return gfnn.fit(pairs, structure=structure, tolerance=tolerance, max_seconds=None)
 
 
 def by_law(law, z0, dt: float, structure: str, fresh, num_steps: int) -> Numbers:
@@ -224,7 +225,8 @@ def three_bodies(quick: bool) -> Numbers:
     known, fresh = z[:200], z[200:]
     pairs = gfnn.Pairs(known[:, :-1].reshape(-1, 12), known[:, 1:].reshape(-1, 12), dt)
     exact = fresh[:, 1], fresh[:, -1]
-    return judged(law, pairs, "bodies:3", fresh[:, 0], exact, steps, parts=CLOSE)
+    # DOP853 itself is off by 1e-12 after a close passage.
+    return judged(law, pairs, "bodies:3", fresh[:, 0], exact, steps, parts=CLOSE, tolerance=1e-11)
 
 
 def four_bodies(quick: bool) -> Numbers:
@@ -249,7 +251,8 @@ def energy(quick: bool) -> Numbers:
     started = time.perf_counter()
     states = np.asarray(map_.rollout(z[40:], steps, save_every=every)[0])
     seconds = time.perf_counter() - started
-    off = growth.energy_error(map_.hamiltonian(states))
+    values = np.asarray(map_.hamiltonian(states.reshape(-1, 2_000))).reshape(states.shape[:2])
+    off = growth.energy_error(values)
     lags = np.unique(np.geomspace(1, off.shape[1] // 4, 20).astype(int))
     rms = [float(np.sqrt(np.mean((off[:, n:] - off[:, :-n]) ** 2))) for n in lags]
     return {

@@ -205,6 +205,36 @@ def test_bodies_that_are_alike_share_their_coefficients():
     assert fit.formula == "0.5 Σ_i |p_i|² - Σ_{i<j} 1/|q_i - q_j|"
 
 
+def test_bodies_of_a_species_share_their_coefficients(tmp_path):
+    """Two light and two heavy ones: a coefficient for each species and each pair of species, as it
+    is written out; from the command line, and from a saved model."""
+    corners = 3.0 * np.array([1, 0, -1, 0, 0, 1, 0, -1])
+    z0 = np.concatenate([corners, np.zeros(8)]) + 0.3 * RNG.normal(size=(260, 16))
+    family = body_terms(4, 2, (-1,), species="abba")
+    exact = np.array([0.5, 0.25, -2.0, -1.0, -4.0])
+
+    def written(z):
+        q, p = z[:8].reshape(4, 2), z[8:].reshape(4, 2)
+        kinetic = sum(c * p[i] @ p[i] for i, c in enumerate((0.5, 0.25, 0.25, 0.5)))
+        pulls = {(0, 1): -2, (0, 2): -2, (1, 3): -2, (2, 3): -2, (0, 3): -1, (1, 2): -4}
+        return kinetic + sum(c / jnp.linalg.norm(q[i] - q[j]) for (i, j), c in pulls.items())
+
+    gradient = jax.vmap(jax.grad(written))(z0[:3])
+    np.testing.assert_allclose(family.gradient(exact, z0[:3]), gradient, atol=1e-13)
+    z1 = images(family, exact, z0, 0.2, Steps(8, 1)).states
+    data, model = tmp_path / "data.npz", tmp_path / "model"
+    np.savez(data, z0=z0, z1=z1, dt=0.2)
+    given = ["fit", str(data), "--out", str(model), "--tolerance", "1e-12"]
+    assert cli.main([*given, "--structure", "bodies:4:abb"]) == 2
+    assert cli.main([*given, "--structure", "bodies:4:abba"]) == 0
+    report = json.loads((model / "report.json").read_text(encoding="utf-8"))
+    assert report["hamiltonian"]["formula"] == (
+        "0.5 Σ_{i∈a} |p_i|² + 0.25 Σ_{i∈b} |p_i|² - 2 Σ_{i∈a,j∈b} 1/|q_i - q_j|"
+        " - 1/|q_1 - q_4| - 4/|q_2 - q_3|"
+    )
+    np.testing.assert_allclose(gfnn.load(model).step(z0[:5])[0], z1[:5], atol=1e-13)
+
+
 def test_a_generated_step_without_matrices():
     """Images, derivatives and the inverse as Newton's method with matrices has them."""
     family, params = springs(20)
@@ -356,6 +386,7 @@ def test_kicked_sites_of_plain_coordinates():
         ({"structure": "ring", "terms": [lambda z: z[0]]}, "as text"),
         ({"structure": "bodies:3"}, "3 bodies in 1 to 3 dimensions"),
         ({"structure": "bodies:1"}, "expected a structure among"),
+        ({"structure": "bodies:10:ab"}, "a letter for each of 10 bodies, as bodies:10:abbbbbbbbb"),
         ({"structure": "bodies:10", "terms": ["q1"]}, "powers of distances"),
     ],
 )

@@ -90,12 +90,14 @@ class Windows:
 class Groups:
     """Groups of one or two bodies in a space of ``space`` dimensions, q body by body.
 
-    members: the bodies of each group. size: of all bodies.
+    members: the bodies of each group. size: of all bodies. species: whose bodies they are, a letter
+    for each of a group's, where not those of all.
     """
 
     members: tuple[tuple[int, ...], ...]
     size: int
     space: int
+    species: str = ""
 
     prefix = ""
 
@@ -135,8 +137,18 @@ class Groups:
         ):
             text = text.replace(written, short)
         text = re.sub(r"\(1/(\|[^|]*\|)\)", r"1/\1", text)
-        every = "Σ_{i<j} " if len(self.members[0]) == 2 else "Σ_i "
-        return text if one else every + text
+        return text if one else f"{self._every} {text}"
+
+    @property
+    def _every(self) -> str:
+        """The sum over all groups, as it stands in a formula."""
+        pairs = len(self.members[0]) == 2
+        if not self.species:
+            return "Σ_{i<j}" if pairs else "Σ_i"
+        first, last = self.species[0], self.species[-1]
+        if not pairs:
+            return f"Σ_{{i∈{first}}}"
+        return f"Σ_{{i<j∈{first}}}" if first == last else f"Σ_{{i∈{first},j∈{last}}}"
 
 
 def momentum_squared(space: int) -> str:
@@ -334,10 +346,14 @@ def _numbered(degree: int) -> list[tuple[int, int]]:
     return [(-1, 0), *((n, n // 2 + 1) for n in range(2 * degree))]
 
 
-def body_terms(bodies: int, space: int, powers: Sequence[int], *, alike: bool) -> Sums:
+def body_terms(
+    bodies: int, space: int, powers: Sequence[int], *, alike: bool = True, species: str = ""
+) -> Sums:
     """|p_i|² of every body, and ``powers`` of the distances of every pair.
 
     alike: whether all bodies share their coefficients; else each body and each pair has its own.
+    species: a letter for each body, as "abbb": bodies of one letter share theirs, and so do pairs
+    of the same two letters.
     """
     r = distance(space)
     rows = tuple((max(n, 0), max(-n, 0)) for n in powers)
@@ -347,8 +363,13 @@ def body_terms(bodies: int, space: int, powers: Sequence[int], *, alike: bool) -
     )
     parts = []
     for terms, groups in local:
-        for members in [groups] if alike else [[group] for group in groups]:
-            parts.append(Part(terms, Groups(tuple(members), bodies, space)))
+        shared: dict[Any, list[tuple[int, ...]]] = {}
+        for group in groups:
+            letters = "".join(sorted(species[i] for i in group)) if species else ""
+            shared.setdefault(letters if species or alike else group, []).append(group)
+        for key, members in shared.items():
+            over = Groups(tuple(members), bodies, space, key if species else "")
+            parts.append(Part(terms, over))
     return Sums(bodies * space, tuple(parts))
 
 

@@ -6,6 +6,7 @@ A structure tells which libraries of terms are tried, and by what the domain of 
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -24,7 +25,7 @@ from gfnn_jax.families.terms import Terms
 from gfnn_jax.maps.domain import Ranges, ranges_of
 from gfnn_jax.phase_space import sizes
 
-NAMES = ("ring", "chain", "bodies:N")
+NAMES = ("ring", "chain", "bodies:N", "bodies:N:SPECIES")
 _ENDS = {"ring": ("ring",), "chain": ("free", "fixed")}
 # (reach, degree, whether functions are tried too) of the libraries, by rising size.
 _LIBRARIES = (
@@ -96,10 +97,13 @@ class Sites:
 
 @dataclasses.dataclass(frozen=True)
 class Bodies:
-    """Bodies in a space of one to three dimensions that attract or repel each other in pairs."""
+    """Bodies in a space of one to three dimensions that attract or repel each other in pairs.
+
+    species: a letter for each body, where those of a species are alike."""
 
     count: int
     space: int
+    species: str = ""
     angles = ""
 
     def fewest(self, width: int) -> int:
@@ -107,8 +111,12 @@ class Bodies:
         return _FEWEST_STATES
 
     def libraries(self, dim: int, given: Sequence[str] = ()) -> Iterator[Sums]:
-        """Sums by rising size: of bodies that are all alike, then of bodies that are not."""
+        """Sums by rising size: of bodies that are all alike, then of bodies that are not; where
+        species are known, of these."""
         for powers in _POWERS:
+            if self.species:
+                yield body_terms(self.count, self.space, powers, species=self.species)
+                continue
             for alike in (True, False):
                 yield body_terms(self.count, self.space, powers, alike=alike)
 
@@ -135,22 +143,35 @@ def structure_of(
     ``dim`` degrees of freedom, or the angles are not those of every site."""
     if text is None:
         return None
-    kind, _, number = str(text).partition(":")
-    if kind == "bodies" and number.isdecimal() and int(number) > 1:
-        count = int(number)
+    known = _bodies(str(text))
+    if known is not None:
+        count, species = known
+        if species and len(species) != count:
+            raise FitError(
+                f"expected a letter for each of {count} bodies, as bodies:{count}:"
+                f"{('a' + 'b' * count)[:count]}; got {len(species)} in {text!r}"
+            )
         if dim % count or not 1 <= dim // count <= 3:
             raise FitError(
                 f"expected {count} bodies in 1 to 3 dimensions, which have {count}, {2 * count} or "
                 f"{3 * count} degrees of freedom; got {dim}"
             )
-        return Bodies(count, dim // count)
+        return Bodies(count, dim // count, species)
     if text not in _ENDS:
         raise FitError(f"expected a structure among {', '.join(NAMES)}; got {text!r}")
     if dim < _FEWEST_SITES:
         raise FitError(f"expected a {text} of at least {_FEWEST_SITES} sites, got {dim}")
-    known = {(): "", tuple(range(dim)): "q", tuple(range(2 * dim)): "qp"}
-    if coordinates.angles not in known:
+    sides = {(): "", tuple(range(dim)): "q", tuple(range(2 * dim)): "qp"}
+    if coordinates.angles not in sides:
         raise FitError(
             f"expected no angles, or all q of the sites, or all q and p; got {coordinates.angles}"
         )
-    return Sites(text, known[coordinates.angles])
+    return Sites(text, sides[coordinates.angles])
+
+
+def _bodies(text: str) -> tuple[int, str] | None:
+    """(number, species) of "bodies:N" or "bodies:N:SPECIES"; None of any other text."""
+    found = re.fullmatch(r"bodies:([0-9]+)(?::([A-Za-z]+))?", text)
+    if found is None or int(found[1]) < 2:
+        return None
+    return int(found[1]), found[2] or ""

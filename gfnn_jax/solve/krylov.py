@@ -19,7 +19,9 @@ import numpy as np
 from gfnn_jax.arrays import namespace
 
 SPACE = 20  # directions before a restart
+_NOTHING = 1e-12  # of an image: what is left of it is roundoff, and the space exhausted
 _SHRUNK = 0.8  # of a residual: below it the next direction begins from it
+_RESTART = 1e-8  # of a residual: where one of the solves to roundoff begins again
 _MOST = 12  # restarts of a system that is solved to roundoff
 _STALLED = 0.5  # of the residual: a restart that leaves more has met roundoff
 
@@ -48,11 +50,13 @@ def solve(product: Callable, rhs: Any, tolerance: float):
         return (s.count < SPACE) & xp.any(s.norm > goal)
 
     def further(s: _Search) -> _Search:
-        pair = xp.stack([s.begin, product(s.begin)])
+        image = product(s.begin)
+        pair = xp.stack([s.begin, image])
         for _ in range(2):  # twice is enough (Kahan)
             along = xp.sum(s.pairs[:, 1] * pair[None, 1], axis=-1)
             pair = pair - xp.sum(along[:, None, :, None] * s.pairs, axis=0)
-        pair = _unit(pair, norm_of(pair[1])[None])
+        size = norm_of(pair[1])
+        pair = _unit(pair, xp.where(size > _NOTHING * norm_of(image), size, 0.0)[None])
         along = xp.sum(s.residual * pair[1], axis=-1)
         moved = xp.where(s.norm > goal, along, 0.0)[None, :, None] * pair
         residual = s.residual - moved[1]
@@ -89,7 +93,7 @@ def solve_to_roundoff(product: Callable, rhs: Any):
 
         def again(state):
             x, residual, norm, earlier, count = state
-            tried = x + solve(product, residual, np.finfo(rhs.dtype).eps)
+            tried = x + solve(product, residual, _RESTART)
             left = rhs - product(tried)
             new = norm_of(left)
             better = (norm < _STALLED * earlier) & (new < norm)
