@@ -29,7 +29,7 @@ from gfnn_jax.storage.partial import told_of
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
 FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
 LEARN = ("auto", "map", "hamiltonian")
-STRUCTURES = ("ring", "chain", "bodies:N", "bodies:N:SPECIES")
+STRUCTURES = ("ring", "chain", "bodies:N", "ring:FIELDS", "chain:FIELDS", "bodies:N:SPECIES")
 
 EXIT_STATUS = """\
 exit status:
@@ -230,8 +230,9 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
     command.add_argument(
         "--structure", type=_structure, metavar="|".join(STRUCTURES),
         help="of many degrees of freedom: H is a sum over equal sites, whose --terms are text in "
-        "q1, p1 of a site and q2, p2, … of the next ones; or over bodies and pairs, of which "
-        "bodies:4:abbb says that the last three are alike",
+        "q1, p1 of a site and q2, p2, … of the next ones (ring:2: two q at every site, side by "
+        "side); or over bodies and pairs, of which bodies:4:abbb says that the last three are "
+        "alike",
     )  # fmt: skip
     command.add_argument("--chart", choices=CHARTS, default="auto", help="default %(default)s")
     command.add_argument(
@@ -305,7 +306,8 @@ def _names(text: str) -> tuple[str, ...]:
 
 def _structure(text: str) -> str:
     bodies = re.fullmatch(r"bodies:([0-9]+)(:[A-Za-z]+)?", text)
-    if text in STRUCTURES[:2] or (bodies and int(bodies[1]) > 1):
+    sites = re.fullmatch(r"(ring|chain)(:[1-9][0-9]?)?", text)
+    if sites or (bodies and int(bodies[1]) > 1):
         return text
     raise argparse.ArgumentTypeError(f"expected {', '.join(STRUCTURES)}; got '{text}'")
 

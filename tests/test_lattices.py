@@ -11,6 +11,7 @@ import pytest
 import gfnn_jax as gfnn
 from gfnn_jax import cli, scenes
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.evaluate import figures, figures_of_many
 from gfnn_jax.families.sums import ENDS, Part, Sums, Windows, body_terms, matrix_free, site_terms
 from gfnn_jax.families.terms import Terms, given_terms
 from gfnn_jax.fitting.gauss_newton import rates
@@ -170,6 +171,41 @@ def test_terms_of_a_site_that_a_user_knows():
     assert {term for term, *_ in fit.hamiltonian.terms} == {
         "1/(1 + q_i**2)", "p_i²", "(q_{i+1} - q_i)²",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("structure", ["ring:2", "chain:2"])
+def test_two_fields_at_every_site(tmp_path, structure):
+    """A chain of springs, each site with an oscillator on it: as written out, learned and saved."""
+    dim, kind = 20, structure[:-2]
+    ends = "ring" if kind == "ring" else "fixed"
+    site = Terms(
+        2, ("p1", "p2", "q2", "q1"), ((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, 2, 0), (0, 0, 2, 1))
+    )
+    bonds = Terms(4, ("q3 - q1", "q4 - q2"), ((2, 0), (0, 2)))
+    family = Sums(dim, (Part(site, Windows(ends, 0, 2)), Part(bonds, Windows(ends, 1, 2))))
+    exact = np.array([0.5, 0.25, 0.3, 0.2, 0.5, 0.1])
+    z0 = 0.3 * RNG.normal(size=(16, 2 * dim))
+
+    def written(z):
+        (q, s), (p, r) = (x.reshape(-1, 2).T for x in (z[:dim], z[dim:]))
+        around = [jnp.append(x, x[0]) if kind == "ring" else jnp.pad(x, 1) for x in (q, s)]
+        bond, other = (x[1:] - x[:-1] for x in around)
+        own = 0.5 * p**2 + 0.25 * r**2 + 0.3 * s**2 + 0.2 * s**2 * q
+        return jnp.sum(own) + jnp.sum(0.5 * bond**2 + 0.1 * other**2)
+
+    gradient = jax.jit(jax.vmap(jax.grad(written)))(z0)
+    np.testing.assert_allclose(family.gradient(exact, z0), gradient, atol=1e-13)
+    z1 = images(family, exact, z0, 0.1, Steps(8, 1)).states
+    fit = gfnn.fit(
+        gfnn.Pairs(z0[:12], z1[:12], 0.1), structure=structure, terms=["q1*q2**2"], tolerance=1e-12
+    )
+    assert {term: round(c, 9) for term, c, _ in fit.hamiltonian.terms} == {
+        "p1_i²": 0.5, "p2_i²": 0.25, "q2_i²": 0.3, "q1_i*q2_i**2": 0.2, "(q1_{i+1} - q1_i)²": 0.5,
+        "(q2_{i+1} - q2_i)²": 0.1,
+    }  # fmt: skip
+    fit.map.save(tmp_path / "model")
+    found, _ = gfnn.load(tmp_path / "model").step(z0[12:])
+    np.testing.assert_allclose(found, z1[12:], atol=1e-13)
 
 
 def test_a_scene_lends_its_structure():
@@ -375,6 +411,11 @@ def test_kicked_sites_of_plain_coordinates():
     ("options", "said"),
     [
         ({"structure": "torus"}, "expected a structure among ring, chain, bodies:N"),
+        ({"structure": "ring:0"}, "expected a structure among"),
+        ({"structure": "ring:3"}, "expected 3 q of every site; got 20"),
+        ({"structure": "chain:10"}, "at least 5 sites, got 2"),
+        ({"structure": "ring:2", "angles": tuple(range(20))}, "no angles of 2 fields"),
+        ({"structure": "ring:2", "terms": ["exp(q9)"]}, "q9"),
         ({"structure": "ring", "family": "sines"}, "its own terms"),
         ({"structure": "ring", "chart": "type1"}, "another chart"),
         ({"structure": "ring", "angles": (0,)}, "all q of the sites"),
@@ -405,6 +446,7 @@ def test_the_command_line_takes_a_structure(tmp_path):
     fit = ["fit", str(data), "--out", str(model), "--tolerance", "1e-10"]
     assert cli.main([*fit, "--structure", "torus"]) == 2
     assert cli.main([*fit, "--structure", "bodies:7"]) == 2
+    assert cli.main([*fit, "--structure", "chain:3"]) == 2
     assert not model.exists()
     assert cli.main([*fit, "--structure", "ring"]) == 0
     report = json.loads((model / "report.json").read_text(encoding="utf-8"))
@@ -431,6 +473,38 @@ def test_a_structure_is_proposed_and_not_used():
     with pytest.warns(gfnn.FitWarning, match="--structure ring explains these pairs"):
         fit = gfnn.fit(pairs, learn="map", chart="type2", tolerance=1e-12, max_seconds=10)
     assert not fit.met
+
+
+@pytest.mark.parametrize("kind", ["ring", "chain"])
+def test_mode_energies_add_up(kind):
+    """To the energy of unit springs, less that of the whole's motion; and one wave is one mode."""
+    family, params = springs(8, "ring" if kind == "ring" else "free")
+    harmonic, z = family.take([0, 1]), RNG.normal(size=(3, 16))
+    z -= np.repeat(z.reshape(3, 2, 8).mean(axis=2), 8, axis=1)
+    energies = figures_of_many.mode_energies(z, kind)
+    np.testing.assert_allclose(energies.sum(axis=1), harmonic.value(params[:2], z), rtol=1e-13)
+    site = np.arange(8) if kind == "ring" else np.arange(8) + 0.5
+    wave = np.cos((2 if kind == "ring" else 1) * np.pi * 3 * site / 8)
+    (energy,) = figures_of_many.mode_energies(np.concatenate([wave, wave])[None], kind)
+    assert energy[2] > 1.0
+    np.testing.assert_allclose(np.delete(energy, 2), 0, atol=1e-14)
+
+
+def test_figures_show_each_panel_what_it_is_named(tmp_path):
+    times, z = np.arange(5.0), RNG.normal(size=(5, 12))
+    off = z + 1e-8
+    drawn = figures_of_many.space_time(times, z, off).axes
+    images_ = [ax.get_images()[0].get_array() for ax in drawn[:3]]
+    for shown, wanted in zip(images_, (z[:, 6:], off[:, 6:], np.full((5, 6), 1e-8)), strict=True):
+        np.testing.assert_allclose(shown, wanted, rtol=1e-6)
+    assert [ax.get_title() for ax in drawn[:3]] == ["reference", "GFNN", "difference"]
+    drawn = figures_of_many.orbits(times, z, off, 3).axes
+    np.testing.assert_array_equal(drawn[1].get_lines()[2].get_xydata(), off[:, 2:4])
+    np.testing.assert_allclose(drawn[2].get_lines()[1].get_ydata(), np.sqrt(2) * 1e-8, rtol=1e-6)
+    line = figures_of_many.orbits(times, z, off, 6)
+    np.testing.assert_array_equal(line.axes[0].get_lines()[0].get_xydata()[:, 0], times)
+    figures.save(line, tmp_path / "line.png")
+    figures.save(figures_of_many.modes(times, z, off), tmp_path / "modes.png")
 
 
 def test_too_few_sites_or_pairs_are_refused():

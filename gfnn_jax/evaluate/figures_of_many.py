@@ -44,7 +44,11 @@ def modes(times, reference, predicted, ends: str = "ring") -> Figure:
     above, middle, below = figure.subplots(3, 1, sharex=True)
     exact, found = (mode_energies(np.asarray(z), ends)[:, :MODES] for z in (reference, predicted))
     for k, colour in zip(range(exact.shape[1]), COLOURS, strict=False):
-        for ax, energy in ((above, exact), (middle, found), (below, np.abs(found - exact))):
+        for ax, energy in (
+            (above, exact),
+            (middle, found),
+            (below, np.maximum(np.abs(found - exact), _ROUNDOFF)),
+        ):
             ax.plot(times, energy[:, k], color=colour, label=f"k = {k + 1}")
     above.set(ylabel="mode energy, reference")
     middle.set(ylabel="mode energy, GFNN", ylim=above.get_ylim())

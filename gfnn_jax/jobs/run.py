@@ -179,7 +179,7 @@ def _figures_of_many(scene: Scene, steps, reference, predicted) -> dict[str, Any
     if isinstance(structure, Bodies):
         return {"orbits": figures_of_many.orbits(*drawn, structure.count)}
     found = {"space-time": figures_of_many.space_time(*drawn, structure.angles)}
-    if not structure.angles:
+    if not structure.angles and structure.fields == 1:
         found["modes"] = figures_of_many.modes(*drawn, structure.kind)
     return found
 
