@@ -274,15 +274,15 @@ _TITLES = {
     "toda": "Toda's ring, d = 32", "froeschle": "64 coupled standard maps",
     "three-bodies": "three equal bodies in the plane", "four-bodies": "four bodies in space",
 }  # fmt: skip
-# (piece, what is measured, its key, the best figure published for such a task). Figures of papers
-# on Hamiltonian networks (HFM, GHNN, GSCD): their own data and noise, nothing was run here.
+# (piece, what is measured, its key, the best published figure that this project knows of for such a
+# task), from Hamiltonian networks on data of their own. Nothing of them was run here.
 _PUBLISHED = (
     ("toda", "mean square error of the rollout, at its last step", "error_mean_square", 2.9e-4),
     ("three-bodies", "mean absolute error at t = 5", "error_mean_absolute", 1.4e-3),
 )
 _BESIDE = (
-    "Published: the best figures that we know of for these tasks, as their papers print them, from "
-    "networks and other data; not run here. They are for scale, not a race: the fits above are "
+    "Published: the best figures known to this project for such tasks, from Hamiltonian "
+    "networks and other data; neither run nor checked here. They are for scale, not a race: the fits above are "
     "told that sites or bodies interact in pairs, and networks are not."
 )
 

@@ -238,7 +238,7 @@ def _parsed(node, names, text, depth) -> Expression:
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         if not math.isfinite(value):
             raise refuse("a number that is beyond float64")
-        return number(value)
+        return number(float(value))
     if isinstance(node, ast.Name):
         if node.id in names:
             return names[node.id]
