@@ -281,9 +281,9 @@ _PUBLISHED = (
     ("three-bodies", "mean absolute error at t = 5", "error_mean_absolute", 1.4e-3),
 )
 _BESIDE = (
-    "Published: the best figures known to this project for such tasks, from Hamiltonian "
-    "networks and other data; neither run nor checked here. They are for scale, not a race: the fits above are "
-    "told that sites or bodies interact in pairs, and networks are not."
+    "Published: the best figures known to this project for such tasks, from Hamiltonian networks "
+    "and other data; neither run nor checked here. They are for scale, not a race: the fits above "
+    "are told that sites or bodies interact in pairs, and networks are not."
 )
 
 
