@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import math
 import os
+import re
 import signal
 import sys
 import warnings
@@ -28,7 +29,7 @@ from gfnn_jax.storage.partial import told_of
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
 FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
 LEARN = ("auto", "map", "hamiltonian")
-STRUCTURES = ("ring", "chain", "bodies:N")
+STRUCTURES = ("ring", "chain", "bodies:N", "ring:FIELDS", "chain:FIELDS", "bodies:N:SPECIES")
 EXPORTS = ("c", "stablehlo")
 
 EXIT_STATUS = """\
@@ -248,7 +249,9 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
     command.add_argument(
         "--structure", type=_structure, metavar="|".join(STRUCTURES),
         help="of many degrees of freedom: H is a sum over equal sites, whose --terms are text in "
-        "q1, p1 of a site and q2, p2, … of the next ones",
+        "q1, p1 of a site and q2, p2, … of the next ones (ring:2: two q at every site, side by "
+        "side); or over bodies and pairs, of which bodies:4:abbb says that the last three are "
+        "alike",
     )  # fmt: skip
     command.add_argument("--chart", choices=CHARTS, default="auto", help="default %(default)s")
     command.add_argument(
@@ -321,8 +324,9 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _structure(text: str) -> str:
-    kind, _, number = text.partition(":")
-    if text in STRUCTURES[:2] or (kind == "bodies" and number.isdecimal() and int(number) > 1):
+    bodies = re.fullmatch(r"bodies:([0-9]+)(:[A-Za-z]+)?", text)
+    sites = re.fullmatch(r"(ring|chain)(:[1-9][0-9]?)?", text)
+    if sites or (bodies and int(bodies[1]) > 1):
         return text
     raise argparse.ArgumentTypeError(f"expected {', '.join(STRUCTURES)}; got '{text}'")
 

@@ -1,6 +1,5 @@
 """Many degrees of freedom: sums over sites, flows without matrices, fits of rings and chains."""
 
-import dataclasses
 import json
 from itertools import combinations
 
@@ -12,6 +11,7 @@ import pytest
 import gfnn_jax as gfnn
 from gfnn_jax import cli, scenes
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.evaluate import figures, figures_of_many
 from gfnn_jax.families.sums import ENDS, Part, Sums, Windows, body_terms, matrix_free, site_terms
 from gfnn_jax.families.terms import Terms, given_terms
 from gfnn_jax.fitting.gauss_newton import rates
@@ -21,8 +21,9 @@ from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.propose import proposed
-from gfnn_jax.phase_space import defect_of_pairs
-from gfnn_jax.solve.status import NOT_CONVERGED
+from gfnn_jax.phase_space import apply_j, defect_of_pairs
+from gfnn_jax.solve import krylov
+from gfnn_jax.solve.status import NON_FINITE
 
 RNG = np.random.default_rng(0)
 
@@ -172,6 +173,41 @@ def test_terms_of_a_site_that_a_user_knows():
     }  # fmt: skip
 
 
+@pytest.mark.parametrize("structure", ["ring:2", "chain:2"])
+def test_two_fields_at_every_site(tmp_path, structure):
+    """A chain of springs, each site with an oscillator on it: as written out, learned and saved."""
+    dim, kind = 20, structure[:-2]
+    ends = "ring" if kind == "ring" else "fixed"
+    site = Terms(
+        2, ("p1", "p2", "q2", "q1"), ((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, 2, 0), (0, 0, 2, 1))
+    )
+    bonds = Terms(4, ("q3 - q1", "q4 - q2"), ((2, 0), (0, 2)))
+    family = Sums(dim, (Part(site, Windows(ends, 0, 2)), Part(bonds, Windows(ends, 1, 2))))
+    exact = np.array([0.5, 0.25, 0.3, 0.2, 0.5, 0.1])
+    z0 = 0.3 * RNG.normal(size=(16, 2 * dim))
+
+    def written(z):
+        (q, s), (p, r) = (x.reshape(-1, 2).T for x in (z[:dim], z[dim:]))
+        around = [jnp.append(x, x[0]) if kind == "ring" else jnp.pad(x, 1) for x in (q, s)]
+        bond, other = (x[1:] - x[:-1] for x in around)
+        own = 0.5 * p**2 + 0.25 * r**2 + 0.3 * s**2 + 0.2 * s**2 * q
+        return jnp.sum(own) + jnp.sum(0.5 * bond**2 + 0.1 * other**2)
+
+    gradient = jax.jit(jax.vmap(jax.grad(written)))(z0)
+    np.testing.assert_allclose(family.gradient(exact, z0), gradient, atol=1e-13)
+    z1 = images(family, exact, z0, 0.1, Steps(8, 1)).states
+    fit = gfnn.fit(
+        gfnn.Pairs(z0[:12], z1[:12], 0.1), structure=structure, terms=["q1*q2**2"], tolerance=1e-12
+    )
+    assert {term: round(c, 9) for term, c, _ in fit.hamiltonian.terms} == {
+        "p1_i²": 0.5, "p2_i²": 0.25, "q2_i²": 0.3, "q1_i*q2_i**2": 0.2, "(q1_{i+1} - q1_i)²": 0.5,
+        "(q2_{i+1} - q2_i)²": 0.1,
+    }  # fmt: skip
+    fit.map.save(tmp_path / "model")
+    found, _ = gfnn.load(tmp_path / "model").step(z0[12:])
+    np.testing.assert_allclose(found, z1[12:], atol=1e-13)
+
+
 def test_a_scene_lends_its_structure():
     scene = scenes.fput(dim=18)
     pairs = gfnn.sample_pairs(scene, 12, jax.random.key(0))
@@ -190,7 +226,7 @@ def test_bodies_in_space():
         exact[f"1/|q_{i + 1} - q_{j + 1}|"] = -masses[i] * masses[j]
     assert found == pytest.approx(exact, rel=1e-10)
     assert "- 0.01/|q_1 - q_2|" in (fit.formula or "")
-    states, _ = fit.map.rollout(pairs.z0[:5], 100)
+    states, _ = fit.map.rollout(gfnn.sample_test_states(scene, 5, jax.random.key(1)), 100)
     for name, invariant in scene.invariants.items():
         values = np.asarray(jax.vmap(jax.vmap(invariant))(np.asarray(states)))
         np.testing.assert_allclose(values, values[:, :1] * np.ones(101), atol=1e-15, err_msg=name)
@@ -203,6 +239,36 @@ def test_bodies_that_are_alike_share_their_coefficients():
     z1 = images(family, np.array([0.5, -1.0]), z0, 0.2, Steps(8, 2)).states
     fit = gfnn.fit(gfnn.Pairs(z0, z1, 0.2), structure="bodies:3", tolerance=1e-12)
     assert fit.formula == "0.5 Σ_i |p_i|² - Σ_{i<j} 1/|q_i - q_j|"
+
+
+def test_bodies_of_a_species_share_their_coefficients(tmp_path):
+    """Two light and two heavy ones: a coefficient for each species and each pair of species, as it
+    is written out; from the command line, and from a saved model."""
+    corners = 3.0 * np.array([1, 0, -1, 0, 0, 1, 0, -1])
+    z0 = np.concatenate([corners, np.zeros(8)]) + 0.3 * RNG.normal(size=(260, 16))
+    family = body_terms(4, 2, (-1,), species="abba")
+    exact = np.array([0.5, 0.25, -2.0, -1.0, -4.0])
+
+    def written(z):
+        q, p = z[:8].reshape(4, 2), z[8:].reshape(4, 2)
+        kinetic = sum(c * p[i] @ p[i] for i, c in enumerate((0.5, 0.25, 0.25, 0.5)))
+        pulls = {(0, 1): -2, (0, 2): -2, (1, 3): -2, (2, 3): -2, (0, 3): -1, (1, 2): -4}
+        return kinetic + sum(c / jnp.linalg.norm(q[i] - q[j]) for (i, j), c in pulls.items())
+
+    gradient = jax.vmap(jax.grad(written))(z0[:3])
+    np.testing.assert_allclose(family.gradient(exact, z0[:3]), gradient, atol=1e-13)
+    z1 = images(family, exact, z0, 0.2, Steps(8, 1)).states
+    data, model = tmp_path / "data.npz", tmp_path / "model"
+    np.savez(data, z0=z0, z1=z1, dt=0.2)
+    given = ["fit", str(data), "--out", str(model), "--tolerance", "1e-12"]
+    assert cli.main([*given, "--structure", "bodies:4:abb"]) == 2
+    assert cli.main([*given, "--structure", "bodies:4:abba"]) == 0
+    report = json.loads((model / "report.json").read_text(encoding="utf-8"))
+    assert report["hamiltonian"]["formula"] == (
+        "0.5 Σ_{i∈a} |p_i|² + 0.25 Σ_{i∈b} |p_i|² - 2 Σ_{i∈a,j∈b} 1/|q_i - q_j|"
+        " - 1/|q_1 - q_4| - 4/|q_2 - q_3|"
+    )
+    np.testing.assert_allclose(gfnn.load(model).step(z0[:5])[0], z1[:5], atol=1e-13)
 
 
 def test_a_generated_step_without_matrices():
@@ -231,9 +297,78 @@ def test_a_generated_step_without_matrices():
     refined, error = sides[0].refined_step(np.asarray(z), np.asarray(z))
     np.testing.assert_allclose(refined, image, atol=1e-14)
     assert (error < 1e-14).all()
-    far = dataclasses.replace(sides[0], dt=np.asarray(9.0))  # does not contract
-    status = jax.jit(lambda piece: piece.step(z)[1].status)(far)
-    assert (np.asarray(status) >= NOT_CONVERGED).all()
+
+
+def test_where_the_fixed_point_diverges():
+    """S of 1,000 sites at a long dt: its equation to roundoff, the inverse, NumPy's own solve; a
+    lane that is not finite says so; no array of (2d)² numbers."""
+    dim, dt = 1_000, 3.0
+    family, params = springs(dim)
+    z = 0.3 * RNG.normal(size=(3, 2 * dim))
+    z[2, 7] = np.nan
+
+    def moved(w):
+        return dt * apply_j(family.gradient(params, w))
+
+    w = z[:2]
+    with np.errstate(all="ignore"):
+        for _ in range(20):
+            w = z[:2] + 0.5 * moved(w)
+    assert not (np.abs(w) < 1e3).all()
+    piece = Generated(family, params, CHARTS["midpoint"], dt, np.ones(2 * dim))
+    step = jax.jit(lambda piece, z: piece.step(z)).lower(piece, z).compile()
+    image, info = step(piece, z)
+    np.testing.assert_array_equal(info.status, [0, 0, NON_FINITE])
+    z, image = z[:2], np.asarray(image)[:2]
+    np.testing.assert_allclose(image - z, moved(0.5 * (z + image)), atol=1e-13)
+    refined, error = piece.refined_step(z, 0.5 * (z + image) + 1e-4 * RNG.normal(size=z.shape))
+    np.testing.assert_allclose(refined, image, atol=1e-12)
+    assert (error < 1e-13).all()
+    back = jax.jit(lambda piece, z: piece.inverse().step(z)[0])(piece, image)
+    np.testing.assert_allclose(back, z, atol=1e-13)
+    memory = step.memory_analysis()
+    assert memory is None or memory.temp_size_in_bytes < 8 * (2 * dim) ** 2
+
+
+def test_a_flow_whose_fixed_point_diverges():
+    """By Newton–Krylov as by Newton's method with matrices; tangents of both kinds agree."""
+    family, params = springs(20)
+    scale, (z, v) = np.ones(40), 0.4 * jnp.asarray(RNG.normal(size=(2, 2, 40)))
+    free = Flow(family, params, 2.0, scale, 3)
+    plain = gfnn.from_function(lambda c, w: family.value(c, w))
+    dense = Flow(plain, params, 2.0, scale, 3, newton=True)
+
+    @jax.jit
+    def both(flow):
+        image, along = jax.jvp(lambda z: flow.step(z)[0], (z,), (v,))
+        return image, along, flow.step(z)[1].status
+
+    assert not images(family, params, np.asarray(z), 2.0, Steps(3, 1)).solved.any()
+    (image, along, status), (exact, tangent, _) = both(free), both(dense)
+    np.testing.assert_array_equal(status, 0)
+    np.testing.assert_allclose(image, exact, atol=1e-13)
+    np.testing.assert_allclose(along, tangent, atol=1e-12)
+    _, unrolled = jax.jit(lambda z: jax.jvp(lambda z: free.step(z, unrolled=True)[0], (z,), (v,)))(
+        z
+    )
+    np.testing.assert_allclose(unrolled, along, atol=1e-12)
+
+
+def test_gmres_takes_any_matrix():
+    """Each lane as NumPy's dense solve has it; skew ones too, on which a plain residual method
+    breaks down."""
+    matrices = RNG.normal(size=(3, 12, 12))
+    matrices[1] -= matrices[1].T
+    rhs = RNG.normal(size=(3, 12))
+    rhs[2] = 0.0
+
+    def product(v):
+        return (matrices @ v[..., None])[..., 0]
+
+    exact = np.linalg.solve(matrices, rhs[..., None])[..., 0]
+    np.testing.assert_allclose(krylov.solve(product, rhs, 1e-14), exact, rtol=1e-9, atol=1e-12)
+    found = jax.jit(lambda rhs: krylov.solve_to_roundoff(product, rhs))(rhs)
+    np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("reduced", [False, True])
@@ -274,6 +409,11 @@ def test_kicked_sites_of_plain_coordinates():
     ("options", "said"),
     [
         ({"structure": "torus"}, "expected a structure among ring, chain, bodies:N"),
+        ({"structure": "ring:0"}, "expected a structure among"),
+        ({"structure": "ring:3"}, "expected 3 q of every site; got 20"),
+        ({"structure": "chain:10"}, "at least 5 sites, got 2"),
+        ({"structure": "ring:2", "angles": tuple(range(20))}, "no angles of 2 fields"),
+        ({"structure": "ring:2", "terms": ["exp(q9)"]}, "q9"),
         ({"structure": "ring", "family": "sines"}, "its own terms"),
         ({"structure": "ring", "chart": "type1"}, "another chart"),
         ({"structure": "ring", "angles": (0,)}, "all q of the sites"),
@@ -285,6 +425,7 @@ def test_kicked_sites_of_plain_coordinates():
         ({"structure": "ring", "terms": [lambda z: z[0]]}, "as text"),
         ({"structure": "bodies:3"}, "3 bodies in 1 to 3 dimensions"),
         ({"structure": "bodies:1"}, "expected a structure among"),
+        ({"structure": "bodies:10:ab"}, "a letter for each of 10 bodies, as bodies:10:abbbbbbbbb"),
         ({"structure": "bodies:10", "terms": ["q1"]}, "powers of distances"),
     ],
 )
@@ -303,6 +444,7 @@ def test_the_command_line_takes_a_structure(tmp_path):
     fit = ["fit", str(data), "--out", str(model), "--tolerance", "1e-10"]
     assert cli.main([*fit, "--structure", "torus"]) == 2
     assert cli.main([*fit, "--structure", "bodies:7"]) == 2
+    assert cli.main([*fit, "--structure", "chain:3"]) == 2
     assert not model.exists()
     assert cli.main([*fit, "--structure", "ring"]) == 0
     report = json.loads((model / "report.json").read_text(encoding="utf-8"))
@@ -329,6 +471,38 @@ def test_a_structure_is_proposed_and_not_used():
     with pytest.warns(gfnn.FitWarning, match="--structure ring explains these pairs"):
         fit = gfnn.fit(pairs, learn="map", chart="type2", tolerance=1e-12, max_seconds=10)
     assert not fit.met
+
+
+@pytest.mark.parametrize("kind", ["ring", "chain"])
+def test_mode_energies_add_up(kind):
+    """To the energy of unit springs, less that of the whole's motion; and one wave is one mode."""
+    family, params = springs(8, "ring" if kind == "ring" else "free")
+    harmonic, z = family.take([0, 1]), RNG.normal(size=(3, 16))
+    z -= np.repeat(z.reshape(3, 2, 8).mean(axis=2), 8, axis=1)
+    energies = figures_of_many.mode_energies(z, kind)
+    np.testing.assert_allclose(energies.sum(axis=1), harmonic.value(params[:2], z), rtol=1e-13)
+    site = np.arange(8) if kind == "ring" else np.arange(8) + 0.5
+    wave = np.cos((2 if kind == "ring" else 1) * np.pi * 3 * site / 8)
+    (energy,) = figures_of_many.mode_energies(np.concatenate([wave, wave])[None], kind)
+    assert energy[2] > 1.0
+    np.testing.assert_allclose(np.delete(energy, 2), 0, atol=1e-14)
+
+
+def test_figures_show_each_panel_what_it_is_named(tmp_path):
+    times, z = np.arange(5.0), RNG.normal(size=(5, 12))
+    off = z + 1e-8
+    drawn = figures_of_many.space_time(times, z, off).axes
+    images_ = [ax.get_images()[0].get_array() for ax in drawn[:3]]
+    for shown, wanted in zip(images_, (z[:, 6:], off[:, 6:], np.full((5, 6), 1e-8)), strict=True):
+        np.testing.assert_allclose(shown, wanted, rtol=1e-6)
+    assert [ax.get_title() for ax in drawn[:3]] == ["reference", "GFNN", "difference"]
+    drawn = figures_of_many.orbits(times, z, off, 3).axes
+    np.testing.assert_array_equal(drawn[1].get_lines()[2].get_xydata(), off[:, 2:4])
+    np.testing.assert_allclose(drawn[2].get_lines()[1].get_ydata(), np.sqrt(2) * 1e-8, rtol=1e-6)
+    line = figures_of_many.orbits(times, z, off, 6)
+    np.testing.assert_array_equal(line.axes[0].get_lines()[0].get_xdata(), times)
+    figures.save(line, tmp_path / "line.png")
+    figures.save(figures_of_many.modes(times, z, off), tmp_path / "modes.png")
 
 
 def test_too_few_sites_or_pairs_are_refused():

@@ -34,68 +34,87 @@ class Windows:
     """``reach`` + 1 sites in a row, wherever such a row fits.
 
     ends: "ring", where the last site's neighbour is the first; "free"; or "fixed", between two
-    sites that stay at q = p = 0.
+    sites that stay at q = p = 0. fields: q of a site, which stand together; as many p.
     """
 
     ends: str
     reach: int
+    fields: int = 1
 
     prefix = "Σ_i "  # of a formula
 
     def gather(self, w):
-        """w (..., 2d) as states (..., windows, 2·(reach + 1)) of the windows."""
+        """w (..., 2d) as states (..., windows, 2·(reach + 1)·fields) of the windows."""
         xp = namespace(w)
         columns = [c for x in split(w) for c in self._shifted(x)]
         return xp.moveaxis(xp.stack(columns), 0, -1)
 
     def scatter(self, g):
-        """The transpose of ``gather``: (..., windows, 2·(reach + 1)) -> (..., 2d)."""
-        xp, count = namespace(g), self.reach + 1
-        sides = (g[..., :count], g[..., count:])
+        """The transpose of ``gather``: (..., windows, 2·(reach + 1)·fields) -> (..., 2d)."""
+        xp, half = namespace(g), g.shape[-1] // 2
+        sides = (g[..., :half], g[..., half:])
         return xp.concatenate([self._summed(side) for side in sides], axis=-1)
 
     def _shifted(self, x) -> list:
         xp = namespace(x)
-        if self.ends == "ring":
-            return [xp.roll(x, -j, axis=-1) for j in range(self.reach + 1)]
+        x = x.reshape(*x.shape[:-1], -1, self.fields)
         if self._held:
-            wall = xp.zeros_like(x[..., :1])
-            x = xp.concatenate([wall, x, wall], axis=-1)
-        last = x.shape[-1] - self.reach
-        return [x[..., j : j + last] for j in range(self.reach + 1)]
+            wall = xp.zeros_like(x[..., :1, :])
+            x = xp.concatenate([wall, x, wall], axis=-2)
+        last = x.shape[-2] - self.reach
+        rows: Any = range(self.reach + 1)
+        if self.ends == "ring":
+            rows = [xp.roll(x, -j, axis=-2) for j in rows]
+        else:
+            rows = [x[..., j : j + last, :] for j in rows]
+        return [row[..., k] for row in rows for k in range(self.fields)]
 
     def _summed(self, g):
-        xp, count = namespace(g), self.reach + 1
+        xp, lanes = namespace(g), g.shape[:-2]
+        g = g.reshape(*g.shape[:-1], self.reach + 1, self.fields)
+        rows = [g[..., j, :] for j in range(self.reach + 1)]
+        total: Any
         if self.ends == "ring":
-            return sum(xp.roll(g[..., j], j, axis=-1) for j in range(count))
-        nothing = [(0, 0)] * (g.ndim - 2)
-        places = [[*nothing, (j, self.reach - j)] for j in range(count)]
-        total: Any = sum(xp.pad(g[..., j], place) for j, place in enumerate(places))
-        return total[..., 1:-1] if self._held else total
+            total = sum(xp.roll(row, j, axis=-2) for j, row in enumerate(rows))
+        else:
+            nothing = [(0, 0)] * len(lanes)
+            places = [[*nothing, (j, self.reach - j), (0, 0)] for j in range(self.reach + 1)]
+            total = sum(xp.pad(row, place) for row, place in zip(rows, places, strict=True))
+            total = total[..., 1:-1, :] if self._held else total
+        return total.reshape(*lanes, -1)
 
     @property
     def _held(self) -> bool:
         return self.ends == "fixed" and self.reach > 0
 
     def count(self, dim: int) -> int:
-        """The number of windows among ``dim`` sites."""
-        return dim if self.ends == "ring" else dim - self.reach + 2 * self._held
+        """The number of windows among the sites of ``dim`` degrees of freedom."""
+        sites = dim // self.fields
+        return sites if self.ends == "ring" else sites - self.reach + 2 * self._held
 
     def named(self, text: str) -> str:
-        """A term of the window's own q1, q2, … as one of a general site: q_i, q_{i+1}, …"""
-        return re.sub(r"\b([qp])([0-9]+)", lambda m: f"{m[1]}_{_site(int(m[2]) - 1)}", text)
+        """A term of the window's own q1, q2, … as one of a general site: q_i, q_{i+1}, …; of
+        several fields q1_i, q2_i, q1_{i+1}, …"""
+
+        def of_site(found) -> str:
+            ahead, field = divmod(int(found[2]) - 1, self.fields)
+            return f"{found[1]}{field + 1 if self.fields > 1 else ''}_{_site(ahead)}"
+
+        return re.sub(r"\b([qp])([0-9]+)", of_site, text)
 
 
 @dataclasses.dataclass(frozen=True)
 class Groups:
     """Groups of one or two bodies in a space of ``space`` dimensions, q body by body.
 
-    members: the bodies of each group. size: of all bodies.
+    members: the bodies of each group. size: of all bodies. species: whose bodies they are, a letter
+    for each of a group's, where not those of all.
     """
 
     members: tuple[tuple[int, ...], ...]
     size: int
     space: int
+    species: str = ""
 
     prefix = ""
 
@@ -135,8 +154,18 @@ class Groups:
         ):
             text = text.replace(written, short)
         text = re.sub(r"\(1/(\|[^|]*\|)\)", r"1/\1", text)
-        every = "Σ_{i<j} " if len(self.members[0]) == 2 else "Σ_i "
-        return text if one else every + text
+        return text if one else f"{self._every} {text}"
+
+    @property
+    def _every(self) -> str:
+        """The sum over all groups, as it stands in a formula."""
+        pairs = len(self.members[0]) == 2
+        if not self.species:
+            return "Σ_{i<j}" if pairs else "Σ_i"
+        first, last = self.species[0], self.species[-1]
+        if not pairs:
+            return f"Σ_{{i∈{first}}}"
+        return f"Σ_{{i<j∈{first}}}" if first == last else f"Σ_{{i∈{first},j∈{last}}}"
 
 
 def momentum_squared(space: int) -> str:
@@ -281,27 +310,33 @@ def matrix_free(family) -> bool:
     return bool(getattr(family, "matrix_free", False))
 
 
-def site_terms(dim: int, ends: str, reach: int, degree: int, functions: Sequence[str] = ()) -> Sums:
-    """Products of total degree 1 to ``degree`` of q_i, p_i and the differences q_{i+k} − q_i up to
-    ``reach``, and ``functions`` as text in a site's q1, p1 and the next sites' q2, p2, … to q4, p4.
+def site_terms(
+    dim: int, ends: str, reach: int, degree: int, functions: Sequence[str] = (), fields: int = 1
+) -> Sums:
+    """Products of total degree 1 to ``degree`` of a site's q and p and the differences of its q to
+    those of the next sites up to ``reach``, and ``functions`` as text in a site's own q1, p1 and
+    the next sites' q2, p2, … to q4, p4; of two fields q1, q2 are the site's, q3, q4 the next one's.
 
     Powers of one variable come first: of combinations that are equal when summed, they are kept.
     Each term goes to the shortest window that holds it. Raises InputError for a function that is
     not understood.
     """
-    variables = ("q1", "p1", *(f"q{k + 1} - q1" for k in range(1, reach + 1)))
+    own = range(1, fields + 1)
+    ahead = (f"q{j * fields + k} - q{k}" for j in range(1, reach + 1) for k in own)
+    variables = (*(f"q{k}" for k in own), *(f"p{k}" for k in own), *ahead)
     rows = exponents(len(variables), degree)
     rows.sort(key=lambda row: sum(a > 0 for a in row) > 1)
-    reaches = [_reach_of(text) for text in functions]
+    reaches = [_reach_of(text, fields) for text in functions]
     parts = []
     for near in range(max([reach, *reaches]) + 1):
-        own = [row[: near + 2] for row in rows if _furthest(row) == near]
-        terms = Terms(near + 1, variables[: near + 2], tuple(own))
+        width = (near + 2) * fields
+        mine = [row[:width] for row in rows if _furthest(row, fields) == near]
+        terms = Terms((near + 1) * fields, variables[:width], tuple(mine))
         given = [t for t, r in zip(functions, reaches, strict=True) if r == near]
         if given:
-            terms = joined(given_terms(near + 1, given), terms)
+            terms = joined(given_terms((near + 1) * fields, given), terms)
         if terms.powers:
-            parts.append(Part(terms, Windows(ends, near)))
+            parts.append(Part(terms, Windows(ends, near, fields)))
     return Sums(dim, tuple(parts))
 
 
@@ -334,10 +369,14 @@ def _numbered(degree: int) -> list[tuple[int, int]]:
     return [(-1, 0), *((n, n // 2 + 1) for n in range(2 * degree))]
 
 
-def body_terms(bodies: int, space: int, powers: Sequence[int], *, alike: bool) -> Sums:
+def body_terms(
+    bodies: int, space: int, powers: Sequence[int], *, alike: bool = True, species: str = ""
+) -> Sums:
     """|p_i|² of every body, and ``powers`` of the distances of every pair.
 
     alike: whether all bodies share their coefficients; else each body and each pair has its own.
+    species: a letter for each body, as "abbb": bodies of one letter share theirs, and so do pairs
+    of the same two letters.
     """
     r = distance(space)
     rows = tuple((max(n, 0), max(-n, 0)) for n in powers)
@@ -347,17 +386,24 @@ def body_terms(bodies: int, space: int, powers: Sequence[int], *, alike: bool) -
     )
     parts = []
     for terms, groups in local:
-        for members in [groups] if alike else [[group] for group in groups]:
-            parts.append(Part(terms, Groups(tuple(members), bodies, space)))
+        shared: dict[Any, list[tuple[int, ...]]] = {}
+        for group in groups:
+            letters = "".join(sorted(species[i] for i in group)) if species else ""
+            shared.setdefault(letters if species or alike else group, []).append(group)
+        for key, members in shared.items():
+            over = Groups(tuple(members), bodies, space, key if species else "")
+            parts.append(Part(terms, over))
     return Sums(bodies * space, tuple(parts))
 
 
-def _furthest(row: tuple[int, ...]) -> int:
-    """How far the last variable is that enters a product of q1, p1 and differences."""
-    return max(max((k for k, a in enumerate(row) if a), default=0) - 1, 0)
+def _furthest(row: tuple[int, ...], fields: int) -> int:
+    """How far the last variable is that enters a product of a site's q and p and differences."""
+    last = max((k for k, a in enumerate(row) if a), default=0)
+    return max(last // fields - 1, 0)
 
 
-def _reach_of(text: str) -> int:
+def _reach_of(text: str, fields: int) -> int:
     """How far a function of a site and those after it reaches."""
-    used = depends_on(parse(text, _LONGEST))
-    return max((i % _LONGEST for i in used), default=0)
+    longest = _LONGEST * fields
+    used = depends_on(parse(text, longest))
+    return max((i % longest // fields for i in used), default=0)

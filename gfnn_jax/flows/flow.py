@@ -27,15 +27,12 @@ from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.generating.generated import two_sum
 from gfnn_jax.phase_space import apply_j, area, symplectic_form
-from gfnn_jax.solve import newton
+from gfnn_jax.solve import fixed_point, krylov, newton
 from gfnn_jax.solve.linear import small_solve
-from gfnn_jax.solve.newton import Evaluation
+from gfnn_jax.solve.newton import Evaluation, largest
 from gfnn_jax.solve.status import NON_FINITE, NOT_CONVERGED, OK, Info
 
 _MOST, _MOST_NEWTON = 100, 40
-# Iterations of the stages' derivative where there are no matrices: roundoff at a factor of 0.5,
-# which substeps of h‖H''‖ ≤ 1 are well within.
-_MOST_TANGENT = 50
 # A change of the stages of so many eps of the state is none; one below eps^¾ that no longer halves
 # is roundoff. With 2 eps in place of the first, what the iteration leaves is of one sign: the
 # energy of Hénon–Heiles at h = 0.5 then drifts by 2.4e-18 of itself per step instead of 1e-18.
@@ -74,9 +71,28 @@ class StageEquation:
         unit = jnp.tile(scale, self.stages) / self.stages
         return evaluation, stage_matrix(hessian, h, self.stages) / unit[None, :, None]
 
+    def unit(self, shared, lanes):
+        """The residual's units (B, s·2d)."""
+        unit = jnp.tile(shared[3], self.stages) / self.stages
+        return jnp.broadcast_to(unit[None], (len(lanes[0]), unit.size))
+
+    def product(self, shared, lanes, x):
+        """v (B, s·2d) -> (∂r/∂x) v in these units, by products with H''."""
+        (family, params, h, _), (z, args) = shared, lanes
+        _, inside = self._inside(z, x)
+        bends = family.curvatures(params, inside, _at_stages(family, args, h, self.stages))
+        unit = self.unit(shared, lanes)
+
+        def along(v):
+            dot = _of_stages(unit * v, self.stages)
+            turned = apply_j(family.hessian_product(bends, _coupled(dot)))
+            return _flat(dot - _weighted(h, dot) * turned) / unit
+
+        return along
+
     def _inside(self, z, x):
         """The slopes L (s, B, 2d), and the states of the stages."""
-        slopes = jnp.swapaxes(x.reshape(len(z), self.stages, -1), 0, 1)
+        slopes = _of_stages(x, self.stages)
         return slopes, z[None] + _coupled(slopes)
 
     def _evaluation(self, z, slopes, field, scale):
@@ -225,7 +241,8 @@ class Flow:
 def _fixed_point(stages: int, shared, z, args):
     """L (s, B, 2d) and Info, by iterating L_i = h b_i J∇H(z + Σ_j μ_ij L_j) from h b_i J∇H(z).
 
-    A lane that is at roundoff keeps its stages: a slow or bad lane changes no other.
+    A lane that is at roundoff keeps its stages: a slow or bad lane changes no other. Where this
+    does not contract and H does without matrices, Newton–Krylov begins again.
     """
     family, params, h, scale = shared
     eps = float(jnp.finfo(z.dtype).eps)
@@ -240,7 +257,7 @@ def _fixed_point(stages: int, shared, z, args):
         slopes, change, open_, iterations = carry
         inside = z[None] + _coupled(slopes)
         new = _weighted(h, inside) * apply_j(family.gradient(params, inside, at))
-        moved = jax.lax.stop_gradient(jnp.max(jnp.abs(new - slopes) / size, axis=(0, 2)))
+        moved = jax.lax.stop_gradient(largest(_flat(jnp.abs(new - slopes) / size)))
         settled = (moved <= eps**_SETTLED) & (moved > 0.5 * change)
         goes_on = ~((moved <= _FLOOR_EPS * eps) | settled) & jnp.isfinite(moved)
         iterations = iterations + open_.astype(jnp.int32)
@@ -257,7 +274,15 @@ def _fixed_point(stages: int, shared, z, args):
     )
     failed = jnp.where(jnp.isfinite(change), NOT_CONVERGED, NON_FINITE)
     status = jnp.where(change <= eps**_SETTLED, OK, failed).astype(jnp.int32)
-    return slopes, Info(status, iterations, change)
+    info = Info(status, iterations, change)
+    if matrix_free(family):
+        nothing = jnp.zeros((len(z), 0), z.dtype)
+        x, _, info = fixed_point.newton_krylov(
+            StageEquation(stages), shared, (z, args), (_flat(slopes), nothing, info),
+            _flat(begun[0]),
+        )  # fmt: skip
+        slopes = _of_stages(x, stages)
+    return slopes, info
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -279,20 +304,17 @@ def _stages_jvp(stages, primals, tangents):
         return _weighted(h, inside) * apply_j(family.gradient(params, inside, at))
 
     _, field_dot = jax.jvp(field, primals, tangents)
-    inside = z[None] + _coupled(slopes)
-    at = _at_stages(family, args, h, stages)
     if matrix_free(family):
-        bends = family.curvatures(params, inside, at)
-
-        def again(dot, _):
-            turned = family.hessian_product(bends, _coupled(dot))
-            return field_dot + _weighted(h, dot) * apply_j(turned), None
-
-        slopes_dot, _ = jax.lax.scan(again, field_dot, length=_MOST_TANGENT)
+        equation, lanes = StageEquation(stages), (z, args)
+        unit = equation.unit(shared, lanes)
+        product = equation.product(shared, lanes, _flat(slopes))
+        solved = unit * krylov.solve_to_roundoff(product, _flat(field_dot) / unit)
     else:
+        inside = z[None] + _coupled(slopes)
+        at = _at_stages(family, args, h, stages)
         _, hessian = family.gradient_and_hessian(params, inside, at)
         solved = small_solve(stage_matrix(hessian, h, stages), _flat(field_dot))
-        slopes_dot = jnp.swapaxes(solved.reshape(len(z), stages, -1), 0, 1)
+    slopes_dot = _of_stages(solved, stages)
     integer_dot: Any = np.zeros(info.status.shape, jax.dtypes.float0)
     info_dot = Info(integer_dot, integer_dot, jnp.zeros_like(info.residual))
     return (slopes, info), (slopes_dot, info_dot)
@@ -319,6 +341,11 @@ def _coupled(slopes):
 def _flat(slopes):
     """(s, B, 2d) as (B, s·2d)."""
     return jnp.swapaxes(slopes, 0, 1).reshape(slopes.shape[1], -1)
+
+
+def _of_stages(x, stages: int):
+    """(B, s·2d) as (s, B, 2d)."""
+    return jnp.swapaxes(x.reshape(len(x), stages, -1), 0, 1)
 
 
 def stage_matrix(hessian, h, stages: int):

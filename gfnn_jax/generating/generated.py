@@ -1,8 +1,8 @@
 """The piece that a generating function makes: Z − z = h J ∇S(w) (paper, eq. (4)).
 
-The implicit equation for w is solved to roundoff by Newton's method, or by fixed point where S has
-too many degrees of freedom for matrices; derivatives in the state, the parameters and dt come from
-the implicit function theorem.
+The implicit equation for w is solved to roundoff by Newton's method; where S has too many degrees
+of freedom for matrices, by fixed point or Newton–Krylov. Derivatives in the state, the parameters
+and dt come from the implicit function theorem.
 """
 
 from __future__ import annotations
@@ -65,6 +65,20 @@ class ImplicitStep:
         (_, _, dt, scale), (z, *_) = shared, lanes
         unit, _ = self.chart.sizes(scale, z, namespace(z).zeros_like(z), dt)
         return jax.lax.stop_gradient(unit) if namespace(z) is jnp else unit
+
+    def product(self, shared, lanes, x):
+        """v (B, n) -> (∂r/∂x) v in the residual's units, by products with S'': for families that
+        do without matrices."""
+        (family, params, dt, _), (z, known, args) = shared, lanes
+        bends = family.curvatures(params, self.chart.complete(known, x), args)
+        unit, nothing = self.unit(shared, lanes), namespace(z).zeros_like(z)
+
+        def along(v):
+            moved = self.chart.complete(nothing, unit * v)
+            turned = family.hessian_product(bends, moved)
+            return self.chart.residual(nothing, moved, turned, dt) / unit
+
+        return along
 
     def _evaluation(self, z, w, gradient, dt, scale):
         unit, size = self.chart.sizes(scale, z, gradient, dt)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.errors import InputError
-from gfnn_jax.evaluate import figures, metrics, report
+from gfnn_jax.evaluate import figures, figures_of_many, metrics, report
 from gfnn_jax.jobs.measure import Measured, measure, plane_of
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.rollouts import NUM_STEPS, NUM_TRAJECTORIES, map_rollouts
@@ -18,6 +18,7 @@ from gfnn_jax.jobs.search import scene_named, search
 from gfnn_jax.jobs.written import MODEL, Ran, already_done, pairs_digest, write
 from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.fit import MAX_SECONDS, Fit
+from gfnn_jax.learn.structures import Bodies, structure_of
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene
 from gfnn_jax.scenes.trajectories import (
@@ -150,6 +151,9 @@ def _figures(fit: Fit, scene: Scene, measured: Measured, reference) -> dict[str,
             for name, trajectories in (("reference", reference), ("GFNN", predicted))
         }
         drawn["section"] = figures.sections({n: (z[:, 1], z[:, 3]) for n, z in sections.items()})[0]
+    drawn_of_many = _figures_of_many(scene, steps, reference, predicted)
+    if drawn_of_many:
+        return {name: ax.figure for name, ax in drawn.items()} | drawn_of_many
     if scene.dim == 1:
         both = {"reference": reference, "GFNN": predicted}
         drawn["portrait"] = figures.sections(
@@ -162,6 +166,22 @@ def _figures(fit: Fit, scene: Scene, measured: Measured, reference) -> dict[str,
              (("reference", reference), ("GFNN", predicted))}, ("$q_1$", "$q_2$"),
         )  # fmt: skip
     return {name: ax.figure for name, ax in drawn.items()}
+
+
+def _figures_of_many(scene: Scene, steps, reference, predicted) -> dict[str, Any]:
+    """Those of the scene's structure, of the first trajectory that both follow to its end."""
+    structure = structure_of(scene.structure, scene.dim, scene.coordinates)
+    if structure is None:
+        return {}
+    whole = np.isfinite(reference).all(axis=(1, 2)) & np.isfinite(predicted).all(axis=(1, 2))
+    lane = int(np.argmax(whole))
+    drawn = scene.dt * np.asarray(steps), reference[lane], predicted[lane]
+    if isinstance(structure, Bodies):
+        return {"orbits": figures_of_many.orbits(*drawn, structure.count)}
+    found = {"space-time": figures_of_many.space_time(*drawn, structure.angles)}
+    if not structure.angles and structure.fields == 1:
+        found["modes"] = figures_of_many.modes(*drawn, structure.kind)
+    return found
 
 
 def _labelled(candidate: Candidate) -> str:

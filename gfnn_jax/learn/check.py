@@ -13,6 +13,7 @@ from gfnn_jax.families.sums import site_terms
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.learn.candidates import Tolerance
+from gfnn_jax.learn.structures import fields_of
 from gfnn_jax.learn.varied import check_varied
 from gfnn_jax.phase_space import Pairs, sizes, split
 from gfnn_jax.scenes.scene import AroundOrbit, Scene
@@ -175,7 +176,7 @@ def _check_structured(
                 "next ones"
             )
         try:
-            site_terms(pairs.dim, "ring", 0, 0, (term,))
+            site_terms(pairs.dim, "ring", 0, 0, (term,), max(1, fields_of(str(structure))))
         except InputError as error:
             raise FitError(str(error)) from error
 

@@ -213,7 +213,8 @@ def fit(
                its flow is factored out, and S learns what it leaves over.
     structure: "ring" or "chain" of equal sites, whose ``terms`` are text in a site's q1, p1 and the
                next ones' q2, p2, …; "bodies:N", q body by body: H is a sum over sites, or over
-               bodies and pairs; of sites, S where learn is "map" or no H meets the tolerance.
+               bodies and pairs, of which "bodies:4:abbb" says that the last three are of one
+               species; of sites, S where learn is "map" or no H meets the tolerance.
                None: the scene's own.
     family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp";
                with learn="hamiltonian" H is a sum of terms, or a network with "mlp".

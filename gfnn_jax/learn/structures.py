@@ -6,7 +6,9 @@ A structure tells which libraries of terms are tried, and by what the domain of 
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterator, Sequence
+from math import comb
 
 import numpy as np
 
@@ -24,7 +26,7 @@ from gfnn_jax.families.terms import Terms
 from gfnn_jax.maps.domain import Ranges, ranges_of
 from gfnn_jax.phase_space import sizes
 
-NAMES = ("ring", "chain", "bodies:N")
+NAMES = ("ring", "chain", "bodies:N", "ring:FIELDS", "chain:FIELDS", "bodies:N:SPECIES")
 _ENDS = {"ring": ("ring",), "chain": ("free", "fixed")}
 # (reach, degree, whether functions are tried too) of the libraries, by rising size.
 _LIBRARIES = (
@@ -43,16 +45,18 @@ _POWERS = ((-3, -2, -1, 1, 2), (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4))
 # A library of sites is fitted to so many pairs, or to those that hold so many numbers; one of
 # bodies to so many pairs, of which the quiet ones come first.
 _FEWEST_PAIRS, _FEWEST_NUMBERS, _FEWEST_STATES = 4, 4_000, 200
+_MOST_PRODUCTS = 350  # of a library: those of higher degree are not tried of several fields
 _FEWEST_SITES = 5  # a window of the longest reach meets itself in a smaller ring
 
 
 @dataclasses.dataclass(frozen=True)
 class Sites:
     """Equal sites in a ring, or in a chain whose ends are free or held. kind: "ring" or "chain".
-    angles: those of a site, "" or "q" or "qp"."""
+    angles: those of a site, "" or "q" or "qp". fields: q of a site, which stand together."""
 
     kind: str
     angles: str = ""
+    fields: int = 1
 
     def fewest(self, width: int) -> int:
         """Pairs of states (2d,) that a library is fitted to, at least."""
@@ -69,16 +73,25 @@ class Sites:
                 )
             return
         if given:
-            yield from (site_terms(dim, end, 0, 0, given) for end in ends)
+            yield from (site_terms(dim, end, 0, 0, given, self.fields) for end in ends)
         for reach, degree, with_functions in _LIBRARIES:
-            functions = (*given, *(_FUNCTIONS if with_functions else ()))
-            yield from (site_terms(dim, end, reach, degree, functions) for end in ends)
+            if comb((2 + reach) * self.fields + degree, degree) > _MOST_PRODUCTS:
+                continue
+            functions = (*given, *(self._functions() if with_functions else ()))
+            yield from (site_terms(dim, end, reach, degree, functions, self.fields) for end in ends)
+
+    def _functions(self) -> Iterator[str]:
+        """The functions of every field."""
+        for k in range(1, self.fields + 1):
+            places = {"q1": f"q{k}", "q2": f"q{k + self.fields}"}
+            yield from (re.sub("q[12]", lambda m: places[m[0]], text) for text in _FUNCTIONS)  # noqa: B023
 
     def sizes(self, z: np.ndarray) -> np.ndarray:
-        """(2d,) sizes of the coordinates: of q and of p of all sites together."""
-        both = z.reshape(len(z), 2, -1)
+        """(2d,) sizes of the coordinates: of q and of p of all sites together, field by field."""
+        both = z.reshape(len(z), 2, -1, self.fields)
         size = both.std(axis=(0, 2))
-        return np.repeat(np.where(size > 0, size, 1.0), both.shape[2])
+        size = np.where(size > 0, size, 1.0)
+        return np.repeat(size[:, None], both.shape[2], axis=1).ravel()
 
     def domain(self, z: np.ndarray, uses_positions: bool = True) -> Ranges:
         """Where the states z (N, 2d) were: p and the differences of neighbours, and q unless only
@@ -86,20 +99,28 @@ class Sites:
         dim = z.shape[1] // 2
         ends = "ring" if self.kind == "ring" else "free"
         own = tuple(x for x in ("q", "p") if x not in self.angles and (x == "p" or uses_positions))
-        variables = tuple(f"{x}1" for x in own), () if self.angles else ("q2 - q1",)
+        fields = range(1, self.fields + 1)
+        alone = tuple(f"{x}{k}" for x in own for k in fields)
+        bonds = () if self.angles else tuple(f"q{k + self.fields} - q{k}" for k in fields)
         seen = tuple(
-            Part(Terms(k + 1, names, _units(len(names))), Windows(ends, k))
-            for k, names in enumerate(variables) if names
+            Part(
+                Terms((k + 1) * self.fields, names, _units(len(names))),
+                Windows(ends, k, self.fields),
+            )
+            for k, names in enumerate((alone, bonds)) if names
         )  # fmt: skip
         return ranges_of(Sums(dim, seen), z)
 
 
 @dataclasses.dataclass(frozen=True)
 class Bodies:
-    """Bodies in a space of one to three dimensions that attract or repel each other in pairs."""
+    """Bodies in a space of one to three dimensions that attract or repel each other in pairs.
+
+    species: a letter for each body, where those of a species are alike."""
 
     count: int
     space: int
+    species: str = ""
     angles = ""
 
     def fewest(self, width: int) -> int:
@@ -107,8 +128,12 @@ class Bodies:
         return _FEWEST_STATES
 
     def libraries(self, dim: int, given: Sequence[str] = ()) -> Iterator[Sums]:
-        """Sums by rising size: of bodies that are all alike, then of bodies that are not."""
+        """Sums by rising size: of bodies that are all alike, then of bodies that are not; where
+        species are known, of these."""
         for powers in _POWERS:
+            if self.species:
+                yield body_terms(self.count, self.space, powers, species=self.species)
+                continue
             for alike in (True, False):
                 yield body_terms(self.count, self.space, powers, alike=alike)
 
@@ -135,22 +160,46 @@ def structure_of(
     ``dim`` degrees of freedom, or the angles are not those of every site."""
     if text is None:
         return None
-    kind, _, number = str(text).partition(":")
-    if kind == "bodies" and number.isdecimal() and int(number) > 1:
-        count = int(number)
+    known = _bodies(str(text))
+    if known is not None:
+        count, species = known
+        if species and len(species) != count:
+            raise FitError(
+                f"expected a letter for each of {count} bodies, as bodies:{count}:"
+                f"{('a' + 'b' * count)[:count]}; got {len(species)} in {text!r}"
+            )
         if dim % count or not 1 <= dim // count <= 3:
             raise FitError(
                 f"expected {count} bodies in 1 to 3 dimensions, which have {count}, {2 * count} or "
                 f"{3 * count} degrees of freedom; got {dim}"
             )
-        return Bodies(count, dim // count)
-    if text not in _ENDS:
+        return Bodies(count, dim // count, species)
+    kind, fields = str(text).partition(":")[0], fields_of(str(text))
+    if fields == 0:
         raise FitError(f"expected a structure among {', '.join(NAMES)}; got {text!r}")
-    if dim < _FEWEST_SITES:
-        raise FitError(f"expected a {text} of at least {_FEWEST_SITES} sites, got {dim}")
-    known = {(): "", tuple(range(dim)): "q", tuple(range(2 * dim)): "qp"}
-    if coordinates.angles not in known:
+    if dim % fields:
+        raise FitError(f"expected {fields} q of every site; got {dim} degrees of freedom")
+    if dim // fields < _FEWEST_SITES:
+        raise FitError(f"expected a {kind} of at least {_FEWEST_SITES} sites, got {dim // fields}")
+    sides = {(): "", tuple(range(dim)): "q", tuple(range(2 * dim)): "qp"}
+    if coordinates.angles not in sides:
         raise FitError(
             f"expected no angles, or all q of the sites, or all q and p; got {coordinates.angles}"
         )
-    return Sites(text, known[coordinates.angles])
+    if coordinates.angles and fields > 1:
+        raise FitError(f"expected no angles of {fields} fields at a site: one q may be an angle")
+    return Sites(kind, sides[coordinates.angles], fields)
+
+
+def fields_of(text: str) -> int:
+    """The fields of a site of "ring", "chain:2" and the like; 0 of any other text."""
+    found = re.fullmatch(r"(?:ring|chain)(?::([1-9][0-9]?))?", text)
+    return int(found[1] or 1) if found is not None else 0
+
+
+def _bodies(text: str) -> tuple[int, str] | None:
+    """(number, species) of "bodies:N" or "bodies:N:SPECIES"; None of any other text."""
+    found = re.fullmatch(r"bodies:([0-9]+)(?::([A-Za-z]+))?", text)
+    if found is None or int(found[1]) < 2:
+        return None
+    return int(found[1]), found[2] or ""

@@ -13,9 +13,11 @@ from gfnn_jax.phase_space import Scalar, State, split
 from gfnn_jax.scenes.scene import DrawnFrom, Scene
 
 _MASSES = (1.0, 0.01, 0.02, 0.005)
-_RADII = (1.0, 1.9, 3.2)  # of the companions' orbits, each drawn within a twentieth
+_RADII = (1.0, 1.9, 3.2)  # of the companions' orbits
 _TILT = 0.1  # standard deviation of a direction out of the plane
-_FASTER = 0.02  # standard deviation of a speed, of that on a circle
+# (part of a radius within which it is drawn, standard deviation of a speed, of that on a circle):
+# of the states that rollouts start from, and of those of pairs, among which such orbits then stay.
+_TEST, _TRAINING = (0.05, 0.02), (0.25, 0.15)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,19 +37,24 @@ class Gravity:
 @dataclasses.dataclass(frozen=True)
 class Companions:
     """``draw(key, num)``: near-circular orbits of any phase about the star, slightly tilted, in the
-    frame of the centre of mass."""
+    frame of the centre of mass.
+
+    spread: part of a radius within which it is drawn. faster: standard deviation of a speed, of
+    that on a circle."""
 
     masses: tuple[float, ...]
     radii: tuple[float, ...]
+    spread: float
+    faster: float
 
     def __call__(self, key, num):
         keys, count = jax.random.split(key, 4), len(self.radii)
         shape = (num, count)
-        spread = jax.random.uniform(keys[0], shape, jnp.float64, 0.95, 1.05)
+        spread = 1 + self.spread * jax.random.uniform(keys[0], shape, jnp.float64, -1, 1)
         r = jnp.asarray(self.radii)[None] * spread
         phase = jax.random.uniform(keys[1], shape, jnp.float64, 0, 2 * jnp.pi)
         tilt = _TILT * jax.random.normal(keys[2], shape, jnp.float64)
-        speed = (1 + _FASTER * jax.random.normal(keys[3], shape, jnp.float64)) / jnp.sqrt(r)
+        speed = (1 + self.faster * jax.random.normal(keys[3], shape, jnp.float64)) / jnp.sqrt(r)
         cos, sin, none = jnp.cos(phase), jnp.sin(phase), jnp.zeros(shape)
         q = r[..., None] * jnp.stack([cos, sin, none], axis=-1)
         along = jnp.stack([-sin * jnp.cos(tilt), cos * jnp.cos(tilt), jnp.sin(tilt)], axis=-1)
@@ -78,7 +85,8 @@ def n_body(dt: float = 0.05) -> Scene:
         purpose="a star and three companions in space: structure bodies:4",
         dim=3 * bodies,
         dt=dt,
-        sampling=DrawnFrom(Companions(_MASSES, _RADII)),
+        sampling=DrawnFrom(Companions(_MASSES, _RADII, *_TRAINING)),
+        test_states=DrawnFrom(Companions(_MASSES, _RADII, *_TEST)),
         hamiltonian=energy,
         invariants={
             "energy": energy,

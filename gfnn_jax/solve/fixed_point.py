@@ -1,12 +1,15 @@
-"""Fixed-point iteration for a batch of systems that are too large for matrices.
+"""Fixed-point iteration for a batch of systems that are too large for matrices, and Newton–Krylov.
 
 The solve finds x (B, n) with r(shared, lanes, x) = 0 by x ← x − unit · r, which contracts where a
-map is near the identity, or is kicked. Iterates are judged as those of Newton's method are, each by
-the residual at it; status is data; a lane that is done is frozen.
+map is near the identity, or is kicked. A lane in which it does not, or hardly does, begins again by
+Newton's method, each step from products with the Jacobian alone and halved until the residual is
+smaller. Iterates are judged as those of `solve.newton` are, each by the residual at it; status is
+data; a lane that is done is frozen.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -14,6 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gfnn_jax.solve import krylov
+from gfnn_jax.solve.krylov import norm_of
 from gfnn_jax.solve.newton import Evaluation, floors, largest, relative, settled_floors, where
 from gfnn_jax.solve.status import NON_FINITE, NOT_CONVERGED, OK, Info
 
@@ -21,7 +26,14 @@ MOST = 100  # updates, of a derivative too: roundoff at a factor of 0.7
 # Near roundoff a lane goes on while two updates, as q moves p and p moves q, leave no more of its
 # residual than this.
 _SHRINKS = 0.7
+# A lane whose error after the first few updates is not below this power of their number has a
+# Newton update instead, which costs as much as some fifty.
+_SLOW, _FIRST = 0.8, 10
+_MOST_NEWTON = 40  # updates of Newton's method
+_LINEAR = 1e-4  # residual of their linear systems: a derivative of so many updates is at roundoff
+_SHORTEST = 2.0**-20  # part of a Newton step
 _CLOSE = 1e-15  # in NumPy, of the residual's terms: roundoff
+_SOLVED = 1e-14  # of them: lanes above it have Newton updates in NumPy
 _STALE = 4  # updates in NumPy that make no lane better: the end
 
 
@@ -37,6 +49,10 @@ class Contraction(Protocol):
         """(B, n): the units of the residual."""
         ...
 
+    def product(self, shared: Any, lanes: Any, x: Any) -> Callable[[Any], Any]:
+        """v (B, n) -> (∂r/∂x) v at x, v in these units too. NumPy or JAX."""
+        ...
+
 
 class _Iterate(NamedTuple):
     x: Any
@@ -48,41 +64,96 @@ class _Iterate(NamedTuple):
     open: Any
 
 
+class _Damped(NamedTuple):
+    x: Any
+    residual: Any
+    aux: Any
+    error: Any
+    step: Any  # of Newton's method from x, and the part of it (B, 1) to be tried next
+    part: Any
+    iterations: Any
+    open: Any
+
+
 def iterate(
     equation: Contraction, shared: Any, lanes: Any, guess: Any, *, most: int
 ) -> tuple[Any, Any, Info]:
-    """The iterations from guess (B, n): (x, aux at x, Info)."""
+    """The iterations from guess (B, n): (x, aux at x, Info). most: of the fixed point."""
     unit, settled = equation.unit(shared, lanes), settled_floors(guess.dtype)
+    evaluation = equation.evaluate(shared, lanes, guess)
+    start = floors(evaluation)
+    begun = _Iterate(
+        guess, evaluation.residual, evaluation.aux, start, jnp.full_like(start, jnp.inf),
+        jnp.zeros(guess.shape[0], jnp.int32), start > 1.0,
+    )  # fmt: skip
 
     def improve(state: _Iterate) -> _Iterate:
         x = state.x - unit * state.residual
         evaluation = equation.evaluate(shared, lanes, x)
         error, iterations = floors(evaluation), state.iterations + 1
         further = (error > settled) | ((error > 1.0) & (error < _SHRINKS * state.earlier))
+        fast = (
+            (iterations < _FIRST)
+            | (error <= settled)
+            | (error < _SLOW ** iterations.astype(error.dtype) * start)
+        )
         new = _Iterate(
             x, evaluation.residual, evaluation.aux, error, state.error, iterations,
-            further & jnp.isfinite(error) & (iterations < most),
+            further & fast & jnp.isfinite(error) & (iterations < most),
         )  # fmt: skip
         return where(state.open, new, state)
 
-    evaluation = equation.evaluate(shared, lanes, guess)
-    error = floors(evaluation)
-    count = jnp.zeros(guess.shape[0], jnp.int32)
-    begun = _Iterate(
-        guess, evaluation.residual, evaluation.aux, error, jnp.full_like(error, jnp.inf), count,
-        error > 1.0,
-    )  # fmt: skip
     state = jax.lax.while_loop(lambda s: jnp.any(s.open), improve, begun)
-    finite = jnp.isfinite(state.error)
-    status = jnp.where(state.error <= settled, OK, jnp.where(finite, NOT_CONVERGED, NON_FINITE))
-    residual = relative(state.error)
-    return state.x, state.aux, Info(status.astype(jnp.int32), state.iterations, residual)
+    info = _info(state.error, state.iterations, settled)
+    return newton_krylov(equation, shared, lanes, (state.x, state.aux, info), guess)
+
+
+def newton_krylov(
+    equation: Contraction, shared: Any, lanes: Any, done: tuple[Any, Any, Info], guess: Any
+) -> tuple[Any, Any, Info]:
+    """``done``, (x, aux at x, Info), where it is ok; the other lanes by Newton's method from guess
+    (B, n), a step halved until the residual is smaller."""
+    unit, settled = equation.unit(shared, lanes), settled_floors(guess.dtype)
+    _, aux, info = done
+    most, infinite = info.iterations + _MOST_NEWTON, jnp.full_like(guess, jnp.inf)
+    begun = _Damped(  # the first step is none: it leads to the guess
+        guess, infinite, aux, infinite[:, 0], jnp.zeros_like(guess), jnp.ones_like(guess[:, :1]),
+        info.iterations, info.status != OK,
+    )  # fmt: skip
+
+    def improve(state: _Damped) -> _Damped:
+        x = state.x - state.part * state.step
+        evaluation = equation.evaluate(shared, lanes, x)
+        error, iterations = floors(evaluation), state.iterations + 1
+        better = state.open & (norm_of(evaluation.residual) < norm_of(state.residual))
+        further = (error > settled) | ((error > 1.0) & (error < 0.5 * state.error))
+        further = better & further & (iterations < most)
+        rhs = jnp.where(further[:, None], evaluation.residual, 0.0)
+        step = krylov.differentiable(equation.product(shared, lanes, x), rhs, _LINEAR)
+        new = _Damped(
+            x, evaluation.residual, evaluation.aux, error, unit * step, jnp.ones_like(state.part),
+            iterations, further,
+        )  # fmt: skip
+        # Close to the floor only the full step makes sense: what is left is roundoff.
+        shortest = jnp.where(state.error <= settled, 1.0, _SHORTEST)
+        halved = state._replace(part=0.5 * state.part, open=state.part[:, 0] > shortest)
+        return where(better, new, where(state.open, halved, state))
+
+    state = jax.lax.while_loop(lambda s: jnp.any(s.open), improve, begun)
+    found = state.x, state.aux, _info(state.error, state.iterations, settled)
+    return where(info.status == OK, done, found)
+
+
+def _info(error, iterations, settled: float) -> Info:
+    failed = jnp.where(jnp.isfinite(error), NOT_CONVERGED, NON_FINITE)
+    status = jnp.where(error <= settled, OK, failed)
+    return Info(status.astype(jnp.int32), iterations, relative(error))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def root(equation: Contraction, shared: Any, lanes: Any, guess: Any):
     """As ``iterate``, with derivatives in shared and lanes by the implicit function theorem, whose
-    linear equation is iterated too; the guess has no influence."""
+    linear equation is solved by products too; the guess has no influence."""
     return iterate(equation, shared, lanes, guess, most=MOST)
 
 
@@ -92,13 +163,8 @@ def _root_jvp(equation, primals, tangents):
     x, aux, info = root(equation, shared, lanes, guess)
     theta, theta_dot = (shared, lanes), tangents[:2]
     _, residual_dot = jax.jvp(lambda s, c: equation.evaluate(s, c, x).residual, theta, theta_dot)
-    _, along = jax.linearize(lambda y: equation.evaluate(shared, lanes, y).residual, x)
-    unit = equation.unit(shared, lanes)
-
-    def again(dot, _):
-        return dot - unit * (residual_dot + along(dot)), None
-
-    x_dot, _ = jax.lax.scan(again, -unit * residual_dot, length=MOST)
+    product = equation.product(shared, lanes, x)
+    x_dot = -equation.unit(shared, lanes) * krylov.solve_to_roundoff(product, residual_dot)
     _, aux_dot = jax.jvp(
         lambda s, c, y: equation.evaluate(s, c, y).aux, (*theta, x), (*theta_dot, x_dot)
     )
@@ -110,7 +176,8 @@ def _root_jvp(equation, primals, tangents):
 def refine(equation: Contraction, shared: Any, lanes: Any, guess: Any):
     """The same in NumPy: (x, aux, error (B,)), the error relative to the residual's terms.
 
-    Each lane's best iterate is what it ends with.
+    Each lane's best iterate is what it ends with; where a fixed point does not get there, of
+    Newton's method from the guess, which is to be close.
     """
 
     def judged(x):
@@ -126,5 +193,14 @@ def refine(equation: Contraction, shared: Any, lanes: Any, guess: Any):
             new = judged(new[0] - unit * new[1].residual)
             better = new[2] < best[2]
             best, stale = where(better, new, best), 0 if better.any() else stale + 1
+        best = where(best[2] <= _SOLVED, best, judged(guess))
+        while (left := ~(best[2] <= _SOLVED)).any():
+            product = equation.product(shared, lanes, best[0])
+            step = krylov.solve(product, np.where(left[:, None], best[1].residual, 0.0), _LINEAR)
+            new = judged(best[0] - unit * step)
+            better = left & (new[2] < _SHRINKS * best[2])
+            best = where(better, new, best)
+            if not better.any():
+                break
         x, evaluation, error = best
         return x, evaluation.aux, error

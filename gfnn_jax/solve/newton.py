@@ -200,8 +200,10 @@ def _newton(equation, shared, lanes, state: _Iterate, *, most, settled) -> _Iter
 
 
 def largest(rows):
-    """The largest entry of each row in magnitude. NumPy or JAX."""
-    return abs(rows).max(axis=-1)
+    """The largest entry of each row in magnitude; infinite where one is NaN, which XLA's maximum of
+    a long row passes over on a CPU. NumPy or JAX."""
+    size = abs(rows)
+    return namespace(rows).where(size == size, size, np.inf).max(axis=-1)
 
 
 def where(chosen, one, other):
