@@ -53,6 +53,7 @@ from gfnn_jax.learn.formula import Term, formula
 from gfnn_jax.learn.held_out import looked_at, outermost
 from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
 from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.learn.whole_sequences import Whole, fitted_to_sequences
 from gfnn_jax.phase_space import Pairs, apply_j, symplectic_form
 
 
@@ -143,6 +144,8 @@ class LearnedHamiltonian:
     messages: tuple[str, ...]
     stalled: bool
     root: np.ndarray | None
+    noise: np.ndarray | None = None
+    arcs: int = 0
 
     @property
     def fast(self) -> bool:
@@ -154,7 +157,8 @@ class _Fitted(NamedTuple):
     """rows: that the fit was given; it has left out those that the flow does not resolve.
     undetermined: of the null terms, those that other states would tell from the rest. ended: why a
     library that grew did so no longer. stalled: whether larger libraries were no better. noisy:
-    whether their errors were the same, which is that of the pairs."""
+    whether their errors were the same, which is that of the pairs. whole: what whole sequences
+    tell, where they were fitted."""
 
     family: Terms | Sums
     fit: FlowFit
@@ -165,6 +169,7 @@ class _Fitted(NamedTuple):
     ended: str = ""
     stalled: bool = False
     noisy: bool = False
+    whole: Whole | None = None
 
 
 def learn_hamiltonian(
@@ -222,6 +227,9 @@ def learn_hamiltonian(
             outside = _held_out_error(best.family, best.fit, prepared, there).relative
         if best.error.relative > _ROUNDOFF and len(best.fit.used) < len(everywhere.training):
             best = _refitted(problem, best, everywhere.training, prepared, judges)
+        if best.error.bound > judges.tolerance.bound:
+            say("H: whole sequences")
+            best = _of_sequences(problem, best, prepared, everywhere, clock)
     except OutOfTime:
         pass  # what was found stands
     problem.check = lambda: None
@@ -603,10 +611,24 @@ def _refitted(problem, found: _Fitted, rows, prepared, judges) -> _Fitted:
     return found._replace(fit=fit, rows=rows, error=error)
 
 
+def _of_sequences(problem, found: _Fitted, prepared, judges, clock: Clock) -> _Fitted:
+    """Fitted to whole sequences, where there are such and held-out steps bear it out."""
+    if found.error.relative <= _ROUNDOFF:
+        return found
+    whole = fitted_to_sequences(problem, found.family, found.fit, prepared, judges, clock.check)
+    if whole is None:
+        return found
+    family = found.family.take(whole.kept)
+    error = _held_out_error(family, whole.fit, prepared, judges)
+    if not error.relative <= OPTIONS.rise * found.error.relative:
+        return found
+    return found._replace(family=family, fit=whole.fit, error=error, whole=whole)
+
+
 def _learned(
     found: _Fitted, problem, prepared: Prepared, judges: Judges, seconds: float, options: Options
 ) -> LearnedHamiltonian:
-    family, fit = found.family, found.fit
+    family, fit, whole = found.family, found.fit, found.whole
     rows = judges.held_out
     z, args = prepared.y0[rows], prepared.given(rows)[1]
     some = slice(FREQUENCY_STATES)
@@ -648,7 +670,9 @@ def _learned(
         float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(error, omega_h, prepared, judges, found, left_out, int((~resolved).sum()))),
-        stalled=found.stalled, root=_root(found, problem, prepared, steps, judges.pairs),
+        stalled=found.stalled,
+        root=_root(found, problem, prepared, steps, judges.pairs) if whole is None else whole.root,
+        noise=None if whole is None else whole.noise, arcs=0 if whole is None else whole.arcs,
     )  # fmt: skip
 
 
@@ -759,6 +783,8 @@ def _messages(
                 else "slowest"
             )
         )
+    if found.whole is not None:
+        yield from found.whole.messages
     if found.undetermined:
         names = found.undetermined
         some = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
