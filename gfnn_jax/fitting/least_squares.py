@@ -33,7 +33,7 @@ _PANEL = 32  # columns per panel of LAPACK's QR: a third faster than 64
 _RIDGES = (0.0, *(10.0**k for k in range(-13, 0)))
 # Standard deviations of chance by which a ridge must lower the held-out squares. Of Hénon–Heiles with
 # noise of 1e-2 and 10⁴ pairs (benchmarks/bands.py) chance alone chose 0.01, four times the error.
-_CERTAIN = 2.0
+_CERTAIN = 3.0
 # A leading block is judged by a triangular solve where the smallest diagonal entry of R, relative
 # to its column, is no smaller than this, and where there are as many rows per term.
 _WELL_CONDITIONED, _WELL_DETERMINED = 1e-13, 1.5

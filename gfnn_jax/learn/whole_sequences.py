@@ -19,7 +19,8 @@ _RISE = 1.01  # of the held-out arcs' noise, by chance
 # Measured numbers for each term from which on a law that held-out sequences have borne out is fitted
 # to these too: what judges it then is in error by less than 1 / 200 of the noise's variance.
 _ROWS_PER_TERM = 200
-_STATES = 50  # from which the growth of noise along an arc is measured
+_STATES = 100  # from which the noise and its growth along an arc are measured
+_NORMAL = 1.4826  # a normal deviation over the median of its size
 _STEP_ERROR = 0.01  # of a step's own error ÷ the noise
 
 
@@ -47,9 +48,13 @@ def fitted_to_sequences(
     plain = coordinates.forward is CARTESIAN.forward and prepared.structure is None
     if not plain or prepared.varied:
         return None
-    c, rms = fit.coefficients, fit.rms
+    c = fit.coefficients
+    some = judges.training[:_STATES]
+    rms = _NORMAL * float(np.median(np.abs(problem.residuals(family, c, fit.steps, some))))
+    if not 0 < rms < np.inf:
+        return None
     steps = problem.fine_steps(family, c, judges.training, (_STEP_ERROR * rms,))[0]
-    longest = longest_arc(family, c, prepared.y0[judges.training[:_STATES]], prepared.dt, steps, rms)
+    longest = longest_arc(family, c, prepared.y0[some], prepared.dt, steps, rms)
 
     def along(rows) -> Shooting | None:
         rows, pairs = np.sort(rows), judges.pairs
