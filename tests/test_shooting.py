@@ -123,6 +123,22 @@ def test_gross_errors_among_pairs_do_not_spoil_the_law(spoilt):
     assert "gross errors" in told and "no weight" in told
 
 
+def test_maps_are_drawn_of_an_s_of_sites():
+    """Of kicked rotors in a ring, noise of 1e-3: coefficients within their deviations."""
+    scene = gfnn.scenes.froeschle(6)
+    pairs = gfnn.sample_pairs(scene, 200, jax.random.key(0))
+    rng = np.random.default_rng(0)
+    z0, z1 = (np.asarray(z) + 1e-3 * rng.normal(size=z.shape) for z in (pairs.z0, pairs.z1))
+    with pytest.warns(gfnn.FitWarning):
+        fit = gfnn.fit(gfnn.Pairs(z0, z1, pairs.dt), scene)
+    assert fit.chosen.learns == "map"
+    drawn = np.asarray(fit.sample(jax.random.key(0), 200).params)
+    clean = gfnn.fit(pairs, scene).map.pieces[0].params
+    assert drawn.shape[1:] == np.shape(clean)
+    off = (drawn.mean(axis=0) - np.asarray(clean)) / drawn.std(axis=0)
+    assert np.all(np.abs(off) < 4) and np.all(drawn.std(axis=0) < 1e-3)
+
+
 def test_sequences_give_the_law_from_all_of_their_states():
     scene = henon_heiles()
     z0 = np.asarray(gfnn.sample_test_states(scene, 40, jax.random.key(11)))

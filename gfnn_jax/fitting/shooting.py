@@ -173,9 +173,14 @@ class Shooting:
             off = np.abs(self.residuals(family, c, x) / self.scale).max(axis=2)
             off = np.where(self.arcs.measured, off, np.nan)
             known = np.isfinite(off[self.arcs.measured]).all()
-            distance = np.nanmedian(np.where(np.isnan(off) & self.arcs.measured, np.inf, off), axis=1)
+            distance = np.nanmedian(
+                np.where(np.isnan(off) & self.arcs.measured, np.inf, off), axis=1
+            )
             better = (distance < nearest) & self.arcs.measured[:, k] & np.isfinite(x).all(axis=1)
-            found, nearest = np.where(better[:, None], x, found), np.where(better, distance, nearest)
+            found, nearest = (
+                np.where(better[:, None], x, found),
+                np.where(better, distance, nearest),
+            )
             if known and k == 0 and np.all(distance < 3 * np.median(distance)):
                 break
         return found
@@ -187,7 +192,9 @@ class Shooting:
         inside = np.abs(known) <= self.options.outlying * middle
         width = known.shape[1]
         free = 1.0 - len(residual) * width / known.size
-        square = np.sum(np.where(inside, known, 0.0) ** 2, axis=0) / np.maximum(inside.sum(axis=0), 1)
+        square = np.sum(np.where(inside, known, 0.0) ** 2, axis=0) / np.maximum(
+            inside.sum(axis=0), 1
+        )
         return np.sqrt(square / max(free, 0.5 / width)) + np.finfo(float).eps * self.scale
 
     def _weights(self, residual, noise, block=slice(None)) -> np.ndarray:
@@ -211,7 +218,9 @@ class Shooting:
             by_state, by_c, residual = self._along(family, c, x[block], block)
             weight = np.sqrt(self._weights(residual, noise, block)) / noise
             residual, by_state, by_c = (
-                weight * residual, weight[..., None] * by_state, weight[..., None] * by_c
+                weight * residual,
+                weight[..., None] * by_state,
+                weight[..., None] * by_c,
             )
             rows = residual.shape[1] * width
             own = by_state.reshape(-1, rows, width)
@@ -299,6 +308,9 @@ def longest_arc(family, c, z, dt: float, steps: Steps, noise, options: Options =
         step = images(family, c, z, dt, steps, derivatives=True)
         z, carried = step.states, step.by_state @ carried
         grown = np.linalg.norm(carried * unit, axis=(1, 2))
-        if not np.quantile(np.where(np.isfinite(grown), grown, np.inf), 0.9) * noise < options.grown:
+        if (
+            not np.quantile(np.where(np.isfinite(grown), grown, np.inf), 0.9) * noise
+            < options.grown
+        ):
             return max(k - 1, 1)
     return options.longest
