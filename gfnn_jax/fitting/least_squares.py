@@ -31,8 +31,8 @@ _BLOCK_BYTES, _FEWEST_ROWS = 2 * 2**20, 256
 _PANEL = 32  # columns per panel of LAPACK's QR: a third faster than 64
 # Ridge parameters tried, relative to the largest singular value; the first is plain least squares.
 _RIDGES = (0.0, *(10.0**k for k in range(-13, 0)))
-# Standard deviations of chance by which a ridge must lower the held-out squares. Of Hénon–Heiles with
-# noise of 1e-2 and 10⁴ pairs (benchmarks/bands.py) chance alone chose 0.01, four times the error.
+# Standard deviations of chance by which a ridge must lower the held-out squares. Of Hénon–Heiles
+# with noise of 1e-2 and 10⁴ pairs (benchmarks/bands.py) chance alone chose 0.01: 4 times the error.
 _CERTAIN = 3.0
 # A leading block is judged by a triangular solve where the smallest diagonal entry of R, relative
 # to its column, is no smaller than this, and where there are as many rows per term.

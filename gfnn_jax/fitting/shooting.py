@@ -31,11 +31,12 @@ from gfnn_jax.flows.collocation import Steps, images
 class Options:
     """Tuned on Hénon–Heiles at dt 0.5 and 0.05 with noise of 1e-3 to 1e-2 (benchmarks/bands.py).
 
-    longest: steps of an arc. grown: noise ÷ spread at its end, if its first state's noise is carried
-    along. biweight: deviations from which on a state does not count. outlying: beyond which it is
-    named an outlier. rounds: Gauss–Newton steps. gained: part of the cost from which a step counts.
-    halvings: of a step that gains nothing. first: states of an arc from which it may start.
-    block_bytes: of the derivatives along the arcs of a block.
+    longest: steps of an arc. grown: noise ÷ spread at its end, if that of its first state goes on
+    along it. biweight: deviations from which on a state does not count. outlying: beyond which it
+    is named an outlier. rounds: Gauss–Newton steps. gained: part of the cost from which a step
+    counts. halvings: of a step that gains nothing. first: states of an arc from which it may start.
+    alike: times their median that the arcs' distances from their starts may be. block_bytes: of the
+    derivatives along the arcs of a block.
     """
 
     longest: int = 100
@@ -46,6 +47,7 @@ class Options:
     gained: float = 1e-5
     halvings: int = 4
     first: int = 4
+    alike: float = 5.0
     block_bytes: int = 64 * 2**20
 
 
@@ -110,14 +112,14 @@ class Shooting:
         self.angles, self.check, self.options = angles, check, options
 
     def fit(self, family, coefficients, *, only_states: bool = False) -> Shot | None:
-        """From coefficients that are close, or with these as they are (``only_states``), and a start
-        of every arc from one of its own states. None where the flow fails."""
+        """From coefficients that are close, or with these as they are (``only_states``); every arc
+        starts from one of its own states. None where the flow fails."""
         c, x = np.array(coefficients, float), self._starts(family, coefficients)
         residual = self.residuals(family, c, x)
-        noise, made = self._deviations(residual), 0
+        noise = self._deviations(residual)
         if not np.isfinite(noise).all():
             return None
-        for made in range(self.options.rounds):
+        for _ in range(self.options.rounds):
             problem = self._linearised(family, c, x, noise)
             cost = self._cost(residual, noise)
             move = np.zeros_like(c) if only_states else -_solved(problem.factor)
@@ -141,10 +143,10 @@ class Shooting:
         problem = self._linearised(family, c, x, noise)
         weight = self._weights(residual, noise)
         far = np.abs(residual) > self.options.outlying * noise
+        outlying = np.any(far & self.arcs.measured[..., None], axis=2)
         return Shot(
-            c, _root(problem.factor, problem.scores), noise, problem.factor, int((weight > 0).sum()),
-            int(np.any(far & self.arcs.measured[..., None], axis=2).sum()),
-            self._cost(residual, noise),
+            c, _root(problem.factor, problem.scores), noise, problem.factor,
+            int((weight > 0).sum()), int(outlying.sum()), self._cost(residual, noise),
         )  # fmt: skip
 
     def residuals(self, family, c, x) -> np.ndarray:
@@ -171,17 +173,12 @@ class Shooting:
             for _ in range(k):
                 x = images(family, c, x, -self.dt, self.steps).states
             off = np.abs(self.residuals(family, c, x) / self.scale).max(axis=2)
-            off = np.where(self.arcs.measured, off, np.nan)
-            known = np.isfinite(off[self.arcs.measured]).all()
-            distance = np.nanmedian(
-                np.where(np.isnan(off) & self.arcs.measured, np.inf, off), axis=1
-            )
-            better = (distance < nearest) & self.arcs.measured[:, k] & np.isfinite(x).all(axis=1)
-            found, nearest = (
-                np.where(better[:, None], x, found),
-                np.where(better, distance, nearest),
-            )
-            if known and k == 0 and np.all(distance < 3 * np.median(distance)):
+            off = np.where(np.isfinite(off), off, np.inf)
+            distance = np.nanmedian(np.where(self.arcs.measured, off, np.nan), axis=1)
+            better = (distance < nearest) & self.arcs.measured[:, k]
+            found = np.where(better[:, None], x, found)
+            nearest = np.where(better, distance, nearest)
+            if np.all(nearest < self.options.alike * np.median(nearest)):
                 break
         return found
 
@@ -217,20 +214,15 @@ class Shooting:
             block = slice(first, first + size)
             by_state, by_c, residual = self._along(family, c, x[block], block)
             weight = np.sqrt(self._weights(residual, noise, block)) / noise
-            residual, by_state, by_c = (
-                weight * residual,
-                weight[..., None] * by_state,
-                weight[..., None] * by_c,
-            )
+            rest = np.concatenate([by_c, residual[..., None]], axis=-1)
+            own, rest = weight[..., None] * by_state, weight[..., None] * rest
             rows = residual.shape[1] * width
-            own = by_state.reshape(-1, rows, width)
-            rest = np.concatenate([by_c, residual[..., None]], axis=-1).reshape(-1, rows, count + 1)
-            q, r = np.linalg.qr(own)
+            rest = rest.reshape(-1, rows, count + 1)
+            q, r = np.linalg.qr(own.reshape(-1, rows, width))
             inside = q.swapaxes(1, 2) @ rest
             rest = rest - q @ inside
-            factor = np.linalg.qr(
-                np.concatenate([factor, rest.reshape(-1, count + 1)]), mode="r"
-            )[: count + 1]  # fmt: skip
+            stacked = np.concatenate([factor, rest.reshape(-1, count + 1)])
+            factor = np.asarray(np.linalg.qr(stacked, mode="r"))
             parts.append((r, inside, rest[..., :-1].swapaxes(1, 2) @ rest[..., -1:]))
         r, inside, scores = (np.concatenate(part) for part in zip(*parts, strict=True))
         return _Arrow(factor, r, inside, scores[..., 0])

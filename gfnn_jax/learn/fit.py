@@ -121,7 +121,7 @@ class Fit:
         each exactly symplectic: `maps.samples.Samples`. key: of ``jax.random``.
 
         Raises ValueError where the map has no posterior: a network, a map of pairs that were drawn
-        from a law, an S with parameters.
+        from a law.
         """
         return self.map.sample(key, num)
 

@@ -11,7 +11,7 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.diagnosed import Diagnosis, diagnose_request
@@ -22,11 +22,11 @@ from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.learn.sweeps import LinearSweep
 from gfnn_jax.phase_space import Pairs
 
-# A residual beyond so many times that which all but two of its neighbours stay below, and the median
-# of all: no normal noise, of which a residual is 3 times the median in one of 10,000 pairs of d = 1.
+# A residual beyond so many times what all but two of its neighbours stay below, and the median of
+# all. Of normal noise and d = 1 it is four times the median in one of 60,000 pairs.
 _BEYOND, _NEIGHBOURS, _BUT = 5.0, 10, 2
-# Those neighbours' residuals are ordinary, below so many times the median: a map that cannot follow a
-# close passage errs around it too.
+# Those neighbours' residuals are ordinary, below so many times the median: a map that cannot follow
+# a close passage errs around it too.
 _ORDINARY = 2.5
 # Gross errors are apart from the others: residuals between so many times the median and _BEYOND are
 # fewer by this factor than they. What a map cannot represent has a tail without a gap.
@@ -40,7 +40,7 @@ _SPOILT, _RISE = 1.15, 1.02
 
 
 class Cleaned(NamedTuple):
-    """The diagnosis and the search of the pairs without gross errors; what is to be said of them."""
+    """The diagnosis and the search without gross errors, and what is to be said of those."""
 
     seen: Diagnosis
     found: Searched
@@ -80,8 +80,8 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
     rows = ", ".join(map(str, (_row(request.pairs, *pair) for pair in zip(z0, z1, strict=True))))
     rows += ", …" if gone > 5 else ""
     return Cleaned(seen, found, [
-        f"{gone} of {count} pairs (rows {rows}) are gross errors beside the map of the others: they "
-        "were given no weight"
+        f"{gone} of {count} pairs (rows {rows}) are gross errors beside the map of the others: "
+        "they were given no weight"
     ])  # fmt: skip
 
 

@@ -16,8 +16,8 @@ from gfnn_jax.learn.prepare import Prepared
 _SHORTEST = 3  # steps of an arc that says more than its pairs do
 _CERTAIN = 4.0  # standard errors below which a term is noise
 _RISE = 1.01  # of the held-out arcs' noise, by chance
-# Measured numbers for each term from which on a law that held-out sequences have borne out is fitted
-# to these too: what judges it then is in error by less than 1 / 200 of the noise's variance.
+# Measured numbers for each term from which on a law that held-out sequences have borne out is
+# fitted to these too: what judges it then is off by less than 1 / 200 of the noise's variance.
 _ROWS_PER_TERM = 200
 _STATES = 100  # from which the noise and its growth along an arc are measured
 _NORMAL = 1.4826  # a normal deviation over the median of its size
@@ -25,9 +25,9 @@ _STEP_ERROR = 0.01  # of a step's own error ÷ the noise
 
 
 class Whole(NamedTuple):
-    """kept: places of the family's terms that are left. fit: theirs. root: (k, k), rootᵀ root is the
-    coefficients' covariance. noise: (2d,) standard deviation of each coordinate's noise. arcs: into
-    which the sequences were cut. messages: about gross errors."""
+    """kept: places of the family's terms that are left. fit: theirs. root: (k, k), rootᵀ root is
+    the coefficients' covariance. noise: (2d,) standard deviation of each coordinate's noise. arcs:
+    into which the sequences were cut. messages: about gross errors."""
 
     kept: tuple[int, ...]
     fit: FlowFit
@@ -105,7 +105,6 @@ def _messages(found: Shot, measured: int) -> tuple[str, ...]:
     if not found.outlying:
         return ()
     return (
-        f"{found.outlying} of {measured} measured states lie more than {OPTIONS.outlying:g} standard "
-        "deviations of the noise from the sequences of the law: outliers, they were given little "
-        "weight",
+        f"{found.outlying} of {measured} measured states lie more than {OPTIONS.outlying:g} times "
+        "the noise from the sequences of the law: outliers, they were given little weight",
     )
