@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gfnn_jax.compiling import enable_compile_cache
     from gfnn_jax.errors import FitError, FitWarning, InputError, WorkError
     from gfnn_jax.evaluate import figures, metrics
+    from gfnn_jax.exports.export import export
     from gfnn_jax.families import from_function
     from gfnn_jax.generating.charts import CHARTS, Chart
     from gfnn_jax.learn.fit import Fit, fit
@@ -48,6 +49,7 @@ _HOMES = {
     "SymplecticMap": "maps.symplectic_map",
     "WorkError": "errors",
     "enable_compile_cache": "compiling",
+    "export": "exports.export",
     "fit": "learn.fit",
     "from_function": "families",
     "load": "maps.saved",
@@ -70,6 +72,7 @@ __all__ = [
     "SymplecticMap",
     "WorkError",
     "enable_compile_cache",
+    "export",
     "figures",
     "fit",
     "from_function",

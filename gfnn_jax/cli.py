@@ -1,4 +1,4 @@
-"""The command line: ``gfnn scenes | run | fit | predict | compare``.
+"""The command line: ``gfnn scenes | run | fit | predict | export | compare``.
 
 Each exit status but 0 comes with one line that says why (`EXIT_STATUS`). Nothing heavy is imported
 before the usage has been found good.
@@ -24,11 +24,12 @@ from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new
 from gfnn_jax.storage.partial import told_of
 
-# Those of `learn.check`, which would bring JAX; a test compares them.
+# Those of `learn.check` and `exports.export`, which would bring JAX; a test compares them.
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
 FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
 LEARN = ("auto", "map", "hamiltonian")
 STRUCTURES = ("ring", "chain", "bodies:N")
+EXPORTS = ("c", "stablehlo")
 
 EXIT_STATUS = """\
 exit status:
@@ -186,6 +187,23 @@ def _parser() -> argparse.ArgumentParser:
         help="this is one of several processes that srun or another launcher has started",
     )  # fmt: skip
     _add_output_options(command)
+
+    command = commands.add_parser(
+        "export", help="write a learned map for other programs",
+        description="One file: step, inverse and status of a learned map, in C or as StableHLO.",
+        **others,
+    )  # fmt: skip
+    command.set_defaults(command=_export)
+    command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
+    command.add_argument(
+        "--to", choices=EXPORTS, required=True,
+        help="c: C99 for one state at a time, of polynomials, Fourier harmonics and formulas; "
+        "stablehlo: batches by jax.export, of any map",
+    )  # fmt: skip
+    command.add_argument(
+        "--out", type=Path, metavar="FILE", help="default: beside MODEL, of its name"
+    )
+    command.add_argument("--overwrite", action="store_true", help="replace an existing output")
 
     command = commands.add_parser(
         "compare", help="the same data through other methods",
@@ -425,6 +443,17 @@ def _predict_and_tell(arguments: argparse.Namespace, share: processes.Share | No
         passed = predicted.horizon[predicted.horizon >= 0]
         first = f", the first at step {passed.min()}" if passed.size else ""
         print(f"{passed.size} of {num_lanes} bands pass {arguments.horizon:g}{first}")
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    _check_exists(arguments.model)
+    if arguments.out is not None:
+        ensure_new(arguments.out, arguments.overwrite)
+    _set_up_jax()
+    from gfnn_jax.exports.export import export
+
+    out = export(arguments.model, arguments.to, arguments.out, overwrite=arguments.overwrite)
+    print(f"{out}: {arguments.model} as {arguments.to}, {out.stat().st_size / 1e3:.0f} kB")
 
 
 def _compare(arguments: argparse.Namespace) -> None:

@@ -119,7 +119,7 @@ class Expression:
         return self.operands[0] if self.operation == "number" else None
 
 
-def number(value: float) -> Expression:
+def number(value: Any) -> Expression:
     return Expression("number", (float(value),))
 
 

@@ -58,7 +58,7 @@ class Inputs:
     def raw(self, w):
         """The unscaled variables (..., k)."""
         if self.features is not None:
-            return feature_tables(self.features, w, order=0)[0]
+            return self.feature_tables(w, 0)[0]
         return w if len(self.keep) == w.shape[-1] else w[..., np.array(self.keep, dtype=int)]
 
     def __call__(self, w):
@@ -70,11 +70,17 @@ class Inputs:
         ``order`` 2, curvatures (..., k, 2d, 2d), else None for both."""
         if self.features is None:
             return self(w), None, None
-        raw, *derivatives = feature_tables(self.features, w, order=order)
+        raw, *derivatives = self.feature_tables(w, order)
         unit = as_row(namespace(w).asarray(self.scale, dtype=w.dtype), raw)
         slope = derivatives[0] / unit[..., None] if order > 0 else None
         curvature = derivatives[1] / unit[..., None, None] if order > 1 else None
         return self._scaled(raw, w), slope, curvature
+
+    def feature_tables(self, w, order: int) -> tuple:
+        """The features (..., k), with slopes (..., k, 2d) and curvatures (..., k, 2d, 2d) up to
+        ``order``."""
+        assert self.features is not None
+        return feature_tables(self.features, w, order=order)
 
     def pull_back_gradient(self, gradient, slope):
         """∇ with respect to w (..., 2d) from that with respect to x (..., k)."""

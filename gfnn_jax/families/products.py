@@ -71,7 +71,8 @@ _FEW_ROWS, _FEW_ENTRIES = 8, 128
 
 def _product(f, picks):
     """f (..., K) @ picks (K, n)."""
-    few = math.prod(f.shape[:-1]) <= _FEW_ROWS and picks.size <= _FEW_ENTRIES
+    rows = math.prod(f.shape[:-1])  # no number where a batch of any size is exported
+    few = isinstance(rows, int) and rows <= _FEW_ROWS and picks.size <= _FEW_ENTRIES
     if namespace(f) is np or not few:
         return matmul(f, picks)
     return sum(f[..., k : k + 1] * as_row(picks[k], f) for k in range(len(picks)))

@@ -63,12 +63,19 @@ class PolynomialModel:
 
     def __call__(self, z):
         """The difference (..., k) at the states z (..., 2d), NumPy or JAX."""
-        xp, inputs = namespace(z), self.family.inputs
+        xp, x = namespace(z), self.family.inputs(z)
+        bound = xp.broadcast_to(xp.asarray(self.reach, dtype=x.dtype), x.shape)
+        return self.of_variables(xp.clip(x, -bound, bound))
+
+    @property
+    def reach(self) -> np.ndarray:
+        """The largest magnitude of each variable that the polynomials are taken at."""
         reach = min(_REACH, math.cosh(math.acosh(_LARGEST) / self.family.degree))
-        reaches = np.where(inputs.is_angle, np.inf, reach)
-        x = inputs(z)
-        bound = xp.broadcast_to(xp.asarray(reaches, dtype=x.dtype), x.shape)
-        (u,), (v,) = self.family.basis.tables(xp.clip(x, -bound, bound), 0)
+        return np.where(self.family.inputs.is_angle, np.inf, reach)
+
+    def of_variables(self, x):
+        """The difference (..., k) at the variables x (..., n) of the family, within reach."""
+        (u,), (v,) = self.family.basis.tables(x, 0)
         row, column = self.family.basis.corner
         low = self._product(self.matrices[:, :row], u[..., :row], v)
         return low + self._product(self.matrices[:, row:, :column], u[..., row:], v[..., :column])

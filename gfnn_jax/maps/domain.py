@@ -49,9 +49,10 @@ class Domain:
         JAX."""
         xp = namespace(y)
         finite = xp.all(xp.isfinite(y), axis=-1)
-        return finite & (self._christoffel(y) <= self.limit) if self.keep else finite
+        return finite & (self.christoffel(y) <= self.limit) if self.keep else finite
 
-    def _christoffel(self, y):
+    def christoffel(self, y):
+        """κ (...) at the states y (..., 2d), NumPy or JAX."""
         x = y[..., np.array(self.keep)]
         x = (x - as_row(self.centre, x)) / as_row(self.scale, x)
         return namespace(y).sum(matmul(_monomials(x), self.factor.T) ** 2, axis=-1)

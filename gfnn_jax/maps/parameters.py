@@ -92,9 +92,7 @@ def _seen(t0: np.ndarray, dt: np.ndarray, period: float) -> tuple[float, float]:
     return float(first), float(first + period - gaps[longest])
 
 
-def as_args(
-    parameters: Parameters | None, given: Any, shape: tuple[int, ...], dtype, t0: Any = None
-) -> Any:
+def as_args(parameters: Parameters | None, given: Any, shape: tuple, dtype, t0: Any = None) -> Any:
     """What steps of states of this shape, (2d,) or (B, 2d), take: (k,) or (B, k), or None.
 
     given: name -> a number or (B,), or an array of the names' order; of one parameter also a

@@ -333,7 +333,7 @@ class SymplecticMap:
         angles = self._angles()
         if not angles.size:
             return y, compensation, jnp.zeros((y.shape[0], 0), y.dtype)
-        two_pi, beyond = _two_pi(y.dtype)
+        two_pi, beyond = parts_of_two_pi(y.dtype)
         turns = jnp.round((y[:, angles] - as_row(self.angle_centre, y)) / TWO_PI)
         reduced, lost = two_sum(
             y[:, angles] - turns * two_pi, compensation[:, angles] - turns * beyond
@@ -351,7 +351,7 @@ class SymplecticMap:
         """The user's states of the reduced y and its turns."""
         angles = self._angles()
         if angles.size:
-            two_pi, beyond = _two_pi(y.dtype)
+            two_pi, beyond = parts_of_two_pi(y.dtype)
             y = y.at[:, angles].set((y[:, angles] + turns * beyond) + turns * two_pi)
         return jax.vmap(self.coordinates.inverse)(y)
 
@@ -374,7 +374,7 @@ class SymplecticMap:
         return self._outer(y, turns), info._replace(status=status.astype(jnp.int32))
 
 
-def _two_pi(dtype):
+def parts_of_two_pi(dtype):
     """2π as the sum of a number of this dtype and a small rest."""
     near = np.asarray(TWO_PI, dtype)
     return near, TWO_PI - float(near) + _TWO_PI_REST

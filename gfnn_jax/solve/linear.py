@@ -11,7 +11,7 @@ from gfnn_jax.arrays import namespace
 # Up to the first size by cofactors, up to the second by unrolled elimination, beyond by LAPACK.
 # A batch of 1,000 systems of size 4: 0.08, 0.14, 0.8 µs each; seconds to compile 0.3, 1.2, 0.7.
 # Of size 8, unrolled: 1.6 µs and 8 s; by LAPACK: 2.6 µs and 0.5 s.
-_COFACTORS_UP_TO, _UNROLL_UP_TO = 4, 8
+COFACTORS_UP_TO, _UNROLL_UP_TO = 4, 8
 
 
 def small_solve(matrix, rhs):
@@ -28,14 +28,16 @@ def small_solve(matrix, rhs):
 def solve_and_sign(matrix, rhs):
     """The solution (..., n), and the sign (...) of the matrix' determinant."""
     n = rhs.shape[-1]
-    if n <= _COFACTORS_UP_TO:
-        return _by_cofactors(matrix, rhs)
+    if n <= COFACTORS_UP_TO:
+        x, determinant = by_cofactors(matrix, rhs)
+        return x, namespace(matrix).sign(determinant)
     if n <= _UNROLL_UP_TO:
         return _by_elimination(matrix, rhs)
     return _by_lapack(matrix, rhs), namespace(matrix).linalg.slogdet(matrix)[0]
 
 
-def _by_cofactors(matrix, rhs):
+def by_cofactors(matrix, rhs):
+    """The solution (..., n) for matrix (..., n, n), and the determinant (...)."""
     xp, n = namespace(matrix, rhs), rhs.shape[-1]
 
     @cache
@@ -57,7 +59,7 @@ def _by_cofactors(matrix, rhs):
         / determinant
         for j in everything
     ]
-    return xp.stack(x, axis=-1), xp.sign(determinant)
+    return xp.stack(x, axis=-1), determinant
 
 
 def _by_elimination(matrix, rhs):

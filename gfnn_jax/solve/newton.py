@@ -130,8 +130,8 @@ def iterate(
         iterations=jnp.where(begun, 0, 1).astype(jnp.int32),  # the loop makes the first one again
         open=begun,
     )
-    few = max(_FEWEST, size // _PART)
-    if most > 1 and gather and size > few:
+    any_size = not isinstance(size, int)  # a batch of any size is exported: nothing is gathered
+    if most > 1 and gather and not any_size and size > (few := max(_FEWEST, size // _PART)):
         state = _gathered(newton, shared, lanes, state, few)
     elif most > 1:
         state = jax.lax.while_loop(

@@ -1,0 +1,212 @@
+"""The pieces of a map in C: ``int PIECE_step(double *z)``, and ``PIECE_back``, its inverse."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.errors import InputError
+from gfnn_jax.exports.formulas import on_symbols
+from gfnn_jax.exports.symbols import Tape, literal
+from gfnn_jax.families.products import Products
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.gauss import gauss
+from gfnn_jax.generating.generated import Generated, ImplicitStep
+from gfnn_jax.generating.predictor import PolynomialModel
+from gfnn_jax.maps.affine import Affine
+from gfnn_jax.solve.linear import COFACTORS_UP_TO, by_cofactors
+
+
+def why_not_piece(piece: Any) -> str | None:
+    """Why a piece cannot be written in C; None where it can."""
+    if isinstance(piece, Affine):
+        return None
+    if not isinstance(piece, (Generated, Flow)):
+        return f"the map has a piece {type(piece).__name__}"
+    family = piece.family
+    if not isinstance(family, (Products, Terms)):
+        return f"the map is one of {getattr(family, 'label', type(family).__name__)}"
+    if isinstance(piece, Flow) and piece.newton:
+        return "the stages of the flow are solved by Newton's method"
+    try:
+        on_symbols(family)
+    except InputError as error:
+        return str(error)
+    return None
+
+
+def unknowns(piece: Generated, dim: int) -> int:
+    """The number of unknowns of the implicit step."""
+    free = piece.chart.free(dim)
+    return free.stop - free.start
+
+
+def piece_functions(name: str, piece: Any, back: Any, width: int) -> list[str]:
+    """The functions of a piece and of its inverse ``back``, for states (width,)."""
+    if isinstance(piece, Affine):
+        return [*_affine(f"{name}_step", piece, width), *_affine(f"{name}_back", back, width)]
+    family, params = on_symbols(piece.family), np.asarray(piece.params)
+    tape = Tape()
+    w = tape.inputs("w", width)
+    parts = [tape.function(f"{name}_gradient", {"g": family.gradient(params, w)})]
+    if isinstance(piece, Flow):
+        return [*parts, *_flow(name, piece, back)]
+    tape = Tape()
+    w = tape.inputs("w", width)
+    gradient, hessian = family.gradient_and_hessian(params, w)
+    parts.append(tape.function(f"{name}_hessian", {"g": gradient, "h": hessian}))
+    for way, one in (("step", piece), ("back", back)):
+        parts += _generated(f"{name}_{way}", name, one, width)
+    return parts
+
+
+def _affine(name: str, piece: Affine, width: int) -> list[str]:
+    tape = Tape()
+    image = tape.function(f"{name}_image", {"Z": piece.image(tape.inputs("z", width))})
+    return [image, f"""\
+static int {name}(double *z)
+{{
+    double Z[{width}];
+    {name}_image(z, Z);
+    memcpy(z, Z, sizeof Z);
+    return OK;
+}}
+"""]  # fmt: skip
+
+
+class _Given:
+    """A family whose derivatives at w are inputs of a C function, whatever w is."""
+
+    operations = (0, 0)
+
+    def __init__(self, gradient, hessian=None):
+        self._gradient, self._hessian = gradient, hessian
+
+    def value(self, params, w, args=None):
+        raise NotImplementedError  # an implicit step asks for derivatives only
+
+    def gradient(self, params, w, args=None):
+        return self._gradient
+
+    def gradient_and_hessian(self, params, w, args=None):
+        return self._gradient, self._hessian
+
+
+def _generated(name: str, family: str, piece: Generated, width: int) -> list[str]:
+    """What S generates, one way. family: of whose functions in C are the derivatives of S."""
+    chart, n = piece.chart, unknowns(piece, width // 2)
+    dt, scale = float(np.asarray(piece.dt)), np.asarray(piece.scale)
+    equation = ImplicitStep(chart)
+
+    tape = Tape()
+    z = tape.inputs("z", width)
+    guess = chart.first_guess(z)[:, chart.free(width // 2)]
+    if piece.predictor is not None:
+        guess = guess + _predicted(piece.predictor.forward, z)
+    parts = [tape.function(f"{name}_guess", {"x": guess})]
+
+    tape = Tape()
+    z, x = tape.inputs("z", width), tape.inputs("x", n)
+    w = chart.complete(chart.first_guess(z), x)
+    parts.append(tape.function(f"{name}_point", {"w": w}))
+
+    for linear in (False, True):
+        tape = Tape()
+        z, x, g = tape.inputs("z", width), tape.inputs("x", n), tape.inputs("g", width)
+        h = tape.inputs("h", width, width) if linear else None
+        shared, lanes = (_Given(g, h), None, dt, scale), (z, chart.first_guess(z), None)
+        if linear:
+            at, matrix = equation.linearise(shared, lanes, x)
+            outputs = {"r": at.residual, "s": at.size, "m": matrix}
+            parts.append(tape.function(f"{name}_linear", outputs))
+        else:
+            at = equation.evaluate(shared, lanes, x)
+            parts.append(tape.function(f"{name}_residual", {"r": at.residual, "s": at.size}))
+
+    tape = Tape()
+    z, x, g = tape.inputs("z", width), tape.inputs("x", n), tape.inputs("g", width)
+    image = chart.image(z, chart.complete(chart.first_guess(z), x), g, dt)
+    parts.append(tape.function(f"{name}_image", {"Z": image}))
+
+    solve = f"return eliminated({n}, m, r, x);"
+    if n <= COFACTORS_UP_TO:
+        tape = Tape()
+        solution, determinant = by_cofactors(tape.inputs("m", n, n), tape.inputs("r", n))
+        parts.append(tape.function(f"{name}_cofactors", {"x": solution, "d": determinant}))
+        solve = f"double d[1];\n    {name}_cofactors(m, r, x, d);\n    return sign_of(d[0]);"
+    parts.append(f"""\
+static void {name}_evaluate(const double *z, const double *x, struct point *at)
+{{
+    double w[{width}];
+    {name}_point(z, x, w);
+    {family}_gradient(w, at->gradient);
+    {name}_residual(z, x, at->gradient, at->residual, at->size);
+}}
+
+static void {name}_linearise(const double *z, const double *x, struct point *at, double *m)
+{{
+    double w[{width}], h[{width * width}];
+    {name}_point(z, x, w);
+    {family}_hessian(w, at->gradient, h);
+    {name}_linear(z, x, at->gradient, h, at->residual, at->size, m);
+}}
+
+static double {name}_solve(const double *m, const double *r, double *x)
+{{
+    {solve}
+}}
+
+static int {name}(double *z)
+{{
+    static const struct equation of = {{{n}, {name}_evaluate, {name}_linearise, {name}_solve}};
+    double x[{n}], g[{width}], Z[{width}];
+    {name}_guess(z, x);
+    const int status = newton(&of, z, x, g);
+    {name}_image(z, x, g, Z);
+    memcpy(z, Z, sizeof Z);
+    return status;
+}}
+""")
+    return parts
+
+
+def _predicted(model: PolynomialModel, z):
+    """What the model adds to the chart's first guess at the symbols z (1, 2d)."""
+    variables = on_symbols(model.family).inputs(z)[0]
+    within = [
+        v if np.isinf(reach) else v.clipped(-reach, reach)
+        for v, reach in zip(variables, model.reach, strict=True)
+    ]
+    return model.of_variables(np.array([within], dtype=object))
+
+
+def _flow(name: str, piece: Flow, back: Flow) -> list[str]:
+    """Gauss collocation by fixed point; the gradient of H is in C already."""
+    rule, stages = gauss(piece.stages), piece.stages
+    parts = [
+        f"static const double {name}_coupling[{stages * stages}] = {_row(rule.coupling)};\n"
+        f"static const double {name}_scale[] = {_row(piece.scale)};\n"
+    ]
+    for way, one in (("step", piece), ("back", back)):
+        h = float(np.asarray(one.dt)) / one.substeps
+        parts.append(f"""\
+static int {name}_{way}(double *z)
+{{
+    static const double weights[{stages}] = {_row(rule.weights * h)};
+    int status = OK;
+    for (int i = 0; i < {one.substeps}; i++)
+        status = worse(status, collocated({name}_gradient, {stages}, {name}_coupling, weights,
+                                          {name}_scale, z));
+    return status;
+}}
+""")
+    return parts
+
+
+def _row(values) -> str:
+    """Numbers as C initialises an array with them, four in a line."""
+    texts = [literal(v) for v in np.ravel(np.asarray(values)).tolist()]
+    lines = [", ".join(texts[i : i + 4]) for i in range(0, len(texts), 4)]
+    return "{\n    " + ",\n    ".join(lines) + "\n}"

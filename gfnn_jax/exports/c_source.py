@@ -1,0 +1,144 @@
+"""A map as one C99 file: step, inverse and status, of one state at a time.
+
+Every formula is that of the package's own lines, run on symbols; the solvers are those of
+`c_parts`. Nothing is allocated and nothing is remembered, so threads may call at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from gfnn_jax.coordinates import CARTESIAN, polar
+from gfnn_jax.errors import InputError
+from gfnn_jax.exports import c_parts
+from gfnn_jax.exports.c_pieces import piece_functions, unknowns, why_not_piece
+from gfnn_jax.exports.symbols import Tape, literal
+from gfnn_jax.families.expressions import coordinate_names
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.maps.domain import Domain
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.solve.linear import COFACTORS_UP_TO
+
+_POLAR = polar(cyclic=True).forward
+
+
+def why_not(map_: SymplecticMap) -> str | None:
+    """Why a map cannot be written in C; None where it can."""
+    if np.dtype(map_.scale.dtype) != np.float64:
+        return f"the map is of {np.dtype(map_.scale.dtype)}, not of float64"
+    if map_.parameters is not None:
+        return f"the map depends on {', '.join(map_.parameters.names)} beside the state"
+    if map_.coordinates.forward not in (CARTESIAN.forward, _POLAR):
+        return f"the map has the {map_.coordinates.name} coordinates of its scene"
+    if not isinstance(map_.domain, Domain):
+        return "the map is a sum over equal sites"
+    return next((why for piece in map_.pieces if (why := why_not_piece(piece))), None)
+
+
+def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
+    """The text of the file, with ``int NAME_step(const double z[2d], double Z[2d])`` and
+    ``NAME_inverse``.
+
+    about: what is told of the map in the comment at the top, name -> text. Raises InputError, in
+    one line, for a map that has no such file.
+    """
+    if (reason := why_not(map_)) is not None:
+        raise InputError(
+            f"{reason}, and has no C: expected polynomials, Fourier harmonics or a formula (--to "
+            "stablehlo takes any map)"
+        )
+    map_ = jax.tree.map(np.asarray, map_)
+    pieces, width, domain = map_.pieces, 2 * map_.dim, map_.domain
+    assert isinstance(domain, Domain)
+    parts = [_comment(map_, name, about), c_parts.INCLUDES, c_parts.COMMON]
+    if map_.coordinates.angles:
+        parts.append(c_parts.ANGLES)
+    if map_.coordinates.forward is _POLAR:
+        parts.append(c_parts.POLAR)
+    most = max((unknowns(p, map_.dim) for p in pieces if isinstance(p, Generated)), default=0)
+    if most:
+        parts.append(c_parts.newton_solver(most, width))
+    if most > COFACTORS_UP_TO:
+        parts.append(c_parts.ELIMINATION)
+    if stages := max((p.stages for p in pieces if isinstance(p, Flow)), default=0):
+        parts.append(c_parts.fixed_point_solver(width, stages))
+    if domain.keep:
+        tape = Tape()
+        y = tape.inputs("y", width)
+        parts.append(tape.function("christoffel", {"kappa": domain.christoffel(y)}))
+    for i, (piece, back) in enumerate(zip(pieces, map_.reversed().pieces[::-1], strict=True)):
+        parts += piece_functions(f"piece{i}", piece, back, width)
+    order = range(len(pieces))
+    parts.append(_whole(map_, f"{name}_step", [f"piece{i}_step" for i in order]))
+    parts.append(_whole(map_, f"{name}_inverse", [f"piece{i}_back" for i in reversed(order)]))
+    return "\n".join(parts)
+
+
+def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str]) -> str:
+    """The public function: `SymplecticMap._apply` of one state."""
+    width, angles, domain = 2 * map_.dim, map_.coordinates.angles, map_.domain
+    changed = map_.coordinates.forward is not CARTESIAN.forward
+    centres = np.ravel(np.asarray(map_.angle_centre))
+    turns = f", turns[{len(angles)}]" if angles else ""
+    lines = [
+        f"double y[{width}]{turns};",
+        "to_inner(z, y);" if changed else "memcpy(y, z, sizeof y);",
+        *(
+            f"y[{a}] = reduced(y[{a}], {literal(centre)}, &turns[{k}]);"
+            for k, (a, centre) in enumerate(zip(angles, centres, strict=True))
+        ),
+        f"int inside = all_finite({width}, y);",
+    ]
+    assert isinstance(domain, Domain)
+    if domain.keep:
+        lines += [
+            "double kappa[1];",
+            "christoffel(y, kappa);",
+            f"inside = inside && kappa[0] <= {literal(float(np.asarray(domain.limit)))};",
+        ]
+    lines += [
+        "int status = OK;",
+        *(f"status = worse(status, {piece}(y));" for piece in pieces),
+        "if (status == OK && !inside)",
+        "    status = LEFT_DOMAIN;",
+        f"if (!all_finite({width}, y))",
+        "    status = NON_FINITE;",
+        *(f"y[{a}] = unreduced(y[{a}], turns[{k}]);" for k, a in enumerate(angles)),
+        "to_user(y, Z);" if changed else "memcpy(Z, y, sizeof y);",
+        "return status;",
+    ]
+    body = "\n".join(f"    {line}" for line in lines)
+    return f"int {name}(const double z[{width}], double Z[{width}])\n{{\n{body}\n}}\n"
+
+
+def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
+    """What the file is, for who opens it."""
+    width, names = 2 * map_.dim, coordinate_names(map_.dim)
+    sizes = ", ".join(f"{n} {s:.3g}" for n, s in zip(names, map_.scale, strict=True))
+    angles = [names[i] for i in map_.coordinates.angles if map_.coordinates.forward is not _POLAR]
+    turned = f" {', '.join(angles)}: period 2 pi, any number of turns." if angles else ""
+    told = "\n".join(f"   {key}: {value}" for key, value in about.items())
+    text = f"""\
+ One step of a learned symplectic map, and its inverse.
+
+       int {name}_step(const double z[{width}], double Z[{width}]);
+       int {name}_inverse(const double z[{width}], double Z[{width}]);
+
+   z = ({", ".join(names)}), in the units of the data; z and Z may be the same array.{turned}
+   Sizes of the coordinates in the data: {sizes}.
+   A step is dt = {literal(np.asarray(map_.dt))} in the data's unit of time.
+
+   Answer: {c_parts.STATUSES}.
+   1: z lies outside the data's domain; its image is in Z all the same. 3, 4: Z is of no use.
+
+   cc -O3 -std=c99 -c {name}.c, and -lm for the linker. No -ffast-math: it takes away the tests for
+   numbers that are not finite. Nothing is allocated or remembered: threads may call at once.
+
+{told}
+"""
+    return f"/*{text.replace('*/', '* /')}*/\n"

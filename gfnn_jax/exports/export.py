@@ -1,0 +1,96 @@
+"""``gfnn.export``: a map for programs that know nothing of this package."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.errors import InputError
+from gfnn_jax.exports.c_source import c_source
+from gfnn_jax.exports.stablehlo import stablehlo
+from gfnn_jax.maps import saved
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.storage.outputs import atomic_write, ensure_new
+
+SUFFIXES = {"c": ".c", "stablehlo": ".zip"}
+_NO_NAMES = {
+    "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else",
+    "enum", "extern", "float", "for", "goto", "if", "inline", "int", "long", "register", "restrict",
+    "return", "short", "signed", "sizeof", "static", "struct", "switch", "typedef", "union",
+    "unsigned", "void", "volatile", "while",
+}  # fmt: skip
+
+
+def export(
+    map_: SymplecticMap | str | Path, to: str, out: str | Path | None = None, *,
+    overwrite: bool = False,
+) -> Path:  # fmt: skip
+    """Write a map as one file, and return where it is.
+
+    map_: a map, or the folder of a saved one, whose record the file then tells too.
+    to:   "c": a C99 file with ``int NAME_step(const double z[2d], double Z[2d])`` and
+          ``NAME_inverse``, NAME that of the file; float64 maps whose functions are polynomials,
+          Fourier harmonics or formulas. "stablehlo": step and inverse of batches of any size, for
+          ``jax.export.deserialize``; any map.
+    out:  the file; None: that of the folder's name beside it, with .c or .zip.
+
+    Raises InputError, in one line, where the file exists (unless ``overwrite``) or the map cannot
+    be exported so, WorkError where writing fails.
+    """
+    if to not in SUFFIXES:
+        raise InputError(f"expected {' or '.join(SUFFIXES)} to export to, got '{to}'")
+    folder = None if isinstance(map_, SymplecticMap) else Path(map_)
+    if out is None and folder is None:
+        raise InputError("expected a file to write (out) for a map that is in no folder")
+    out = Path(out) if out is not None else default_out(Path(folder or ""), to)
+    if out.suffix != SUFFIXES[to]:
+        raise InputError(f"{out}: is written as {SUFFIXES[to]}")
+    ensure_new(out, overwrite)
+    map_ = map_ if isinstance(map_, SymplecticMap) else saved.load(map_)
+    about = _about(folder)
+    if to == "c":
+        atomic_write(out, c_source(map_, _identifier(out), about))
+    else:
+        known = {"dim": map_.dim, "dt": float(np.asarray(map_.dt))}
+        names = map_.parameters.names if map_.parameters is not None else ()
+        atomic_write(out, stablehlo(map_, {**known, "parameters": list(names), **about}))
+    return out
+
+
+def default_out(folder: Path, to: str) -> Path:
+    """The file beside a model's folder, of its name."""
+    folder = folder.absolute()
+    return folder.with_name(folder.name + SUFFIXES[to])
+
+
+def _identifier(out: Path) -> str:
+    name = out.stem
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) or name in _NO_NAMES:
+        raise InputError(
+            f"{out}: expected letters, digits and _ before .c, which C functions are named after"
+        )
+    return name
+
+
+def _about(folder: Path | None) -> dict[str, Any]:
+    """Where a map comes from, by name."""
+    about: dict[str, Any] = {"written by": f"gfnn_jax {saved.versions()['gfnn_jax']}"}
+    if folder is None:
+        return about
+    about["model"] = f"{folder.name}, SHA-256 {saved.digest(folder)}"
+    record = saved.record(folder)
+    for part, key, told in (
+        ("data", "source", "data"),
+        ("data", "units", "units"),
+        ("fit", "tolerance", "tolerance asked for, relative to each coordinate's spread"),
+        ("fit", "validation_relative", "one-step error of held-out pairs, relative"),
+        ("fit", "validation_rms", "one-step error of held-out pairs, in the data's units"),
+    ):
+        inside = record.get(part)
+        if isinstance(inside, Mapping) and inside.get(key) is not None:
+            about[told] = inside[key]
+    return about

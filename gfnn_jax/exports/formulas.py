@@ -1,0 +1,43 @@
+"""What runs on symbols: families whose features, functions of JAX, are read as formulas."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.families.expressions import jets, traced
+from gfnn_jax.families.inputs import Inputs
+from gfnn_jax.families.products import Products
+
+
+class Formulas(Inputs):
+    """Inputs whose features are formulas: on symbols, where JAX cannot compute them."""
+
+    def feature_tables(self, w, order: int) -> tuple:
+        """Of w (1, 2d), symbols."""
+        width = w.shape[-1]
+        assert self.features is not None
+        found = jets(traced(self.features, width // 2), w, order)
+        tables: list[np.ndarray] = [
+            np.zeros((1, len(found), *[width] * n), dtype=object) for n in range(order + 1)
+        ]
+        for k, jet in enumerate(found):
+            tables[0][:, k] = jet.value
+            for i, slope in jet.slope.items():
+                tables[1][:, k, i] = slope
+            for (i, j), curvature in jet.curvature.items():
+                tables[2][:, k, i, j] = tables[2][:, k, j, i] = curvature
+        return tuple(tables)
+
+
+def on_symbols(family: Any) -> Any:
+    """The family as it runs on symbols. Raises InputError for a feature that is no formula."""
+    if not isinstance(family, Products) or family.inputs.features is None:
+        return family
+    inputs = family.inputs
+    assert inputs.features is not None
+    traced(inputs.features, inputs.width // 2)
+    fields = {f.name: getattr(inputs, f.name) for f in dataclasses.fields(inputs)}
+    return dataclasses.replace(family, inputs=Formulas(**fields))

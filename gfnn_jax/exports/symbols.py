@@ -1,0 +1,203 @@
+"""Numbers that remember how they were made: what runs on them in NumPy becomes C.
+
+Families, charts and domains are written once against the array namespace of their input. On an
+object array of symbols the very lines that a fit runs in NumPy leave behind the arithmetic that
+they would do: products with a zero and sums with one are gone, what occurs twice is computed once,
+and all else stands in the order of the original, so that the C rounds as NumPy does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+_LONGEST = 90  # characters of an expression that is written where it is used
+_SUM, _PRODUCT, _ATOM = range(3)  # how tightly an operation binds
+_BINDS = {"+": _SUM, "-": _SUM, "*": _PRODUCT, "/": _PRODUCT}
+# NumPy's names of functions, which it calls as methods of objects, and those of C.
+_FUNCTIONS = {
+    "cos": "cos", "sin": "sin", "tan": "tan", "exp": "exp", "log": "log", "sqrt": "sqrt",
+    "sinh": "sinh", "cosh": "cosh", "tanh": "tanh", "arctan": "atan",
+}  # fmt: skip
+
+
+class Symbol:
+    """A number of the C function that ``tape`` records: one operation with its operands, symbols
+    or floats. NumPy's object arrays hold them."""
+
+    __slots__ = ("number", "operands", "operation", "tape")
+
+    def __init__(self, tape: Tape, operation: str, operands: tuple, number: int):
+        self.tape, self.operation, self.operands, self.number = tape, operation, operands, number
+
+    def __add__(self, other):
+        return _sum(self, other)
+
+    def __radd__(self, other):
+        return _sum(other, self)
+
+    def __sub__(self, other):
+        return _difference(self, other)
+
+    def __rsub__(self, other):
+        return _difference(other, self)
+
+    def __mul__(self, other):
+        return _product(self, other)
+
+    def __rmul__(self, other):
+        return _product(other, self)
+
+    def __truediv__(self, other):
+        return self if other == 1 else self.tape.made("/", self, other)
+
+    def __rtruediv__(self, other):
+        return self.tape.made("/", other, self)
+
+    def __neg__(self):
+        return (
+            self.operands[0] if self.operation == "negative" else self.tape.made("negative", self)
+        )
+
+    def __abs__(self):
+        return self.tape.made("fabs", self)
+
+    def __pow__(self, exponent):
+        return self * self if exponent == 2 else self.tape.made("pow", self, exponent)
+
+    def clipped(self, low: float, high: float) -> Symbol:
+        """This number brought between low and high; NaN stays."""
+        return self.tape.made("clip", self, low, high)
+
+
+def _method(function: str) -> Callable:
+    return lambda self: self.tape.made(function, self)
+
+
+for _name, _function in _FUNCTIONS.items():
+    setattr(Symbol, _name, _method(_function))
+
+
+def _sum(a, b):
+    if not isinstance(a, Symbol) and a == 0:
+        return b
+    if not isinstance(b, Symbol) and b == 0:
+        return a
+    tape = a.tape if isinstance(a, Symbol) else b.tape
+    if isinstance(b, Symbol) and b.operation == "negative":
+        return _difference(a, b.operands[0])
+    if isinstance(a, Symbol) and a.operation == "negative":
+        return _difference(b, a.operands[0])
+    return tape.made("+", a, b)
+
+
+def _difference(a, b):
+    if not isinstance(b, Symbol):
+        return _sum(a, -b)
+    if not isinstance(a, Symbol) and a == 0:
+        return -b
+    if b.operation == "negative":
+        return _sum(a, b.operands[0])
+    return b.tape.made("-", a, b)
+
+
+def _product(a, b):
+    for one, other in ((a, b), (b, a)):
+        if not isinstance(one, Symbol) and one in (0, 1, -1):
+            return 0.0 if one == 0 else (other if one == 1 else -other)
+    if not isinstance(b, Symbol):  # a constant stands first
+        a, b = b, a
+    return b.tape.made("*", a, b)
+
+
+class Tape:
+    """The operations of one C function, each once, in an order in which they can be done."""
+
+    def __init__(self):
+        self._known: dict[tuple, Symbol] = {}
+        self._made: list[Symbol] = []
+        self._inputs: dict[str, int] = {}
+
+    def inputs(self, name: str, *shape: int) -> np.ndarray:
+        """An input of the function, an array of C, as an object array (1, *shape): one lane."""
+        size = int(np.prod(shape))
+        self._inputs[name] = size
+        values = [self.made("input", f"{name}[{i}]") for i in range(size)]
+        return np.array(values, dtype=object).reshape(1, *shape)
+
+    def made(self, operation: str, *operands: Any) -> Symbol:
+        """The symbol of this operation: the one that is known, or a new one."""
+        operands = tuple(o if isinstance(o, (Symbol, str)) else float(o) for o in operands)
+        names = tuple(("t", o.number) if isinstance(o, Symbol) else o for o in operands)
+        key = (operation, *sorted(names, key=str)) if operation in "+*" else (operation, *names)
+        if key not in self._known:
+            self._known[key] = Symbol(self, operation, operands, len(self._made))
+            self._made.append(self._known[key])
+        return self._known[key]
+
+    def function(self, name: str, outputs: Mapping[str, Any]) -> str:
+        """``static void name(inputs, outputs)`` in C; outputs: name -> values of any shape."""
+        results = {
+            f"{output}[{i}]": value
+            for output, values in outputs.items()
+            for i, value in enumerate(np.ravel(np.asarray(values, dtype=object)).tolist())
+        }
+        sizes = {output: np.size(values) for output, values in outputs.items()}
+        given = [f"const double {n}[{size}]" for n, size in self._inputs.items()]
+        taken = [f"double {n}[{size}]" for n, size in sizes.items()]
+        uses = self._uses(results.values())
+        texts: dict[int, tuple[str, int]] = {}
+        used = {s.operands[0].partition("[")[0] for s in self._made
+                if s.operation == "input" and s.number in uses}  # fmt: skip
+        lines = [f"    (void)({n});" for n in self._inputs if n not in used]
+        for symbol in self._made:
+            if symbol.number not in uses:
+                continue
+            text, binds = _text(symbol, texts)
+            inline = uses[symbol.number] == 1 and len(text) <= _LONGEST
+            if symbol.operation == "input" or inline:
+                texts[symbol.number] = text, binds
+            else:
+                lines.append(f"    const double t{symbol.number} = {text};")
+                texts[symbol.number] = f"t{symbol.number}", _ATOM
+        lines += [f"    {n} = {_operand(value, texts, _SUM)};" for n, value in results.items()]
+        return "\n".join([f"static void {name}({', '.join([*given, *taken])})", "{", *lines, "}\n"])
+
+    def _uses(self, results) -> dict[int, int]:
+        """How often each symbol that matters is used."""
+        uses: dict[int, int] = {}
+        ahead = [value for value in results if isinstance(value, Symbol)]
+        while ahead:
+            symbol = ahead.pop()
+            uses[symbol.number] = uses.get(symbol.number, 0) + 1
+            if uses[symbol.number] == 1:
+                ahead += [o for o in symbol.operands if isinstance(o, Symbol)]
+        return uses
+
+
+def literal(value: Any) -> str:
+    """A number as C reads it back, a float64 to the last bit."""
+    return repr(float(value))
+
+
+def _operand(value, texts, least: int) -> str:
+    if not isinstance(value, Symbol):
+        text = literal(value)
+        return f"({text})" if text.startswith("-") and least > _SUM else text
+    text, binds = texts[value.number]
+    return text if binds >= least else f"({text})"
+
+
+def _text(symbol: Symbol, texts) -> tuple[str, int]:
+    operation, operands = symbol.operation, symbol.operands
+    if operation == "input":
+        return operands[0], _ATOM
+    if operation == "negative":
+        return f"-{_operand(operands[0], texts, _ATOM)}", _SUM
+    if operation in _BINDS:
+        binds = _BINDS[operation]
+        left, right = (_operand(o, texts, binds + i) for i, o in enumerate(operands))
+        return f"{left}{'*' if operation == '*' else f' {operation} '}{right}", binds
+    return f"{operation}({', '.join(_operand(o, texts, _SUM) for o in operands)})", _ATOM

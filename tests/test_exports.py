@@ -1,0 +1,303 @@
+"""Maps for other programs: the C file and the StableHLO of a map do what its own step does."""
+
+import ctypes
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+import zipfile
+
+import jax
+import numpy as np
+import pytest
+from analytic import generated, map_of, oscillator
+from jax import export as jax_export
+from scipy.linalg import expm
+
+import gfnn_jax as gfnn
+from gfnn_jax import cli, scenes
+from gfnn_jax.coordinates import CARTESIAN, Coordinates, polar, to_inner
+from gfnn_jax.exports.export import SUFFIXES
+from gfnn_jax.exports.symbols import Tape
+from gfnn_jax.families.expressions import jets, parse
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.products import Products
+from gfnn_jax.families.terms import given_terms
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE1, TYPE2, TYPE3
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.generating.predictor import fit_predictors
+from gfnn_jax.maps.affine import Affine
+from gfnn_jax.phase_space import symplectic_form
+from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, OK
+
+DT, SIZE = 0.3, 0.6
+needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+FLAGS = ("-O1", "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+
+
+def states(dim, count=300):
+    return np.random.default_rng(dim).uniform(-1, 1, (count, 2 * dim))
+
+
+def map_in(chart, dim, degree, *, angles=(), predicted=True, around=()):
+    """S with falling random coefficients in a chart: near the identity, or in type 1 near q·Q."""
+    z = states(dim)
+    own = [a for a in angles if a < dim]
+    z[:, list(angles)] *= np.pi
+    family = Products(box_inputs(z, angles=tuple(own)), degree)
+    rng = np.random.default_rng(5)
+    count = family.num_parameters
+    coefficients = 0.2 * rng.normal(size=count) / np.arange(1, count + 1)
+    if chart is TYPE1:
+        terms = family.term_gradients(z).reshape(-1, count)
+        wanted = 5 * np.concatenate([z[:, dim:], z[:, :dim]], axis=1).ravel()
+        coefficients = 0.2 * coefficients + np.linalg.lstsq(terms, wanted)[0]
+    unit = np.full(2 * dim, SIZE)
+    piece = Generated(family, family.unflatten(coefficients), chart, DT, unit)
+    map_ = map_of(piece, z, coordinates=Coordinates("own", tuple(angles)), scale=unit)
+    if predicted:
+        Z, info = map_.step(z)
+        good = np.asarray(info.status) <= LEFT_DOMAIN
+        found = fit_predictors(chart, z[good], np.asarray(Z)[good], DT, angles=own)
+        piece = dataclasses.replace(piece, predictor=found[-1].predictor)
+    return dataclasses.replace(map_, pieces=(*around, piece, *around)), z
+
+
+def turning(dim):
+    """Half a base map: a symplectic matrix, a centre and a shift."""
+    rng = np.random.default_rng(3)
+    a = rng.normal(size=(2 * dim, 2 * dim))
+    matrix = expm(0.3 * symplectic_form(dim) @ (a + a.T))
+    return Affine(matrix, 0.1 * rng.normal(size=2 * dim), 0.05 * rng.normal(size=2 * dim))
+
+
+def law(stages=4, substeps=2):
+    texts = ["p1**2", "p2**2", "q1**2", "q2**2*p1", "cos(q1)", "exp(-q2)",
+             "1/sqrt(q1**2 + q2**2 + 1)", "(q1 + 2*q2)**1.5*0.1 + sin(2*q1)"]  # fmt: skip
+    z, unit = 0.3 + 0.2 * states(2), np.full(4, SIZE)
+    piece = Flow(given_terms(2, texts), np.linspace(0.2, 0.6, 8), DT, unit, stages, substeps)
+    return map_of(piece, z, scale=unit), z
+
+
+def featured():
+    """S of 1/r and r² of a state in the plane, as a scene declares them."""
+    scene = scenes.make("pcr3bp")
+    z = 0.1 * states(2) + np.array([0.5, 0.0, 0.0, 1.2])
+    family = Products(box_inputs(z, features=scene.features), 2)
+    params = family.unflatten(0.02 * np.random.default_rng(1).normal(size=family.num_parameters))
+    piece = Generated(family, params, MIDPOINT, DT, np.full(4, 0.1))
+    return map_of(piece, z, scale=np.full(4, 0.1)), z
+
+
+def in_polar():
+    z = states(2) * 0.1 + np.array([1.0, 0.0, 0.0, 1.0])
+    y = to_inner(coordinates := polar(cyclic=True), z)
+    family = Products(box_inputs(y, cyclic=(1,)), 2)
+    params = family.unflatten(0.005 * np.random.default_rng(1).normal(size=family.num_parameters))
+    piece = Generated(family, params, TYPE2, DT, np.full(4, 0.1))
+    return map_of(piece, y, coordinates=coordinates, scale=np.full(4, 0.1)), z
+
+
+QUICK = {
+    "type 1": lambda: map_in(TYPE1, 1, 4, predicted=False),
+    "type 2, angles": lambda: map_in(TYPE2, 1, 4, angles=(0, 1)),
+    "type 3, base map": lambda: map_in(TYPE3, 1, 4, around=(turning(1),)),
+    "midpoint": lambda: map_in(MIDPOINT, 2, 3),
+    "law": law,
+}
+MAPS = {
+    **QUICK,
+    **{f"{name}, d = 2": lambda chart=chart: map_in(chart, 2, 4, predicted=chart is not TYPE1)
+       for name, chart in CHARTS.items()},
+    "type 2": lambda: map_in(TYPE2, 1, 3),
+    "midpoint, d = 3": lambda: map_in(MIDPOINT, 3, 3),
+    "an angle": lambda: map_in(MIDPOINT, 2, 3, angles=(0,)),
+    "base map": lambda: map_in(TYPE3, 2, 3, around=(turning(2),)),
+    "features": featured,
+    "polar": in_polar,
+}  # fmt: skip
+
+
+def compiled(path, *flags):
+    library = path.with_suffix(".so")
+    command = ["cc", *FLAGS, *flags, "-shared", "-fPIC", str(path), "-o", str(library), "-lm"]
+    subprocess.run(command, check=True)
+    return ctypes.CDLL(str(library))
+
+
+def by_c(function, z):
+    """Images (N, 2d) and statuses (N,), one state after another, in place."""
+    pointer = ctypes.POINTER(ctypes.c_double)
+    images = np.array(z)
+    found = [function(row.ctypes.data_as(pointer), row.ctypes.data_as(pointer)) for row in images]
+    return images, np.array(found)
+
+
+def scattered(map_, z):
+    """States of the data, at its border, beside it and far away, turned, and not finite."""
+    middle = z.mean(axis=0)
+    found = np.concatenate([z[:60], *(middle + s * (z[:40] - middle) for s in (1.2, 2, 20))])
+    turned = found[:40].copy()
+    if map_.coordinates.forward is CARTESIAN.forward:
+        turned[:, list(map_.coordinates.angles)] += 2 * np.pi * 12_345
+    wrong = np.tile(middle, (2, 1))
+    wrong[0, 0], wrong[1, -1] = np.nan, np.inf
+    return np.concatenate([found, turned, wrong])
+
+
+@needs_cc
+@pytest.mark.parametrize(
+    "kind", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in MAPS]
+)
+def test_c_is_the_maps_own_step(kind, tmp_path):
+    map_, z = MAPS[kind]()
+    z = scattered(map_, z)
+    library = compiled(gfnn.export(map_, "c", tmp_path / "own.c"))
+    for function, own in ((library.own_step, map_.step), (library.own_inverse, map_.inverse)):
+        images, status = by_c(function, z)
+        expected, info = own(z)
+        expected = np.asarray(expected)
+        np.testing.assert_array_equal(status, info.status)
+        assert {OK, LEFT_DOMAIN, NON_FINITE} <= {*status.tolist()} or "angles" in kind
+        inside = status == OK
+        assert inside.sum() > 30
+        np.testing.assert_allclose(images[inside], expected[inside], rtol=1e-13, atol=1e-13)
+        # Far outside, folds are near and powers large.
+        outside = status == LEFT_DOMAIN
+        np.testing.assert_allclose(images[outside], expected[outside], rtol=1e-11, atol=1e-11)
+
+
+@needs_cc
+def test_c_gives_up_where_the_map_does(tmp_path):
+    """Beyond a fold, P + 3 s q² P² = p has no solution."""
+    z = states(1)
+    family = given_terms(1, ["q1**3*p1**2"])
+    unit = np.ones(2)
+    map_ = map_of(Generated(family, np.array([-1.0]), TYPE2, 1.0, unit), z)
+    library = compiled(gfnn.export(map_, "c", tmp_path / "own.c"))
+    _, status = by_c(library.own_step, z)
+    np.testing.assert_array_equal(status, map_.step(z)[1].status)
+    assert (status == NOT_CONVERGED).sum() > 10
+
+
+@needs_cc
+def test_c_is_optimised_to_the_same(tmp_path):
+    map_, z = map_in(MIDPOINT, 1, 4)
+    path = gfnn.export(map_, "c", tmp_path / "own.c")
+    plain, plain_status = by_c(compiled(path).own_step, z)
+    faster = path.rename(tmp_path / "faster.c")
+    images, status = by_c(compiled(faster, "-O3").own_step, z)
+    np.testing.assert_array_equal(status, plain_status)
+    np.testing.assert_array_equal(images, plain)
+
+
+def test_the_file_tells_where_it_comes_from_and_keeps_nothing(tmp_path):
+    map_, _ = map_in(MIDPOINT, 1, 3)
+    plain = dataclasses.replace(map_, coordinates=CARTESIAN)
+    plain.save(tmp_path / "mine", record={"fit": {"tolerance": 1e-6}, "data": {"source": "*/ x"}})
+    text = gfnn.export(tmp_path / "mine", "c").read_text()
+    comment, code = text.split("*/", 1)
+    for told in ("dt = 0.3 in", "q1 0.6, p1 0.6", "0 ok; 1 left", "cc -O3 -std=c99", "1e-06",
+                 "SHA-256", "gfnn_jax 0", "* / x"):  # fmt: skip
+        assert told in comment
+    assert "malloc" not in code
+    assert not re.search(r"^static (?!const)\w+ \w+(\[|;| =)", code, re.M)  # no state that changes
+
+
+@pytest.mark.parametrize(
+    "kind", ["type 2", *(pytest.param(k, marks=pytest.mark.slow) for k in ("an angle", "law"))]
+)
+def test_stablehlo_is_the_maps_own_step(kind, tmp_path):
+    map_, z = MAPS[kind]()
+    with zipfile.ZipFile(gfnn.export(map_, "stablehlo", tmp_path / "own.zip")) as archive:
+        assert json.loads(archive.read("about.json"))["dim"] == map_.dim
+        loaded = {
+            name: jax_export.deserialize(bytearray(archive.read(f"{name}.jax")))
+            for name in ("step", "inverse")
+        }
+    many = scattered(map_, z)
+    for name, own, batch in (("step", map_.step, many), ("inverse", map_.inverse, many[:3])):
+        images, status = loaded[name].call(batch)
+        expected, info = own(batch)
+        np.testing.assert_array_equal(status, info.status)
+        good = np.asarray(status) == OK
+        np.testing.assert_allclose(images[good], expected[good], rtol=1e-14, atol=1e-14)
+
+
+def test_stablehlo_takes_any_function(tmp_path):
+    map_ = map_of(generated(oscillator, 1.1, MIDPOINT, DT), z := states(1))
+    path = gfnn.export(map_, "stablehlo", tmp_path / "own.zip")
+    loaded = jax_export.deserialize(bytearray(zipfile.ZipFile(path).read("step.jax")))
+    np.testing.assert_allclose(loaded.call(z)[0], map_.step(z)[0], rtol=0, atol=1e-15)
+
+
+def test_what_has_no_c_is_refused(tmp_path):
+    network = map_of(generated(oscillator, 1.1, MIDPOINT, DT), states(1))
+    map_, _ = map_in(MIDPOINT, 1, 3)
+    single = jax.tree.map(lambda a: np.asarray(a, np.float32), map_)
+    for bad, why in ((network, "one of a function"), (single, "not of float64")):
+        with pytest.raises(gfnn.InputError, match=rf"{why}.*--to stablehlo takes any map"):
+            gfnn.export(bad, "c", tmp_path / "a.c")
+    for to, out, why in (("c", "a.txt", "is written as .c"), ("c", "a-1.c", "C functions are"),
+                         ("c", "double.c", "C functions are"), ("onnx", "a", "c or stablehlo"),
+                         ("c", None, "expected a file")):  # fmt: skip
+        with pytest.raises(gfnn.InputError, match=why):
+            gfnn.export(map_, to, None if out is None else tmp_path / out)
+    assert not list(tmp_path.iterdir())
+
+
+def test_command_line(tmp_path, capsys):
+    map_, _ = map_in(MIDPOINT, 1, 3)
+    dataclasses.replace(map_, coordinates=CARTESIAN).save(tmp_path / "m")
+    model = str(tmp_path / "m")
+    assert tuple(SUFFIXES) == cli.EXPORTS
+    assert cli.main(["export", model, "--to", "c"]) == 0
+    assert "m.c" in capsys.readouterr().out
+    assert "int m_step(" in (before := (tmp_path / "m.c").read_text())
+    assert cli.main(["export", model, "--to", "c"]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert cli.main(["export", model, "--to", "c", "--overwrite"]) == 0
+    assert (tmp_path / "m.c").read_text() == before
+    assert cli.main(["export", str(tmp_path / "none"), "--to", "c"]) == 2
+    assert "no such file" in capsys.readouterr().err
+
+
+# Symbols
+
+
+def test_symbols_leave_no_arithmetic_with_zeros_and_do_nothing_twice():
+    tape = Tape()
+    z = tape.inputs("z", 3)
+    matrix = np.array([[0.0, 1.0, 2.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]])
+    text = tape.function("f", {"out": [*(z @ matrix)[0], 2.0 * z[0, 0] - z[0, 1]]})
+    assert text.splitlines()[2:] == [
+        "    const double t5 = 2.0*z[0] - z[1];",
+        "    out[0] = 0.0;",
+        "    out[1] = z[0];",
+        "    out[2] = t5;",
+        "    out[3] = t5;",
+        "}",
+    ]  # fmt: skip
+
+
+@needs_cc
+def test_every_function_of_formulas_has_its_c(tmp_path):
+    texts = ["sin(q1)", "cos(3*q1)", "tan(q1)", "exp(q1)", "log(q1)", "sqrt(q1)", "sinh(q1)",
+             "cosh(q1)", "tanh(q1)", "arctan(q1)", "q1**-3", "q1**0.3", "T5(q1)", "q1 - (p1 - q1)",
+             "q1/(p1/q1)", "-(q1 + p1)*-q1", "2 - q1", "q1/p1"]  # fmt: skip
+    trees = [parse(text, 1) for text in texts]
+    tape = Tape()
+    z = tape.inputs("z", 2)
+    entries = [v for jet in jets(trees, z, 2)
+               for v in (jet.value, *jet.slope.values(), *jet.curvature.values())]  # fmt: skip
+    path = tmp_path / "f.c"
+    text = tape.function("all_of", {"out": [np.ravel(np.asarray(e, object))[0] for e in entries]})
+    path.write_text("#include <math.h>\n" + text.removeprefix("static "))
+    at, pointer = np.array([[0.7, 0.4]]), ctypes.POINTER(ctypes.c_double)
+    out = np.empty(len(entries))
+    compiled(path).all_of(at.ctypes.data_as(pointer), out.ctypes.data_as(pointer))
+    expected = [v for jet in jets(trees, at, 2)
+                for v in (jet.value, *jet.slope.values(), *jet.curvature.values())]  # fmt: skip
+    np.testing.assert_allclose(out, [np.ravel(e)[0] for e in expected], rtol=1e-14)
