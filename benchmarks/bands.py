@@ -34,7 +34,7 @@ from harness import (
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import nearest_image
-from gfnn_jax.scenes import DrawnFrom, Scene, henon_heiles, two_body
+from gfnn_jax.scenes import DrawnFrom, Scene, froeschle, henon_heiles, two_body
 
 SIGMAS, SIZES, STEPS = (0.0, 1e-6, 1e-4, 1e-2), (100, 1_000, 10_000), (1, 10, 100)
 STATES, SAMPLES = 40, 50
@@ -186,11 +186,12 @@ PIECES = {
     "henon-heiles": partial(calibrated, henon_heiles, lend=False, learn="hamiltonian"),
     "two-body": partial(calibrated, two_body, lend=True, sizes=(1_000,), learn="map"),
     "pendulum": partial(calibrated, pendulum, lend=False, learn="map"),
+    "ring-32": partial(calibrated, partial(froeschle, 32), lend=True, sizes=SIZES[:2], learn="map"),
     "noise-dt-0.5": partial(sequences, 0.5),
     "noise-dt-0.05": partial(sequences, 0.05),
     "cost": cost,
 }
-CALIBRATED = tuple(PIECES)[:4]
+CALIBRATED = tuple(PIECES)[:5]
 
 
 def _calibration_table(found: dict[str, Numbers]) -> str:
@@ -254,7 +255,7 @@ def figure(found: dict[str, Numbers]) -> None:
     drawn, panels = pyplot.subplots(1, len(STEPS), figsize=(10, 3.4), sharex=True, sharey=True)
     for k, (panel, step) in enumerate(zip(panels, STEPS, strict=True)):
         panel.axhspan(100 * COVERED[0], 100 * COVERED[1], color="0.92")
-        for name, marker in zip(CALIBRATED, "osD^", strict=True):
+        for name, marker in zip(CALIBRATED, "osD^v", strict=True):
             rows = found[name]["measured"]["rows"] if name in found else []
             rows = [r for r in rows if "coverage" in r]
             if rows:

@@ -31,6 +31,9 @@ _BLOCK_BYTES, _FEWEST_ROWS = 2 * 2**20, 256
 _PANEL = 32  # columns per panel of LAPACK's QR: a third faster than 64
 # Ridge parameters tried, relative to the largest singular value; the first is plain least squares.
 _RIDGES = (0.0, *(10.0**k for k in range(-13, 0)))
+# Standard deviations of chance by which a ridge must lower the held-out squares. Of Hénon–Heiles
+# with noise of 1e-2 and 10⁴ pairs (benchmarks/bands.py) chance alone chose 0.01: 4 times the error.
+_CERTAIN = 3.0
 # A leading block is judged by a triangular solve where the smallest diagonal entry of R, relative
 # to its column, is no smaller than this, and where there are as many rows per term.
 _WELL_CONDITIONED, _WELL_DETERMINED = 1e-13, 1.5
@@ -155,8 +158,9 @@ def _rms(norm: Any, rows: int) -> float:
 def solve(train: Reduced, held: Reduced, num_terms: int) -> LeastSquaresFit:
     """Coefficients of the leading ``num_terms`` terms.
 
-    Scaled columns; the ridge parameter with the smallest error on the held-out rows, zero included,
-    so that noisy or too few data give a regularised fit and clean ones the plain one.
+    Scaled columns; the ridge parameter with the smallest error on the held-out rows where that is
+    smaller than the plain one's by more than their noise makes it by chance, so that too few data
+    give a regularised fit and others the plain one: what a ridge shrinks, no posterior knows of.
     """
     # Below its leading block R has zeros in these columns.
     a, b = train.factor[:num_terms, :num_terms], train.factor[:num_terms, -1]
@@ -173,6 +177,10 @@ def solve(train: Reduced, held: Reduced, num_terms: int) -> LeastSquaresFit:
     tried = (vt.T @ (filters * along).T) / column[:, None]
     errors = np.hypot(np.linalg.norm(held_a @ tried - held_b[:, None], axis=0), held_rest)
     best = int(np.argmin(errors))
+    apart = np.linalg.norm(held_a @ (tried[:, best] - tried[:, 0]))
+    by_chance = _CERTAIN * 2 * apart * errors[best] / math.sqrt(max(held.rows, 1))
+    if not errors[0] ** 2 - errors[best] ** 2 > by_chance:
+        best = 0
     c, error = tried[:, best], errors[best]
     # A coefficient no larger than rounding of b would make it is zero, if held-out pairs agree.
     # A symmetry of S that is broken by 1e-17 biases the rounding of every step in one direction.

@@ -134,8 +134,12 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
             "these functions cannot represent, or pairs of no symplectic map"
         )
         return _LeftOver(None, [message], "what is left over is smooth, and no noise")
-    taken = candidate.num_parameters / (judges.training.size * 2 * judges.pairs.dim)
-    noise = state_noise(candidate.map, judges.pairs.take(rows[:_NOISE_PAIRS]), taken)
+    law = searched.law
+    if law is not None and law.noise is not None and candidate.learns == "hamiltonian":
+        noise = law.noise
+    else:
+        taken = candidate.num_parameters / (judges.training.size * 2 * judges.pairs.dim)
+        noise = state_noise(candidate.map, judges.pairs.take(rows[:_NOISE_PAIRS]), taken)
     own = ""
     if candidate.learns == "map" and entry is not None:
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))

@@ -29,6 +29,7 @@ from gfnn_jax.learn.diagnose import ChartJudgement
 from gfnn_jax.learn.diagnosed import diagnose_request
 from gfnn_jax.learn.draw import NUM_PAIRS, drawn
 from gfnn_jax.learn.flows import LearnedHamiltonian
+from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.posterior import with_posterior
 from gfnn_jax.learn.request import checked
@@ -120,7 +121,7 @@ class Fit:
         each exactly symplectic: `maps.samples.Samples`. key: of ``jax.random``.
 
         Raises ValueError where the map has no posterior: a network, a map of pairs that were drawn
-        from a law, an S with parameters.
+        from a law.
         """
         return self.map.sample(key, num)
 
@@ -257,6 +258,9 @@ def fit(
     warn(seen.messages)
     judges = Judges(pairs, *split_rows(pairs, seed), request.tolerance)
     found = searched(request, plain, seen, judges, on_better)
+    seen, found, about_pairs = without_gross_errors(request, seen, found)
+    warn(about_pairs)
+    pairs = found.judges.pairs
     chosen = with_posterior(choose(found, request), found)
     conclusion = conclude(chosen, found, request)
     warn(conclusion.messages)

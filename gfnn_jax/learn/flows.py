@@ -7,6 +7,7 @@ go while the held-out error does not rise.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -54,6 +55,7 @@ from gfnn_jax.learn.formula import Term, formula
 from gfnn_jax.learn.held_out import looked_at, outermost
 from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
 from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.learn.whole_sequences import Whole, fitted_to_sequences
 from gfnn_jax.phase_space import Pairs, apply_j, symplectic_form
 
 
@@ -147,6 +149,8 @@ class LearnedHamiltonian:
     messages: tuple[str, ...]
     stalled: bool
     root: np.ndarray | None
+    noise: np.ndarray | None = None
+    arcs: int = 0
 
     @property
     def fast(self) -> bool:
@@ -158,7 +162,8 @@ class _Fitted(NamedTuple):
     """rows: that the fit was given; it has left out those that the flow does not resolve.
     undetermined: of the null terms, those that other states would tell from the rest. ended: why a
     library that grew did so no longer. stalled: whether larger libraries were no better. noisy:
-    whether their errors were the same, which is that of the pairs."""
+    whether their errors were the same, which is that of the pairs. whole: what whole sequences
+    tell, where they were fitted."""
 
     family: Terms | Sums
     fit: FlowFit
@@ -169,6 +174,7 @@ class _Fitted(NamedTuple):
     ended: str = ""
     stalled: bool = False
     noisy: bool = False
+    whole: Whole | None = None
 
 
 def learn_hamiltonian(
@@ -236,12 +242,17 @@ def learn_hamiltonian(
     except OutOfTime:
         pass  # what was found stands
     problem.check, problem.spend = lambda: None, Counted(np.inf).spend
-    seconds = time.perf_counter() - started
     root = None
     if arcs is not None:
         root = _root(best, problem, prepared, best.fit.steps, everywhere.pairs)
         prepared, everywhere = steps_of, judges_of_steps
         problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale)
+        best = best._replace(error=_held_out_error(best.family, best.fit, prepared, everywhere))
+    if best.error.bound > everywhere.tolerance.bound:
+        say("H: whole sequences")
+        with contextlib.suppress(OutOfTime):
+            best = _of_sequences(problem, best, prepared, everywhere, clock)
+    seconds = time.perf_counter() - started
     learned = _learned(best, problem, prepared, everywhere, seconds, options, root)
     candidate = dataclasses.replace(learned.candidate, outside=outside)
     return dataclasses.replace(learned, candidate=candidate)
@@ -621,12 +632,26 @@ def _refitted(problem, found: _Fitted, rows, prepared, judges) -> _Fitted:
     return found._replace(fit=fit, rows=rows, error=error)
 
 
+def _of_sequences(problem, found: _Fitted, prepared, judges, clock: Clock) -> _Fitted:
+    """Fitted to whole sequences, where there are such and held-out steps bear it out."""
+    if found.error.relative <= _ROUNDOFF:
+        return found
+    whole = fitted_to_sequences(problem, found.family, found.fit, prepared, judges, clock.check)
+    if whole is None:
+        return found
+    family = found.family.take(whole.kept)
+    error = _held_out_error(family, whole.fit, prepared, judges)
+    if not error.relative <= OPTIONS.rise * found.error.relative:
+        return found
+    return found._replace(family=family, fit=whole.fit, error=error, whole=whole)
+
+
 def _learned(
     found: _Fitted, problem, prepared: Prepared, judges: Judges, seconds: float, options: Options,
     root: np.ndarray | None,
 ) -> LearnedHamiltonian:  # fmt: skip
     """root: of the covariance, where the fit was not to these pairs but to arcs of them."""
-    family, fit = found.family, found.fit
+    family, fit, whole = found.family, found.fit, found.whole
     rows = judges.held_out
     z, args = prepared.y0[rows], prepared.given(rows)[1]
     some = slice(FREQUENCY_STATES)
@@ -663,13 +688,18 @@ def _learned(
     omega_h = omega_h_of(family, fit.coefficients, prepared, fastest)
     left_out = len(np.setdiff1d(found.rows, fit.used))
     resolved = np.abs(off).max(axis=1) <= _bound(judges, prepared.scale)
+    if whole is not None:
+        root = whole.root
+    elif root is None:
+        root = _root(found, problem, prepared, steps, judges.pairs)
     return LearnedHamiltonian(
         with_error(candidate, error), flow, terms, getattr(family, "prefix", "") + formula(terms),
         float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(error, omega_h, prepared, judges, found, left_out, int((~resolved).sum()))),
         stalled=found.stalled,
-        root=_root(found, problem, prepared, steps, judges.pairs) if root is None else root,
+        root=root, noise=None if whole is None else whole.noise,
+        arcs=0 if whole is None else whole.arcs,
     )  # fmt: skip
 
 
@@ -780,6 +810,8 @@ def _messages(
                 else "slowest"
             )
         )
+    if found.whole is not None:
+        yield from found.whole.messages
     if found.undetermined:
         names = found.undetermined
         some = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")

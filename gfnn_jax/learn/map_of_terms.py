@@ -20,7 +20,9 @@ from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms
+from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.gauss_newton import fitted_gradients, null_terms, significant
+from gfnn_jax.fitting.least_squares import Reduced
 from gfnn_jax.generating.charts import CHARTS, AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.assemble import Assembled, composed, stepped
@@ -41,10 +43,12 @@ _SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved
 
 
 class LearnedMap(NamedTuple):
-    """The candidate, its error measured by steps in NumPy, and the piece that S generates."""
+    """The candidate, its error measured by steps in NumPy, and the piece that S generates. root:
+    (m, m), rootᵀ root is the coefficients' covariance."""
 
     candidate: Candidate
     piece: Generated
+    root: np.ndarray
 
 
 class _Tried(NamedTuple):
@@ -92,7 +96,8 @@ def learn_map(
         deviations=best.error.deviations, train_rms=best.train_rms,
         fit_seconds=time.perf_counter() - started,
     )  # fmt: skip
-    return LearnedMap(with_error(candidate, best.error), piece)
+    root = _root(piece, prepared, _fewer(prepared, judges) if prepared.structure else judges)
+    return LearnedMap(with_error(candidate, best.error), piece, root)
 
 
 def map_of(
@@ -219,6 +224,29 @@ def _judged(piece: Generated, prepared: Prepared, judges: Judges) -> _Tried:
 def _weight(prepared: Prepared) -> np.ndarray:
     """h over the scale of what each entry of ∇S changes (2d,)."""
     return prepared.dt / np.roll(prepared.scale, prepared.dim)
+
+
+def _root(piece: Generated, prepared: Prepared, judges: Judges) -> np.ndarray:
+    """What of the residual is noise, the next library tells, which leaves that too; without a
+    structure all of it may be misfit."""
+    family, count = piece.family, piece.family.num_parameters
+    w, target, args = _data(piece.chart, family, prepared, judges.training)
+    weight = _weight(prepared)
+    aim = (target * weight).ravel()
+    slopes = (family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
+    residual, noise = slopes @ np.asarray(piece.params) - aim, None
+    if prepared.structure is not None:
+        larger = (f for f in prepared.structure.libraries(prepared.dim) if f.num_parameters > count)
+        found = next(larger, None)
+        if found is not None and _ROWS_PER_TERM * found.num_parameters <= target.size:
+            known = found.take(null_terms(found, w[: max(1, _NULL_ROWS // w.shape[1])])[0])
+            both = least_squares.reduce(known, [(w, target)], weight)
+            part = uncertainty.variance(both, known.num_parameters)
+            left = float(np.sum(residual**2)) / max(target.size - count, 1)
+            noise = min(part / left, 1.0) if left > 0 else 1.0
+    factor = np.linalg.qr(np.column_stack([slopes, aim]), mode="r")
+    train = Reduced(np.asfortranarray(factor), target.size)
+    return uncertainty.root(train, count, slopes, residual, noise=noise)
 
 
 def _sparse(full: _Tried, prepared: Prepared, judges: Judges) -> _Tried:

@@ -21,6 +21,8 @@ def with_posterior(chosen: Chosen, searched: Searched) -> Chosen:
         if not (own and isinstance(entry.sweep, LinearSweep)):
             return chosen
         kind, root = Generated, entry.sweep.root(entry.size)
+    elif searched.of_terms is not None and chosen.candidate.learns == "map":
+        kind, root = Generated, searched.of_terms.root
     elif law is not None and law.root is not None and chosen.candidate.learns == "hamiltonian":
         kind, root = Flow, law.root
     else:

@@ -200,6 +200,12 @@ class LinearSweep:
         solved = least_squares.solve(train, held, size.family.num_parameters)
         return solved, size.family.unflatten(solved.coefficients)
 
+    def left_over(self, size: Size) -> np.ndarray:
+        """(N, 2d): what the size leaves of ∇S of every pair, unit-free as train_rms."""
+        _, params = self.solve(size, Clock(), lambda message: None)
+        (w, target), weight = _rows(self.prepared, self.chart, slice(None))
+        return weight * (np.asarray(size.family.gradient(params, w)) - target)
+
     def own_error(self, size: Size) -> float:
         """What noise leaves wrong in the size's ∇S, in the measure of train_rms: half of the
         difference between the fits to either half of the training pairs, blocks in time."""

@@ -117,7 +117,7 @@ def sampled(map_: SymplecticMap, key, num: int) -> Samples:
     if map_.posterior is None:
         raise ValueError(
             "expected a map with a posterior: one that gfnn.fit fitted to the pairs themselves, "
-            "linear in its coefficients; networks, maps of drawn pairs and of parameters have none"
+            "linear in its coefficients; networks and maps of drawn pairs have none"
         )
     if num < 1:
         raise ValueError(f"expected a number of samples above 0, got {num}")

@@ -1,0 +1,139 @@
+"""Pairs that the map found contradicts by far more than it does the pairs around them.
+
+Neighbours tell an outlier where states are dense (`learn.diagnose.outliers`); a map that all pairs
+agree on tells it anywhere. What a map cannot represent is smooth: its residual is as large at the
+neighbours. A gross error of measurement stands alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+
+from gfnn_jax.learn.candidates import Judges
+from gfnn_jax.learn.diagnosed import Diagnosis, diagnose_request
+from gfnn_jax.learn.held_out import split_rows
+from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.learn.request import Request
+from gfnn_jax.learn.searches import Searched, searched
+from gfnn_jax.learn.sweeps import LinearSweep
+from gfnn_jax.phase_space import Pairs
+
+# A residual beyond so many times what all but two of its neighbours stay below, and the median of
+# all. Of normal noise and d = 1 it is four times the median in one of 60,000 pairs.
+_BEYOND, _NEIGHBOURS, _BUT = 5.0, 10, 2
+# Those neighbours' residuals are ordinary, below so many times the median: a map that cannot follow
+# a close passage errs around it too.
+_ORDINARY = 2.5
+# Gross errors are apart from the others: residuals between so many times the median and _BEYOND are
+# fewer by this factor than they. What a map cannot represent has a tail without a gap.
+_TAIL, _APART = 3.0, 0.5
+_ROUNDOFF = 1e-10  # of the spread: below it residuals are arithmetic
+_MOST = 0.12  # of the pairs: gross errors of a twentieth of the states of sequences, two pairs each
+_ROUNDS = 3  # large ones hide smaller ones
+# The RMS residual of all pairs over that of the others, for a search without them to be worth its
+# time; and by how much that of the others may rise then.
+_SPOILT, _RISE = 1.15, 1.02
+
+
+class Cleaned(NamedTuple):
+    """The diagnosis and the search without gross errors, and what is to be said of those."""
+
+    seen: Diagnosis
+    found: Searched
+    messages: list[str]
+
+
+def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> Cleaned:
+    """Searched again without gross errors, as long as that lowers what is left over of the others;
+    as it is, where the tolerance is met, there are none, or too many."""
+    taken, gone = found.judges.pairs, 0
+    count = len(taken)
+    kept = np.arange(count)
+    request = dataclasses.replace(request, factors=None, checkpoints=None)
+    for _ in range(_ROUNDS):
+        size = _residuals(found)
+        if size is None:
+            break
+        rows = _standing_alone(found.plain, size)
+        if not len(rows) or gone + len(rows) > _MOST * count or request.clock.left <= 0:
+            break
+        others = np.setdiff1d(np.arange(len(size)), rows)
+        if not _rms(size) > _SPOILT * _rms(size[others]):
+            break
+        pairs, plain = found.judges.pairs.take(others), found.plain.take(others)
+        request.say(f"without {gone + len(rows)} of {count} pairs that are gross errors")
+        diagnosis = diagnose_request(request, plain)
+        judges = Judges(pairs, *split_rows(pairs, request.seed), request.tolerance)
+        again = searched(request, plain, diagnosis, judges, None)
+        left = _residuals(again)
+        if left is not None and not _rms(left) <= _RISE * _rms(size[others]):
+            break
+        seen, found, gone, kept = diagnosis, again, gone + len(rows), kept[others]
+    if not gone:
+        return Cleaned(seen, found, [])
+    first = np.setdiff1d(np.arange(count), kept)[:5]
+    z0, z1 = (np.asarray(z)[first] for z in (taken.z0, taken.z1))
+    rows = ", ".join(map(str, (_row(request.pairs, *pair) for pair in zip(z0, z1, strict=True))))
+    rows += ", …" if gone > 5 else ""
+    return Cleaned(seen, found, [
+        f"{gone} of {count} pairs (rows {rows}) are gross errors beside the map of the others: "
+        "they were given no weight"
+    ])  # fmt: skip
+
+
+def _row(pairs: Pairs, z0, z1) -> int:
+    """Of the user's pairs, the first that is this one."""
+    return int(np.argmax(np.all((pairs.z0 == z0) & (pairs.z1 == z1), axis=1)))
+
+
+def _rms(size) -> float:
+    return float(np.sqrt(np.mean(size**2)))
+
+
+def _residuals(found: Searched) -> np.ndarray | None:
+    """(N,) what the best map leaves of every pair; of a law by its steps ÷ scale, of S in its
+    gradient, which has the same unit. None where it meets the tolerance, or is neither."""
+    law, judges, plain = found.law, found.judges, found.plain
+    entry = next(iter(found.found.ranking), None)
+    best = min(
+        (c for c in (law and law.candidate, entry and entry.candidate) if c is not None),
+        key=lambda c: c.validation_relative, default=None,
+    )  # fmt: skip
+    if best is None or judges.met_by(best) or best.validation_relative <= _ROUNDOFF:
+        return None
+    if plain.structure is not None or plain.varied:
+        return None
+    if law is not None and best is law.candidate:
+        left = (law.flow.image(plain.y0) - plain.y1) / plain.scale
+    elif entry is not None and isinstance(entry.sweep, LinearSweep) and _same(entry.sweep, judges):
+        left = entry.sweep.left_over(entry.size)
+    else:
+        return None
+    size = np.linalg.norm(left, axis=1)
+    return np.where(np.isfinite(size), size, np.inf)
+
+
+def _same(sweep: LinearSweep, judges: Judges) -> bool:
+    return sweep.judges.pairs is judges.pairs
+
+
+def _standing_alone(plain: Prepared, size) -> np.ndarray:
+    """The rows whose residual is far beyond those of all but a few of the neighbours, of the state
+    or of the image: a state that is a gross error has no neighbours but its like."""
+    if len(size) <= _NEIGHBOURS:
+        return np.zeros(0, int)
+    middle = np.median(size)
+    rows = np.flatnonzero(size > _BEYOND * middle)
+    if not len(rows) or not middle > 0:
+        return rows[:0]
+    around = np.full(len(rows), np.inf)
+    for y in (plain.y0 / plain.scale, plain.y1 / plain.scale):
+        near = cKDTree(y).query(y[rows], k=_NEIGHBOURS + 1)[1][:, 1:]
+        around = np.minimum(around, np.sort(size[near], axis=1)[:, -1 - _BUT])
+    alone = rows[(size[rows] > _BEYOND * around) & (around < _ORDINARY * middle)]
+    between = np.sum((size > _TAIL * middle) & (size <= _BEYOND * middle))
+    return alone if between < _APART * len(alone) else alone[:0]
