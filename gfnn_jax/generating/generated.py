@@ -106,11 +106,11 @@ class Generated:
         """
         known = self.chart.first_guess(z)
         guess = known[:, self.chart.free(z.shape[1] // 2)]
-        if self.predictor is not None:
-            guess = guess + self.predictor.forward(z)
-        shared = (self.family, self.params, self.dt, self.scale)
         if args is not None:  # open lanes are taken out of the batch, with their own
             args = jnp.broadcast_to(self._midway(args), (z.shape[0], args.shape[-1]))
+        if self.predictor is not None:
+            guess = guess + self.predictor.forward(z, args)
+        shared = (self.family, self.params, self.dt, self.scale)
         equation, lanes = ImplicitStep(self.chart), (z, known, args)
         if matrix_free(self.family):
             x, gradient, info = self._by_fixed_point(equation, shared, lanes, guess, unrolled)

@@ -21,7 +21,7 @@ import scipy.linalg
 
 from gfnn_jax.arrays import matmul, namespace
 from gfnn_jax.families.inputs import Inputs, box_inputs
-from gfnn_jax.families.products import Products
+from gfnn_jax.families.products import Basis, Products, basis_of
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.threads import one_thread
@@ -53,23 +53,27 @@ class PolynomialModel:
     matrices: Any
 
     @property
+    def basis(self) -> Basis:
+        return _basis(self.family)
+
+    @property
     def operations(self) -> int:
         """Floating-point operations of an evaluation."""
-        basis, count = self.family.basis, len(self.matrices)
+        basis, count = self.basis, len(self.matrices)
         (m, i), (n, j) = (h.indices.shape for h in basis.halves)
         row, column = basis.corner
         tables = m * (i - 1) + n * max(j - 1, 0) + 4 * self.family.degree * (i + j)
         return 2 * count * (row * n + (m - row) * column + m) + tables
 
-    def __call__(self, z):
+    def __call__(self, z, args=None):
         """The difference (..., k) at the states z (..., 2d), NumPy or JAX."""
         xp, inputs = namespace(z), self.family.inputs
         reach = min(_REACH, math.cosh(math.acosh(_LARGEST) / self.family.degree))
         reaches = np.where(inputs.is_angle, np.inf, reach)
-        x = inputs(z)
+        x = inputs(z, args)
         bound = xp.broadcast_to(xp.asarray(reaches, dtype=x.dtype), x.shape)
-        (u,), (v,) = self.family.basis.tables(xp.clip(x, -bound, bound), 0)
-        row, column = self.family.basis.corner
+        (u,), (v,) = self.basis.tables(xp.clip(x, -bound, bound), 0)
+        row, column = self.basis.corner
         low = self._product(self.matrices[:, :row], u[..., :row], v)
         return low + self._product(self.matrices[:, row:, :column], u[..., row:], v[..., :column])
 
@@ -105,16 +109,16 @@ class Fitted(NamedTuple):
 
 def fit_predictors(
     chart: AnyChart, y0, y1, dt: float, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
-    features=None,
+    features=None, args=None,
 ) -> list[Fitted]:  # fmt: skip
     """Predictors of a chart's map and of its inverse, by rising degree.
 
-    y0, y1: (N, 2d) states and images, NumPy, angles lifted. angles, cyclic, features: as those of
-    ``box_inputs``. The degree rises until the model is as close as it need be, or no longer gains:
-    then noise, or the number of pairs, is the limit.
+    y0, y1: (N, 2d) states and images, NumPy, angles lifted. angles, cyclic, features, args: as
+    those of ``box_inputs``. The degree rises until the model is as close as it need be, or no
+    longer gains: then noise, or the number of pairs, is the limit.
     """
     rows = np.linspace(0, len(y0) - 1, min(_ROWS, len(y0))).astype(int)
-    y0, y1 = y0[rows], y1[rows]
+    y0, y1, args = y0[rows], y1[rows], None if args is None else args[rows]
 
     def fitted(chart: AnyChart, given, other) -> list[tuple[PolynomialModel, float]]:
         dim = given.shape[1] // 2
@@ -123,9 +127,9 @@ def fit_predictors(
         known = chart.first_guess(given)[:, free]
         inputs = box_inputs(
             given, angles=tuple(a for a in angles if a < dim), cyclic=tuple(cyclic),
-            features=features,
+            features=features, args=args,
         )  # fmt: skip
-        return _by_degree(inputs, given, unknown - known, sizes(unknown))
+        return _by_degree(inputs, inputs(given, args), unknown - known, sizes(unknown))
 
     forward, backward = fitted(chart, y0, y1), fitted(chart.reverse(dt)[0], y1, y0)
     # The direction that is close first waits for the other.
@@ -153,15 +157,21 @@ def affordable(fitted: list[Fitted], family) -> Fitted:
     return close[-1] if close and cheap[-1].error > CLOSE else cheap[-1]
 
 
-def _by_degree(inputs: Inputs, y, target, unit) -> list[tuple[PolynomialModel, float]]:
-    """Least-squares models of the target (N, k), one factorisation for all degrees."""
-    held = np.arange(len(y)) % 5 == 0
-    most = min(_MOST_TERMS, len(y) // 3)
+def _basis(family: Products) -> Basis:
+    """The products of a model: unlike S it also has those of args alone."""
+    return basis_of(family.inputs.is_angle, family.degree, None)
+
+
+def _by_degree(inputs: Inputs, x, target, unit) -> list[tuple[PolynomialModel, float]]:
+    """Least-squares models of the target (N, k) at the variables x (N, ...), one factorisation for
+    all degrees."""
+    held = np.arange(len(x)) % 5 == 0
+    most = min(_MOST_TERMS, len(x) // 3)
     top = 1
     while top < _MOST_DEGREE and Products(inputs, top + 1).num_parameters <= most:
         top += 1
-    largest = Products(inputs, top).basis
-    design = _design(largest, inputs(y))
+    largest = _basis(Products(inputs, top))
+    design = _design(largest, x)
     width = design.shape[1]
     ridge = _RIDGE * np.linalg.norm(design[~held], axis=0)
     ridge = np.where(ridge > 0, ridge, 1.0)  # a product that vanishes on all states: no part of it
@@ -180,7 +190,7 @@ def _by_degree(inputs: Inputs, y, target, unit) -> list[tuple[PolynomialModel, f
             continue  # an odd map gains nothing by an even degree
         closest = error
         family = Products(inputs, degree)
-        matrices = family.basis.placed(solution[1:].T)
+        matrices = _basis(family).placed(solution[1:].T)
         matrices[:, 0, 0] = solution[0]
         found.append((PolynomialModel(family, matrices), float(error)))
         if error < _STEADY:

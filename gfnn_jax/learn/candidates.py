@@ -141,7 +141,8 @@ def refined_images(
     solved (N,). In NumPy, from the data's own evaluation points: nothing is compiled."""
     y0, y1 = prepared.y0[rows], prepared.y1[rows]
     piece = Generated(family, params, chart, prepared.dt, prepared.scale)
-    images, error = piece.refined_step(y0, chart.evaluation_point(y0, y1))
+    args = prepared.given(rows)[1]
+    images, error = piece.refined_step(y0, chart.evaluation_point(y0, y1), args)
     return images, (error < _SOLVED) & np.isfinite(images).all(axis=1)
 
 

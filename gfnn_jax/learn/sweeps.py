@@ -28,10 +28,11 @@ _DEGREES = ((2, 3), (4, 5, 6), (7, 8), (9, 10), (12, 14), (16, 18, 20))
 _TRIAL = (2, 3, 4, 5, 6)
 _EVEN_DEGREES = tuple((degree,) for degree in (2, 4, 6, 8, 10, 12, 14, 16, 18, 20))
 _SINES = (100, 200, 400, 800, 1_600)
-_MOST_TERMS = 1_500
+# Products of degree 14 in four variables: benchmarks/storage_ring.py.
+_MOST_TERMS = 3_100
 _ROWS_PER_TERM = 3
-# Rows × terms² of one factor: about ten seconds on two cores.
-_MOST_OPERATIONS = 1.2e11
+# Rows × terms² of one factor: about half a minute on one core. 2,000 terms take 80,000 rows.
+_MOST_OPERATIONS = 3.2e11
 # Whether S is even is tested where terms are scarce, from so many rows for each term, by odd terms
 # up to a degree. Those of an even S bring nothing: the held-out residual becomes 0.98 … 1.09 of
 # what it was (FPUT chains, a Penning trap, a satellite); to leave them out costs no more than that.
@@ -120,6 +121,7 @@ class LinearSweep:
         inputs = box_inputs(
             w, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
             cyclic=coordinates.cyclic, features=features, reversor=reversor,
+            args=prepared.given(judges.training)[1],
         )  # fmt: skip
         if kind == "sines":
             groups: Iterable[Iterable[Any]] = ([Sines(inputs, count)] for count in _SINES)
@@ -174,7 +176,7 @@ class LinearSweep:
         else:
             degree = round(extent)
             label = f"{self._prefix}{family.name} {degree}"
-            terms = number_of_terms(family.inputs.is_angle, degree, family.signs)
+            terms = family.terms_of(degree)
         rows = self._train[0].shape
         share = rows[0] / (rows[0] + len(self.judges.held_out))
         pairs = int(np.ceil(_ROWS_PER_TERM * terms / rows[1] / share))
@@ -409,10 +411,11 @@ def is_even(prepared: Prepared, judges: Judges) -> bool:
     """Whether S(−w) = S(w) as far as any size of a sweep could tell: odd terms beside the even ones
     of the highest degree that a sweep has do not make the held-out residual smaller.
 
-    False where terms are not scarce, where angles are, or where the test would take too much.
+    False where terms are not scarce, where angles or args are, or where the test would take too
+    much.
     """
     dim = prepared.dim
-    if dim < _SCARCE_FROM_DIM or prepared.coordinates.angles:
+    if dim < _SCARCE_FROM_DIM or prepared.coordinates.angles or prepared.args is not None:
         return False
     (w, target), weight = _rows(prepared, MIDPOINT, judges.training)
     held, _ = _rows(prepared, MIDPOINT, judges.held_out)
@@ -478,9 +481,11 @@ def trial_residual(prepared: Prepared) -> float:
 
 
 def _rows(prepared: Prepared, chart: AnyChart, rows):
-    """(w, target_gradient) of these rows, and the weight that makes a row of ∇S unit-free."""
-    y0, y1 = prepared.y0[rows], prepared.y1[rows]
+    """(w, target_gradient) of these rows, with their args where there are some, and the weight that
+    makes a row of ∇S unit-free."""
+    (y0, y1), args = (prepared.y0[rows], prepared.y1[rows]), prepared.given(rows)[1]
     data = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, prepared.dt)
+    data = data if args is None else (*data, args)
     return data, residual_weight(chart, prepared.scale, prepared.dt)
 
 

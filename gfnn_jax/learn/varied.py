@@ -79,8 +79,9 @@ def as_varied(
     differs = "dt" if np.ndim(pairs.dt) else "parameters" if pairs.args else None
     if differs is None:
         return pairs, learn, messages
-    if differs == "parameters" and (family, base) == ("auto", None):
-        return pairs, "map" if chart != "auto" else learn, messages
+    families = ("auto",) if pairs.period is not None else ("auto", "polynomial")
+    if differs == "parameters" and family in families and base is None:
+        return pairs, "map" if (family, chart) != ("auto", "auto") else learn, messages
     if learn == "map" or (family, chart) != ("auto", "auto") or base is not None:
         raise FitError(
             f"the pairs differ in their {differs}: expected learn='auto' or 'hamiltonian', and no "
