@@ -28,7 +28,7 @@ from gfnn_jax.coordinates import CARTESIAN  # noqa: E402
 from gfnn_jax.evaluate import metrics, report  # noqa: E402
 from gfnn_jax.maps.saved import versions  # noqa: E402
 from gfnn_jax.maps.symplectic_map import SymplecticMap  # noqa: E402
-from gfnn_jax.scenes import Scene, henon_heiles  # noqa: E402
+from gfnn_jax.scenes import Scene  # noqa: E402
 
 HERE = Path(__file__).resolve().parent
 RESULTS, TABLES, README = HERE / "results", HERE / "RESULTS.md", HERE.parent / "README.md"
@@ -87,15 +87,6 @@ def drawn(scene: Scene, num_pairs: int, quick: bool) -> tuple[gfnn.Pairs, gfnn.P
     key, fresh = jax.random.split(jax.random.key(SEED))
     pairs = gfnn.sample_pairs(scene, num_pairs, key)
     return finite(pairs), finite(gfnn.sample_pairs(scene, 200 if quick else 2_000, fresh))
-
-
-def bounded_states(key, num):
-    """Uniform over the well of Hénon and Heiles below E = 1/8."""
-    energy = henon_heiles().invariants["energy"]
-    box = np.array([0.7, 0.7, 0.5, 0.5])
-    z = box * jax.random.uniform(key, (100 * num, 4), jnp.float64, -1, 1)
-    inside = jnp.nonzero(jax.vmap(energy)(z) < 1 / 8, size=num)[0]
-    return z[inside]
 
 
 def one_step_rms(map_: SymplecticMap, fresh: gfnn.Pairs, angles=()) -> float:

@@ -30,7 +30,6 @@ from harness import (
     Numbers,
     angles_of,
     between_markers,
-    bounded_states,
     drawn,
     fitted,
     markdown,
@@ -44,6 +43,7 @@ from harness import (
 # isort: split
 import jax
 import numpy as np
+from systems import bounded_states
 
 import gfnn_jax as gfnn
 from gfnn_jax.baselines import Budget, Sequences

@@ -156,6 +156,19 @@ def test_a_dependence_that_is_no_power_is_a_series():
     assert tried[-1] <= 42
 
 
+def test_auto_finds_a_law_of_many_functions_of_a_parameter():
+    """The series needs a library of more than the sixty terms that a law beside a map may have."""
+    law = given_terms(1, ["p**2/(2*(0.3 + l**2)) - 9.81*(0.2 + l)*cos(q)"], ("l",))
+    rng = np.random.default_rng(0)
+    length = rng.uniform(0.5, 2, 1_000)
+    z = np.stack([rng.uniform(-2, 2, 1_000), length**2 * rng.uniform(-2, 2, 1_000)], axis=1)
+    steps = images(law, np.ones(1), z, np.full(1_000, 0.05), FINE, args=length[:, None])
+    pairs = gfnn.Pairs(z, steps.states, 0.05, {"l": length})
+    fit = gfnn.fit(pairs, angles=(0,), tolerance=1e-8)
+    assert fit.chosen.learns == "hamiltonian"
+    assert fit.chosen.validation_bound <= 1e-8
+
+
 def kicked(z, strength):
     """The standard map."""
     p = z[:, 1] + strength * np.sin(z[:, 0])

@@ -46,9 +46,9 @@ def law_of(
         if learn == "hamiltonian":
             raise FitError(f"expected data of an autonomous flow to learn H from: {unfit}")
         return None
-    # S of a driven system needs more harmonics than H, and is no map to wait for.
+    # S of a driven system, or of one with parameters, needs more terms than H: no map to wait for.
     structured = prepared.structure is not None
-    foremost = learn == "hamiltonian" or terms or prepared.period is not None or structured
+    foremost = learn == "hamiltonian" or terms or prepared.args is not None or structured
     options = OPTIONS if foremost else _BESIDE
     if structured:  # nothing else is learned of bodies, and of sites S in a few seconds
         beside = learn == "auto" and prepared.of_terms
