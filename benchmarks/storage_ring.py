@@ -6,8 +6,9 @@
 
 The lattices are those that PyAT ships: `err.mat`, a whole ring with errors, and `hmba.mat`, a cell
 of ESRF-EBS. States are (x, y, p_x, p_y) about the closed orbit, in metres and radians, four
-dimensional: the energy deviation is fixed. Pairs are drawn from an ellipsoid whose half axes are
-amplitudes of 2 mm in x and in y at the point where a turn begins.
+dimensional: the energy deviation δ of a particle does not change; it is 0, or a parameter of the
+map. Pairs are drawn from an ellipsoid whose half axes are amplitudes of 2 mm in x and in y at the
+point where a turn begins.
 """
 
 from __future__ import annotations
@@ -45,6 +46,11 @@ AMPLITUDE = 2e-3  # metres, in x and in y
 NUM_PAIRS, FRESH, BATCH = 5_000, 1_000, 1_000
 TURNS, ORBITS = 300, 20  # compared with the tracking code
 TUNE_TURNS = 1_024
+DEVIATION, DELTA_PAIRS = 0.01, 20_000  # δ is drawn from ± this
+# Tolerances, and after how many quarters of the ring each piece ends.
+ROWS = ((1e-4, (0, 4)), (1e-5, (0, 4)), (3e-7, (0, 4)), (1e-9, (0, 4)), (1e-7, (0, 2, 4)))
+# Metres: x and y of the frequency map, inside the aperture of the cell.
+REGION = (8e-3, 4e-3)
 # (x, p_x, y, p_y) of PyAT as (x, y, p_x, p_y), which is its own inverse.
 ORDER = [0, 2, 1, 3]
 
@@ -58,12 +64,12 @@ class Ring(NamedTuple):
     alpha: np.ndarray
     orbits: dict[int, np.ndarray]
 
-    def track(self, z, points: tuple[int, ...] = (), turns: int = 1) -> np.ndarray:
+    def track(self, z, points: tuple[int, ...] = (), turns: int = 1, delta=0.0) -> np.ndarray:
         """States (turns, points, N, 4) after these elements of each turn; the last one unless
-        told. NaN where a particle is lost."""
+        told. delta: energy deviation, a number or (N,). NaN where a particle is lost."""
         points = points or (len(self.lattice),)
         start = np.zeros((6, len(z)), order="F")
-        start[:4] = (np.asarray(z)[:, ORDER] + self.orbit(0)).T
+        start[:4], start[4] = (np.asarray(z)[:, ORDER] + self.orbit(0)).T, delta
         out, *_ = self.lattice.track(start, nturns=turns, refpts=list(points))
         orbits = np.stack([self.orbit(i) for i in points])
         return (out[:4].transpose(3, 2, 1, 0) - orbits[:, None])[..., ORDER]
@@ -119,14 +125,18 @@ def ellipsoid(half_axes, count: int, seed: int) -> np.ndarray:
 # One turn
 
 
-def learned(sectors: list[np.ndarray]) -> tuple[SymplecticMap, list[gfnn.Fit]]:
+def learned(
+    sectors: list[np.ndarray], tolerance: float = 1e-9
+) -> tuple[SymplecticMap, list[gfnn.Fit]]:
     """The map of the sectors' maps in a row, from states at their ends (K + 1, N, 4)."""
     fits = []
     for before, after in pairwise(sectors):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", gfnn.FitWarning)
             pairs = gfnn.Pairs(before[:NUM_PAIRS], after[:NUM_PAIRS], 1 / (len(sectors) - 1))
-            fits.append(gfnn.fit(pairs, learn="map", tolerance=1e-9, max_seconds=None, seed=SEED))
+            fits.append(
+                gfnn.fit(pairs, learn="map", tolerance=tolerance, max_seconds=None, seed=SEED)
+            )
     map_ = fits[0].map
     for fit in fits[1:]:
         map_ = map_.then(fit.map)
@@ -151,7 +161,7 @@ def polynomial(before, after, degree: int):
 
 
 def turn(quick: bool) -> Numbers:
-    """One turn of the ring with errors, by one, two and four generated pieces."""
+    """One turn of the ring with errors, by one and by two generated pieces."""
     err = ring("err.mat")
     half = err.half_axes(AMPLITUDE, AMPLITUDE)
     count = 600 if quick else NUM_PAIRS + FRESH
@@ -172,9 +182,9 @@ def turn(quick: bool) -> Numbers:
                 "lost": int(np.isnan(far).any(axis=1).sum())}  # fmt: skip
 
     rows: list[Numbers] = []
-    for cuts in ((0, 4),) if quick else ((0, 4), (0, 2, 4), (0, 1, 2, 3, 4)):
+    for tolerance, cuts in ROWS[1:2] if quick else ROWS:
         started = time.perf_counter()
-        map_, fits = learned([ends[i] for i in cuts])
+        map_, fits = learned([ends[i] for i in cuts], tolerance)
         seconds = time.perf_counter() - started
         batch = ellipsoid(half, BATCH, 2)
         step = timed(lambda m=map_, b=batch: m.rollout(b, num_steps=100, save_every=100))
@@ -184,6 +194,7 @@ def turn(quick: bool) -> Numbers:
         )
         rows.append({
             "map": f"{len(fits)} generated", "label": fits[0].chosen.label, **found,
+            "tolerance": tolerance,
             "fit_seconds": seconds, "microseconds_per_turn": step.seconds / 100 / BATCH * 1e6,
             "defect": float(np.max(np.asarray(map_.defect(few)))),
         })  # fmt: skip
@@ -244,8 +255,8 @@ def tunes(quick: bool) -> Numbers:
         return np.array([[tune(signals[:, i, k]) for k in (0, 1)] for i in range(len(start))])
 
     theirs, rows = found(orbits), {}
-    for cuts in ((0, 4),) if quick else ((0, 4), (0, 1, 2, 3, 4)):
-        map_, fits = learned([ends[i] for i in cuts])
+    for cuts in ((0, 4),) if quick else ((0, 4), (0, 2, 4)):
+        map_, fits = learned([ends[i] for i in cuts], 1e-6 if quick else 1e-9)
         states = np.asarray(map_.rollout(start, num_steps=turns)[0]).transpose(1, 0, 2)
         rows[f"{len(fits)} generated"] = found(states)
     return {
@@ -257,6 +268,122 @@ def tunes(quick: bool) -> Numbers:
     }  # fmt: skip
 
 
+# The energy deviation
+
+
+def deviation(quick: bool) -> Numbers:
+    """One turn of the ring with errors, δ a parameter, for two sizes of the region; the tunes
+    against δ."""
+    err = ring("err.mat")
+    count, turns = (300, 5) if quick else (DELTA_PAIRS, TURNS)
+    rng = np.random.default_rng([SEED, 4])
+    rows: list[Numbers] = []
+    map_ = None
+    for amplitude in (AMPLITUDE / 2,) if quick else (AMPLITUDE, AMPLITUDE / 2):
+        half = err.half_axes(amplitude, amplitude)
+        z = ellipsoid(half, count + FRESH, 4)
+        delta = rng.uniform(-DEVIATION, DEVIATION, len(z))
+        image = err.track(z, delta=delta)[0, 0]
+        few, own = ellipsoid(0.9 * half, 3 if quick else ORBITS, 5), delta[:ORBITS]
+        own = own[: len(few)]
+        orbits = err.track(few, turns=turns, delta=own)[-1, 0]
+        started = time.perf_counter()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", gfnn.FitWarning)
+            fit = gfnn.fit(
+                gfnn.Pairs(z[:count], image[:count], 1.0, {"delta": delta[:count]}), learn="map",
+                family="polynomial", tolerance=1e-2 if quick else 3e-6, max_seconds=None,
+                seed=SEED,
+            )  # fmt: skip
+        seconds = time.perf_counter() - started
+        map_, spread, batch = fit.map, z.std(axis=0), slice(0, min(BATCH, count))
+        step = timed(lambda m=map_, b=batch, z=z, d=delta: m.rollout(
+            z[b], num_steps=20, save_every=20, params={"delta": d[b]}
+        ))  # fmt: skip
+        ours, info = map_.step(z[count:], {"delta": delta[count:]})
+        one = (np.asarray(ours) - image[count:]) / spread
+        last, _ = map_.rollout(few, num_steps=turns, save_every=turns, params={"delta": own})
+        far = (np.asarray(last)[:, -1] - orbits) / spread
+        rows.append({
+            "amplitude": amplitude, "label": fit.chosen.label, "terms": fit.chosen.num_parameters,
+            "one_turn": float(np.sqrt(np.mean(one**2))),
+            "one_turn_median": float(np.median(np.sqrt(np.mean(one**2, axis=1)))),
+            "after_turns": float(np.sqrt(np.nanmedian(np.mean(far**2, axis=1)))),
+            "lost": int(np.isnan(far).any(axis=1).sum()),
+            "failed": int(np.sum(np.asarray(info.status) > 1)),
+            "defect": float(np.max(np.asarray(map_.defect(few, {"delta": own})))),
+            "fit_seconds": seconds,
+            "microseconds_per_turn": step.seconds / 20 / len(z[batch]) * 1e6,
+        })  # fmt: skip
+    grid = np.linspace(-DEVIATION, DEVIATION, 3 if quick else 9)
+    start, turns = np.zeros((len(grid), 4)), 64 if quick else 512
+    start[:, :2] = 1e-4
+    tracked = np.concatenate([start[None], err.track(start, turns=turns, delta=grid)[:, 0]])
+    states, _ = map_.rollout(start, num_steps=turns, params={"delta": grid})
+    theirs, ours = (
+        tunes_of(err, a) for a in (tracked, np.asarray(states).transpose(1, 0, 2))
+    )  # fmt: skip
+    return {
+        "rows": rows, "num_pairs": count, "turns": TURNS, "delta": grid.tolist(),
+        "tracked": theirs.tolist(), "learned": ours.tolist(),
+        "largest_tune_difference": float(np.abs(ours - theirs).max()),
+    }  # fmt: skip
+
+
+def tunes_of(machine: Ring, states) -> np.ndarray:
+    """(N, 2) of orbits (turns, N, 4), about their own means: δ moves the closed orbit."""
+    signals = machine.normalised(states - states.mean(axis=0))
+    return np.array([[tune(signals[:, i, k]) for k in (0, 1)] for i in range(states.shape[1])])
+
+
+# A frequency map, and Poincaré sections
+
+
+def frequencies(quick: bool) -> Numbers:
+    """Of one cell: the change of the tunes from the first half of an orbit to the second, over the
+    plane of amplitudes; sections of orbits in the mid-plane. Of map and tracking code."""
+    cell = ring("hmba.mat")
+    half = cell.half_axes(1.2 * REGION[0], 1.2 * REGION[1])
+    z = ellipsoid(half, 800 if quick else NUM_PAIRS, 0)
+    map_, (fit,) = learned([z, cell.track(z)[0, 0]], 1e-3 if quick else 1e-6)
+    side, turns = (3, 64) if quick else (24, 512)
+    x, y = np.meshgrid(*(np.linspace(0.04, 1, side) * size for size in REGION))
+    start = np.zeros((side * side, 4))
+    start[:, 0], start[:, 1] = x.ravel(), y.ravel()
+    orbits = np.linspace(0.1, 0.95, 3 if quick else 8) * REGION[0]
+    start = np.concatenate([start, np.stack([orbits, *3 * [0 * orbits]], axis=1)])
+
+    def diffusion(states) -> np.ndarray:
+        kept = np.flatnonzero(np.isfinite(states).all(axis=(0, 2)))
+        kept = kept[kept < side * side]
+        parts = states[:turns, kept], states[turns : 2 * turns, kept]
+        first, second = (tunes_of(cell, part) for part in parts)
+        found = np.full(side * side, np.nan)
+        found[kept] = np.log10(np.linalg.norm(first - second, axis=1) + 1e-16)
+        return found
+
+    tracked = np.concatenate([start[None], cell.track(start, turns=2 * turns)[:, 0]])
+    states, _ = map_.rollout(start, num_steps=2 * turns)
+    states = np.asarray(states).transpose(1, 0, 2)
+    theirs, ours = diffusion(tracked), diffusion(states)
+    both = np.isfinite(theirs) & np.isfinite(ours)
+    sections = {
+        name: np.round(1e6 * found[: 20 if quick else 300, side * side :][..., [0, 2]], 2)
+        for name, found in (("tracking", tracked), ("map", states))
+    }  # fmt: skip
+    return {
+        "label": fit.chosen.label, "one_turn": fit.chosen.validation_relative, "side": side,
+        "turns": turns, "tracking": _listed(theirs), "map": _listed(ours),
+        "median_difference": float(np.median(np.abs(theirs - ours)[both])),
+        "kept_by_one_only": int(np.sum(np.isfinite(theirs) != np.isfinite(ours))),
+        "sections_micro": {name: found.tolist() for name, found in sections.items()},
+    }  # fmt: skip
+
+
+def _listed(found: np.ndarray) -> list[float | None]:
+    return [None if np.isnan(value) else round(float(value), 3) for value in found]
+
+
 # A million turns
 
 
@@ -265,7 +392,7 @@ def long(quick: bool) -> Numbers:
     err = ring("err.mat")
     half = err.half_axes(AMPLITUDE, AMPLITUDE)
     z = ellipsoid(half, 600 if quick else NUM_PAIRS, 0)
-    map_, _ = learned([z, err.track(z)[0, 0]])
+    map_, _ = learned([z, err.track(z)[0, 0]], 1e-5)
     turns, every, particles = (1_000, 10, 5) if quick else (1_000_000, 97, 50)
     start = ellipsoid(0.6 * half, particles, 3)
     started = time.perf_counter()
@@ -296,7 +423,7 @@ def aperture(quick: bool) -> Numbers:
     cell = ring("hmba.mat")
     half, turns = cell.half_axes(14e-3, 9e-3), 100 if quick else 1_000
     z = ellipsoid(half, 800 if quick else NUM_PAIRS, 0)
-    map_, (fit,) = learned([z, cell.track(z)[0, 0]])
+    map_, (fit,) = learned([z, cell.track(z)[0, 0]], 1e-5)
     angles = np.linspace(0, np.pi, 3 if quick else 9)
     radii = np.arange(4e-3, 14e-3, 1e-3 if quick else 1e-4)
     start = np.zeros((len(angles), len(radii), 4))
@@ -329,7 +456,10 @@ def aperture(quick: bool) -> Numbers:
     }  # fmt: skip
 
 
-PIECES = {"turn": turn, "tunes": tunes, "long": long, "aperture": aperture}
+PIECES = {
+    "turn": turn, "tunes": tunes, "long": long, "aperture": aperture, "deviation": deviation,
+    "frequencies": frequencies,
+}  # fmt: skip
 
 
 def tables() -> None:
@@ -354,11 +484,39 @@ def tables() -> None:
             "lost", "defect", "fit, all in, s", "µs a turn", "times faster than tracking",
         )  # fmt: skip
         text.append(markdown(heads, rows))
+    if "deviation" in found:
+        m = found["deviation"]["measured"]
+        rows = [
+            [
+                f"{1e3 * row['amplitude']:g} mm", row["label"], f"{row['terms']:,}",
+                number(row["one_turn"]), number(row["one_turn_median"]),
+                number(row["after_turns"]), str(row["lost"]), number(row["defect"]),
+                number(row["fit_seconds"]), number(row["microseconds_per_turn"]),
+            ]
+            for row in m["rows"]
+        ]  # fmt: skip
+        heads = (
+            f"`err.mat`, δ in ±1 %, {m['num_pairs']:,} pairs, within", "one piece", "terms",
+            "one turn ÷ spread", "median", f"after {m['turns']} turns", "lost", "defect",
+            "fit, all in, s", "µs a turn",
+        )  # fmt: skip
+        text.append(markdown(heads, rows))
     heads, rows = ("what", "measured", "asked"), []
     if "tunes" in found:
         difference = found["tunes"]["measured"]["largest_difference"]
         told = ", ".join(f"{name} {number(value)}" for name, value in difference.items())
         rows.append(["tunes of 18 orbits up to 1.8 mm, largest difference", told, "1e-6"])
+    if "deviation" in found:
+        difference = found["deviation"]["measured"]["largest_tune_difference"]
+        rows.append(["tunes against δ in ±1 %, largest difference", number(difference), "1e-6"])
+    if "frequencies" in found:
+        m = found["frequencies"]["measured"]
+        rows.append([
+            f"frequency map of `hmba.mat`, {m['side']}² orbits of {2 * m['turns']:,} passages "
+            f"({m['label']}, one turn {number(m['one_turn'])}): median difference of log₁₀ of the "
+            "tunes' change", f"{number(m['median_difference'])} ({m['kept_by_one_only']} orbits "
+            "lost by one of the two only)", "–",
+        ])  # fmt: skip
     if "long" in found:
         m = found["long"]["measured"]
         rows.append([
@@ -380,6 +538,8 @@ def tables() -> None:
         between_markers(TABLES, "ring", "\n\n".join([*text, provenance(found)]))
     if {"tunes", "aperture"} <= set(found):
         figure(found["tunes"]["measured"], found["aperture"]["measured"])
+    if {"deviation", "frequencies"} <= set(found):
+        second_figure(found["deviation"]["measured"], found["frequencies"]["measured"])
 
 
 def figure(tunes_: Numbers, aperture_: Numbers) -> None:
@@ -406,6 +566,35 @@ def figure(tunes_: Numbers, aperture_: Numbers) -> None:
     right.set(xlabel="x [mm]", ylabel="y [mm]", title="dynamic aperture of a cell")
     right.legend(fontsize=8)
     drawn.savefig(FIGURES / "storage-ring.png", dpi=150)
+
+
+def second_figure(deviation_: Numbers, frequencies_: Numbers) -> None:
+    """Frequency maps of map and tracking, sections, and the tunes against δ."""
+    import matplotlib.pyplot as plt
+
+    drawn, axes = plt.subplots(2, 2, figsize=(9, 6.6), layout="constrained")
+    side = frequencies_["side"]
+    x, y = (1e3 * np.linspace(0.04, 1, side) * size for size in REGION)
+    for axis, name in zip(axes[0], ("tracking", "map"), strict=True):
+        values = np.array(frequencies_[name], float).reshape(side, side)
+        shown = axis.pcolormesh(x, y, values, vmin=-10, vmax=-2, cmap="viridis", rasterized=True)
+        axis.set(xlabel="x [mm]", ylabel="y [mm]", title=f"frequency map of a cell, {name}")
+    drawn.colorbar(shown, ax=axes[0], label="log₁₀ of the tunes' change")
+    section, of_delta = axes[1]
+    for name, style in (("tracking", "k,"), ("map", "C1,")):
+        points = 1e-3 * np.array(frequencies_["sections_micro"][name])  # (turns, orbits, 2)
+        section.plot(points[..., 0].ravel(), points[..., 1].ravel(), style)
+        section.plot([], [], style[:-1] + "o", markersize=3, label=name)
+    section.set(xlabel="x [mm]", ylabel="$p_x$ [10⁻³]", title="section of a cell, y = 0")
+    section.legend(fontsize=8, loc="upper right")
+    delta = 100 * np.asarray(deviation_["delta"])
+    for k, colour in enumerate(("C0", "C1")):
+        theirs, ours = (np.asarray(deviation_[name])[:, k] for name in ("tracked", "learned"))
+        of_delta.plot(delta, theirs, colour, label=f"$\\nu_{'xy'[k]}$")
+        of_delta.plot(delta, ours, f"{colour}o", markersize=4)
+    of_delta.set(xlabel="δ [%]", ylabel="tune", title="a ring with errors: tracking, map (dots)")
+    of_delta.legend(fontsize=8)
+    drawn.savefig(FIGURES / "storage-ring-frequencies.png", dpi=150)
 
 
 if __name__ == "__main__":

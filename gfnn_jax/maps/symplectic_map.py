@@ -175,7 +175,7 @@ class SymplecticMap:
         Raises ValueError for any other map, unless dt is its own: it is known at one dt only.
         """
         known = not any(isinstance(value, jax.core.Tracer) for value in (dt, self.dt))
-        if known and np.ndim(dt) == 0 and dt == self.dt:
+        if known and np.ndim(dt) == 0 and np.array_equal(dt, self.dt):  # inside jit too
             return self
         if len(self.pieces) != 1 or not isinstance(self.pieces[0], Flow):
             raise ValueError(
