@@ -200,7 +200,8 @@ def fit(
     """Learn the map of these pairs: the cheapest candidate within the tolerance, else the best.
 
     pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order.
-               Pairs of different dt, or with parameters (args), are learned as H.
+               Pairs of different dt are learned as H; those with parameters (args) as H, or as an S
+               of state and parameters, which family="polynomial" or learn="map" ask for.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
     tolerance: bound on the RMS over coordinates of the one-step error ÷ that coordinate's spread,
                at its upper 95 % bound; a pure number.

@@ -480,7 +480,7 @@ def trial_residual(prepared: Prepared) -> float:
     return residual
 
 
-def _rows(prepared: Prepared, chart: AnyChart, rows):
+def _rows(prepared: Prepared, chart: AnyChart, rows) -> tuple[Any, np.ndarray]:
     """(w, target_gradient) of these rows, with their args where there are some, and the weight that
     makes a row of ∇S unit-free."""
     (y0, y1), args = (prepared.y0[rows], prepared.y1[rows]), prepared.given(rows)[1]

@@ -174,7 +174,7 @@ class SymplecticMap:
         dt: a number, or one of each lane where that many ``lanes`` are to be stepped; above 0.
         Raises ValueError for any other map, unless dt is its own: it is known at one dt only.
         """
-        known = not any(isinstance(value, jax.core.Tracer) for value in (dt, self.dt))
+        known = not any(isinstance(value, Tracer) for value in (dt, self.dt))
         if known and np.ndim(dt) == 0 and np.array_equal(dt, self.dt):  # inside jit too
             return self
         if len(self.pieces) != 1 or not isinstance(self.pieces[0], Flow):
