@@ -1,11 +1,11 @@
 """The paper's theorems as measurements: how the error of a prediction grows.
 
-    python benchmarks/error_growth.py               all pieces without a result yet, then the tables
-    python benchmarks/error_growth.py vfnn --overwrite   one piece again
-    python benchmarks/error_growth.py --quick       small sizes, into runs/error-growth, no tables
+    python benchmarks/error_growth.py                          pieces without a result, then tables
+    python benchmarks/error_growth.py --only vfnn --overwrite  one piece again
+    python benchmarks/error_growth.py --quick                  small sizes, into runs/growth
 
-A piece's result is one JSON file in benchmarks/results; the section of benchmarks/RESULTS.md and
-the figures are made from these files alone.
+A piece's result is one JSON file, growth-*.json in benchmarks/results; the section of
+benchmarks/RESULTS.md and the figures are made from these files alone.
 
 The knob on the one-step error ε is the s of S + s g: S a fitted polynomial, accurate to 1e-10 or
 better, and g a random one of low degree, the same for all s. Each such map is symplectic and wrong
@@ -14,31 +14,27 @@ by as much as s says, as the theorems have it. ε is measured on fresh pairs.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import functools
-import time
 import warnings
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 # Sets float64, so it comes before all of JAX.
 from harness import (
     FIGURES,
-    RESULTS,
     SEED,
     TABLES,
     Numbers,
     angles_of,
     between_markers,
     drawn,
+    main,
     number,
     one_step_rms,
     provenance,
-    read,
-    write,
-)
+    results,
+)  # fmt: skip
 
 # isort: split
 import jax
@@ -246,22 +242,11 @@ NEAR_RESONANCE = {
     "actions then drift for as long as the beat of the two frequencies takes)"
 }
 PIECES: dict[str, Callable[[bool], Numbers]] = {
-    **{f"growth-{name}": growth(name) for name in GROWTH},
-    "growth-actions": actions,
-    "growth-vfnn": vfnn,
-    "growth-generic-bound": generic_bound,
+    **{name: growth(name) for name in GROWTH},
+    "actions": actions,
+    "vfnn": vfnn,
+    "generic-bound": generic_bound,
 }
-
-
-def run(name: str, folder: Path, quick: bool) -> None:
-    """Measure a piece and write its result."""
-    print(name, flush=True)
-    started = time.perf_counter()
-    measured = PIECES[name](quick)
-    seconds = time.perf_counter() - started
-    write(folder / f"{name}.json", {"piece": name, "quick": quick, "measured": measured,
-                                    "seconds": seconds})  # fmt: skip
-    print(f"{name}: {seconds:.0f} s", flush=True)
 
 
 def interval(row: Numbers, key: str = "exponent") -> str:
@@ -320,7 +305,7 @@ def verdicts(m: dict[str, Numbers]) -> list[str]:
 
 def section(found: dict[str, Numbers]) -> str:
     """Markdown of all results."""
-    m = {name.removeprefix("growth-"): r["measured"] for name, r in found.items()}
+    m = {name: r["measured"] for name, r in found.items()}
     lines = ["**Claims of the paper, and what was measured:**", ""]
     lines += [*(f"- {claim}" for claim in verdicts(m)), ""]
     scenes = [m[name] for name in GROWTH if name in m]
@@ -391,7 +376,7 @@ def section(found: dict[str, Numbers]) -> str:
 
 def draw(found: dict[str, Numbers]) -> None:
     """The figures, from the results."""
-    m = {name.removeprefix("growth-"): r["measured"] for name, r in found.items()}
+    m = {name: r["measured"] for name, r in found.items()}
     FIGURES.mkdir(exist_ok=True)
 
     def until_lost(curve: Numbers):
@@ -423,25 +408,12 @@ def draw(found: dict[str, Numbers]) -> None:
         figures.save(ax.figure, FIGURES / "growth_vfnn.png")
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("pieces", nargs="*", choices=[[], *PIECES], metavar="PIECE",
-                        help=", ".join(PIECES))  # fmt: skip
-    parser.add_argument("--quick", action="store_true", help="small sizes; writes no tables")
-    parser.add_argument("--overwrite", action="store_true", help="measure finished pieces again")
-    parser.add_argument("--tables", action="store_true", help="only make tables and figures again")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
-    arguments = parser.parse_args(argv)
-    folder = arguments.out or (Path("runs/error-growth") if arguments.quick else RESULTS)
-    for name in [] if arguments.tables else arguments.pieces or PIECES:
-        if arguments.overwrite or not (folder / f"{name}.json").exists():
-            run(name, folder, arguments.quick)
-    if folder == RESULTS:
-        found = read({name: folder / f"{name}.json" for name in PIECES})
-        if found:
-            draw(found)
-            between_markers(TABLES, "growth", f"{section(found)}\n\n{provenance(found)}")
+def tables() -> None:
+    found = results(PIECES, "growth")
+    if found:
+        draw(found)
+        between_markers(TABLES, "growth", f"{section(found)}\n\n{provenance(found)}")
 
 
 if __name__ == "__main__":
-    main()
+    main(__doc__ or "", PIECES, "growth", tables, None)

@@ -6,30 +6,18 @@
 
 The learned map beside a learned vector field (VFNN: finite differences, a network, an adaptive
 Runge–Kutta method) and beside an integrator that knows H (Yoshida's of order 4, ten substeps to a
-step). The reference is Kepler's exact solution. The result is benchmarks/results/kepler.json.
+step). The reference is Kepler's exact solution. The result is kepler-million-steps.json in
+benchmarks/results.
 """
 
 from __future__ import annotations
 
-import argparse
 import textwrap
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 # Sets float64, so it comes before all of JAX.
-from harness import (
-    FIGURES,
-    README,
-    RESULTS,
-    SEED,
-    Numbers,
-    between_markers,
-    number,
-    read,
-    timed,
-    write,
-)
+from harness import FIGURES, README, SEED, Numbers, between_markers, main, number, results, timed
 
 # isort: split
 import jax
@@ -154,18 +142,13 @@ def draw(result: Numbers) -> None:
     between_markers(README, "kepler", textwrap.fill(caption, 100, break_long_words=False))
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="small sizes; no figure")
-    parser.add_argument("--tables", action="store_true", help="only the figure and its caption")
-    arguments = parser.parse_args(argv)
-    folder = Path("runs/kepler") if arguments.quick else RESULTS
-    path = folder / "kepler.json"
-    if not arguments.tables:
-        write(path, {"quick": arguments.quick, "measured": measure(arguments.quick)})
-    if not arguments.quick:
-        draw(read({"kepler": path})["kepler"])
+def tables() -> None:
+    for result in results(PIECES, "kepler").values():
+        draw(result)
+
+
+PIECES = {"million-steps": measure}
 
 
 if __name__ == "__main__":
-    main()
+    main(__doc__ or "", PIECES, "kepler", tables, None)

@@ -1,30 +1,27 @@
 """How accurate the chosen maps are, and what they cost: every target of the project, measured.
 
-    python benchmarks/targets.py                     all rows that have no result yet, then tables
-    python benchmarks/targets.py pcr3bp --overwrite  one row again
-    python benchmarks/targets.py --quick             small sizes, into runs/targets, no tables
+    python benchmarks/targets.py                            rows without a result, then the tables
+    python benchmarks/targets.py --only pcr3bp --overwrite  one row again
+    python benchmarks/targets.py --quick                    small sizes, into runs/targets
 
-A row's result is one JSON file in benchmarks/results. The tables of benchmarks/RESULTS.md and of
-README.md, and the README's figure, are made from these files alone; --tables makes them again.
+A row's result is one JSON file, targets-*.json in benchmarks/results. The tables of
+benchmarks/RESULTS.md and of README.md, and the README's figure, are made from these files alone;
+--tables makes them again.
 All errors are those of states that no fit has seen.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import textwrap
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 # Sets float64, so it comes before all of JAX.
 from harness import (
     FIGURES,
     README,
-    RESULTS,
     SEED,
     TABLES,
     Numbers,
@@ -32,13 +29,13 @@ from harness import (
     between_markers,
     drawn,
     fitted,
+    main,
     markdown,
     number,
     one_step_rms,
     provenance,
-    read,
-    write,
-)
+    results,
+)  # fmt: skip
 
 # isort: split
 import jax
@@ -260,31 +257,9 @@ ROWS: dict[str, Row] = {
 # Results and tables
 
 
-def run(name: str, folder: Path, quick: bool) -> None:
-    """Measure a row and write its result."""
-    row = ROWS[name]
-    print(f"{name}: {row.title}")
-    started = time.perf_counter()
-    measured = row.measure(quick)
-    seconds = time.perf_counter() - started
-    met = {key: bool(measured[key] <= most) for key, most in row.targets.items()}
-    write(folder / f"{name}.json", {
-        "row": name, "title": row.title, "quick": quick, "targets": row.targets, "met": met,
-        "measured": measured, "seconds": seconds,
-    })  # fmt: skip
-    said = "met" if all(met.values()) else f"NOT met: {met}"
-    print(f"{name}: {said}, {seconds:.0f} s", flush=True)
-    jax.clear_caches()  # a process may map only so many compiled programs
-
-
-def results(folder: Path) -> dict[str, Numbers]:
-    """Results so far, in the order of the rows."""
-    return read({name: folder / f"{name}.json" for name in ROWS})
-
-
-def against(result: Numbers, key: str) -> str:
+def against(measured: Numbers, row: Row, key: str) -> str:
     """Measured (at most target)."""
-    value, target = result["measured"].get(key), result["targets"].get(key)
+    value, target = measured.get(key), row.targets.get(key)
     if value is None:
         return "–"
     shown = number(value)
@@ -293,9 +268,9 @@ def against(result: Numbers, key: str) -> str:
     return f"{shown} (≤ {target:.0e})" if target < 0.01 else f"{shown} (≤ {target:,g})"
 
 
-def verdict(result: Numbers) -> str:
-    missed = [key.replace("_", " ") for key, met in result["met"].items() if not met]
-    if not result["met"]:
+def verdict(measured: Numbers, row: Row) -> str:
+    missed = [key.replace("_", " ") for key, most in row.targets.items() if measured[key] > most]
+    if not row.targets:
         return "–"
     return "no: " + ", ".join(missed) if missed else "yes"
 
@@ -306,29 +281,29 @@ def table(found: dict[str, Numbers], *, full: bool) -> str:
     heads += ["parameters", "µs/step", "defect", "compile, s", "all of it, s"] if full else []
     heads += ["targets met"]
     rows = []
-    for result in found.values():
-        m = result["measured"]
-        at_end = "error_median" if "error_median" in result["targets"] else "error_mean"
-        error = against(result, at_end)
+    for name, result in found.items():
+        m, row = result["measured"], ROWS[name]
+        at_end = "error_median" if "error_median" in row.targets else "error_mean"
+        error = against(m, row, at_end)
         if at_end == "error_median":
             inside = f"{number(m['error_median_inside'])} of those that stayed where the data are"
             error = f"{error} median; {inside}" if full else f"{error} median"
         cells = [
-            result["title"], number(m["pairs"]), against(result, "one_step_rms"), error,
-            against(result, "fit_seconds"),
+            row.title, number(m["pairs"]), against(m, row, "one_step_rms"), error,
+            against(m, row, "fit_seconds"),
             f"{m['chart']} {m['label']}".strip() + (", base map" if m.get("base_map") else ""),
         ]  # fmt: skip
         if full:
             keys = ("num_parameters", "microseconds_per_step", "symplecticity_defect",
                     "compile_seconds", "total_seconds")  # fmt: skip
             cells += [number(m.get(key)) for key in keys]
-        rows.append([*cells, verdict(result)])
+        rows.append([*cells, verdict(m, row)])
     return markdown(heads, rows)
 
 
 def tables() -> None:
     """The tables of README.md and RESULTS.md and the README's figure, from the results."""
-    found = results(RESULTS)
+    found = results(PIECES, "targets")
     if not found:
         return
     between_markers(TABLES, "targets", f"{table(found, full=True)}\n\n{provenance(found)}")
@@ -361,21 +336,8 @@ def figure(found: dict[str, Numbers]) -> str:
     return "; ".join(sizes)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("rows", nargs="*", choices=[[], *ROWS], metavar="ROW", help=", ".join(ROWS))
-    parser.add_argument("--quick", action="store_true", help="small sizes; writes no tables")
-    parser.add_argument("--overwrite", action="store_true", help="measure finished rows again")
-    parser.add_argument("--tables", action="store_true", help="only make the tables again")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
-    arguments = parser.parse_args(argv)
-    folder = arguments.out or (Path("runs") / "targets" if arguments.quick else RESULTS)
-    for name in [] if arguments.tables else arguments.rows or ROWS:
-        if arguments.overwrite or not (folder / f"{name}.json").exists():
-            run(name, folder, arguments.quick)
-    if folder == RESULTS:
-        tables()
+PIECES = {name: row.measure for name, row in ROWS.items()}
 
 
 if __name__ == "__main__":
-    main()
+    main(__doc__ or "", PIECES, "targets", tables, None)

@@ -374,6 +374,8 @@ def _fit(arguments: argparse.Namespace) -> None:
             progress=shown,
         )  # fmt: skip
     _summarise(ran, arguments.out)
+    print(f"next: gfnn predict {arguments.out} --initial {arguments.data} --num-steps 1000 "
+          "--out prediction.npz")  # fmt: skip
     _hold_to(arguments.strict, arguments.out)
 
 
@@ -471,7 +473,19 @@ def _summarise(ran: Any, out: Path) -> None:
             print(f"growth exponent {rollout['growth_exponent']:.2f}")
         counts = rollout["status_counts"].items()
         print("rollouts: " + ", ".join(f"{n} {name}" for name, n in counts if n))
+    print(_holds(ran.fit))
     print(f"written to {out}")
+
+
+def _holds(fit: Any) -> str:
+    """Where the map may be trusted, in one sentence."""
+    parts = ["valid where the data are; a prediction names the trajectories that leave them"]
+    outside = fit.chosen.outside
+    if outside is not None and math.isfinite(outside):
+        parts.append(f"error at the outermost twentieth {outside:.1e} of the spread")
+    if fit.chosen.learns == "hamiltonian":
+        parts.append("any time step: gfnn predict --dt")
+    return "; ".join(parts)
 
 
 def _print_table(table: Any) -> None:

@@ -155,7 +155,7 @@ BAD_USAGE = [
     (("run", "two-body", "--quik"), "unrecognized arguments: --quik"),
     (("run", "two-body", "--out", "{file}"), "is a file, expected a folder"),
     (("run", "two-body", "--out", "{file}/x"), "is not a folder"),
-    (("run", "two-body", "--out", "{folder}"), "exists already (--overwrite replaces it)"),
+    (("run", "two-body", "--out", "{folder}"), "exists already (--overwrite, in Python"),
     (("run", "two-body", "--out", "{folder}", "--overwrite"), "not overwritten"),
     (("fit", "{data}"), "required: --out"),
     (("fit", "{tmp}/none.npz", "--out", "{new}"), "no such file"),

@@ -41,6 +41,7 @@ def check_request(
     base=None,
     structure=None,
     seed=0,
+    max_seconds: float | None = None,
 ) -> None:
     """Raises FitError where the request or the pairs cannot give a map."""
     for name, value, known in (
@@ -50,6 +51,11 @@ def check_request(
             raise FitError(f"expected a {name} among {', '.join(known)}; got '{value}'")
     if not isinstance(pairs, Pairs):
         raise FitError(f"expected gfnn.Pairs(z0, z1, dt), got {type(pairs).__name__}")
+    if scene is not None and not isinstance(scene, Scene):
+        raise FitError(f"expected a scene, as gfnn.scenes.make('two-body'), got {scene!r}")
+    budget = isinstance(max_seconds, numbers.Real) and max_seconds > 0
+    if max_seconds is not None and not budget:
+        raise FitError(f"expected max_seconds above 0, or None for no limit; got {max_seconds!r}")
     if not (isinstance(seed, numbers.Integral) and 0 <= seed < 2**32):
         raise FitError(f"expected a whole number from 0 to 2**32 - 1 as seed, got {seed!r}")
     own_dt = bool(np.ndim(pairs.dt))
@@ -127,9 +133,10 @@ def check_request(
 def check_number(pairs: Pairs) -> None:
     """Raises FitError where there are fewer pairs than a local Jacobian needs."""
     if len(pairs) < 8 * pairs.dim:
+        turned = 8 * len(pairs) < 2 * pairs.dim
         raise FitError(
             f"expected at least {8 * pairs.dim} different pairs for d = {pairs.dim}, "
-            f"got {len(pairs)}"
+            f"got {len(pairs)}" + turned * ": a row is a state; are the arrays transposed?"
         )
 
 

@@ -76,14 +76,14 @@ def checked(
 
     Raises FitError, in one line, where it or the pairs cannot give a map.
     """
-    if structure is None and scene is not None and (family, base) == ("auto", None):
+    if structure is None and isinstance(scene, Scene) and (family, base) == ("auto", None):
         structure = lent(scene, learn, chart)
     bound = Tolerance(tolerance)
     if absolute_tolerance is not None:
         bound = Tolerance(absolute_tolerance, relative=False)
     check_request(
         pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, angles=angles,
-        terms=terms, base=base, structure=structure, seed=seed,
+        terms=terms, base=base, structure=structure, seed=seed, max_seconds=clock.max_seconds,
     )  # fmt: skip
     coordinates = scene.coordinates if scene else Coordinates("cartesian", angles=tuple(angles))
     found = structure_of(structure, pairs.dim, coordinates)

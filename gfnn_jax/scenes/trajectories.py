@@ -7,6 +7,7 @@ NumPy arrays: each function here compiles one program per scene and shape, and n
 from __future__ import annotations
 
 import dataclasses
+import numbers
 from collections.abc import Callable
 from functools import lru_cache, partial
 
@@ -271,7 +272,17 @@ def _reduce_angles(coordinates, z):
     return to_user(coordinates, y)
 
 
+def _check_drawn(scene, num, key) -> None:
+    if not isinstance(scene, Scene):
+        raise ValueError(f"expected a scene, as gfnn.scenes.make('two-body'), got {scene!r}")
+    if not isinstance(num, numbers.Integral) or num < 1:
+        raise ValueError(f"expected a whole number of states from 1 on, got {num!r}")
+    if not isinstance(key, (jax.Array, np.ndarray)):
+        raise ValueError(f"expected a key, as jax.random.key(0), got {key!r}")
+
+
 def _draw(scene, law, num, key):
+    _check_drawn(scene, num, key)
     require_x64("drawing states")
     if isinstance(law, DrawnFrom):
         return np.asarray(_drawn(key, draw=law.draw, num=num), np.float64)
@@ -330,6 +341,7 @@ def sample_pairs(
     dt_range: the shortest and the longest time between the states of a pair, which is then drawn
     uniformly for each: irregular sampling. Raises ValueError where the scene has no flow.
     """
+    _check_drawn(scene, num_pairs, key)
     params = sample_params(scene, num_pairs, key)
     args = None if params is None else dict(zip(scene.parameters, params.T, strict=True))
     t0 = sample_t0(scene, num_pairs, key)

@@ -1,0 +1,121 @@
+"""Ten lines on top of RESULTS.md, and five of them in README.md: claim, figure, command.
+
+    python benchmarks/summary.py
+
+Measures nothing: every figure is read from the JSON files in benchmarks/results.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+from harness import README, RESULTS, TABLES, Numbers, between_markers, markdown, number
+
+
+def measured(name: str) -> Numbers:
+    """What results/``name``.json holds."""
+    return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))["measured"]
+
+
+def accuracy() -> str:
+    ours, paper = measured("targets-two-body"), measured("targets-paper-recipe")
+    return (
+        f"{number(ours['one_step_rms'])}; the paper's network and training, from "
+        f"{paper['pairs']:,} pairs, {number(paper['one_step_rms'])}"
+    )
+
+
+def million_steps() -> str:
+    methods = measured("kepler-million-steps")["methods"]
+    ours, known = methods["learned map"], methods["integrator, H known"]
+    return (
+        f"position off by {number(ours['error_end'])}, semi-major axis by "
+        f"{number(ours['axis_end'])}; an integrator of order 4 that is told H: "
+        f"{number(known['error_end'])}"
+    )
+
+
+def law() -> str:
+    m = measured("laws-henon-heiles-regular")
+    return (
+        f"{m['num_terms']} terms, coefficients to {number(m['coefficient_error'])}; step 1,000 to "
+        f"{number(m['error_median'])}"
+    )
+
+
+def long_step() -> str:
+    m = measured("laws-henon-heiles-dt-3")
+    return f"the same {m['num_terms']} terms; one-step error {number(m['one_step_rms'])}"
+
+
+def parameter() -> str:
+    m = measured("args-pendulum-length")
+    return f"H = {m['formula']}; step 1,000 at new lengths to {number(m['error_median'])}"
+
+
+def ring() -> str:
+    m = measured("many-fput-1000")
+    return (
+        f"{m['terms']} terms in {number(m['fit_seconds'])} s; step 1,000 to "
+        f"{number(m['error_median'])}"
+    )
+
+
+def storage_ring() -> str:
+    m, long = measured("ring-turn"), measured("ring-long")
+    row = m["rows"][0]
+    faster = m["tracking_microseconds_per_turn"] / row["microseconds_per_turn"]
+    return (
+        f"{number(row['microseconds_per_turn'])} µs, {number(faster)} times faster than tracking "
+        f"its {m['num_elements']:,} elements; {long['turns']:,} turns, drift exponent of the "
+        f"action {number(long['drift_exponent'])}"
+    )
+
+
+def bands() -> str:
+    rows = measured("bands-henon-heiles")["rows"]
+    covers = [c for row in rows for c in row["coverage"]]
+    held = sum(0.9 <= c <= 1 for c in covers)
+    return f"{held} of {len(covers)} (noise, pairs, horizon) cover 90 % of the errors or more"
+
+
+def first_answer() -> str:
+    m = measured("speed-start")
+    return (
+        f"first fit {number(m['first_fit'])} s, first 1,000 steps of 25 orbits "
+        f"{number(m['first_rollout'])} s, compilation included"
+    )
+
+
+def truthful() -> str:
+    cases = measured("as-a-user").values()
+    true, in_time = (sum(c[key] for c in cases) for key in ("truthful", "in_time"))
+    return f"{true} of {len(cases)} verdicts are true, {in_time} in their time"
+
+
+# claim, its figure, the study that measures it; True: in the README too.
+LINES: list[tuple[str, Callable[[], str], str, bool]] = [
+    ("Two bodies, one step, from 4,000 pairs", accuracy, "targets", True),
+    ("A million steps of two bodies", million_steps, "kepler", False),
+    ("A law from 100 raw pairs: Hénon–Heiles", law, "laws", True),
+    ("The same at a step of half a period, 400 pairs", long_step, "laws", False),
+    ("A pendulum's length as a parameter, told nothing", parameter, "args", False),
+    ("A ring of 1,000 springs from 40 pairs, told that it is a ring", ring, "many", True),
+    ("One turn of a storage ring", storage_ring, "storage_ring", True),
+    ("Bands of two standard deviations, Hénon–Heiles with noise", bands, "bands", True),
+    ("The first answer, nothing compiled before", first_answer, "speed", False),
+    ("What a new user is told of data of all kinds", truthful, "as_a_user", False),
+]
+
+
+def main() -> None:
+    rows = [([claim, figure(), f"`python -m benchmarks {study}`"], shown)
+            for claim, figure, study, shown in LINES]  # fmt: skip
+    heads = ["claim", "measured", "command"]
+    between_markers(TABLES, "summary", markdown(heads, [cells for cells, _ in rows]))
+    between_markers(README, "five", markdown(heads, [cells for cells, shown in rows if shown]))
+
+
+if __name__ == "__main__":
+    main()

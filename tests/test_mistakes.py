@@ -1,0 +1,140 @@
+"""Fifty mistakes that users of the Python API make: each is refused before any work, in one line
+that says what was expected. Those of the command line are in tests/test_cli.py, those of files in
+tests/test_files.py; what only a fit can see (degrees, friction), benchmarks/as_a_user.py has."""
+
+import re
+
+import jax
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax.errors import FitError, InputError
+
+DT = 0.1
+RNG = np.random.default_rng(0)
+Z0 = RNG.uniform(-1, 1, (200, 2))
+TURN = np.array([[np.cos(DT), np.sin(DT)], [-np.sin(DT), np.cos(DT)]])
+Z1 = Z0 @ TURN.T
+PAIRS = gfnn.Pairs(Z0, Z1, DT)
+SCENE = gfnn.scenes.make("two-body")
+KEY = jax.random.key(0)
+LENGTH = RNG.uniform(0.5, 2, 200)
+
+
+def fit(*arrays, **options):
+    """A fit to other arrays than those that are right."""
+    given = dict(zip(("z0", "z1", "dt", "args"), arrays, strict=False))
+    return gfnn.fit(gfnn.Pairs(**{"z0": Z0, "z1": Z1, "dt": DT, **given}), **options)
+
+
+MISTAKES = {
+    # The pairs.
+    "a list of lists": (lambda: fit(Z0.tolist()), "arrays z0 and z1 of shape (N, 2d), got a list"),
+    "one state more": (lambda: fit(Z0[:-1]), "one shape (N, 2d), got (199, 2) and (200, 2)"),
+    "a single state": (lambda: fit(Z0[0], Z1[0]), "one shape (N, 2d), got (2,)"),
+    "q without p": (lambda: fit(Z0[:, :1], Z1[:, :1]), "one shape (N, 2d), got (200, 1)"),
+    "q, p and a third": (lambda: fit(np.ones((9, 3)), np.ones((9, 3))), "(N, 2d), got (9, 3)"),
+    "sequences as pairs": (lambda: fit(Z0.reshape(10, 20, 2), Z1), "(N, 2d), got (10, 20, 2)"),
+    "transposed": (lambda: fit(Z0.T, Z1.T), "a row is a state; are the arrays transposed?"),
+    "the same state all over": (lambda: fit(0 * Z0, 0 * Z1), "at least 8 different pairs"),
+    "seven pairs": (lambda: fit(Z0[:7], Z1[:7]), "at least 8 different pairs for d = 1, got 7"),
+    "complex numbers": (lambda: fit(Z0 + 0j), "z0 of real numbers, got complex128"),
+    "numbers as text": (lambda: fit(Z0, Z1.astype(str)), "z1 of real numbers, got <U"),
+    "objects": (lambda: fit(Z0.astype(object)), "z0 of real numbers, got object"),
+    "a state that is not finite": (
+        lambda: fit(np.where(np.arange(200)[:, None] == 5, np.nan, Z0)), "the first is row 5"),
+    "the array instead of pairs": (lambda: gfnn.fit(Z0), "gfnn.Pairs(z0, z1, dt), got ndarray"),
+    "a tuple instead of pairs": (lambda: gfnn.fit((Z0, Z1, DT)), "(z0, z1, dt), got tuple"),
+    "the file instead of pairs": (lambda: gfnn.fit("data.npz"), "gfnn.Pairs(z0, z1, dt), got str"),
+    # The time step, parameters, the drive.
+    "dt as text": (lambda: fit(Z0, Z1, "0.1"), "expected a number as time step, got '0.1'"),
+    "no dt": (lambda: fit(Z0, Z1, None), "expected a number as time step, got None"),
+    "dt = 0": (lambda: fit(Z0, Z1, 0.0), "finite and above 0, got 0"),
+    "dt < 0": (lambda: fit(Z0, Z1, -DT), "finite and above 0, got -0.1"),
+    "times instead of dt": (lambda: fit(Z0, Z1, np.arange(3.0)), "(200,), got (3,)"),
+    "a parameter of few": (lambda: fit(Z0, Z1, DT, {"l": np.ones(3)}), "args['l'] of shape (200,)"),
+    "parameters without names or shape": (lambda: fit(Z0, Z1, DT, [1, 2]), "name -> (200,)"),
+    "a parameter called q1": (lambda: fit(Z0, Z1, DT, {"q1": LENGTH}), "has no meaning yet"),
+    "a drive without its period": (
+        lambda: gfnn.fit(gfnn.Pairs(Z0, Z1, DT, t0=LENGTH)), "together with its period"),
+    "a drive of period < 0": (
+        lambda: gfnn.fit(gfnn.Pairs(Z0, Z1, DT, t0=LENGTH, period=-1.0)), "drive's period, got -1"),
+    # What is asked for.
+    "tolerance as text": (lambda: fit(tolerance="1e-6"), "a number as tolerance, got '1e-6'"),
+    "tolerance = 0": (lambda: fit(tolerance=0), "expected a tolerance > 0, got 0"),
+    "a budget of nothing": (lambda: fit(max_seconds=0), "above 0, or None for no limit"),
+    "a budget as text": (lambda: fit(max_seconds="1 min"), "max_seconds above 0"),
+    "a chart with a capital": (lambda: fit(chart="Midpoint"), "type3, midpoint; got 'Midpoint'"),
+    "an unknown family": (lambda: fit(family="nn"), "sines, mlp; got 'nn'"),
+    "an unknown thing to learn": (lambda: fit(learn="H"), "auto, map, hamiltonian; got 'H'"),
+    "the scene's name": (lambda: fit(scene="two-body"), "as gfnn.scenes.make('two-body'), got"),
+    "another scene's data": (lambda: fit(scene=SCENE), "has dim 2, the pairs have 1"),
+    "an angle that is no index": (lambda: fit(angles=("q1",)), "angles as a tuple of indices"),
+    "an angle beyond the last": (lambda: fit(angles=(2,)), "different angles among 0..1, got (2,)"),
+    "one term without a list": (lambda: fit(terms="p1**2"), "a sequence of terms, got the text"),
+    "a power as ^": (lambda: fit(terms=["p1^2"]), "a power is written **"),
+    "an unknown name in a term": (lambda: fit(terms=["x1**2"]), "the name 'x1': expected numbers"),
+    "code in a term": (lambda: fit(terms=['__import__("os")']), "a call of '__import__'"),
+    "terms for a map": (lambda: fit(terms=["p1**2"], learn="map"), "terms are those of H"),
+    "three bodies of one coordinate": (lambda: fit(structure="bodies:3"), "3, 6 or 9 degrees"),
+    "a seed as text": (lambda: fit(seed="a"), "from 0 to 2**32 - 1 as seed, got 'a'"),
+    # Drawing from scenes, loading.
+    "a scene by a wrong name": (
+        lambda: gfnn.scenes.make("twobody"), "unknown scene 'twobody', did you mean 'two-body'?"),
+    "a name to draw from": (
+        lambda: gfnn.sample_pairs("two-body", 10, KEY), "as gfnn.scenes.make('two-body'), got"),
+    "no pairs": (lambda: gfnn.sample_pairs(SCENE, 0, KEY), "number of states from 1 on, got 0"),
+    "a number as key": (lambda: gfnn.sample_pairs(SCENE, 10, 0), "as jax.random.key(0), got 0"),
+    "a folder that is not there": (lambda: gfnn.load("nowhere"), "nowhere: no such folder"),
+    "a file instead of the folder": (lambda: gfnn.load(__file__), "no such folder"),
+}  # fmt: skip
+
+
+def test_there_are_fifty():
+    assert len(MISTAKES) == 50
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_named(mistake, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    make, message = MISTAKES[mistake]
+    with pytest.raises((FitError, InputError, ValueError), match=re.escape(message)) as refused:
+        make()
+    assert "\n" not in str(refused.value)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def learned():
+    return gfnn.fit(PAIRS, tolerance=1e-8).map
+
+
+WITH_A_MAP = {
+    "states of another d": (lambda m: m.rollout(np.ones((3, 4)), 9), "(2,) or (B, 2), got (3, 4)"),
+    "transposed states": (lambda m: m.rollout(Z0[:5].T, 9), "(2,) or (B, 2), got (2, 5)"),
+    "steps that are no whole number": (
+        lambda m: m.rollout(Z0[:3], 1e3), "whole number as num_steps"),
+    "steps back": (lambda m: m.rollout(Z0[:3], -5), "num_steps >= 0"),
+    "nothing saved": (lambda m: m.rollout(Z0[:3], 9, save_every=0), "save_every >= 1"),
+    "another dt": (lambda m: m.rollout(Z0[:3], 9, dt=0.2), "fit with learn='hamiltonian'"),
+    "parameters that it has not": (
+        lambda m: m.rollout(Z0[:3], 9, params={"l": 1.0}), "learned without"),
+    "the time of no drive": (lambda m: m.rollout(Z0[:3], 9, t0=np.zeros(3)), "without a drive"),
+    "no samples": (lambda m: m.sample(KEY, 0), "a number of samples above 0"),
+    "more devices than there are": (lambda m: m.sharded(99), "devices, which there are; got 99"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", WITH_A_MAP)
+def test_a_mistake_with_a_map_is_named(mistake, learned):
+    make, message = WITH_A_MAP[mistake]
+    with pytest.raises(ValueError, match=re.escape(message)) as refused:
+        make(learned)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_map_is_not_overwritten_unasked(learned, tmp_path):
+    learned.save(tmp_path / "model")
+    with pytest.raises(InputError, match=r"exists already .* overwrite=True"):
+        learned.save(tmp_path / "model")
