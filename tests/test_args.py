@@ -242,6 +242,60 @@ def test_a_saved_map_knows_its_parameters(learned, tmp_path):
     )
 
 
+# A series in the state and a parameter.
+
+
+def turned(z, delta):
+    """A kick and a rotation that both depend on δ: the fixed point moves with it too."""
+    (q, p), angle = z.T, 2.2 * (1 + delta)
+    p = p - (1 - delta) * 0.3 * q**2 + 0.1 * delta
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * q + s * p, c * p - s * q], axis=1)
+
+
+@pytest.fixture(scope="module")
+def series():
+    rng = np.random.default_rng(5)
+    z, delta = rng.uniform(-0.5, 0.5, (900, 2)), rng.uniform(-0.1, 0.1, 900)
+    pairs = gfnn.Pairs(z, turned(z, delta), 1.0, {"delta": delta})
+    return gfnn.fit(pairs, family="polynomial", tolerance=1e-7)
+
+
+def test_a_series_in_state_and_parameter_steps_other_ones(series):
+    assert series.met
+    assert series.base_map  # an angle of 2.2
+    rng = np.random.default_rng(6)
+    z, delta = rng.uniform(-0.45, 0.45, (200, 2)), rng.uniform(-0.1, 0.1, 200)
+    image, info = series.map.step(z, {"delta": delta})
+    assert np.sqrt(np.mean((image - turned(z, delta)) ** 2)) < 1e-7
+    assert np.max(info.iterations) <= 2  # the predictor knows δ
+    assert series.symplecticity_defect < 1e-14
+    back, _ = series.map.inverse(image, {"delta": delta})
+    np.testing.assert_allclose(back, z, rtol=0, atol=1e-13)
+    outside = series.map.rollout(z[:2], 1, params={"delta": np.array([0.0, 0.2])})[1]
+    np.testing.assert_array_equal(outside.status, [0, 1])
+
+
+def test_a_series_is_differentiated_in_its_parameter(series):
+    z, h = np.array([0.2, -0.1]), 1e-5
+
+    def step(delta):
+        return series.map.step(z, {"delta": delta})[0]
+
+    exact = (turned(z[None], 0.03 + h) - turned(z[None], 0.03 - h))[0] / (2 * h)
+    np.testing.assert_allclose(jax.jacfwd(step)(0.03), exact, rtol=0, atol=1e-5)
+
+
+def test_a_series_with_a_parameter_is_saved_and_put_in_a_row(series, tmp_path):
+    z, delta = np.array([[0.2, -0.1], [0.1, 0.3]]), {"delta": np.array([0.05, -0.02])}
+    series.map.save(tmp_path / "model")
+    again = gfnn.load(tmp_path / "model")
+    image = series.map.step(z, delta)[0]
+    np.testing.assert_array_equal(again.step(z, delta)[0], image)
+    twice = again.then(again).step(z, delta)[0]
+    np.testing.assert_allclose(twice, series.map.step(image, delta)[0], rtol=0, atol=1e-14)
+
+
 # What is refused.
 
 

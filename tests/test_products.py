@@ -1,7 +1,9 @@
 """Chebyshev × Fourier products: the formula, parity, counts of terms, inputs."""
 
 import math
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -179,3 +181,35 @@ def test_terms_are_counted_without_making_them(case, even):
         family = family_of(case, degree, even)
         counted = number_of_terms(family.inputs.is_angle, degree, family.signs)
         assert counted == family.num_parameters
+
+
+# Args beside the state.
+
+
+@pytest.mark.parametrize(("width", "num_args"), [(4, 1), (2, 1), (2, 3)])
+def test_products_of_state_and_args_have_the_gradients_of_jax(width, num_args):
+    """Also where one half of the variables is args alone."""
+    rng = np.random.default_rng(3)
+    w, args = rng.uniform(-2, 1, (6, width)), rng.uniform(0.1, 0.4, (6, num_args))
+    family = Products(box_inputs(w, args=args), 3)
+    assert family.num_parameters == family.terms_of(3)
+    assert family.terms_of(3) == math.comb(3 + width + num_args, 3) - math.comb(3 + num_args, 3)
+    c = rng.standard_normal(family.num_parameters)
+    params = family.unflatten(c)
+    gradient, hessian = family.gradient_and_hessian(params, w, args)
+    value = partial(family, params)
+    slopes, bends = (
+        jax.jit(jax.vmap(derivative(value)))(w, args) for derivative in (jax.grad, jax.hessian)
+    )
+    np.testing.assert_allclose(gradient, slopes, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(hessian, bends, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(family.gradient(params, w, args), gradient, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(family.term_gradients(w, args) @ c, gradient, rtol=0, atol=1e-11)
+
+
+def test_every_product_of_state_and_args_moves_the_state():
+    rng = np.random.default_rng(4)
+    w, args = rng.uniform(-1, 1, (200, 2)), rng.uniform(-1, 1, (200, 1))
+    family = Products(box_inputs(w, args=args), 5)
+    columns = family.term_gradients(w, args).reshape(-1, family.num_parameters)
+    assert np.linalg.matrix_rank(columns) == family.num_parameters

@@ -20,7 +20,7 @@ _CHUNK = 4_096  # states for which features are compiled, whatever the number of
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=("centre", "scale"),
+    data_fields=("centre", "scale", "args_centre", "args_scale"),
     meta_fields=("keep", "angles", "width", "features"),
 )
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,8 +35,10 @@ class Inputs:
     centre, scale: (k,) of the variables, so that the data fill [-1, 1]; any scaling inside S leaves
               the map symplectic. They are leaves of the pytree that a family is: what is compiled
               for one set of data serves the next.
+    args_centre, args_scale: (a,) of the args, where the family depends on them: they are variables
+              too, behind those of w, which nothing is differentiated in.
 
-    Every method takes w of shape (..., 2d), NumPy or JAX.
+    Every method takes w of shape (..., 2d), NumPy or JAX, and args (..., a) or (a,).
     """
 
     keep: tuple[int, ...]
@@ -45,10 +47,16 @@ class Inputs:
     centre: Any
     scale: Any
     features: Callable | None = None
+    args_centre: Any = None
+    args_scale: Any = None
+
+    @property
+    def num_args(self) -> int:
+        return 0 if self.args_centre is None else self.args_centre.shape[0]
 
     @property
     def num_variables(self) -> int:
-        return self.centre.shape[0]
+        return self.centre.shape[0] + self.num_args
 
     @property
     def is_angle(self) -> tuple[bool, ...]:
@@ -61,20 +69,20 @@ class Inputs:
             return self.feature_tables(w, 0)[0]
         return w if len(self.keep) == w.shape[-1] else w[..., np.array(self.keep, dtype=int)]
 
-    def __call__(self, w):
-        """The scaled variables (..., k)."""
-        return self._scaled(self.raw(w), w)
+    def __call__(self, w, args=None):
+        """The scaled variables (..., k + a)."""
+        return self._scaled(self.raw(w), w, args)
 
-    def tables(self, w, order: int):
-        """The scaled variables (..., k), and for features their slopes (..., k, 2d) and, with
+    def tables(self, w, order: int, args=None):
+        """The scaled variables (..., k + a), and for features their slopes (..., k, 2d) and, with
         ``order`` 2, curvatures (..., k, 2d, 2d), else None for both."""
         if self.features is None:
-            return self(w), None, None
+            return self(w, args), None, None
         raw, *derivatives = self.feature_tables(w, order)
         unit = as_row(namespace(w).asarray(self.scale, dtype=w.dtype), raw)
         slope = derivatives[0] / unit[..., None] if order > 0 else None
         curvature = derivatives[1] / unit[..., None, None] if order > 1 else None
-        return self._scaled(raw, w), slope, curvature
+        return self._scaled(raw, w, args), slope, curvature
 
     def feature_tables(self, w, order: int) -> tuple:
         """The features (..., k), with slopes (..., k, 2d) and curvatures (..., k, 2d, 2d) up to
@@ -110,12 +118,14 @@ class Inputs:
         moved = xp.swapaxes(gradients / as_row(unit, gradients), -1, -2)
         return xp.swapaxes(self._spread(moved), -1, -2)
 
-    def _scaled(self, raw, w):
-        xp = namespace(w)
-        centre, scale = (
-            as_row(xp.asarray(side, dtype=w.dtype), raw) for side in (self.centre, self.scale)
-        )
-        return (raw - centre) / scale
+    def _scaled(self, raw, w, args):
+        x = _in_box(raw, self.centre, self.scale, w.dtype)
+        if self.args_centre is None:
+            return x
+        xp = namespace(x, args)
+        given = _in_box(args, self.args_centre, self.args_scale, w.dtype)
+        given = xp.broadcast_to(given, (*x.shape[:-1], self.num_args))
+        return xp.concatenate([x, given], axis=-1)
 
     def _spread(self, values):
         """(..., k) placed at ``keep`` in (..., 2d), zeros elsewhere."""
@@ -125,6 +135,12 @@ class Inputs:
         place = np.full(self.width, len(self.keep))
         place[list(self.keep)] = np.arange(len(self.keep))
         return xp.concatenate([values, xp.zeros_like(values[..., :1])], axis=-1)[..., place]
+
+
+def _in_box(values, centre, scale, dtype):
+    xp = namespace(values)
+    centre, scale = (as_row(xp.asarray(side, dtype=dtype), values) for side in (centre, scale))
+    return (values - centre) / scale
 
 
 def feature_tables(features: Callable, w, *, order: int) -> tuple:
@@ -165,8 +181,9 @@ def box_inputs(
     cyclic: tuple[int, ...] = (),
     features: Callable | None = None,
     reversor: tuple[int, ...] | None = None,
+    args=None,
 ) -> Inputs:
-    """Inputs whose box is that of the data w (N, 2d), NumPy.
+    """Inputs whose box is that of the data w (N, 2d), NumPy; with ``args`` (N, a) of theirs too.
 
     ``reversor`` (signs of the entries of w): the box is made symmetric about 0 in the coordinates
     that it flips, because an even or odd polynomial is so about 0 and nowhere else.
@@ -184,7 +201,11 @@ def box_inputs(
     scale = np.where(scale > 0, scale, np.where(centre != 0, np.abs(centre), 1.0))
     positions = tuple(keep.index(i) for i in angles if i in keep) if features is None else ()
     centre[list(positions)], scale[list(positions)] = 0.0, 1.0
-    return Inputs(keep, positions, w.shape[-1], centre, scale, features)
+    if args is None:
+        return Inputs(keep, positions, w.shape[-1], centre, scale, features)
+    low, high = np.min(args, axis=0), np.max(args, axis=0)
+    of_args = 0.5 * (low + high), 0.5 * (high - low) * _MARGIN
+    return Inputs(keep, positions, w.shape[-1], centre, scale, features, *of_args)
 
 
 def variable_signs(inputs: Inputs, reversor: tuple[int, ...], w) -> tuple[int, ...]:

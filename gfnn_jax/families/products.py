@@ -78,8 +78,8 @@ def _product(f, picks):
     return sum(f[..., k : k + 1] * as_row(picks[k], f) for k in range(len(picks)))
 
 
-def number_of_terms(is_angle: tuple[bool, ...], degree: int, signs=None) -> int:
-    """How many products a basis of this degree has, counted without making it."""
+def number_of_terms(is_angle: tuple[bool, ...], degree: int, signs=None, still: int = 0) -> int:
+    """How many products a basis of this degree has, counted without making it; as `Basis`."""
     counts = np.zeros((2, degree + 1), dtype=object)  # by parity and total degree
     counts[0, 0] = 1
     for angle, sign in zip(is_angle, signs or (1,) * len(is_angle), strict=True):
@@ -91,7 +91,7 @@ def number_of_terms(is_angle: tuple[bool, ...], degree: int, signs=None) -> int:
                 moved = counts[::-1] if flips and sign < 0 else counts
                 after[:, k:] += moved[:, : degree + 1 - k]
         counts = after
-    return int(counts[0].sum()) - 1  # a constant generates nothing
+    return int(counts[0].sum()) - math.comb(degree + still, still)  # they generate nothing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,6 +102,12 @@ class _Half:
     signs: tuple[int, ...]  # of each variable under the reversor
     degree: int
     only_even: bool  # whether the other half has only even products to go with
+    still: int = 0  # so many of the last variables have no derivatives
+
+    @property
+    def moving(self) -> int:
+        """The number of variables that have."""
+        return len(self.is_angle) - self.still
 
     @cached_property
     def indices(self) -> np.ndarray:
@@ -129,6 +135,11 @@ class _Half:
         """Total degree of each product (terms,)."""
         return np.array([self._order(t) for t in self.indices.tolist()], dtype=int)
 
+    @cached_property
+    def depends(self) -> np.ndarray:
+        """Whether each product depends on a variable that has derivatives (terms,)."""
+        return (self.indices[:, : self.moving] > 0).any(axis=1)
+
     def _parity(self, term) -> int:
         """Sign under the reversor: that of sines and odd degrees of the variables that flip."""
         odd = [
@@ -152,24 +163,24 @@ class _Half:
 
     def tables(self, functions: list, order: int, like) -> list:
         """Products u (..., terms), gradients (..., n, terms) and, with ``order`` 2, Hessians
-        (..., n, n, terms), from the functions (..., K) of each of the n variables."""
-        xp, n, terms = namespace(like), len(self.is_angle), len(self.indices)
-        if n == 0:  # a single variable leaves the other half empty
-            one = xp.ones_like(like[..., :1])
-            tables = [one, one[..., None, :][..., :0, :], one[..., None, None, :][..., :0, :0, :]]
-            return tables[: order + 1]
+        (..., n, n, terms), from the functions (..., K) of each variable, n of them moving."""
+        xp, n, terms = namespace(like), self.moving, len(self.indices)
         factors: list[Any] = []  # of each variable: its factor of every product, and derivatives
         for j, f in enumerate(functions):
-            side_by_side: Any = _product(f, xp.asarray(self.picks(j, order), dtype=f.dtype))
+            most = order if j < n else 0
+            side_by_side: Any = _product(f, xp.asarray(self.picks(j, most), dtype=f.dtype))
             factors.append(
-                [side_by_side[..., r * terms : (r + 1) * terms] for r in range(order + 1)]
+                [side_by_side[..., r * terms : (r + 1) * terms] for r in range(most + 1)]
             )
 
         def product(*raised) -> Any:
             """Of the factors, each differentiated as often as its variable is among ``raised``."""
-            orders = (raised.count(j) for j in range(n))
-            return reduce(mul, (f[order] for f, order in zip(factors, orders, strict=True)))
+            return reduce(mul, (f[raised.count(j)] for j, f in enumerate(factors)))
 
+        if n == 0:  # a single variable leaves the other half empty, or to what is still
+            one = product() if factors else xp.ones_like(like[..., :1])
+            tables = [one, one[..., None, :][..., :0, :], one[..., None, None, :][..., :0, :0, :]]
+            return tables[: order + 1]
         tables = [product()]
         if order > 0:
             tables.append(xp.stack([product(j) for j in range(n)], axis=-2))
@@ -185,11 +196,15 @@ class _Half:
 
 @dataclasses.dataclass(frozen=True)
 class Basis:
-    """Which products exist: all that is static about a family, made once for each kind."""
+    """Which products exist: all that is static about a family, made once for each kind.
+
+    still: so many of the last variables have no derivatives; products of them alone do not exist.
+    """
 
     is_angle: tuple[bool, ...]
     degree: int
     signs: tuple[int, ...] | None
+    still: int = 0
 
     @property
     def cut(self) -> int:
@@ -203,9 +218,10 @@ class Basis:
             self.signs is not None and min(part, default=1) > 0
             for part in (signs[:cut], signs[cut:])
         ]
+        in_second = min(self.still, len(self.is_angle) - cut)
         return (
-            _Half(self.is_angle[:cut], signs[:cut], self.degree, only_even=even[1]),
-            _Half(self.is_angle[cut:], signs[cut:], self.degree, only_even=even[0]),
+            _Half(self.is_angle[:cut], signs[:cut], self.degree, even[1], self.still - in_second),
+            _Half(self.is_angle[cut:], signs[cut:], self.degree, even[0], in_second),
         )
 
     @cached_property
@@ -230,7 +246,8 @@ class Basis:
     def _sorted_terms(self) -> tuple[np.ndarray, np.ndarray]:
         a, b = self.halves
         order = a.orders[:, None] + b.orders[None, :]
-        exists = (order <= self.degree) & (order > 0)  # a constant generates nothing
+        # A constant generates nothing, nor does what no coordinate changes.
+        exists = (order <= self.degree) & (a.depends[:, None] | b.depends[None, :])
         if self.signs is not None:
             exists &= a.parities[:, None] * b.parities[None, :] > 0
         rising = np.argsort(order[exists], kind="stable")
@@ -265,7 +282,8 @@ basis_of = cache(Basis)
 @partial(jax.tree_util.register_dataclass, data_fields=("inputs",), meta_fields=("degree", "signs"))
 @dataclasses.dataclass(frozen=True, eq=False)
 class Products:
-    """Chebyshev × Fourier products of total degree at most ``degree`` in the inputs' variables.
+    """Chebyshev × Fourier products of total degree at most ``degree`` in the inputs' variables,
+    the args among them where S depends on some.
 
     signs: of the variables under a reversor; then only even terms exist (midpoint chart).
     """
@@ -287,11 +305,18 @@ class Products:
 
     @property
     def basis(self) -> Basis:
-        return basis_of(self.inputs.is_angle, self.degree, self.signs)
+        still = self.inputs.num_args
+        signs = None if self.signs is None else self.signs + (1,) * still
+        return basis_of(self.inputs.is_angle, self.degree, signs, still)
 
     @property
     def num_parameters(self) -> int:
         return len(self.basis.terms)
+
+    def terms_of(self, degree: int) -> int:
+        """How many parameters it would have of another degree."""
+        basis = self.basis
+        return number_of_terms(basis.is_angle, degree, basis.signs, basis.still)
 
     @property
     def operations(self) -> tuple[int, int]:
@@ -311,19 +336,19 @@ class Products:
 
     def value(self, params, w, args=None):
         """S(C, w), shape (...): params the matrix C, w (..., 2d)."""
-        (u,), (v,) = self.basis.tables(self.inputs(w), 0)
+        (u,), (v,) = self.basis.tables(self.inputs(w, args), 0)
         return namespace(w).sum(matmul(u, params) * v, axis=-1)
 
     def gradient(self, params, w, args=None):
         """∇S(C, w), shape (..., 2d)."""
-        x, slope, _ = self.inputs.tables(w, order=1)
+        x, slope, _ = self.inputs.tables(w, 1, args)
         tables = self.basis.tables(x, 1)
         return self.inputs.pull_back_gradient(_gradient(tables, params)[0], slope)
 
     def gradient_and_hessian(self, params, w, args=None):
         """∇S (..., 2d) and S'' (..., 2d, 2d)."""
         xp = namespace(w)
-        x, slope, curvature = self.inputs.tables(w, order=2)
+        x, slope, curvature = self.inputs.tables(w, 2, args)
         tables = self.basis.tables(x, 2)
         gradient, to_a, to_b = _gradient(tables, params)
         (_, du, ddu), (_, dv, ddv) = tables
@@ -341,7 +366,7 @@ class Products:
     def term_gradients(self, w, args=None):
         """∇ of every term at w (..., 2d): (..., 2d, num_parameters)."""
         xp = namespace(w)
-        x, slope, _ = self.inputs.tables(w, order=1)
+        x, slope, _ = self.inputs.tables(w, 1, args)
         (u, du), (v, dv) = self.basis.tables(x, 1)
         row, column = self.basis.terms.T
         by_variable = xp.concatenate(

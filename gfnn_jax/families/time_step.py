@@ -8,15 +8,14 @@ the coordinates, by which S is not differentiated.
 from __future__ import annotations
 
 import dataclasses
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 
-from gfnn_jax.arrays import namespace
 from gfnn_jax.families.inputs import Inputs
-from gfnn_jax.families.products import Basis, Products
+from gfnn_jax.families.products import Products
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("products",), meta_fields=())
@@ -24,7 +23,7 @@ from gfnn_jax.families.products import Basis, Products
 class OfTimeStep:
     """S(C, w; dt²): args are the time step, (1,) or (..., 1), of either sign.
 
-    products: of the variables (w, dt²), (..., 2d + 1).
+    products: those of w whose only argument is dt².
     """
 
     products: Products
@@ -49,12 +48,16 @@ class OfTimeStep:
 
     @property
     def inputs(self) -> Inputs:
-        """Those of (w, dt²)."""
+        """Those of w and dt²."""
         return self.products.inputs
 
     @property
     def num_parameters(self) -> int:
-        return len(_of_state(self.products.basis))
+        return self.products.num_parameters
+
+    def terms_of(self, degree: int) -> int:
+        """How many parameters it would have of another degree."""
+        return self.products.terms_of(degree)
 
     @property
     def operations(self) -> tuple[int, int]:
@@ -63,43 +66,23 @@ class OfTimeStep:
 
     def unflatten(self, coefficients) -> np.ndarray:
         """Coefficients (..., num_parameters), NumPy -> the matrix C, the parameters of S."""
-        every = np.zeros((*np.shape(coefficients)[:-1], self.products.num_parameters))
-        every[..., _of_state(self.products.basis)] = coefficients
-        return self.products.unflatten(every)
+        return self.products.unflatten(coefficients)
 
     def __call__(self, params, w, args=None):
         return self.value(params, w, args)
 
     def value(self, params: Any, w: Any, args: Any = None):
         """S, shape (...)."""
-        return self.products.value(params, _beside(w, args))
+        return self.products.value(params, w, args**2)
 
     def gradient(self, params: Any, w: Any, args: Any = None):
         """∂S/∂w, shape (..., 2d)."""
-        return self.products.gradient(params, _beside(w, args))[..., :-1]
+        return self.products.gradient(params, w, args**2)
 
     def gradient_and_hessian(self, params: Any, w: Any, args: Any = None):
         """∂S/∂w (..., 2d) and ∂²S/∂w² (..., 2d, 2d)."""
-        gradient, hessian = self.products.gradient_and_hessian(params, _beside(w, args))
-        return gradient[..., :-1], hessian[..., :-1, :-1]
+        return self.products.gradient_and_hessian(params, w, args**2)
 
     def term_gradients(self, w: Any, args: Any = None):
         """∂/∂w of every term, shape (..., 2d, num_parameters)."""
-        every = self.products.term_gradients(_beside(w, args))
-        return every[..., :-1, _of_state(self.products.basis)]
-
-
-def _beside(w, dt):
-    """(w, dt²), (..., 2d + 1)."""
-    xp = namespace(w, dt)
-    square = xp.broadcast_to(xp.asarray(dt, dtype=w.dtype) ** 2, (*w.shape[:-1], 1))
-    return xp.concatenate([w, square], axis=-1)
-
-
-@cache
-def _of_state(basis: Basis) -> np.ndarray:
-    """The terms that w enters: a function of dt alone generates nothing."""
-    first, second = (half.orders for half in basis.halves)
-    row, column = basis.terms.T
-    in_dt = basis.halves[1].indices[:, -1]  # dt² is the last variable, and no angle
-    return np.flatnonzero(first[row] + (second - in_dt)[column] > 0)
+        return self.products.term_gradients(w, args**2)

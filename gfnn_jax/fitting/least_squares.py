@@ -70,10 +70,10 @@ def reduce(
     weight: np.ndarray,
     on_block: Callable[[], Any] | None = None,
 ) -> Reduced:
-    """The factor of [A b] of a linear family, from (w, target_gradient), each (N, 2d), in parts.
+    """The factor of [A b] of a linear family, from (w, target_gradient), each (N, 2d), in parts;
+    with args (N, k) as the third where the family depends on them.
 
-    rows:     any number of such pairs of arrays, which need never be in memory together. w may have
-              more columns, which the family knows.
+    rows:     any number of such pairs of arrays, which need never be in memory together.
     weight:   (2d,), what a row of ∇S is multiplied by: h divided by the scale of the conjugate
               coordinate, so that the result does not depend on the units of q and p.
     on_block: called before each block of rows; it may raise to stop.
@@ -82,12 +82,12 @@ def reduce(
     """
     m = family.num_parameters
     factor, seen = np.zeros((m + 1, m + 1), order="F"), 0
-    for w, target in _blocks(rows, m):
+    for w, target, *args in _blocks(rows, m):
         if on_block is not None:
             on_block()
         # LAPACK works in place on columns that are contiguous.
-        block = np.empty((target.size, m + 1), order="F")
-        gradients = family.term_gradients(w) * weight[:, None]
+        block = np.empty((w.size, m + 1), order="F")
+        gradients = family.term_gradients(w, *args) * weight[:, None]
         block[:, :m] = gradients.reshape(-1, m)
         block[:, m] = (target * weight).ravel()
         with one_thread():
@@ -105,14 +105,14 @@ def merged(one: Reduced, other: Reduced) -> Reduced:
     return Reduced(factor, one.rows + other.rows)
 
 
-def _blocks(rows, num_parameters: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """(w, target_gradient) of as many pairs as one block holds."""
-    for w, target in rows:
-        w, target = np.asarray(w, np.float64), np.asarray(target, np.float64)
+def _blocks(rows, num_parameters: int) -> Iterator[tuple[np.ndarray, ...]]:
+    """(w, target_gradient), and args, of as many pairs as one block holds."""
+    for part in rows:
+        part = tuple(np.asarray(a, np.float64) for a in part)
         most = max(_FEWEST_ROWS, _BLOCK_BYTES // (8 * (num_parameters + 1)))
-        pairs = max(1, most // w.shape[1])
-        for first in range(0, len(w), pairs):
-            yield w[first : first + pairs], target[first : first + pairs]
+        pairs = max(1, most // part[0].shape[1])
+        for first in range(0, len(part[0]), pairs):
+            yield tuple(a[first : first + pairs] for a in part)
 
 
 def _folded(factor, block):

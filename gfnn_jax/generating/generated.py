@@ -128,8 +128,7 @@ class Generated:
         if args is not None:  # open lanes are taken out of the batch, with their own
             args = jnp.broadcast_to(args, (z.shape[0], args.shape[-1]))
         if self.predictor is not None:
-            given = jnp.concatenate([z, args], axis=-1) if self.serves_any_dt else z
-            guess = guess + self.predictor.forward(given)
+            guess = guess + self.predictor.forward(z, args)
         shared, lanes = self._shared_and_lanes(z, known, args)
         equation = ImplicitStep(self.chart)
         if matrix_free(self.family):

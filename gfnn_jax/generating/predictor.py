@@ -21,7 +21,7 @@ import scipy.linalg
 
 from gfnn_jax.arrays import matmul, namespace
 from gfnn_jax.families.inputs import Inputs, box_inputs
-from gfnn_jax.families.products import Products
+from gfnn_jax.families.products import Basis, Products, basis_of
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.threads import one_thread
@@ -53,17 +53,21 @@ class PolynomialModel:
     matrices: Any
 
     @property
+    def basis(self) -> Basis:
+        return _basis(self.family)
+
+    @property
     def operations(self) -> int:
         """Floating-point operations of an evaluation."""
-        basis, count = self.family.basis, len(self.matrices)
+        basis, count = self.basis, len(self.matrices)
         (m, i), (n, j) = (h.indices.shape for h in basis.halves)
         row, column = basis.corner
         tables = m * (i - 1) + n * max(j - 1, 0) + 4 * self.family.degree * (i + j)
         return 2 * count * (row * n + (m - row) * column + m) + tables
 
-    def __call__(self, z):
+    def __call__(self, z, args=None):
         """The difference (..., k) at the states z (..., 2d), NumPy or JAX."""
-        xp, x = namespace(z), self.family.inputs(z)
+        xp, x = namespace(z), self.family.inputs(z, args)
         bound = xp.broadcast_to(xp.asarray(self.reach, dtype=x.dtype), x.shape)
         return self.of_variables(xp.clip(x, -bound, bound))
 
@@ -75,8 +79,8 @@ class PolynomialModel:
 
     def of_variables(self, x):
         """The difference (..., k) at the variables x (..., n) of the family, within reach."""
-        (u,), (v,) = self.family.basis.tables(x, 0)
-        row, column = self.family.basis.corner
+        (u,), (v,) = self.basis.tables(x, 0)
+        row, column = self.basis.corner
         low = self._product(self.matrices[:, :row], u[..., :row], v)
         return low + self._product(self.matrices[:, row:, :column], u[..., row:], v[..., :column])
 
@@ -112,33 +116,31 @@ class Fitted(NamedTuple):
 
 def fit_predictors(
     chart: AnyChart, y0, y1, dt: Any, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
-    features=None,
+    features=None, args=None,
 ) -> list[Fitted]:  # fmt: skip
     """Predictors of a chart's map and of its inverse, by rising degree.
 
     y0, y1: (N, 2d) states and images, NumPy, angles lifted. dt: a number, or one of each pair (N,),
-    which is then a variable of the models beside the state, of either sign. angles, cyclic,
-    features: as those of ``box_inputs``. The degree rises until the model is as close as it need
-    be, or no longer gains: then noise, or the number of pairs, is the limit.
+    which is then what the models depend on beside the state, of either sign. angles, cyclic,
+    features, args: as those of ``box_inputs``. The degree rises until the model is as close as it
+    need be, or no longer gains: then noise, or the number of pairs, is the limit.
     """
     rows = np.linspace(0, len(y0) - 1, min(_ROWS, len(y0))).astype(int)
-    y0, y1 = y0[rows], y1[rows]
-    dts = dt[rows, None] if np.ndim(dt) else np.empty((len(rows), 0))
+    y0, y1, args = y0[rows], y1[rows], None if args is None else args[rows]
+    args, back = (dt[rows, None], -dt[rows, None]) if np.ndim(dt) else (args, args)
 
-    def fitted(chart: AnyChart, given, other, dts) -> list[tuple[PolynomialModel, float]]:
+    def fitted(chart: AnyChart, given, other, args) -> list[tuple[PolynomialModel, float]]:
         dim = given.shape[1] // 2
         free = chart.free(dim)
         unknown = chart.evaluation_point(given, other)[:, free]
         known = chart.first_guess(given)[:, free]
-        given = np.concatenate([given, dts], axis=1)
         inputs = box_inputs(
             given, angles=tuple(a for a in angles if a < dim), cyclic=tuple(cyclic),
-            features=features,
+            features=features, args=args,
         )  # fmt: skip
-        return _by_degree(inputs, given, unknown - known, sizes(unknown))
+        return _by_degree(inputs, inputs(given, args), unknown - known, sizes(unknown))
 
-    forward = fitted(chart, y0, y1, dts)
-    backward = fitted(chart.reverse(dt)[0], y1, y0, -dts)
+    forward, backward = fitted(chart, y0, y1, args), fitted(chart.reverse(dt)[0], y1, y0, back)
     # The direction that is close first waits for the other.
     rising = range(max(len(forward), len(backward)))
     sides = ([side[min(i, len(side) - 1)] for i in rising] for side in (forward, backward))
@@ -164,15 +166,21 @@ def affordable(fitted: list[Fitted], family) -> Fitted:
     return close[-1] if close and cheap[-1].error > CLOSE else cheap[-1]
 
 
-def _by_degree(inputs: Inputs, y, target, unit) -> list[tuple[PolynomialModel, float]]:
-    """Least-squares models of the target (N, k), one factorisation for all degrees."""
-    held = np.arange(len(y)) % 5 == 0
-    most = min(_MOST_TERMS, len(y) // 3)
+def _basis(family: Products) -> Basis:
+    """The products of a model: unlike S it also has those of args alone."""
+    return basis_of(family.inputs.is_angle, family.degree, None)
+
+
+def _by_degree(inputs: Inputs, x, target, unit) -> list[tuple[PolynomialModel, float]]:
+    """Least-squares models of the target (N, k) at the variables x (N, ...), one factorisation for
+    all degrees."""
+    held = np.arange(len(x)) % 5 == 0
+    most = min(_MOST_TERMS, len(x) // 3)
     top = 1
     while top < _MOST_DEGREE and Products(inputs, top + 1).num_parameters <= most:
         top += 1
-    largest = Products(inputs, top).basis
-    design = _design(largest, inputs(y))
+    largest = _basis(Products(inputs, top))
+    design = _design(largest, x)
     width = design.shape[1]
     ridge = _RIDGE * np.linalg.norm(design[~held], axis=0)
     ridge = np.where(ridge > 0, ridge, 1.0)  # a product that vanishes on all states: no part of it
@@ -191,7 +199,7 @@ def _by_degree(inputs: Inputs, y, target, unit) -> list[tuple[PolynomialModel, f
             continue  # an odd map gains nothing by an even degree
         closest = error
         family = Products(inputs, degree)
-        matrices = family.basis.placed(solution[1:].T)
+        matrices = _basis(family).placed(solution[1:].T)
         matrices[:, 0, 0] = solution[0]
         found.append((PolynomialModel(family, matrices), float(error)))
         if error < _STEADY:

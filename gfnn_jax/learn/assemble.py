@@ -45,7 +45,7 @@ def assemble(
     )  # fmt: skip
     map_ = composed(generated, prepared, judges)
     held = judges.pairs.take(judges.held_out)
-    steps = stepped(map_, np.asarray(held.z0), held.dt)
+    steps = stepped(map_, np.asarray(held.z0), held.dt, held.args)
     error = judges.error_of(
         np.where(steps.failed[:, None], np.nan, steps.images), prepared.coordinates
     )
@@ -66,11 +66,11 @@ def with_predictor(generated: Generated, prepared: Prepared, rows, features=None
     )
     if solved.sum() < 2:  # nothing to learn from: the data's own images
         images, solved = prepared.y1[rows], np.ones(len(rows), bool)
-    coordinates = prepared.coordinates
+    coordinates, args = prepared.coordinates, prepared.given(rows[solved])[1]
     fitted = fit_predictors(
         generated.chart, prepared.y0[rows][solved], images[solved],
         of_lanes(prepared.given(rows)[0], solved),
-        angles=coordinates.angles, cyclic=coordinates.cyclic, features=features,
+        angles=coordinates.angles, cyclic=coordinates.cyclic, features=features, args=args,
     )  # fmt: skip
     chosen = affordable(fitted, generated.family)
     return dataclasses.replace(generated, predictor=chosen.predictor)

@@ -140,8 +140,9 @@ def refined_images(
     """Images of these rows by the map that S generates, as prepared (N, 2d), and which steps were
     solved (N,). In NumPy, from the data's own evaluation points: nothing is compiled."""
     y0, y1 = prepared.y0[rows], prepared.y1[rows]
-    piece = Generated(family, params, chart, prepared.given(rows)[0], prepared.scale)
-    images, error = piece.refined_step(y0, chart.evaluation_point(y0, y1))
+    dt, args = prepared.given(rows)
+    piece = Generated(family, params, chart, dt, prepared.scale)
+    images, error = piece.refined_step(y0, chart.evaluation_point(y0, y1), args)
     return images, (error < _SOLVED) & np.isfinite(images).all(axis=1)
 
 

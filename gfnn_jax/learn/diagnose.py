@@ -67,16 +67,21 @@ class ChartJudgement(NamedTuple):
         return self.low > SINGULAR
 
 
-def local_jacobians(y0, y1, scale, *, seed: int = 0) -> tuple[np.ndarray, float]:
+def local_jacobians(
+    y0, y1, scale, given=None, *, seed: int = 0
+) -> tuple[np.ndarray, float]:  # fmt: skip
     """Jacobians of y0 -> y1 at 50 to 400 of the states, (n, 2d, 2d), and the error of their entries
     in coordinates of unit size, infinite where most are not known in all directions.
 
-    y0, y1: (N, 2d) with angles lifted; scale (2d,) makes the coordinates comparable. A local
+    y0, y1: (N, 2d) with angles lifted; scale (2d,) makes the coordinates comparable. given: (N, k)
+    of unit sizes, what else a move depends on. A local
     quadratic fit where there are pairs enough, else a local linear one; over more neighbours where
     the pairs are noisy.
     """
-    n, width = y0.shape
+    n, of_state = y0.shape
     x, move = np.asarray(y0) / scale, (np.asarray(y1) - np.asarray(y0)) / scale
+    x = x if given is None else np.concatenate([x, given], axis=1)
+    width = x.shape[1]
     i, j = np.triu_indices(width)
     quadratic = n >= 20 * (1 + width + len(i))
     terms = 1 + width + (len(i) if quadratic else 0)
@@ -101,7 +106,7 @@ def local_jacobians(y0, y1, scale, *, seed: int = 0) -> tuple[np.ndarray, float]
         if error <= _SLOPE_ERROR or count >= min(n, _MOST_NEIGHBOURS):
             break
         count = min(n, _MOST_NEIGHBOURS, 2 * count)
-    slope = np.eye(width) + np.swapaxes(solution[:, 1 : 1 + width], 1, 2)
+    slope = np.eye(of_state) + np.swapaxes(solution[:, 1 : 1 + of_state], 1, 2)
     # How far neighbours reach in the direction where they differ least, apart from what the other
     # columns tell of it: along a curve or a torus the rest of the map is anybody's guess.
     reach = 1 / (np.sqrt(count) * spread.max(axis=1) * np.sqrt(np.mean(offset**2, axis=(1, 2))))

@@ -17,6 +17,7 @@ from gfnn_jax.learn.diagnose import (
 from gfnn_jax.learn.factor_out import factored_out, flow_of
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
+from gfnn_jax.learn.varied import given_by
 
 
 class Diagnosis(NamedTuple):
@@ -31,7 +32,7 @@ def diagnose_request(request: Request, plain: Prepared) -> Diagnosis:
 
     Raises FitError where no chart covers the data.
     """
-    if plain.varied or plain.structure is not None:  # neighbours tell no Jacobian
+    if plain.varied or plain.structure is not None:  # H or a sum of terms is looked for first
         return Diagnosis(plain, Charts([], None, {}, []), float("nan"), [])
     prepared = plain
     if request.base is not None:
@@ -44,7 +45,9 @@ def diagnose_request(request: Request, plain: Prepared) -> Diagnosis:
 def diagnosed(prepared: Prepared, chart: str, reversor, seed: int) -> Diagnosis:
     """What the local Jacobians say: whether the pairs look symplectic, and which charts cover
     them; the base map is factored out where one is needed."""
-    jacobians, error = local_jacobians(prepared.y0, prepared.y1, prepared.scale, seed=seed)
+    jacobians, error = local_jacobians(
+        prepared.y0, prepared.y1, prepared.scale, given_by(prepared), seed=seed
+    )
     defect, messages = data_defect(jacobians, prepared.scale), _thin(prepared)
     if not look_symplectic(jacobians, error, prepared.scale):
         messages.append(

@@ -201,7 +201,9 @@ def fit(
     """Learn the map of these pairs: the cheapest candidate within the tolerance, else the best.
 
     pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order.
-               Of different dt, S is a function of dt too, in the midpoint chart.
+               Of different dt, S is a function of dt too, in the midpoint chart. With parameters
+               (args) H is learned, or an S of state and parameters, which family="polynomial" or
+               learn="map" ask for.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
     tolerance: bound on the RMS over coordinates of the one-step error ÷ that coordinate's spread,
                at its upper 95 % bound; a pure number.

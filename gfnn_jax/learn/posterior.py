@@ -17,7 +17,7 @@ def with_posterior(chosen: Chosen, searched: Searched) -> Chosen:
     linear in its coefficients, or is the flow of a learned H; as it is, where neither holds."""
     map_, entry, law = chosen.candidate.map, chosen.entry, searched.law
     if entry is not None:
-        own = entry.sweep.judges.pairs is searched.judges.pairs
+        own = entry.sweep.judges.pairs is searched.judges.pairs and map_.parameters is None
         if not (own and isinstance(entry.sweep, LinearSweep)):
             return chosen
         kind, root = Generated, entry.sweep.root(entry.size)

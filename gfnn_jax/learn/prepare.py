@@ -62,6 +62,12 @@ class Prepared:
         sites = isinstance(self.structure, Sites) and self.own_dt is None
         return sites or self.args is not None
 
+    @property
+    def of_one_dt(self) -> bool:
+        """Whether S can be a series in the state, and in parameters where there are some: not of
+        several dt, nor in the time of a drive."""
+        return self.own_dt is None and self.period is None
+
     def given(self, rows) -> tuple[Any, Any]:
         """(dt, args) of these rows."""
         return of_lanes(self.each_dt, rows), of_lanes(self.args, rows)

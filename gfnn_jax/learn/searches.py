@@ -14,7 +14,7 @@ from gfnn_jax.learn.candidates import Candidate, Judges
 from gfnn_jax.learn.choose_charts import Charts
 from gfnn_jax.learn.choose_law import DEARER, law_of
 from gfnn_jax.learn.clock import Clock
-from gfnn_jax.learn.diagnosed import Diagnosis
+from gfnn_jax.learn.diagnosed import Diagnosis, diagnosed
 from gfnn_jax.learn.flows import LearnedHamiltonian
 from gfnn_jax.learn.law_maps import (
     better_than,
@@ -61,10 +61,20 @@ def searched(
     scene, prepared, charts = request.scene, seen.prepared, seen.charts
     better = _Better(on_better) if on_better is not None else None
     law = _law(request, plain, judges, better)
-    of_terms = None
+    of_terms, failed = None, None
     met_by_law = law is not None and judges.met_by(law.candidate)
-    if prepared.of_terms and request.learn != "hamiltonian" and not met_by_law:
-        of_terms = map_of(prepared, judges, scene, request.chart, law, clock, say)
+    wanted = prepared.of_terms and request.learn != "hamiltonian" and not met_by_law
+    if wanted and request.family == "auto":
+        try:
+            of_terms = map_of(prepared, judges, scene, request.chart, law, clock, say)
+        except FitError as error:
+            failed = error
+    if wanted and plain.args is not None and not _met(of_terms, judges):
+        try:
+            seen = diagnosed(plain, request.chart, request.reversor, request.seed)
+        except FitError as error:
+            failed = failed or error
+        prepared, charts = seen.prepared, seen.charts
     sweeps = _sweeps(request, seen, judges)
     dearest = law.candidate.operations if law is not None and met_by_law else np.inf
     found = search(sweeps, bound.bound, clock, say, tell, better, dearest)
@@ -79,14 +89,25 @@ def searched(
         )  # fmt: skip
         if drawn is not None:
             found, charts = drawn
-    elif law is not None and not met_by_law and law_explains_most(law, found, bound, clock):
+    elif (
+        law is not None and not met_by_law and plain.args is None
+        and law_explains_most(law, found, bound, clock)
+    ):  # fmt: skip
         say(f"learning what the flow of {law.candidate.label} leaves over")
         around = search_around(law, plain, judges, scene, clock, say, tell, better, request.seed)
         if around is not None and better_than(around.found, found, law):
             found, charts = around
     if not found.ranking and law is None and of_terms is None:
-        raise FitError(_nothing_found(len(judges.pairs), clock))
+        raise failed or FitError(_nothing_found(len(judges.pairs), clock))
+    if of_terms is not None and found.ranking and not _met(of_terms, judges):
+        best = found.ranking[0].candidate
+        if best.validation_bound < of_terms.candidate.validation_bound:
+            of_terms = None
     return Searched(law, of_terms, found, bool(sweeps), charts, plain, judges)
+
+
+def _met(found: LearnedMap | None, judges: Judges) -> bool:
+    return found is not None and judges.met_by(found.candidate)
 
 
 def _law(
@@ -113,13 +134,13 @@ def _law(
 
 def _sweeps(request: Request, seen: Diagnosis, judges: Judges) -> list[Any]:
     """The sweeps of S over the charts that cover the data; none where H alone is learned, or the
-    pairs are of more than one map."""
+    pairs are driven, or differ in dt and in parameters too."""
     charts, prepared = seen.charts.charts, seen.prepared
-    if request.learn == "hamiltonian" or prepared.args is not None:
+    if request.learn == "hamiltonian" or prepared.period is not None:
         return []
     if prepared.own_dt is not None:
-        structured = prepared.structure is not None
-        return [] if structured else [sweep_of_dt(prepared, request.scene, judges, request.factors)]
+        plain = prepared.structure is None and prepared.args is None
+        return [sweep_of_dt(prepared, request.scene, judges, request.factors)] if plain else []
     if request.family == "mlp":
         return [
             NetworkSweep(

@@ -29,10 +29,11 @@ _DEGREES = ((2, 3), (4, 5, 6), (7, 8), (9, 10), (12, 14), (16, 18, 20))
 _TRIAL = (2, 3, 4, 5, 6)
 _EVEN_DEGREES = tuple((degree,) for degree in (2, 4, 6, 8, 10, 12, 14, 16, 18, 20))
 _SINES = (100, 200, 400, 800, 1_600)
-_MOST_TERMS = 1_500
+# Products of degree 14 in four variables: benchmarks/storage_ring.py.
+_MOST_TERMS = 3_100
 _ROWS_PER_TERM = 3
-# Rows × terms² of one factor: about ten seconds on two cores.
-_MOST_OPERATIONS = 1.2e11
+# Rows × terms² of one factor: about half a minute on one core. 2,000 terms take 80,000 rows.
+_MOST_OPERATIONS = 3.2e11
 # Whether S is even is tested where terms are scarce, from so many rows for each term, by odd terms
 # up to a degree. Those of an even S bring nothing: the held-out residual becomes 0.98 … 1.09 of
 # what it was (FPUT chains, a Penning trap, a satellite); to leave them out costs no more than that.
@@ -123,18 +124,18 @@ class LinearSweep:
         free = (*prepared.coordinates.cyclic, *prepared.whole)
         self._outermost = outermost(prepared.y0[judges.training], free)
         coordinates = prepared.coordinates
-        w, seen, of = self._train[0], self._train[0], Products
+        w, of, args = self._train[0], Products, prepared.given(judges.training)[1]
         if prepared.own_dt is not None:
-            of, seen = _of_time_step, np.column_stack([w[:, :-1], w[:, -1] ** 2])
-            reversor = (*reversor, 1) if reversor is not None else None
+            of, args = _of_time_step, prepared.own_dt[judges.training, None] ** 2
         inputs = box_inputs(
-            seen, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+            w, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
             cyclic=coordinates.cyclic, features=features, reversor=reversor,
+            args=args,
         )  # fmt: skip
         if kind == "sines":
             groups: Iterable[Iterable[Any]] = ([Sines(inputs, count)] for count in _SINES)
         else:
-            signs = variable_signs(inputs, reversor, seen) if reversor is not None else None
+            signs = variable_signs(inputs, reversor, w) if reversor is not None else None
             degrees = _EVEN_DEGREES if even else _DEGREES
             groups = ((of(inputs, degree, signs) for degree in g) for g in degrees)
         known = len(_SINES) if kind == "sines" else sum(map(len, degrees))
@@ -185,10 +186,8 @@ class LinearSweep:
         else:
             degree = round(extent)
             label = f"{self._prefix}{family.name} {degree}"
-            terms = number_of_terms(family.inputs.is_angle, degree, family.signs)
-            if isinstance(family, OfTimeStep):  # of dt alone
-                label, terms = f"{label} with dt²", terms - degree
-        rows = self._train[1].shape
+            terms = family.terms_of(degree)
+        rows = self._train[0].shape
         share = rows[0] / (rows[0] + len(self.judges.held_out))
         pairs = int(np.ceil(_ROWS_PER_TERM * terms / rows[1] / share))
         most = f", more than the {_MOST_TERMS:,} that are tried" if terms > _MOST_TERMS else ""
@@ -203,8 +202,11 @@ class LinearSweep:
     def left_over(self, size: Size) -> np.ndarray:
         """(N, 2d): what the size leaves of ∇S of every pair, unit-free as train_rms."""
         _, params = self.solve(size, Clock(), lambda message: None)
-        (w, target), weight = _rows(self.prepared, self.chart, slice(None))
-        return weight * (np.asarray(size.family.gradient(params, w)) - target)
+        (w, target, *args), weight = _rows(self.prepared, self.chart, slice(None))
+        gradient = np.asarray(size.family.gradient(params, w, *args))
+        if self.prepared.own_dt is not None:
+            gradient = args[0] * gradient
+        return weight * (gradient - target)
 
     def own_error(self, size: Size) -> float:
         """What noise leaves wrong in the size's ∇S, in the measure of train_rms: half of the
@@ -236,32 +238,30 @@ class LinearSweep:
         width = self._train[0].shape[1]
         pairs = -(-_SAMPLE_ROWS * most.num_parameters // width)
         places, goes_on = looked_at(self.judges.pairs, self.judges.training, pairs)
-        w, target = (a[places] for a in self._train)
+        w, target, *args = data = tuple(a[places] for a in self._train)
         params = family.unflatten(solved.coefficients)
-        slopes = self._slopes(family, w)
+        slopes = self._slopes(family, w, *args)
         residual = slopes @ solved.coefficients - target * self._weight
         states = None
         if goes_on.any() and not (self.prepared.before or self.prepared.after):
-            states = (residual, *self._by_states(family, params, w), goes_on)
+            states = (residual, *self._by_states(family, params, w, *args), goes_on)
         scores = shared_noise.scores(slopes, *states) if states else None
-        noise = self._noise(size, larger, w, target, states) if larger is not None else None
+        noise = self._noise(size, larger, data, states) if larger is not None else None
         return uncertainty.root(
             train, family.num_parameters, slopes.reshape(-1, family.num_parameters),
             residual.ravel(), noise=noise, ridge=solved.ridge, scores=scores,
         )  # fmt: skip
 
-    def _slopes(self, family, w) -> np.ndarray:
-        return _of_rows(family).term_gradients(w) * self._weight[:, None]
+    def _slopes(self, family, w, *args) -> np.ndarray:
+        return _of_rows(family).term_gradients(w, *args) * self._weight[:, None]
 
-    def _by_states(self, family, params, w) -> tuple[np.ndarray, np.ndarray]:
+    def _by_states(self, family, params, w, *args) -> tuple[np.ndarray, np.ndarray]:
         """The residual's derivatives in z₀ and z₁ (n, 2d, 2d), those ÷ their scale."""
         eye, chart = np.eye(2 * self.prepared.dim), self.chart
         none, dt, scale = np.zeros_like(eye), self.prepared.dt, self.prepared.scale
-        if self.prepared.own_dt is None:
-            hessian = family.gradient_and_hessian(params, w)[1]
-        else:
-            h, dt = w[:, -1:], 1.0
-            hessian = h[..., None] * family.gradient_and_hessian(params, w[:, :-1], h)[1]
+        hessian = family.gradient_and_hessian(params, w, *args)[1]
+        if self.prepared.own_dt is not None:
+            dt, hessian = 1.0, args[0][..., None] * hessian
 
         def by(y0, y1):
             point, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, dt)
@@ -269,7 +269,7 @@ class LinearSweep:
 
         return by(eye, none), by(none, eye)
 
-    def _noise(self, size: Size, larger: Size, w, target, states) -> float:
+    def _noise(self, size: Size, larger: Size, data, states) -> float:
         """The part of the residual's mean square that a larger size leaves too: of all rows where
         that one was judged by all of them, else of these. states: residual, its derivatives and
         which pairs go on, as `shared_noise.scores` takes them, or None."""
@@ -277,11 +277,11 @@ class LinearSweep:
         def left(of: Size) -> float:
             reduced = (
                 self._factors[of.group].train if larger.group in self._factors
-                else least_squares.reduce(_of_rows(of.family), [(w, target)], self._weight)
+                else least_squares.reduce(_of_rows(of.family), [data], self._weight)
             )  # fmt: skip
             freedom = None
             if states is not None:
-                slopes = self._slopes(of.family, w)
+                slopes = self._slopes(of.family, data[0], *data[2:])
                 scores = shared_noise.scores(slopes, *states)
                 freedom = shared_noise.freedom(slopes, states[0], scores)
             return uncertainty.variance(reduced, of.family.num_parameters, freedom)
@@ -432,10 +432,11 @@ def is_even(prepared: Prepared, judges: Judges) -> bool:
     """Whether S(−w) = S(w) as far as any size of a sweep could tell: odd terms beside the even ones
     of the highest degree that a sweep has do not make the held-out residual smaller.
 
-    False where terms are not scarce, where angles are, or where the test would take too much.
+    False where terms are not scarce, where angles or args are, or where the test would take too
+    much.
     """
     dim = prepared.dim
-    if dim < _SCARCE_FROM_DIM or prepared.coordinates.angles:
+    if dim < _SCARCE_FROM_DIM or prepared.coordinates.angles or prepared.args is not None:
         return False
     (w, target), weight = _rows(prepared, MIDPOINT, judges.training)
     held, _ = _rows(prepared, MIDPOINT, judges.held_out)
@@ -500,19 +501,22 @@ def trial_residual(prepared: Prepared) -> float:
     return residual
 
 
-def _rows(prepared: Prepared, chart: AnyChart, rows):
-    """(w, target_gradient) of these rows, and the weight that makes a row of ∇S unit-free. Where
-    each pair has its own dt: ((w, dt), h times that), as `_Moves` has its terms."""
-    y0, y1 = prepared.y0[rows], prepared.y1[rows]
-    w, dt = chart.evaluation_point(y0, y1), prepared.dt
+def _rows(prepared: Prepared, chart: AnyChart, rows) -> tuple[Any, np.ndarray]:
+    """(w, target_gradient) of these rows, with their args where there are some, and the weight that
+    makes a row of ∇S unit-free. Where each pair has its own dt: (w, h times that, dt), as `_Moves`
+    has its terms."""
+    (y0, y1), (_, args) = (prepared.y0[rows], prepared.y1[rows]), prepared.given(rows)
+    dt = prepared.dt
     if prepared.own_dt is not None:
-        w, dt = np.column_stack([w, prepared.own_dt[rows]]), 1.0
-    return (w, chart.target_gradient(y0, y1, dt)), residual_weight(chart, prepared.scale, dt)
+        dt, args = 1.0, prepared.own_dt[rows, None]
+    data = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, dt)
+    data = data if args is None else (*data, args)
+    return data, residual_weight(chart, prepared.scale, dt)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Moves:
-    """h ∇φ of the terms of an S of dt, at (w, dt)."""
+    """h ∇φ of the terms of an S of dt."""
 
     family: OfTimeStep
 
@@ -520,8 +524,7 @@ class _Moves:
     def num_parameters(self) -> int:
         return self.family.num_parameters
 
-    def term_gradients(self, given):
-        w, dt = given[:, :-1], given[:, -1:]
+    def term_gradients(self, w, dt):
         return dt[..., None] * self.family.term_gradients(w, dt)
 
 

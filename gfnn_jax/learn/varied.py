@@ -80,8 +80,9 @@ def as_varied(
     differs = "dt" if np.ndim(pairs.dt) else "parameters" if pairs.args else None
     if differs is None:
         return pairs, learn, messages
-    if differs == "parameters" and (family, base) == ("auto", None):
-        return pairs, "map" if chart != "auto" else learn, messages
+    families = ("auto",) if pairs.period is not None else ("auto", "polynomial")
+    if differs == "parameters" and family in families and base is None:
+        return pairs, "map" if (family, chart) != ("auto", "auto") else learn, messages
     of_dt = differs == "dt" and not pairs.args and structure is None and learn != "hamiltonian"
     if of_dt and base is None and family in _OF_DT and chart in ("auto", "midpoint"):
         return pairs, learn, messages

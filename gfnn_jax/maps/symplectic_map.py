@@ -180,7 +180,7 @@ class SymplecticMap:
         Raises ValueError for any other map, unless dt is its own: it is known at one dt only.
         """
         known = not any(isinstance(value, Tracer) for value in (dt, self.dt))
-        if known and np.ndim(dt) == 0 and np.asarray(dt) == np.asarray(self.dt):
+        if known and np.ndim(dt) == 0 and np.array_equal(dt, self.dt):  # inside jit too
             return self
         if len(self.pieces) != 1 or not _serves_any_dt(self.pieces[0]):
             raise ValueError(
@@ -199,13 +199,22 @@ class SymplecticMap:
     def then(self, other: SymplecticMap) -> SymplecticMap:
         """This map and the other one after it, as one map: sectors of a ring, phases of a period.
 
-        Its domain and its sizes are those of this map, its dt the sum of both. Raises ValueError
-        where the maps have different coordinates, or parameters.
+        Its domain and its sizes are those of this map, its dt the sum of both; the values of
+        parameters are those that both have seen. Raises ValueError where the maps have different
+        coordinates or parameters, or are driven.
         """
-        if self.coordinates != other.coordinates or self.parameters or other.parameters:
-            raise ValueError("expected two maps of the same coordinates and without parameters")
+        ours, theirs = self.parameters, other.parameters
+        names = [() if p is None else p.names for p in (ours, theirs)]
+        driven = any(p is not None and p.period is not None for p in (ours, theirs))
+        if self.coordinates != other.coordinates or names[0] != names[1] or driven:
+            raise ValueError(
+                "expected two maps of the same coordinates and parameters, and without a drive"
+            )
+        if ours is not None and theirs is not None:
+            low, high = np.maximum(ours.low, theirs.low), np.minimum(ours.high, theirs.high)
+            ours = dataclasses.replace(ours, low=low, high=high)
         return dataclasses.replace(
-            self, pieces=(*self.pieces, *other.pieces), dt=self.dt + other.dt
+            self, pieces=(*self.pieces, *other.pieces), dt=self.dt + other.dt, parameters=ours
         )
 
     def reversed(self) -> SymplecticMap:
