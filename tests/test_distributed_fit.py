@@ -206,6 +206,23 @@ def test_files_that_differ_or_cannot_be_shared(tmp_path):
         next(iterate_pairs(tmp_path / "a.csv", 10, share=Share(0, 2)))
 
 
+@pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")
+@pytest.mark.parametrize("learns", ["map", "hamiltonian"])
+def test_of_several_dt_the_map_is_that_of_the_sample(learns, tmp_path):
+    """Of pairs so noisy that a step of the median dt misses none by far."""
+    pairs = noisy(flow, sigma=3e-3)
+    for i, dt in enumerate((0.999 * DT, 1.001 * DT)):
+        own = pairs.take(slice(200 * i, 200 * (i + 1)))
+        np.savez(tmp_path / f"{i}.npz", z0=own.z0, z1=own.z1, dt=dt)
+    ran = fit_job.fit(
+        [tmp_path / "0.npz", tmp_path / "1.npz"], out=tmp_path / "m", learn=learns, tolerance=0.1
+    )
+    assert not any("whose map is kept" in message for message in ran.fit.messages)
+    both = read_sample([tmp_path / "0.npz", tmp_path / "1.npz"]).pairs()
+    alone = gfnn.fit(both, learn=learns, tolerance=0.1)
+    np.testing.assert_array_equal(ran.fit.map.step(both.z0)[0], alone.map.step(both.z0)[0])
+
+
 # Real processes, on this machine
 
 
