@@ -196,6 +196,21 @@ def test_the_same_sample_of_any_number_of_processes(num_pairs, tmp_path, in_thre
     assert read_sample(names[0], num_pairs=50, group=Group()).digest != found[0].digest
 
 
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_process_may_have_no_pair(order, tmp_path, in_threads):
+    """Sequences of one state."""
+    states = np.random.default_rng(0).normal(size=(40, 2, 2))
+    np.savez(tmp_path / "0.npz", z0=states[:, 0], z1=states[:, 1], dt=DT)
+    np.savez(tmp_path / "1.npz", trajectories=states[:5, :1], dt=DT)
+    paths = [tmp_path / f"{i}.npz" for i in order]
+    found = in_threads(2, lambda group: read_sample(paths, group=group))
+    alone = read_sample(paths, group=Group())
+    np.testing.assert_array_equal(found[0].states, alone.states)
+    assert (found[0].dt, found[0].digest) == (DT, alone.digest)
+    with pytest.raises(InputError, match="no pair"):
+        in_threads(2, lambda group: read_sample([tmp_path / "1.npz"] * 2, group=group))
+
+
 def test_files_that_differ_or_cannot_be_shared(tmp_path):
     np.savez(tmp_path / "a.npz", z0=np.ones((9, 2)), z1=np.ones((9, 2)), dt=1.0)
     np.savez(tmp_path / "b.npz", z0=np.ones((9, 4)), z1=np.ones((9, 4)), dt=1.0)
