@@ -1,5 +1,7 @@
 """H from whole noisy sequences, and gross errors among measured states and pairs."""
 
+import re
+
 import jax
 import numpy as np
 import pytest
@@ -134,6 +136,10 @@ def test_gross_errors_among_pairs_do_not_spoil_the_law(spoilt):
     assert fit.met
     told = " ".join(fit.messages)
     assert "gross errors" in told
+    named = [
+        int(n) for part in re.findall(r"rows ([\d, ]+)", told) for n in part.split(",") if n.strip()
+    ]
+    assert sorted(named) == rows.tolist()
 
 
 def test_maps_are_drawn_of_an_s_of_sites():

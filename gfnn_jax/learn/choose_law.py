@@ -113,7 +113,7 @@ def unfit_for_law(prepared: Prepared, scene: Scene | None) -> str | None:
 
 def preferred(law: Candidate, chosen: Candidate, bound: float) -> bool:
     """Whether the law is taken instead of the map that was chosen: where it alone meets the
-    tolerance, or meets it and is not four times dearer, or where none meets it and it is as good."""
+    tolerance, or meets it and is not four times dearer, or none meets it and it is as good."""
     if law.validation_bound <= bound:
         return not chosen.validation_bound <= bound or law.operations <= DEARER * chosen.operations
     if chosen.validation_bound <= bound or not np.isfinite(law.validation_relative):
