@@ -15,7 +15,7 @@ from gfnn_jax.learn.structures import Structure
 from gfnn_jax.learn.varied import given_by
 from gfnn_jax.phase_space import Pairs
 
-_MOST_OUTLIERS = 0.05  # of the states measured may be gross errors, to be left out
+_MOST_OUTLIERS = 0.05  # of the pairs may be left out
 
 
 class Taken(NamedTuple):
@@ -43,9 +43,7 @@ def clean(pairs: Pairs, coordinates: Coordinates, structure: Structure | None = 
         return Taken(pairs, prepared, messages)
     found = outliers(prepared.y0, prepared.y1, prepared.scale, given_by(prepared))
     if len(found):
-        z0, z1 = (np.asarray(z)[found] for z in (pairs.z0, pairs.z1))
-        shared = np.all(z1[:-1] == z0[1:], axis=1)  # one state of a sequence, in two pairs
-        few = len(found) - np.sum(shared) <= _MOST_OUTLIERS * len(pairs)
+        few = len(found) <= _MOST_OUTLIERS * len(pairs)
         rows = ", ".join(map(str, first[found[:5]])) + (", …" if len(found) > 5 else "")
         messages.append(
             f"{len(found)} of {len(pairs)} pairs contradict the pairs around them (rows {rows}): "
