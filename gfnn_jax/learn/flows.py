@@ -387,7 +387,8 @@ def _grown(
     try:
         for grown in grow(problem, basis, judges.training, goal, min(most, options.most_modes)):
             ended = grown.ended
-            say(f"H grows: {len(grown.coefficients)} modes, error {grown.rms:.1e} {ended}")
+            why = f": {ended}" if ended else ""
+            say(f"H grows: {len(grown.coefficients)} modes, error {grown.rms:.1e}{why}")
     except OutOfTime:
         if grown is None:
             raise
