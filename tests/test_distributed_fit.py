@@ -196,6 +196,21 @@ def test_the_same_sample_of_any_number_of_processes(num_pairs, tmp_path, in_thre
     assert read_sample(names[0], num_pairs=50, group=Group()).digest != found[0].digest
 
 
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_process_may_have_no_pair(order, tmp_path, in_threads):
+    """Sequences of one state."""
+    states = np.random.default_rng(0).normal(size=(40, 2, 2))
+    np.savez(tmp_path / "0.npz", z0=states[:, 0], z1=states[:, 1], dt=DT)
+    np.savez(tmp_path / "1.npz", trajectories=states[:5, :1], dt=DT)
+    paths = [tmp_path / f"{i}.npz" for i in order]
+    found = in_threads(2, lambda group: read_sample(paths, group=group))
+    alone = read_sample(paths, group=Group())
+    np.testing.assert_array_equal(found[0].states, alone.states)
+    assert (found[0].dt, found[0].digest) == (DT, alone.digest)
+    with pytest.raises(InputError, match="no pair"):
+        in_threads(2, lambda group: read_sample([tmp_path / "1.npz"] * 2, group=group))
+
+
 def test_files_that_differ_or_cannot_be_shared(tmp_path):
     np.savez(tmp_path / "a.npz", z0=np.ones((9, 2)), z1=np.ones((9, 2)), dt=1.0)
     np.savez(tmp_path / "b.npz", z0=np.ones((9, 4)), z1=np.ones((9, 4)), dt=1.0)
@@ -204,6 +219,23 @@ def test_files_that_differ_or_cannot_be_shared(tmp_path):
     (tmp_path / "a.csv").write_text("t,q1,p1\n0,1,2\n1,2,3\n")
     with pytest.raises(InputError, match="or as many files as processes"):
         next(iterate_pairs(tmp_path / "a.csv", 10, share=Share(0, 2)))
+
+
+@pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")
+@pytest.mark.parametrize("learns", ["map", "hamiltonian"])
+def test_of_several_dt_the_map_is_that_of_the_sample(learns, tmp_path):
+    """Of pairs so noisy that a step of the median dt misses none by far."""
+    pairs = noisy(flow, sigma=3e-3)
+    for i, dt in enumerate((0.999 * DT, 1.001 * DT)):
+        own = pairs.take(slice(200 * i, 200 * (i + 1)))
+        np.savez(tmp_path / f"{i}.npz", z0=own.z0, z1=own.z1, dt=dt)
+    ran = fit_job.fit(
+        [tmp_path / "0.npz", tmp_path / "1.npz"], out=tmp_path / "m", learn=learns, tolerance=0.1
+    )
+    assert not any("whose map is kept" in message for message in ran.fit.messages)
+    both = read_sample([tmp_path / "0.npz", tmp_path / "1.npz"]).pairs()
+    alone = gfnn.fit(both, learn=learns, tolerance=0.1)
+    np.testing.assert_array_equal(ran.fit.map.step(both.z0)[0], alone.map.step(both.z0)[0])
 
 
 # Real processes, on this machine

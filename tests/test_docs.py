@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 # What these show is tested always elsewhere: the README, tests/test_args.py.
 SLOW = ("your-own-data", "args")
+sys.path.insert(0, str(ROOT / "benchmarks"))
 INSTALL = ("python3 -m venv ", ".venv/bin/pip install ")
 
 
@@ -71,3 +73,11 @@ def test_site_builds_without_warnings(tmp_path):
     load_config = pytest.importorskip("mkdocs.config").load_config
     build(load_config(str(ROOT / "mkdocs.yml"), site_dir=str(tmp_path), strict=True))
     assert (tmp_path / "reference" / "index.html").exists()
+
+
+def test_the_ten_lines_are_what_the_results_hold():
+    import summary
+
+    text = (ROOT / "benchmarks" / "RESULTS.md").read_text(encoding="utf-8")
+    for claim, figure, _, _ in summary.LINES:
+        assert f"| {claim} | {figure()} |" in text

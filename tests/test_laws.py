@@ -106,6 +106,7 @@ def candidate(operations, error):
         (candidate(1.0, 1e-7), candidate(100.0, 1e-9), False),
         (candidate(9.0, 1e-6), candidate(1.0, 1e-5), True),  # neither does
         (candidate(1.0, 1e-5), candidate(9.0, 1e-6), False),
+        (candidate(9.0, 1.005e-5), candidate(1.0, 1e-5), True),  # noise tells them not apart
         (candidate(1.0, np.inf), candidate(9.0, np.inf), False),
     ],
 )

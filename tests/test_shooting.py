@@ -1,5 +1,7 @@
 """H from whole noisy sequences, and gross errors among measured states and pairs."""
 
+import re
+
 import jax
 import numpy as np
 import pytest
@@ -17,13 +19,13 @@ OSCILLATOR = given_terms(1, ("q1**2", "p1**2", "q1**4"))
 TRUE = np.array([0.5, 0.5, 0.1])
 
 
-def measured(seed, sequences=20, length=11, outliers=0.0):
+def measured(seed, sequences=20, length=11, outliers=0.0, noise=NOISE):
     """(B, length, 2) states of sequences with noise, and which of them are gross errors."""
     rng = np.random.default_rng(seed)
     states = [rng.normal(size=(sequences, 2))]
     for _ in range(length - 1):
         states.append(images(OSCILLATOR, TRUE, states[-1], DT, STEPS).states)
-    states = np.stack(states, axis=1) + NOISE * rng.normal(size=(sequences, length, 2))
+    states = np.stack(states, axis=1) + noise * rng.normal(size=(sequences, length, 2))
     wrong = rng.random(states.shape[:2]) < outliers
     return states + wrong[..., None] * rng.normal(size=states.shape), wrong
 
@@ -71,6 +73,18 @@ def test_gross_errors_change_nothing_and_are_counted():
     assert np.all(np.abs(found.coefficients - TRUE) < 4 * deviation)
     assert found.outlying == pytest.approx(spoilt[1].sum(), abs=1)
     np.testing.assert_allclose(found.noise, NOISE, rtol=0.15)
+
+
+def test_a_coordinate_without_noise_has_no_outliers():
+    """What the steps' own error leaves of it is no noise, beside which others would be gross."""
+    arcs = arcs_of(*pairs_of(measured(0, length=40, noise=np.array([NOISE, 0.0]))[0]), 100)
+    assert arcs is not None
+    steps = Steps(2, 1)  # off by 3e-4 in a step
+    found = Shooting(arcs, DT, steps, np.ones(2), resolved=3e-4).fit(OSCILLATOR, TRUE)
+    assert found is not None
+    assert found.outlying == 0
+    np.testing.assert_allclose(found.noise[0], NOISE, rtol=0.06)
+    assert found.noise[1] < 0.5 * NOISE
 
 
 def test_an_arc_ends_before_noise_has_grown():
@@ -122,6 +136,10 @@ def test_gross_errors_among_pairs_do_not_spoil_the_law(spoilt):
     assert fit.met
     told = " ".join(fit.messages)
     assert "gross errors" in told
+    named = [
+        int(n) for part in re.findall(r"rows ([\d, ]+)", told) for n in part.split(",") if n.strip()
+    ]
+    assert sorted(named) == rows.tolist()
 
 
 def test_maps_are_drawn_of_an_s_of_sites():

@@ -79,6 +79,15 @@ def test_a_step_that_was_not_sampled_has_a_status(learned):
         assert learned.map.rollout(z, 3, dt=dt)[1].status.tolist() == [status]
 
 
+def test_a_step_after_another_is_within_the_range_of_both(learned):
+    z = np.full((1, 2), 0.1)
+    for dts, status in (((0.4, 0.5), 0), ((0.6, 0.7), 1)):
+        one, other = (learned.map.over(dt) for dt in dts)
+        state, info = one.then(other).step(z)
+        assert info.status.tolist() == [status]
+        np.testing.assert_allclose(state, other.step(one.step(z)[0])[0], atol=1e-15)
+
+
 def test_the_derivative_in_dt_is_the_velocity(learned):
     z = np.array([0.5, 0.3])
     velocity = jax.jit(jax.jacfwd(lambda h: learned.map.step(z, dt=h)[0]))(0.4)

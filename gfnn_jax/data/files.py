@@ -147,30 +147,32 @@ def read_sample(
         checksum, count = checksum + new["hash"].sum(), count + len(pairs)
         seen = [min(seen[0], new["dt"].min()), max(seen[1], new["dt"].max())]
         found = _smallest(_both(found, new), num_pairs)
-    if found is None and group.share.count == 1:
-        raise InputError(f"{_named(paths)}: no pair of consecutive states found")
     told = {"count": [count], "hash": checksum, "low": [seen[0]], "high": [seen[1]]}
     all_told = group.folded({n: np.array(v) for n, v in told.items()}, _both)
     total = group.told({"count": all_told["count"].sum()} if group.first else None)["count"]
+    if not total:
+        raise InputError(f"{_named(paths)}: no pair of consecutive states found")
     if group.share.count > 1:  # those that the first will want, and a few more
         part = (num_pairs + _MORE * np.sqrt(num_pairs)) / max(int(total), 1)
         if found is not None and part < 1:
             found = _taken(found, found["hash"] < np.uint64(part * 2.0**64))
         found = group.folded(found or {}, _both)
-    if not found:
-        raise InputError(f"{_named(paths)}: no pair of consecutive states found")
+    with _open(_own(paths, group.share)[0][0], dt) as source:
+        precision, units, period = source.precision, source.units, source.period
+        none = np.empty((0, 2, 2 * source.dim))
+    if not found:  # this process has no pair, and sends none
+        found = {"pairs": none, "dt": none[:, 0, 0], "hash": np.empty(0, np.uint64)}
     if total > num_pairs or not alone:
         found = _taken(found, np.argsort(found["hash"], kind="stable")[:num_pairs])
     alone = alone and len(_listed(paths)) == 1
     digest = _digest(_listed(paths)[0]) if alone else f"{all_told['hash'].sum():016x}"
     same = all_told["low"].min() == all_told["high"].max()
-    with _open(_own(paths, group.share)[0][0], dt) as source:
-        precision, units, period = source.precision, source.units, source.period
     states = found["pairs"].reshape(-1, found["pairs"].shape[-1])
     args = {n.removeprefix(_ARG): v for n, v in found.items() if n.startswith(_ARG)}
+    each = float(found["dt"][0]) if same and len(states) else found["dt"]
     return TrajectoryData(
-        states, np.full(len(found["pairs"]), 2), float(found["dt"][0]) if same else found["dt"],
-        _named(paths), digest, precision, units, args or None, period,
+        states, np.full(len(found["pairs"]), 2), each, _named(paths), digest, precision, units,
+        args or None, period,
     )  # fmt: skip
 
 

@@ -100,16 +100,18 @@ def arcs_of(z0, z1, longest: int) -> Arcs | None:
 class Shooting:
     """Arcs that are dt apart from state to state, and how the flow along them is computed.
 
-    angles: coordinates that are compared modulo 2π. check: called at every step along the arcs; it
-    may raise to stop.
+    angles: coordinates that are compared modulo 2π. resolved: error of the steps ÷ scale, below
+    which no coordinate's noise is told. check: called at every step along the arcs; it may raise to
+    stop.
     """
 
     def __init__(
         self, arcs: Arcs, dt: float, steps: Steps, scale, angles: tuple[int, ...] = (), *,
-        check: Callable[[], Any] = lambda: None, options: Options = OPTIONS,
+        resolved: float = 0.0, check: Callable[[], Any] = lambda: None, options: Options = OPTIONS,
     ):  # fmt: skip
         self.arcs, self.dt, self.steps, self.scale = arcs, dt, steps, scale
         self.angles, self.check, self.options = angles, check, options
+        self.least = max(resolved, float(np.finfo(float).eps)) * scale
 
     def fit(self, family, coefficients, *, only_states: bool = False) -> Shot | None:
         """From coefficients that are close, or with these as they are (``only_states``); every arc
@@ -192,7 +194,7 @@ class Shooting:
         square = np.sum(np.where(inside, known, 0.0) ** 2, axis=0) / np.maximum(
             inside.sum(axis=0), 1
         )
-        return np.sqrt(square / max(free, 0.5 / width)) + np.finfo(float).eps * self.scale
+        return np.hypot(np.sqrt(square / max(free, 0.5 / width)), self.least)
 
     def _weights(self, residual, noise, block=slice(None)) -> np.ndarray:
         size = np.minimum(np.abs(residual) / (self.options.biweight * noise), 1.0)

@@ -95,7 +95,8 @@ def fit(
                 trajectories.pairs(), scene, angles=angles, max_seconds=max_seconds,
                 progress=progress, kept_in=kept_in, job=job, **options,
             )  # fmt: skip
-            if large and can_be_refitted(fitted.map):
+            one_dt = np.ndim(trajectories.dt) == 0  # a refit has the rows of one step
+            if large and one_dt and can_be_refitted(fitted.map):
                 progress.say("all pairs, for the chosen candidate")
                 sampled = trajectories.pairs()
                 held = sampled.take(slice(min(_HELD, len(sampled) // _HELD_PART)))

@@ -25,6 +25,8 @@ _BESIDE = dataclasses.replace(
 )  # fmt: skip
 # A law holds outside the data and at any time step: so much dearer a step it may be.
 DEARER = 4.0
+# Where none meets the tolerance, errors that the noise of held-out pairs does not tell apart.
+_AS_GOOD = 1.01
 _TURNED = 0.2  # radians backwards that are worth a word
 _PART = 0.5  # of the time that is left, at most, for H beside a map
 _PART_STRUCTURED = 0.6  # the same where S is a sum over sites
@@ -111,9 +113,9 @@ def unfit_for_law(prepared: Prepared, scene: Scene | None) -> str | None:
 
 def preferred(law: Candidate, chosen: Candidate, bound: float) -> bool:
     """Whether the law is taken instead of the map that was chosen: where it alone meets the
-    tolerance, or meets it and is not four times dearer, or where none meets it and it is better."""
+    tolerance, or meets it and is not four times dearer, or none meets it and it is as good."""
     if law.validation_bound <= bound:
         return not chosen.validation_bound <= bound or law.operations <= DEARER * chosen.operations
     if chosen.validation_bound <= bound or not np.isfinite(law.validation_relative):
         return False
-    return law.validation_relative <= chosen.validation_relative
+    return law.validation_relative <= _AS_GOOD * chosen.validation_relative

@@ -53,7 +53,8 @@ def fitted_to_sequences(
     rms = _NORMAL * float(np.median(np.abs(problem.residuals(family, c, fit.steps, some))))
     if not 0 < rms < np.inf:
         return None
-    steps = problem.fine_steps(family, c, judges.training, (_STEP_ERROR * rms,))[0]
+    resolved = _STEP_ERROR * rms
+    steps = problem.fine_steps(family, c, judges.training, (resolved,))[0]
     longest = longest_arc(family, c, prepared.y0[some], prepared.dt, steps, rms)
 
     def along(rows) -> Shooting | None:
@@ -62,7 +63,8 @@ def fitted_to_sequences(
         if arcs is None or np.median(arcs.measured.sum(axis=1)) <= _SHORTEST:
             return None
         return Shooting(
-            arcs, prepared.dt, steps, problem.scale, coordinates.angles, check=check
+            arcs, prepared.dt, steps, problem.scale, coordinates.angles, resolved=resolved,
+            check=check,
         )  # fmt: skip
 
     train, held = along(judges.training), along(judges.held_out)

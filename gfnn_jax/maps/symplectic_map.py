@@ -199,9 +199,9 @@ class SymplecticMap:
     def then(self, other: SymplecticMap) -> SymplecticMap:
         """This map and the other one after it, as one map: sectors of a ring, phases of a period.
 
-        Its domain and its sizes are those of this map, its dt the sum of both; the values of
-        parameters are those that both have seen. Raises ValueError where the maps have different
-        coordinates or parameters, or are driven.
+        Its domain and its sizes are those of this map, its dt, and the range of one that S was
+        learned with, the sum of both; the values of parameters are those that both have seen.
+        Raises ValueError where the maps have different coordinates or parameters, or are driven.
         """
         ours, theirs = self.parameters, other.parameters
         names = [() if p is None else p.names for p in (ours, theirs)]
@@ -213,9 +213,13 @@ class SymplecticMap:
         if ours is not None and theirs is not None:
             low, high = np.maximum(ours.low, theirs.low), np.minimum(ours.high, theirs.high)
             ours = dataclasses.replace(ours, low=low, high=high)
+        dt_range = None
+        if self.dt_range is not None or other.dt_range is not None:
+            dt_range = sum(m.dt if m.dt_range is None else m.dt_range for m in (self, other))
         return dataclasses.replace(
-            self, pieces=(*self.pieces, *other.pieces), dt=self.dt + other.dt, parameters=ours
-        )
+            self, pieces=(*self.pieces, *other.pieces), dt=self.dt + other.dt, parameters=ours,
+            dt_range=dt_range,
+        )  # fmt: skip
 
     def reversed(self) -> SymplecticMap:
         """The inverse map, as a map of its own."""
