@@ -251,7 +251,7 @@ def learn_hamiltonian(
     noisy = best.noisy or arcs is not None
     if noisy and best.error.bound > everywhere.tolerance.bound:
         say("H: whole sequences")
-        with contextlib.suppress(OutOfTime):
+        with contextlib.suppress(OutOfTime, np.linalg.LinAlgError):
             best = _of_sequences(problem, best, prepared, everywhere, clock)
     seconds = time.perf_counter() - started
     learned = _learned(best, problem, prepared, everywhere, seconds, options, root)
