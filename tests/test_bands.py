@@ -8,7 +8,6 @@ import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.data.files import read_initial_noise
 from gfnn_jax.errors import InputError
-from gfnn_jax.maps.bands import bands, horizon
 from gfnn_jax.fitting import shared_noise, uncertainty
 from gfnn_jax.fitting.least_squares import Reduced
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
@@ -16,6 +15,7 @@ from gfnn_jax.jobs.predict import predict
 from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.sweeps import LinearSweep
+from gfnn_jax.maps.bands import bands, horizon
 from gfnn_jax.scenes import henon_heiles
 
 NOISE = 1e-3
