@@ -10,10 +10,14 @@ import gfnn_jax as gfnn
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp
 from gfnn_jax.fitting.levenberg_marquardt import (
+    LMState,
     levenberg_marquardt,
     levenberg_marquardt_together,
 )
 from gfnn_jax.jobs.predict import predict
+from gfnn_jax.jobs.progress import Progress
+from gfnn_jax.jobs.search import search
+from gfnn_jax.learn import sweeps
 
 DT = 0.5
 
@@ -36,13 +40,13 @@ def pairs_of(num, seed, noise=0.0):
     return gfnn.Pairs(*(z + noise * rng.normal(size=z.shape) for z in (z0, z1)), DT)
 
 
-OPTIONS = {"family": "mlp", "chart": "midpoint", "max_iterations": 25, "max_seconds": None}
+OPTIONS = {"family": "mlp", "chart": "midpoint", "max_iterations": 15, "max_seconds": None}
 
 
 @pytest.fixture(scope="module")
 def fit():
     with pytest.warns(gfnn.FitWarning):
-        return gfnn.fit(pairs_of(200, 0), ensemble=4, **OPTIONS)
+        return gfnn.fit(pairs_of(150, 0), ensemble=4, **OPTIONS)
 
 
 def gradients(num, seed):
@@ -54,18 +58,23 @@ def test_members_are_trained_as_they_are_alone():
     """With equal shares, as long as every step lowers the loss."""
     (w, target), held = gradients(90, 0), gradients(30, 1)
     family = Mlp(box_inputs(w), (5,), "tanh")
+    starts = [family.init(jax.random.key(i), np.float64) for i in range(3)]
+    theta = np.stack([np.concatenate([np.ravel(a) for a in jax.tree.leaves(p)]) for p in starts])
+
+    def begun(theta, damping):
+        return LMState(theta, theta, damping, 0, np.nan, np.inf, np.inf, np.inf, 0, 0.0)
+
     options, together = {"validation": held, "max_iterations": 3, "chunk": 40}, []
-    starts = [
-        levenberg_marquardt(
-            family, family.init(jax.random.key(i), np.float64), w, target, **options
-        ).params for i in range(3)
-    ]  # fmt: skip
     levenberg_marquardt_together(
-        family, starts, w, target, shares=np.ones((3, 90)), on_progress=together.append, **options
-    )
+        family, starts, w, target, shares=np.ones((3, 90)), on_progress=together.append,
+        resume=begun(theta, np.full(3, 1e3)), **options,
+    )  # fmt: skip
     for i, start in enumerate(starts):
         alone = []
-        levenberg_marquardt(family, start, w, target, on_progress=alone.append, **options)
+        levenberg_marquardt(
+            family, start, w, target, on_progress=alone.append, resume=begun(theta[i], 1e3),
+            **options,
+        )  # fmt: skip
         for ours, its in zip(together, alone, strict=True):
             np.testing.assert_allclose(ours.theta[i], its.theta, rtol=1e-6, atol=1e-9)
             assert ours.damping[i] == pytest.approx(its.damping)
@@ -107,7 +116,7 @@ def test_the_map_is_the_mean_and_its_samples_are_symplectic(fit):
 def test_bands_hold_the_true_error(fit, noise):
     if noise:
         with pytest.warns(gfnn.FitWarning):
-            fit = gfnn.fit(pairs_of(200, 0, noise), ensemble=4, **OPTIONS)
+            fit = gfnn.fit(pairs_of(150, 0, noise), ensemble=4, **OPTIONS)
     z = states(200, 9) * 0.9
     found, info = fit.map.rollout(z, 1, samples=40, key=jax.random.key(0))
     error = np.abs(np.asarray(found)[:, 1] - moved(z))
@@ -131,11 +140,8 @@ def test_a_saved_ensemble_keeps_its_members_and_predicts_bands(fit, tmp_path):
         assert (file["std"][:, 1:] > 0).all()
 
 
-def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path):
-    from gfnn_jax.jobs.progress import Progress
-    from gfnn_jax.jobs.search import search
-    from gfnn_jax.learn import sweeps
-
+@pytest.mark.filterwarnings("ignore::gfnn_jax.FitWarning")
+def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path, monkeypatch):
     options = {"family": "mlp", "chart": "midpoint", "max_iterations": 6, "ensemble": 4}
 
     class Stopping(Progress):
@@ -150,16 +156,15 @@ def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path):
             pass
 
     def run(folder, at):
-        return search(pairs_of(200, 0), None, progress=Stopping(at), kept_in=folder, job={},
+        return search(pairs_of(150, 0), None, progress=Stopping(at), kept_in=folder, job={},
                       max_seconds=None, **options)  # fmt: skip
 
-    with pytest.MonkeyPatch.context() as patch, pytest.warns(gfnn.FitWarning):
-        patch.setattr(sweeps, "_CHECKPOINT_SECONDS", 0.0)
-        whole = run(tmp_path / "whole", 99)
-        with pytest.raises(KeyboardInterrupt):
-            run(tmp_path / "part", 3)
-        assert list((tmp_path / "part").glob("step_*"))
-        resumed = run(tmp_path / "part", 99)
+    monkeypatch.setattr(sweeps, "_CHECKPOINT_SECONDS", 0.0)
+    whole = run(tmp_path / "whole", 99)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "part", 3)
+    assert list((tmp_path / "part").glob("step_*"))
+    resumed = run(tmp_path / "part", 99)
     for one, other in zip(*(jax.tree.leaves(f.map.pieces[0].family) for f in (whole, resumed)),
                           strict=True):  # fmt: skip
         np.testing.assert_array_equal(one, other)

@@ -139,7 +139,9 @@ def _band(map_: SymplecticMap, z0, predicted, given: dict[str, Any]) -> np.ndarr
     if map_.posterior is None:
         return None
     few = slice(_BAND_TRAJECTORIES)
-    own = {name: None if values is None else values[few] for name, values in given.items()}
+    own: dict[str, Any] = {
+        name: None if values is None else values[few] for name, values in given.items()
+    }
     samples = map_.sample(jax.random.key(0), _BAND_SAMPLES)
     drawn, _ = samples.rollout(z0[few], predicted.shape[1] - 1, **own)
     std = bands(drawn, predicted[few], map_.angles_of_z).std
