@@ -65,7 +65,9 @@ class Ring(NamedTuple):
     alpha: np.ndarray
     orbits: dict[int, np.ndarray]
 
-    def track(self, z, points: tuple[int, ...] = (), turns: int = 1, delta=0.0) -> np.ndarray:
+    def track(
+        self, z, points: tuple[int, ...] = (), turns: int = 1, delta: float | np.ndarray = 0.0
+    ) -> np.ndarray:
         """States (turns, points, N, 4) after these elements of each turn; the last one unless
         told. delta: energy deviation, a number or (N,). NaN where a particle is lost."""
         points = points or (len(self.lattice),)

@@ -138,7 +138,7 @@ class _Half:
     @cached_property
     def depends(self) -> np.ndarray:
         """Whether each product depends on a variable that has derivatives (terms,)."""
-        return (self.indices[:, : self.moving] > 0).any(axis=1)
+        return np.asarray((self.indices[:, : self.moving] > 0).any(axis=1))
 
     def _parity(self, term) -> int:
         """Sign under the reversor: that of sines and odd degrees of the variables that flip."""

@@ -48,7 +48,7 @@ class ImplicitStep:
         (family, params, dt, scale), (z, known, args, *own_dt) = shared, lanes
         w = self.chart.complete(known, x)
         gradient = symmetric_gradient(family, params, w, args)
-        return self._evaluation(z, w, gradient, *(own_dt or [dt]), scale)[0]
+        return self._evaluation(z, w, gradient, own_dt[0] if own_dt else dt, scale)[0]
 
     def linearise(self, shared, lanes, x) -> tuple[Evaluation, Any]:
         """The residual and its Jacobian ∂r/∂x (B, n, n)."""
