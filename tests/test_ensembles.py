@@ -175,7 +175,6 @@ def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path, monkeypat
     ("options", "words"),
     [
         ({"ensemble": 0}, "whole number of 1 or more as ensemble, got 0"),
-        ({"ensemble": 2.5, "family": "mlp"}, "whole number"),
         ({"ensemble": 3}, "expected family='mlp'"),
         ({"ensemble": 3, "family": "mlp", "learn": "hamiltonian"}, "an ensemble is of networks S"),
     ],
