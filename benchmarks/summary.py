@@ -67,9 +67,9 @@ def storage_ring() -> str:
     row = m["rows"][0]
     faster = m["tracking_microseconds_per_turn"] / row["microseconds_per_turn"]
     return (
-        f"{number(row['microseconds_per_turn'])} µs, {number(faster)} times faster than tracking "
-        f"its {m['num_elements']:,} elements; {long['turns']:,} turns, drift exponent of the "
-        f"action {number(long['drift_exponent'])}"
+        f"{number(row['one_turn'])} of the spread in {number(row['microseconds_per_turn'])} µs, "
+        f"{number(faster)} times faster than tracking its {m['num_elements']:,} elements; "
+        f"{long['turns']:,} turns, drift exponent of the action {number(long['drift_exponent'])}"
     )
 
 

@@ -160,12 +160,19 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     command.set_defaults(command=_predict)
     command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
-    command.add_argument("--initial", type=Path, metavar="FILE", required=True)
+    command.add_argument(
+        "--initial", type=Path, metavar="FILE", required=True,
+        help="initial states, or a trajectory file, whose sequences go on from their last states",
+    )  # fmt: skip
     command.add_argument("--num-steps", type=_count, metavar="N", required=True)
-    command.add_argument("--save-every", type=_count, metavar="K", default=1)
+    command.add_argument(
+        "--save-every", type=_count, metavar="K", default=1,
+        help="save the state of every K-th step (default %(default)s)",
+    )  # fmt: skip
     command.add_argument(
         "--dt", type=_positive, metavar="H",
-        help="another time step than the data's, of a model that learned a Hamiltonian",
+        help="another time step than the data's, of a model that learned a Hamiltonian, or pairs "
+        "of several time steps",
     )  # fmt: skip
     command.add_argument("--out", type=Path, metavar="FILE", required=True, help=".npz to write")
     command.add_argument(
@@ -260,7 +267,7 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
     )  # fmt: skip
     command.add_argument(
         "--scalar", dest="family", choices=FAMILIES, default=argparse.SUPPRESS,
-        help="the old name of --family",
+        help=argparse.SUPPRESS,  # the old name of --family
     )  # fmt: skip
     command.add_argument(
         "--ensemble", type=_count, default=1, metavar="N",
@@ -358,7 +365,7 @@ def _scenes(arguments: argparse.Namespace) -> None:
 
     for name, make in SCENES.items():
         scene = make()
-        print(f"{name:22} dim {scene.dim}  dt {scene.dt:<7g} {scene.purpose}")
+        print(f"{name:22} dim {scene.dim:<3} dt {scene.dt:<9g} {scene.purpose}")
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -519,7 +526,8 @@ def _summarise(ran: Any, out: Path) -> None:
         f"{fit['tolerance']:g}), symplecticity defect {report['map']['symplecticity_defect']:.1e}"
     )
     if report["hamiltonian"] is not None:
-        print(f"H = {report['hamiltonian']['formula']}")
+        also = "" if report["model"]["learns"] == "hamiltonian" else "not chosen: "
+        print(f"{also}H = {report['hamiltonian']['formula']}")
     print(fit["ended"])
     rollout = report["rollout"]
     if rollout is not None:
@@ -547,7 +555,7 @@ def _holds(fit: Any) -> str:
 def _print_table(table: Any) -> None:
     from rich.console import Console
 
-    wide = Console() if sys.stdout.isatty() else Console(width=120)
+    wide = Console() if sys.stdout.isatty() else Console(width=132)
     wide.print(table)
 
 

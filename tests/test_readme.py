@@ -81,12 +81,13 @@ def test_your_own_data_in_python(mine):
 
 def test_your_own_data_by_commands(mine):
     np.savez("data.npz", **mine, dt=0.1)
+    np.save("start.npy", mine["z0"][:5])
     fit, predict = gfnn_commands()
     predict[predict.index("100000")] = "1000"
     assert cli.main(fit) == 0
     assert cli.main(predict) == 0
     with np.load("prediction.npz") as done:
-        assert done["trajectories"].shape == (200, 11, 2)
+        assert done["trajectories"].shape == (5, 11, 2)
 
 
 def test_links_lead_somewhere():

@@ -268,7 +268,8 @@ def phase_portrait(orbits: Mapping, labels=("$q$", "$p$"), modulo=False, ax=None
     place = 0
     for name, (x, y) in orbits.items():
         if name == "reference":
-            _points(ax, x, y, modulo, color=REFERENCE, marker="o", label=name, zorder=1.5)
+            # Larger: it shows as a rim where the others cover it.
+            _points(ax, x, y, modulo, 1.7, color=REFERENCE, marker="o", label=name, zorder=1.5)
         else:
             look = _look(place)
             _points(ax, x, y, modulo, color=look["color"], marker=look["marker"], label=name)
@@ -308,13 +309,13 @@ def sections(points: Mapping, labels=("$q_2$", "$p_2$"), modulo=False, axes=None
     return list(axes)
 
 
-def _points(ax, x, y, modulo, **look):
+def _points(ax, x, y, modulo, larger=1.0, **look):
     x, y = np.ravel(np.asarray(x)), np.ravel(np.asarray(y))
     if modulo:
         x, y = x % (2 * np.pi), y % (2 * np.pi)
     size = float(np.clip(60 / np.sqrt(max(x.size, 1)), 0.5, 3))
     # Rasterised, as a PDF of 100,000 vector points takes a minute to show.
-    ax.plot(x, y, ls="none", ms=size, mew=0, rasterized=True, **look)
+    ax.plot(x, y, ls="none", ms=larger * size, mew=0, rasterized=True, **look)
     return x, y
 
 

@@ -122,7 +122,10 @@ def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     sizes = ", ".join(f"{n} {s:.3g}" for n, s in zip(names, map_.scale, strict=True))
     angles = [names[i] for i in map_.coordinates.angles if map_.coordinates.forward is not _POLAR]
     turned = f" {', '.join(angles)}: period 2 pi, any number of turns." if angles else ""
-    told = "\n".join(f"   {key}: {value}" for key, value in about.items())
+    told = "\n".join(
+        f"   {key}: {value:.3g}" if isinstance(value, float) else f"   {key}: {value}"
+        for key, value in about.items()
+    )
     text = f"""\
  One step of a learned symplectic map, and its inverse.
 

@@ -91,6 +91,6 @@ def _about(folder: Path | None) -> dict[str, Any]:
         ("fit", "validation_rms", "one-step error of held-out pairs, in the data's units"),
     ):
         inside = record.get(part)
-        if isinstance(inside, Mapping) and inside.get(key) is not None:
+        if isinstance(inside, Mapping) and inside.get(key) not in (None, {}):
             about[told] = inside[key]
     return about

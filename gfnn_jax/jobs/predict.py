@@ -255,8 +255,12 @@ def _go_on(
     many = 1 if drawn is None else 1 + len(drawn.z0)
     chunk = _chunk_length(z0.shape[0] * many, z0.shape[1], save_every)
     options = {"params": params, "save_every": save_every, "stop_outside": stop_outside}
+    started, begun = time.perf_counter(), writer.saved
     while writer.saved < writer.total:
-        progress.say(f"step {(writer.saved - 1) * save_every} of {request.num_steps}")
+        progress.say(
+            f"step {(writer.saved - 1) * save_every} of {request.num_steps}"
+            + _time_left(time.perf_counter() - started, writer.saved - begun, writer)
+        )
         count = min(chunk, writer.total - writer.saved)
         lanes, states = map_.advance(lanes, count, **options)
         if drawn is not None and of_samples is not None:
@@ -265,6 +269,13 @@ def _go_on(
             states, passed = _with_bands(drawn, states, others, steps, passed)
         writer.append(states, _carry(lanes, of_samples, passed))
     return lanes
+
+
+def _time_left(seconds: float, done: int, writer: PredictionWriter) -> str:
+    """The time that is left at the rate of these seconds for ``done`` saved states, if any."""
+    if not done:
+        return ""
+    return f", about {seconds * (writer.total - writer.saved) / done:.0f} s left"
 
 
 _OF_SAMPLES = "samples_"  # before the names of their lanes in a carry

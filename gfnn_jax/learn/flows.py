@@ -248,7 +248,8 @@ def learn_hamiltonian(
         prepared, everywhere = steps_of, judges_of_steps
         problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale)
         best = best._replace(error=_held_out_error(best.family, best.fit, prepared, everywhere))
-    if best.error.bound > everywhere.tolerance.bound:
+    noisy = best.noisy or arcs is not None
+    if noisy and best.error.bound > everywhere.tolerance.bound:
         say("H: whole sequences")
         with contextlib.suppress(OutOfTime):
             best = _of_sequences(problem, best, prepared, everywhere, clock)
@@ -387,7 +388,8 @@ def _grown(
     try:
         for grown in grow(problem, basis, judges.training, goal, min(most, options.most_modes)):
             ended = grown.ended
-            say(f"H grows: {len(grown.coefficients)} modes, error {grown.rms:.1e} {ended}")
+            why = f": {ended}" if ended else ""
+            say(f"H grows: {len(grown.coefficients)} modes, error {grown.rms:.1e}{why}")
     except OutOfTime:
         if grown is None:
             raise
