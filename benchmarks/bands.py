@@ -42,6 +42,8 @@ STATES, SAMPLES = 40, 50
 SEED, FITS_OF_SEQUENCES = 11, 3
 # Samples, states and steps whose time is measured: a law's step is ten times as dear.
 COSTS = {"map": (5, 1_000, 1_000), "hamiltonian": (5, 1_000, 50)}
+# Networks of 16-16-16 units.
+NETWORKS = {"family": "mlp", "chart": "midpoint", "ensemble": 8, "max_iterations": 30}
 # Coverage that a band of two standard deviations is to have, and its width over the RMS error.
 COVERED, WIDEST = (0.90, 0.995), 3.0
 WIDTHS = (0.1, 0.3, 1.0, 3.0, 10.0)  # of the figure
@@ -99,14 +101,14 @@ def errors_and_bands(fit, z0, reference, seed: int, angles) -> tuple[np.ndarray,
     return between(mean, reference[:, STEPS]), 2 * spread
 
 
-def calibrated(make, quick: bool, *, lend: bool, sizes=SIZES, **options) -> Numbers:
+def calibrated(make, quick: bool, *, lend: bool, sizes=SIZES, sigmas=SIGMAS, **options) -> Numbers:
     """Coverage and width for every σ and number of pairs, of one fit each."""
     scene = make()
     angles = angles_of(scene)
     z0 = np.asarray(gfnn.sample_test_states(scene, STATES, jax.random.key(100 + SEED)))
     reference = np.asarray(gfnn.reference_trajectories(scene, z0, STEPS[-1]))
     rows = []
-    for sigma in SIGMAS[2:] if quick else SIGMAS:
+    for sigma in SIGMAS[2:] if quick else sigmas:
         for size in SIZES[1:2] if quick else sizes:
             pairs = gfnn.sample_pairs(scene, size, jax.random.key(SEED))
             fit = quietly(noisy(pairs, sigma, SEED), scene if lend else None, seed=SEED, **options)
@@ -173,6 +175,19 @@ def cost(quick: bool) -> Numbers:
     return found
 
 
+def together(quick: bool) -> Numbers:
+    """Networks trained together beside one network, the same number of iterations."""
+    pairs = gfnn.sample_pairs(henon_heiles(), 500, jax.random.key(SEED))
+    options = {**NETWORKS, "max_iterations": 3 if quick else 15}
+    found = {
+        str(count): quietly(pairs, **{**options, "ensemble": count}).chosen.fit_seconds
+        for count in (1, NETWORKS["ensemble"])
+    }
+    per_second = {count: int(count) / seconds for count, seconds in found.items()}
+    return {"pairs": 500, "iterations": options["max_iterations"], "seconds": found,
+            "models_per_second": per_second}  # fmt: skip
+
+
 PIECES = {
     "henon-heiles-map": partial(
         calibrated,
@@ -190,8 +205,12 @@ PIECES = {
     "noise-dt-0.5": partial(sequences, 0.5),
     "noise-dt-0.05": partial(sequences, 0.05),
     "cost": cost,
+    "ensemble": partial(
+        calibrated, henon_heiles, lend=False, sizes=(500,), sigmas=(0.0, 1e-4, 1e-2), **NETWORKS
+    ),
+    "together": together,
 }
-CALIBRATED = tuple(PIECES)[:5]
+CALIBRATED = (*tuple(PIECES)[:5], "ensemble")
 
 
 def _calibration_table(found: dict[str, Numbers]) -> str:
@@ -240,10 +259,22 @@ def _cost_table(found: dict[str, Numbers]) -> str:
     return markdown(head, rows)
 
 
+def _together_table(found: dict[str, Numbers]) -> str:
+    head = ["networks trained together", "pairs", "iterations", "s", "models per second"]
+    m = found["together"]["measured"] if "together" in found else {"seconds": {}}
+    rows = [
+        [count, str(m["pairs"]), str(m["iterations"]), number(seconds),
+         number(m["models_per_second"][count])]
+        for count, seconds in m["seconds"].items()
+    ]  # fmt: skip
+    return markdown(head, rows)
+
+
 def tables() -> None:
     """The section of RESULTS.md, and the figure."""
     found = results(PIECES, "bands")
-    text = "\n\n".join((_calibration_table(found), _noise_table(found), _cost_table(found)))
+    parts = (_calibration_table, _noise_table, _cost_table, _together_table)
+    text = "\n\n".join(part(found) for part in parts)
     between_markers(TABLES, "bands", text)
     figure(found)
 
@@ -255,7 +286,7 @@ def figure(found: dict[str, Numbers]) -> None:
     drawn, panels = pyplot.subplots(1, len(STEPS), figsize=(10, 3.4), sharex=True, sharey=True)
     for k, (panel, step) in enumerate(zip(panels, STEPS, strict=True)):
         panel.axhspan(100 * COVERED[0], 100 * COVERED[1], color="0.92")
-        for name, marker in zip(CALIBRATED, "osD^v", strict=True):
+        for name, marker in zip(CALIBRATED, "osD^vP", strict=True):
             rows = found[name]["measured"]["rows"] if name in found else []
             rows = [r for r in rows if "coverage" in r]
             if rows:

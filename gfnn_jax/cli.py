@@ -269,6 +269,11 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
         "--scalar", dest="family", choices=FAMILIES, default=argparse.SUPPRESS,
         help=argparse.SUPPRESS,  # the old name of --family
     )  # fmt: skip
+    command.add_argument(
+        "--ensemble", type=_count, default=1, metavar="N",
+        help="with --family mlp: so many networks trained together; their mean is the map, and "
+        "their spread its bands",
+    )  # fmt: skip
     command.add_argument("--seed", type=_seed, default=0, metavar="N")
     command.add_argument(
         "--max-seconds", type=_positive, default=120.0, metavar="S",
@@ -376,8 +381,8 @@ def _run(arguments: argparse.Namespace) -> None:
             tolerance=arguments.tolerance, max_seconds=arguments.max_seconds,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
             base=arguments.base, structure=arguments.structure,
-            family=arguments.family, overwrite=arguments.overwrite, resume=arguments.resume,
-            progress=shown,
+            family=arguments.family, ensemble=arguments.ensemble, overwrite=arguments.overwrite,
+            resume=arguments.resume, progress=shown,
         )  # fmt: skip
     _summarise(ran, out)
     _hold_to(arguments.strict, out / "model")
@@ -410,9 +415,9 @@ def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) 
             absolute_tolerance=arguments.absolute_tolerance, max_seconds=arguments.max_seconds,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
             base=arguments.base, structure=arguments.structure,
-            family=arguments.family, scene_name=arguments.scene, angles=arguments.angles,
-            seed=arguments.seed, overwrite=arguments.overwrite, resume=arguments.resume,
-            group=group, progress=shown,
+            family=arguments.family, ensemble=arguments.ensemble, scene_name=arguments.scene,
+            angles=arguments.angles, seed=arguments.seed, overwrite=arguments.overwrite,
+            resume=arguments.resume, group=group, progress=shown,
         )  # fmt: skip
     if group is not None:
         processes.wait_for_all()

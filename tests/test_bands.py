@@ -8,7 +8,6 @@ import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.data.files import read_initial_noise
 from gfnn_jax.errors import InputError
-from gfnn_jax.evaluate.bands import bands, horizon
 from gfnn_jax.fitting import shared_noise, uncertainty
 from gfnn_jax.fitting.least_squares import Reduced
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
@@ -16,6 +15,7 @@ from gfnn_jax.jobs.predict import predict
 from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.sweeps import LinearSweep
+from gfnn_jax.maps.bands import bands, horizon
 from gfnn_jax.scenes import henon_heiles
 
 NOISE = 1e-3
@@ -116,6 +116,22 @@ def test_bands_hold_the_true_error_of_a_noisy_law(noisy):
         error = np.abs(mean - reference)[:, step]
         assert np.mean(error <= band[:, step]) > 0.75  # six coefficients: errors go together
         assert np.median(band[:, step]) < 4 * np.sqrt(np.mean(error**2))
+
+
+def test_a_rollout_has_the_bands_of_its_samples(noisy):
+    scene, fit = noisy
+    z0 = np.asarray(gfnn.sample_test_states(scene, 3, jax.random.key(9)))
+    states, info = fit.map.rollout(z0, 6, save_every=2, samples=8, key=jax.random.key(1))
+    drawn = fit.sample(jax.random.key(1), 8).rollout(z0, 6, save_every=2)[0]
+    assert info.bands.std.shape == info.bands.median.shape == (3, 4, 4)
+    np.testing.assert_allclose(info.bands.median, np.median(drawn, axis=0), atol=1e-15)
+    np.testing.assert_array_equal(info.bands.std, bands(drawn, states).std)
+    np.testing.assert_array_equal(states, fit.map.rollout(z0, 6, save_every=2)[0])
+    one = fit.map.rollout(z0[1], 6, save_every=2, samples=8, key=jax.random.key(1))[1].bands
+    np.testing.assert_allclose(one.std, info.bands.std[1], rtol=1e-9, atol=1e-15)
+    assert one.quantiles.shape == (3, 4, 4)
+    with pytest.raises(ValueError, match="a key"):
+        fit.map.rollout(z0, 6, samples=8)
 
 
 def test_every_sample_is_a_symplectic_map_and_rolls_out_as_it(noisy):

@@ -111,6 +111,16 @@ def test_a_lost_prediction_ends_its_curve_and_is_counted():
     assert line(ax, "HNN (1 of 3 lost)")[0].max() == 49
 
 
+def test_error_growth_shades_what_the_posterior_holds():
+    error = power_laws()
+    band = 3 * error[:2]
+    ax = figures.error_growth({"GFNN": (STEPS, error)}, band=(STEPS, band))
+    np.testing.assert_allclose(line(ax, "_band")[1], band.mean(axis=0)[1:])
+    labels = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert labels == ["GFNN", r"$\propto n$", r"two $\sigma$ of the posterior"]
+    assert ax.get_ylim()[1] > band.mean(axis=0)[-1]
+
+
 def test_element_errors_draws_each_element_on_its_own_axes():
     a, e = power_laws(), power_laws()
     ax_a, ax_e = figures.element_errors({"GFNN": (STEPS, a, e)})

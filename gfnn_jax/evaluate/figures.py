@@ -82,18 +82,21 @@ def _look(place: int) -> dict:
 
 
 @style()
-def error_growth(errors: Mapping, ylabel="position error", ax=None) -> Axes:
+def error_growth(errors: Mapping, ylabel="position error", ax=None, band=None) -> Axes:
     """Mean error over trajectories against step, log–log, with a band of one standard deviation.
 
     errors: name -> (steps (L,), error (B, L)). Above the mean the band is mean + std. Below it is
     mean / (1 + std/mean), the same factor down: mean − std to first order, and positive where
     mean − std is not. Where a prediction is lost the mean ends, and the median goes on, thin, until
     half are lost; the legend counts those. The dotted line grows as the step, the paper's theorem
-    for regular orbits.
+    for regular orbits. band: (steps (L,), two standard deviations of the posterior (B, L)), whose
+    mean over trajectories is shaded from below.
     """
     ax = _axes(ax)
     _error_curves(ax, errors, ylabel)
     _guide(ax, 1.0, r"$\propto n$")
+    if band is not None:
+        _shaded(ax, np.asarray(band[0]), np.mean(band[1], axis=0))
     _legend_above(ax)
     return ax
 
@@ -140,6 +143,20 @@ def energy_error(errors: Mapping, ax=None) -> Axes:
     _guide(ax, 0.5, r"$\propto \sqrt{n}$")
     _legend_above(ax)
     return ax
+
+
+def _shaded(ax, steps, upper):
+    """What lies below ``upper`` (L,), without a change of the limits downwards."""
+    shown = (steps > 0) & np.isfinite(upper) & (upper > 0)
+    if not shown.any():
+        return
+    ax.plot(steps[shown], upper[shown], color=REFERENCE, linewidth=0.8, alpha=0.5, label="_band")
+    low = min(ax.get_ylim()[0], float(upper[shown].min()))
+    ax.fill_between(
+        steps[shown], low, upper[shown], color="0.5", alpha=0.15, linewidth=0, zorder=0,
+        label=r"two $\sigma$ of the posterior",
+    )  # fmt: skip
+    ax.set_ylim(bottom=low)
 
 
 def _error_curves(ax, errors, ylabel):

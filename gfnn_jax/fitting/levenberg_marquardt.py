@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -41,6 +41,8 @@ from gfnn_jax.phase_space import require_x64
 LARGEST_ACCELERATION = 0.75
 # Damping grown by 2^(1 + 2 + ... + 10) without descent: F is flat to roundoff.
 MAX_TRIALS = 11
+# Of members that are trained together: damping after a step that has not lowered F.
+TOGETHER_GROWTH = 4.0
 
 Rows = Float[Array | np.ndarray, "_ _"]
 
@@ -49,7 +51,8 @@ class LMState(NamedTuple):
     """All that the next iteration depends on: arrays and numbers, ready for a checkpoint.
 
     theta, best_theta: flattened parameters (P,), of now and of the best validation error so far.
-    damping:           μ; NaN before the first iteration, which takes it from AᵀA.
+    damping:           μ; NaN before the first iteration, which takes it from AᵀA. (E,) of members
+                       that are trained together, whose theta are (E, P).
     iteration:         iterations done.
     train_rms, validation_rms, best_validation_rms: of ∇S − target_gradient, per
                        component.
@@ -59,7 +62,7 @@ class LMState(NamedTuple):
 
     theta: Any
     best_theta: Any
-    damping: float
+    damping: Any
     iteration: int
     train_rms: float
     validation_rms: float
@@ -133,43 +136,130 @@ def levenberg_marquardt(
     linearize = partial(_linearize, family, chunks, layout=layout)
     attempt = partial(_attempt, family, chunks, layout=layout)
 
+    def descend(theta, damping):
+        return _descend(theta, damping, linearize, attempt)
+
     def validation_rms(theta):
         return math.sqrt(float(_loss(family, held, theta, layout=layout)))
 
     started = time.perf_counter()
     _compile(family, chunks, held, theta, layout)
     compile_seconds = time.perf_counter() - started
+    options = _Options(
+        max_iterations, max_seconds, target_rms, patience, (on_progress, checkpoint)
+    )  # fmt: skip
+    first = _first_state(theta, math.nan, validation_rms(theta)) if resume is None else resume
+    state, why = _trained(first, descend, validation_rms, w.size, options)
+    params = _unflattened(np.asarray(state.best_theta), layout)
+    return _result(state, params, compile_seconds, why)
 
-    started = time.perf_counter()
-    state = _first_state(theta, validation_rms(theta)) if resume is None else resume
-    seconds_before = state.seconds
+
+def levenberg_marquardt_together(
+    family: Family,
+    members: Sequence[Any],
+    w: Rows,
+    target_gradient: Rows,
+    *,
+    validation: tuple[Rows, Rows],
+    weight: Any = 1.0,
+    shares: Float[np.ndarray, "_ _"],
+    max_iterations: int = 200,
+    max_seconds: float | None = None,
+    target_rms: float = 0.0,
+    patience: int = 20,
+    chunk: int = 500,
+    on_progress: Callable[[LMState], Any] | None = None,
+    checkpoint: Callable[[LMState], Any] | None = None,
+    resume: LMState | None = None,
+) -> LMResult:
+    """Minimise that loss for E members of a family at once, each from its own start and with its
+    own shares of the pairs; one program linearises and tries a step of all of them.
+
+    members: E starts, pytrees of one structure. shares: (E, N), 0 or more, of mean 1: what the
+    square of a pair's residual counts in each member's loss. All else is as for
+    `levenberg_marquardt`, but for this: a member whose step does not lower its loss waits with four
+    times the damping for the next iteration; validation errors are those of the members' mean ∇S;
+    theta and best_theta of a state are (E, P), its damping (E,); the params that are returned have
+    a leading axis E. The memory is E times as much.
+    """
+    flat = [_flattened(member) for member in members]
+    theta, layout = np.stack([t for t, _ in flat]), flat[0][1]
+    rows = (np.asarray(a) for a in (w, target_gradient, *validation))
+    w, target_gradient, held_w, held_target = rows
+    _check(theta, w, target_gradient, held_w, held_target)
+    weight = np.broadcast_to(np.asarray(weight, theta.dtype), w.shape[-1:])
+    held = jax.device_put((held_w, held_target, weight[None, :]))
+    *points, weights = _chunked(w, target_gradient, weight, chunk)
+    padding = weights.shape[0] * weights.shape[1] - len(w)
+    parts = np.pad(np.sqrt(shares), ((0, 0), (0, padding))).reshape(-1, *weights.shape[:2], 1)
+    points, weights = jax.device_put((tuple(points), parts * weights))
+    program = partial(_descend_together, family, points, weights, layout=layout)
+
+    def descend(theta, damping):
+        theta, losses, damping = program(theta, damping)
+        if not np.isfinite(losses).all():
+            raise ValueError("∇S(params, w) is not finite on the training pairs at the start")
+        return theta, float(np.mean(losses)), np.asarray(damping)
+
+    def validation_rms(theta):
+        return math.sqrt(float(_loss_of_mean(family, held, theta, layout=layout)))
+
+    started, unknown = time.perf_counter(), np.full(len(theta), math.nan)
+    _descend_together.lower(family, points, weights, theta, unknown, layout=layout).compile()
+    _loss_of_mean.lower(family, held, theta, layout=layout).compile()
+    compile_seconds = time.perf_counter() - started
+    options = _Options(
+        max_iterations, max_seconds, target_rms, patience, (on_progress, checkpoint)
+    )  # fmt: skip
+    first = _first_state(theta, unknown, validation_rms(theta)) if resume is None else resume
+    state, why = _trained(first, descend, validation_rms, w.size, options)
+    each = [_unflattened(one, layout) for one in np.asarray(state.best_theta)]
+    return _result(state, jax.tree.map(lambda *a: np.stack(a), *each), compile_seconds, why)
+
+
+class _Options(NamedTuple):
+    """When a training stops, and who is told of its states."""
+
+    max_iterations: int
+    max_seconds: float | None
+    target_rms: float
+    patience: int
+    told: tuple[Callable[[LMState], Any] | None, ...]
+
+
+def _trained(state: LMState, descend, validation_rms, size: int, options: _Options):
+    """The last state from this one on, and why there is no further one."""
+    started, seconds_before = time.perf_counter(), state.seconds
 
     def reason_to_stop(state):
-        if state.best_validation_rms <= target_rms:
+        if state.best_validation_rms <= options.target_rms:
             return "target"
-        if state.iteration >= max_iterations:
+        if state.iteration >= options.max_iterations:
             return "iterations"
-        if max_seconds is not None and state.seconds >= max_seconds:
+        if options.max_seconds is not None and state.seconds >= options.max_seconds:
             return "seconds"
-        if state.iteration - state.landmark_iteration >= patience:
+        if state.iteration - state.landmark_iteration >= options.patience:
             return "no progress"
         return None
 
     while (stopped_because := reason_to_stop(state)) is None:
-        step = _descend(state.theta, state.damping, linearize, attempt)
+        step = descend(state.theta, state.damping)
         if step is None:
             stopped_because = "no progress"
             break
         theta, loss, damping = step
-        train_rms = math.sqrt(loss / w.size)
+        train_rms = math.sqrt(loss / size)
         seconds = seconds_before + time.perf_counter() - started
         state = _next_state(state, theta, damping, train_rms, validation_rms(theta), seconds)
-        for report in (on_progress, checkpoint):
+        for report in options.told:
             if report is not None:
                 report(state)
+    return state, stopped_because
 
+
+def _result(state: LMState, params, compile_seconds: float, stopped_because: str) -> LMResult:
     return LMResult(
-        params=jax.tree.map(jnp.asarray, _unflattened(np.asarray(state.best_theta), layout)),
+        params=jax.tree.map(jnp.asarray, params),
         train_rms=state.train_rms,
         validation_rms=state.best_validation_rms,
         iterations=state.iteration,
@@ -295,6 +385,38 @@ def _loss(family, rows, theta, *, layout):
     return jnp.mean(_residual(family, layout, theta, *rows) ** 2)
 
 
+@partial(jax.jit, static_argnames="layout")
+def _descend_together(family, points, weights, thetas, dampings, *, layout):
+    """One trial step of every member: θ (E, P), F and μ (E,) after it, θ as before where F did not
+    fall. The products AᵀA of all members are one batched product of matrices."""
+
+    def of_one(theta, damping, weight):
+        chunks = (*points, weight)
+        matrix, slope, loss = _linearize(family, chunks, theta, layout=layout)
+        first = 1e-3 * jnp.max(jnp.diagonal(matrix))
+        damping = jnp.where(jnp.isnan(damping), first, damping)
+        trial, trial_loss, promised = _attempt(
+            family, chunks, theta, matrix, slope, damping, layout=layout
+        )
+        decrease = loss - trial_loss
+        better = decrease > 0
+        shrunk = damping * jnp.maximum(1 / 3, 1 - (2 * decrease / promised - 1) ** 3)
+        return (
+            jnp.where(better, trial, theta),
+            jnp.where(better, trial_loss, loss),
+            jnp.where(better, shrunk, TOGETHER_GROWTH * damping),
+        )
+
+    return jax.vmap(of_one)(thetas, dampings, weights)
+
+
+@partial(jax.jit, static_argnames="layout")
+def _loss_of_mean(family, held, thetas, *, layout):
+    """The mean square of a component of the residual of the members' mean ∇S."""
+    each = jax.vmap(lambda theta: _residual(family, layout, theta, *held))(thetas)
+    return jnp.mean(jnp.mean(each, axis=0) ** 2)
+
+
 def _chunked(w, target_gradient, weight, chunk):
     """All three as equal chunks (num_chunks, rows, 2d); weight 0 marks padding. NumPy."""
     num_chunks = -(-len(w) // chunk)
@@ -306,11 +428,11 @@ def _chunked(w, target_gradient, weight, chunk):
     return tuple(a.reshape(num_chunks, rows, -1) for a in (w[take], target_gradient[take], weights))
 
 
-def _first_state(theta, validation_rms):
+def _first_state(theta, damping, validation_rms):
     return LMState(
         theta=np.asarray(theta),
         best_theta=np.asarray(theta),
-        damping=math.nan,
+        damping=damping,
         iteration=0,
         train_rms=math.nan,
         validation_rms=validation_rms,

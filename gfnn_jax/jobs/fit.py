@@ -40,6 +40,7 @@ def fit(
     base: str | None = None,
     structure: str | None = None,
     family: str = "auto",
+    ensemble: int = 1,
     scene_name: str | None = None,
     angles: tuple[int, ...] = (),
     seed: int = 0,
@@ -79,7 +80,7 @@ def fit(
     options = {
         "tolerance": tolerance, "absolute_tolerance": absolute_tolerance, "chart": chart,
         "learn": learn, "terms": list(terms), "base": base, "structure": structure,
-        "family": family, "seed": seed,
+        "family": family, "seed": seed, **({} if ensemble == 1 else {"ensemble": ensemble}),
     }  # fmt: skip
     job = {
         "command": "fit", "data": trajectories.digest,

@@ -10,14 +10,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.data.files import read_initial, read_initial_noise
 from gfnn_jax.data.parts import number_of_parts, part_of, put_together
 from gfnn_jax.data.predictions import PredictionWriter, is_done, job_of
 from gfnn_jax.errors import InputError
-from gfnn_jax.evaluate.bands import bands, horizon
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.maps import saved
+from gfnn_jax.maps.bands import bands, horizon
 from gfnn_jax.maps.samples import Samples
 from gfnn_jax.maps.sharded import Sharded
 from gfnn_jax.maps.symplectic_map import Lanes, SymplecticMap
@@ -230,9 +229,7 @@ def _drawn(map_: SymplecticMap, count: int, z0, std, size: float | None) -> _Dra
     if std is not None:
         begun = begun + std * np.random.default_rng(1).normal(size=begun.shape)
         of = "model and initial state"
-    coordinates = map_.coordinates
-    angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
-    return _Drawn(samples, begun, angles, size, of)
+    return _Drawn(samples, begun, map_.angles_of_z, size, of)
 
 
 def _go_on(

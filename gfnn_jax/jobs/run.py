@@ -19,6 +19,8 @@ from gfnn_jax.jobs.written import MODEL, Ran, already_done, pairs_digest, write
 from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.fit import MAX_SECONDS, Fit
 from gfnn_jax.learn.structures import Bodies, structure_of
+from gfnn_jax.maps.bands import bands
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene
 from gfnn_jax.scenes.trajectories import (
@@ -33,6 +35,8 @@ from gfnn_jax.storage.partial import unfinished
 
 # Of a network: pairs, tolerance, iterations; and of a quick look.
 _NETWORK, _NETWORK_QUICK = (6_000, 1e-6, 250), (3_000, 1e-5, 60)
+# Trajectories and maps of the band in the figure of errors: twice the work of all rollouts.
+_BAND_TRAJECTORIES, _BAND_SAMPLES = 10, 20
 QUICK_PAIRS, QUICK_TRAJECTORIES, QUICK_TOLERANCE = 4_000, 25, 1e-7
 
 
@@ -51,6 +55,7 @@ def run(
     base: str | None = None,
     structure: str | None = None,
     family: str = "auto",
+    ensemble: int = 1,
     overwrite: bool = False,
     resume: bool = False,
     progress: Progress = SILENT,
@@ -73,6 +78,7 @@ def run(
     options = {
         "tolerance": default if tolerance is None else tolerance, "chart": chart, "learn": learn,
         "terms": list(terms), "base": base, "structure": structure, "family": family, "seed": seed,
+        **({} if ensemble == 1 else {"ensemble": ensemble}),
     }  # fmt: skip
     num_trajectories = QUICK_TRAJECTORIES if quick else NUM_TRAJECTORIES
     job = {
@@ -107,7 +113,8 @@ def run(
         progress.say("figures")
         with atomic_folder(out) as folder:
             write(folder, folder / MODEL, fitted, result, job)
-            for file, figure in _figures(fitted, scene, measured, reference).items():
+            band = _band(fitted.map, z0, measured.predicted, given)
+            for file, figure in _figures(fitted, scene, measured, reference, band).items():
                 figures.save(figure, folder / f"{file}.png")
     return Ran(fitted, out, result)
 
@@ -126,10 +133,26 @@ def _finite(pairs: Pairs) -> Pairs:
     return dataclasses.replace(pairs, z0=z0, z1=z1).take(known)
 
 
-def _figures(fit: Fit, scene: Scene, measured: Measured, reference) -> dict[str, Any]:
-    """The scene's figures by file name."""
+def _band(map_: SymplecticMap, z0, predicted, given: dict[str, Any]) -> np.ndarray | None:
+    """(B, L): two standard deviations of the position of the first trajectories; None where the map
+    has no posterior."""
+    if map_.posterior is None:
+        return None
+    few = slice(_BAND_TRAJECTORIES)
+    own: dict[str, Any] = {
+        name: None if values is None else values[few] for name, values in given.items()
+    }
+    samples = map_.sample(jax.random.key(0), _BAND_SAMPLES)
+    drawn, _ = samples.rollout(z0[few], predicted.shape[1] - 1, **own)
+    std = bands(drawn, predicted[few], map_.angles_of_z).std
+    return 2 * np.linalg.norm(std[..., : map_.dim], axis=-1)
+
+
+def _figures(fit: Fit, scene: Scene, measured: Measured, reference, band=None) -> dict[str, Any]:
+    """The scene's figures by file name. band: of the error (B, L)."""
     steps, predicted = measured.steps, measured.predicted
-    drawn = {"error": figures.error_growth({"GFNN": (steps, measured.error)})}
+    band = None if band is None else (steps, band)
+    drawn = {"error": figures.error_growth({"GFNN": (steps, measured.error)}, band=band)}
     if measured.energy_error is not None:
         drawn["energy"] = figures.energy_error({"GFNN": (steps, measured.energy_error)})
     shown = [c for c in fit.candidates if np.isfinite(c.validation_relative)]

@@ -41,6 +41,7 @@ def check_request(
     terms=(),
     base=None,
     structure=None,
+    ensemble=1,
     seed=0,
     max_seconds: float | None = None,
 ) -> None:
@@ -59,6 +60,10 @@ def check_request(
         raise FitError(f"expected max_seconds above 0, or None for no limit; got {max_seconds!r}")
     if not (isinstance(seed, numbers.Integral) and 0 <= seed < 2**32):
         raise FitError(f"expected a whole number from 0 to 2**32 - 1 as seed, got {seed!r}")
+    if not (isinstance(ensemble, numbers.Integral) and ensemble >= 1):
+        raise FitError(f"expected a whole number of 1 or more as ensemble, got {ensemble!r}")
+    if ensemble > 1 and (family != "mlp" or learn == "hamiltonian"):
+        raise FitError("an ensemble is of networks S: expected family='mlp', and S to be learned")
     own_dt = bool(np.ndim(pairs.dt))
     one = () if own_dt else (("time step", pairs.dt),)
     for name, value in (("tolerance", tolerance), *one):

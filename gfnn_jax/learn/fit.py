@@ -120,8 +120,8 @@ class Fit:
         """``num`` maps drawn from the posterior of the chosen map's coefficients, as one pytree,
         each exactly symplectic: `maps.samples.Samples`. key: of ``jax.random``.
 
-        Raises ValueError where the map has no posterior: a network, a map of pairs that were drawn
-        from a law.
+        Raises ValueError where the map has no posterior: a single network, a map of pairs that were
+        drawn from a law.
         """
         return self.map.sample(key, num)
 
@@ -188,6 +188,7 @@ def fit(
     structure: str | None = None,
     family: str = "auto",
     chart: str = "auto",
+    ensemble: int = 1,
     angles: tuple[int, ...] = (),
     seed: int = 0,
     max_seconds: float | None = MAX_SECONDS,
@@ -222,6 +223,8 @@ def fit(
     family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp";
                with learn="hamiltonian" H is a sum of terms, or a network with "mlp".
     chart:     "auto" or one of type1, type2, type3, midpoint.
+    ensemble:  so many networks trained together, of which the map is the mean and their spread the
+               posterior; with family="mlp".
     angles:    without a scene, the indices of z that have period 2π.
     max_seconds: for all of it; the search ends with the best map so far while there is time to
                compile its step. None: no budget.
@@ -248,9 +251,9 @@ def fit(
 
     request = checked(
         pairs, scene, tolerance=tolerance, absolute_tolerance=absolute_tolerance, learn=learn,
-        terms=terms, base=base, structure=structure, family=family, chart=chart, angles=angles,
-        seed=seed, clock=clock, max_iterations=max_iterations, checkpoints=checkpoints,
-        factors=factors, say=on_progress, tell=on_candidate,
+        terms=terms, base=base, structure=structure, family=family, chart=chart,
+        ensemble=ensemble, angles=angles, seed=seed, clock=clock, max_iterations=max_iterations,
+        checkpoints=checkpoints, factors=factors, say=on_progress, tell=on_candidate,
     )  # fmt: skip
     warn(request.messages)
     on_progress("looking at the map's local Jacobians")

@@ -7,6 +7,7 @@ import dataclasses
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.choose import Chosen
+from gfnn_jax.learn.ensembles import EnsembleSweep
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.learn.sweeps import LinearSweep
 from gfnn_jax.maps.posterior import Posterior
@@ -14,11 +15,12 @@ from gfnn_jax.maps.posterior import Posterior
 
 def with_posterior(chosen: Chosen, searched: Searched) -> Chosen:
     """The choice with the posterior of its map, where that was fitted to the user's pairs and is
-    linear in its coefficients, or is the flow of a learned H; as it is, where neither holds."""
+    linear in its coefficients, an ensemble of networks, or the flow of a learned H; as it is, where
+    it is none of these."""
     map_, entry, law = chosen.candidate.map, chosen.entry, searched.law
     if entry is not None:
         own = entry.sweep.judges.pairs is searched.judges.pairs and map_.parameters is None
-        if not (own and isinstance(entry.sweep, LinearSweep)):
+        if not (own and isinstance(entry.sweep, (LinearSweep, EnsembleSweep))):
             return chosen
         kind, root = Generated, entry.sweep.root(entry.size)
     elif searched.of_terms is not None and chosen.candidate.learns == "map":

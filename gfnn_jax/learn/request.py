@@ -35,6 +35,7 @@ class Request:
     structure: Structure | None
     family: str
     chart: str
+    ensemble: int
     seed: int
     clock: Clock
     max_iterations: int
@@ -70,7 +71,7 @@ def lent(scene: Scene, learn: str, chart: str) -> str | None:
 
 def checked(
     pairs: Pairs, scene: Scene | None, *, tolerance, absolute_tolerance, learn, terms, base,
-    structure, family, chart, angles, seed, clock: Clock, **others: Any,
+    structure, family, chart, ensemble, angles, seed, clock: Clock, **others: Any,
 ) -> Request:  # fmt: skip
     """The request, with what is constant in the pairs as a constant.
 
@@ -83,7 +84,8 @@ def checked(
         bound = Tolerance(absolute_tolerance, relative=False)
     check_request(
         pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, angles=angles,
-        terms=terms, base=base, structure=structure, seed=seed, max_seconds=clock.max_seconds,
+        terms=terms, base=base, structure=structure, ensemble=ensemble, seed=seed,
+        max_seconds=clock.max_seconds,
     )  # fmt: skip
     coordinates = scene.coordinates if scene else Coordinates("cartesian", angles=tuple(angles))
     found = structure_of(structure, pairs.dim, coordinates)
@@ -96,6 +98,7 @@ def checked(
         messages += unlike_the_scene(pairs, scene)
     messages += coarse_tolerance(pairs, bound)
     return Request(
-        pairs, scene, coordinates, bound, learn, terms, base, found, family, chart, seed, clock,
+        pairs, scene, coordinates, bound, learn, terms, base, found, family, chart, ensemble, seed,
+        clock,
         messages=messages, **others,
     )  # fmt: skip

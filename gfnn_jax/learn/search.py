@@ -92,6 +92,7 @@ def search(
             clock.check()
             sweep, size = sweeps[i], sweeps[i].sizes[n]
             judged = sweep.judge(size, clock, say)
+            size = sweep.sizes[n]  # with what was trained
             candidate = judged
             # Something to keep should the search be interrupted is worth a few more looks.
             keep = on_validated is not None and judged.validation_relative < _KEPT * kept

@@ -15,6 +15,7 @@ from gfnn_jax.learn.choose_charts import Charts
 from gfnn_jax.learn.choose_law import DEARER, law_of
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.diagnosed import Diagnosis, diagnosed
+from gfnn_jax.learn.ensembles import EnsembleSweep
 from gfnn_jax.learn.flows import LearnedHamiltonian
 from gfnn_jax.learn.law_maps import (
     better_than,
@@ -142,12 +143,10 @@ def _sweeps(request: Request, seen: Diagnosis, judges: Judges) -> list[Any]:
         plain = prepared.structure is None and prepared.args is None
         return [sweep_of_dt(prepared, request.scene, judges, request.factors)] if plain else []
     if request.family == "mlp":
-        return [
-            NetworkSweep(
-                prepared, charts[0], judges, request.max_iterations, request.seed,
-                request.checkpoints,
-            )
-        ]  # fmt: skip
+        given = (prepared, charts[0], judges, request.max_iterations, request.seed,
+                 request.checkpoints)  # fmt: skip
+        count = request.ensemble
+        return [NetworkSweep(*given) if count == 1 else EnsembleSweep(*given, count=count)]
     return list(
         sweeps_for(request.family, charts, prepared, request.scene, judges, request.factors)
     )

@@ -16,7 +16,7 @@ from gfnn_jax.families.products import Products, number_of_terms
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
-from gfnn_jax.fitting.levenberg_marquardt import LMState, levenberg_marquardt
+from gfnn_jax.fitting.levenberg_marquardt import LMResult, LMState, levenberg_marquardt
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.learn.candidates import Candidate, Judges, validated
 from gfnn_jax.learn.clock import Clock
@@ -119,8 +119,8 @@ class LinearSweep:
         reversor = (-1,) * 2 * prepared.dim if even else reversor
         self._kept, self._prefix = factors, "even " if even else ""
         self.prepared, self.chart, self.judges, self.kind = prepared, chart, judges, kind
-        self._train, self._weight = _rows(prepared, chart, judges.training)
-        self._held, _ = _rows(prepared, chart, judges.held_out)
+        self._train, self._weight = rows_of(prepared, chart, judges.training)
+        self._held, _ = rows_of(prepared, chart, judges.held_out)
         free = (*prepared.coordinates.cyclic, *prepared.whole)
         self._outermost = outermost(prepared.y0[judges.training], free)
         coordinates = prepared.coordinates
@@ -202,7 +202,7 @@ class LinearSweep:
     def left_over(self, size: Size) -> np.ndarray:
         """(N, 2d): what the size leaves of ∇S of every pair, unit-free as train_rms."""
         _, params = self.solve(size, Clock(), lambda message: None)
-        (w, target, *args), weight = _rows(self.prepared, self.chart, slice(None))
+        (w, target, *args), weight = rows_of(self.prepared, self.chart, slice(None))
         gradient = np.asarray(size.family.gradient(params, w, *args))
         if self.prepared.own_dt is not None:
             gradient = args[0] * gradient
@@ -359,7 +359,7 @@ class NetworkSweep:
     def __init__(self, prepared, chart, judges: Judges, max_iterations, seed, checkpoints):
         self.prepared, self.chart, self.judges = prepared, chart, judges
         self._max_iterations, self._seed, self._checkpoints = max_iterations, seed, checkpoints
-        (w, target), self._weight = _rows(prepared, chart, judges.training[:_MLP_PAIRS])
+        (w, target), self._weight = rows_of(prepared, chart, judges.training[:_MLP_PAIRS])
         coordinates = prepared.coordinates
         inputs = box_inputs(
             w, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
@@ -372,7 +372,7 @@ class NetworkSweep:
     def judge(self, size: Size, clock: Clock, say: Callable[[str], Any]) -> Candidate:
         """Train the network."""
         family = size.family
-        held, _ = _rows(self.prepared, self.chart, self.judges.held_out)
+        held, _ = rows_of(self.prepared, self.chart, self.judges.held_out)
 
         def report(state: LMState) -> None:
             say(
@@ -380,18 +380,14 @@ class NetworkSweep:
                 f"validation {state.validation_rms:.2e} of the data's spread"
             )
 
-        theta = np.zeros(family.num_parameters)
-        like = LMState(theta, theta, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0, 0.0)  # its structure counts
-        resume = self._checkpoints.latest(like) if self._checkpoints else None
-        result = levenberg_marquardt(
-            family, family.init(jax.random.key(self._seed), np.float64), *self._train,
+        resume = self._checkpoints.latest(self._like()) if self._checkpoints else None
+        result = self._trained(
             validation=held, weight=self._weight, max_iterations=self._max_iterations,
             max_seconds=clock.left if np.isfinite(clock.left) else None,
             target_rms=0.5 * self.judges.tolerance.bound,
             on_progress=report, checkpoint=_every_few_seconds(self._checkpoints),
             resume=resume[1] if resume else None,
         )  # fmt: skip
-        self._params = jax.tree.map(np.asarray, result.params)
         error = self.judges.estimate(result.validation_rms)
         return Candidate(
             label=family.label, family=self.kind, chart=self.chart.name,
@@ -400,6 +396,19 @@ class NetworkSweep:
             validation_bound=error.bound, deviations=error.deviations,
             train_rms=result.train_rms, fit_seconds=result.seconds,
         )  # fmt: skip
+
+    def _like(self) -> LMState:
+        """A state whose structure is that of this training's."""
+        theta = np.zeros(self.sizes[0].family.num_parameters)
+        return LMState(theta, theta, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0, 0.0)
+
+    def _trained(self, **options: Any) -> LMResult:
+        """The training; its params are then those of the sweep."""
+        family = self.sizes[0].family
+        start = family.init(jax.random.key(self._seed), np.float64)
+        result = levenberg_marquardt(family, start, *self._train, **options)
+        self._params = jax.tree.map(np.asarray, result.params)
+        return result
 
     def validate(self, size: Size, judged: Candidate, clock: Clock, say) -> Candidate:
         """The trained network with its error measured by steps."""
@@ -438,8 +447,8 @@ def is_even(prepared: Prepared, judges: Judges) -> bool:
     dim = prepared.dim
     if dim < _SCARCE_FROM_DIM or prepared.coordinates.angles or prepared.args is not None:
         return False
-    (w, target), weight = _rows(prepared, MIDPOINT, judges.training)
-    held, _ = _rows(prepared, MIDPOINT, judges.held_out)
+    (w, target), weight = rows_of(prepared, MIDPOINT, judges.training)
+    held, _ = rows_of(prepared, MIDPOINT, judges.held_out)
     flip = (-1,) * 2 * dim
     inputs = box_inputs(w, cyclic=prepared.coordinates.cyclic, reversor=flip)
     signs = variable_signs(inputs, flip, w)
@@ -483,7 +492,7 @@ def trial_residual(prepared: Prepared) -> float:
     """The held-out residual of ∇S, ÷ scale, of polynomials of a low degree in the midpoint chart:
     how near these pairs are to a map that a small S generates. Infinite where some are missing."""
     half = len(prepared.y0) // 2
-    (w, target), weight = _rows(prepared, MIDPOINT, slice(None))
+    (w, target), weight = rows_of(prepared, MIDPOINT, slice(None))
     if not np.isfinite(w + target).all():
         return float("inf")
     coordinates = prepared.coordinates
@@ -501,7 +510,7 @@ def trial_residual(prepared: Prepared) -> float:
     return residual
 
 
-def _rows(prepared: Prepared, chart: AnyChart, rows) -> tuple[Any, np.ndarray]:
+def rows_of(prepared: Prepared, chart: AnyChart, rows) -> tuple[Any, np.ndarray]:
     """(w, target_gradient) of these rows, with their args where there are some, and the weight that
     makes a row of ∇S unit-free. Where each pair has its own dt: (w, h times that, dt), as `_Moves`
     has its terms."""
@@ -529,7 +538,7 @@ class _Moves:
 
 
 def _of_rows(family: Any) -> Any:
-    """The family whose terms make the rows of `_rows`."""
+    """The family whose terms make the rows of `rows_of`."""
     return _Moves(family) if isinstance(family, OfTimeStep) else family
 
 

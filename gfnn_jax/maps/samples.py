@@ -117,7 +117,8 @@ def sampled(map_: SymplecticMap, key, num: int) -> Samples:
     if map_.posterior is None:
         raise ValueError(
             "expected a map with a posterior: one that gfnn.fit fitted to the pairs themselves, "
-            "linear in its coefficients; networks and maps of drawn pairs have none"
+            "linear in its coefficients or an ensemble of networks; a single network and a map of "
+            "drawn pairs have none"
         )
     if num < 1:
         raise ValueError(f"expected a number of samples above 0, got {num}")

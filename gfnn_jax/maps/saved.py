@@ -20,6 +20,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.errors import InputError
+from gfnn_jax.families.ensemble import Ensemble
 from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.mlp import Mlp
 from gfnn_jax.families.products import Products
@@ -47,7 +48,7 @@ _TYPES: dict[str, type] = {
     for kind in (
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
         Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
-        Windows, Groups, Ranges, OfTimeStep,
+        Windows, Groups, Ranges, OfTimeStep, Ensemble,
     )
 }  # fmt: skip
 # Names that were used before, in models that may still be about.

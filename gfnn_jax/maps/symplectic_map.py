@@ -21,9 +21,10 @@ from jax.core import Tracer
 
 from gfnn_jax.arrays import as_row
 from gfnn_jax.compiling import compiled_sooner
-from gfnn_jax.coordinates import TWO_PI, Coordinates
+from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated, two_sum
+from gfnn_jax.maps.bands import Bands, bands
 from gfnn_jax.maps.domain import Domain, Ranges
 from gfnn_jax.maps.modified_hamiltonian import NUM_STEPS, Cells, ModifiedHamiltonian, of_cells
 from gfnn_jax.maps.parameters import Parameters, as_args
@@ -84,11 +85,12 @@ class Lanes(NamedTuple):
 
 class RolloutInfo(NamedTuple):
     """How each lane of a rollout ended: status, step at which it left the domain (−1 if it never
-    did), most Newton updates in a step; each (B,)."""
+    did), most Newton updates in a step; each (B,). bands: of the samples that were asked for."""
 
     status: Any
     left_at: Any
     iterations: Any
+    bands: Bands | None = None
 
 
 @partial(
@@ -288,15 +290,18 @@ class SymplecticMap:
 
     def rollout(
         self, z0, num_steps: int, *, params=None, t0=None, dt=None, save_every: int = 1,
-        stop_outside: bool = False,
+        stop_outside: bool = False, samples: int | None = None, key=None,
     ) -> tuple[Any, RolloutInfo]:  # fmt: skip
         """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d).
 
         params: the values of a map's parameters. t0: the time of a drive at z0; it goes on with the
-        steps. dt: of `over`, for each step.
+        steps. dt: of `over`, for each step. samples, key: how many maps are drawn from the
+        posterior by which key of ``jax.random``; the states of all of them are held at once.
         Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first, and a
-        RolloutInfo. A lane whose step fails, or that leaves the domain with ``stop_outside``,
-        repeats NaN from there on. Raises ValueError where a number of steps or a shape is wrong.
+        RolloutInfo; with samples its ``bands`` have their std about the states, median and
+        quantiles. A lane whose step fails, or that leaves the domain with ``stop_outside``,
+        repeats NaN from there on. Raises ValueError where a number of steps or a shape is wrong,
+        and where samples are asked for without a key or of a map without posterior.
         """
         for name, number in (("num_steps", num_steps), ("save_every", save_every)):
             if not isinstance(number, Integral):
@@ -313,7 +318,24 @@ class SymplecticMap:
         z0 = self._states(z0)
         map_ = self if dt is None else self.over(dt, z0.shape[:-1])
         args = self._args(params, z0, t0)
-        return _rollout(map_, z0, args, num_steps // save_every, save_every, stop_outside)
+        states, info = _rollout(map_, z0, args, num_steps // save_every, save_every, stop_outside)
+        if samples is None:
+            return states, info
+        if key is None:
+            raise ValueError("expected a key of jax.random beside samples")
+        options = {"params": params, "t0": t0, "save_every": save_every}
+        drawn, _ = map_.sample(key, samples).rollout(
+            np.atleast_2d(z0), num_steps, stop_outside=stop_outside, **options
+        )
+        found = bands(drawn, states if z0.ndim == 2 else states[None], self.angles_of_z)
+        if z0.ndim == 1:
+            found = Bands(found.std[0], found.quantiles[:, 0])
+        return states, info._replace(bands=found)
+
+    @property
+    def angles_of_z(self) -> tuple[int, ...]:
+        """Indices of the user's coordinates that are angles."""
+        return self.coordinates.angles if self.coordinates.forward is CARTESIAN.forward else ()
 
     def _args(self, given, z, t0=None):
         return as_args(self.parameters, given, z.shape, np.dtype(self.scale.dtype), t0)

@@ -19,6 +19,11 @@ class Bands(NamedTuple):
     std: np.ndarray
     quantiles: np.ndarray
 
+    @property
+    def median(self) -> np.ndarray:
+        """(B, S, 2d)."""
+        return self.quantiles[1]
+
 
 def bands(drawn, states, angles: tuple[int, ...] = ()) -> Bands:
     """Bands of the samples' states (n, B, S, 2d) about the prediction (B, S, 2d). angles: indices
