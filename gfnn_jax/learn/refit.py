@@ -111,7 +111,7 @@ def refit(
         group.told({})
     if chosen is None or not chosen.validation_rms <= _NO_WORSE * before:
         found_map = "no map" if chosen is None else f"a worse map ({chosen.validation_rms:.2e})"
-        warn(f"all pairs give {found_map} than the sample ({before:.2e}), whose map is kept")
+        warn(f"all pairs give {found_map}: that of the sample ({before:.2e}) is kept")
         chosen, num_pairs = old, fitted.num_pairs
     elif law is not None and found.law is not None and old.learns == "hamiltonian":
         law = _with_coefficients(law, found.law, chosen)
