@@ -604,10 +604,11 @@ def second_figure(deviation_: Numbers, frequencies_: Numbers) -> None:
         axis.set(xlabel="x [mm]", ylabel="y [mm]", title=f"frequency map of a cell, {name}")
     drawn.colorbar(shown, ax=axes[0], label="log₁₀ of the tunes' change")
     section, of_delta = axes[1]
-    for name, style in (("tracking", "k,"), ("map", "C1,")):
+    for name, colour, size in (("tracking", "k", 3.0), ("map", "C1", 0.8)):  # the map on top
         points = 1e-3 * np.array(frequencies_["sections_micro"][name])  # (turns, orbits, 2)
-        section.plot(points[..., 0].ravel(), points[..., 1].ravel(), style)
-        section.plot([], [], style[:-1] + "o", markersize=3, label=name)
+        x, y = points[..., 0].ravel(), points[..., 1].ravel()
+        section.plot(x, y, f"{colour}o", markersize=size, markeredgewidth=0)
+        section.plot([], [], f"{colour}o", markersize=3, label=name)
     section.set(xlabel="x [mm]", ylabel="$p_x$ [10⁻³]", title="section of a cell, y = 0")
     section.legend(fontsize=8, loc="upper right")
     delta = 100 * np.asarray(deviation_["delta"])
