@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import types
@@ -51,6 +52,13 @@ def pytest_configure(config):
     # The suite's workers want all cores: threads of the linear algebra would wait for each other.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     threadpool_limits(limits=1, user_api="blas")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _interruptible():
+    """A shell that starts the tests in the background has them ignore SIGINT."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True, scope="module")

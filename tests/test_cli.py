@@ -486,8 +486,6 @@ def test_a_fit_survives_two_of_each_signal(family, tmp_path, monkeypatch):
     fit = ("fit", data, "--family", family, "--chart", "midpoint", "--tolerance", tolerance)
     assert gfnn(*fit, "--out", tmp_path / "whole") == 0
     say, count = progress._Lines.say, 0
-    # A shell that starts the tests in the background has them ignore SIGINT.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     signals = [(signal.SIGINT, 2), (signal.SIGTERM, 3), (signal.SIGINT, 4), (signal.SIGTERM, 5)]
     for number, moment in signals:
         count = 0
@@ -505,7 +503,6 @@ def test_a_fit_survives_two_of_each_signal(family, tmp_path, monkeypatch):
         if (tmp_path / "m").exists():
             assert np.isfinite(models.load(tmp_path / "m").step(np.full(2, 0.1))[0]).all()
     monkeypatch.setattr(progress._Lines, "say", say)
-    signal.signal(signal.SIGINT, before)
     assert gfnn(*fit, "--out", tmp_path / "m", "--resume") == 0
     z = np.random.default_rng(1).uniform(-0.5, 0.5, (5, 2))
     images = [models.load(tmp_path / name).step(z)[0] for name in ("m", "whole")]

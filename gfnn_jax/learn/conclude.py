@@ -43,14 +43,16 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     """What is to be said of the chosen map."""
     candidate, law, found = chosen.candidate, searched.law, searched.found
     met = searched.judges.met_by(candidate)
-    ended, noise, messages = found.ended, None, []
+    ended, noise, messages, unmet, reason = found.ended, None, [], "", ""
     if not searched.swept:
         ended = MET if met else _NO_MORE[request.of_network]
     if ended.startswith(MET) and not met:
         ended = "the steps of a map that was to meet it do not converge from some of the states"
     if law is not None and searched.of_terms is None:
         on_law = chosen.entry is None or searched.met_by_law
-        messages += law.messages if on_law or (law.fast and not met) else ()
+        said = on_law or (law.fast and not met)
+        messages += law.messages if said else ()
+        unmet = law.unmet if said else ""
     if met:
         return Conclusion(ended, None, messages)
     diagnosis: list[str] = []
@@ -67,6 +69,8 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     messages += not_radians(chosen.judges.pairs, request.coordinates)
     if not structured:
         diagnosis += proposed(searched.plain)
+    if unmet and noise is None and not reason:  # else it is known why
+        messages = [unmet, *messages]
     messages += [not_met(candidate, request.tolerance, ended), *diagnosis]
     return Conclusion(ended, noise, messages)
 
@@ -135,11 +139,11 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         )
         return _LeftOver(None, [message], "what is left over is smooth, and no noise")
     law = searched.law
+    taken = candidate.num_parameters / (judges.training.size * 2 * judges.pairs.dim)
+    noise = state_noise(candidate.map, judges.pairs.take(rows[:_NOISE_PAIRS]), taken)
     if law is not None and law.noise is not None and candidate.learns == "hamiltonian":
-        noise = law.noise
-    else:
-        taken = candidate.num_parameters / (judges.training.size * 2 * judges.pairs.dim)
-        noise = state_noise(candidate.map, judges.pairs.take(rows[:_NOISE_PAIRS]), taken)
+        # Along an arc what the law misses adds up, and looks like noise.
+        noise = np.minimum(law.noise, noise)
     own = ""
     if candidate.learns == "map" and entry is not None:
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))

@@ -133,7 +133,8 @@ class LearnedHamiltonian:
     contraction: the fixed point's factor where it is largest. condition: of the terms' columns.
     null_terms: that the data do not tell from the others. left_out: pairs that the flow does not
     resolve. stalled: whether larger libraries were no more accurate. root: (m, m), rootᵀ root is
-    the coefficients' covariance; None of a network.
+    the coefficients' covariance; None of a network. unmet: that the tolerance is missed, and what
+    that may be from; "" where it is met.
     """
 
     candidate: Candidate
@@ -151,6 +152,7 @@ class LearnedHamiltonian:
     root: np.ndarray | None
     noise: np.ndarray | None = None
     arcs: int = 0
+    unmet: str = ""
 
     @property
     def fast(self) -> bool:
@@ -702,6 +704,7 @@ def _learned(
         stalled=found.stalled,
         root=root, noise=None if whole is None else whole.noise,
         arcs=0 if whole is None else whole.arcs,
+        unmet=_unmet(error, omega_h, prepared, judges, found),
     )  # fmt: skip
 
 
@@ -789,19 +792,22 @@ def _cheapest(problem, family, fit: FlowFit, fastest, judges: Judges, options: O
     return next(s for s in reversed(found) if s == found[0] or cost(s) < 2 * cost(found[0]))
 
 
+def _unmet(error: OneStepError, omega_h: float, prepared, judges, found: _Fitted) -> str:
+    if error.bound <= judges.tolerance.bound:
+        return ""
+    return (
+        f"no H of the terms tried meets the tolerance (best {error.relative:.2e} of the spread, its "
+        f"fastest oscillation {omega_h:.2g} in a step): the pairs carry noise, other terms are "
+        f"needed, the map has no flow, or ωh > π at dt = {prepared.dt:g}, and then only a shorter "
+        "dt tells H" + (f"; modes were added until {found.ended}" if found.ended else "")
+    )
+
+
 def _messages(
     error: OneStepError, omega_h: float, prepared, judges, found: _Fitted, left_out: int,
     unresolved: int,
 ) -> Iterator[str]:  # fmt: skip
-    if error.bound > judges.tolerance.bound:
-        yield (
-            f"no H of the terms tried meets the tolerance (best {error.relative:.2e} of the "
-            f"spread, its fastest oscillation {omega_h:.2g} in a step): the pairs carry noise, "
-            "other terms are needed, the map has no flow, or ωh > π at "
-            f"dt = {prepared.dt:g}, and then only a shorter dt tells H"
-            + (f"; modes were added until {found.ended}" if found.ended else "")
-        )
-    elif omega_h > _FAST:
+    if error.bound <= judges.tolerance.bound and omega_h > _FAST:
         yield (
             f"H oscillates by {omega_h:.2g} radians in a step (ωh, its median over the states"
             f"{', beyond π' if omega_h > np.pi else ''}): an H whose frequencies differ by 2π per "
