@@ -796,8 +796,8 @@ def _unmet(error: OneStepError, omega_h: float, prepared, judges, found: _Fitted
     if error.bound <= judges.tolerance.bound:
         return ""
     return (
-        f"no H of the terms tried meets the tolerance (best {error.relative:.2e} of the spread, its "
-        f"fastest oscillation {omega_h:.2g} in a step): the pairs carry noise, other terms are "
+        f"no H of the terms tried meets the tolerance (best {error.relative:.2e} of the spread, "
+        f"its fastest oscillation {omega_h:.2g} in a step): the pairs carry noise, other terms are "
         f"needed, the map has no flow, or ωh > π at dt = {prepared.dt:g}, and then only a shorter "
         "dt tells H" + (f"; modes were added until {found.ended}" if found.ended else "")
     )
