@@ -13,8 +13,8 @@ from gfnn_jax import cli
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
-# What these show is tested always elsewhere: the README, tests/test_args.py.
-SLOW = ("your-own-data", "args")
+# What these show is tested always elsewhere: README, tests/test_args.py, tests/test_lattices.py.
+SLOW = ("your-own-data", "args", "many")
 sys.path.insert(0, str(ROOT / "benchmarks"))
 INSTALL = ("python3 -m venv ", ".venv/bin/pip install ")
 
