@@ -63,8 +63,8 @@ def run(
     """Reference data of a scene, fit, rollouts, metrics, figures and report, into the folder out.
 
     tolerance: relative; None: the scene's own, close to the best that can be had. quick: fewer
-    pairs and rollouts, a tolerance of 1e-7 at best. resume: None where ``out`` is this very job,
-    done.
+    pairs and rollouts, a tolerance of 1e-7 at best, no band in the figure of errors. resume: None
+    where ``out`` is this very job, done.
     """
     scene = scene_named(name, dt)
     if family == "features" and scene.features is None:
@@ -113,7 +113,8 @@ def run(
         progress.say("figures")
         with atomic_folder(out) as folder:
             write(folder, folder / MODEL, fitted, result, job)
-            band = _band(fitted.map, z0, measured.predicted, given)
+            # Samples are stepped by a program of their own, which takes as long to compile.
+            band = None if quick else _band(fitted.map, z0, measured.predicted, given)
             for file, figure in _figures(fitted, scene, measured, reference, band).items():
                 figures.save(figure, folder / f"{file}.png")
     return Ran(fitted, out, result)
