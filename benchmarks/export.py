@@ -18,7 +18,6 @@ import os
 import shutil
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -34,6 +33,7 @@ from harness import (
     fitted,
     markdown,
     number,
+    once,
     provenance,
     read,
     results,
@@ -95,10 +95,8 @@ def in_c(path: Path, flags: Sequence[str], map_, z0, steps: int, repeats: int) -
     whole = path.with_name(f"{path.stem}{len(flags)}.c")
     library = whole.with_suffix(".so")
     whole.write_text(path.read_text(encoding="utf-8") + LOOP, encoding="utf-8")
-    started = time.perf_counter()
     command = ["cc", *flags, "-shared", "-fPIC", str(whole), "-o", str(library), "-lm"]
-    subprocess.run(command, check=True)
-    compiled = time.perf_counter() - started
+    compiled = once(lambda: subprocess.run(command, check=True).returncode).seconds
     functions, pointer = ctypes.CDLL(str(library)), ctypes.POINTER(ctypes.c_double)
     images, status = np.array(z0), np.empty(len(z0), int)
     for lane, row in enumerate(images):

@@ -67,6 +67,22 @@ def timed(function: Callable[[], Any], repeats: int | None = None) -> Timed:
     return Timed(out, fastest, max(0.0, first - fastest))
 
 
+class Once(NamedTuple):
+    """What a single call returned, the seconds that passed, and the processor seconds of all of its
+    threads: other work on the machine changes these less."""
+
+    out: Any
+    seconds: float
+    processor_seconds: float
+
+
+def once(function: Callable[[], Any]) -> Once:
+    """A call that takes too long to be repeated, compilation included."""
+    started, busy = time.perf_counter(), time.process_time()
+    out = jax.block_until_ready(function())
+    return Once(out, time.perf_counter() - started, time.process_time() - busy)
+
+
 # Data and fits
 
 

@@ -10,7 +10,6 @@ the flow of the true H by 12-stage Gauss collocation; three bodies by scipy's DO
 from __future__ import annotations
 
 import resource
-import time
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -26,10 +25,11 @@ from harness import (
     main,
     markdown,
     number,
+    once,
     provenance,
     results,
     timed,
-)
+)  # fmt: skip
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
@@ -70,9 +70,7 @@ def judged(
     where they are after all steps. parts: of a step of the rollout. apart: the law's coefficients
     where what is alike has terms of its own."""
     (family, params), (one, last), dt = law, exact, float(pairs.dt)
-    started = time.perf_counter()
-    fit = fitted_to(pairs, structure, tolerance)
-    seconds = time.perf_counter() - started
+    fit, seconds, _ = once(lambda: fitted_to(pairs, structure, tolerance))
     every = num_steps * parts
     rollout: Callable[[], Any] = partial(
         fit.map.rollout, fresh, every, dt=dt / parts if parts > 1 else None, save_every=every
@@ -176,12 +174,11 @@ def froeschle(quick: bool) -> Numbers:
     """A ring of 64 coupled standard maps, 100 pairs: a map without a flow, judged modulo 2π."""
     scene = gfnn.scenes.froeschle()
     pairs = gfnn.sample_pairs(scene, 110, jax.random.key(SEED))
-    started = time.perf_counter()
-    fit = gfnn.fit(
+    fit, seconds, _ = once(lambda: gfnn.fit(
         gfnn.Pairs(pairs.z0[:100], pairs.z1[:100], 1.0), structure="ring", learn="map",
         angles=scene.coordinates.angles, tolerance=1e-12, max_seconds=None,
-    )  # fmt: skip
-    seconds, fresh, steps = time.perf_counter() - started, pairs.z0[100:], 10
+    ))  # fmt: skip
+    fresh, steps = pairs.z0[100:], 10
     exact = np.asarray(gfnn.reference_trajectories(scene, fresh, steps))
     states = np.asarray(fit.map.rollout(fresh, steps)[0])
     error = np.remainder(states - exact + np.pi, 2 * np.pi) - np.pi
@@ -255,9 +252,8 @@ def energy(quick: bool) -> Numbers:
     z, steps, every = normal(1_000, 42, 0.2, 0.28), 2_000 if quick else 100_000, 100
     pairs = gfnn.Pairs(z[:40], moved(fput_ring(1_000), z[:40], 0.1), 0.1)
     map_ = fitted_to(pairs, "ring").map
-    started = time.perf_counter()
-    states = np.asarray(map_.rollout(z[40:], steps, save_every=every)[0])
-    seconds = time.perf_counter() - started
+    (states, _), seconds, _ = once(lambda: map_.rollout(z[40:], steps, save_every=every))
+    states = np.asarray(states)
     values = np.asarray(map_.hamiltonian(states.reshape(-1, 2_000))).reshape(states.shape[:2])
     off = growth.energy_error(values)
     lags = np.unique(np.geomspace(1, off.shape[1] // 4, 20).astype(int))

@@ -28,6 +28,7 @@ from harness import (
     between_markers,
     drawn,
     fitted,
+    once,
     one_step_rms,
     provenance,
     results,
@@ -191,12 +192,8 @@ def iterated(scene: Scene, num: int, lanes: int, most: int, seen: int, quick: bo
     fit, about = fitted(pairs, scene, fresh, absolute_tolerance=TOLERANCES[-1])
     z0 = gfnn.sample_test_states(scene, lanes, jax.random.key(SEED))
     points = 100
-    started = time.perf_counter()
-    states, info = jax.block_until_ready(fit.map.rollout(z0, num, save_every=num // points))
-    ours = time.perf_counter() - started
-    started = time.perf_counter()
-    exact = jax.block_until_ready(gfnn.reference_trajectories(scene, z0[:seen], most))
-    theirs = time.perf_counter() - started
+    (states, info), ours, _ = once(lambda: fit.map.rollout(z0, num, save_every=num // points))
+    exact, theirs, _ = once(lambda: gfnn.reference_trajectories(scene, z0[:seen], most))
     print(f"  {scene.name}: {ours:.0f} s and {theirs:.0f} s")
     states, exact = np.asarray(states[:seen, 1:]), np.asarray(exact)
     curves = metrics_of_curves(states, exact) if scene.section is not None else None

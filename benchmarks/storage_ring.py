@@ -16,14 +16,12 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import time
 import warnings
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from harness import (
     FIGURES,
@@ -34,10 +32,11 @@ from harness import (
     main,
     markdown,
     number,
+    once,
     provenance,
     results,
     timed,
-)
+)  # fmt: skip
 from scipy.optimize import minimize_scalar
 
 import gfnn_jax as gfnn
@@ -125,20 +124,6 @@ def ellipsoid(half_axes, count: int, seed: int) -> np.ndarray:
     return u * half_axes
 
 
-class Busy(NamedTuple):
-    """What a call returned, and the CPU seconds of it: other work on the machine changes them
-    less than it does the time that passes."""
-
-    out: Any
-    seconds: float
-
-
-def busy(function) -> Busy:
-    began = time.process_time()
-    out = jax.block_until_ready(function())
-    return Busy(out, time.process_time() - began)
-
-
 def of_a_turn(map_: SymplecticMap, batch, turns: int, params=None) -> float:
     """CPU microseconds of a turn of one particle of a batch (B, 4)."""
 
@@ -146,7 +131,7 @@ def of_a_turn(map_: SymplecticMap, batch, turns: int, params=None) -> float:
         return map_.rollout(batch, num_steps=turns, save_every=turns, params=params)
 
     run()
-    return min(busy(run).seconds for _ in range(3)) / turns / len(batch) * 1e6
+    return min(once(run).processor_seconds for _ in range(3)) / turns / len(batch) * 1e6
 
 
 # One turn
@@ -195,7 +180,7 @@ def turn(quick: bool) -> Numbers:
     z, points = ellipsoid(half, count, 0), err.boundaries(4)
     ends = [z, *err.track(z, points)[0]]
     timed_ones = z[:20] if quick else z[:500]
-    tracking = busy(lambda: err.track(timed_ones)).seconds / len(timed_ones)
+    tracking = once(lambda: err.track(timed_ones)).processor_seconds / len(timed_ones)
     few = ellipsoid(half, 4 if quick else ORBITS, 1)
     turns = 20 if quick else TURNS
     orbits = err.track(few, turns=turns)[:, 0]
@@ -210,7 +195,9 @@ def turn(quick: bool) -> Numbers:
 
     rows: list[Numbers] = []
     for tolerance, cuts in ROWS[1:2] if quick else ROWS:
-        (map_, fits), seconds = busy(lambda c=cuts, t=tolerance: learned([ends[i] for i in c], t))
+        (map_, fits), _, seconds = once(
+            lambda c=cuts, t=tolerance: learned([ends[i] for i in c], t)
+        )
         batch = ellipsoid(half, BATCH, 2)
         found = errors(
             lambda x, m=map_: np.asarray(m.step(x)[0]),
@@ -318,7 +305,7 @@ def of_region(amplitude: float, quick: bool) -> Numbers:
     pairs = gfnn.Pairs(z[:count], image[:count], 1.0, {"delta": delta[:count]})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
-        fit, seconds = busy(lambda: gfnn.fit(
+        fit, _, seconds = once(lambda: gfnn.fit(
             pairs, learn="map", family="polynomial", tolerance=1e-2 if quick else 3e-6,
             max_seconds=None, seed=SEED,
         ))  # fmt: skip
@@ -417,10 +404,10 @@ def long(quick: bool) -> Numbers:
     map_, _ = learned([z, err.track(z)[0, 0]], 1e-5)
     turns, every, particles = (1_000, 10, 5) if quick else (1_000_000, 97, 50)
     start = ellipsoid(0.6 * half, particles, 3)
-    started = time.perf_counter()
-    states, info = map_.rollout(start, num_steps=turns, save_every=every)
+    (states, info), seconds, _ = once(
+        lambda: map_.rollout(start, num_steps=turns, save_every=every)
+    )
     states = np.asarray(states)
-    seconds = time.perf_counter() - started
     action = np.sum(np.abs(err.normalised(states)) ** 2, axis=-1) / 2  # (B, saved)
     block = 5 if quick else 50
     count = action.shape[1] // block
@@ -452,9 +439,7 @@ def aperture(quick: bool) -> Numbers:
     start[..., 0] = radii * np.cos(angles)[:, None]
     start[..., 1] = radii * np.sin(angles)[:, None]
     flat = start.reshape(-1, 4)
-    began = time.perf_counter()
-    tracked = cell.track(flat, turns=turns)[-1, 0]
-    theirs = time.perf_counter() - began
+    tracked, theirs, _ = once(lambda: cell.track(flat, turns=turns)[-1, 0])
 
     def run():
         return map_.rollout(flat, num_steps=turns, save_every=turns)[1]
