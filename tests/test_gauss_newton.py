@@ -9,9 +9,10 @@ from gfnn_jax.families.terms import Terms, given_terms, polynomial_terms
 from gfnn_jax.fitting.gauss_newton import Problem, log_start, midpoint_start, null_terms
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.learn.candidates import Judges, Tolerance
-from gfnn_jax.learn.flows import assembled, learn_hamiltonian
+from gfnn_jax.learn.flows import learn_hamiltonian
 from gfnn_jax.learn.formula import Term, formula
 from gfnn_jax.learn.held_out import split_rows
+from gfnn_jax.learn.learned_law import assembled
 from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.phase_space import Pairs
 

@@ -10,7 +10,7 @@ from gfnn_jax.learn.assemble import assemble
 from gfnn_jax.learn.candidates import Candidate, Judges
 from gfnn_jax.learn.choose_law import preferred
 from gfnn_jax.learn.clock import Clock
-from gfnn_jax.learn.flows import assembled as flow_assembled
+from gfnn_jax.learn.learned_law import assembled as flow_assembled
 from gfnn_jax.learn.map_of_terms import assembled as map_assembled
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request

@@ -12,7 +12,9 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.fitting.turns import backwards, tangent, turns
 from gfnn_jax.learn.candidates import Candidate, Judges
 from gfnn_jax.learn.clock import Clock, OutOfTime
-from gfnn_jax.learn.flows import OPTIONS, LearnedHamiltonian, learn_hamiltonian
+from gfnn_jax.learn.flows import learn_hamiltonian
+from gfnn_jax.learn.law_options import OPTIONS
+from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.scenes.scene import Scene
 

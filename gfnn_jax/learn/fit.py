@@ -28,9 +28,9 @@ from gfnn_jax.learn.conclude import conclude
 from gfnn_jax.learn.diagnose import ChartJudgement
 from gfnn_jax.learn.diagnosed import diagnose_request
 from gfnn_jax.learn.draw import NUM_PAIRS, drawn
-from gfnn_jax.learn.flows import LearnedHamiltonian
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.held_out import split_rows
+from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.posterior import with_posterior
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched

@@ -19,7 +19,7 @@ from gfnn_jax.learn.cost_of_flow import flow_operations
 from gfnn_jax.learn.diagnosed import diagnosed
 from gfnn_jax.learn.draw import drawn
 from gfnn_jax.learn.factor_out import TRIAL_PAIRS, factored_out, flow_of
-from gfnn_jax.learn.flows import LearnedHamiltonian
+from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.search import Entry, Found, search
 from gfnn_jax.learn.sweeps import sweeps_for

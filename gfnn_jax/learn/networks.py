@@ -30,7 +30,7 @@ from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_erro
 from gfnn_jax.learn.choose_law import unfit_for_law
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.cost_of_flow import contraction_of, omega_h_of, operations_of
-from gfnn_jax.learn.flows import LearnedHamiltonian
+from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.sweeps import residual_weight
 from gfnn_jax.scenes.scene import Scene

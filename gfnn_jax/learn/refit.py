@@ -27,8 +27,8 @@ from gfnn_jax.learn.assemble import stepped
 from gfnn_jax.learn.candidates import Candidate, Tolerance, one_step_error, with_error
 from gfnn_jax.learn.conclude import not_met
 from gfnn_jax.learn.fit import Fit
-from gfnn_jax.learn.flows import LearnedHamiltonian
 from gfnn_jax.learn.formula import Term, formula
+from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.sweeps import residual_weight
 from gfnn_jax.maps.saved import packed, unpacked
 from gfnn_jax.maps.symplectic_map import SymplecticMap

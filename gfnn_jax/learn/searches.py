@@ -16,7 +16,6 @@ from gfnn_jax.learn.choose_law import DEARER, law_of
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.diagnosed import Diagnosis, diagnosed
 from gfnn_jax.learn.ensembles import EnsembleSweep
-from gfnn_jax.learn.flows import LearnedHamiltonian
 from gfnn_jax.learn.law_maps import (
     better_than,
     law_explains_most,
@@ -24,6 +23,7 @@ from gfnn_jax.learn.law_maps import (
     search_around,
     search_of_law,
 )
+from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.map_of_terms import LearnedMap, map_of
 from gfnn_jax.learn.networks import learn_network
 from gfnn_jax.learn.prepare import Prepared

@@ -1,0 +1,58 @@
+"""What a search for H may try: sizes of libraries, limits and thresholds."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Tuned on Hénon–Heiles at dt 0.5 to 3, on three bodies and on the double pendulum.
+
+    degrees: of the products of coordinates; feature_degrees: of a scene's features; given_degrees:
+    of the products that stand beside a user's own terms (0: his alone), given_products: by which
+    his terms are multiplied too.
+    most_terms: of a library; most_modes: of one that grows. rows_per_term: that a library needs.
+    judged_rows: per term, from which a library is judged; all pairs only count in the last fit.
+    thresholds: standard errors below which terms go, tried in turn.
+    rise: of the held-out error that dropping terms may cost; rounding: below which it is roundoff.
+    flat: libraries one after the other whose errors differ by less have met the pairs' noise;
+    certain: standard errors below which a term is then noise (one in 16,000 by chance).
+    explained: standard errors of the part of a residual that is noise, within which all of it is.
+    gained: a library that lowers the error by less has not helped; twice in a row ends the search.
+    truncation: a flow's own error, as a part of the tolerance. goal: residual that modes grow to,
+    as a part of the tolerance. generators: degrees of those that look for misfit; sampled_rows: per
+    term, where what is left over is looked at. max_seconds: of the search; mode_seconds: where
+    modes grow, growth_part: the part of them in which they may. max_operations, mode_operations: of
+    the flows that are evaluated on the way, counted.
+    """
+
+    degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 8)
+    feature_degrees: tuple[int, ...] = (2, 3)
+    given_degrees: tuple[int, ...] = (0, 2, 3, 4)
+    given_products: tuple[int, ...] = (2,)
+    most_terms: int = 350
+    most_modes: int = 500
+    rows_per_term: float = 1.6
+    judged_rows: float = 12.0
+    thresholds: tuple[float, ...] = (1e4, 1e3, 100.0, 30.0, 10.0, 5.0, 3.0)
+    rise: float = 1.1
+    rounding: float = 1e-15
+    flat: float = 1.2
+    certain: float = 4.0
+    explained: float = 2.0
+    gained: float = 0.5
+    truncation: float = 0.1
+    goal: float = 0.3
+    generators: tuple[int, ...] = (2, 3, 4, 5, 6)
+    sampled_rows: int = 6
+    max_seconds: float = 30.0
+    mode_seconds: float = 60.0
+    max_operations: float = np.inf
+    mode_operations: float = np.inf
+    growth_part: float = 0.7
+
+
+OPTIONS = Options()

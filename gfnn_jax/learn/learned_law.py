@@ -1,0 +1,355 @@
+"""A learned H as a candidate: its flow with the cheapest steps, errors, covariance, messages."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.coordinates import to_user
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.products import Products
+from gfnn_jax.families.sums import Sums, matrix_free
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
+from gfnn_jax.fitting.gauss_newton import (
+    MOST_SUBSTEPS,
+    FlowFit,
+    Problem,
+    rates,
+)
+from gfnn_jax.fitting.least_squares import Reduced
+from gfnn_jax.flows.collocation import Steps, images, truncation
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.learn.assemble import Assembled, composed, stepped
+from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
+from gfnn_jax.learn.cost_of_flow import (
+    CONTRACTING,
+    FREQUENCY_STATES,
+    contraction_of,
+    omega_h_of,
+    operations_of,
+)
+from gfnn_jax.learn.formula import Term, formula
+from gfnn_jax.learn.held_out import looked_at
+from gfnn_jax.learn.law_options import OPTIONS, Options
+from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.learn.whole_sequences import Whole
+from gfnn_jax.phase_space import Pairs, apply_j, symplectic_form
+
+FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
+_NEAR_ROUNDOFF = 3e-15  # of the spread
+_NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
+_FEWEST_SAMPLED = 2_000  # pairs that tell noise from misfit
+_NAMED = 5  # terms in a message
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnedHamiltonian:
+    """H as learned, in the inner coordinates.
+
+    candidate: as the others of a fit, its error measured by steps in NumPy. flow: the piece.
+    terms, formula: what H is; () and None of a network. truncation: largest error of the flow's
+    own steps on the held-out states, ÷ scale. omega_h: the fastest oscillation of the linearised
+    flow, times dt, in the median over the data; beyond π pairs of one dt may not tell H.
+    contraction: the fixed point's factor where it is largest. condition: of the terms' columns.
+    null_terms: that the data do not tell from the others. left_out: pairs that the flow does not
+    resolve. stalled: whether larger libraries were no more accurate. root: (m, m), rootᵀ root is
+    the coefficients' covariance; None of a network. unmet: that the tolerance is missed, and what
+    that may be from; "" where it is met.
+    """
+
+    candidate: Candidate
+    flow: Flow
+    terms: tuple[Term, ...]
+    formula: str | None
+    truncation: float
+    omega_h: float
+    contraction: float
+    condition: float
+    null_terms: tuple[str, ...]
+    left_out: int
+    messages: tuple[str, ...]
+    stalled: bool
+    root: np.ndarray | None
+    noise: np.ndarray | None = None
+    arcs: int = 0
+    unmet: str = ""
+
+    @property
+    def fast(self) -> bool:
+        """Whether H oscillates so fast that other laws are not far from the same pairs."""
+        return self.omega_h > FAST
+
+
+class FittedLaw(NamedTuple):
+    """rows: that the fit was given; it has left out those that the flow does not resolve.
+    undetermined: of the null terms, those that other states would tell from the rest. ended: why a
+    library that grew did so no longer. stalled: whether larger libraries were no better. noisy:
+    whether their errors were the same, which is that of the pairs. whole: what whole sequences
+    tell, where they were fitted."""
+
+    family: Terms | Sums
+    fit: FlowFit
+    rows: np.ndarray
+    error: OneStepError
+    null: tuple[str, ...]
+    undetermined: tuple[str, ...] = ()
+    ended: str = ""
+    stalled: bool = False
+    noisy: bool = False
+    whole: Whole | None = None
+
+
+def learned_from(
+    found: FittedLaw, problem, prepared: Prepared, judges: Judges, seconds: float, options: Options,
+    root: np.ndarray | None,
+) -> LearnedHamiltonian:  # fmt: skip
+    """root: of the covariance, where the fit was not to these pairs but to arcs of them."""
+    family, fit, whole = found.family, found.fit, found.whole
+    rows = judges.held_out
+    z, args = prepared.y0[rows], prepared.given(rows)[1]
+    some = slice(FREQUENCY_STATES)
+    fastest = rates(family, fit.coefficients, prepared.y0[some], prepared.given(some)[1])
+    if prepared.own_dt is not None:  # the map's own dt, from which others follow
+        problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, args=prepared.args)
+    steps = _cheapest(problem, family, fit, fastest, judges, options)
+    steps = _resolving(family, fit.coefficients, steps, prepared, judges)
+    contraction = contraction_of(fastest, prepared.dt, steps)
+    by_newton = contraction > CONTRACTING and not matrix_free(family)
+    off = truncation(family, fit.coefficients, z, prepared.dt, steps, args=args) / prepared.scale
+    flow = Flow(
+        family, fit.coefficients, prepared.dt, prepared.scale, steps.stages, steps.substeps,
+        by_newton,
+    )  # fmt: skip
+    longest = flow.over(np.max(prepared.each_dt)).substeps
+    of_all = dataclasses.replace(steps, substeps=longest)
+    error = error_of_steps(family, fit.coefficients, of_all, prepared, judges)
+    candidate = Candidate(
+        label=f"H, {family.num_parameters} terms", family=family.name, chart="flow",
+        num_parameters=family.num_parameters,
+        operations=operations_of(family, 2 * family.dim, fastest, prepared.dt, steps),
+        validation_rms=error.rms, validation_relative=error.relative,
+        validation_bound=error.bound, deviations=error.deviations, train_rms=fit.rms,
+        fit_seconds=seconds, condition=fit.condition, rank=family.num_parameters,
+        learns="hamiltonian",
+    )  # fmt: skip
+    terms = tuple(
+        Term(*entry)
+        for entry in zip(
+            family.term_names, fit.coefficients.tolist(), fit.standard_errors.tolist(), strict=True
+        )
+    )
+    omega_h = omega_h_of(family, fit.coefficients, prepared, fastest)
+    left_out = len(np.setdiff1d(found.rows, fit.used))
+    resolved = np.abs(off).max(axis=1) <= bound_of(judges, prepared.scale)
+    if whole is not None:
+        root = whole.root
+    elif root is None:
+        root = covariance_root(found, problem, prepared, steps, judges.pairs)
+    return LearnedHamiltonian(
+        with_error(candidate, error), flow, terms, getattr(family, "prefix", "") + formula(terms),
+        float(np.abs(off).max()),
+        omega_h, contraction, fit.condition, found.null, left_out,
+        tuple(_messages(error, omega_h, prepared, judges, found, left_out, int((~resolved).sum()))),
+        stalled=found.stalled,
+        root=root, noise=None if whole is None else whole.noise,
+        arcs=0 if whole is None else whole.arcs,
+        unmet=_unmet(error, omega_h, prepared, judges, found),
+    )  # fmt: skip
+
+
+def held_out_error(family, fit: FlowFit, prepared, judges: Judges) -> OneStepError:
+    """By steps that resolve the held-out pairs: an unresolved passage says nothing of the law."""
+    steps = _resolving(family, fit.coefficients, fit.steps, prepared, judges)
+    return error_of_steps(family, fit.coefficients, steps, prepared, judges)
+
+
+def error_of_steps(family, coefficients, steps: Steps, prepared, judges: Judges) -> OneStepError:
+    states, (dt, args) = prepared.y0[judges.held_out], prepared.given(judges.held_out)
+    found = images(family, coefficients, states, dt, steps, args=args).states
+    return judges.error_of(to_user(prepared.coordinates, found), prepared.coordinates)
+
+
+def bound_of(judges: Judges, scale) -> float:
+    """The tolerance as a part of the coordinates' scale."""
+    bound = judges.tolerance.bound
+    return bound if judges.tolerance.relative else bound / float(scale.max())
+
+
+def _resolving(family, coefficients, steps: Steps, prepared, judges: Judges) -> Steps:
+    """These steps, or, where the law misses the tolerance by them, finer ones: halved until they
+    resolve the held-out pairs, or there are as many as a flow may have."""
+    bound, states = bound_of(judges, prepared.scale), prepared.y0[judges.held_out]
+    if (
+        error_of_steps(family, coefficients, steps, prepared, judges).bound
+        <= judges.tolerance.bound
+    ):
+        return steps
+    dt, args = prepared.given(judges.held_out)
+    while 2 * steps.substeps <= MOST_SUBSTEPS:
+        off = truncation(family, coefficients, states, dt, steps, args=args) / prepared.scale
+        if np.sqrt(np.mean(off**2)) <= OPTIONS.truncation * bound:
+            break
+        steps = dataclasses.replace(steps, substeps=2 * steps.substeps)
+    return steps
+
+
+def _cheapest(problem, family, fit: FlowFit, fastest, judges: Judges, options: Options) -> Steps:
+    """Steps whose own error is a tenth of the tolerance; near roundoff, or at it, where that is not
+    twice as dear."""
+
+    def cost(steps: Steps) -> float:
+        return operations_of(family, 2 * family.dim, fastest, problem.dt, steps)
+
+    bound = max(options.truncation * bound_of(judges, problem.scale), 0.3 * fit.rms)
+    tolerances = (bound, min(bound, _NEAR_ROUNDOFF), None)
+    found = problem.fine_steps(family, fit.coefficients, judges.training, tolerances)
+    return next(s for s in reversed(found) if s == found[0] or cost(s) < 2 * cost(found[0]))
+
+
+def covariance_root(
+    found: FittedLaw, problem: Problem, prepared: Prepared, steps: Steps, pairs: Pairs
+) -> np.ndarray:
+    """(m, m): rootᵀ root is the covariance of the coefficients. What is noise, a generator of
+    polynomials tells, which does not explain it; what it explains is misfit, of these steps too."""
+    fit, count = found.fit, found.family.num_parameters
+    most = max(_FEWEST_SAMPLED, OPTIONS.sampled_rows * count // prepared.y0.shape[1])
+    structure = prepared.structure
+    if structure is not None:
+        most = structure.fewest(prepared.y0.shape[1])
+    places, goes_on = looked_at(pairs, fit.used, most)
+    rows, scale = fit.used[places], problem.scale
+    images = problem.images(found.family, fit.coefficients, rows, steps, derivatives=True)
+    residual = images.states - prepared.y1[rows]
+    if not np.isfinite(residual).all():  # of a flow that runs away from some of the states
+        return np.full((count, count), np.nan)
+    slopes = images.by_coefficient / scale[:, None]
+    left, scores, states, noise = residual / scale, None, None, None
+    if structure is None:  # of many coordinates both would take too much
+        if goes_on.any():
+            first = images.by_state * scale
+            second = np.broadcast_to(-np.diag(scale), first.shape)
+            scores = shared_noise.scores(
+                slopes, left, first / scale[:, None], second / scale[:, None], goes_on
+            )
+            states = first, second, goes_on
+        noise = unexplained(prepared, rows, residual, count, states)
+    train = Reduced(np.asfortranarray(fit.factor), fit.rows)
+    return uncertainty.root(
+        train, count, slopes.reshape(-1, count), np.hypot(left, _NEAR_ROUNDOFF).ravel(),
+        noise=noise, scores=scores,
+    )  # fmt: skip
+
+
+def unexplained(prepared: Prepared, rows, residual, taken: int, states) -> float | None:
+    """Of the mean square of what a map leaves over (n, 2d) on these rows, the part that no
+    generator K explains, residual = J∇K at the images: K of as high a degree as the rows tell.
+    taken: coefficients that the map itself was given. states: the residual's derivatives and which
+    pairs go on, as `shared_noise.scores` takes them, or None. None where the rows are too few.
+
+    1 where K explains no more than it would of noise, by ``explained`` standard errors: an F test.
+    """
+    z, coordinates, width = prepared.y1[rows], prepared.coordinates, residual.shape[1]
+    inputs = box_inputs(
+        z, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+        cyclic=coordinates.cyclic,
+    )  # fmt: skip
+    sizes = [Products(inputs, degree) for degree in OPTIONS.generators]
+    most = min(len(rows) * width // OPTIONS.sampled_rows, OPTIONS.most_terms)
+    known = [family for family in sizes if family.num_parameters <= most]
+    if not known:
+        return None
+    family, weight = known[-1], 1.0 / np.roll(prepared.scale, prepared.dim)
+    target = -apply_j(residual)
+    reduced = least_squares.reduce(family, [(z, target)], weight)
+    count, freedom = family.num_parameters, None
+    if states is not None:
+        to_target = -weight[:, None] * symplectic_form(prepared.dim)
+        slopes, (first, second, goes_on) = family.term_gradients(z) * weight[:, None], states
+        scores = shared_noise.scores(
+            slopes, weight * target, to_target @ first, to_target @ second, goes_on
+        )
+        freedom = shared_noise.freedom(slopes, weight * target, scores)
+    left = np.sum(reduced.factor[:, -1] ** 2) / max(reduced.rows - taken, 1)
+    if left == 0:
+        return 1.0
+    part = float(uncertainty.variance(reduced, count, freedom) / left)
+    by_chance = OPTIONS.explained * np.sqrt(2 * count) / reduced.rows
+    return part if part < 1 - by_chance else 1.0
+
+
+def _unmet(error: OneStepError, omega_h: float, prepared, judges, found: FittedLaw) -> str:
+    if error.bound <= judges.tolerance.bound:
+        return ""
+    return (
+        f"no H of the terms tried meets the tolerance (best {error.relative:.2e} of the spread, "
+        f"its fastest oscillation {omega_h:.2g} in a step): the pairs carry noise, other terms are "
+        f"needed, the map has no flow, or ωh > π at dt = {prepared.dt:g}, and then only a shorter "
+        "dt tells H" + (f"; modes were added until {found.ended}" if found.ended else "")
+    )
+
+
+def _messages(
+    error: OneStepError, omega_h: float, prepared, judges, found: FittedLaw, left_out: int,
+    unresolved: int,
+) -> Iterator[str]:  # fmt: skip
+    if error.bound <= judges.tolerance.bound and omega_h > FAST:
+        yield (
+            f"H oscillates by {omega_h:.2g} radians in a step (ωh, its median over the states"
+            f"{', beyond π' if omega_h > np.pi else ''}): an H whose frequencies differ by 2π per "
+            "step gives the same pairs, or nearly; this is the "
+            + (
+                "simplest; a smaller dt, or several, would settle it"
+                if omega_h > np.pi
+                else "slowest"
+            )
+        )
+    if found.whole is not None:
+        yield from found.whole.messages
+    if found.undetermined:
+        names = found.undetermined
+        some = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
+        yield (
+            f"the pairs do not determine {len(names)} terms of H ({some}): they are left "
+            "out, and H is known only where the pairs are"
+        )
+    if left_out:
+        yield (
+            f"{left_out} of {len(found.rows)} pairs, as of close passages, are not resolved by the "
+            "steps of the fit: they are left out of it"
+        )
+    if unresolved:
+        yield (
+            f"{unresolved} of {len(judges.held_out)} held-out pairs are not resolved to the "
+            "tolerance by the flow's own steps: there the map is in error, and not the law"
+        )
+
+
+def assembled(learned: LearnedHamiltonian, prepared: Prepared, judges: Judges) -> Assembled:
+    """The candidate's map, its error and its time per step measured by the steps that users run."""
+    prepared = _in_relative_domain(learned.flow, prepared)
+    map_ = composed(learned.flow, prepared, judges)
+    held = judges.pairs.take(judges.held_out)
+    steps = stepped(map_, np.asarray(held.z0), held.dt, held.args)
+    states = np.where(steps.failed[:, None], np.nan, steps.images)
+    error = judges.error_of(states, prepared.coordinates)
+    candidate = dataclasses.replace(
+        with_error(learned.candidate, error), map=map_,
+        newton_iterations_max=int(steps.iterations.max()),
+        microseconds_per_step=steps.microseconds_per_step,
+    )  # fmt: skip
+    return Assembled(candidate, steps.compile_seconds)
+
+
+def _in_relative_domain(flow: Flow, prepared: Prepared) -> Prepared:
+    """With a domain that leaves out where the whole is, if no force depends on that."""
+    if prepared.structure is None:
+        return prepared
+    force = flow.family.gradient(flow.params, prepared.y0)[:, : prepared.dim]
+    moves = np.abs(force.sum(axis=1)).max() > _NO_FORCE * np.abs(force).sum(axis=1).max()
+    return dataclasses.replace(
+        prepared, domain=prepared.structure.domain(prepared.y0, uses_positions=bool(moves))
+    )
