@@ -18,7 +18,7 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import LogFormatterSciNotation, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from gfnn_jax.evaluate.chaos import kl_divergence
 from gfnn_jax.evaluate.errors import error_statistics
@@ -425,7 +425,9 @@ def speed_against_error(
     )
     ax.margins(0.12)
     ax.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))  # more labels would cover each other
-    ax.xaxis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(3, 3)))
+    ax.xaxis.set_major_formatter("{x:g}")
+    few = max(cost) < 1e3 * min(cost)
+    ax.xaxis.set_minor_formatter("{x:g}" if few else NullFormatter())
     _number_points(ax, cost, error, order)
     ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
     names = [
