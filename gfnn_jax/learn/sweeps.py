@@ -25,9 +25,9 @@ from gfnn_jax.learn.prepare import Prepared
 
 # Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
 # judged from one factor of the rows of its largest.
-_DEGREES = ((2, 3), (4, 5, 6), (7, 8), (9, 10), (12, 14), (16, 18, 20))
+_DEGREES = ((2, 3), (4, 5, 6), (7, 8), (9, 10), (12, 14), (16, 18, 20), (24, 28, 32))
 _TRIAL = (2, 3, 4, 5, 6)
-_EVEN_DEGREES = tuple((degree,) for degree in (2, 4, 6, 8, 10, 12, 14, 16, 18, 20))
+_EVEN_DEGREES = tuple((degree,) for degree in (2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 24, 28, 32))
 _SINES = (100, 200, 400, 800, 1_600)
 # Products of degree 14 in four variables: benchmarks/storage_ring.py.
 _MOST_TERMS = 3_100
