@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import statistics
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -265,12 +266,13 @@ def verdicts(m: dict[str, Numbers]) -> list[str]:
         if name not in m:
             continue
         row, p = m[name]["rows"][-1], m[name]["proportionality"]
-        linear = row["exponent"] < 1.1
+        pace = "linear"
+        if abs(row["exponent"] - 1.0) > 0.1:
+            pace = f"{'faster' if row['exponent'] > 1.0 else 'slower'} than linear over these steps"
         said.append(
             f"{name}, *the error grows linearly, in proportion to ε*: "
-            + (f"linear, α = {interval(row)}" if linear else
-               f"faster than linear over these steps, α = {interval(row)} of the mean")
-            + ("" if linear else NEAR_RESONANCE.get(name, ""))
+            f"{pace}, α = {interval(row)} of the mean"
+            + (NEAR_RESONANCE.get(name, "") if pace.startswith("faster") else "")
             + f"; proportional to ε over {p['decades']:.1f} decades, b = {interval(p)}."
         )  # fmt: skip
     if "actions" in m:
@@ -278,7 +280,8 @@ def verdicts(m: dict[str, Numbers]) -> list[str]:
         quotients = [r["largest"] / r["one_step_rms"] for r in rows]
         said.append(
             "two-body, *actions stay within C ε over 1/(ε dt) steps*: the largest change is "
-            f"{min(quotients):.2f} to {max(quotients):.2f} times ε, nearly all of it in the first "
+            f"{statistics.median(quotients):.1f} times ε in the median map, "
+            f"{max(quotients):.1f} times in the worst, nearly all of it in the first "
             "tenth; the smaller ε were followed for a part of that time (table below). Where ε is "
             "so large that orbits leave what was learned, nothing holds (–)."
         )
