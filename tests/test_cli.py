@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 import warnings
+from importlib.metadata import version
 
 import jax
 import numpy as np
@@ -123,7 +124,17 @@ def test_scenes(capsys):
     assert [line[0] for line in lines] == list(scenes.names())
 
 
-@pytest.mark.parametrize("command", [(), ("run",), ("fit",), ("predict",), ("scenes",)])
+def test_version(capsys):
+    with pytest.raises(SystemExit) as stop:
+        gfnn("--version")
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"gfnn {version('gfnn_jax')}\n"
+
+
+HELP = [(), ("run",), ("fit",), ("predict",), ("export",), ("compare",), ("scenes",)]
+
+
+@pytest.mark.parametrize("command", HELP)
 def test_help(command, capsys):
     with pytest.raises(SystemExit) as stop:
         gfnn(*command, "--help")
@@ -131,6 +142,8 @@ def test_help(command, capsys):
     out = capsys.readouterr().out
     assert "usage: gfnn" in out
     assert ("exit status:" in out) == (command != ("scenes",))
+    # A process can only be lost where there are several; the first help is of all commands.
+    assert ("  134  " in out) == (not command or "--distributed" in out)
     assert ("95 % bound" in out) == (command in (("run",), ("fit",)))
 
 
