@@ -29,7 +29,7 @@ from gfnn_jax.jobs import predict as predict_job
 from gfnn_jax.jobs import progress, search
 from gfnn_jax.learn import check, structures
 from gfnn_jax.learn import fit as learn_fit
-from gfnn_jax.learn.candidates import Tolerance
+from gfnn_jax.learn.candidates import Candidate, Tolerance
 from gfnn_jax.maps import saved as models
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -145,6 +145,15 @@ def test_help(command, capsys):
     # A process can only be lost where there are several; the first help is of all commands.
     assert ("  134  " in out) == (not command or "--distributed" in out)
     assert ("95 % bound" in out) == (command in (("run",), ("fit",)))
+
+
+def test_a_line_of_progress_says_where_its_error_comes_from():
+    known = {"label": "polynomial 4", "family": "polynomial", "chart": "midpoint",
+             "num_parameters": 69, "operations": 1e3, "validation_rms": 1e-5,
+             "validation_relative": 2e-5, "validation_bound": 3e-5, "deviations": np.zeros(2),
+             "train_rms": 1e-5, "fit_seconds": 0.1}  # fmt: skip
+    for steps, error in ((False, "first estimated at 2.00e-05"), (True, "error 2.00e-05")):
+        assert error in search.line(Candidate(**known, validated=steps))
 
 
 WHOLE = "expected a whole number from 1 to 2**53 - 1, got "
