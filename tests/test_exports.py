@@ -20,8 +20,9 @@ from gfnn_jax import cli, scenes
 from gfnn_jax.coordinates import CARTESIAN, Coordinates, polar, to_inner
 from gfnn_jax.exports.export import SUFFIXES
 from gfnn_jax.exports.symbols import Tape
-from gfnn_jax.families.expressions import jets, parse
+from gfnn_jax.families.expressions import parse
 from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.jets import jets
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.flow import Flow
