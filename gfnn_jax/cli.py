@@ -38,8 +38,8 @@ exit status:
   1    a failure during the work (a full disk); with --strict also a missed tolerance
   2    bad usage or bad input, before any long work
   130  stopped by Ctrl-C
-  134  with --distributed: another process of the job was lost
   143  stopped by SIGTERM"""
+DISTRIBUTED_STATUS = "  134  with --distributed: another process of the job was lost"
 WORDS = """\
 the table of candidates:
   chart      where the generating function S is evaluated: type2 at (q, P), type3 at (Q, p),
@@ -99,12 +99,26 @@ def _fail(status: int, why: object) -> int:
     return status
 
 
+class _Version(argparse.Action):
+    def __call__(self, parser, namespace, values, option_string=None) -> NoReturn:
+        from gfnn_jax import __version__
+
+        print(f"gfnn {__version__}")
+        parser.exit()
+
+
+def _with_status(options: dict[str, Any]) -> dict[str, Any]:
+    """The options of a command that has --distributed."""
+    return {**options, "epilog": f"{options['epilog']}\n{DISTRIBUTED_STATUS}"}
+
+
 def _parser() -> argparse.ArgumentParser:
     plain: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
     parser = _Parser(
         prog="gfnn", description="Learn exactly symplectic maps, predict with them.",
-        epilog=EXIT_STATUS, **plain,
+        epilog=f"{EXIT_STATUS}\n{DISTRIBUTED_STATUS}", **plain,
     )  # fmt: skip
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     fitting: dict[str, Any] = {"epilog": f"{WORDS}\n\n{EXIT_STATUS}", **plain}
     others: dict[str, Any] = {"epilog": EXIT_STATUS, **plain}
@@ -127,7 +141,7 @@ def _parser() -> argparse.ArgumentParser:
     command = commands.add_parser(
         "fit", help="learn the map of your own trajectories",
         description="Learn the map of a .npz, .npy or .csv file; q first.",
-        **fitting,
+        **_with_status(fitting),
     )  # fmt: skip
     command.set_defaults(command=_fit)
     command.add_argument(
@@ -156,7 +170,7 @@ def _parser() -> argparse.ArgumentParser:
     command = commands.add_parser(
         "predict", help="predict with a learned map",
         description="Predict from initial states (.npy, .npz with z0, or a trajectory file).",
-        **others,
+        **_with_status(others),
     )  # fmt: skip
     command.set_defaults(command=_predict)
     command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 import warnings
+from importlib.metadata import version
 
 import jax
 import numpy as np
@@ -28,7 +29,7 @@ from gfnn_jax.jobs import predict as predict_job
 from gfnn_jax.jobs import progress, search
 from gfnn_jax.learn import check, structures
 from gfnn_jax.learn import fit as learn_fit
-from gfnn_jax.learn.candidates import Tolerance
+from gfnn_jax.learn.candidates import Candidate, Tolerance
 from gfnn_jax.maps import saved as models
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -123,7 +124,17 @@ def test_scenes(capsys):
     assert [line[0] for line in lines] == list(scenes.names())
 
 
-@pytest.mark.parametrize("command", [(), ("run",), ("fit",), ("predict",), ("scenes",)])
+def test_version(capsys):
+    with pytest.raises(SystemExit) as stop:
+        gfnn("--version")
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"gfnn {version('gfnn_jax')}\n"
+
+
+HELP = [(), ("run",), ("fit",), ("predict",), ("export",), ("compare",), ("scenes",)]
+
+
+@pytest.mark.parametrize("command", HELP)
 def test_help(command, capsys):
     with pytest.raises(SystemExit) as stop:
         gfnn(*command, "--help")
@@ -131,7 +142,18 @@ def test_help(command, capsys):
     out = capsys.readouterr().out
     assert "usage: gfnn" in out
     assert ("exit status:" in out) == (command != ("scenes",))
+    # A process can only be lost where there are several; the first help is of all commands.
+    assert ("  134  " in out) == (not command or "--distributed" in out)
     assert ("95 % bound" in out) == (command in (("run",), ("fit",)))
+
+
+def test_a_line_of_progress_says_where_its_error_comes_from():
+    known = {"label": "polynomial 4", "family": "polynomial", "chart": "midpoint",
+             "num_parameters": 69, "operations": 1e3, "validation_rms": 1e-5,
+             "validation_relative": 2e-5, "validation_bound": 3e-5, "deviations": np.zeros(2),
+             "train_rms": 1e-5, "fit_seconds": 0.1}  # fmt: skip
+    for steps, error in ((False, "first estimated at 2.00e-05"), (True, "error 2.00e-05")):
+        assert error in search.line(Candidate(**known, validated=steps))
 
 
 WHOLE = "expected a whole number from 1 to 2**53 - 1, got "

@@ -20,8 +20,9 @@ from gfnn_jax import cli, scenes
 from gfnn_jax.coordinates import CARTESIAN, Coordinates, polar, to_inner
 from gfnn_jax.exports.export import SUFFIXES
 from gfnn_jax.exports.symbols import Tape
-from gfnn_jax.families.expressions import jets, parse
+from gfnn_jax.families.expressions import parse
 from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.jets import jets
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.flow import Flow
@@ -29,6 +30,7 @@ from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE1, TYPE2, TYPE3
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import fit_predictors
 from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.parameters import sampled
 from gfnn_jax.phase_space import symplectic_form
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, OK
 
@@ -167,6 +169,59 @@ def test_c_is_the_maps_own_step(kind, tmp_path):
         # Far outside, folds are near and powers large.
         outside = status == LEFT_DOMAIN
         np.testing.assert_allclose(images[outside], expected[outside], rtol=1e-11, atol=1e-11)
+
+
+def with_length(kind):
+    """A map whose S or H depends on a length l, its states and their lengths (N, 1)."""
+    z, lengths = 0.5 * states(1), np.random.default_rng(2).uniform(0.5, 2, (300, 1))
+    unit, names = np.ones(2), ("l",)
+    if kind == "law":
+        family = given_terms(1, ["p1**2/l**2", "l*cos(q1)", "T3(q1)*l"], names)
+        piece = Flow(family, np.array([0.5, -1.0, 0.1]), DT, unit, 4, 2)
+    else:
+        family = Products(box_inputs(z, args=lengths), 4)
+        rng = np.random.default_rng(5)
+        params = family.unflatten(0.03 * rng.normal(size=family.num_parameters))
+        piece = Generated(family, params, MIDPOINT if kind == "midpoint" else TYPE2, DT, unit)
+    map_ = dataclasses.replace(map_of(piece, z), parameters=sampled(names, lengths))
+    if kind == "type 2":
+        image = np.asarray(map_.step(z, lengths)[0])
+        found = fit_predictors(TYPE2, z, image, DT, args=lengths)
+        piece = dataclasses.replace(piece, predictor=found[-1].predictor)
+        turned = Affine(expm(0.2 * symplectic_form(1)), np.zeros(2), np.zeros(2))
+        map_ = dataclasses.replace(map_, pieces=(turned, piece, turned))
+    return map_, z, lengths
+
+
+@needs_cc
+@pytest.mark.parametrize("kind", ["law", "midpoint", "type 2"])
+def test_c_of_a_map_with_parameters(kind, tmp_path):
+    map_, z, args = with_length(kind)
+    z = np.concatenate([z, z[:20], z[:2]])
+    args = np.concatenate([args, np.full((20, 1), 2.1), args[:2]])
+    args[-1], z[-2] = np.nan, np.nan
+    path = gfnn.export(map_, "c", tmp_path / "own.c")
+    assert f"args = (l), in the data l from {args[:300].min():.6g} to" in path.read_text()
+    library, pointer = compiled(path), ctypes.POINTER(ctypes.c_double)
+    for function, own in ((library.own_step, map_.step), (library.own_inverse, map_.inverse)):
+        images = z.copy()
+        rows = [
+            [a.ctypes.data_as(pointer) for a in both] for both in zip(images, args, strict=True)
+        ]
+        status = np.array([function(row, given, row) for row, given in rows])
+        expected, info = own(z, args)
+        np.testing.assert_array_equal(status, info.status)
+        assert {OK, LEFT_DOMAIN, NON_FINITE} <= {*status.tolist()}
+        inside = status == OK
+        assert inside.sum() > 200
+        np.testing.assert_allclose(images[inside], expected[inside], rtol=1e-14, atol=1e-14)
+
+
+def test_a_driven_map_has_no_c(tmp_path):
+    map_, _, lengths = with_length("law")
+    driven = dataclasses.replace(map_, parameters=sampled(("t",), lengths, DT, 2 * np.pi))
+    with pytest.raises(gfnn.InputError, match=r"the map is driven.*--to stablehlo takes any map"):
+        gfnn.export(driven, "c", tmp_path / "a.c")
 
 
 @needs_cc

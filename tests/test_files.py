@@ -293,6 +293,24 @@ def folder(tmp):
     return tmp / "d.npz"
 
 
+def packed(compression):
+    def make(tmp):
+        with zipfile.ZipFile(tmp / "d.npz", "w", compression) as archive:
+            for name, value in {"z0": Z[:-1], "z1": Z[1:], "dt": np.array(0.1)}.items():
+                with archive.open(f"{name}.npy", "w") as member:
+                    np.save(member, value)
+        return tmp / "d.npz"
+
+    return make
+
+
+def other_member(tmp):
+    with zipfile.ZipFile(tmp / "d.npz", "w") as archive:
+        archive.writestr("z0", "")
+        archive.writestr("z1", "")
+    return tmp / "d.npz"
+
+
 def encrypted_flag(tmp):
     path = npz(z0=Z, z1=Z, dt=0.1)(tmp)
     data = bytearray(path.read_bytes())
@@ -319,6 +337,19 @@ BAD_FILES = {
     "too long npy": (changed(lambda b: b + b"x", npy(Z)), "bytes expected for shape (30, 4)"),
     "flipped bit in npz": (changed(lambda b: flip(b, 700)), "damaged"),
     "flipped header in npy": (changed(lambda b: flip(b, 20), npy(Z)), "damaged"),
+    "flipped version in npy": (changed(lambda b: flip(b, 6), npy(Z)), "damaged? (version (17, 0)"),
+    "cut text of a header": (changed(lambda b: b.replace(b"), }", b"   }"), npy(Z)), "damaged"),
+    "bytes for a header's key": (
+        changed(lambda b: b.replace(b" 'fortran_", b"b'fortran_"), npy(Z)),
+        "damaged",
+    ),
+    "flipped bit in lzma": (changed(lambda b: flip(b, 700), packed(zipfile.ZIP_LZMA)), "damaged"),
+    "flipped bit in bzip2": (changed(lambda b: flip(b, 700), packed(zipfile.ZIP_BZIP2)), "damaged"),
+    "flipped bit in deflate": (
+        changed(lambda b: flip(b, 700), packed(zipfile.ZIP_DEFLATED)),
+        "damaged",
+    ),
+    "no .npy in an archive": (other_member, "found none"),
     "huge shape in npy": (
         changed(lambda b: b.replace(b"(30, 4), }        ", b"(3000000000, 4), }"), npy(Z)),
         "damaged",
@@ -462,6 +493,18 @@ def test_damaged_bytes_never_escape(tmp_path_factory, data):
         else:
             if kind in ("npz", "zip"):  # the archive's checksums vouch for every bit
                 assert np.array_equal(read.pairs().z1, Z[1:10])
+
+
+@pytest.mark.parametrize("mistake", [TypeError, KeyError, AttributeError, IndexError])
+def test_a_mistake_is_not_called_damage(tmp_path, monkeypatch, mistake):
+    path = save(tmp_path / "d.npz", z0=Z, z1=Z, dt=0.1)
+
+    def wrong(*args, **kwargs):
+        raise mistake("ours")
+
+    monkeypatch.setattr(np, "frombuffer", wrong)
+    with pytest.raises(mistake, match="ours"):
+        files.read_trajectories(path)
 
 
 def test_reading_needs_no_jax():

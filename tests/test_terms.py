@@ -9,9 +9,10 @@ import pytest
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.families import Family, LinearFamily
-from gfnn_jax.families.expressions import parse, to_text, traced
+from gfnn_jax.families.expressions import parse, to_text
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
+from gfnn_jax.families.traced import traced
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.pcr3bp import features
 

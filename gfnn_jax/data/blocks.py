@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import lzma
+import tokenize
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -18,6 +22,12 @@ LARGEST = 1e100
 # Rows read at a time when no chunk is asked for; 16k rows of four numbers are 6 MB as text.
 BLOCK_ROWS = 16_384
 TIME = "t"  # `phase_space.TIME`, which brings JAX
+# What flipped bits and cuts in files made zipfile, its decompressors, NumPy and the decoding of
+# text raise; a flipped bit in a header may ask for an unknown compression or for a password.
+_OF_DAMAGE = (
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, ValueError,
+    tokenize.TokenError, SyntaxError, NotImplementedError, RuntimeError, MemoryError,
+)  # fmt: skip
 
 
 class DataWarning(UserWarning):
@@ -129,12 +139,13 @@ def column(index: int, dim: int) -> str:
 
 
 @contextlib.contextmanager
-def damage(path, name: str) -> Iterator[None]:
-    """Whatever a damaged file makes zipfile, zlib or NumPy raise, in one line."""
+def damage(path, name: str, *more: type[Exception]) -> Iterator[None]:
+    """What a damaged file makes its readers raise, in one line; a mistake of ours goes through.
+    more: what only this reader raises."""
     try:
         yield
     except InputError:
         raise
-    except Exception as error:
+    except (*_OF_DAMAGE, *more) as error:
         detail = (str(error) or type(error).__name__)[:120]
         raise InputError(f"{path}: {name} cannot be read: damaged? ({detail})") from error

@@ -24,6 +24,11 @@ from gfnn_jax.processes import WHOLE, Share
 
 _LOCAL_HEADER = 30  # bytes before the name of a member of a .zip
 _SKIPPED = 2**20  # bytes at a time
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+_OF_HEADERS = (TypeError,)  # NumPy sorts the keys of a header, which may be text and bytes
 
 
 class _StoredArray:
@@ -35,12 +40,11 @@ class _StoredArray:
 
     def __init__(self, path, name: str, stream, size: int, begin: int | None):
         self.path, self.name, self.stream, self.begin = path, name, stream, begin
-        with damage(path, name):
+        with damage(path, name, *_OF_HEADERS):
             version = np.lib.format.read_magic(stream)
-            read_header = {
-                (1, 0): np.lib.format.read_array_header_1_0,
-                (2, 0): np.lib.format.read_array_header_2_0,
-            }[version]
+            if version not in _HEADERS:
+                raise ValueError(f"version {version} of its format is not known")
+            read_header = _HEADERS[version]
             self.shape, self.fortran_order, self.dtype = read_header(stream)
         if self.dtype.kind not in "fiu":
             hint = " (save padded sequences with 'lengths')" if self.dtype.hasobject else ""
@@ -112,7 +116,7 @@ def open_npy(path: Path, stream, dt, initial: bool, driven: bool) -> Source:
 def open_npz(path: Path, stream, dt, initial: bool, driven: bool) -> Source:
     with damage(path, "the archive"):
         archive = zipfile.ZipFile(stream)
-    names = [name.removesuffix(".npy") for name in archive.namelist()]
+    names = [name[:-4] for name in archive.namelist() if name.endswith(".npy")]
 
     def member(name: str) -> _StoredArray:
         with damage(path, name):
@@ -218,7 +222,7 @@ def _read_params(path, names: list[str], member) -> tuple[tuple[str, ...], np.nd
         )
     called = tuple(f"a{i + 1}" for i in range(values.shape[1]))
     if "param_names" in names:
-        with damage(path, "param_names"), np.load(path, allow_pickle=False) as file:
+        with damage(path, "param_names", *_OF_HEADERS), np.load(path, allow_pickle=False) as file:
             called = tuple(np.atleast_1d(file["param_names"]).astype(str).tolist())
         if len(called) != values.shape[1] or len(set(called)) < len(called):
             raise InputError(

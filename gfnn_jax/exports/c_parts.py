@@ -248,8 +248,13 @@ static double eliminated(int n, const double *matrix, const double *rhs, double 
 """
 
 
-def fixed_point_solver(width: int, stages: int) -> str:
-    """The stages of Gauss collocation, up to so many, for states (width,)."""
+def fixed_point_solver(width: int, stages: int, more: int = 0) -> str:
+    """The stages of Gauss collocation, up to so many, for states (width,), which ``more`` args
+    follow."""
+    room, follow = "", ""
+    if more:
+        room = f" + {more}"
+        follow = f"    memcpy(inside + STATE, z + STATE, {more}*sizeof *z);\n"
     return f"""\
 enum {{ MOST_STAGES = {stages}, STATE = {width} }};
 
@@ -257,9 +262,9 @@ enum {{ MOST_STAGES = {stages}, STATE = {width} }};
 static int collocated(void (*gradient)(const double *, double *), int stages,
                       const double *coupling, const double *weights, const double *scale, double *z)
 {{
-    double slopes[MOST_STAGES][STATE], fresh[MOST_STAGES][STATE], inside[STATE], g[STATE];
+    double slopes[MOST_STAGES][STATE], fresh[MOST_STAGES][STATE], inside[STATE{room}], g[STATE];
     double change = INFINITY;
-    gradient(z, g);
+{follow}    gradient(z, g);
     for (int i = 0; i < stages; i++)
         for (int a = 0; a < STATE; a++)
             slopes[i][a] = weights[i]*(a < STATE/2 ? g[a + STATE/2] : -g[a - STATE/2]);

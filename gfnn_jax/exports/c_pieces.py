@@ -1,4 +1,7 @@
-"""The pieces of a map in C: ``int PIECE_step(double *z)``, and ``PIECE_back``, its inverse."""
+"""The pieces of a map in C: ``int PIECE_step(double *z)``, and ``PIECE_back``, its inverse.
+
+The values of a map's parameters, the args, follow the state in z and in w, and stay.
+"""
 
 from __future__ import annotations
 
@@ -43,23 +46,30 @@ def unknowns(piece: Generated, dim: int) -> int:
     return free.stop - free.start
 
 
-def piece_functions(name: str, piece: Any, back: Any, width: int) -> list[str]:
-    """The functions of a piece and of its inverse ``back``, for states (width,)."""
+def piece_functions(name: str, piece: Any, back: Any, width: int, more: int = 0) -> list[str]:
+    """The functions of a piece and of its inverse ``back``, for states (width,), which ``more``
+    args follow."""
     if isinstance(piece, Affine):
         return [*_affine(f"{name}_step", piece, width), *_affine(f"{name}_back", back, width)]
     family, params = on_symbols(piece.family), np.asarray(piece.params)
     tape = Tape()
-    w = tape.inputs("w", width)
-    parts = [tape.function(f"{name}_gradient", {"g": family.gradient(params, w)})]
+    w, args = _with_args(tape, "w", width, more)
+    parts = [tape.function(f"{name}_gradient", {"g": family.gradient(params, w, args)})]
     if isinstance(piece, Flow):
         return [*parts, *_flow(name, piece, back)]
     tape = Tape()
-    w = tape.inputs("w", width)
-    gradient, hessian = family.gradient_and_hessian(params, w)
+    w, args = _with_args(tape, "w", width, more)
+    gradient, hessian = family.gradient_and_hessian(params, w, args)
     parts.append(tape.function(f"{name}_hessian", {"g": gradient, "h": hessian}))
     for way, one in (("step", piece), ("back", back)):
-        parts += _generated(f"{name}_{way}", name, one, width)
+        parts += _generated(f"{name}_{way}", name, one, width, more)
     return parts
+
+
+def _with_args(tape: Tape, name: str, width: int, more: int) -> tuple[np.ndarray, Any]:
+    """An input (1, width), and the args (1, more) that follow it, or None."""
+    both = tape.inputs(name, width + more)
+    return both[:, :width], both[:, width:] if more else None
 
 
 def _affine(name: str, piece: Affine, width: int) -> list[str]:
@@ -94,22 +104,24 @@ class _Given:
         return self._gradient, self._hessian
 
 
-def _generated(name: str, family: str, piece: Generated, width: int) -> list[str]:
+def _generated(name: str, family: str, piece: Generated, width: int, more: int) -> list[str]:
     """What S generates, one way. family: of whose functions in C are the derivatives of S."""
     chart, n = piece.chart, unknowns(piece, width // 2)
     dt, scale = float(np.asarray(piece.dt)), np.asarray(piece.scale)
     equation = ImplicitStep(chart)
 
     tape = Tape()
-    z = tape.inputs("z", width)
+    z, args = _with_args(tape, "z", width, more)
     guess = chart.first_guess(z)[:, chart.free(width // 2)]
     if piece.predictor is not None:
-        guess = guess + _predicted(piece.predictor.forward, z)
+        guess = guess + _predicted(piece.predictor.forward, z, args)
     parts = [tape.function(f"{name}_guess", {"x": guess})]
 
     tape = Tape()
-    z, x = tape.inputs("z", width), tape.inputs("x", n)
+    (z, args), x = _with_args(tape, "z", width, more), tape.inputs("x", n)
     w = chart.complete(chart.first_guess(z), x)
+    if args is not None:
+        w = np.concatenate([w, args], axis=1)
     parts.append(tape.function(f"{name}_point", {"w": w}))
 
     for linear in (False, True):
@@ -139,7 +151,7 @@ def _generated(name: str, family: str, piece: Generated, width: int) -> list[str
     parts.append(f"""\
 static void {name}_evaluate(const double *z, const double *x, struct point *at)
 {{
-    double w[{width}];
+    double w[{width + more}];
     {name}_point(z, x, w);
     {family}_gradient(w, at->gradient);
     {name}_residual(z, x, at->gradient, at->residual, at->size);
@@ -147,7 +159,7 @@ static void {name}_evaluate(const double *z, const double *x, struct point *at)
 
 static void {name}_linearise(const double *z, const double *x, struct point *at, double *m)
 {{
-    double w[{width}], h[{width * width}];
+    double w[{width + more}], h[{width * width}];
     {name}_point(z, x, w);
     {family}_hessian(w, at->gradient, h);
     {name}_linear(z, x, at->gradient, h, at->residual, at->size, m);
@@ -172,9 +184,9 @@ static int {name}(double *z)
     return parts
 
 
-def _predicted(model: PolynomialModel, z):
-    """What the model adds to the chart's first guess at the symbols z (1, 2d)."""
-    variables = on_symbols(model.family).inputs(z)[0]
+def _predicted(model: PolynomialModel, z, args):
+    """What the model adds to the chart's first guess at the symbols z (1, 2d), args (1, k)."""
+    variables = on_symbols(model.family).inputs(z, args)[0]
     within = [
         v if np.isinf(reach) else v.clipped(-reach, reach)
         for v, reach in zip(variables, model.reach, strict=True)

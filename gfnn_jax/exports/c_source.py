@@ -31,8 +31,8 @@ def why_not(map_: SymplecticMap) -> str | None:
     """Why a map cannot be written in C; None where it can."""
     if np.dtype(map_.scale.dtype) != np.float64:
         return f"the map is of {np.dtype(map_.scale.dtype)}, not of float64"
-    if map_.parameters is not None:
-        return f"the map depends on {', '.join(map_.parameters.names)} beside the state"
+    if map_.parameters is not None and map_.parameters.period is not None:
+        return "the map is driven"
     if map_.coordinates.forward not in (CARTESIAN.forward, _POLAR):
         return f"the map has the {map_.coordinates.name} coordinates of its scene"
     if not isinstance(map_.domain, Domain):
@@ -42,7 +42,7 @@ def why_not(map_: SymplecticMap) -> str | None:
 
 def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     """The text of the file, with ``int NAME_step(const double z[2d], double Z[2d])`` and
-    ``NAME_inverse``.
+    ``NAME_inverse``; of a map with k parameters both take ``const double args[k]`` after z.
 
     about: what is told of the map in the comment at the top, name -> text. Raises InputError, in
     one line, for a map that has no such file.
@@ -54,6 +54,7 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
         )
     map_ = jax.tree.map(np.asarray, map_)
     pieces, width, domain = map_.pieces, 2 * map_.dim, map_.domain
+    more = _num_args(map_)
     assert isinstance(domain, Domain)
     parts = [_comment(map_, name, about), c_parts.INCLUDES, c_parts.COMMON]
     if map_.coordinates.angles:
@@ -66,28 +67,40 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     if most > COFACTORS_UP_TO:
         parts.append(c_parts.ELIMINATION)
     if stages := max((p.stages for p in pieces if isinstance(p, Flow)), default=0):
-        parts.append(c_parts.fixed_point_solver(width, stages))
+        parts.append(c_parts.fixed_point_solver(width, stages, more))
     if domain.keep:
         tape = Tape()
         y = tape.inputs("y", width)
         parts.append(tape.function("christoffel", {"kappa": domain.christoffel(y)}))
     for i, (piece, back) in enumerate(zip(pieces, map_.reversed().pieces[::-1], strict=True)):
-        parts += piece_functions(f"piece{i}", piece, back, width)
+        parts += piece_functions(f"piece{i}", piece, back, width, more)
     order = range(len(pieces))
     parts.append(_whole(map_, f"{name}_step", [f"piece{i}_step" for i in order]))
     parts.append(_whole(map_, f"{name}_inverse", [f"piece{i}_back" for i in reversed(order)]))
     return "\n".join(parts)
 
 
+def _num_args(map_: SymplecticMap) -> int:
+    return 0 if map_.parameters is None else len(map_.parameters.names)
+
+
+def _signature(map_: SymplecticMap, name: str) -> str:
+    width, more = 2 * map_.dim, _num_args(map_)
+    args = f"const double args[{more}], " if more else ""
+    return f"int {name}(const double z[{width}], {args}double Z[{width}])"
+
+
 def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str]) -> str:
-    """The public function: `SymplecticMap._apply` of one state."""
+    """The public function: `SymplecticMap._apply` of one state, which the args follow in y."""
     width, angles, domain = 2 * map_.dim, map_.coordinates.angles, map_.domain
+    more = _num_args(map_)
     changed = map_.coordinates.forward is not CARTESIAN.forward
     centres = np.ravel(np.asarray(map_.angle_centre))
     turns = f", turns[{len(angles)}]" if angles else ""
     lines = [
-        f"double y[{width}]{turns};",
-        "to_inner(z, y);" if changed else "memcpy(y, z, sizeof y);",
+        f"double y[{width + more}]{turns};",
+        "to_inner(z, y);" if changed else f"memcpy(y, z, {width}*sizeof *y);",
+        *([f"memcpy(y + {width}, args, {more}*sizeof *y);"] if more else []),
         *(
             f"y[{a}] = reduced(y[{a}], {literal(centre)}, &turns[{k}]);"
             for k, (a, centre) in enumerate(zip(angles, centres, strict=True))
@@ -101,6 +114,12 @@ def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str]) -> str:
             "christoffel(y, kappa);",
             f"inside = inside && kappa[0] <= {literal(float(np.asarray(domain.limit)))};",
         ]
+    if map_.parameters is not None:
+        low, high = map_.parameters.bounds
+        lines += [
+            f"inside = inside && args[{k}] >= {literal(a)} && args[{k}] <= {literal(b)};"
+            for k, (a, b) in enumerate(zip(low, high, strict=True))
+        ]
     lines += [
         "int status = OK;",
         *(f"status = worse(status, {piece}(y));" for piece in pieces),
@@ -109,19 +128,29 @@ def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str]) -> str:
         f"if (!all_finite({width}, y))",
         "    status = NON_FINITE;",
         *(f"y[{a}] = unreduced(y[{a}], turns[{k}]);" for k, a in enumerate(angles)),
-        "to_user(y, Z);" if changed else "memcpy(Z, y, sizeof y);",
+        "to_user(y, Z);" if changed else f"memcpy(Z, y, {width}*sizeof *y);",
         "return status;",
     ]
     body = "\n".join(f"    {line}" for line in lines)
-    return f"int {name}(const double z[{width}], double Z[{width}])\n{{\n{body}\n}}\n"
+    return f"{_signature(map_, name)}\n{{\n{body}\n}}\n"
 
 
 def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     """What the file is, for who opens it."""
-    width, names = 2 * map_.dim, coordinate_names(map_.dim)
+    names = coordinate_names(map_.dim)
     sizes = ", ".join(f"{n} {s:.3g}" for n, s in zip(names, map_.scale, strict=True))
     angles = [names[i] for i in map_.coordinates.angles if map_.coordinates.forward is not _POLAR]
     turned = f" {', '.join(angles)}: period 2 pi, any number of turns." if angles else ""
+    given, outside = "", "z lies"
+    if map_.parameters is not None:
+        ranges = ", ".join(
+            f"{n} from {low:.6g} to {high:.6g}"
+            for n, low, high in zip(
+                map_.parameters.names, map_.parameters.low, map_.parameters.high, strict=True
+            )
+        )
+        given = f"\n   args = ({', '.join(map_.parameters.names)}), in the data {ranges}."
+        outside = "z or args are"
     told = "\n".join(
         f"   {key}: {value:.3g}" if isinstance(value, float) else f"   {key}: {value}"
         for key, value in about.items()
@@ -129,15 +158,15 @@ def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     text = f"""\
  One step of a learned symplectic map, and its inverse.
 
-       int {name}_step(const double z[{width}], double Z[{width}]);
-       int {name}_inverse(const double z[{width}], double Z[{width}]);
+       {_signature(map_, f"{name}_step")};
+       {_signature(map_, f"{name}_inverse")};
 
-   z = ({", ".join(names)}), in the units of the data; z and Z may be the same array.{turned}
+   z = ({", ".join(names)}), in the units of the data; z and Z may be the same array.{turned}{given}
    Sizes of the coordinates in the data: {sizes}.
    A step is dt = {literal(np.asarray(map_.dt))} in the data's unit of time.
 
    Answer: {c_parts.STATUSES}.
-   1: z lies outside the data's domain; its image is in Z all the same. 3, 4: Z is of no use.
+   1: {outside} outside the data's domain; the image is in Z all the same. 3, 4: Z is of no use.
 
    cc -O3 -std=c99 -c {name}.c, and -lm for the linker. No -ffast-math: it takes away the tests for
    numbers that are not finite. Nothing is allocated or remembered: threads may call at once.

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.families.expressions import jets, traced
 from gfnn_jax.families.inputs import Inputs
+from gfnn_jax.families.jets import jets
 from gfnn_jax.families.products import Products
+from gfnn_jax.families.traced import traced
 
 
 class Formulas(Inputs):

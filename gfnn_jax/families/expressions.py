@@ -1,9 +1,8 @@
 """Expressions in the coordinates of a state: trees made of text or of a Python function.
 
 Text is parsed with `ast` against a list of allowed names; nothing is ever evaluated as code, so
-that a term a user gives is data. A Python function is traced by JAX, once, into the same tree.
-Values and first and second derivatives are those of truncated Taylor arithmetic: the same lines
-compute in NumPy and are traced by JAX.
+that a term a user gives is data. A Python function becomes the same tree in `traced`; values and
+derivatives are computed in `jets`.
 """
 
 from __future__ import annotations
@@ -12,54 +11,14 @@ import ast
 import dataclasses
 import keyword
 import math
-import operator
-import re
-from collections.abc import Callable, Sequence
-from functools import cache, cached_property, reduce
+from collections.abc import Sequence
+from functools import cache, cached_property
 from typing import Any
 
-import numpy as np
-
-from gfnn_jax.arrays import as_row, namespace
 from gfnn_jax.errors import InputError
+from gfnn_jax.families.functions import CHEBYSHEV, FUNCTIONS
 
 _LONGEST_TEXT, _DEEPEST = 2_000, 60
-
-
-def _squared(xp, v):
-    return v * v
-
-
-# name -> f, f', f'' of a value v with f(v) = y: functions of (xp, v, y).
-_FUNCTIONS: dict[str, tuple[Callable, Callable, Callable]] = {
-    "tan": (
-        lambda xp, v: xp.tan(v),
-        lambda xp, v, y: 1 + y * y,
-        lambda xp, v, y: 2 * y * (1 + y * y),
-    ),
-    "exp": (lambda xp, v: xp.exp(v), lambda xp, v, y: y, lambda xp, v, y: y),
-    "log": (lambda xp, v: xp.log(v), lambda xp, v, y: 1 / v, lambda xp, v, y: -1 / (v * v)),
-    "sqrt": (
-        lambda xp, v: xp.sqrt(v),
-        lambda xp, v, y: 0.5 / y,
-        lambda xp, v, y: -0.25 / (y * v),
-    ),
-    "sinh": (lambda xp, v: xp.sinh(v), lambda xp, v, y: xp.cosh(v), lambda xp, v, y: y),
-    "cosh": (lambda xp, v: xp.cosh(v), lambda xp, v, y: xp.sinh(v), lambda xp, v, y: y),
-    "tanh": (
-        lambda xp, v: xp.tanh(v),
-        lambda xp, v, y: 1 - y * y,
-        lambda xp, v, y: -2 * y * (1 - y * y),
-    ),
-    "arctan": (
-        lambda xp, v: xp.arctan(v),
-        lambda xp, v, y: 1 / (1 + v * v),
-        lambda xp, v, y: -2 * v / _squared(xp, 1 + v * v),
-    ),
-}  # fmt: skip
-_CHEBYSHEV = re.compile(r"T\d{1,2}")
-_CIRCULAR = ("sin", "cos")  # which share their values
-FUNCTIONS = (*_CIRCULAR, *_FUNCTIONS)
 _OTHER_NAMES = {"atan": "arctan", "ln": "log"}
 _CONSTANTS = {"pi": math.pi, "e": math.e}
 
@@ -194,7 +153,7 @@ def check_names(dim: int, names: Sequence[str]) -> None:
     for name in names:
         if not name.isidentifier() or keyword.iskeyword(name):
             raise InputError(f"expected letters, digits and _ as a parameter's name, got '{name}'")
-        if name in taken or _CHEBYSHEV.fullmatch(name):
+        if name in taken or CHEBYSHEV.fullmatch(name):
             raise InputError(
                 f"expected a name for a parameter that has no meaning yet, got '{name}'"
             )
@@ -251,7 +210,7 @@ def _parsed(node, names, text, depth) -> Expression:
     if isinstance(node, ast.Call):
         name = node.func.id if isinstance(node.func, ast.Name) else "?"
         name = _OTHER_NAMES.get(name, name)
-        known = name in FUNCTIONS or _CHEBYSHEV.fullmatch(name)
+        known = name in FUNCTIONS or CHEBYSHEV.fullmatch(name)
         if not known or node.keywords or len(node.args) != 1:
             raise refuse(f"a call of '{ast.unparse(node.func)}' with {len(node.args)} arguments")
         return call(name, inner(node.args[0]))
@@ -326,285 +285,3 @@ def count_operations(tree: Expression) -> int:
     inner = sum(count_operations(o) for o in tree.operands if isinstance(o, Expression))
     cost = {"number": 0, "coordinate": 0, "parameter": 0, "+": 1, "*": 1, "/": 4, "power": 4}
     return inner + cost.get(tree.operation, 10)
-
-
-# Values and derivatives.
-
-
-@dataclasses.dataclass(frozen=True)
-class Jet:
-    """An expression's value, its slopes {i: ∂/∂z_i} and curvatures {(i, j): ∂²/∂z_i∂z_j}, i ≤ j,
-    those that are not identically zero; each an array of the lanes' shape, or a number."""
-
-    value: Any
-    slope: dict[int, Any]
-    curvature: dict[tuple[int, int], Any]
-
-
-def jets(trees: Sequence[Expression], w, order: int, args=None) -> list[Jet]:
-    """The expressions at states w (..., 2d), with derivatives in w up to ``order`` (0, 1, 2). args:
-    the parameters' values (k,) or, for lanes of w, (..., k)."""
-    known: dict[Any, Any] = {}
-    if args is not None:
-        for i in range(args.shape[-1]):
-            known[parameter(i)] = Jet(as_row(args[..., i], w[..., 0]), {}, {})
-    return [_jet(tree, w, order, known) for tree in trees]
-
-
-def _jet(tree: Expression, w, order: int, known) -> Jet:
-    if tree not in known:
-        known[tree] = _jet_of(tree, w, order, known)
-    return known[tree]
-
-
-def _jet_of(tree: Expression, w, order, known) -> Jet:
-    xp = namespace(w)
-    operation, operands = tree.operation, tree.operands
-    if operation == "number":
-        return Jet(operands[0], {}, {})
-    if operation == "coordinate":
-        return Jet(w[..., operands[0]], {operands[0]: 1.0} if order else {}, {})
-    if operation == "parameter":
-        raise ValueError("expected the values of the parameters (args), got none")
-    first = _jet(operands[0], w, order, known)
-    if _CHEBYSHEV.fullmatch(operation):
-        return _chebyshev(first, operands[0], int(operation[1:]), order, known)
-    if operation == "power":
-        return _composed(first, order, *_power_derivatives(xp, first.value, operands[1], order))
-    if operation in _CIRCULAR:
-        cos, sin = _circle(*_multiple(operands[0]), w, order, known)
-        y, slope = (sin, cos) if operation == "sin" else (cos, -sin)
-        return _composed(first, order, y, slope, -y if order > 1 else 0.0)
-    if operation in _FUNCTIONS:
-        f, df, ddf = _FUNCTIONS[operation]
-        v = first.value if not isinstance(first.value, float) else xp.asarray(first.value)
-        y = f(xp, v)
-        return _composed(
-            first, order, y, df(xp, v, y) if order else 0.0, ddf(xp, v, y) if order > 1 else 0.0
-        )
-    second = _jet(operands[1], w, order, known)
-    if operation == "+":
-        return Jet(
-            first.value + second.value,
-            _added(first.slope, second.slope), _added(first.curvature, second.curvature),
-        )  # fmt: skip
-    if operation == "/":
-        inverse = 1.0 / second.value
-        slope = -inverse * inverse if order else 0.0
-        curvature = -2 * slope * inverse if order > 1 else 0.0
-        second = _composed(second, order, inverse, slope, curvature)
-    return _multiplied(first, second, order)
-
-
-def _chebyshev(x: Jet, part: Expression, n: int, order: int, known) -> Jet:
-    """T_n(x) of the jet x of an expression: T_n = 2x T_n−1 − T_n−2."""
-    if n < 2:
-        return x if n else Jet(1.0, {}, {})
-    if ("T", part, n) not in known:
-        last, before = (_chebyshev(x, part, k, order, known) for k in (n - 1, n - 2))
-        twice = _multiplied(Jet(2.0, {}, {}), _multiplied(x, last, order), order)
-        less = _multiplied(Jet(-1.0, {}, {}), before, order)
-        known["T", part, n] = Jet(
-            twice.value + less.value,
-            _added(twice.slope, less.slope), _added(twice.curvature, less.curvature),
-        )  # fmt: skip
-    return known["T", part, n]
-
-
-def _circle(part: Expression, n: int, w, order: int, known):
-    """cos and sin of n times an expression: of a multiple by products of those of smaller ones."""
-    if (part, n) not in known:
-        if n > 1:
-            c, s = _circle(part, n // 2, w, order, known)
-            d, t = _circle(part, n - n // 2, w, order, known)
-            known[part, n] = c * d - s * t, s * d + c * t
-        else:
-            xp, v = namespace(w), _jet(part, w, order, known).value
-            v = xp.asarray(v) if isinstance(v, float) else v
-            known[part, n] = xp.cos(v), xp.sin(v)
-    return known[part, n]
-
-
-@cache
-def _multiple(tree: Expression) -> tuple[Expression, int]:
-    """(part, n) with tree = n · part, n the greatest common divisor of a sum of whole multiples of
-    coordinates; (tree, 1) for anything else."""
-    found = _whole_multiples(tree)
-    if not found or (n := math.gcd(*found.values())) < 2:
-        return tree, 1
-    parts = [coordinate(i) * (m // n) for i, m in sorted(found.items())]
-    return reduce(operator.add, parts), n
-
-
-def _whole_multiples(tree: Expression) -> dict[int, int] | None:
-    """{i: m} of Σ m_i z_i, None for another tree."""
-    operation, operands = tree.operation, tree.operands
-    if operation == "coordinate":
-        return {operands[0]: 1}
-    if operation == "*":
-        m, inner = operands[0].value, _whole_multiples(operands[1])
-        if m is None or not m.is_integer() or inner is None:
-            return None
-        return {i: int(m) * k for i, k in inner.items()}
-    if operation == "+":
-        left, right = (_whole_multiples(o) for o in operands)
-        if left is not None and right is not None and not left.keys() & right.keys():
-            return left | right
-    return None
-
-
-def _power_derivatives(xp, v, exponent: float, order: int):
-    whole = exponent == int(exponent) and abs(exponent) <= 32
-
-    def raised(k: float):
-        return _whole_power(v, int(k)) if whole else v**k
-
-    if whole and exponent == 2:
-        return v * v, 2 * v, 2.0
-    return (
-        raised(exponent),
-        exponent * raised(exponent - 1) if order else 0.0,
-        exponent * (exponent - 1) * raised(exponent - 2) if order > 1 else 0.0,
-    )
-
-
-def _whole_power(v, k: int):
-    if k < 0:
-        return 1.0 / _whole_power(v, -k)
-    if k == 0:
-        return 1.0
-    half = _whole_power(v, k // 2)
-    square = half * half
-    return square * v if k % 2 else square
-
-
-def _added(a: dict, b: dict) -> dict:
-    return {k: a[k] + b[k] if k in a and k in b else a.get(k, b.get(k)) for k in {**a, **b}}
-
-
-def _composed(inner: Jet, order, value, slope, curvature) -> Jet:
-    """f(inner), f's value, slope and curvature there."""
-    slopes = {i: slope * s for i, s in inner.slope.items()} if order else {}
-    if order < 2:
-        return Jet(value, slopes, {})
-    bent = {k: slope * c for k, c in inner.curvature.items()}
-    outer = {
-        (i, j): curvature * a * b
-        for i, a in inner.slope.items() for j, b in inner.slope.items() if i <= j
-    }  # fmt: skip
-    return Jet(value, slopes, _added(bent, outer))
-
-
-def _multiplied(a: Jet, b: Jet, order) -> Jet:
-    def scaled(entries, factor):
-        return {k: factor * v for k, v in entries.items()}
-
-    slopes = _added(scaled(a.slope, b.value), scaled(b.slope, a.value)) if order else {}
-    if order < 2:
-        return Jet(a.value * b.value, slopes, {})
-    mixed: dict = {}
-    for i, left in a.slope.items():
-        for j, right in b.slope.items():
-            entry = {(min(i, j), max(i, j)): (2.0 if i == j else 1.0) * left * right}
-            mixed = _added(mixed, entry)
-    curvature = _added(scaled(a.curvature, b.value), scaled(b.curvature, a.value))
-    return Jet(a.value * b.value, slopes, _added(curvature, mixed))
-
-
-# A Python function of z (2d,) as trees.
-
-
-def traced(function: Callable, dim: int) -> list[Expression]:
-    """The trees of ``function(z)``, z (2d,), a scalar or a vector made by JAX or by plain
-    arithmetic.
-
-    Raises InputError where the function branches on its values or uses what has no tree here.
-    """
-    import jax
-
-    z = jax.ShapeDtypeStruct((2 * dim,), np.float64)
-    closed = jax.make_jaxpr(function)(z)
-    symbols = np.array([coordinate(i) for i in range(2 * dim)], dtype=object)
-    results = _run(closed.jaxpr, closed.consts, [symbols])
-    return [tree for out in results for tree in np.ravel(_trees(out)).tolist()]
-
-
-_ELEMENTWISE: dict[str, Callable] = {
-    "add": lambda a, b: a + b, "add_any": lambda a, b: a + b, "sub": lambda a, b: a - b,
-    "mul": lambda a, b: a * b, "div": lambda a, b: a / b, "neg": lambda a: -a,
-    "square": lambda a: power(a, 2), "rsqrt": lambda a: 1.0 / call("sqrt", a),
-    "sqrt": lambda a: power(a, 0.5), "atan": lambda a: call("arctan", a),
-    "copy": lambda a: a, "copy_p": lambda a: a, "stop_gradient": lambda a: a,
-    **{name: (lambda a, name=name: call(name, a)) for name in FUNCTIONS if name != "sqrt"},
-}  # fmt: skip
-_REARRANGE = {
-    "slice", "squeeze", "reshape", "broadcast_in_dim", "transpose", "rev", "gather",
-    "dynamic_slice", "expand_dims",
-}  # fmt: skip
-
-
-def _trees(values):
-    """An object array of expressions of an array of numbers or expressions."""
-    values = np.asarray(values, dtype=object)
-    return _elementwise(as_expression, values) if values.size else values
-
-
-def _run(jaxpr, constants, arguments) -> list:
-    """The results of a jaxpr on object arrays of expressions; integers stay numbers."""
-    known: dict = dict(zip(jaxpr.constvars, map(np.asarray, constants), strict=True))
-    known.update(zip(jaxpr.invars, arguments, strict=True))
-
-    def read(atom):
-        return np.asarray(atom.val) if hasattr(atom, "val") else known[atom]
-
-    for equation in jaxpr.eqns:
-        values = [read(atom) for atom in equation.invars]
-        results = _applied(equation.primitive, equation.params, values)
-        known.update(zip(equation.outvars, map(np.asarray, results), strict=True))
-    return [read(atom) for atom in jaxpr.outvars]
-
-
-def _applied(primitive, params, values) -> list:
-    import jax
-
-    name = primitive.name
-    inner = params.get("jaxpr", params.get("call_jaxpr"))
-    if inner is not None and hasattr(inner, "jaxpr"):
-        return _run(inner.jaxpr, inner.consts, values)
-    if all(v.dtype != object for v in values):  # numbers only
-        with jax.enable_x64(True):
-            out = primitive.bind(*values, **params)
-        return [np.asarray(o) for o in (out if primitive.multiple_results else [out])]
-    if name == "convert_element_type":
-        return values
-    if name in _REARRANGE:
-        place = np.arange(values[0].size).reshape(values[0].shape)
-        moved = np.asarray(primitive.bind(place, *values[1:], **params))
-        return [values[0].ravel()[moved]]
-    if name == "concatenate":
-        return [np.concatenate([_trees(v) for v in values], axis=params["dimension"])]
-    values = [_trees(v) for v in values]
-    if name == "stack":
-        return [np.stack(values, axis=params["axis"])]
-    if name in _ELEMENTWISE:
-        return [_elementwise(_ELEMENTWISE[name], *values)]
-    if name == "integer_pow":
-        return [_elementwise(lambda a: power(a, params["y"]), *values)]
-    if name == "pow":
-        exponents = {e.value for e in values[1].ravel().tolist()}
-        if len(exponents) == 1 and None not in exponents:
-            return [_elementwise(lambda a: power(a, exponents.copy().pop()), values[0])]
-    if name == "reduce_sum":
-        return [np.sum(values[0], axis=tuple(params["axes"]))]
-    if name == "dot_general":
-        contract, batch = params["dimension_numbers"]
-        if not any(batch):
-            return [np.tensordot(*values, axes=contract)]
-    raise InputError(
-        f"a term uses '{name}', which has no formula here: expected sums, products, quotients, "
-        f"constant powers and {', '.join(FUNCTIONS)}"
-    )
-
-
-def _elementwise(function, *values):
-    return np.asarray(np.frompyfunc(function, len(values), 1)(*values), dtype=object)

@@ -26,11 +26,11 @@ from gfnn_jax.families.expressions import (
     coordinate_names,
     count_operations,
     depends_on,
-    jets,
     parse,
     to_text,
-    traced,
 )
+from gfnn_jax.families.jets import jets
+from gfnn_jax.families.traced import traced
 
 # So many products with coefficients are written one by one, where XLA fuses them; beyond, a matrix.
 _MOST_WRITTEN_OUT = 400

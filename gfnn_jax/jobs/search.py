@@ -76,11 +76,11 @@ def _error_of(folder: Path) -> float:
 
 
 def line(candidate: Candidate) -> str:
-    """A finished candidate in one line: what it is, and its one-step error ÷ spread, which is an
-    estimate until steps have validated it."""
-    about = "" if candidate.validated else "about "
+    """A finished candidate in one line: what it is, and its one-step error ÷ spread; until steps
+    have validated it, what the gradient's residual lets expect."""
+    first = "" if candidate.validated else "first estimated at "
     return (
-        f"{candidate.chart} {candidate.label}: one-step error {about}"
+        f"{candidate.chart} {candidate.label}: one-step error {first}"
         f"{candidate.validation_relative:.2e} of the spread, "
         f"{candidate.num_parameters} parameters"
     )

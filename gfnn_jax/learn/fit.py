@@ -323,8 +323,10 @@ def _smallest_determinant(chosen: Chosen) -> float:
 def candidates_table(fit: Fit):
     """The candidates of a fit as a ``rich`` table, by rising operations; the chosen one is marked.
 
-    An error with ~ before it is an estimate from the gradient's residual; the others were measured
-    by steps. Outside: the error at the outermost twentieth of the states, of a fit without them.
+    An error with ~ before it is an estimate: the gradient's residual, which was told as a first
+    estimate, times the ratio that measured steps of the same sweep have shown, if any were. The
+    others were measured by steps. Outside: the error at the outermost twentieth of the states, of a
+    fit without them.
     """
     from rich.table import Table  # loaded when first used
 

@@ -29,6 +29,7 @@ from gfnn_jax.fitting.gauss_newton import (
 from gfnn_jax.fitting.growth import grow
 from gfnn_jax.learn.arcs import arcs_of
 from gfnn_jax.learn.candidates import Judges, OneStepError
+from gfnn_jax.learn.centrifugal import centrifugal_terms
 from gfnn_jax.learn.clock import Clock, Counted, OutOfTime
 from gfnn_jax.learn.held_out import outermost
 from gfnn_jax.learn.law_libraries import (
@@ -78,6 +79,9 @@ def learn_hamiltonian(
     Raises FitError where no library can be tried, OutOfTime where the budget ends before the first.
     """
     basis = modes_of(prepared, scene, terms)
+    if basis is not None and not terms:
+        own = centrifugal_terms(prepared, judges.training, basis.terms(basis.box()))
+        basis = modes_of(prepared, scene, own)
     most = options.max_seconds if basis is None else options.mode_seconds
     clock = clock or Clock()
     searching = Clock(min(most, clock.left))
@@ -107,7 +111,10 @@ def learn_hamiltonian(
     elif basis is not None:
         best = _grown(problem, basis, prepared, judges, searching, options, say)
     else:
-        best, options = _searched(problem, prepared, judges, scene, terms, options, say)
+        found = _searched(problem, prepared, judges, scene, terms, options, say)
+        if not terms and prepared.structure is None:
+            found = _beside_centrifugal(problem, found, prepared, judges, options, say)
+        best, options = found
     everyone = np.arange(len(prepared.y0))
     if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
         raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
@@ -192,6 +199,25 @@ def _searched(
         best = near[0]._replace(noisy=True)
         stalled, options = True, dataclasses.replace(options, thresholds=(options.certain,))
     return best._replace(stalled=stalled), options
+
+
+def _beside_centrifugal(
+    problem, before: tuple[FittedLaw, Options], prepared, judges: Judges, options: Options, say
+) -> tuple[FittedLaw, Options]:
+    """The best of libraries with centrifugal terms and their options, where ``before`` misses the
+    tolerance, the pairs ask for such terms and these libraries are better; else ``before``."""
+    best, _ = before
+    if best.error.bound <= judges.tolerance.bound:
+        return before
+    own = centrifugal_terms(prepared, judges.training, best.family)
+    if not own:
+        return before
+    options = dataclasses.replace(options, given_degrees=options.given_degrees[1:])
+    try:
+        found = _searched(problem, prepared, judges, None, own, options, say)
+    except (OutOfTime, FitError):
+        return before
+    return found if found[0].error.relative < best.error.relative else before
 
 
 def _walked(

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.arrays import as_row, matmul, namespace
-from gfnn_jax.families.expressions import jets
+from gfnn_jax.families.jets import jets
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.phase_space import sizes
 

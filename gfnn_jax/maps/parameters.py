@@ -41,10 +41,16 @@ class Parameters:
     high: Any
     period: Any = None
 
+    @property
+    def bounds(self) -> tuple[Any, Any]:
+        """(k,) each: low and high, and what a printed number may miss them by."""
+        edge = _EDGE * (self.high - self.low)
+        return self.low - edge, self.high + edge
+
     def contains(self, args):
         """Whether the values args (..., k) lie where data were: (...). NumPy or JAX."""
-        xp, edge = namespace(args), _EDGE * (self.high - self.low)
-        low, high = (as_row(a, args) for a in (self.low - edge, self.high + edge))
+        xp = namespace(args)
+        low, high = (as_row(a, args) for a in self.bounds)
         if self.period is not None:
             turns = xp.floor((args[..., -1:] - low[..., -1:]) / self.period)
             args = xp.concatenate([args[..., :-1], args[..., -1:] - turns * self.period], axis=-1)

@@ -1,0 +1,107 @@
+"""Python functions of a state as expressions: JAX traces them once, their jaxpr runs on trees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from gfnn_jax.errors import InputError
+from gfnn_jax.families.expressions import Expression, as_expression, call, coordinate, power
+from gfnn_jax.families.functions import FUNCTIONS
+
+
+def traced(function: Callable, dim: int) -> list[Expression]:
+    """The trees of ``function(z)``, z (2d,), a scalar or a vector made by JAX or by plain
+    arithmetic.
+
+    Raises InputError where the function branches on its values or uses what has no tree here.
+    """
+    import jax
+
+    z = jax.ShapeDtypeStruct((2 * dim,), np.float64)
+    closed = jax.make_jaxpr(function)(z)
+    symbols = np.array([coordinate(i) for i in range(2 * dim)], dtype=object)
+    results = _run(closed.jaxpr, closed.consts, [symbols])
+    return [tree for out in results for tree in np.ravel(_trees(out)).tolist()]
+
+
+_ELEMENTWISE: dict[str, Callable] = {
+    "add": lambda a, b: a + b, "add_any": lambda a, b: a + b, "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b, "div": lambda a, b: a / b, "neg": lambda a: -a,
+    "square": lambda a: power(a, 2), "rsqrt": lambda a: 1.0 / call("sqrt", a),
+    "sqrt": lambda a: power(a, 0.5), "atan": lambda a: call("arctan", a),
+    "copy": lambda a: a, "copy_p": lambda a: a, "stop_gradient": lambda a: a,
+    **{name: (lambda a, name=name: call(name, a)) for name in FUNCTIONS if name != "sqrt"},
+}  # fmt: skip
+_REARRANGE = {
+    "slice", "squeeze", "reshape", "broadcast_in_dim", "transpose", "rev", "gather",
+    "dynamic_slice", "expand_dims",
+}  # fmt: skip
+
+
+def _trees(values):
+    """An object array of expressions of an array of numbers or expressions."""
+    values = np.asarray(values, dtype=object)
+    return _elementwise(as_expression, values) if values.size else values
+
+
+def _run(jaxpr, constants, arguments) -> list:
+    """The results of a jaxpr on object arrays of expressions; integers stay numbers."""
+    known: dict = dict(zip(jaxpr.constvars, map(np.asarray, constants), strict=True))
+    known.update(zip(jaxpr.invars, arguments, strict=True))
+
+    def read(atom):
+        return np.asarray(atom.val) if hasattr(atom, "val") else known[atom]
+
+    for equation in jaxpr.eqns:
+        values = [read(atom) for atom in equation.invars]
+        results = _applied(equation.primitive, equation.params, values)
+        known.update(zip(equation.outvars, map(np.asarray, results), strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def _applied(primitive, params, values) -> list:
+    import jax
+
+    name = primitive.name
+    inner = params.get("jaxpr", params.get("call_jaxpr"))
+    if inner is not None and hasattr(inner, "jaxpr"):
+        return _run(inner.jaxpr, inner.consts, values)
+    if all(v.dtype != object for v in values):  # numbers only
+        with jax.enable_x64(True):
+            out = primitive.bind(*values, **params)
+        return [np.asarray(o) for o in (out if primitive.multiple_results else [out])]
+    if name == "convert_element_type":
+        return values
+    if name in _REARRANGE:
+        place = np.arange(values[0].size).reshape(values[0].shape)
+        moved = np.asarray(primitive.bind(place, *values[1:], **params))
+        return [values[0].ravel()[moved]]
+    if name == "concatenate":
+        return [np.concatenate([_trees(v) for v in values], axis=params["dimension"])]
+    values = [_trees(v) for v in values]
+    if name == "stack":
+        return [np.stack(values, axis=params["axis"])]
+    if name in _ELEMENTWISE:
+        return [_elementwise(_ELEMENTWISE[name], *values)]
+    if name == "integer_pow":
+        return [_elementwise(lambda a: power(a, params["y"]), *values)]
+    if name == "pow":
+        exponents = {e.value for e in values[1].ravel().tolist()}
+        if len(exponents) == 1 and None not in exponents:
+            return [_elementwise(lambda a: power(a, exponents.copy().pop()), values[0])]
+    if name == "reduce_sum":
+        return [np.sum(values[0], axis=tuple(params["axes"]))]
+    if name == "dot_general":
+        contract, batch = params["dimension_numbers"]
+        if not any(batch):
+            return [np.tensordot(*values, axes=contract)]
+    raise InputError(
+        f"a term uses '{name}', which has no formula here: expected sums, products, quotients, "
+        f"constant powers and {', '.join(FUNCTIONS)}"
+    )
+
+
+def _elementwise(function, *values):
+    return np.asarray(np.frompyfunc(function, len(values), 1)(*values), dtype=object)

@@ -1,0 +1,75 @@
+"""Centrifugal terms of motion on a sphere, p_j²/sin² q_i, where the pairs ask for them.
+
+They are in no library of products: 1/sin² has its poles where the angle q_i is a multiple of π (of
+latitudes, 1/cos² at the odd ones of π/2), close to which states are found. Least squares of the
+pairs' forces and velocities at their midpoints, exact to second order in dt, tell within
+milliseconds whether these terms explain what a library leaves over.
+"""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+
+from gfnn_jax.errors import FitError
+from gfnn_jax.families.sums import Sums
+from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
+from gfnn_jax.fitting.gauss_newton import fitted_gradients
+from gfnn_jax.generating.charts import MIDPOINT
+from gfnn_jax.learn.prepare import Prepared
+
+_MOST_DIM = 3  # beyond it they are too many
+_ROWS_PER_TERM = 4  # numbers for each coefficient, and half as many again to judge by
+_GAINED = 0.2  # of what the library leaves over, that may be left with them
+
+
+def centrifugal_terms(
+    prepared: Prepared, rows: np.ndarray, family: Terms | Sums
+) -> tuple[str, ...]:
+    """Centrifugal terms, and the cosine and sine of their angles, which with the quadratic terms
+    leave a fifth or less of what ``family`` leaves over; none where they do not.
+
+    rows: of pairs in plain coordinates, without args or a structure. At states beyond a pole, and
+    where one lies between states, a term is not tried."""
+    dim = prepared.dim
+    if dim > _MOST_DIM:
+        return ()
+    texts = [
+        f"p{j + 1}**2/{f}(q{i + 1})**2"
+        for f, pole in (("sin", 0.0), ("cos", np.pi / 2))
+        for i, j in permutations(range(dim), 2)
+        if i not in prepared.coordinates.cyclic and _between_poles(prepared.y0[rows, i], pole)
+    ]
+    if not texts:
+        return ()
+    angles = [i for i in range(dim) if any(f"(q{i + 1})" in text for text in texts)]
+    texts += [f"{f}(q{i + 1})" for i in angles for f in ("cos", "sin")]
+    with_them = joined(given_terms(dim, texts), polynomial_terms(dim, 2))
+    left = _left_over(with_them, prepared, rows)
+    return tuple(texts) if left <= _GAINED * _left_over(family, prepared, rows) else ()
+
+
+def _between_poles(q: np.ndarray, pole: float) -> bool:
+    """Whether the values lie between two neighbouring poles, at ``pole`` and every π from it."""
+    return bool(np.ptp(np.floor((q - pole) / np.pi)) == 0)
+
+
+def _left_over(family: Terms | Sums, prepared: Prepared, rows: np.ndarray) -> float:
+    """RMS of the held-out target gradients, in units of the coordinates' sizes, that least squares
+    leave over; infinite where they fail."""
+    count = -(-_ROWS_PER_TERM * family.num_parameters // (2 * prepared.dim))
+    rows, scale = rows[: count + count // 2], prepared.scale
+    if len(rows) <= count:
+        return np.inf
+    y0, y1 = prepared.y0[rows], prepared.y1[rows]
+    w = MIDPOINT.evaluation_point(y0, y1)
+    dt = np.reshape(prepared.given(rows)[0], (-1, 1))
+    target = MIDPOINT.target_gradient(y0, y1, dt)
+    try:
+        c = fitted_gradients(family, w[:count], target[:count], scale)
+    except (FitError, np.linalg.LinAlgError):  # terms that overflow at these states
+        return np.inf
+    off = (family.gradient(c, w[count:]) - target[count:]) / np.roll(scale, prepared.dim)
+    rms = float(np.sqrt(np.mean(off**2)))
+    return rms if np.isfinite(rms) else np.inf

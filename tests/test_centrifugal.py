@@ -1,0 +1,60 @@
+"""Motion on a sphere, whose H has p²/sin² of an angle, which no library of products has."""
+
+import numpy as np
+import pytest
+from analytic import henon_heiles_pairs
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.families.modes import Modes
+from gfnn_jax.families.terms import polynomial_terms
+from gfnn_jax.learn.centrifugal import centrifugal_terms
+from gfnn_jax.learn.prepare import prepare
+
+
+def spherical_pendulum_pairs(count, latitude=False):
+    """At dt = 0.1, from another solver; the angle from the lower pole, or the latitude."""
+    rng = np.random.default_rng(0)
+    q1, q2 = rng.uniform(0.4, 2.7, count), rng.uniform(-np.pi, np.pi, count)
+    p1, p2 = rng.uniform(-1, 1, (2, count))
+    z0 = np.stack([q1, q2, p1, p2 * np.sin(q1)])
+
+    def slope(t, y):
+        q1, _, p1, p2 = y.reshape(4, count)
+        sin, cos = np.sin(q1), np.cos(q1)
+        return np.concatenate([p1, p2 / sin**2, p2**2 * cos / sin**3 - sin, 0 * p2])
+
+    found = solve_ivp(slope, (0, 0.1), z0.ravel(), "DOP853", rtol=1e-13, atol=1e-13)
+    states = np.stack([z0.T, found.y[:, -1].reshape(4, count).T])
+    if latitude:
+        states[..., 0] -= np.pi / 2
+    return gfnn.Pairs(*states, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("latitude", "expected"),
+    [
+        (False, "0.5 p2**2/sin(q1)**2 - cos(q1) + 0.5 p1²"),
+        (True, "0.5 p2**2/cos(q1)**2 + sin(q1) + 0.5 p1²"),
+    ],
+)
+def test_a_spherical_pendulum_told_nothing(latitude, expected):
+    pairs = spherical_pendulum_pairs(400, latitude)
+    fit = gfnn.fit(pairs, learn="hamiltonian", tolerance=1e-8)
+    assert fit.formula == expected
+    assert fit.met
+
+
+def test_centrifugal_terms_only_where_pairs_ask_for_them():
+    def asked(pairs, family):
+        return centrifugal_terms(prepare(pairs, CARTESIAN), np.arange(len(pairs)), family)
+
+    sphere, cubic = spherical_pendulum_pairs(400), polynomial_terms(2, 3)
+    found = ("p2**2/sin(q1)**2", "cos(q1)", "sin(q1)")
+    assert asked(sphere, cubic) == found
+    modes = Modes(2, (0, 1), ("p1", "p2"))
+    assert asked(sphere, modes.terms(modes.box())) == found
+    shift = np.eye(4)[0]  # the pole at π then lies between the states
+    assert asked(gfnn.Pairs(sphere.z0 + shift, sphere.z1 + shift, 0.1), cubic) == ()
+    assert asked(henon_heiles_pairs(200), cubic) == ()
