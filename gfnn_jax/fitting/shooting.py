@@ -56,8 +56,8 @@ _NORMAL = 1.4826  # a normal deviation over the median of its size
 
 
 class Arcs(NamedTuple):
-    """states: (B, L + 1, 2d), measured; those beyond an arc's end are repeated. measured: which of
-    them are, (B, L + 1)."""
+    """states: (B, L + 1, 2d), measured; of those that are not, within an arc or beyond its end, the
+    one before stands again. measured: which of them are, (B, L + 1)."""
 
     states: np.ndarray
     measured: np.ndarray
@@ -78,22 +78,33 @@ class Shot(NamedTuple):
     cost: float
 
 
-def arcs_of(z0, z1, longest: int) -> Arcs | None:
-    """Arcs of at most ``longest`` steps of pairs z0 -> z1 (N, 2d) in their order, the image of one
-    the state of the next within an arc. None where there is no pair."""
+def arcs_of(z0, z1, longest: int, steps=None) -> Arcs | None:
+    """Arcs of at most ``longest`` steps of pairs z0 -> z1 (N, 2d) in their order. None where there
+    is no pair.
+
+    steps: (N − 1,) from the state of a pair to that of the next, 0 where that is of another arc.
+    None: 1 where the image of the one is the state of the other.
+    """
     if not len(z0):
         return None
-    starts = np.flatnonzero(np.concatenate([[True], ~np.all(z1[:-1] == z0[1:], axis=1)]))
-    ends = np.append(starts[1:], len(z0))
-    cut = [
-        (first, min(first + longest, end))
-        for start, end in zip(starts, ends, strict=True) for first in range(start, end, longest)
-    ]  # fmt: skip
-    first, end = np.array(cut).T
-    place = first[:, None] + np.arange(-1, int((end - first).max()))
-    measured = place < end[:, None]
-    states = z1[np.minimum(place, end[:, None] - 1)]
-    states[:, 0] = z0[first]
+    if steps is None:
+        steps = np.all(z1[:-1] == z0[1:], axis=1).astype(int)
+    time = np.concatenate([[0], np.cumsum(steps)])
+    starts = np.concatenate([[True], np.asarray(steps) == 0])
+    time -= time[starts][np.cumsum(starts) - 1]  # from the start of the sequence
+    begins = starts.copy()
+    begins[1:] |= time[1:] // longest != time[:-1] // longest
+    arc = np.cumsum(begins) - 1
+    time -= time[begins][arc]
+    shape = arc[-1] + 1, int(time.max()) + 2
+    measured, last = np.zeros(shape, bool), np.zeros(shape, int)
+    for later in (0, 1):
+        measured[arc, time + later] = True
+    last[arc, time + 1] = np.arange(len(z0)) + 1  # the pair, from 1, whose image it is
+    last = np.maximum.accumulate(last, axis=1)
+    first = np.flatnonzero(begins)
+    states = np.where(last[..., None] > 0, z1[last - 1], z0[first][:, None])
+    states[arc, time] = z0
     return Arcs(states, measured)
 
 

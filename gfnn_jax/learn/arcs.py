@@ -121,6 +121,6 @@ def _strided(
     if min(map(len, rows)) < options.fewest:
         return None
     return Arcs(
-        dataclasses.replace(prepared, y0=y0, y1=y1, dt=length * prepared.dt),
+        dataclasses.replace(prepared, y0=y0, y1=y1, dt=length * prepared.dt, place=None),
         Judges(strided, rows[0], rows[1], judges.tolerance), length,
     )  # fmt: skip

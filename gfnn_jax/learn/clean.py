@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -9,8 +10,9 @@ import numpy as np
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.learn.check import check_number
 from gfnn_jax.learn.diagnose import outliers
-from gfnn_jax.learn.held_out import first_occurrences
+from gfnn_jax.learn.held_out import first_occurrences, places, steps_between
 from gfnn_jax.learn.prepare import Prepared, prepare
+from gfnn_jax.learn.screening import gross_errors
 from gfnn_jax.learn.structures import Structure
 from gfnn_jax.learn.varied import given_by
 from gfnn_jax.phase_space import Pairs
@@ -27,7 +29,8 @@ class Taken(NamedTuple):
 
 
 def clean(pairs: Pairs, coordinates: Coordinates, structure: Structure | None = None) -> Taken:
-    """The pairs without copies and, where they are few, without outliers.
+    """The pairs without copies, without gross errors that are certain, and, where they are few,
+    without outliers.
 
     Raises FitError where too few are left, or states have no inner coordinates.
     """
@@ -41,15 +44,40 @@ def clean(pairs: Pairs, coordinates: Coordinates, structure: Structure | None = 
     prepared = prepare(pairs, coordinates, structure)
     if structure is not None:  # too few pairs for so many dimensions to have neighbours
         return Taken(pairs, prepared, messages)
+    count = len(pairs)
     found = outliers(prepared.y0, prepared.y1, prepared.scale, given_by(prepared))
+    few = len(found) <= _MOST_OUTLIERS * count
+    wrong = np.zeros(count, bool)
+    wrong[found[: len(found) if few else 0]] = True
+    gross = gross_errors(prepared, steps_between(pairs, None) > 0, wrong)
+    wrong[gross] = True
+    kept = np.flatnonzero(~wrong)
+    place = places(pairs) if len(kept) < count else None
+    if len(gross):
+        # Sizes, and the interval of an angle, are those of what is left.
+        prepared = prepare(pairs.take(kept), coordinates)
+        if not few:
+            found = kept[outliers(prepared.y0, prepared.y1, prepared.scale, given_by(prepared))]
+            few = len(found) <= _MOST_OUTLIERS * count
+            kept = np.setdiff1d(kept, found) if few else kept
+            prepared = prepare(pairs.take(kept), coordinates)
+    elif len(kept) < count:
+        prepared = prepared.take(kept)
     if len(found):
-        few = len(found) <= _MOST_OUTLIERS * len(pairs)
-        rows = ", ".join(map(str, first[found[:5]])) + (", …" if len(found) > 5 else "")
         messages.append(
-            f"{len(found)} of {len(pairs)} pairs contradict the pairs around them (rows {rows}): "
+            f"{len(found)} of {count} pairs contradict the pairs around them "
+            f"(rows {_named(first[found])}): "
             + ("outliers, they are left out" if few else "too many to be left out")
         )
-        if few:
-            kept = np.setdiff1d(np.arange(len(pairs)), found)
-            pairs, prepared = pairs.take(kept), prepared.take(kept)
-    return Taken(pairs, prepared, messages)
+    if len(gross):
+        messages.append(
+            f"{len(gross)} of {count} pairs (rows {_named(first[gross])}) are gross errors beside "
+            "a polynomial through the others: they are left out"
+        )
+    if place is not None:
+        prepared = dataclasses.replace(prepared, place=place[kept])
+    return Taken(pairs.take(kept) if len(kept) < count else pairs, prepared, messages)
+
+
+def _named(rows: np.ndarray) -> str:
+    return ", ".join(map(str, rows[:5])) + (", …" if len(rows) > 5 else "")

@@ -261,7 +261,7 @@ def fit(
     warn(about_pairs)
     seen = diagnose_request(request, plain)
     warn(seen.messages)
-    judges = Judges(pairs, *split_rows(pairs, seed), request.tolerance)
+    judges = Judges(pairs, *split_rows(pairs, seed, plain.place), request.tolerance)
     found = searched(request, plain, seen, judges, on_better)
     seen, found, about_pairs = without_gross_errors(request, seen, found)
     warn(about_pairs)

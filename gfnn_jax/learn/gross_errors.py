@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.diagnosed import Diagnosis, diagnose_request
-from gfnn_jax.learn.held_out import split_rows
+from gfnn_jax.learn.held_out import places, split_rows
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched, searched
@@ -64,10 +64,13 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
         others = np.setdiff1d(np.arange(len(size)), rows)
         if not _rms(size) > _SPOILT * _rms(size[others]):
             break
-        pairs, plain = found.judges.pairs.take(others), found.plain.take(others)
+        pairs, plain = found.judges.pairs, found.plain
+        if plain.place is None:
+            plain = dataclasses.replace(plain, place=places(pairs))
+        pairs, plain = pairs.take(others), plain.take(others)
         request.say(f"without {gone + len(rows)} of {count} pairs that are gross errors")
         diagnosis = diagnose_request(request, plain)
-        judges = Judges(pairs, *split_rows(pairs, request.seed), request.tolerance)
+        judges = Judges(pairs, *split_rows(pairs, request.seed, plain.place), request.tolerance)
         again = searched(request, plain, diagnosis, judges, None)
         left = _residuals(again)
         if left is not None and not _rms(left) <= _RISE * _rms(size[others]):

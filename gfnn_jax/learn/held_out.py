@@ -6,6 +6,7 @@ import numpy as np
 
 _FRACTION, _FEWEST, _MOST = 0.1, 4, 2_000
 _OUTSIDE = 0.05  # of the training pairs, by which errors outside the data are measured
+_BRIDGED = 10  # pairs of a sequence, left out in a row, beyond which it goes on
 _TOGETHER = 50  # pairs of a sequence that are looked at or left out as one
 
 
@@ -18,18 +19,34 @@ def first_occurrences(pairs) -> np.ndarray:
     return np.sort(np.unique(rows, axis=0, return_index=True)[1])
 
 
-def split_rows(pairs, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def places(pairs) -> np.ndarray:
+    """(N,) consecutive numbers along a sequence, with more than N between sequences: what is left
+    of them when pairs are left out tells the steps between the others."""
+    begins = np.any(np.asarray(pairs.z1)[:-1] != np.asarray(pairs.z0)[1:], axis=1)
+    return np.arange(len(pairs)) + len(pairs) * np.concatenate([[0], np.cumsum(begins)])
+
+
+def steps_between(pairs, place: np.ndarray | None) -> np.ndarray:
+    """(N − 1,) steps from the state of each pair to that of the next: 1 where its image is the
+    next one's state, more where pairs between them were left out, 0 where the next one is of
+    another sequence, or far along it. place: as of `Prepared`."""
+    if place is None:
+        return np.all(np.asarray(pairs.z1)[:-1] == np.asarray(pairs.z0)[1:], axis=1).astype(int)
+    steps = np.diff(place)
+    return np.where((steps > 0) & (steps <= 1 + _BRIDGED), steps, 0)
+
+
+def split_rows(pairs, seed: int, place: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Rows for training and rows held out, shuffled by the seed.
 
     Where the image of one pair is the state of the next, both are of one sequence. They share the
     noise of that state and lie on one orbit, so that a random half would judge the other too
     kindly: whole sequences are held out then. A sequence longer than all that is to be held out is
-    cut into blocks in time first.
+    cut into blocks in time first. place: as of `Prepared`.
     """
     rng, count = np.random.default_rng(seed), len(pairs)
-    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
     target = max(_FEWEST, int(_FRACTION * count))
-    goes_on = np.all(z1[:-1] == z0[1:], axis=1)  # from each row to the next
+    goes_on = steps_between(pairs, place) > 0  # from each row to the next
     if not goes_on.any():
         order, target = rng.permutation(count), min(target, _MOST)
         return order[target:], order[:target]

@@ -11,6 +11,7 @@ from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem, significant
 from gfnn_jax.fitting.shooting import OPTIONS, Shooting, Shot, arcs_of, longest_arc
 from gfnn_jax.learn.candidates import Judges
+from gfnn_jax.learn.held_out import steps_between
 from gfnn_jax.learn.prepare import Prepared
 
 _SHORTEST = 3  # steps of an arc that says more than its pairs do
@@ -55,11 +56,14 @@ def fitted_to_sequences(
         return None
     resolved = _STEP_ERROR * rms
     steps = problem.fine_steps(family, c, judges.training, (resolved,))[0]
+    between = steps_between(judges.pairs, prepared.place)
     longest = longest_arc(family, c, prepared.y0[some], prepared.dt, steps, rms)
 
     def along(rows) -> Shooting | None:
         rows, pairs = np.sort(rows), judges.pairs
-        arcs = arcs_of(np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows], longest)
+        # What was left out is bridged, what is held out is not.
+        onward = np.where(np.diff(rows) == 1, between[rows[:-1]], 0)
+        arcs = arcs_of(np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows], longest, onward)
         if arcs is None or np.median(arcs.measured.sum(axis=1)) <= _SHORTEST:
             return None
         return Shooting(

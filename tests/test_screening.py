@@ -1,0 +1,176 @@
+"""Gross errors that are many are found before a fit, and honest pairs never are."""
+
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.families.terms import given_terms
+from gfnn_jax.fitting.shooting import arcs_of
+from gfnn_jax.flows.collocation import Steps, images
+from gfnn_jax.learn.clean import clean
+from gfnn_jax.learn.held_out import places, split_rows, steps_between
+from gfnn_jax.learn.prepare import prepare
+from gfnn_jax.learn.screening import gross_errors
+
+NOISE, DT = 1e-3, 0.5
+HENON_HEILES = given_terms(2, ("q1**2 + q2**2 + p1**2 + p2**2", "q1**2*q2 - q2**3/3"))
+TRUE = np.array([0.5, 1.0])
+SWING = given_terms(1, ("p1**2", "cos(q1)"))
+
+
+def recorded(family, coefficients, start, length, dt, noise=NOISE, seed=0):
+    """(B, length, 2d) sequences from these states, with noise."""
+    states = [start]
+    for _ in range(length - 1):
+        states.append(images(family, coefficients, states[-1], dt, Steps(4, 4)).states)
+    states = np.stack(states, axis=1)
+    return states + noise * np.random.default_rng(seed).normal(size=states.shape)
+
+
+def henon_heiles(length):
+    start = np.random.default_rng(0).uniform(-0.25, 0.25, (2_000 // length, 4))
+    return recorded(HENON_HEILES, TRUE, start, length, DT)
+
+
+def swings(length):
+    start = np.random.default_rng(0).uniform(-1, 1, (2_000 // length, 2))
+    return recorded(SWING, np.array([0.5, -1.0]), start, length, 0.2)
+
+
+def spoilt(states, part, size, seed=1):
+    """The states, of which a part is drawn anew from the box of all, or moved by 20 to 200 times
+    the noise, and (B, L) which."""
+    rng, width = np.random.default_rng(seed), states.shape[-1]
+    if states.shape[1] == 2:  # one state of a pair
+        wrong = np.zeros(states.shape[:2], bool)
+        rows = rng.choice(len(states), round(part * len(states)), replace=False)
+        wrong[rows, rng.integers(0, 2, len(rows))] = True
+    else:
+        wrong = rng.permutation(states[..., 0].size) < part * states[..., 0].size
+        wrong = wrong.reshape(states.shape[:2])
+    every = states.reshape(-1, width)
+    other = rng.uniform(every.min(axis=0), every.max(axis=0), states.shape)
+    if size == "noise":
+        way = rng.normal(size=states.shape)
+        way /= np.linalg.norm(way, axis=-1, keepdims=True)
+        other = states + way * np.sqrt(width) * NOISE * np.exp(
+            rng.uniform(np.log(20), np.log(200), (*states.shape[:2], 1))
+        )
+    return np.where(wrong[..., None], other, states), wrong
+
+
+def pairs_of(states, dt=DT):
+    width = states.shape[-1]
+    return gfnn.Pairs(states[:, :-1].reshape(-1, width), states[:, 1:].reshape(-1, width), dt)
+
+
+def named(pairs, angles=()):
+    """Rows that are named, with nothing left out before."""
+    prepared = prepare(pairs, Coordinates("cartesian", angles=angles))
+    return gross_errors(
+        prepared, steps_between(pairs, None) > 0, np.zeros(len(prepared.y0), bool)
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("size", ["box", "noise"])
+@pytest.mark.parametrize(("length", "part"), [(50, 0.1), (2, 0.1)])
+@pytest.mark.parametrize(("make", "angles"), [(henon_heiles, ()), (swings, (0,))])
+def test_gross_errors_are_named_and_no_others(make, angles, length, part, size):
+    """Of 20 to 200 times the noise, or as large as the data; two in a hundred may stay."""
+    states, wrong = spoilt(make(length), part, size)
+    rows = named(pairs_of(states), angles)
+    bad = np.flatnonzero((wrong[:, :-1] | wrong[:, 1:]).ravel())
+    assert np.isin(rows, bad).all()
+    assert len(rows) >= 0.98 * len(bad)
+
+
+def kepler_passages():
+    """20 orbits of eccentricity 0.5 to 0.95, by Kepler's equation: a step of 0.5 takes a close
+    passage at once."""
+    rng = np.random.default_rng(0)
+    e, turn = rng.uniform(0.5, 0.95, (20, 1)), rng.uniform(0, 2 * np.pi, (20, 1))
+    mean = rng.uniform(0, 2 * np.pi, (20, 1)) + 0.5 * np.arange(51)
+    low, high = mean - 1, mean + 1
+    for _ in range(60):
+        middle = (low + high) / 2
+        late = middle - e * np.sin(middle) > mean
+        low, high = np.where(late, low, middle), np.where(late, middle, high)
+    c, s, minor = np.cos(low), np.sin(low), np.sqrt(1 - e**2)
+    x, y = c - e, minor * s
+    vx, vy = -s / (1 - e * c), minor * c / (1 - e * c)
+    c, s = np.cos(turn), np.sin(turn)
+    return np.stack([c * x - s * y, s * x + c * y, c * vx - s * vy, s * vx + c * vy], axis=-1)
+
+
+def standard_map(k):
+    z = np.random.default_rng(0).uniform(0, 2 * np.pi, (2_000, 2))
+    p = z[:, 1] + k * np.sin(z[:, 0])
+    return gfnn.Pairs(z, np.stack([z[:, 0] + p, p], axis=1), 1.0)
+
+
+HONEST = {
+    "passages": lambda: pairs_of(kepler_passages()),
+    "few": lambda: pairs_of(kepler_passages()[:, :2]),
+    "map-2": lambda: standard_map(2.0),
+    "map-10": lambda: standard_map(10.0),
+    "noisy": lambda: pairs_of(henon_heiles(50)),
+    "columns": lambda: pairs_of(henon_heiles(50)[..., [0, 2, 1, 3]]),
+    "swings": lambda: pairs_of(swings(50)),
+}
+
+
+@pytest.mark.parametrize("make", HONEST.values(), ids=HONEST.keys())
+def test_honest_pairs_are_all_kept(make):
+    assert len(named(make())) == 0
+
+
+def test_a_jump_that_stays_is_no_gross_error_of_a_state():
+    """Ten sequences are kicked once: the states before do not lead to those after."""
+    states = henon_heiles(50)
+    states[:10, 25:] = henon_heiles(50)[10:20, :25]
+    assert len(named(pairs_of(states))) == 0
+
+
+def test_what_was_left_out_is_bridged():
+    states = henon_heiles(50)[:2, :8]
+    pairs = pairs_of(states)
+    kept = np.setdiff1d(np.arange(14), [2, 3])  # the state 3 of the first sequence
+    place = places(pairs)[kept]
+    few = pairs.take(kept)
+    steps = steps_between(few, place)
+    assert steps.tolist() == [1, 3, 1, 1, 0, *[1] * 6]
+    arcs = arcs_of(few.z0, few.z1, 100, steps)
+    assert arcs is not None
+    assert arcs.measured.sum(axis=1).tolist() == [7, 8]
+    assert not arcs.measured[0, 3]
+    for n, measured in enumerate(arcs.measured):
+        np.testing.assert_array_equal(arcs.states[n, measured], states[n, measured])
+
+
+def test_sequences_are_held_out_whole_where_pairs_were_left_out():
+    states, _ = spoilt(henon_heiles(50), 0.05, "box")
+    taken = clean(pairs_of(states), Coordinates("cartesian"))
+    assert len(taken.pairs) < 1_850
+    training, held_out = split_rows(taken.pairs, 0, taken.prepared.place)
+    assert taken.prepared.place is not None
+    sequence = taken.prepared.place // 1_961
+    assert not set(sequence[training]) & set(sequence[held_out])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [50, 2])
+def test_a_fit_is_not_spoilt(length):
+    """A twentieth of states, or of pairs, as large as the data: errors within a factor of two."""
+    clean_states = henon_heiles(length)
+    states, wrong = spoilt(clean_states, 0.05, "box")
+    test = np.random.default_rng(2).uniform(-0.2, 0.2, (200, 4))
+    true = images(HENON_HEILES, TRUE, test, DT, Steps(4, 4)).states
+    errors = []
+    for part in (clean_states, states):
+        with pytest.warns(gfnn.FitWarning):
+            fit = gfnn.fit(pairs_of(part), learn="hamiltonian", max_seconds=None)
+        found = np.asarray(fit.map.rollout(test, 1)[0])[:, 1]
+        errors.append(np.sqrt(np.mean((found - true) ** 2)))
+    assert errors[1] < 2 * errors[0] + 1e-5
+    assert fit.num_pairs == np.sum(~(wrong[:, :-1] | wrong[:, 1:]))
