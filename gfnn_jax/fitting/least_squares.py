@@ -128,7 +128,7 @@ def _reduced_on_devices(family: Any, rows, weight, on_block) -> Reduced:
 
     def of_part(part, device) -> Reduced:
         if not on_host:
-            pairs = max(1, least // part[0].shape[1])
+            pairs = _pairs_of(m, part[0].shape[1], least)
             return Reduced(accelerated.factor(family, part, weight, pairs, device), part[0].size)
         factor = np.zeros((m + 1, m + 1), order="F")
         for block in _blocks([part], m):
@@ -156,10 +156,14 @@ def _blocks(rows, num_parameters: int, least: int = 0) -> Iterator[tuple[np.ndar
     """(w, target_gradient), and args, of as many pairs as one block holds, or ``least`` rows."""
     for part in rows:
         part = tuple(np.asarray(a, np.float64) for a in part)
-        most = max(_FEWEST_ROWS, _BLOCK_BYTES // (8 * (num_parameters + 1)), least)
-        pairs = max(1, most // part[0].shape[1])
+        pairs = _pairs_of(num_parameters, part[0].shape[1], least)
         for first in range(0, len(part[0]), pairs):
             yield tuple(a[first : first + pairs] for a in part)
+
+
+def _pairs_of(num_parameters: int, width: int, least: int) -> int:
+    """How many pairs of states (2d,) of this width a block holds."""
+    return max(1, max(_FEWEST_ROWS, _BLOCK_BYTES // (8 * (num_parameters + 1)), least) // width)
 
 
 def residuals(train: Reduced, held: Reduced, sizes: Sequence[int]) -> list[tuple[float, float]]:

@@ -16,7 +16,7 @@ from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.search import BEST, failures_of_arithmetic, scene_named, search
 from gfnn_jax.jobs.written import Ran, already_done, publish, write
 from gfnn_jax.learn.check import FEWEST
-from gfnn_jax.learn.refit import can_be_refitted, help_refit, refit
+from gfnn_jax.learn.refit import can_be_refitted, help_refit, not_refitted, refit
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.processes import Group, Share
@@ -105,8 +105,7 @@ def fit(
                 trajectories.pairs(), scene, angles=angles, max_seconds=max_seconds,
                 progress=progress, kept_in=kept_in, job=job, devices=devices, **options,
             )  # fmt: skip
-            one_dt = np.ndim(trajectories.dt) == 0  # a refit has the rows of one step
-            if large and one_dt and can_be_refitted(fitted.map):
+            if large and can_be_refitted(fitted.map):
                 progress.say("all pairs, for the chosen candidate")
                 sampled = trajectories.pairs()
                 held = sampled.take(slice(min(_HELD, len(sampled) // _HELD_PART)))
@@ -114,6 +113,7 @@ def fit(
                     fitted = refit(fitted, pairs, held, scene=scene, group=group)
             else:
                 group.told({})
+                fitted = not_refitted(fitted) if large else fitted
             progress.say("the report: compiling the derivative of a step")
             result = report.assemble(
                 fitted, scene=scene_name, dt=float(np.asarray(fitted.map.dt)), seed=seed,
