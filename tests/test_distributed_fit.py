@@ -360,32 +360,50 @@ def data(tmp_path_factory):
     return folder
 
 
-def test_two_processes_fit_one_map(data):
-    found = ended(started(data / "two", data / "pairs.npz", *OPTIONS, count=2))
+@pytest.fixture(scope="module")
+def undisturbed(data):
+    """The fit of one process."""
+    return fit_job.fit(data / "pairs.npz", out=data / "one", learn="map", chart="midpoint",
+                       tolerance=3e-3, group=Group()).fit  # fmt: skip
+
+
+def moved_alike(one, other):
+    z = np.random.default_rng(1).uniform(-0.8, 0.8, (200, 2))
+    moved = [np.asarray(map_.step(z)[0]) for map_ in (one, other)]
+    np.testing.assert_allclose(moved[0], moved[1], rtol=0, atol=1e-12)
+
+
+def test_two_processes_fit_one_map(data, undisturbed):
+    """Each on its own number of devices."""
+    found = ended(started(data / "two", data / "pairs.npz", *OPTIONS, "--devices", 1, count=2))
     assert [status for status, *_ in found] == [0, 0], found
     assert "written to" in found[0][1]
     assert "process 1 of 2: " in found[1][1]
-    ran = fit_job.fit(data / "pairs.npz", out=data / "one", learn="map", chart="midpoint",
-                      tolerance=3e-3, group=Group())  # fmt: skip
-    one, two = ran.fit.map, saved.load(data / "two")
-    z = np.random.default_rng(1).uniform(-0.8, 0.8, (200, 2))
-    moved = [np.asarray(map_.step(z)[0]) for map_ in (one, two)]
-    np.testing.assert_allclose(moved[0], moved[1], rtol=0, atol=1e-12)
+    moved_alike(undisturbed.map, saved.load(data / "two"))
     assert saved.record(data / "two")["data"]["num_pairs"] == PAIRS
-    assert not any("is kept" in message for message in ran.fit.messages)
+    assert not any("is kept" in message for message in undisturbed.messages)
 
 
+# JAX tells others that the first process is gone at once, and of another after ten seconds.
 @pytest.mark.slow
-def test_a_killed_process_ends_the_others(data):
-    """The one that decides, while the other waits for its map."""
-    running = started(data / "killed", data / "pairs.npz", *OPTIONS, count=2)
+@pytest.mark.parametrize("killed", [0, 1])
+def test_a_killed_process_ends_the_others(killed, data, undisturbed):
+    """While the first one searches and the other waits for its map; what is begun anew is fitted
+    as if nothing had been."""
+    out = data / f"killed{killed}"
+    running = started(out, data / "pairs.npz", *OPTIONS, count=2)
     limit = time.monotonic() + 60
-    while not (data / "killed.partial").exists():
+    while not out.with_name(f"{out.name}.partial").exists():
         assert time.monotonic() < limit, [p.poll() for p in running]
         time.sleep(0.02)
-    running[0].send_signal(signal.SIGKILL)
-    status, _, told = ended(running)[1]
+    running[killed].send_signal(signal.SIGKILL)
+    status, _, told = ended(running)[1 - killed]
     assert status != 0
     lines = [line for line in told.splitlines() if not line.startswith("[")]  # but progress
     assert len(lines) == 1, told
     assert lines[0].startswith("gfnn: this process or another one of the job was lost")
+    assert not out.exists()
+    found = ended(started(out, data / "pairs.npz", *OPTIONS, "--resume", count=2))
+    assert [status for status, *_ in found] == [0, 0], found
+    moved_alike(undisturbed.map, saved.load(out))
+    assert saved.record(out)["data"]["num_pairs"] == PAIRS
