@@ -352,9 +352,9 @@ def tables() -> None:
             for task in SHARED
             for row in m["rows"]
         ]  # fmt: skip
-    between_markers(
-        TABLES, "scaling-fit-devices", f"{markdown(heads, rows)}\n\n{provenance(found)}"
-    )
+    if found:
+        text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
+        between_markers(TABLES, "scaling-fit-devices", text)
     heads = (
         "accelerator", "fit there, s", "fit on the processor, s", "step of a state there, µs",
         "on the processor, µs", "states apart by",
@@ -371,9 +371,9 @@ def tables() -> None:
             there, number(on["fit_seconds"]), number(here["fit_seconds"]),
             number(on["microseconds"]), number(here["microseconds"]), f"{m['states_apart']:.1e}",
         ])  # fmt: skip
-    between_markers(
-        TABLES, "scaling-accelerator", f"{markdown(heads, rows)}\n\n{provenance(found)}"
-    )
+    if found:
+        text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
+        between_markers(TABLES, "scaling-accelerator", text)
     heads = (
         "all rows", "pairs", "file, MB", "coefficients", "processes", "seconds", "sent, MB",
         "memory beside the start, MB", "maps apart by",
