@@ -1,8 +1,8 @@
 """Rows of a least-squares problem, evaluated and folded on an accelerator.
 
 There the rows are made where they are used, and ``jnp.linalg.qr`` is the vendor's own. On a CPU
-the same program is twice as slow as NumPy with LAPACK's ``tpqrt``, which keeps a block in the
-cache and knows that the factor is triangular.
+the same program takes a tenth more processor time than NumPy with LAPACK's ``tpqrt``, its QR a
+fifth more (494 terms, one thread), and it is compiled for each size of a family and each device.
 """
 
 from __future__ import annotations
