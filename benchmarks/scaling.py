@@ -1,8 +1,9 @@
-"""Rollouts shared out among devices, fits among processes: the same results, and how fast.
+"""Rollouts and fits shared out among devices and processes: the same results, and how fast.
 
     python benchmarks/scaling.py             all of it (about six minutes on two cores), tables
     python benchmarks/scaling.py --quick     few steps, into runs/scaling
     python benchmarks/scaling.py --only fit-map,fit-law,reading
+    python benchmarks/scaling.py --only accelerator     on a machine that has one
 
 Every number of devices has a process of its own, with so many virtual CPU devices; the digest of
 all states says whether the bits are the same. More devices than cores gain nothing: the table says
@@ -11,6 +12,11 @@ how many there are. Beside them the map itself, all lanes in one batch, and bloc
 Fits: the chosen map of a sample is fitted to all rows by 1, 2 and 4 processes of this machine, each
 of which reads its own rows of one file: seconds, bytes that the processes send, and how far their
 maps are apart. Reading: a file of half a gigabyte, and what memory a process needs for its part.
+
+Fits on devices: the factor of a least-squares problem, one Gauss–Newton problem of a law and some
+iterations of an ensemble, by a fit that was told no devices and by 1, 2, 4 and 8 of them, processor
+seconds beside. Accelerator: the first of these and rollouts, in float64, on the accelerator that
+JAX finds and on this machine's processor; where there is none it says so.
 """
 
 from __future__ import annotations
@@ -23,8 +29,10 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -38,6 +46,7 @@ from harness import (
     main,
     markdown,
     number,
+    once,
     provenance,
     results,
     timed,
@@ -46,6 +55,14 @@ from harness import (
 import gfnn_jax as gfnn
 from gfnn_jax import processes
 from gfnn_jax.data.files import iterate_pairs, read_sample
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.mlp import Mlp, amplitude_of
+from gfnn_jax.families.products import Products
+from gfnn_jax.families.terms import polynomial_terms
+from gfnn_jax.fitting import gauss_newton, least_squares, row_blocks
+from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt_together
+from gfnn_jax.flows.collocation import Steps
+from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.learn.refit import help_refit, refit
 from gfnn_jax.maps import sharded
 from gfnn_jax.scenes import henon_heiles
@@ -97,6 +114,100 @@ def measure(quick: bool, *, learns: str) -> Numbers:
     if not same:
         raise SystemExit("the bits depend on the number of devices")
     return {"lanes": LANES, "cores": cores(), "same_bits": same, "rows": rows}
+
+
+# Fits on devices.
+
+SHARED = {"rows": (40_000, 8), "gauss-newton": (40_000, 4), "ensemble": (1_000, 8)}
+
+
+def problem(task: str, quick: bool) -> Callable[[], Any]:
+    """A part of a fit, as a function without arguments: arrays that should not depend on who makes
+    them. Of so many pairs, and terms of this degree or networks."""
+    number, size = SHARED[task]
+    scene = henon_heiles(energy=1 / 12)
+    pairs = gfnn.sample_pairs(scene, number // (10 if quick else 1), jax.random.key(SEED))
+    z0, z1, dt = np.asarray(pairs.z0), np.asarray(pairs.z1), float(pairs.dt)
+    w, target = MIDPOINT.evaluation_point(z0, z1), MIDPOINT.target_gradient(z0, z1, dt)
+    if task == "rows":
+        family = Products(box_inputs(w), size)
+        return lambda: least_squares.reduce(family, [(w, target)], np.ones(4)).factor
+    if task == "gauss-newton":
+        terms = polynomial_terms(2, size)
+        own = gauss_newton.Problem(z0, z1, dt, np.ones(4))
+        c = gauss_newton.midpoint_start(terms, z0, z1, dt, np.ones(4))
+        return lambda: own.factor(terms, c, Steps(5, 1), np.arange(len(z0))).matrix
+    network = Mlp(box_inputs(w), (16, 16, 16), "gelu", amplitude_of(w, target))
+    starts = [network.init(key, np.float64) for key in jax.random.split(jax.random.key(1), size)]
+    held = len(w) // 5
+
+    def trained():
+        result = levenberg_marquardt_together(
+            network, starts, w[held:], target[held:], validation=(w[:held], target[:held]),
+            shares=np.ones((size, len(w) - held)), max_iterations=2 if quick else 5,
+        )  # fmt: skip
+        return np.concatenate([np.ravel(a) for a in jax.tree.leaves(result.params)])
+
+    return trained
+
+
+def on_devices_here(count: int, quick: bool) -> Numbers:
+    """Seconds on so many devices of this process, 0 for none told, and digests."""
+    gfnn.enable_compile_cache()
+    found: Numbers = {"devices": count}
+    for task in SHARED:
+        work = problem(task, quick)
+        with row_blocks.on_devices(jax.local_devices()[:count]):
+            work()
+            ran = min((once(work) for _ in range(3)), key=lambda ran: ran.seconds)
+        found[task] = {
+            "seconds": ran.seconds, "processor_seconds": ran.processor_seconds,
+            "digest": hashlib.sha256(np.ascontiguousarray(ran.out).tobytes()).hexdigest(),
+        }  # fmt: skip
+    return found
+
+
+def measure_fits_on_devices(quick: bool) -> Numbers:
+    """No devices told, then each number of them in a process of its own."""
+    rows = []
+    for count in (0, *DEVICES):
+        flags = f"--xla_force_host_platform_device_count={max(count, 1)}"
+        ran = subprocess.run(
+            [sys.executable, __file__, "--fits-here", str(count), str(int(quick))],
+            env={**os.environ, "XLA_FLAGS": flags}, stdout=subprocess.PIPE, text=True, check=True,
+        )  # fmt: skip
+        rows.append(json.loads(ran.stdout.splitlines()[-1]))
+        print(f"  {count}: " + ", ".join(f"{t} {rows[-1][t]['seconds']:.2f} s" for t in SHARED))
+    if any(len({row[task]["digest"] for row in rows[1:]}) > 1 for task in SHARED):
+        raise SystemExit("the bits depend on the number of devices")
+    return {"pairs": {t: n // (10 if quick else 1) for t, (n, _) in SHARED.items()},
+            "cores": cores(), "same_bits": True, "rows": rows}  # fmt: skip
+
+
+def measure_accelerator(quick: bool) -> Numbers:
+    """Rows of a fit and a rollout, float64, on the accelerator and on the processor."""
+    devices = {"accelerator": jax.local_devices()[0], "processor": jax.devices("cpu")[0]}
+    if devices["accelerator"].platform == "cpu":
+        print("  no accelerator")
+        return {"accelerator": None}
+    work, (map_, z0) = problem("rows", quick), learned("map")
+    z0 = np.resize(z0, (sharded._ON_ACCELERATORS, 4))
+    found: Numbers = {"accelerator": devices["accelerator"].device_kind, "lanes": len(z0)}
+    factors, states = {}, {}
+    for name, device in devices.items():
+        with row_blocks.on_devices([device]):
+            factored = timed(work, repeats=3)
+        roll = sharded.Sharded(map_, (device,)).rollout
+        rolled = timed(lambda roll=roll: roll(z0, STEPS, save_every=STEPS)[0], repeats=3)
+        factors[name], states[name] = factored.out, rolled.out
+        found[f"on_{name}"] = {
+            "fit_seconds": factored.seconds,
+            "microseconds": 1e6 * rolled.seconds / (STEPS * len(z0)),
+        }
+    squares = [np.triu(factor).T @ np.triu(factor) for factor in factors.values()]
+    found["normal_matrices_apart"] = float(np.abs(np.subtract(*squares)).max() / squares[1].max())
+    found["states_apart"] = float(np.abs(np.subtract(*states.values())).max())
+    return found
 
 
 # Fits of several processes.
@@ -204,7 +315,9 @@ GROUPS = {
     "fit-law": partial(measure_group, task="hamiltonian"),
     "reading": partial(measure_group, task="reading"),
 }
-PIECES = ROLLOUTS | GROUPS
+ON_DEVICES = {"fit-devices": measure_fits_on_devices}
+ACCELERATOR = {"accelerator": measure_accelerator}
+PIECES = ROLLOUTS | ON_DEVICES | ACCELERATOR | GROUPS
 
 
 def tables() -> None:
@@ -225,6 +338,42 @@ def tables() -> None:
         ])  # fmt: skip
     text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
     between_markers(TABLES, "scaling", text)
+    heads = ("a part of a fit", "pairs", "cores", "devices", "seconds", "processor seconds",
+             "same bits")  # fmt: skip
+    rows, found = [], results(ON_DEVICES, "scaling")
+    for result in found.values():
+        m = result["measured"]
+        rows += [
+            [
+                task, f"{m['pairs'][task]:,}", str(m["cores"]), str(row["devices"] or "none told"),
+                number(row[task]["seconds"]), number(row[task]["processor_seconds"]),
+                "yes" if m["same_bits"] and row["devices"] else "–",
+            ]
+            for task in SHARED
+            for row in m["rows"]
+        ]  # fmt: skip
+    if found:
+        text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
+        between_markers(TABLES, "scaling-fit-devices", text)
+    heads = (
+        "accelerator", "fit there, s", "fit on the processor, s", "step of a state there, µs",
+        "on the processor, µs", "states apart by",
+    )  # fmt: skip
+    rows, found = [], results(ACCELERATOR, "scaling")
+    for result in found.values():
+        m = result["measured"]
+        there, here = m["accelerator"], m.get("on_processor")
+        if there is None:
+            rows.append(["no accelerator", *["–"] * 5])
+            continue
+        on = m["on_accelerator"]
+        rows.append([
+            there, number(on["fit_seconds"]), number(here["fit_seconds"]),
+            number(on["microseconds"]), number(here["microseconds"]), f"{m['states_apart']:.1e}",
+        ])  # fmt: skip
+    if found:
+        text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
+        between_markers(TABLES, "scaling-accelerator", text)
     heads = (
         "all rows", "pairs", "file, MB", "coefficients", "processes", "seconds", "sent, MB",
         "memory beside the start, MB", "maps apart by",
@@ -250,7 +399,9 @@ if __name__ == "__main__":
         jax.config.update("jax_enable_x64", True)
         print(json.dumps(in_group(*sys.argv[2:])))
         raise SystemExit
-    if sys.argv[1:2] == ["--here"]:
+    if sys.argv[1:2] == ["--fits-here"]:
+        print(json.dumps(on_devices_here(int(sys.argv[2]), sys.argv[3] == "1")))
+    elif sys.argv[1:2] == ["--here"]:
         print(json.dumps(in_this_process(sys.argv[2], int(sys.argv[3]))))
     else:
         main(__doc__ or "", PIECES, "scaling", tables, None)

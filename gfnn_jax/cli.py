@@ -158,6 +158,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_fit_options(command, "1e-6")
     command.add_argument(
+        "--devices", type=_devices, metavar="all|N",
+        help="share the rows, and the networks of an ensemble, out among so many devices; on a CPU "
+        "these are its cores",
+    )  # fmt: skip
+    command.add_argument(
         "--distributed", action="store_true",
         help="this is one of several processes that srun or another launcher has started: each "
         "reads its own rows of DATA, or its own files",
@@ -413,7 +418,7 @@ def _fit(arguments: argparse.Namespace) -> None:
         group = None
         if arguments.distributed:
             stack.enter_context(processes.watched(f"gfnn: {processes.LOST}"))
-        _set_up_jax()
+        _set_up_jax(arguments.devices)
         if arguments.distributed:
             group = processes.Group(processes.join())
         _fit_and_tell(arguments, group)
@@ -431,7 +436,7 @@ def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) 
             base=arguments.base, structure=arguments.structure,
             family=arguments.family, ensemble=arguments.ensemble, scene_name=arguments.scene,
             angles=arguments.angles, seed=arguments.seed, overwrite=arguments.overwrite,
-            resume=arguments.resume, group=group, progress=shown,
+            resume=arguments.resume, devices=arguments.devices, group=group, progress=shown,
         )  # fmt: skip
     if group is not None:
         processes.wait_for_all()

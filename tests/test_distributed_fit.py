@@ -221,21 +221,104 @@ def test_files_that_differ_or_cannot_be_shared(tmp_path):
         next(iterate_pairs(tmp_path / "a.csv", 10, share=Share(0, 2)))
 
 
+def in_files(folder, pairs, parts):
+    """The files that these pairs are shared out among."""
+    names = [folder / f"{i}.npz" for i in range(parts)]
+    for name, rows in zip(names, np.array_split(np.arange(len(pairs)), parts), strict=True):
+        own = pairs.take(rows)
+        given = {} if own.args is None else {"params": np.stack([*own.args.values()], axis=1)}
+        np.savez(name, z0=own.z0, z1=own.z1, dt=own.dt, **given)
+    return names
+
+
+def turned(z, dt):
+    """By the flow of p²/2 + q²/2 over dt, each its own."""
+    (q, p), cos, sin = z.T, np.cos(dt), np.sin(dt)
+    return np.stack([cos * q + sin * p, cos * p - sin * q], axis=1)
+
+
+def varied(of, sigma=1e-3):
+    """Noisy pairs that differ in their dt, or in a parameter: the strength of a kick."""
+    rng = np.random.default_rng(0)
+    z, noise = rng.uniform(-1, 1, (PAIRS, 2)), sigma * rng.standard_normal((2, PAIRS, 2))
+    if of == "dt":
+        dt = rng.uniform(0.8, 1.2, PAIRS) * DT
+        return gfnn.Pairs(z + noise[0], turned(z, dt) + noise[1], dt)
+    k = rng.uniform(0.5, 1.5, PAIRS)
+    moved = turned(z - np.stack([np.zeros(PAIRS), 0.1 * k * z[:, 0] ** 2], axis=1), DT)
+    return gfnn.Pairs(z + noise[0], moved + noise[1], DT, k)
+
+
 @pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")
-@pytest.mark.parametrize("learns", ["map", "hamiltonian"])
-def test_of_several_dt_the_map_is_that_of_the_sample(learns, tmp_path):
-    """Of pairs so noisy that a step of the median dt misses none by far."""
-    pairs = noisy(flow, sigma=3e-3)
+@pytest.mark.parametrize(
+    ("of", "options"),
+    [
+        ("dt", {"learn": "map", "tolerance": 1e-3}),
+        ("dt", {"learn": "hamiltonian", "terms": ("p1**2", "q1**2"), "tolerance": 5e-3}),
+        ("parameters", {"learn": "map", "chart": "type2", "tolerance": 1e-3}),
+    ],
+)
+def test_pairs_that_differ_in_dt_or_parameters_are_all_taken(of, options, in_threads):
+    pairs = varied(of)
+    held = pairs.take(slice(100))
+    fit = gfnn.fit(pairs.take(slice(100, 250)), **options)
+    found = [in_threads(count, lambda group: refitted(group, pairs, held, fit)) for count in (1, 3)]
+    one, three = found[0][0], found[1][0]
+    assert one.num_pairs == PAIRS
+    assert not any("is kept" in message for message in one.messages)
+    exact = varied(of, sigma=0.0)
+    steps = []
+    for each in (fit, one, three):
+        dt = exact.dt if of == "dt" else None
+        steps.append(np.asarray(each.map.step(exact.z0, exact.args, dt=dt)[0]))
+    np.testing.assert_allclose(steps[1], steps[2], rtol=0, atol=1e-12)
+    errors = [np.sqrt(np.mean((states - exact.z1) ** 2)) for states in steps]
+    assert errors[1] < 0.7 * errors[0]  # eight times the pairs: √8 at best
+
+
+def test_pairs_of_another_dt_are_left_out(in_threads):
+    """As those across a gap, where nearly all are of one dt."""
+    pairs = noisy(image)
+    fit = gfnn.fit(pairs.take(slice(100, 300)), learn="map", tolerance=3e-3, chart="midpoint")
+    dt = np.full(PAIRS, DT)
+    dt[[3, 500, 900]] = 2 * DT
+    gaps = gfnn.Pairs(pairs.z0, pairs.z1, dt)
+    with pytest.warns(gfnn.FitWarning, match="3 of 1200 pairs are not dt = 0.5 apart"):
+        again = refit(fit, [gaps], gaps.take(slice(100)))
+    assert again.num_pairs == PAIRS - 3
+    clean = pairs.take(np.delete(np.arange(PAIRS), [3, 500, 900]))
+    other = refit(fit, [clean], clean.take(slice(99)))
+    z = np.random.default_rng(1).uniform(-0.8, 0.8, (50, 2))
+    np.testing.assert_allclose(*(f.map.step(z)[0] for f in (again, other)), rtol=0, atol=1e-12)
+
+
+def test_files_of_several_dt_are_all_taken(tmp_path):
+    pairs = noisy(flow)
     for i, dt in enumerate((0.999 * DT, 1.001 * DT)):
         own = pairs.take(slice(200 * i, 200 * (i + 1)))
         np.savez(tmp_path / f"{i}.npz", z0=own.z0, z1=own.z1, dt=dt)
     ran = fit_job.fit(
-        [tmp_path / "0.npz", tmp_path / "1.npz"], out=tmp_path / "m", learn=learns, tolerance=0.1
-    )
+        [tmp_path / "0.npz", tmp_path / "1.npz"], out=tmp_path / "m", learn="hamiltonian",
+        terms=("p1**2", "q1**4"), tolerance=0.1,
+    )  # fmt: skip
+    assert ran.fit.num_pairs == 400
     assert not any("is kept" in message for message in ran.fit.messages)
-    both = read_sample([tmp_path / "0.npz", tmp_path / "1.npz"]).pairs()
-    alone = gfnn.fit(both, learn=learns, tolerance=0.1)
-    np.testing.assert_array_equal(ran.fit.map.step(both.z0)[0], alone.map.step(both.z0)[0])
+
+
+@pytest.mark.filterwarnings("ignore:no candidate:gfnn_jax.errors.FitWarning")
+def test_a_network_is_that_of_the_sample_and_says_so(tmp_path, monkeypatch):
+    from gfnn_jax.learn import searches, sweeps
+
+    monkeypatch.setattr(sweeps, "_MLP_HIDDEN", (3,))
+    train = searches.NetworkSweep._trained
+    monkeypatch.setattr(
+        searches.NetworkSweep, "_trained",
+        lambda self, **options: train(self, **{**options, "max_iterations": 1}),
+    )  # fmt: skip
+    names = in_files(tmp_path, noisy(image).take(slice(300)), 2)
+    with pytest.warns(gfnn.FitWarning, match="is fitted to a sample of 300 pairs, not to all"):
+        ran = fit_job.fit(names, out=tmp_path / "m", family="mlp", chart="midpoint")
+    assert any("not to all" in message for message in ran.fit.messages)
 
 
 # Real processes, on this machine
@@ -277,32 +360,50 @@ def data(tmp_path_factory):
     return folder
 
 
-def test_two_processes_fit_one_map(data):
-    found = ended(started(data / "two", data / "pairs.npz", *OPTIONS, count=2))
+@pytest.fixture(scope="module")
+def undisturbed(data):
+    """The fit of one process."""
+    return fit_job.fit(data / "pairs.npz", out=data / "one", learn="map", chart="midpoint",
+                       tolerance=3e-3, group=Group()).fit  # fmt: skip
+
+
+def moved_alike(one, other):
+    z = np.random.default_rng(1).uniform(-0.8, 0.8, (200, 2))
+    moved = [np.asarray(map_.step(z)[0]) for map_ in (one, other)]
+    np.testing.assert_allclose(moved[0], moved[1], rtol=0, atol=1e-12)
+
+
+def test_two_processes_fit_one_map(data, undisturbed):
+    """Each on its own number of devices."""
+    found = ended(started(data / "two", data / "pairs.npz", *OPTIONS, "--devices", 1, count=2))
     assert [status for status, *_ in found] == [0, 0], found
     assert "written to" in found[0][1]
     assert "process 1 of 2: " in found[1][1]
-    ran = fit_job.fit(data / "pairs.npz", out=data / "one", learn="map", chart="midpoint",
-                      tolerance=3e-3, group=Group())  # fmt: skip
-    one, two = ran.fit.map, saved.load(data / "two")
-    z = np.random.default_rng(1).uniform(-0.8, 0.8, (200, 2))
-    moved = [np.asarray(map_.step(z)[0]) for map_ in (one, two)]
-    np.testing.assert_allclose(moved[0], moved[1], rtol=0, atol=1e-12)
+    moved_alike(undisturbed.map, saved.load(data / "two"))
     assert saved.record(data / "two")["data"]["num_pairs"] == PAIRS
-    assert not any("is kept" in message for message in ran.fit.messages)
+    assert not any("is kept" in message for message in undisturbed.messages)
 
 
+# JAX tells others that the first process is gone at once, and of another after ten seconds.
 @pytest.mark.slow
-def test_a_killed_process_ends_the_others(data):
-    """The one that decides, while the other waits for its map."""
-    running = started(data / "killed", data / "pairs.npz", *OPTIONS, count=2)
+@pytest.mark.parametrize("killed", [0, 1])
+def test_a_killed_process_ends_the_others(killed, data, undisturbed):
+    """While the first one searches and the other waits for its map; what is begun anew is fitted
+    as if nothing had been."""
+    out = data / f"killed{killed}"
+    running = started(out, data / "pairs.npz", *OPTIONS, count=2)
     limit = time.monotonic() + 60
-    while not (data / "killed.partial").exists():
+    while not out.with_name(f"{out.name}.partial").exists():
         assert time.monotonic() < limit, [p.poll() for p in running]
         time.sleep(0.02)
-    running[0].send_signal(signal.SIGKILL)
-    status, _, told = ended(running)[1]
+    running[killed].send_signal(signal.SIGKILL)
+    status, _, told = ended(running)[1 - killed]
     assert status != 0
     lines = [line for line in told.splitlines() if not line.startswith("[")]  # but progress
     assert len(lines) == 1, told
     assert lines[0].startswith("gfnn: this process or another one of the job was lost")
+    assert not out.exists()
+    found = ended(started(out, data / "pairs.npz", *OPTIONS, "--resume", count=2))
+    assert [status for status, *_ in found] == [0, 0], found
+    moved_alike(undisturbed.map, saved.load(out))
+    assert saved.record(out)["data"]["num_pairs"] == PAIRS

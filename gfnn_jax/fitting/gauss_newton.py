@@ -10,6 +10,7 @@ singular values come every damping at once, the condition number and the standar
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
@@ -20,6 +21,7 @@ import scipy.linalg
 
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import matrix_free
+from gfnn_jax.fitting import row_blocks
 from gfnn_jax.fitting.base_map import field_for
 from gfnn_jax.fitting.turns import backwards, forward_logarithm, tangent, turns
 from gfnn_jax.flows.collocation import Steps, images, of_lanes, operations, truncation
@@ -38,7 +40,8 @@ class Options:
     lower it by no more than this, and does not, has met the floor of rounding or truncation.
     foretold: how well the linearised problem must tell the next residual for a start to be close.
     null: of a term's size; one that is closer to the span of those before it is not known apart.
-    block_bytes: of the arrays that a block of pairs takes.
+    block_bytes: of the arrays that a block of pairs takes. part_bytes: of a block that one of
+    several devices takes; part_rows: rows of its part per term, at least.
     reach: h‖H''‖ of one substep. coarse_stages: of the early rounds.
     early_rows: rows per term that the early rounds look at; fewest: pairs at least.
     judged: pairs at which a step's own error is measured; judged_free: of a family that does
@@ -57,6 +60,8 @@ class Options:
     foretold: float = 0.1
     null: float = 1e-10
     block_bytes: int = 32 * 2**20
+    part_bytes: int = 4 * 2**20
+    part_rows: float = 4.0
     reach: float = 1.0
     coarse_stages: int = 4
     early_rows: float = 6.0
@@ -259,36 +264,84 @@ class Problem:
 
     def residuals(self, family, coefficients, steps: Steps, rows) -> np.ndarray:
         """(Φ(z₀) − z₁) ÷ scale of these rows (n, 2d); not finite where the flow fails."""
-        parts = [
-            (self.images(family, coefficients, b, steps).states - self.z1[b]) / self.scale
-            for b in self._blocks(rows, 0, matrix_free(family))
-        ]
+
+        def of(problem: Problem, block) -> np.ndarray:
+            states = problem.images(family, coefficients, block, steps).states
+            return (states - self.z1[block]) / self.scale
+
+        blocks = self._blocks(rows, 0, matrix_free(family))
+        if row_blocks.devices():
+            own = self._unpaid()
+            paid = (self._paid(block, family, steps) for block in blocks)
+            parts = row_blocks.each(lambda block, device: of(own, block), paid)
+        else:
+            parts = [of(self, block) for block in blocks]
         return np.concatenate(parts) if parts else np.zeros((0, self.z0.shape[1]))
 
     def factor(self, family, coefficients, steps: Steps, rows) -> Factor:
         """The Gauss–Newton problem of these rows; its cost is infinite where a flow fails."""
+        if not np.isfinite(coefficients).all():
+            return self._folded(family, coefficients, steps, (), failed=True)
+        columns = family.num_parameters * steps.stages
+        blocks = self._blocks(rows, columns, matrix_free(family))
+        if not row_blocks.devices():
+            return self._folded(family, coefficients, steps, blocks)
+        own = self._unpaid()
+        found = row_blocks.tree(
+            lambda part, device: own._folded(family, coefficients, steps, part),
+            self._parts(blocks, family, steps), lambda one, other, device: merged(one, other),
+        )  # fmt: skip
+        return self._folded(family, coefficients, steps, ()) if found is None else found
+
+    def _folded(self, family, coefficients, steps: Steps, blocks, failed: bool = False) -> Factor:
+        """The problem of the rows of these blocks, of none where it has failed before."""
         count = family.num_parameters
-        matrix, seen, failed = np.zeros((0, count + 1)), 0, not np.isfinite(coefficients).all()
-        for block in self._blocks(rows, count * steps.stages, matrix_free(family)):
-            if failed:
-                break
+        matrix, seen = np.zeros((0, count + 1)), 0
+        for block in blocks:
             found = self.images(family, coefficients, block, steps, derivatives=True)
             residual = (found.states - self.z1[block]) / self.scale
             slope = found.by_coefficient / self.scale[:, None]
             part = np.concatenate([slope, residual[..., None]], axis=-1).reshape(-1, count + 1)
             failed = not np.isfinite(part).all()
-            if not failed:
-                matrix = np.linalg.qr(np.concatenate([matrix, part]), mode="r")
-                seen += len(part)
+            if failed:
+                break
+            matrix = np.linalg.qr(np.concatenate([matrix, part]), mode="r")
+            seen += len(part)
         short = max(count + 1 - len(matrix), 0)
         matrix = np.concatenate([matrix, np.zeros((short, count + 1))])
         cost = np.inf if failed else float(np.linalg.norm(matrix[:, -1]))
         return Factor(matrix, seen, cost)
 
+    # Operations are spent where devices are told what to do, in one order, whoever is the first
+    # to be done.
+
+    def _unpaid(self) -> Problem:
+        """The problem whose operations are spent already."""
+        problem = copy.copy(self)
+        problem.spend = lambda operations: None
+        return problem
+
+    def _paid(self, block, family, steps: Steps, along=None):
+        self.spend(len(block) * operations(family, self.z0.shape[1], steps, along))
+        return block
+
+    def _parts(self, blocks, family, steps: Steps):
+        """The blocks, spent, in lists of as many rows as make the merging of two lists cheap."""
+        least, part, seen = self.options.part_rows * (family.num_parameters + 1), [], 0
+        for block in blocks:
+            part.append(self._paid(block, family, steps, family))
+            seen += len(block) * self.z0.shape[1]
+            if seen >= least:
+                yield part
+                part, seen = [], 0
+        if part:
+            yield part
+
     def _blocks(self, rows, columns: int, free: bool):
         width = self.z0.shape[1]
         pair = 8 * width * (columns + 40 * (1 if free else width))
-        size = max(1 if free else 16, self.options.block_bytes // pair)
+        most = self.options.part_bytes if row_blocks.devices() else self.options.block_bytes
+        size = max(1 if free else 16, most // pair)
         for first in range(0, len(rows), size):
             self.check()
             yield rows[first : first + size]
@@ -375,8 +428,19 @@ class Problem:
         """Of these rows whether the flow is known (n,), the steps' own error (n,) ÷ scale, and the
         error up to which a row counts as resolved among them."""
         size = np.abs(self.residuals(family, c, steps, rows)).max(axis=1, initial=0.0)
-        dt, args = self.given(rows)
-        off = truncation(family, c, self.z0[rows], dt, steps, args=args, on_substep=self.check)
+
+        def own_error(block) -> np.ndarray:
+            dt, args = self.given(block)
+            return truncation(
+                family, c, self.z0[block], dt, steps, args=args, on_substep=self.check
+            )
+
+        if row_blocks.devices() and len(rows):
+            blocks = self._blocks(rows, 0, matrix_free(family))
+            found = row_blocks.each(lambda block, device: own_error(block), blocks)
+            off = np.concatenate(found)
+        else:
+            off = own_error(rows)
         off = np.abs(off / self.scale).max(axis=1, initial=0.0)
         known = np.isfinite(size) & np.isfinite(off)
         if not known.any():

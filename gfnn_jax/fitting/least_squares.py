@@ -20,15 +20,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
-from scipy.linalg.lapack import dtpqrt  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.errors import FitError
+from gfnn_jax.fitting import accelerated, row_blocks
+from gfnn_jax.fitting.triangular import folded
 from gfnn_jax.threads import one_thread
 
 # Rows that are folded at once stay in the cache: 16 MiB take a quarter longer per row. A block of
 # 1,500 terms takes 50 ms on two cores.
 _BLOCK_BYTES, _FEWEST_ROWS = 2 * 2**20, 256
-_PANEL = 32  # columns per panel of LAPACK's QR: a third faster than 64
+# Rows of a part that a device folds, for each term: to merge two parts takes a third as many
+# operations as rows as there are terms. An accelerator wants larger ones, and was not at hand to
+# tell how large.
+_PART_ON_CPU, _PART_ON_ACCELERATORS = 4, 16
 # Ridge parameters tried, relative to the largest singular value; the first is plain least squares.
 _RIDGES = (0.0, *(10.0**k for k in range(-13, 0)))
 # Standard deviations of chance by which a ridge must lower the held-out squares. Of Hénon–Heiles
@@ -80,47 +84,86 @@ def reduce(
 
     Raises FitError where a term's gradient or a target is not finite.
     """
+    if row_blocks.devices():
+        return _finite(_reduced_on_devices(family, rows, weight, on_block))
     m = family.num_parameters
     factor, seen = np.zeros((m + 1, m + 1), order="F"), 0
-    for w, target, *args in _blocks(rows, m):
+    for part in _blocks(rows, m):
         if on_block is not None:
             on_block()
-        # LAPACK works in place on columns that are contiguous.
-        block = np.empty((w.size, m + 1), order="F")
-        gradients = family.term_gradients(w, *args) * weight[:, None]
-        block[:, :m] = gradients.reshape(-1, m)
-        block[:, m] = (target * weight).ravel()
+        block = _block_of(family, part, weight)
         with one_thread():
-            factor = _folded(factor, block)
+            factor = folded(factor, block)
         seen += len(block)
-    if not np.isfinite(factor).all():
+    return _finite(Reduced(factor, seen))
+
+
+def _block_of(family: Any, part: Sequence[Any], weight) -> np.ndarray:
+    """[A b] of these rows: LAPACK works in place on columns that are contiguous."""
+    (w, target, *args), m = part, family.num_parameters
+    block = np.empty((w.size, m + 1), order="F")
+    gradients = family.term_gradients(w, *args) * weight[:, None]
+    block[:, :m] = gradients.reshape(-1, m)
+    block[:, m] = (target * weight).ravel()
+    return block
+
+
+def _finite(reduced: Reduced) -> Reduced:
+    if not np.isfinite(reduced.factor).all():
         raise FitError("expected finite gradients of all terms and finite targets on the pairs")
-    return Reduced(factor, seen)
+    return reduced
+
+
+def _reduced_on_devices(family: Any, rows, weight, on_block) -> Reduced:
+    """The factor of rows that are shared out among devices."""
+    m = family.num_parameters
+    on_host = row_blocks.devices()[0].platform == "cpu" or not accelerated.takes(family)
+    least = (_PART_ON_CPU if on_host else _PART_ON_ACCELERATORS) * (m + 1)
+
+    def parts() -> Iterator[tuple[np.ndarray, ...]]:
+        for part in _blocks(rows, m, least):
+            if on_block is not None:
+                on_block()
+            yield part
+
+    def of_part(part, device) -> Reduced:
+        if not on_host:
+            pairs = _pairs_of(m, part[0].shape[1], least)
+            return Reduced(accelerated.factor(family, part, weight, pairs, device), part[0].size)
+        factor = np.zeros((m + 1, m + 1), order="F")
+        for block in _blocks([part], m):
+            factor = folded(factor, _block_of(family, block, weight))
+        return Reduced(factor, part[0].size)
+
+    def of_both(one: Reduced, other: Reduced, device) -> Reduced:
+        seen = one.rows + other.rows
+        if not on_host:
+            return Reduced(accelerated.merged(one.factor, other.factor, device), seen)
+        return Reduced(folded(one.factor, other.factor, triangular=True), seen)
+
+    found = row_blocks.tree(of_part, parts(), of_both)
+    return Reduced(np.zeros((m + 1, m + 1), order="F"), 0) if found is None else found
 
 
 def merged(one: Reduced, other: Reduced) -> Reduced:
     """The factor of the rows of both."""
     with one_thread():
-        factor = _folded(np.array(one.factor, order="F"), np.array(other.factor, order="F"))
+        factor = folded(np.array(one.factor, order="F"), np.array(other.factor, order="F"))
     return Reduced(factor, one.rows + other.rows)
 
 
-def _blocks(rows, num_parameters: int) -> Iterator[tuple[np.ndarray, ...]]:
-    """(w, target_gradient), and args, of as many pairs as one block holds."""
+def _blocks(rows, num_parameters: int, least: int = 0) -> Iterator[tuple[np.ndarray, ...]]:
+    """(w, target_gradient), and args, of as many pairs as one block holds, or ``least`` rows."""
     for part in rows:
         part = tuple(np.asarray(a, np.float64) for a in part)
-        most = max(_FEWEST_ROWS, _BLOCK_BYTES // (8 * (num_parameters + 1)))
-        pairs = max(1, most // part[0].shape[1])
+        pairs = _pairs_of(num_parameters, part[0].shape[1], least)
         for first in range(0, len(part[0]), pairs):
             yield tuple(a[first : first + pairs] for a in part)
 
 
-def _folded(factor, block):
-    """R of the stacked [R; block]; both are overwritten. Costs 2 rows · m² operations."""
-    panel = min(_PANEL, len(factor))
-    upper, _, _, status = dtpqrt(0, panel, factor, block, overwrite_a=1, overwrite_b=1)
-    assert status == 0  # an argument of the wrong shape, which it is not
-    return upper
+def _pairs_of(num_parameters: int, width: int, least: int) -> int:
+    """How many pairs of states (2d,) of this width a block holds."""
+    return max(1, max(_FEWEST_ROWS, _BLOCK_BYTES // (8 * (num_parameters + 1)), least) // width)
 
 
 def residuals(train: Reduced, held: Reduced, sizes: Sequence[int]) -> list[tuple[float, float]]:

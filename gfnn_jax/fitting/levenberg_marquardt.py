@@ -35,6 +35,7 @@ from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
 from gfnn_jax.families import Family
+from gfnn_jax.fitting import row_blocks
 from gfnn_jax.phase_space import require_x64
 
 # δ₂ is a correction: where it is not small beside δ₁ the expansion has failed and δ₁ goes alone.
@@ -181,6 +182,9 @@ def levenberg_marquardt_together(
     times the damping for the next iteration; validation errors are those of the members' mean ∇S;
     theta and best_theta of a state are (E, P), its damping (E,); the params that are returned have
     a leading axis E. The memory is E times as much.
+
+    On the devices of the fit (`fitting.row_blocks`) members are trained one at a time on each: to
+    the same bits on any number of devices, which one batch of all members would not give.
     """
     flat = [_flattened(member) for member in members]
     theta, layout = np.stack([t for t, _ in flat]), flat[0][1]
@@ -192,8 +196,7 @@ def levenberg_marquardt_together(
     *points, weights = _chunked(w, target_gradient, weight, chunk)
     padding = weights.shape[0] * weights.shape[1] - len(w)
     parts = np.pad(np.sqrt(shares), ((0, 0), (0, padding))).reshape(-1, *weights.shape[:2], 1)
-    points, weights = jax.device_put((tuple(points), parts * weights))
-    program = partial(_descend_together, family, points, weights, layout=layout)
+    on_device = tuple(points), parts * weights
 
     def descend(theta, damping):
         theta, losses, damping = program(theta, damping)
@@ -205,7 +208,8 @@ def levenberg_marquardt_together(
         return math.sqrt(float(_loss_of_mean(family, held, theta, layout=layout)))
 
     started, unknown = time.perf_counter(), np.full(len(theta), math.nan)
-    _descend_together.lower(family, points, weights, theta, unknown, layout=layout).compile()
+    compiled = _compiled_on_devices if row_blocks.devices() else _compiled_together
+    program = compiled(family, on_device, theta, layout)
     _loss_of_mean.lower(family, held, theta, layout=layout).compile()
     compile_seconds = time.perf_counter() - started
     options = _Options(
@@ -215,6 +219,39 @@ def levenberg_marquardt_together(
     state, why = _trained(first, descend, validation_rms, w.size, options)
     each = [_unflattened(one, layout) for one in np.asarray(state.best_theta)]
     return _result(state, jax.tree.map(lambda *a: np.stack(a), *each), compile_seconds, why)
+
+
+def _compiled_together(family, rows, theta, layout):
+    """One trial step of all members (θ, μ) -> (θ, F, μ), compiled."""
+    given = (family, *jax.device_put(rows))
+    unknown = np.full(len(theta), math.nan)
+    _descend_together.lower(*given, theta, unknown, layout=layout).compile()
+    return partial(_descend_together, *given, layout=layout)
+
+
+def _compiled_on_devices(family, rows, theta, layout):
+    """The same, each member by itself on the next device that is free."""
+    points, weights = rows
+    own = [weights[i : i + 1] for i in range(len(theta))]
+    placed = {d: jax.device_put((family, points, own), d) for d in row_blocks.devices()}
+
+    def compile_on(device, _) -> None:
+        family, points, own = placed[device]
+        unknown = np.full(1, math.nan)
+        _descend_together.lower(family, points, own[0], theta[:1], unknown, layout=layout).compile()
+
+    def program(theta, damping):
+        def of_one(i: int, device):
+            family, points, own = placed[device]
+            start = theta[i : i + 1], damping[i : i + 1]
+            found = _descend_together(family, points, own[i], *start, layout=layout)
+            return jax.tree.map(np.asarray, found)
+
+        found = row_blocks.each(of_one, range(len(theta)))
+        return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
+
+    row_blocks.each(compile_on, placed)
+    return program
 
 
 class _Options(NamedTuple):

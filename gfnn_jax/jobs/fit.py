@@ -9,12 +9,15 @@ import numpy as np
 
 from gfnn_jax.data.files import iterate_pairs, read_sample, read_trajectories
 from gfnn_jax.data.summary import summary
+from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import report
+from gfnn_jax.fitting import row_blocks
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.search import BEST, failures_of_arithmetic, scene_named, search
 from gfnn_jax.jobs.written import Ran, already_done, publish, write
 from gfnn_jax.learn.check import FEWEST
-from gfnn_jax.learn.refit import can_be_refitted, help_refit, refit
+from gfnn_jax.learn.refit import can_be_refitted, help_refit, not_refitted, refit
+from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.processes import Group, Share
 from gfnn_jax.storage.outputs import atomic_folder
@@ -46,15 +49,21 @@ def fit(
     seed: int = 0,
     overwrite: bool = False,
     resume: bool = False,
+    devices: int | str | None = None,
     group: Group | None = None,
     progress: Progress = SILENT,
 ) -> Ran | None:
     """Learn the map of trajectory files, and write it with its report into the model folder out.
 
     scene_name: lends its coordinates and features. resume: None where ``out`` is this very job,
-    done. group: the processes that do this job, each with its own rows or files; all but the first
+    done. devices: of each process, as ``gfnn.fit`` takes them; a job may be resumed on others.
+    group: the processes that do this job, each with its own rows or files; all but the first
     answer None. The other options are those of ``gfnn.fit``.
     """
+    try:
+        own = () if devices is None else local_devices(devices)
+    except ValueError as error:
+        raise InputError(f"--devices: {error}") from error
     scene = scene_named(scene_name) if scene_name is not None else None
     data = [data] if isinstance(data, Path) else list(data)
     processes, group = group, group or Group()
@@ -72,7 +81,7 @@ def fit(
         progress.say("waiting for the map of a sample")
         told = group.told()
         progress.say("own pairs, for the chosen candidate")
-        with failures_of_arithmetic():
+        with failures_of_arithmetic(), row_blocks.on_devices(own):
             help_refit(told, pairs, group, scene=scene)
         return None
     for line in summary(trajectories):
@@ -94,17 +103,17 @@ def fit(
         try:
             fitted = search(
                 trajectories.pairs(), scene, angles=angles, max_seconds=max_seconds,
-                progress=progress, kept_in=kept_in, job=job, **options,
+                progress=progress, kept_in=kept_in, job=job, devices=devices, **options,
             )  # fmt: skip
-            one_dt = np.ndim(trajectories.dt) == 0  # a refit has the rows of one step
-            if large and one_dt and can_be_refitted(fitted.map):
+            if large and can_be_refitted(fitted.map):
                 progress.say("all pairs, for the chosen candidate")
                 sampled = trajectories.pairs()
                 held = sampled.take(slice(min(_HELD, len(sampled) // _HELD_PART)))
-                with failures_of_arithmetic():
+                with failures_of_arithmetic(), row_blocks.on_devices(own):
                     fitted = refit(fitted, pairs, held, scene=scene, group=group)
             else:
                 group.told({})
+                fitted = not_refitted(fitted) if large else fitted
             progress.say("the report: compiling the derivative of a step")
             result = report.assemble(
                 fitted, scene=scene_name, dt=float(np.asarray(fitted.map.dt)), seed=seed,

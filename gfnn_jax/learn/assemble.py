@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gfnn_jax.fitting import row_blocks
 from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.generating.generated import Generated
@@ -131,27 +132,37 @@ class Steps(NamedTuple):
 def stepped(
     map_: SymplecticMap, z: np.ndarray, dt: Any = None, args=None, *, timed: bool = True
 ) -> Steps:
-    """One step of the states z (N, 2d), in blocks of one shape; times are 0 unless ``timed``. dt:
-    of each state (N,), or that of the map. args: name -> (N,), as those of `Pairs`."""
+    """One step of the states z (N, 2d), in blocks of one shape; times are 0 unless ``timed``, and
+    blocks are then shared out among the devices of the fit. dt: of each state (N,), or that of the
+    map. args: name -> (N,), as those of `Pairs`."""
     size = block_of(z.shape[1])
     rows = np.resize(np.arange(len(z)), -(-len(z) // size) * size).reshape(-1, size)
     longest = map_.over(np.max(dt)) if np.ndim(dt) else map_  # as many substeps in every block
 
-    def run(block) -> tuple[Any, float]:
+    placed: dict[Any, Any] = {}  # the map on each device, which one thread at a time has
+
+    def run(block, device: Any = None) -> tuple[Any, float]:
         own, given = longest, args and {name: values[block] for name, values in args.items()}
+        if device is not None:
+            own = placed[device] = placed.get(device) or jax.device_put(longest, device)
         if np.ndim(dt):
-            piece = dataclasses.replace(longest.pieces[0], dt=dt[block])
-            own = dataclasses.replace(longest, pieces=(piece,), dt=dt[block])
+            piece = dataclasses.replace(own.pieces[0], dt=dt[block])
+            own = dataclasses.replace(own, pieces=(piece,), dt=dt[block])
         started = time.perf_counter()
         out = jax.block_until_ready(own.step(z[block], given))
         return jax.tree.map(np.asarray, out), time.perf_counter() - started
 
-    (images, infos), first = run(rows[0])
-    seconds = min(run(rows[0])[1] for _ in range(_REPEATS)) if timed else 0.0
-    blocks = [(images, infos), *(run(block)[0] for block in rows[1:])]
+    if row_blocks.devices() and not timed:
+        found, seconds, compiling = row_blocks.each(run, rows), 0.0, 0.0
+    else:
+        found, seconds = [run(rows[0])], 0.0
+        if timed:
+            seconds = min(run(rows[0])[1] for _ in range(_REPEATS))
+        compiling = found[0][1] - seconds if timed else 0.0
+        found += [run(block) for block in rows[1:]]
+    blocks = [out for out, _ in found]
     images, status, iterations = (
         np.concatenate(parts)[: len(z)]
         for parts in zip(*((i, f.status, f.iterations) for i, f in blocks), strict=True)
     )
-    compiling = first - seconds if timed else 0.0
     return Steps(images, iterations, status > LEFT_DOMAIN, 1e6 * seconds / size, compiling)

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_user
+from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.prepare import Prepared
@@ -20,6 +21,7 @@ from gfnn_jax.phase_space import Pairs, sizes
 _NORMAL_95 = 1.645
 # A step in NumPy whose residual is larger, relative to its terms, has not been solved.
 _SOLVED = 1e-10
+_BLOCK = 500  # states that one of several devices steps at a time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,11 +141,19 @@ def refined_images(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Images of these rows by the map that S generates, as prepared (N, 2d), and which steps were
     solved (N,). In NumPy, from the data's own evaluation points: nothing is compiled."""
-    y0, y1 = prepared.y0[rows], prepared.y1[rows]
-    dt, args = prepared.given(rows)
-    piece = Generated(family, params, chart, dt, prepared.scale)
-    images, error = piece.refined_step(y0, chart.evaluation_point(y0, y1), args)
-    return images, (error < _SOLVED) & np.isfinite(images).all(axis=1)
+
+    def of(rows) -> tuple[np.ndarray, np.ndarray]:
+        y0, y1 = prepared.y0[rows], prepared.y1[rows]
+        dt, args = prepared.given(rows)
+        piece = Generated(family, params, chart, dt, prepared.scale)
+        images, error = piece.refined_step(y0, chart.evaluation_point(y0, y1), args)
+        return images, (error < _SOLVED) & np.isfinite(images).all(axis=1)
+
+    if not row_blocks.devices() or len(rows) <= _BLOCK:
+        return of(rows)
+    blocks = (rows[first : first + _BLOCK] for first in range(0, len(rows), _BLOCK))
+    images, solved = zip(*row_blocks.each(lambda block, device: of(block), blocks), strict=True)
+    return np.concatenate(images), np.concatenate(solved)
 
 
 def validated(candidate: Candidate, prepared, chart, family, params, judges: Judges) -> Candidate:

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.errors import FitError, FitWarning
+from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.assemble import block_of
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance
@@ -35,6 +36,7 @@ from gfnn_jax.learn.posterior import with_posterior
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.maps.domain import Ranges
+from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
@@ -193,6 +195,7 @@ def fit(
     seed: int = 0,
     max_seconds: float | None = MAX_SECONDS,
     max_iterations: int = 250,
+    devices: int | str | None = None,
     checkpoints: Any = None,
     factors: Any = None,
     on_progress: Callable[[str], Any] = lambda message: None,
@@ -229,6 +232,9 @@ def fit(
     max_seconds: for all of it; the search ends with the best map so far while there is time to
                compile its step. None: no budget.
     max_iterations: of the training of "mlp".
+    devices:   of this process, among which the rows of the least-squares and Gauss–Newton problems,
+               the steps of held-out pairs and the networks of an ensemble are shared out: "all" or
+               the first so many. The same bits on any number; None: the arithmetic of one batch.
     checkpoints, factors: a ``TrainingCheckpoints`` and a ``KeptFactors``, which an interrupted fit
                has saved to and the same fit goes on from.
     on_progress, on_candidate: called with what is being done, and with every candidate.
@@ -257,18 +263,19 @@ def fit(
     )  # fmt: skip
     warn(request.messages)
     on_progress("looking at the map's local Jacobians")
-    pairs, plain, about_pairs = clean(request.pairs, request.coordinates, request.structure)
-    warn(about_pairs)
-    seen = diagnose_request(request, plain)
-    warn(seen.messages)
-    judges = Judges(pairs, *split_rows(pairs, seed, plain.place), request.tolerance)
-    found = searched(request, plain, seen, judges, on_better)
-    seen, found, about_pairs = without_gross_errors(request, seen, found)
-    warn(about_pairs)
-    pairs = found.judges.pairs
-    chosen = with_posterior(choose(found, request), found)
-    conclusion = conclude(chosen, found, request)
-    warn(conclusion.messages)
+    with row_blocks.on_devices(_devices(devices)):
+        pairs, plain, about_pairs = clean(request.pairs, request.coordinates, request.structure)
+        warn(about_pairs)
+        seen = diagnose_request(request, plain)
+        warn(seen.messages)
+        judges = Judges(pairs, *split_rows(pairs, seed, plain.place), request.tolerance)
+        found = searched(request, plain, seen, judges, on_better)
+        seen, found, about_pairs = without_gross_errors(request, seen, found)
+        warn(about_pairs)
+        pairs = found.judges.pairs
+        chosen = with_posterior(choose(found, request), found)
+        conclusion = conclude(chosen, found, request)
+        warn(conclusion.messages)
     judged = min(_JUDGED, block_of(2 * pairs.dim))
     test = chosen.judges.pairs.take(chosen.judges.held_out[:judged])
     return Fit(
@@ -291,6 +298,14 @@ def fit(
         pairs=pairs,
         scene=scene,
     )
+
+
+def _devices(devices: int | str | None) -> tuple[Any, ...]:
+    """JAX's devices of this process that were asked for; none where nobody asked."""
+    try:
+        return () if devices is None else local_devices(devices)
+    except ValueError as error:
+        raise FitError(str(error)) from error
 
 
 def _all_candidates(chosen: Chosen, found: Searched) -> tuple[Candidate, ...]:

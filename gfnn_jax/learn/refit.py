@@ -18,6 +18,8 @@ import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_inner, whole_turns
 from gfnn_jax.errors import FitWarning
+from gfnn_jax.families.family import at_time
+from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import gauss_newton, least_squares
 from gfnn_jax.fitting.gauss_newton import FlowFit
 from gfnn_jax.flows.collocation import Steps
@@ -29,9 +31,9 @@ from gfnn_jax.learn.conclude import not_met
 from gfnn_jax.learn.fit import Fit
 from gfnn_jax.learn.formula import Term, formula
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
-from gfnn_jax.learn.sweeps import residual_weight
+from gfnn_jax.learn.sweeps import of_rows, residual_weight
 from gfnn_jax.maps.saved import packed, unpacked
-from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.maps.symplectic_map import SymplecticMap, serves_any_dt
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.processes import Group
 from gfnn_jax.scenes import Scene
@@ -41,19 +43,26 @@ _BLOCK = 20_000  # pairs at a time
 # million pairs with one at this limit have no worse a fit for it.
 _OUTLYING, _ROUNDOFF = 100.0, 1e-14
 _OF_TASK = "task "  # before the names of a task, in what processes are told
-_COUNTED = ("count", "outliers", "unresolved")  # pairs that are close or not, and of the first
+# Pairs that are close or not, of the first those that are not resolved, and those of another dt.
+_COUNTED = ("count", "outliers", "unresolved", "other_dt")
+_SAME, _PRINTED = 1e-9, 1e-5  # of dt: two that are one, and what printed times may differ by
 _NO_WORSE = 1.1  # a refit whose error is larger by this factor than that of its sample is not kept
 
 
 def can_be_refitted(map_: SymplecticMap) -> bool:
-    """Whether `refit` knows what to do: S or H is linear in its coefficients, and nothing but the
-    state matters."""
+    """Whether `refit` knows what to do: S or H is linear in its coefficients. A network is not."""
     index = _fitted_piece(map_.pieces)
-    return (
-        map_.parameters is None
-        and index is not None
-        and hasattr(map_.pieces[index].family, "term_gradients")
+    return index is not None and hasattr(map_.pieces[index].family, "term_gradients")
+
+
+def not_refitted(fitted: Fit) -> Fit:
+    """The fit of a sample as it is, with a warning (FitWarning) that says so."""
+    message = (
+        f"{fitted.chosen.label} is fitted to a sample of {fitted.num_pairs} pairs, not to all of "
+        "them: only sums of terms are (leave out --family mlp)"
     )
+    warnings.warn(message, FitWarning, stacklevel=2)
+    return dataclasses.replace(fitted, messages=(*fitted.messages, message))
 
 
 def refit(
@@ -97,6 +106,11 @@ def refit(
             warn(
                 f"{found.outliers} of {found.count + found.outliers} pairs are far from what "
                 "the others tell: outliers, they are left out"
+            )
+        if found.other_dt:
+            warn(
+                f"{found.other_dt} of {found.count + found.outliers + found.other_dt} pairs are "
+                f"not dt = {float(old.map.dt):g} apart: they are left out"
             )
         if found.unresolved:
             warn(
@@ -174,8 +188,8 @@ def _with_coefficients(
 
 class _Solved(NamedTuple):
     """The map with its new coefficients, None where there were no rows; of a law its fit too.
-    count, outliers, unresolved: of pairs that were close, that were not, and that were close but
-    are not resolved."""
+    count, outliers, unresolved, other_dt: of pairs that were close, that were not, that were close
+    but are not resolved, and that are apart by a time which the map does not serve."""
 
     map: SymplecticMap | None
     train_rms: float
@@ -183,6 +197,17 @@ class _Solved(NamedTuple):
     count: int
     outliers: int
     unresolved: int
+    other_dt: int
+
+
+class _Rows(NamedTuple):
+    """Pairs (n, 2d) as the fitted piece sees them, their dt (n,) where it is not the map's, and
+    their args (n, k), or None."""
+
+    y0: np.ndarray
+    y1: np.ndarray
+    dt: np.ndarray | None
+    args: np.ndarray | None
 
 
 class _Refit:
@@ -200,18 +225,43 @@ class _Refit:
         assert index is not None  # `can_be_refitted`
         self.index = index
         self.before, self.piece, self.after = pieces[:index], pieces[index], pieces[index + 1 :]
-        self.spread = np.asarray(map_.scale)
+        self.spread, self.dt = np.asarray(map_.scale), float(np.asarray(map_.dt))
+        self.any_dt = len(pieces) == 1 and serves_any_dt(self.piece)
 
     def close(self, pairs: Pairs) -> np.ndarray:
-        """Which pairs (N,) the old map does not miss by far."""
-        return self._close(np.asarray(pairs.z1), self._images(self.map, pairs.z0))
+        """Which pairs (N,) the old map serves, and does not miss by far."""
+        served = self._served(pairs)
+        served[served] = self._close(
+            np.asarray(pairs.z1)[served], self._images(self.map, pairs.take(np.flatnonzero(served)))
+        )
+        return served
+
+    def _served(self, pairs: Pairs) -> np.ndarray:
+        """Which pairs (N,) are apart by a dt that the map has steps of."""
+        off = np.abs(np.broadcast_to(np.asarray(pairs.dt), len(pairs)) - self.dt)
+        return np.full(len(pairs), True) if self.any_dt else off <= _PRINTED * self.dt
+
+    def _own_dt(self, pairs: Pairs) -> np.ndarray | None:
+        """Their dt (N,), where a map of any dt must be told."""
+        dt = np.broadcast_to(np.asarray(pairs.dt, float), len(pairs))
+        same = not isinstance(self.piece.family, OfTimeStep) and np.ndim(pairs.dt) == 0
+        if not self.any_dt or (same and np.all(np.abs(dt - self.dt) <= _SAME * self.dt)):
+            return None
+        return np.array(dt)
+
+    def _args(self, pairs: Pairs) -> dict[str, np.ndarray] | None:
+        """Those that the map depends on: others did not vary in the sample."""
+        if self.map.parameters is None:
+            return None
+        given: dict[str, Any] = pairs.args or {}
+        return {name: np.asarray(given[name], float) for name in self.map.parameters.names}
 
     def _close(self, z1, images) -> np.ndarray:
         return np.all(np.abs(self._difference(images - z1)) <= self.task["most"], axis=1)
 
     def error(self, map_: SymplecticMap, pairs: Pairs, tolerance: Tolerance):
         """The one-step error of a map on pairs."""
-        images = self._images(map_, pairs.z0)
+        images = self._images(map_, pairs)
         return one_step_error(
             self._difference(images - np.asarray(pairs.z1)), self.spread, tolerance
         )
@@ -221,7 +271,7 @@ class _Refit:
         as resolved. Nothing of S."""
         if isinstance(self.piece, Generated):
             return {}
-        problem, rows = self._problem(*self._inner(held)), np.arange(len(held))
+        problem, rows = self._problem(self._inner(held)), np.arange(len(held))
         family, c = self.piece.family, self.piece.params
         steps = problem.fine_steps(family, c, rows)[0]
         limit = problem.resolution(family, c, steps, rows)[2]
@@ -284,22 +334,28 @@ class _Refit:
         map_ = dataclasses.replace(self.map, pieces=tuple(pieces))
         return _Solved(map_, train_rms, law, **counts)
 
-    def _reduced(self, kept: Iterable[tuple[np.ndarray, np.ndarray]]) -> least_squares.Reduced:
-        """The factor of S from pairs (y0, y1) as its piece sees them."""
-        chart, dt = self.piece.chart, float(self.map.dt)
+    def _reduced(self, kept: Iterable[_Rows]) -> least_squares.Reduced:
+        """The factor of S from pairs as its piece sees them."""
+        chart, family = self.piece.chart, self.piece.family
+        # The rows of an S of dt are multiplied by each pair's own.
+        dt = 1.0 if isinstance(family, OfTimeStep) else self.dt
         weight = residual_weight(chart, self.piece.scale, dt)
-        rows = (
-            (chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, dt)) for y0, y1 in kept
-        )
-        return least_squares.reduce(self.piece.family, rows, weight)
+
+        def row_of(y0, y1, own_dt, args) -> tuple[np.ndarray, ...]:
+            row = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, dt)
+            if own_dt is not None:
+                return *row, own_dt[:, None]
+            return row if args is None else (*row, at_time(family, args, 0.5 * dt))
+
+        return least_squares.reduce(of_rows(family), (row_of(*rows) for rows in kept), weight)
 
     def _of_law(self, kept, c, counts: dict[str, int]) -> gauss_newton.Factor:
-        """The Gauss–Newton problem of H at c, from pairs (y0, y1) that its steps resolve."""
+        """The Gauss–Newton problem of H at c, from pairs that its steps resolve."""
         family = self.piece.family
         size = family.num_parameters + 1
         whole = gauss_newton.Factor(np.zeros((size, size)), 0, 0.0)
-        for y0, y1 in kept:
-            problem, rows = self._problem(y0, y1), np.arange(len(y0))
+        for own in kept:
+            problem, rows = self._problem(own), np.arange(len(own.y0))
             known, off, _ = problem.resolution(family, self.piece.params, self._steps, rows)
             resolved = rows[known & (off <= self.task["limit"])]
             counts["unresolved"] += len(rows) - len(resolved)
@@ -312,39 +368,49 @@ class _Refit:
         names = (field.name for field in dataclasses.fields(Steps))
         return Steps(**{name: np.asarray(self.task[name]).item() for name in names})
 
-    def _problem(self, y0, y1) -> gauss_newton.Problem:
-        return gauss_newton.Problem(y0, y1, float(self.map.dt), np.asarray(self.piece.scale))
+    def _problem(self, rows: _Rows) -> gauss_newton.Problem:
+        dt = self.dt if rows.dt is None else rows.dt
+        return gauss_newton.Problem(
+            rows.y0, rows.y1, dt, np.asarray(self.piece.scale), args=rows.args
+        )
 
-    def _kept(self, chunks: Iterable[Pairs], counts: dict[str, int]) -> Iterator[tuple]:
+    def _kept(self, chunks: Iterable[Pairs], counts: dict[str, int]) -> Iterator[_Rows]:
         """Pairs but outliers and those held out, as the fitted piece sees them."""
         judges = _keys(self.task["held"])
         for chunk in chunks:
             for first in range(0, len(chunk), _BLOCK):
                 part = chunk.take(slice(first, first + _BLOCK))
+                served = self._served(part)
+                counts["other_dt"] += int((~served).sum())
+                if not served.all():
+                    part = part.take(np.flatnonzero(served))
                 z0, z1 = np.asarray(part.z0), np.asarray(part.z1)
-                images = self._images(self.map, z0)
+                images = self._images(self.map, part)
                 close = self._close(z1, images)
                 counts["count"] += int(close.sum())
                 counts["outliers"] += int((~close).sum())
                 taken = close & ~np.isin(_keys(z0), judges)
                 if taken.any():
-                    yield self._as_fitted(z0[taken], z1[taken], images[taken])
+                    yield self._as_fitted(part.take(np.flatnonzero(taken)), images[taken])
 
-    def _inner(self, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
-        z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
-        return self._as_fitted(z0, z1, self._images(self.map, z0))
+    def _inner(self, pairs: Pairs) -> _Rows:
+        return self._as_fitted(pairs, self._images(self.map, pairs))
 
-    def _images(self, map_: SymplecticMap, z) -> np.ndarray:
-        steps = stepped(map_, np.asarray(z), timed=False)
+    def _images(self, map_: SymplecticMap, pairs: Pairs) -> np.ndarray:
+        if not len(pairs):
+            return np.zeros(pairs.z0.shape)
+        z, dt, args = np.asarray(pairs.z0), self._own_dt(pairs), self._args(pairs)
+        steps = stepped(map_, z, dt, args, timed=False)
         return np.where(steps.failed[:, None], np.nan, steps.images)
 
     def _difference(self, difference) -> np.ndarray:
         plain = self.map.coordinates.forward is CARTESIAN.forward
         return nearest_image(difference, self.map.coordinates.angles if plain else ())
 
-    def _as_fitted(self, z0, z1, images) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs (N, 2d) as the fitted piece sees them: inner coordinates, the angles of z1
-        lifted to the nearest image of the map's own prediction, the base map factored out."""
+    def _as_fitted(self, pairs: Pairs, images) -> _Rows:
+        """Pairs as the fitted piece sees them: inner coordinates, the angles of z1 lifted to the
+        nearest image of the map's own prediction, the base map factored out."""
+        z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
         coordinates, angles = self.map.coordinates, list(self.map.coordinates.angles)
         y0, y1, predicted = (to_inner(coordinates, z) for z in (z0, z1, images))
         y1[:, angles] -= whole_turns(y1[:, angles] - predicted[:, angles])
@@ -355,7 +421,9 @@ class _Refit:
             y0 = piece.image(y0)
         for piece in reversed(self.after):
             y1 = piece.inverse().image(y1)
-        return y0, y1
+        args = self._args(pairs)
+        columns = None if args is None else np.stack([*args.values()], axis=-1)
+        return _Rows(y0, y1, self._own_dt(pairs), columns)
 
 
 def _as_reduced(answer: dict[str, Any]) -> least_squares.Reduced:

@@ -217,7 +217,7 @@ class LinearSweep:
         one, other = (
             least_squares.solve(
                 least_squares.reduce(
-                    _of_rows(size.family), [tuple(a[half == i] for a in self._train)], self._weight
+                    of_rows(size.family), [tuple(a[half == i] for a in self._train)], self._weight
                 ),
                 held, count,
             ).coefficients
@@ -253,7 +253,7 @@ class LinearSweep:
         )  # fmt: skip
 
     def _slopes(self, family, w, *args) -> np.ndarray:
-        return _of_rows(family).term_gradients(w, *args) * self._weight[:, None]
+        return of_rows(family).term_gradients(w, *args) * self._weight[:, None]
 
     def _by_states(self, family, params, w, *args) -> tuple[np.ndarray, np.ndarray]:
         """The residual's derivatives in z₀ and z₁ (n, 2d, 2d), those ÷ their scale."""
@@ -277,7 +277,7 @@ class LinearSweep:
         def left(of: Size) -> float:
             reduced = (
                 self._factors[of.group].train if larger.group in self._factors
-                else least_squares.reduce(_of_rows(of.family), [data], self._weight)
+                else least_squares.reduce(of_rows(of.family), [data], self._weight)
             )  # fmt: skip
             freedom = None
             if states is not None:
@@ -324,7 +324,7 @@ class LinearSweep:
         started = time.perf_counter()
         train, outermost = tuple(a[:taken] for a in self._train), self._outermost[:taken]
         inner, outer, held = (
-            least_squares.reduce(_of_rows(group), [rows], self._weight, on_block=clock.check)
+            least_squares.reduce(of_rows(group), [rows], self._weight, on_block=clock.check)
             for rows in (
                 tuple(a[~outermost] for a in train), tuple(a[outermost] for a in train), self._held
             )
@@ -537,7 +537,7 @@ class _Moves:
         return dt[..., None] * self.family.term_gradients(w, dt)
 
 
-def _of_rows(family: Any) -> Any:
+def of_rows(family: Any) -> Any:
     """The family whose terms make the rows of `rows_of`."""
     return _Moves(family) if isinstance(family, OfTimeStep) else family
 

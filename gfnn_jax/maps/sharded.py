@@ -29,7 +29,9 @@ def local_devices(devices: int | str = "all") -> tuple[Any, ...]:
     """Devices of this process: "all", or the first so many. Raises ValueError where there are not
     so many."""
     own = jax.local_devices()
-    count = len(own) if isinstance(devices, str) else devices
+    count = len(own) if devices == "all" else devices
+    if isinstance(count, bool) or not isinstance(count, int):
+        raise ValueError(f"expected a number of devices or 'all', got {devices!r}")
     if not 1 <= count <= len(own):
         raise ValueError(f"expected 1 to {len(own)} devices, which there are; got {count}")
     return tuple(own[:count])

@@ -184,7 +184,7 @@ class SymplecticMap:
         known = not any(isinstance(value, Tracer) for value in (dt, self.dt))
         if known and np.ndim(dt) == 0 and np.array_equal(dt, self.dt):  # inside jit too
             return self
-        if len(self.pieces) != 1 or not _serves_any_dt(self.pieces[0]):
+        if len(self.pieces) != 1 or not serves_any_dt(self.pieces[0]):
             raise ValueError(
                 f"expected the flow of a Hamiltonian to step another dt, got a map of dt = "
                 f"{float(np.asarray(self.dt)):g} only: fit with learn='hamiltonian'"
@@ -417,7 +417,7 @@ class SymplecticMap:
         return self._outer(y, turns), info._replace(status=status.astype(jnp.int32))
 
 
-def _serves_any_dt(piece: Any) -> bool:
+def serves_any_dt(piece: Any) -> bool:
     """Whether a piece can be stepped over any time."""
     return isinstance(piece, Flow) or (isinstance(piece, Generated) and piece.serves_any_dt)
 
