@@ -64,7 +64,7 @@ def test_rows_of_the_nearest_states_have_no_bias(chart):
 
     naive = least_squares.fit(family, (w, target), (w, target), np.ones(2)).coefficients
     assert off(family, (w, target)) > 3
-    found, moved = naive, (of_point, of_target)
+    found = naive
     for _ in range(2):
         near = family.unflatten(found)
         rows = nearest(
