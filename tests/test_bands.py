@@ -180,7 +180,7 @@ def test_residual_of_s_moves_with_the_states_as_its_derivatives_say():
             return sweep._weight * (gradient - chart.target_gradient(y0, y1, pairs.dt))
 
         y0, y1, scale = prepared.y0[:5], prepared.y1[:5], prepared.scale
-        found = sweep._by_states(family, params, chart.evaluation_point(y0, y1))
+        found = sweep.by_states(family, params, chart.evaluation_point(y0, y1))
         off = 1e-5 * np.diag(scale)
         for j in range(4):
             by = [(residual(y0 + off[j], y1) - residual(y0 - off[j], y1)) / 2e-5,

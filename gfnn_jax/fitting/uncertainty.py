@@ -16,6 +16,7 @@ What the terms cannot represent is not independent: it stays, however many pairs
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import gammainc
 
 from gfnn_jax.fitting.least_squares import Reduced
 
@@ -25,6 +26,8 @@ _MOST_LEVERAGE = 0.9
 # by chance: it is alike along an orbit. With 1, bands of two deviations held 86 to 90 % of the true
 # errors at step 100 (benchmarks/bands.py, Hénon–Heiles without noise) and were 1.3 RMS errors wide.
 _ALIKE = 2.0
+# The mean of a variance that fewer terms tell does not exist.
+_FEWEST_TERMS, _TINY = 3, 1e-280
 
 
 def variance(reduced: Reduced, size: int, freedom: float | None = None) -> float:
@@ -35,6 +38,26 @@ def variance(reduced: Reduced, size: int, freedom: float | None = None) -> float
     """
     left = float(np.sum(reduced.factor[size:, -1] ** 2))
     return left / max(reduced.rows - (size if freedom is None else freedom), 1.0)
+
+
+def misfit(explained: float, terms: int, variance: float) -> float:
+    """The sum of squares that ``terms`` further terms are to be expected to stand for, which
+    explain ``explained`` of a residual; noise of this variance alone gives variance · χ²(terms).
+
+    The posterior mean, never 0: every entry of the triangular factor that belongs to a further term
+    is normal, of a variance v no smaller than that of the noise, and 1/v is its prior density.
+    """
+    if terms < 1 or not variance > 0:
+        return max(explained, 0.0)
+    shape = max(terms, _FEWEST_TERMS) / 2 - 1
+    most = explained / (2 * variance)
+    upper = float(gammainc(shape + 1, most))
+    # The mean of v; its limit where far less is explained than noise would, and nothing is left of
+    # the integrals.
+    mean = variance * (1 + 1 / shape)
+    if upper > _TINY:
+        mean = 0.5 * explained * float(gammainc(shape, most)) / (shape * upper)
+    return terms * max(mean - variance, 0.0)
 
 
 def root(

@@ -58,7 +58,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     diagnosis: list[str] = []
     structured = request.structure is not None  # too few pairs to look at their neighbours
     if candidate.validation_relative > _ROUNDOFF and not structured:
-        stalled = _stalled(chosen, searched)
+        stalled = _stalled(candidate, chosen.entry, searched)
         noise, diagnosis, reason = _what_is_left(chosen, searched, stalled)
         if reason and stalled:
             ended = f"larger models are no more accurate: {reason}"
@@ -75,13 +75,20 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     return Conclusion(ended, noise, messages)
 
 
-def _stalled(chosen: Chosen, searched: Searched) -> bool:
+def only_noise(entry: Entry, searched: Searched) -> bool:
+    """Whether what this entry leaves over is noise, as far as its residuals tell."""
+    if not _stalled(entry.candidate, entry, searched):
+        return False
+    return _no_noise(_residuals_of_sample(entry.candidate, entry, searched), True) is None
+
+
+def _stalled(candidate: Candidate, entry: Entry | None, searched: Searched) -> bool:
     """Whether larger models stopped helping: in the chosen sweep, in another that has come as far,
     or, where no S was found, among the libraries of H."""
     found = searched.found
-    if chosen.entry is None and not found.ranking:
+    if entry is None and not found.ranking:
         return searched.law is not None and searched.law.stalled
-    limit = AS_FAR * chosen.candidate.validation_relative
+    limit = AS_FAR * candidate.validation_relative
     return any(
         (e.candidate.chart, e.candidate.family) in found.stalled
         and e.candidate.validation_relative <= limit
@@ -98,21 +105,33 @@ class _LeftOver(NamedTuple):
     reason: str = ""
 
 
-def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOver:
-    """Noise, where larger models no longer helped, friction, or a parameter that differs between
-    sequences.
+class _Sample(NamedTuple):
+    """Rows of training pairs (n,), their states and residuals (n, 2d), sizes of these (2d,), and
+    the sequence that each is of (n,)."""
 
-    The residuals are those of the chosen map, or of the best generated one where H was chosen.
-    """
-    candidate, judges = chosen.candidate, searched.judges
-    entry = chosen.entry or next(iter(searched.found.ranking), None)
-    if entry is not None:
-        judges = entry.sweep.judges
+    rows: np.ndarray
+    y0: np.ndarray
+    residual: np.ndarray
+    scale: np.ndarray
+    sequence: np.ndarray
+
+
+def _residuals_of_sample(
+    candidate: Candidate, entry: Entry | None, searched: Searched
+) -> _Sample:  # fmt: skip
+    """The residuals of the entry's map, or of the candidate's where there is none."""
+    judges = searched.judges if entry is None else entry.sweep.judges
     rows = np.sort(judges.training)[:_RESIDUAL_PAIRS]
     y0, residual, solved = _residuals(candidate, entry, judges, rows)
     rows, y0, residual = rows[solved], y0[solved], residual[solved]
     sequence = sequences_of(judges.pairs.z0, judges.pairs.z1)[rows]
     scale = judges.spread if entry is None else entry.sweep.prepared.scale
+    return _Sample(rows, y0, residual, scale, sequence)
+
+
+def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
+    """What these residuals are, where they are something else than noise."""
+    _, y0, residual, scale, sequence = sample
     if differs_between_sequences(y0 / scale, residual / scale, sequence):
         message = (
             "what is left over agrees within a sequence and differs between sequences: something "
@@ -138,6 +157,24 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
             "these functions cannot represent, or pairs of no symplectic map"
         )
         return _LeftOver(None, [message], "what is left over is smooth, and no noise")
+    return None
+
+
+def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOver:
+    """Noise, where larger models no longer helped, friction, or a parameter that differs between
+    sequences.
+
+    The residuals are those of the chosen map, or of the best generated one where H was chosen.
+    """
+    candidate, judges = chosen.candidate, searched.judges
+    entry = chosen.entry or next(iter(searched.found.ranking), None)
+    if entry is not None:
+        judges = entry.sweep.judges
+    sample = _residuals_of_sample(candidate, entry, searched)
+    known = _no_noise(sample, stalled)
+    if known is not None:
+        return known
+    rows, sequence = sample.rows, sample.sequence
     law = searched.law
     taken = candidate.num_parameters / (judges.training.size * 2 * judges.pairs.dim)
     noise = state_noise(candidate.map, judges.pairs.take(rows[:_NOISE_PAIRS]), taken)

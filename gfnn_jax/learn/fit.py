@@ -32,6 +32,7 @@ from gfnn_jax.learn.draw import NUM_PAIRS, drawn
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
+from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.posterior import with_posterior
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
@@ -272,6 +273,7 @@ def fit(
         found = searched(request, plain, seen, judges, on_better)
         seen, found, about_pairs = without_gross_errors(request, seen, found)
         warn(about_pairs)
+        found = without_bias(found, request)
         pairs = found.judges.pairs
         chosen = with_posterior(choose(found, request), found)
         conclusion = conclude(chosen, found, request)

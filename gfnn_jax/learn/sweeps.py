@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +24,7 @@ from gfnn_jax.learn.candidates import Candidate, Judges, validated
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.held_out import looked_at, outermost
 from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.maps.affine import Affine
 
 # Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
 # judged from one factor of the rows of its largest.
@@ -32,6 +35,8 @@ _SINES = (100, 200, 400, 800, 1_600)
 # Products of degree 14 in four variables: benchmarks/storage_ring.py.
 _MOST_TERMS = 3_100
 _ROWS_PER_TERM = 3
+# Enough to tell misfit from noise by a size, though not to choose it.
+_ROWS_THAT_TELL = 1.5
 # Rows × terms² of one factor: about half a minute on one core. 2,000 terms take 80,000 rows.
 _MOST_OPERATIONS = 3.2e11
 # Whether S is even is tested where terms are scarce, from so many rows for each term, by odd terms
@@ -47,6 +52,7 @@ _HALVES_BLOCK = 50
 _CHECKPOINT_SECONDS = 10.0
 # Rows per term of a larger size, by which noise is told from misfit.
 _SAMPLE_ROWS = 6
+_NOISE_PAIRS = 4_096  # that tell the noise of each coordinate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,17 +138,21 @@ class LinearSweep:
             cyclic=coordinates.cyclic, features=features, reversor=reversor,
             args=args,
         )  # fmt: skip
-        if kind == "sines":
-            groups: Iterable[Iterable[Any]] = ([Sines(inputs, count)] for count in _SINES)
-        else:
-            signs = variable_signs(inputs, reversor, w) if reversor is not None else None
-            degrees = _EVEN_DEGREES if even else _DEGREES
-            groups = ((of(inputs, degree, signs) for degree in g) for g in degrees)
+        degrees = _EVEN_DEGREES if even else _DEGREES
+        signs = None
+        if kind != "sines" and reversor is not None:
+            signs = variable_signs(inputs, reversor, w)
+
+        def groups() -> Iterator[Iterable[Any]]:
+            if kind == "sines":
+                return ([Sines(inputs, count)] for count in _SINES)
+            return ((of(inputs, degree, signs) for degree in g) for g in degrees)
+
         known = len(_SINES) if kind == "sines" else sum(map(len, degrees))
-        rows = self._train[1].size
+        self._groups, rows = groups, self._train[1].size
         self.sizes = [
             Size(family, group[-1], _extent(family))
-            for group in _determined(groups, rows) for family in group
+            for group in _determined(groups(), rows) for family in group
         ]  # fmt: skip
         # Else the last size is the largest there is, or the most terms are reached.
         self.short_of_pairs = len(self.sizes) < known and rows < _ROWS_PER_TERM * _MOST_TERMS
@@ -151,7 +161,7 @@ class LinearSweep:
     def judge(self, size: Size, clock: Clock, say: Callable[[str], Any]) -> Candidate:
         """The size with its error estimated from the held-out residual of the gradient."""
         started = time.perf_counter()
-        train, held = self._factor(size.group, clock, say)[:2]
+        train, held = self.factors(size.group, clock, say)[:2]
         count = size.family.num_parameters
         ((train_rms, held_rms),) = least_squares.residuals(train, held, [count])
         return self._candidate(size, train_rms, held_rms, time.perf_counter() - started)
@@ -162,7 +172,7 @@ class LinearSweep:
         say(f"{judged.chart} {judged.label}: steps of the held-out pairs")
         started = time.perf_counter()
         solved, params = self.solve(size, clock, say)
-        factors = self._factor(size.group, clock, say)
+        factors = self.factors(size.group, clock, say)
         outside = None
         if factors.outer.rows:  # none where every coordinate covers its circle
             ((_, outside),) = least_squares.residuals(
@@ -195,7 +205,7 @@ class LinearSweep:
 
     def solve(self, size: Size, clock: Clock, say) -> tuple[least_squares.LeastSquaresFit, Any]:
         """The coefficients of this size, and the params of its family."""
-        train, held = self._factor(size.group, clock, say)[:2]
+        train, held = self.factors(size.group, clock, say)[:2]
         solved = least_squares.solve(train, held, size.family.num_parameters)
         return solved, size.family.unflatten(solved.coefficients)
 
@@ -212,12 +222,13 @@ class LinearSweep:
         """What noise leaves wrong in the size's ∇S, in the measure of train_rms: half of the
         difference between the fits to either half of the training pairs, blocks in time."""
         half = self.judges.training // _HALVES_BLOCK % 2
-        train, held = self._factor(size.group, Clock(), lambda message: None)[:2]
+        train, held = self.factors(size.group, Clock(), lambda message: None)[:2]
         count = size.family.num_parameters
         one, other = (
             least_squares.solve(
                 least_squares.reduce(
-                    of_rows(size.family), [tuple(a[half == i] for a in self._train)], self._weight
+                    self.in_rows(size.family), [tuple(a[half == i] for a in self._train)],
+                    self._weight,
                 ),
                 held, count,
             ).coefficients
@@ -231,20 +242,18 @@ class LinearSweep:
 
         What of the residual is noise, a larger size tells: it leaves that too.
         """
-        train = self._factor(size.group, Clock(), lambda message: None).train
+        train = self.factors(size.group, Clock(), lambda message: None).train
         family, solved = size.family, self.solve(size, Clock(), lambda message: None)[0]
         larger = self._larger(size)
         most = family if larger is None else larger.family
-        width = self._train[0].shape[1]
-        pairs = -(-_SAMPLE_ROWS * most.num_parameters // width)
-        places, goes_on = looked_at(self.judges.pairs, self.judges.training, pairs)
-        w, target, *args = data = tuple(a[places] for a in self._train)
+        data, goes_on = self._sample(-(-_SAMPLE_ROWS * most.num_parameters // self._width))
+        w, target, *args = data
         params = family.unflatten(solved.coefficients)
         slopes = self._slopes(family, w, *args)
         residual = slopes @ solved.coefficients - target * self._weight
         states = None
-        if goes_on.any() and not (self.prepared.before or self.prepared.after):
-            states = (residual, *self._by_states(family, params, w, *args), goes_on)
+        if goes_on.any() and self.moved_by_states:
+            states = (residual, *self.by_states(family, params, w, *args), goes_on)
         scores = shared_noise.scores(slopes, *states) if states else None
         noise = self._noise(size, larger, data, states) if larger is not None else None
         return uncertainty.root(
@@ -253,50 +262,129 @@ class LinearSweep:
         )  # fmt: skip
 
     def _slopes(self, family, w, *args) -> np.ndarray:
-        return of_rows(family).term_gradients(w, *args) * self._weight[:, None]
+        return self.in_rows(family).term_gradients(w, *args) * self._weight[:, None]
 
-    def _by_states(self, family, params, w, *args) -> tuple[np.ndarray, np.ndarray]:
+    def in_rows(self, family: Any) -> Any:
+        """The family whose terms make the rows of this sweep."""
+        return of_rows(family)
+
+    def by_states(self, family, params, w, *args) -> tuple[np.ndarray, np.ndarray]:
         """The residual's derivatives in z₀ and z₁ (n, 2d, 2d), those ÷ their scale."""
-        eye, chart = np.eye(2 * self.prepared.dim), self.chart
-        none, dt, scale = np.zeros_like(eye), self.prepared.dt, self.prepared.scale
         hessian = family.gradient_and_hessian(params, w, *args)[1]
         if self.prepared.own_dt is not None:
-            dt, hessian = 1.0, args[0][..., None] * hessian
+            hessian = args[0][..., None] * hessian
+        of_point, of_target = self.of_states
+        by = self._weight[:, None] * (hessian @ of_point - of_target)
+        return by[..., : len(of_point)], by[..., len(of_point) :]
 
-        def by(y0, y1):
-            point, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, dt)
-            return self._weight[:, None] * (hessian @ point.T - target.T) * scale
+    @cached_property
+    def of_states(self) -> tuple[np.ndarray, np.ndarray]:
+        """(2d, 4d) each: what the numbers of z₀ and z₁, ÷ their scale, add to w and to the target.
+        An affine base map is counted, the flow of a law is not."""
+        prepared, chart = self.prepared, self.chart
+        dt = 1.0 if prepared.own_dt is not None else prepared.dt
+        eye = np.eye(2 * prepared.dim)
+        first, second, none = eye, eye, np.zeros_like(eye)
+        for piece in prepared.before:
+            first = getattr(piece, "matrix", eye) @ first
+        for piece in prepared.after:
+            second = getattr(piece, "matrix", eye) @ second
+        ends = ((first.T, none), (none, np.linalg.inv(second).T))
+        of_point = [chart.evaluation_point(*of).T * prepared.scale for of in ends]
+        of_target = [chart.target_gradient(*of, dt).T * prepared.scale for of in ends]
+        return np.concatenate(of_point, axis=1), np.concatenate(of_target, axis=1)
 
-        return by(eye, none), by(none, eye)
+    @property
+    def moved_by_states(self) -> bool:
+        """Whether ``of_states`` is all that states' noise does: not behind the flow of a law."""
+        return all(isinstance(p, Affine) for p in (*self.prepared.before, *self.prepared.after))
+
+    @property
+    def largest_known(self) -> Size:
+        """The largest size that a factor answers for."""
+        return [size for size in self.sizes if size.group in self._factors][-1]
+
+    def state_deviations(self, size: Size) -> np.ndarray:
+        """(2d,) standard deviation of each coordinate's noise, ÷ its scale, from what this size
+        leaves of a sample of the training pairs."""
+        (w, target, *args), goes_on = self._sample(_NOISE_PAIRS)
+        solved, params = self.solve(size, Clock(), lambda message: None)
+        slopes = self._slopes(size.family, w, *args)
+        residual = slopes @ solved.coefficients - target * self._weight
+        first, second = self.by_states(size.family, params, w, *args)
+        step = np.linalg.solve(second, np.concatenate([residual[..., None], -first], axis=-1))
+        found = shared_noise.variances(step[..., 0], step[..., 1:], np.flatnonzero(goes_on))
+        return np.sqrt(found)
+
+    def freedoms(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
+        """Degrees of freedom that noise takes of a fit of so many of the leading terms of a size:
+        as many, where no state stands in two pairs."""
+        (w, target, *args), goes_on = self._sample(-(-_SAMPLE_ROWS * max(counts) // self._width))
+        if not goes_on.any() or not self.moved_by_states:
+            return [float(count) for count in counts]
+        solved, params = self.solve(near, Clock(), lambda message: None)
+        slopes = self._slopes(most.family, w, *args)
+        residual = slopes[..., : len(solved.coefficients)] @ solved.coefficients
+        residual = residual - target * self._weight
+        states = residual, *self.by_states(near.family, params, w, *args), goes_on
+        scores = shared_noise.scores(slopes, *states)
+        return [
+            shared_noise.freedom(slopes[..., :count], residual, scores[:, :count])
+            for count in counts
+        ]
+
+    @property
+    def _width(self) -> int:
+        return self._train[0].shape[1]
+
+    def _sample(self, pairs: int) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+        """Rows of about so many training pairs, and which of them go on with the next."""
+        places, goes_on = looked_at(self.judges.pairs, self.judges.training, pairs)
+        return tuple(a[places] for a in self._train), goes_on
 
     def _noise(self, size: Size, larger: Size, data, states) -> float:
-        """The part of the residual's mean square that a larger size leaves too: of all rows where
-        that one was judged by all of them, else of these. states: residual, its derivatives and
-        which pairs go on, as `shared_noise.scores` takes them, or None."""
+        """The part of the residual's mean square that is noise, by what a larger size explains of
+        it: of all rows where that one was judged by all of them, else of these. states: residual,
+        its derivatives and which pairs go on, as `shared_noise.scores` takes them, or None."""
 
-        def left(of: Size) -> float:
+        def left(of: Size) -> tuple[float, float, int]:
+            """Mean square, the degrees of freedom that noise takes, and the rows."""
+            count = of.family.num_parameters
             reduced = (
                 self._factors[of.group].train if larger.group in self._factors
-                else least_squares.reduce(of_rows(of.family), [data], self._weight)
+                else least_squares.reduce(self.in_rows(of.family), [data], self._weight)
             )  # fmt: skip
-            freedom = None
+            freedom = float(count)
             if states is not None:
                 slopes = self._slopes(of.family, data[0], *data[2:])
                 scores = shared_noise.scores(slopes, *states)
                 freedom = shared_noise.freedom(slopes, states[0], scores)
-            return uncertainty.variance(reduced, of.family.num_parameters, freedom)
+            square = float(np.sum(reduced.factor[count:, -1] ** 2)) / max(reduced.rows, 1)
+            return square, freedom, reduced.rows
 
-        all_of_it = left(size)
-        return left(larger) / all_of_it if all_of_it > 0 else 1.0
+        (of_all, taken, _), (of_rest, more, rows) = left(size), left(larger)
+        noise = of_rest / max(1.0 - more / rows, 1.0 / rows)
+        if not noise > 0:
+            return 1.0 if not of_all > 0 else 0.0
+        further = larger.family.num_parameters - size.family.num_parameters
+        each = noise * max(more - taken, 0.0) / further  # of noise, in what a further term explains
+        explained = rows * max(of_all - of_rest, 0.0)
+        return noise / (noise + uncertainty.misfit(explained, further, each) / rows)
 
     def _larger(self, size: Size) -> Size | None:
         """The size two further, as a symmetric map gains nothing from the odd degrees; the next, or
-        None, where there is none."""
+        None, where there is none. Of few pairs, one that they tell, if too badly to be chosen."""
         place = self.sizes.index(size)
         further = self.sizes[place + 1 : place + 3]
+        if len(further) < 2:
+            rows = self._train[1].size
+            families = (f for g in _determined(self._groups(), rows, _ROWS_THAT_TELL) for f in g)
+            beyond = (f for f in families if f.num_parameters > rows // _ROWS_PER_TERM)
+            further += [Size(f, f, _extent(f)) for f in itertools.islice(beyond, 2 - len(further))]
         return further[-1] if further else None
 
-    def _factor(self, group, clock: Clock, say) -> _Factors:
+    def factors(self, group, clock: Clock, say) -> _Factors:
+        """Those of a group's largest family, which answer for all of its sizes."""
         if group not in self._factors:
             self._factors[group] = self._known(group) or self._computed(group, clock, say)
         return self._factors[group]
@@ -324,7 +412,7 @@ class LinearSweep:
         started = time.perf_counter()
         train, outermost = tuple(a[:taken] for a in self._train), self._outermost[:taken]
         inner, outer, held = (
-            least_squares.reduce(of_rows(group), [rows], self._weight, on_block=clock.check)
+            least_squares.reduce(self.in_rows(group), [rows], self._weight, on_block=clock.check)
             for rows in (
                 tuple(a[~outermost] for a in train), tuple(a[outermost] for a in train), self._held
             )
@@ -523,6 +611,11 @@ def rows_of(prepared: Prepared, chart: AnyChart, rows) -> tuple[Any, np.ndarray]
     return data, residual_weight(chart, prepared.scale, dt)
 
 
+def of_rows(family: Any) -> Any:
+    """The family whose terms make the rows: the moves h ∇φ where pairs have a dt of their own."""
+    return _Moves(family) if isinstance(family, OfTimeStep) else family
+
+
 @dataclasses.dataclass(frozen=True)
 class _Moves:
     """h ∇φ of the terms of an S of dt."""
@@ -537,11 +630,6 @@ class _Moves:
         return dt[..., None] * self.family.term_gradients(w, dt)
 
 
-def of_rows(family: Any) -> Any:
-    """The family whose terms make the rows of `rows_of`."""
-    return _Moves(family) if isinstance(family, OfTimeStep) else family
-
-
 def _of_time_step(inputs, degree: int, signs=None) -> OfTimeStep:
     return OfTimeStep(Products(inputs, degree, signs))
 
@@ -553,13 +641,15 @@ def residual_weight(chart: AnyChart, scale, dt: float) -> np.ndarray:
     return dt / (np.tile(scale[dim:], 2) if chart.name == "type1" else np.roll(scale, dim))
 
 
-def _determined(groups: Iterable[Iterable[Any]], rows: int) -> Iterator[list[Any]]:
-    """The families, group by group, whose terms so many rows determine.
+def _determined(
+    groups: Iterable[Iterable[Any]], rows: int, each: float = _ROWS_PER_TERM
+) -> Iterator[list[Any]]:
+    """The families, group by group, whose terms so many rows determine, ``each`` for a term.
 
     Sizes rise, so the first that is too large is the last that is looked at: in many dimensions the
     terms of a high degree could not even be counted.
     """
-    most = min(_MOST_TERMS, rows // _ROWS_PER_TERM)
+    most = min(_MOST_TERMS, int(rows / each))
     for group in groups:
         kept = []
         for family in group:

@@ -1,0 +1,200 @@
+"""S of noisy pairs: its size, chart and coefficients without the bias of noisy evaluation points.
+
+A search judges sizes by residuals that are nearly all noise, and fits at measured points. Where
+that is what stopped it, the sweeps that came as far as the best are fitted again to the states that
+the pairs most likely had (`fitting.nearest_states`). In these rows the residual is a distance from
+the map's graph in units of the noise, whatever the chart, and the expected error of every size on
+fresh pairs follows from one factor (Mallows, Technometrics 15 (1973) 661).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.families.products import Products
+from gfnn_jax.fitting.nearest_states import Whitened, nearest
+from gfnn_jax.learn.candidates import Candidate, validated
+from gfnn_jax.learn.choose_law import preferred
+from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.conclude import only_noise
+from gfnn_jax.learn.request import Request
+from gfnn_jax.learn.search import AS_FAR, Entry
+from gfnn_jax.learn.searches import Searched
+from gfnn_jax.learn.sweeps import LinearSweep, Size, rows_of
+
+_MOST_SWEEPS = 3
+_NO_WORSE = 1.2  # of the expected squared error: a map that is cheaper is as good
+
+
+def without_bias(found: Searched, request: Request) -> Searched:
+    """The search with S fitted to the states that the pairs most likely had, where noise is what
+    stopped it; else as it is.
+
+    Left as they are: maps with parameters, of several dt, of many degrees of freedom by a
+    structure, of sines, and behind a law's flow.
+    """
+    ranking, law = found.found.ranking, found.law
+    if not ranking or request.structure is not None or found.of_terms is not None:
+        return found
+    best = ranking[0]
+    met = found.judges.met_by(best.candidate)
+    if met or (law is not None and preferred(law.candidate, best.candidate, np.inf)):
+        return found
+    rivals = _as_far(found)
+    if not rivals or request.clock.left <= 0 or not only_noise(best, found):
+        return found
+    request.say("fitting S to the states that noisy pairs most likely had")
+    try:
+        entry = _corrected(rivals, request)
+    except (np.linalg.LinAlgError, OutOfTime):  # a chart that is singular at some pair
+        return found
+    if not entry.candidate.validation_relative <= AS_FAR * best.candidate.validation_relative:
+        return found
+    request.tell(entry.candidate)
+    others = [e for e in found.found.entries if e.size is not entry.size]
+    again = found.found._replace(entries=[*others, entry], ranking=[entry, *ranking])
+    return found._replace(found=again)
+
+
+def _as_far(found: Searched) -> list[Entry]:
+    """The best entry of every sweep that has come as far as the best one and can be corrected."""
+    best: dict[int, Entry] = {}
+    limit = AS_FAR * found.found.ranking[0].candidate.validation_relative
+    for entry in found.found.entries:
+        error = entry.candidate.validation_relative
+        known = best.get(id(entry.sweep))
+        if error <= limit and (known is None or error < known.candidate.validation_relative):
+            best[id(entry.sweep)] = entry
+    able = [e for e in best.values() if _can_be_corrected(e)]
+    return sorted(able, key=lambda e: e.candidate.validation_relative)[:_MOST_SWEEPS]
+
+
+def _can_be_corrected(entry: Entry) -> bool:
+    plain = isinstance(entry.sweep, LinearSweep) and isinstance(entry.size.family, Products)
+    if not plain:
+        return False
+    return not entry.sweep.prepared.varied and entry.sweep.moved_by_states
+
+
+class Expected(NamedTuple):
+    """A size of a sweep: its squared error on fresh pairs, their noise in it; what noise of its
+    coefficients alone makes of that; and the variance of the noise. In units of its rows."""
+
+    size: Size
+    error: float
+    own: float
+    noise: float
+
+
+def best_size(sweep: LinearSweep, near: Size, most: Size, clock: Clock, say) -> Expected:
+    """The size of the smallest expected error, among those up to ``most``, and those beyond as long
+    as the last one is the best.
+
+    What a size leaves of its own rows is less than of fresh ones by twice what noise takes, and
+    the largest size tells the noise. near: whose residuals tell how noise is shared.
+    """
+    while True:
+        train = sweep.factors(most.group, clock, say).train
+        place = sweep.sizes.index(most)
+        sizes = sweep.sizes[: place + 1]
+        counts = [size.family.num_parameters for size in sizes]
+        left = [float(np.sum(train.factor[count:, -1] ** 2)) for count in counts]
+        taken = sweep.freedoms(near, most, counts)
+        noise = left[-1] / (train.rows - taken[-1])
+        errors = [(a + 2 * noise * b) / train.rows for a, b in zip(left, taken, strict=True)]
+        best = int(np.argmin(errors))
+        if best < place or place + 1 == len(sweep.sizes):
+            own = noise * taken[best] / train.rows
+            return Expected(sizes[best], errors[best], own, noise)
+        most = _last_of_group(sweep, sweep.sizes[place + 1])
+
+
+def _last_of_group(sweep: LinearSweep, size: Size) -> Size:
+    """The largest size that is judged from the same factor."""
+    return [other for other in sweep.sizes if other.group is size.group][-1]
+
+
+def _corrected(rivals: list[Entry], request: Request) -> Entry:
+    """The entry of smallest expected error, or the cheapest that is as good."""
+    given = request.clock, request.say
+    most = [entry.sweep.largest_known for entry in rivals]
+    starts = [
+        best_size(e.sweep, e.size, m, *given).size for e, m in zip(rivals, most, strict=True)
+    ]  # fmt: skip
+    # The same for all, so that their distances have one unit.
+    deviations = rivals[0].sweep.state_deviations(starts[0])
+    judged: list[tuple[NoisySweep, Expected]] = []
+    for entry, start, m in zip(rivals, starts, most, strict=True):
+        sweep = NoisySweep(entry.sweep, entry.sweep, start, deviations)
+        judged.append((sweep, best_size(sweep, start, m, *given)))
+    floor = min(expected.noise for _, expected in judged)
+    risks = [max(expected.error - floor, expected.own) for _, expected in judged]
+    sweep, expected = min(
+        (j for j, risk in zip(judged, risks, strict=True) if risk <= _NO_WORSE * min(risks)),
+        key=lambda j: j[1].size.operations,
+    )
+    # Once more, by states that a corrected S has found: where an S of too many terms reaches beyond
+    # the states, one pass is not enough.
+    size, m = expected.size, most[judged.index((sweep, expected))]
+    sweep = NoisySweep(sweep.plain, sweep, size, deviations)
+    size = best_size(sweep, size, m, *given).size
+    free = Clock()
+    candidate = sweep.validate(size, sweep.judge(size, free, request.say), free, request.say)
+    return Entry(candidate, sweep, size)
+
+
+class NoisySweep(LinearSweep):
+    """The sizes of a sweep, in rows of the states that its pairs most likely had.
+
+    plain: the sweep. near: one whose solution of ``size`` says where those states are. deviations:
+    (2d,) of the noise of each coordinate, ÷ its scale.
+    """
+
+    def __init__(
+        self, plain: LinearSweep, near: LinearSweep, size: Size, deviations: np.ndarray
+    ):  # fmt: skip
+        self.__dict__.update(plain.__dict__)
+        self.__dict__.pop("of_states", None)
+        self.plain, self._kept, self._factors = plain, None, {}
+        family, params = size.family, near.solve(size, Clock(), lambda message: None)[1]
+        of_noise = np.tile(deviations, 2)
+        of_point, of_target = (of * of_noise for of in plain.of_states)
+
+        def rows(which):
+            (w, target), _ = rows_of(self.prepared, self.chart, which)
+            found = nearest(
+                lambda w: family.gradient_and_hessian(params, w), w, target, of_point, of_target
+            )
+            return found.points, found.target, found.whitening
+
+        self._train, self._held = (rows(r) for r in (self.judges.training, self.judges.held_out))
+        self._weight = np.ones(len(deviations))
+
+    def in_rows(self, family: Any) -> Any:
+        """The family whose terms make the rows of this sweep."""
+        return Whitened(family)
+
+    def judge(self, size: Size, clock: Clock, say) -> Candidate:
+        """As the sweep that was corrected judges it, by the measured points."""
+        return self.plain.judge(size, clock, say)
+
+    def validate(self, size: Size, judged: Candidate, clock: Clock, say) -> Candidate:
+        """The judged size solved in these rows, and its error measured by steps."""
+        plain = self.plain.validate(size, judged, clock, say)
+        solved, params = self.solve(size, clock, say)
+        candidate = dataclasses.replace(plain, condition=solved.condition, rank=solved.rank)
+        return validated(candidate, self.prepared, self.chart, size.family, params, self.judges)
+
+    def own_error(self, size: Size) -> float:
+        """That of the measured points."""
+        return self.plain.own_error(size)
+
+    def by_states(self, family, params, w, whitening) -> tuple[np.ndarray, np.ndarray]:
+        """The residual's derivatives in z₀ and z₁ (n, 2d, 2d), those ÷ their scale."""
+        hessian = family.gradient_and_hessian(params, w)[1]
+        of_point, of_target = self.of_states
+        by = whitening @ (hessian @ of_point - of_target)
+        return by[..., : len(of_point)], by[..., len(of_point) :]

@@ -1,0 +1,175 @@
+"""S of noisy pairs: no bias of noisy evaluation points, its size, and misfit near the noise."""
+
+import jax
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.products import Products
+from gfnn_jax.fitting import least_squares, uncertainty
+from gfnn_jax.fitting.nearest_states import Whitened, nearest
+from gfnn_jax.generating.charts import MIDPOINT, TYPE2
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.learn import noisy_sweeps
+from gfnn_jax.learn.candidates import Judges, Tolerance
+from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.noisy_sweeps import NoisySweep, best_size
+from gfnn_jax.learn.prepare import prepare
+from gfnn_jax.learn.sweeps import LinearSweep
+from gfnn_jax.maps.affine import Affine
+
+SIGMA, DT = 0.03, 0.5
+
+
+def generated_pairs(chart, num, degree=4, seed=0):
+    """Pairs of the map that a known S of one degree of freedom generates, without noise; the S."""
+    rng = np.random.default_rng(seed)
+    z0 = rng.uniform(-1, 1, (num, 2))
+    family = Products(box_inputs(1.5 * np.array([[-1.0, -1.0], [1.0, 1.0]])), degree)
+    params = family.unflatten(0.15 * rng.normal(size=family.num_parameters))
+    piece = Generated(family, params, chart, DT, np.ones(2))
+    z1 = piece.refined_step(z0, chart.first_guess(z0))[0]
+    for _ in range(20):
+        z1, error = piece.refined_step(z0, chart.evaluation_point(z0, z1))
+    assert error.max() < 1e-10
+    return z0, z1, family, params
+
+
+@pytest.mark.parametrize("chart", [MIDPOINT, TYPE2], ids=["midpoint", "type2"])
+def test_rows_of_the_nearest_states_have_no_bias(chart):
+    """Coefficients of 100,000 noisy pairs against the S that made them, in standard errors."""
+    z0, z1, family, params = generated_pairs(chart, 100_000)
+    rng = np.random.default_rng(1)
+    z0, z1 = (z + SIGMA * rng.normal(size=z.shape) for z in (z0, z1))
+    w, target = chart.evaluation_point(z0, z1), chart.target_gradient(z0, z1, DT)
+    true = np.asarray(
+        least_squares.fit(family, *2 * [(w, np.asarray(family.gradient(params, w)))], np.ones(2))
+        .coefficients
+    )  # fmt: skip
+    eye, none = np.eye(2), np.zeros((2, 2))
+    ends = ((eye, none), (none, eye))
+    of_point = SIGMA * np.concatenate([chart.evaluation_point(*e).T for e in ends], axis=1)
+    of_target = SIGMA * np.concatenate([chart.target_gradient(*e, DT).T for e in ends], axis=1)
+
+    def off(of, rows) -> float:
+        """RMS of the coefficients' errors in standard errors."""
+        reduced = least_squares.reduce(of, [rows], np.ones(2))
+        count = family.num_parameters
+        found = least_squares.solve(reduced, reduced, count).coefficients
+        a = reduced.factor[:count, :count]
+        error = a @ (found - true) / np.sqrt(uncertainty.variance(reduced, count))
+        return float(np.sqrt(np.mean(error**2)))
+
+    naive = least_squares.fit(family, (w, target), (w, target), np.ones(2)).coefficients
+    assert off(family, (w, target)) > 3
+    found = naive
+    for _ in range(2):
+        near = family.unflatten(found)
+        rows = nearest(
+            lambda w, near=near: family.gradient_and_hessian(near, w),
+            w,
+            target,
+            of_point,
+            of_target,
+        )
+        reduced = least_squares.reduce(Whitened(family), [_in_order(rows)], np.ones(2))
+        found = least_squares.solve(reduced, reduced, family.num_parameters).coefficients
+    assert off(Whitened(family), _in_order(rows)) < 1.6
+    variance = uncertainty.variance(reduced, family.num_parameters)
+    assert variance == pytest.approx(1.0, abs=0.05)  # in units of the noise
+
+
+def _in_order(rows):
+    return rows.points, rows.target, rows.whitening
+
+
+def test_misfit_is_the_posterior_mean_of_what_was_simulated():
+    """Variances v ≥ 1 drawn from 1/v, and sums of squares of as many normal numbers: the mean of
+    v − 1 among those whose sum is close to a given one."""
+    rng = np.random.default_rng(0)
+    for terms in (6, 40):
+        v = np.exp(rng.uniform(0, np.log(50), 2_000_000))
+        explained = v * rng.chisquare(terms, len(v))
+        for given in (0.7 * terms, 1.0 * terms, 2.0 * terms):
+            near = np.abs(explained - given) < 0.03 * given
+            simulated = terms * np.mean(v[near] - 1)
+            found = uncertainty.misfit(2.5 * given, terms, 2.5) / 2.5
+            assert found == pytest.approx(simulated, rel=0.08)
+    assert uncertainty.misfit(1e6, 40, 1.0) == pytest.approx(1e6 * 40 / 38 - 40)
+    assert 0 < uncertainty.misfit(0.0, 40, 1.0) < 4
+
+
+def sweep_of(chart, sigma, num=3_000):
+    z0, z1, family, params = generated_pairs(chart, num)
+    rng = np.random.default_rng(2)
+    pairs = gfnn.Pairs(*(z + sigma * rng.normal(size=z.shape) for z in (z0, z1)), DT)
+    judges = Judges(pairs, np.arange(300, num), np.arange(300), Tolerance(1e-6))
+    plain = LinearSweep(prepare(pairs, CARTESIAN), chart, judges, "polynomial", None, None)
+    return plain, family, params, pairs
+
+
+def test_the_size_of_smallest_expected_error_is_that_of_the_true_s():
+    plain, *_ = sweep_of(MIDPOINT, SIGMA)
+    free = (Clock(), lambda message: None)
+    most = next(s for s in plain.sizes if s.family.degree == 6)
+    size = best_size(plain, plain.sizes[0], most, *free).size
+    deviations = plain.state_deviations(size) * plain.prepared.scale
+    np.testing.assert_allclose(deviations, SIGMA, rtol=0.1)
+    sweep = NoisySweep(plain, plain, size, plain.state_deviations(size))
+    found = best_size(sweep, size, most, *free)
+    assert found.size.family.degree == 4
+    assert found.noise == pytest.approx(1.0, abs=0.08)
+
+
+def test_derivatives_in_the_states_count_a_base_map():
+    plain, *_ = sweep_of(MIDPOINT, 0.0, 400)
+    turn = np.array([[0.8, 0.6], [-0.6, 0.8]])
+    half = Affine(turn, np.zeros(2), np.zeros(2))
+    prepared = plain.prepared.without(None, half)
+    moved = LinearSweep(prepared, MIDPOINT, plain.judges, "polynomial", None, None)
+    of_point, of_target = moved.of_states
+    z0, z1 = plain.prepared.y0[:5], plain.prepared.y1[:5]
+    states = np.concatenate([z0, z1], axis=1) / np.tile(prepared.scale, 2)
+    y1 = half.inverse().image(z1)
+    np.testing.assert_allclose(states @ of_point.T, MIDPOINT.evaluation_point(z0, y1), atol=1e-12)
+    np.testing.assert_allclose(
+        states @ of_target.T, MIDPOINT.target_gradient(z0, y1, DT), atol=1e-12
+    )  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")
+@pytest.mark.parametrize("tolerance", [1e-5, 1e-12])
+def test_pairs_without_noise_are_fitted_as_measured(monkeypatch, tolerance):
+    """The correction changes no bit of a fit that meets its tolerance, or misses it for misfit."""
+    pairs = gfnn.sample_pairs(gfnn.scenes.henon_heiles(), 300, jax.random.key(0))
+    options = {"learn": "map", "family": "polynomial", "chart": "midpoint"}
+    fit = gfnn.fit(pairs, tolerance=tolerance, **options)
+    monkeypatch.setattr("gfnn_jax.learn.fit.without_bias", lambda found, request: found)
+    again = gfnn.fit(pairs, tolerance=tolerance, **options)
+    np.testing.assert_array_equal(fit.map.pieces[0].params, again.map.pieces[0].params)
+
+
+def test_noisy_pairs_are_fitted_to_their_nearest_states(monkeypatch):
+    """Two pairs of fits: with as without the correction, error at a hundred steps."""
+    scene = gfnn.scenes.henon_heiles()
+    clean = gfnn.sample_pairs(scene, 2_000, jax.random.key(0))
+    rng = np.random.default_rng(0)
+    spread = np.std(clean.z0, axis=0)
+    z0, z1 = (
+        np.asarray(z) + 0.03 * spread * rng.normal(size=z.shape) for z in (clean.z0, clean.z1)
+    )
+    test = np.asarray(gfnn.sample_test_states(scene, 30, jax.random.key(7)))
+    reference = np.asarray(gfnn.reference_trajectories(scene, test, 50))
+
+    def error() -> float:
+        with pytest.warns(gfnn.FitWarning):
+            fit = gfnn.fit(gfnn.Pairs(z0, z1, scene.dt), learn="map", family="polynomial",
+                           chart="type2")  # fmt: skip
+        np.testing.assert_allclose(fit.noise / spread, 0.03, rtol=0.12)
+        return float(np.sqrt(np.mean((np.asarray(fit.map.rollout(test, 50)[0]) - reference) ** 2)))
+
+    corrected = error()
+    monkeypatch.setattr(noisy_sweeps, "only_noise", lambda entry, found: False)
+    assert corrected < 0.8 * error()
