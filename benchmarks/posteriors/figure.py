@@ -52,8 +52,8 @@ def figure(rows: dict[str, list[dict[str, Any]]]) -> None:
         for name, marker in zip(rows, MARKERS, strict=False)
     ]  # fmt: skip
     noise = [
-        Line2D([], [], marker="s", color=color, linestyle="none", label=f"noise {sigma:g}")
-        for sigma, color in COLORS.items()
+        Line2D([], [], marker="s", color=COLORS[sigma], linestyle="none", label=f"noise {name}")
+        for name, sigma in SIGMAS.items()
     ]  # fmt: skip
     drawn.legend(handles=[*cases, *noise], loc="outside lower center", ncols=6, fontsize=8)
     drawn.tight_layout(rect=(0, 0.07, 1, 1))
