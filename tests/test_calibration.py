@@ -1,0 +1,63 @@
+"""What benchmarks/bands.py makes of errors and bands of several data sets."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+
+from posteriors.calibration import FAR, STATES, STEPS, Cell, cells, pooled
+
+SHAPE = (STATES, len(STEPS), 4)
+
+
+def data_sets(count, error_of, band=2.0):
+    """(error, band) of each; at the last step only the first FAR states go on."""
+    found = []
+    for k in range(count):
+        error = np.broadcast_to(error_of(k), SHAPE).copy()
+        error[FAR:, -1] = np.nan
+        found.append((error, np.full(SHAPE, band)))
+    return found
+
+
+def row(found, **others):
+    return {**pooled(found, np.ones(4)), **others}
+
+
+def test_normal_errors_are_covered_as_they_should_be():
+    rng = np.random.default_rng(0)
+    found = row(data_sets(200, lambda k: rng.normal(size=SHAPE)))
+    np.testing.assert_allclose(found["coverage"], 0.9545, atol=0.01)
+    np.testing.assert_allclose(found["width"], 2.0, rtol=0.02)
+    np.testing.assert_allclose(found["rms"], 1.0, rtol=0.02)
+    assert all(isinstance(c, Cell) and c.covers for c in cells(found)[:-1])
+    assert cells(found)[-1] == "large"
+
+
+def test_chance_is_that_of_data_sets_and_not_of_their_errors():
+    """All errors of one data set lie inside together, those of one in four outside."""
+    found = row(data_sets(8, lambda k: 3.0 if k % 4 == 0 else 1.0))
+    assert found["coverage"] == [0.75] * len(STEPS)
+    expected = np.std([0, 1, 1, 1] * 2, ddof=1) / np.sqrt(8)
+    np.testing.assert_allclose(found["coverage_error"], expected)
+    assert row(data_sets(1, lambda k: 1.0))["coverage_error"] == [None] * len(STEPS)
+
+
+def test_a_lost_prediction_lies_outside():
+    found = row(data_sets(2, lambda k: np.nan if k else 1.0))
+    assert found["coverage"] == [0.5] * len(STEPS)
+    assert found["lost"] == [STATES] * (len(STEPS) - 1) + [FAR]
+    np.testing.assert_allclose(found["rms"], 1.0)
+
+
+@pytest.mark.parametrize(
+    ("relative", "judged"), [(1e-13, ["roundoff"] * 4), (0.01, [Cell] * 4), (0.06, [Cell] * 3)]
+)
+def test_rows_of_roundoff_and_far_steps_of_large_errors_are_not_judged(relative, judged):
+    found = row(data_sets(2, lambda k: relative))
+    for cell, expected in zip(cells(found), judged, strict=False):
+        assert cell == expected if isinstance(expected, str) else isinstance(cell, expected)
+    assert (cells(found)[-1] == "large") == (relative == 0.06)
