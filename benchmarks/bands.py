@@ -32,6 +32,7 @@ from posteriors.calibration import (
 from posteriors.costs import COSTS, NETWORKS, cost, together
 from posteriors.figure import figure
 from posteriors.sequences import sequences
+from posteriors.told import told
 
 from gfnn_jax.scenes import froeschle, henon_heiles, two_body
 
@@ -69,6 +70,7 @@ PIECES = {
     },
     "noise-dt-0.5": partial(sequences, 0.5),
     "noise-dt-0.05": partial(sequences, 0.05),
+    "noise-told": told,
     "cost": cost,
     "together": together,
 }
@@ -132,6 +134,19 @@ def _noise_table(found: dict[str, Numbers]) -> str:
         if m["runs"]:
             rows.append([str(m["dt"]), "all", "bands: covered %, width ÷ RMS, RMS",
                          *(_cell(c) for c in cells(m))])  # fmt: skip
+    return markdown(head, rows)
+
+
+def _told_table(found: dict[str, Numbers]) -> str:
+    head = ["what is learned", "σ ÷ spread", "fits that tell noise", "noise told ÷ noise put in"]
+    rows = []
+    for row in found["noise-told"]["measured"]["rows"] if "noise-told" in found else ():
+        ratios = [r for of_fit in row["ratios"] for r in of_fit or ()]
+        known = sum(r is not None for r in row["ratios"])
+        span = f"{min(ratios):.2f} to {max(ratios):.2f}" if ratios else "–"
+        rows.append(
+            [row["case"], f"{row['sigma']:g}", f"{known} of {len(row['ratios'])}", span]
+        )  # fmt: skip
     return markdown(head, rows)
 
 

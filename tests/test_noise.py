@@ -1,12 +1,14 @@
 """The noise of the states from the residuals of a map that is known exactly."""
 
+import jax
 import numpy as np
 import pytest
 from analytic import exact_oscillator, generated, map_of, oscillator, rotated
 
 import gfnn_jax as gfnn
 from gfnn_jax.generating.charts import MIDPOINT
-from gfnn_jax.learn.noise import state_noise
+from gfnn_jax.learn.noise import noise_of_sites, state_noise
+from gfnn_jax.scenes import froeschle
 
 
 def noisy_turns(angle, sigma, num_steps):
@@ -44,3 +46,28 @@ def test_coefficients_take_a_part_of_the_noise():
     map_, pairs = noisy_turns(0.1, np.array([1e-3, 1e-3]), 1)
     ratio = state_noise(map_, pairs, taken=0.36) / state_noise(map_, pairs, taken=0.0)
     np.testing.assert_allclose(ratio, 1.25)
+
+
+@pytest.mark.parametrize("sigma", [(1e-3, 1e-3), (1e-5, 1e-6), (1e-3, 1e-2)])
+def test_noise_of_sites_is_that_of_each_half(sigma):
+    """Of oscillators whose maps are known: random directions tell what all derivatives do."""
+    rng, angle, dim = np.random.default_rng(1), 0.7, 1
+    map_, pairs = noisy_turns(angle, np.zeros(2), 1)
+    noise = [np.array(sigma) * rng.normal(size=(1_000, 2 * dim)) for _ in range(2)]
+    z0, z1 = (z + e for z, e in zip((pairs.z0, pairs.z1), noise, strict=True))
+    found = noise_of_sites(map_, gfnn.Pairs(z0, z1, angle))
+    if min(sigma) > 0.2 * max(sigma):
+        np.testing.assert_allclose(found, sigma, rtol=0.1)
+    else:  # the smaller is hidden by the larger, which a turn mixes into both
+        assert found.max() == pytest.approx(max(sigma), rel=0.1)
+        assert found.argmax() == np.argmax(sigma)
+
+
+def test_a_fit_with_a_structure_tells_the_noise():
+    scene = froeschle(32)
+    pairs = gfnn.sample_pairs(scene, 100, jax.random.key(0))
+    rng, sigma = np.random.default_rng(0), np.repeat([1e-3, 3e-3], 32)
+    z0, z1 = (np.asarray(z) + sigma * rng.normal(size=z.shape) for z in (pairs.z0, pairs.z1))
+    with pytest.warns(gfnn.FitWarning, match="noise of about .* on positions"):
+        fit = gfnn.fit(gfnn.Pairs(z0, z1, pairs.dt), scene, learn="map")
+    np.testing.assert_allclose(fit.noise, sigma, rtol=0.1)

@@ -14,7 +14,7 @@ from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.choose_law import long_step
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.diagnose import differs_between_sequences, sequences_of, volume_change
-from gfnn_jax.learn.noise import state_noise
+from gfnn_jax.learn.noise import noise_of_sites, state_noise
 from gfnn_jax.learn.propose import proposed
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import AS_FAR, MET, Entry
@@ -29,6 +29,7 @@ _SHARE = 0.1  # of the residual, that a change of volume must explain
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 _RESIDUAL_PAIRS = 2_000  # whose residuals are looked at
 _NOISE_PAIRS = 1_024  # from which the noise of the states is measured
+_NOISE_NUMBERS = 8_192  # the same of many sites: numbers of so many pairs
 
 
 class Conclusion(NamedTuple):
@@ -57,9 +58,10 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         return Conclusion(ended, None, messages)
     diagnosis: list[str] = []
     structured = request.structure is not None  # too few pairs to look at their neighbours
-    if candidate.validation_relative > _ROUNDOFF and not structured:
+    if candidate.validation_relative > _ROUNDOFF:
         stalled = _stalled(candidate, chosen.entry, searched)
-        noise, diagnosis, reason = _what_is_left(chosen, searched, stalled)
+        left = _left_of_sites if structured else _what_is_left
+        noise, diagnosis, reason = left(chosen, searched, stalled)
         if reason and stalled:
             ended = f"larger models are no more accurate: {reason}"
         elif reason:
@@ -86,6 +88,8 @@ def _stalled(candidate: Candidate, entry: Entry | None, searched: Searched) -> b
     """Whether larger models stopped helping: in the chosen sweep, in another that has come as far,
     or, where no S was found, among the libraries of H."""
     found = searched.found
+    if searched.of_terms is not None and candidate.learns == "map":
+        return searched.of_terms.stalled
     if entry is None and not found.ranking:
         return searched.law is not None and searched.law.stalled
     limit = AS_FAR * candidate.validation_relative
@@ -195,6 +199,22 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         "larger models are no more accurate: the pairs seem to carry noise of about "
         f"{', '.join(f'{sigma:.1e}' for sigma in noise)} on the coordinates in their order{own}, "
         f"{hidden}or to have a structure that these functions cannot represent"
+    )
+    return _LeftOver(noise, [message])
+
+
+def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOver:
+    """Noise, where other libraries of the structure leave as much."""
+    if not stalled:
+        return _LeftOver(None, [])
+    judges = chosen.judges
+    few = max(1, _NOISE_NUMBERS // (2 * judges.pairs.dim))
+    rows = np.sort(judges.training)[:few]
+    noise = noise_of_sites(chosen.candidate.map, judges.pairs.take(rows))
+    message = (
+        "other libraries of the structure are no more accurate: the pairs seem to carry noise of "
+        f"about {noise[0]:.1e} on positions and {noise[-1]:.1e} on momenta, or to have terms that "
+        "these libraries do not hold"
     )
     return _LeftOver(noise, [message])
 

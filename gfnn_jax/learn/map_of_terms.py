@@ -39,16 +39,19 @@ _RISE, _ROUNDING = 1.1, 1e-15  # of the held-out error that this may cost
 _STRUCTURED_ROWS = 50_000  # numbers of training pairs that sites are fitted to: no more are needed
 _NULL_ROWS = 4_000  # of them, which tell whose gradients are combinations of others
 _BETTER = 0.5  # of the error of an H, that S of a structure must have to be taken in its stead
+_FLAT = 1.2  # libraries whose errors differ by less have met the pairs' noise
 _SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved
 
 
 class LearnedMap(NamedTuple):
     """The candidate, its error measured by steps in NumPy, and the piece that S generates. root:
-    (m, m), rootᵀ root is the coefficients' covariance."""
+    (m, m), rootᵀ root is the coefficients' covariance. stalled: whether another library of the
+    chart was no less accurate, and the tolerance is missed."""
 
     candidate: Candidate
     piece: Generated
     root: np.ndarray
+    stalled: bool
 
 
 class _Tried(NamedTuple):
@@ -68,9 +71,11 @@ def learn_map(
     """
     clock, started = clock or Clock(), time.perf_counter()
     best: _Tried | None = None
+    tried: list[_Tried] = []
     try:
         for name in _CHARTS if chart == "auto" else (chart,):
             for found in _of_chart(CHARTS[name], prepared, judges, scene, clock, say):
+                tried.append(found)
                 if best is None or found.error.bound < best.error.bound:
                     best = found
             if best is not None and best.error.bound <= judges.tolerance.bound:
@@ -83,6 +88,11 @@ def learn_map(
             "expected pairs that tell an S of such terms: they are too few, or no chart covers "
             f"them{' for all values of the parameters' if prepared.args is not None else ''}"
         )
+    rivals = [
+        f for f in tried
+        if f.piece.chart is best.piece.chart and f.error.relative <= _FLAT * best.error.relative
+    ]  # fmt: skip
+    stalled = len(rivals) > 1 and best.error.bound > judges.tolerance.bound
     if prepared.structure is not None:
         judges = _fewer(prepared, judges)
     best = _sparse(best, prepared, judges)
@@ -97,7 +107,7 @@ def learn_map(
         fit_seconds=time.perf_counter() - started,
     )  # fmt: skip
     root = _root(piece, prepared, _fewer(prepared, judges) if prepared.structure else judges)
-    return LearnedMap(with_error(candidate, best.error), piece, root)
+    return LearnedMap(with_error(candidate, best.error), piece, root, stalled)
 
 
 def map_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import nnls
 
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
 from gfnn_jax.fitting.shared_noise import variances
@@ -11,6 +12,8 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, sizes
 
 _APART = 1e-4  # of the coordinates' sizes: the step of the central differences
+_PROBES = 4  # random directions of each half of the coordinates
+_PRIOR = 0.1  # weight of the guess that the noise of each half is half of what its residual holds
 
 
 def state_noise(map_: SymplecticMap, pairs: Pairs, taken: float) -> np.ndarray:
@@ -19,19 +22,59 @@ def state_noise(map_: SymplecticMap, pairs: Pairs, taken: float) -> np.ndarray:
     taken: the part of the residuals' degrees of freedom that the map's coefficients took.
     """
     z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
-    width, size, coordinates = z0.shape[1], sizes(z0), map_.coordinates
-    angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
-    given = pairs.dt, pairs.args
-    steps = stepped(map_, z0, *given, timed=False)
-    residual = nearest_image(z1 - steps.images, angles)
+    width, size = z0.shape[1], sizes(z0)
+    residual = _difference(map_, z1, _images(map_, pairs, z0))
     jacobian = np.empty((len(z0), width, width))
     for j, apart in enumerate(_APART * size):
         offset = apart * (np.arange(width) == j)
-        ahead, behind = (
-            stepped(map_, z0 + s * offset, *given, timed=False).images for s in (1, -1)
-        )
-        jacobian[:, :, j] = nearest_image(ahead - behind, angles) / (2 * apart)
+        jacobian[:, :, j] = _change(map_, pairs, offset) / apart
     known = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
     z0, z1, r, m = z0[known], z1[known], residual[known], jacobian[known]
     shared = np.flatnonzero(np.all(z1[:-1] == z0[1:], axis=1))
     return np.sqrt(variances(r, m, shared) / (1.0 - taken))
+
+
+def noise_of_sites(map_: SymplecticMap, pairs: Pairs) -> np.ndarray:
+    """The same (2d,) where all positions have one noise, and all momenta one, as of equal sites.
+
+    The mean square of what the pairs leave over of either half is s² + Σ_j M_ij² s_j², linear in
+    the two variances. The sums of squares of M's rows are means of (M v)² over random signs v: the
+    steps that they take do not depend on d (Hutchinson, Commun. Stat. Simul. 18 (1989) 1059).
+    """
+    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
+    dim, size, rng = pairs.dim, sizes(z0), np.random.default_rng(0)
+    residual = _difference(map_, z1, _images(map_, pairs, z0))
+    halves = np.arange(2 * dim) // dim
+    grown = np.zeros((2, len(z0), 2 * dim))
+    for half in (0, 1):
+        apart = _APART * float(size[halves == half].min())
+        for _ in range(_PROBES):
+            signs = rng.choice([-1.0, 1.0], z0.shape) * (halves == half)
+            grown[half] += (_change(map_, pairs, apart * signs) / apart) ** 2 / _PROBES
+    known = np.isfinite(residual).all(axis=1) & np.isfinite(grown).all(axis=(0, 2))
+    mean = np.array([np.mean(residual[known][:, halves == half] ** 2) for half in (0, 1)])
+    factors = np.array(
+        [[np.mean(grown[by][known][:, halves == half]) for by in (0, 1)] for half in (0, 1)]
+    ) + np.eye(2)
+    # In units of each half's own residual, as q and p may differ by orders of magnitude.
+    relative = factors * mean / mean[:, None]
+    rows = np.concatenate([relative, _PRIOR * np.eye(2)])
+    found, _ = nnls(rows, np.concatenate([np.ones(2), np.full(2, 0.5 * _PRIOR)]))
+    return np.sqrt(mean * found)[halves]
+
+
+def _images(map_: SymplecticMap, pairs: Pairs, z) -> np.ndarray:
+    return stepped(map_, z, pairs.dt, pairs.args, timed=False).images
+
+
+def _change(map_: SymplecticMap, pairs: Pairs, offset) -> np.ndarray:
+    """(N, 2d), what the step changes by when the states of the pairs change by the offset, to
+    second order."""
+    z0 = np.asarray(pairs.z0)
+    ahead, behind = (_images(map_, pairs, z0 + sign * offset) for sign in (1, -1))
+    return _difference(map_, ahead, behind) / 2
+
+
+def _difference(map_: SymplecticMap, one, other) -> np.ndarray:
+    plain = map_.coordinates.forward is CARTESIAN.forward
+    return nearest_image(one - other, map_.coordinates.angles if plain else ())
