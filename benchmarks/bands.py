@@ -183,7 +183,7 @@ def tables() -> None:
     """The section of RESULTS.md, and the figure."""
     found, rows = results(PIECES, "bands"), calibration()
     parts = [_calibration_table(rows)]
-    parts += [part(found) for part in (_noise_table, _cost_table, _together_table)]
+    parts += [part(found) for part in (_noise_table, _told_table, _cost_table, _together_table)]
     between_markers(TABLES, "bands", "\n\n".join(parts))
     figure(rows)
 
