@@ -55,5 +55,5 @@ def _sequences(scene, sigma: float, seed: int):
     states = np.asarray(gfnn.reference_trajectories(scene, z0, STATES - 1))
     true = sigma * states.reshape(-1, states.shape[-1]).std(axis=0)
     states = states + true * np.random.default_rng(seed).normal(size=states.shape)
-    halves = (part.reshape(-1, states.shape[-1]) for part in (states[:, :-1], states[:, 1:]))
-    return gfnn.Pairs(*halves, scene.dt), true
+    z0, z1 = (part.reshape(-1, states.shape[-1]) for part in (states[:, :-1], states[:, 1:]))
+    return gfnn.Pairs(z0, z1, scene.dt), true
