@@ -318,12 +318,14 @@ class LinearSweep:
 
     def freedoms(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
         """Degrees of freedom that noise takes of a fit of so many of the leading terms of a size:
-        as many, where no state stands in two pairs."""
+        as many, where no state stands in two pairs. near: whose residuals tell the noise; it may
+        be the larger one, whose terms begin with those of the other."""
         (w, target, *args), goes_on = self._sample(-(-_SAMPLE_ROWS * max(counts) // self._width))
         if not goes_on.any() or not self.moved_by_states:
             return [float(count) for count in counts]
         solved, params = self.solve(near, Clock(), lambda message: None)
-        slopes = self._slopes(most.family, w, *args)
+        larger = max(near, most, key=lambda size: size.family.num_parameters)
+        slopes = self._slopes(larger.family, w, *args)
         residual = slopes[..., : len(solved.coefficients)] @ solved.coefficients
         residual = residual - target * self._weight
         states = residual, *self.by_states(near.family, params, w, *args), goes_on
