@@ -800,9 +800,9 @@ TRAINING = """
 import sys
 from gfnn_jax import cli
 from gfnn_jax.jobs import progress
-from gfnn_jax.learn import sweeps
+from gfnn_jax.learn import network_sweep
 
-sweeps._CHECKPOINT_SECONDS = progress.BETWEEN = 0.0
+network_sweep._CHECKPOINT_SECONDS = progress.BETWEEN = 0.0
 sys.exit(cli.main(sys.argv[1:]))
 """
 

@@ -17,7 +17,7 @@ from gfnn_jax.fitting.levenberg_marquardt import (
 from gfnn_jax.jobs.predict import predict
 from gfnn_jax.jobs.progress import Progress
 from gfnn_jax.jobs.search import search
-from gfnn_jax.learn import sweeps
+from gfnn_jax.learn import network_sweep
 
 DT = 0.5
 
@@ -159,7 +159,7 @@ def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path, monkeypat
         return search(pairs_of(150, 0), None, progress=Stopping(at), kept_in=folder, job={},
                       max_seconds=None, **options)  # fmt: skip
 
-    monkeypatch.setattr(sweeps, "_CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(network_sweep, "_CHECKPOINT_SECONDS", 0.0)
     whole = run(tmp_path / "whole", 99)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "part", 3)

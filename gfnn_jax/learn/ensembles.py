@@ -19,7 +19,9 @@ from gfnn_jax.fitting.levenberg_marquardt import (
     LMState,
     levenberg_marquardt_together,
 )
-from gfnn_jax.learn.sweeps import NetworkSweep, Size, rows_of, trial_residual
+from gfnn_jax.learn.network_sweep import NetworkSweep
+from gfnn_jax.learn.rows import rows_of
+from gfnn_jax.learn.sweeps import Size, trial_residual
 
 # Variance of a misfit beside that of residuals which differ by chance, as in `fitting.uncertainty`:
 # it is alike along an orbit. Hénon–Heiles, 500 pairs without noise, three seeds: with 1, bands of

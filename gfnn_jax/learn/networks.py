@@ -32,7 +32,7 @@ from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.cost_of_flow import contraction_of, omega_h_of, operations_of
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.prepare import Prepared
-from gfnn_jax.learn.sweeps import residual_weight
+from gfnn_jax.learn.rows import residual_weight
 from gfnn_jax.scenes.scene import Scene
 
 

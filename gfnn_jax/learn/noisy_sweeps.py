@@ -21,9 +21,10 @@ from gfnn_jax.learn.choose_law import preferred
 from gfnn_jax.learn.clock import Clock, OutOfTime
 from gfnn_jax.learn.conclude import only_noise
 from gfnn_jax.learn.request import Request
+from gfnn_jax.learn.rows import rows_of
 from gfnn_jax.learn.search import AS_FAR, Entry
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.learn.sweeps import LinearSweep, Size, rows_of
+from gfnn_jax.learn.sweeps import LinearSweep, Size
 
 _MOST_SWEEPS = 3
 _NO_WORSE = 1.2  # of the expected squared error: a map that is cheaper is as good

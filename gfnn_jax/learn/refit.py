@@ -31,7 +31,7 @@ from gfnn_jax.learn.conclude import not_met
 from gfnn_jax.learn.fit import Fit
 from gfnn_jax.learn.formula import Term, formula
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
-from gfnn_jax.learn.sweeps import of_rows, residual_weight
+from gfnn_jax.learn.rows import of_rows, residual_weight
 from gfnn_jax.maps.saved import packed, unpacked
 from gfnn_jax.maps.symplectic_map import SymplecticMap, serves_any_dt
 from gfnn_jax.phase_space import Pairs

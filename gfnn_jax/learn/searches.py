@@ -25,11 +25,12 @@ from gfnn_jax.learn.law_maps import (
 )
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.map_of_terms import LearnedMap, map_of
+from gfnn_jax.learn.network_sweep import NetworkSweep
 from gfnn_jax.learn.networks import learn_network
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import Entry, Found, search
-from gfnn_jax.learn.sweeps import NetworkSweep, sweep_of_dt, sweeps_for
+from gfnn_jax.learn.sweeps import sweep_of_dt, sweeps_for
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 OnBetter = Callable[[SymplecticMap, Candidate], Any]

@@ -9,21 +9,19 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from gfnn_jax.families.inputs import box_inputs, variable_signs
-from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.families.products import Products, number_of_terms
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
-from gfnn_jax.fitting.levenberg_marquardt import LMResult, LMState, levenberg_marquardt
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.learn.candidates import Candidate, Judges, validated
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.held_out import looked_at, outermost
 from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.learn.rows import of_rows, rows_of
 from gfnn_jax.maps.affine import Affine
 
 # Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
@@ -45,11 +43,8 @@ _MOST_OPERATIONS = 3.2e11
 _SCARCE_FROM_DIM, _PARITY_ROWS, _ODD_DEGREE, _NO_GAIN = 3, 6, 3, 0.98
 _WORTH_KEEPING = 1.0  # seconds
 _OPERATIONS_PER_SECOND = 1e10  # of a factorisation on one thread, for the estimate that is told
-# The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
-_MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
 # Pairs of a block that goes to one of two halves: long beside the noise that neighbours share.
 _HALVES_BLOCK = 50
-_CHECKPOINT_SECONDS = 10.0
 # Rows per term of a larger size, by which noise is told from misfit.
 _SAMPLE_ROWS = 6
 _NOISE_PAIRS = 4_096  # that tell the noise of each coordinate
@@ -440,75 +435,6 @@ class LinearSweep:
         )  # fmt: skip
 
 
-class NetworkSweep:
-    """The one size of a network, trained by Levenberg–Marquardt."""
-
-    kind = "mlp"
-    short_of_pairs = False  # its one size is trained on any number of pairs
-
-    def __init__(self, prepared, chart, judges: Judges, max_iterations, seed, checkpoints):
-        self.prepared, self.chart, self.judges = prepared, chart, judges
-        self._max_iterations, self._seed, self._checkpoints = max_iterations, seed, checkpoints
-        (w, target), self._weight = rows_of(prepared, chart, judges.training[:_MLP_PAIRS])
-        coordinates = prepared.coordinates
-        inputs = box_inputs(
-            w, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
-            cyclic=coordinates.cyclic,
-        )  # fmt: skip
-        family = Mlp(inputs, _MLP_HIDDEN, _MLP_ACTIVATION, amplitude_of(w, target))
-        self._train, self.sizes = (w, target), [Size(family, family, 0.0)]
-        self._params: Any = None
-
-    def judge(self, size: Size, clock: Clock, say: Callable[[str], Any]) -> Candidate:
-        """Train the network."""
-        family = size.family
-        held, _ = rows_of(self.prepared, self.chart, self.judges.held_out)
-
-        def report(state: LMState) -> None:
-            say(
-                f"{self.chart.name} {family.label}: iteration {state.iteration}, "
-                f"validation {state.validation_rms:.2e} of the data's spread"
-            )
-
-        resume = self._checkpoints.latest(self._like()) if self._checkpoints else None
-        result = self._trained(
-            validation=held, weight=self._weight, max_iterations=self._max_iterations,
-            max_seconds=clock.left if np.isfinite(clock.left) else None,
-            target_rms=0.5 * self.judges.tolerance.bound,
-            on_progress=report, checkpoint=_every_few_seconds(self._checkpoints),
-            resume=resume[1] if resume else None,
-        )  # fmt: skip
-        error = self.judges.estimate(result.validation_rms)
-        return Candidate(
-            label=family.label, family=self.kind, chart=self.chart.name,
-            num_parameters=family.num_parameters, operations=size.operations,
-            validation_rms=error.rms, validation_relative=error.relative,
-            validation_bound=error.bound, deviations=error.deviations,
-            train_rms=result.train_rms, fit_seconds=result.seconds,
-        )  # fmt: skip
-
-    def _like(self) -> LMState:
-        """A state whose structure is that of this training's."""
-        theta = np.zeros(self.sizes[0].family.num_parameters)
-        return LMState(theta, theta, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0, 0.0)
-
-    def _trained(self, **options: Any) -> LMResult:
-        """The training; its params are then those of the sweep."""
-        family = self.sizes[0].family
-        start = family.init(jax.random.key(self._seed), np.float64)
-        result = levenberg_marquardt(family, start, *self._train, **options)
-        self._params = jax.tree.map(np.asarray, result.params)
-        return result
-
-    def validate(self, size: Size, judged: Candidate, clock: Clock, say) -> Candidate:
-        """The trained network with its error measured by steps."""
-        return validated(judged, self.prepared, self.chart, size.family, self._params, self.judges)
-
-    def solve(self, size: Size, clock: Clock, say) -> tuple[Any, Any]:
-        """The params of the trained network."""
-        return None, self._params
-
-
 def _extent(family) -> float:
     """The degree of products, or log₂ of the number of sines."""
     return float(np.log2(family.num_parameters) if isinstance(family, Sines) else family.degree)
@@ -563,21 +489,6 @@ def is_even(prepared: Prepared, judges: Judges) -> bool:
     return with_odd >= _NO_GAIN * without
 
 
-def _every_few_seconds(checkpoints) -> Callable | None:
-    """A checkpoint callback that saves when ten seconds have passed since it last did."""
-    if checkpoints is None:
-        return None
-    last = time.monotonic()
-
-    def save(state: LMState) -> None:
-        nonlocal last
-        if time.monotonic() - last > _CHECKPOINT_SECONDS:
-            checkpoints.save(state.iteration, state)
-            last = time.monotonic()
-
-    return save
-
-
 def trial_residual(prepared: Prepared) -> float:
     """The held-out residual of ∇S, ÷ scale, of polynomials of a low degree in the midpoint chart:
     how near these pairs are to a map that a small S generates. Infinite where some are missing."""
@@ -600,47 +511,8 @@ def trial_residual(prepared: Prepared) -> float:
     return residual
 
 
-def rows_of(prepared: Prepared, chart: AnyChart, rows) -> tuple[Any, np.ndarray]:
-    """(w, target_gradient) of these rows, with their args where there are some, and the weight that
-    makes a row of ∇S unit-free. Where each pair has its own dt: (w, h times that, dt), as `_Moves`
-    has its terms."""
-    (y0, y1), (_, args) = (prepared.y0[rows], prepared.y1[rows]), prepared.given(rows)
-    dt = prepared.dt
-    if prepared.own_dt is not None:
-        dt, args = 1.0, prepared.own_dt[rows, None]
-    data = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, dt)
-    data = data if args is None else (*data, args)
-    return data, residual_weight(chart, prepared.scale, dt)
-
-
-def of_rows(family: Any) -> Any:
-    """The family whose terms make the rows: the moves h ∇φ where pairs have a dt of their own."""
-    return _Moves(family) if isinstance(family, OfTimeStep) else family
-
-
-@dataclasses.dataclass(frozen=True)
-class _Moves:
-    """h ∇φ of the terms of an S of dt."""
-
-    family: OfTimeStep
-
-    @property
-    def num_parameters(self) -> int:
-        return self.family.num_parameters
-
-    def term_gradients(self, w, dt):
-        return dt[..., None] * self.family.term_gradients(w, dt)
-
-
 def _of_time_step(inputs, degree: int, signs=None) -> OfTimeStep:
     return OfTimeStep(Products(inputs, degree, signs))
-
-
-def residual_weight(chart: AnyChart, scale, dt: float) -> np.ndarray:
-    """h over the scale of what each entry of ∇S changes, (2d,): ∂S/∂q changes p and conversely; in
-    type 1 both entries are momenta."""
-    dim = len(scale) // 2
-    return dt / (np.tile(scale[dim:], 2) if chart.name == "type1" else np.roll(scale, dim))
 
 
 def _determined(

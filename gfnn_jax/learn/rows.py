@@ -1,0 +1,51 @@
+"""The rows of the least-squares problem of S, from prepared pairs."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.families.time_step import OfTimeStep
+from gfnn_jax.generating.charts import AnyChart
+from gfnn_jax.learn.prepare import Prepared
+
+
+def rows_of(prepared: Prepared, chart: AnyChart, rows) -> tuple[Any, np.ndarray]:
+    """(w, target_gradient) of these rows, with their args where there are some, and the weight that
+    makes a row of ∇S unit-free. Where each pair has its own dt: (w, h times that, dt), as `_Moves`
+    has its terms."""
+    (y0, y1), (_, args) = (prepared.y0[rows], prepared.y1[rows]), prepared.given(rows)
+    dt = prepared.dt
+    if prepared.own_dt is not None:
+        dt, args = 1.0, prepared.own_dt[rows, None]
+    data = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, dt)
+    data = data if args is None else (*data, args)
+    return data, residual_weight(chart, prepared.scale, dt)
+
+
+def of_rows(family: Any) -> Any:
+    """The family whose terms make the rows: the moves h ∇φ where pairs have a dt of their own."""
+    return _Moves(family) if isinstance(family, OfTimeStep) else family
+
+
+@dataclasses.dataclass(frozen=True)
+class _Moves:
+    """h ∇φ of the terms of an S of dt."""
+
+    family: OfTimeStep
+
+    @property
+    def num_parameters(self) -> int:
+        return self.family.num_parameters
+
+    def term_gradients(self, w, dt):
+        return dt[..., None] * self.family.term_gradients(w, dt)
+
+
+def residual_weight(chart: AnyChart, scale, dt: float) -> np.ndarray:
+    """h over the scale of what each entry of ∇S changes, (2d,): ∂S/∂q changes p and conversely; in
+    type 1 both entries are momenta."""
+    dim = len(scale) // 2
+    return dt / (np.tile(scale[dim:], 2) if chart.name == "type1" else np.roll(scale, dim))
