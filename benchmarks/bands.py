@@ -38,8 +38,8 @@ from gfnn_jax.scenes import froeschle, henon_heiles, two_body
 
 # Of two bodies, whose H is no sum of products of coordinates.
 KEPLER_TERMS = ["p1**2 + p2**2", "1/sqrt(q1**2 + q2**2)"]
-# Few coefficients make all errors of a law's fit, and those of 10⁴ pairs take little time.
-SETS_OF_LAWS = {**DATA_SETS, 10_000: 20}
+# Few coefficients make all errors of a law's fit.
+SETS_OF_LAWS = {size: 2 * count for size, count in DATA_SETS.items()}
 # Of S there have to be more pairs than 100 in four dimensions, of a ring fewer tell it.
 SETS_OF_S = {size: DATA_SETS[size] for size in (1_000, 10_000)}
 SETS_OF_RINGS = {size: DATA_SETS[size] for size in (100, 1_000)}
@@ -51,9 +51,12 @@ CASES = {
         calibrated, henon_heiles, lend=False, data_sets=SETS_OF_LAWS, learn="hamiltonian"
     ),
     "two-body-law": partial(
-        calibrated, two_body, lend=False, learn="hamiltonian", terms=KEPLER_TERMS
+        calibrated, two_body, lend=False, data_sets=SETS_OF_LAWS, learn="hamiltonian",
+        terms=KEPLER_TERMS,
     ),
-    "pendulum-law": partial(calibrated, pendulum, lend=False, learn="hamiltonian"),
+    "pendulum-law": partial(
+        calibrated, pendulum, lend=False, data_sets=SETS_OF_LAWS, learn="hamiltonian"
+    ),
     "henon-heiles": partial(
         calibrated, henon_heiles, lend=False, data_sets=SETS_OF_S, **_S_OF_HENON_HEILES
     ),
