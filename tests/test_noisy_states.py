@@ -1,5 +1,8 @@
 """S of noisy pairs: no bias of noisy evaluation points, its size, and misfit near the noise."""
 
+from types import SimpleNamespace
+from typing import cast
+
 import jax
 import numpy as np
 import pytest
@@ -17,7 +20,7 @@ from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.noisy_sweeps import NoisySweep, best_size
 from gfnn_jax.learn.prepare import prepare
-from gfnn_jax.learn.sweeps import LinearSweep
+from gfnn_jax.learn.sweeps import LinearSweep, Size
 from gfnn_jax.maps.affine import Affine
 
 SIGMA, DT = 0.03, 0.5
@@ -121,6 +124,24 @@ def test_the_size_of_smallest_expected_error_is_that_of_the_true_s():
     found = best_size(sweep, size, most, *free)
     assert found.size.family.degree == 4
     assert found.noise == pytest.approx(1.0, abs=0.08)
+
+
+@pytest.mark.parametrize(("misfit", "count"), [(1.0, 3), (2.0, 6), (4.0, 6)])
+def test_misfit_weighs_as_much_as_in_the_posterior(misfit, count):
+    """Three more terms take three units of noise: worth it where twice the misfit is more."""
+    counts, rows, larger = (3, 6, 9), 1_009, []
+    factor = np.zeros((10, 10))
+    # Noise of variance 1: every term takes one unit of it, and what nine leave is one for each row.
+    factor[3:, -1] = np.sqrt([1 + misfit / 3] * 3 + [1.0] * 3 + [rows - 9.0])
+    sizes = [Size(SimpleNamespace(num_parameters=n), larger, float(n)) for n in counts]
+    sweep = SimpleNamespace(
+        sizes=sizes,
+        factors=lambda *_: SimpleNamespace(train=least_squares.Reduced(factor, rows)),
+        freedoms=lambda near, most, counts: list(map(float, counts)),
+    )
+    found = best_size(cast(LinearSweep, sweep), sizes[0], sizes[-1], Clock(), print)
+    assert found.size.family.num_parameters == count
+    assert found.noise == pytest.approx(1.0)
 
 
 def test_derivatives_in_the_states_count_a_base_map():

@@ -25,7 +25,7 @@ _MOST_LEVERAGE = 0.9
 # Variance of a misfit beside that of residuals which differ from one part of phase space to another
 # by chance: it is alike along an orbit. With 1, bands of two deviations held 86 to 90 % of the true
 # errors at step 100 (benchmarks/bands.py, Hénon–Heiles without noise) and were 1.3 RMS errors wide.
-_ALIKE = 2.0
+ALIKE = 2.0
 # The mean of a variance that fewer terms tell does not exist.
 _FEWEST_TERMS, _TINY = 3, 1e-280
 
@@ -83,7 +83,7 @@ def root(
     leverage = np.minimum(np.sum((sample @ along) ** 2, axis=1), _MOST_LEVERAGE)
     rows = np.linalg.qr((residual / (1 - leverage))[:, None] * sample, mode="r")
     share = 0.0 if noise is None else min(noise, 1.0)
-    misfit = (1 - share) * _ALIKE * max(train.rows / told, 1.0)
+    misfit = (1 - share) * ALIKE * max(train.rows / told, 1.0)
     of_noise = rows if scores is None else np.linalg.qr(scores, mode="r")
     both = np.concatenate([np.sqrt(share) * of_noise, np.sqrt(misfit) * rows])
     weighted = np.linalg.qr(np.sqrt(train.rows / len(sample)) * both, mode="r")

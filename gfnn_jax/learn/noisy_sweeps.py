@@ -4,7 +4,7 @@ A search judges sizes by residuals that are nearly all noise, and fits at measur
 that is what stopped it, the sweeps that came as far as the best are fitted again to the states that
 the pairs most likely had (`fitting.nearest_states`). In these rows the residual is a distance from
 the map's graph in units of the noise, whatever the chart, and the expected error of every size on
-fresh pairs follows from one factor (Mallows, Technometrics 15 (1973) 661).
+fresh pairs follows from one factor, as Mallows' C_p does (Technometrics 15 (1973) 661).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.families.products import Products
+from gfnn_jax.fitting import uncertainty
 from gfnn_jax.fitting.nearest_states import Whitened, nearest
 from gfnn_jax.learn.candidates import Candidate, validated
 from gfnn_jax.learn.choose_law import preferred
@@ -81,8 +82,9 @@ def _can_be_corrected(entry: Entry) -> bool:
 
 
 class Expected(NamedTuple):
-    """A size of a sweep: its squared error on fresh pairs, their noise in it; what noise of its
-    coefficients alone makes of that; and the variance of the noise. In units of its rows."""
+    """A size of a sweep: its squared error on fresh pairs, their noise in it, misfit weighed as in
+    the posterior; what noise of its coefficients alone makes of that; and the variance of the
+    noise. In units of its rows."""
 
     size: Size
     error: float
@@ -94,8 +96,9 @@ def best_size(sweep: LinearSweep, near: Size, most: Size, clock: Clock, say) -> 
     """The size of the smallest expected error, among those up to ``most``, and those beyond as long
     as the last one is the best.
 
-    What a size leaves of its own rows is less than of fresh ones by twice what noise takes, and
-    the largest size tells the noise. near: whose residuals tell how noise is shared.
+    The largest size tells the noise. Misfit is alike along an orbit, and weighs as much as in the
+    posterior: of two sizes with one error at step 1, that with less misfit is better at step 100.
+    near: whose residuals tell how noise is shared.
     """
     while True:
         train = sweep.factors(most.group, clock, say).train
@@ -103,13 +106,16 @@ def best_size(sweep: LinearSweep, near: Size, most: Size, clock: Clock, say) -> 
         sizes = sweep.sizes[: place + 1]
         counts = [size.family.num_parameters for size in sizes]
         left = [float(np.sum(train.factor[count:, -1] ** 2)) for count in counts]
-        taken = sweep.freedoms(near, most, counts)
+        taken = np.array(sweep.freedoms(near, most, counts))
         noise = left[-1] / (train.rows - taken[-1])
-        errors = [(a + 2 * noise * b) / train.rows for a, b in zip(left, taken, strict=True)]
+        # What each size leaves out of the next, beyond what that one makes of noise.
+        added = np.maximum(-np.diff(left) - noise * np.diff(taken), 0.0)
+        misfit = np.append(np.cumsum(added[::-1])[::-1], 0.0)
+        own = noise * taken / train.rows
+        errors = noise + own + uncertainty.ALIKE * misfit / train.rows
         best = int(np.argmin(errors))
         if best < place or place + 1 == len(sweep.sizes):
-            own = noise * taken[best] / train.rows
-            return Expected(sizes[best], errors[best], own, noise)
+            return Expected(sizes[best], float(errors[best]), float(own[best]), noise)
         most = _last_of_group(sweep, sweep.sizes[place + 1])
 
 
