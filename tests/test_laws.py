@@ -142,6 +142,29 @@ def test_refusals(options, words):
     assert "\n" not in str(refused.value)
 
 
+def test_a_law_that_misses_the_tolerance_is_the_best_there_is():
+    """A pendulum told nothing of its angle: the degrees of −cos q, whose odd ones bring nothing."""
+    z0 = np.random.default_rng(0).uniform(-1.3, 1.3, (300, 2))
+
+    def end(z):
+        swing = lambda t, z: [z[1], -np.sin(z[0])]  # noqa: E731
+        return solve_ivp(swing, (0, 0.2), z, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+
+    pairs = gfnn.Pairs(z0, np.array([end(z) for z in z0]), 0.2)
+    with pytest.warns(gfnn.FitWarning, match="no candidate meets"):
+        fit = gfnn.fit(pairs, learn="hamiltonian", tolerance=1e-10)
+    assert fit.hamiltonian is not None
+    found = {term.term: term.coefficient for term in fit.hamiltonian.terms}
+    assert list(found) == ["q1²", "p1²", "q1⁴", "q1⁶", "q1⁸"]
+    np.testing.assert_allclose(
+        list(found.values())[:4], [1 / 2, 1 / 2, -1 / 24, 1 / 720], rtol=5e-3
+    )
+    assert fit.chosen.validation_relative < 1e-6
+    assert repr(fit).startswith("Fit(flow H, 5 terms, 5 parameters: one-step error ")
+    assert "not met" in repr(fit)
+    assert repr(fit.map) == "SymplecticMap(Flow; cartesian, d = 1, dt = 0.2)"
+
+
 def test_a_known_term_makes_a_hard_law_easy():
     """A rational potential, which no polynomial of few terms is."""
 

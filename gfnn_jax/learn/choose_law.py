@@ -58,6 +58,8 @@ def law_of(
     structured = prepared.structure is not None
     foremost = learn == "hamiltonian" or terms or prepared.varied or structured
     options = OPTIONS if foremost else _BESIDE
+    if learn == "hamiltonian":  # no map stands in for a law that misses the tolerance
+        options = dataclasses.replace(options, only_within=False)
     if structured:  # nothing else is learned of bodies, and of sites S in a few seconds
         beside = learn == "auto" and prepared.of_terms
         most = _PART_STRUCTURED * clock.left if beside else np.inf

@@ -83,6 +83,16 @@ class Fit:
     pairs: Pairs | None = None
     scene: Scene | None = None
 
+    def __repr__(self) -> str:
+        """One line: the chosen map, its error and the tolerance."""
+        best = self.chosen
+        error = best.validation_relative if self.asked.relative else best.validation_rms
+        return (
+            f"Fit({best.chart} {best.label}, {best.num_parameters:,} parameters: one-step error "
+            f"{error:.2e} (≤ {best.validation_bound:.2e} at 95 %), tolerance {self.tolerance:g} "
+            f"{'met' if self.met else 'not met'}, {self.num_pairs:,} pairs, {self.seconds:.1f} s)"
+        )
+
     def accelerate(
         self, *, dt: float | None = None, region=None, tolerance: float | None = None,
         num_pairs: int = NUM_PAIRS, seed: int = 0, max_seconds: float | None = MAX_SECONDS,

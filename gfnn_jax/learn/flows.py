@@ -181,9 +181,8 @@ def _searched(
             errors.append(found.error.bound)
             if best.error.bound <= bound or poor == most_poor:
                 break
-            if not structured and _out_of_reach(
-                errors, len(libraries) - 1 - libraries.index(family), bound
-            ):
+            left = len(libraries) - 1 - libraries.index(family)
+            if not structured and options.only_within and _out_of_reach(errors, left, bound):
                 options = dataclasses.replace(options, thresholds=())  # no law: nothing to read
                 break
     except OutOfTime:

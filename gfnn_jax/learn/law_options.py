@@ -26,7 +26,8 @@ class Options:
     as a part of the tolerance. generators: degrees of those that look for misfit; sampled_rows: per
     term, where what is left over is looked at. max_seconds: of the search; mode_seconds: where
     modes grow, growth_part: the part of them in which they may. max_operations, mode_operations: of
-    the flows that are evaluated on the way, counted.
+    the flows that are evaluated on the way, counted. only_within: whether a law that misses the
+    tolerance is of no use, so that the search ends where it is out of reach.
     """
 
     degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 8)
@@ -53,6 +54,7 @@ class Options:
     max_operations: float = np.inf
     mode_operations: float = np.inf
     growth_part: float = 0.7
+    only_within: bool = True
 
 
 OPTIONS = Options()

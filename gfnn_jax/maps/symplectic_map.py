@@ -99,7 +99,7 @@ class RolloutInfo(NamedTuple):
     meta_fields=("coordinates",),
     drop_fields=("posterior",),
 )
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class SymplecticMap:
     """A learned map and what it knows of its data.
 
@@ -136,6 +136,11 @@ class SymplecticMap:
     def __post_init__(self):
         if isinstance(self.dt, (int, float)):
             object.__setattr__(self, "dt", np.asarray(self.dt, self.scale.dtype))
+
+    def __repr__(self) -> str:
+        """One line, without the arrays."""
+        pieces = ", ".join(type(piece).__name__ for piece in self.pieces)
+        return f"SymplecticMap({pieces}; {self.coordinates.name}, d = {self.dim}, dt = {self.dt})"
 
     @property
     def dim(self) -> int:
