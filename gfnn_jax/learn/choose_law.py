@@ -29,6 +29,8 @@ _BESIDE = dataclasses.replace(
 DEARER = 4.0
 # Where none meets the tolerance, errors that the noise of held-out pairs does not tell apart.
 _AS_GOOD = 1.01
+# Of the error that a library must leave to have helped, where noise hides what it brings.
+_GAINED_ALONE = 0.8
 _TURNED = 0.2  # radians backwards that are worth a word
 _PART = 0.5  # of the time that is left, at most, for H beside a map
 _PART_STRUCTURED = 0.6  # the same where S is a sum over sites
@@ -59,7 +61,7 @@ def law_of(
     foremost = learn == "hamiltonian" or terms or prepared.varied or structured
     options = OPTIONS if foremost else _BESIDE
     if learn == "hamiltonian":  # no map stands in for a law that misses the tolerance
-        options = dataclasses.replace(options, only_within=False)
+        options = dataclasses.replace(options, only_within=False, gained=_GAINED_ALONE)
     if structured:  # nothing else is learned of bodies, and of sites S in a few seconds
         beside = learn == "auto" and prepared.of_terms
         most = _PART_STRUCTURED * clock.left if beside else np.inf

@@ -123,7 +123,7 @@ def learn_hamiltonian(
         if best.noisy:
             # What is pruned is soon fitted: the search is over.
             problem.check, problem.spend = clock.check, Counted(np.inf).spend
-            best = _pruned(problem, best, judges.training, prepared, judges, options)
+            best = _told_from_noise(problem, best, judges.training, prepared, judges, options)
         best = _sparse(problem, best, prepared, judges, options, say)
         there = dataclasses.replace(everywhere, held_out=everywhere.training[outer])
         if outer.any():
@@ -195,7 +195,7 @@ def _searched(
     stalled = poor == most_poor
     near = [f for f in tried if f.error.relative <= options.flat * best.error.relative]
     if len(near) > 1 and best.error.bound > bound:  # noise: the fewest terms leave no more of it
-        best = near[0]._replace(noisy=True)
+        best = near[0]._replace(noisy=True, larger=near[-1])
         stalled, options = True, dataclasses.replace(options, thresholds=(options.certain,))
     return best._replace(stalled=stalled), options
 
@@ -348,23 +348,51 @@ def _scattered(z) -> np.ndarray:
     return z + size * np.random.default_rng(0).normal(size=z.shape)
 
 
+def _told_from_noise(
+    problem, smallest: FittedLaw, rows, prepared, judges, options: Options
+) -> FittedLaw:
+    """The terms that these pairs tell from noise: of the smallest library whose error is that of
+    the noise, and those of the largest that they tell beside them. An error that is noise for the
+    most part hides terms which 10,000 pairs tell."""
+    found = _pruned(problem, smallest, rows, prepared, judges, options)
+    if smallest.larger is None:
+        return found
+    with contextlib.suppress(OutOfTime):
+        few = _significant(problem, smallest.larger, rows, options)
+        more = 0 if few is None else few.family.num_parameters - found.family.num_parameters
+        if few is None or more <= 0:
+            return found
+        few = _refitted(problem, few, rows, prepared, judges)
+        # Twice the logarithm of the likelihood's ratio.
+        gained = 2 * few.fit.rows * np.log(found.fit.rms / few.fit.rms)
+        if gained > options.certain**2 * more and few.error.relative <= found.error.relative:
+            return few._replace(noisy=True)
+    return found
+
+
 def _pruned(problem, full: FittedLaw, rows, prepared, judges, options: Options) -> FittedLaw:
-    """The terms that all of these pairs tell from noise, fitted to them: one Gauss–Newton problem
-    of all terms says which, so that only a few are fitted to many pairs."""
+    """The terms that all of these pairs tell from noise, fitted to them."""
+    few = _significant(problem, full, rows, options)
+    if few is not None:
+        few = _refitted(problem, few, rows, prepared, judges)
+        if few.error.relative <= options.rise * full.error.relative:
+            return few
+    return _refitted(problem, full, rows, prepared, judges)
+
+
+def _significant(problem, full: FittedLaw, rows, options: Options) -> FittedLaw | None:
+    """The terms that these pairs tell from noise, which one Gauss–Newton problem of all terms says,
+    so that only a few are fitted to many pairs; None where it tells none."""
     resolved = np.setdiff1d(rows, np.setdiff1d(full.rows, full.fit.used))
     found = problem.factor(full.family, full.fit.coefficients, full.fit.steps, resolved)
-    if np.isfinite(found.cost):
-        kept, start = significant(
-            found.matrix, full.fit.coefficients, found.rows, options.certain
-        )  # fmt: skip
-        few = full._replace(
-            family=full.family.take(tuple(kept.tolist())), fit=full.fit._replace(coefficients=start)
-        )
-        if len(kept):
-            few = _refitted(problem, few, rows, prepared, judges)
-            if few.error.relative <= options.rise * full.error.relative:
-                return few
-    return _refitted(problem, full, rows, prepared, judges)
+    if not np.isfinite(found.cost):
+        return None
+    kept, start = significant(found.matrix, full.fit.coefficients, found.rows, options.certain)
+    if not len(kept):
+        return None
+    return full._replace(
+        family=full.family.take(tuple(kept.tolist())), fit=full.fit._replace(coefficients=start)
+    )
 
 
 def _sparse(problem, full: FittedLaw, prepared, judges, options: Options, say) -> FittedLaw:

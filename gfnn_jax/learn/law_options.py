@@ -23,8 +23,9 @@ class Options:
     explained: standard errors of the part of a residual that is noise, within which all of it is.
     gained: a library that lowers the error by less has not helped; twice in a row ends the search.
     truncation: a flow's own error, as a part of the tolerance. goal: residual that modes grow to,
-    as a part of the tolerance. generators: degrees of those that look for misfit; sampled_rows: per
-    term, where what is left over is looked at. max_seconds: of the search; mode_seconds: where
+    as a part of the tolerance. generators: degrees of those that look for misfit, beside the one
+    that is so far ``beyond`` the law's own: an even H lacks no odd terms; sampled_rows: per term,
+    where what is left over is looked at. max_seconds: of the search; mode_seconds: where
     modes grow, growth_part: the part of them in which they may. max_operations, mode_operations: of
     the flows that are evaluated on the way, counted. only_within: whether a law that misses the
     tolerance is of no use, so that the search ends where it is out of reach.
@@ -48,6 +49,7 @@ class Options:
     truncation: float = 0.1
     goal: float = 0.3
     generators: tuple[int, ...] = (2, 3, 4, 5, 6)
+    beyond: int = 2
     sampled_rows: int = 6
     max_seconds: float = 30.0
     mode_seconds: float = 60.0

@@ -88,8 +88,9 @@ class FittedLaw(NamedTuple):
     """rows: that the fit was given; it has left out those that the flow does not resolve.
     undetermined: of the null terms, those that other states would tell from the rest. ended: why a
     library that grew did so no longer. stalled: whether larger libraries were no better. noisy:
-    whether their errors were the same, which is that of the pairs. whole: what whole sequences
-    tell, where they were fitted."""
+    whether their errors were the same, which is that of the pairs; larger: the largest
+    of those. whole:
+    what whole sequences tell, where they were fitted."""
 
     family: Terms | Sums
     fit: FlowFit
@@ -100,6 +101,7 @@ class FittedLaw(NamedTuple):
     ended: str = ""
     stalled: bool = False
     noisy: bool = False
+    larger: FittedLaw | None = None
     whole: Whole | None = None
 
 
@@ -228,7 +230,7 @@ def covariance_root(
         return np.full((count, count), np.nan)
     slopes = images.by_coefficient / scale[:, None]
     left, scores, states, noise = residual / scale, None, None, None
-    if structure is None:  # of many coordinates both would take too much
+    if isinstance(found.family, Terms):  # of many coordinates both would take too much
         if goes_on.any():
             first = images.by_state * scale
             second = np.broadcast_to(-np.diag(scale), first.shape)
@@ -236,7 +238,8 @@ def covariance_root(
                 slopes, left, first / scale[:, None], second / scale[:, None], goes_on
             )
             states = first, second, goes_on
-        noise = unexplained(prepared, rows, residual, count, states)
+        degree = int(np.max(np.sum(found.family.powers, axis=1)))
+        noise = unexplained(prepared, rows, residual, count, degree, states)
     train = Reduced(np.asfortranarray(fit.factor), fit.rows)
     return uncertainty.root(
         train, count, slopes.reshape(-1, count), np.hypot(left, _NEAR_ROUNDOFF).ravel(),
@@ -244,11 +247,14 @@ def covariance_root(
     )  # fmt: skip
 
 
-def unexplained(prepared: Prepared, rows, residual, taken: int, states) -> float | None:
-    """Of the mean square of what a map leaves over (n, 2d) on these rows, the part that no
+def unexplained(
+    prepared: Prepared, rows, residual, taken: int, degree: int, states
+) -> float | None:  # fmt: skip
+    """Of the mean square of what a law leaves over (n, 2d) on these rows, the part that no
     generator K explains, residual = J∇K at the images: K of as high a degree as the rows tell.
-    taken: coefficients that the map itself was given. states: the residual's derivatives and which
-    pairs go on, as `shared_noise.scores` takes them, or None. None where the rows are too few.
+    taken: coefficients that the law itself was given, degree: its own. states: the residual's
+    derivatives and which pairs go on, as `shared_noise.scores` takes them, or None. None where the
+    rows are too few.
 
     1 where K explains no more than it would of noise, by ``explained`` standard errors: an F test.
     """
@@ -257,7 +263,8 @@ def unexplained(prepared: Prepared, rows, residual, taken: int, states) -> float
         z, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
         cyclic=coordinates.cyclic,
     )  # fmt: skip
-    sizes = [Products(inputs, degree) for degree in OPTIONS.generators]
+    degrees = sorted({*OPTIONS.generators, degree + OPTIONS.beyond})
+    sizes = [Products(inputs, n) for n in degrees]
     most = min(len(rows) * width // OPTIONS.sampled_rows, OPTIONS.most_terms)
     known = [family for family in sizes if family.num_parameters <= most]
     if not known:
