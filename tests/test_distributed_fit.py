@@ -253,7 +253,7 @@ def varied(of, sigma=1e-3):
 @pytest.mark.parametrize(
     ("of", "options"),
     [
-        ("dt", {"learn": "map", "tolerance": 1e-3}),
+        pytest.param("dt", {"learn": "map", "tolerance": 1e-3}, marks=pytest.mark.slow),
         ("dt", {"learn": "hamiltonian", "terms": ("p1**2", "q1**2"), "tolerance": 5e-3}),
         ("parameters", {"learn": "map", "chart": "type2", "tolerance": 1e-3}),
     ],

@@ -283,6 +283,7 @@ def test_pairs_are_drawn_in_the_region_that_is_named(law):
         dataclasses.replace(law, hamiltonian=None).accelerate()
 
 
+@pytest.mark.slow
 def test_a_map_that_is_far_cheaper_than_the_law_is_fitted_to_pairs_of_the_law(pairs, monkeypatch):
     few = pairs.take(np.arange(60))
     for module in (searches, choose_law):  # as if the law's step were ten times as dear
