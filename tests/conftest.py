@@ -46,6 +46,8 @@ def pytest_configure(config):
     shared = {
         "jax_compilation_cache_dir": str(config.cache.mkdir("compiled")),
         "jax_persistent_cache_min_compile_time_secs": 0.02,
+        # Lines of source in what is compiled take time to lower and to compile; nobody reads them.
+        "jax_traceback_in_locations_limit": 0,
     }
     for name, value in shared.items():
         os.environ[name.upper()] = str(value)

@@ -208,6 +208,7 @@ def test_two_fields_at_every_site(tmp_path, structure):
     np.testing.assert_allclose(found, z1[12:], atol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_scene_lends_its_structure():
     scene = scenes.fput(dim=18)
     pairs = gfnn.sample_pairs(scene, 12, jax.random.key(0))
@@ -339,6 +340,7 @@ def test_where_the_fixed_point_diverges():
     assert memory is None or memory.temp_size_in_bytes < 8 * (2 * dim) ** 2
 
 
+@pytest.mark.slow
 def test_a_flow_whose_fixed_point_diverges():
     """By Newton–Krylov as by Newton's method with matrices; tangents of both kinds agree."""
     family, params = springs(20)
@@ -444,6 +446,7 @@ def test_what_goes_with_no_structure_is_refused(options, said):
         gfnn.fit(pairs, **options)
 
 
+@pytest.mark.slow
 def test_the_command_line_takes_a_structure(tmp_path):
     """Fewer pairs than coordinates, in a file; a formula in the report; a prediction."""
     family, params = springs(40)

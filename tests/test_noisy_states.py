@@ -176,6 +176,7 @@ def test_pairs_without_noise_are_fitted_as_measured(monkeypatch, tolerance):
     np.testing.assert_array_equal(fit.map.pieces[0].params, again.map.pieces[0].params)
 
 
+@pytest.mark.slow
 def test_noisy_pairs_are_fitted_to_their_nearest_states(monkeypatch):
     """Two pairs of fits: with as without the correction, error at a hundred steps."""
     scene = gfnn.scenes.henon_heiles()

@@ -182,6 +182,7 @@ def alone(folder):
     return (folder / "alone.npz").read_bytes()
 
 
+@pytest.mark.slow
 def test_two_processes_write_one_result(folder, alone):
     found = ended(started(folder, folder / "two.npz"))
     assert [status for status, *_ in found] == [0, 0], found
