@@ -31,9 +31,9 @@ def largest_defect(step, states):
 
 KEY = jax.random.key(0)
 SYMPLECTIC = {
-    "la": (la_step, la_init(KEY, 2, 6, 4)),
-    "g": (g_step, g_init(KEY, 2, 7, 9)),
-    "p": (lambda params, z: p_step(params, z, DT), p_init(KEY, 2, 7, 3)),
+    "la": (jax.jit(la_step), la_init(KEY, 2, 6, 4)),
+    "g": (jax.jit(g_step), g_init(KEY, 2, 7, 9)),
+    "p": (jax.jit(lambda params, z: p_step(params, z, DT)), p_init(KEY, 2, 7, 3)),
 }
 
 
