@@ -1,6 +1,7 @@
 """Strict numerics for every test: float64, no silent rank or dtype promotion."""
 
 import contextlib
+import gc
 import os
 import signal
 import subprocess
@@ -45,10 +46,15 @@ def pytest_configure(config):
     shared = {
         "jax_compilation_cache_dir": str(config.cache.mkdir("compiled")),
         "jax_persistent_cache_min_compile_time_secs": 0.02,
+        # Lines of source in what is compiled take time to lower and to compile; nobody reads them.
+        "jax_traceback_in_locations_limit": 0,
     }
     for name, value in shared.items():
         os.environ[name.upper()] = str(value)
         jax.config.update(name, value)
+    # Tracing makes millions of small objects that live on: looking through them so often as Python
+    # does by itself takes a twentieth of the suite's time.
+    gc.set_threshold(50_000, 20, 20)
     # The suite's workers want all cores: threads of the linear algebra would wait for each other.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     threadpool_limits(limits=1, user_api="blas")

@@ -156,6 +156,7 @@ def test_a_dependence_that_is_no_power_is_a_series():
     assert tried[-1] <= 42
 
 
+@pytest.mark.slow
 def test_auto_finds_a_law_of_many_functions_of_a_parameter():
     """The series needs a library of more than the sixty terms that a law beside a map may have."""
     law = given_terms(1, ["p**2/(2*(0.3 + l**2)) - 9.81*(0.2 + l)*cos(q)"], ("l",))
@@ -276,6 +277,7 @@ def test_a_series_in_state_and_parameter_steps_other_ones(series):
     np.testing.assert_array_equal(outside.status, [0, 1])
 
 
+@pytest.mark.slow
 def test_a_series_is_differentiated_in_its_parameter(series):
     z, h = np.array([0.2, -0.1]), 1e-5
 

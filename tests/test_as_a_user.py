@@ -9,9 +9,11 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import as_a_user as benchmark
 
+# Of the pendulum's levels of noise two are quick: the largest, and one between.
 LONG = {
     "satellite", "satellite-any-height", "penning-linear", "penning-quartic", "double-pendulum",
-    "fput-4", "fput-8", "noisy-file", "interleaved",
+    "fput-4", "fput-8", "noisy-file", "interleaved", "noise-pendulum-1e-03", "noise-pendulum-1e-05",
+    "noise-pendulum-1e-06",
 }  # fmt: skip
 
 

@@ -37,6 +37,7 @@ def test_a_law_is_fitted_to_whole_sequences(noisy):
     """Pairs alone gave 2 to 5e-5 of one step and 4 to 10e-4 of a hundred."""
     scene, fit = noisy
     assert fit.hamiltonian.arcs == 40
+    assert fit.chosen.num_parameters == 6
     np.testing.assert_allclose(fit.noise, NOISE, rtol=0.04)
     test = np.asarray(gfnn.sample_test_states(scene, 40, jax.random.key(111)))
     reference = np.asarray(gfnn.reference_trajectories(scene, test, 100))
@@ -90,6 +91,7 @@ def test_directions_that_no_row_tells_are_not_sampled():
     assert np.linalg.norm(root @ [0.0, 1.0, 1.0]) > 0.01
 
 
+@pytest.mark.slow
 def test_noise_leaves_the_six_terms_of_the_law(noisy):
     scene, fit = noisy
     assert fit.chosen.num_parameters == 6

@@ -104,7 +104,9 @@ def test_every_method_ends_in_a_step(name, monkeypatch):
     assert np.max(np.abs(states[:, 1] - sequences.z[:3, 1])) < 0.5
 
 
-@pytest.mark.parametrize(("name", "share"), [("hnn", 0.2), ("srnn-5", 0.1)])
+@pytest.mark.parametrize(
+    ("name", "share"), [("hnn", 0.2), pytest.param("srnn-5", 0.1, marks=pytest.mark.slow)]
+)
 def test_learns_an_oscillator(name, share, monkeypatch):
     """RMS error in four steps, as a share of how far the states move. HNN's is that of finite
     differences: (φ − 1)/dt is the field up to dt/2."""

@@ -36,7 +36,7 @@ def spherical_pendulum_pairs(count, latitude=False):
     ("latitude", "expected"),
     [
         (False, "0.5 p2**2/sin(q1)**2 - cos(q1) + 0.5 p1²"),
-        (True, "0.5 p2**2/cos(q1)**2 + sin(q1) + 0.5 p1²"),
+        pytest.param(True, "0.5 p2**2/cos(q1)**2 + sin(q1) + 0.5 p1²", marks=pytest.mark.slow),
     ],
 )
 def test_a_spherical_pendulum_told_nothing(latitude, expected):

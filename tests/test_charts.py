@@ -19,7 +19,11 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.phase_space import symplecticity_defect
 
 SKEW = Chart("skew 0.3", 0.3)
-EVERY = pytest.mark.parametrize("chart", [*CHARTS.values(), SKEW], ids=lambda chart: chart.name)
+EVERY = pytest.mark.parametrize(
+    "chart",
+    [*CHARTS.values(), pytest.param(SKEW, marks=pytest.mark.slow)],
+    ids=lambda chart: chart.name,
+)
 NEAR_IDENTITY = [TYPE2, TYPE3, MIDPOINT, SKEW]
 DT, BATCH = 0.3, 16
 
@@ -127,7 +131,11 @@ def test_jacobian_of_the_residual_and_determinant_are_those_of_the_formulas(char
     np.testing.assert_allclose(np.abs(product), 1.0, rtol=1e-9)
 
 
-@pytest.mark.parametrize("chart", [TYPE1, MIDPOINT], ids=lambda chart: chart.name)
+@pytest.mark.parametrize(
+    "chart",
+    [pytest.param(TYPE1, marks=pytest.mark.slow), MIDPOINT],
+    ids=lambda chart: chart.name,
+)
 def test_derivatives_of_step_and_rollout_in_state_and_parameters(chart):
     """Forward = reverse = through the iterations = finite difference, along a random direction."""
     flat, unravel = ravel_pytree((random_params(chart), STATES[0, :2]))

@@ -140,6 +140,7 @@ def test_a_runaway_is_lost_from_there_on():
     assert kept.status.tolist() == [0, 4]
 
 
+@pytest.mark.slow
 def test_the_papers_recipe_on_the_standard_map(small):
     """Its map commutes with the shifts by 2π, and S sees no more of θ than cos and sin."""
     data = SharedData(scenes.make("standard-map-regular"), 0, True)

@@ -253,7 +253,7 @@ def varied(of, sigma=1e-3):
 @pytest.mark.parametrize(
     ("of", "options"),
     [
-        ("dt", {"learn": "map", "tolerance": 1e-3}),
+        pytest.param("dt", {"learn": "map", "tolerance": 1e-3}, marks=pytest.mark.slow),
         ("dt", {"learn": "hamiltonian", "terms": ("p1**2", "q1**2"), "tolerance": 5e-3}),
         ("parameters", {"learn": "map", "chart": "type2", "tolerance": 1e-3}),
     ],
@@ -373,6 +373,7 @@ def moved_alike(one, other):
     np.testing.assert_allclose(moved[0], moved[1], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_two_processes_fit_one_map(data, undisturbed):
     """Each on its own number of devices."""
     found = ended(started(data / "two", data / "pairs.npz", *OPTIONS, "--devices", 1, count=2))

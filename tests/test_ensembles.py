@@ -112,7 +112,7 @@ def test_the_map_is_the_mean_and_its_samples_are_symplectic(fit):
     assert np.max(np.abs(energy[..., -1] - energy[..., 0])) < 0.02
 
 
-@pytest.mark.parametrize("noise", [0.0, 1e-2])
+@pytest.mark.parametrize("noise", [0.0, pytest.param(1e-2, marks=pytest.mark.slow)])
 def test_bands_hold_the_true_error(fit, noise):
     if noise:
         with pytest.warns(gfnn.FitWarning):

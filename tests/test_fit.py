@@ -538,6 +538,7 @@ def test_a_base_map_is_found_where_it_is_needed():
     assert fit.symplecticity_defect < 1e-12
 
 
+@pytest.mark.slow
 def test_a_linear_map_far_from_the_identity_needs_a_base_map():
     """A turn by 3 radians: the midpoint chart's determinant is cos²(1.5) = 0.005."""
     z = disc(300)

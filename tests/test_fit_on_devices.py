@@ -21,6 +21,7 @@ from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.learn.clock import Counted, OutOfTime
 
 FITS = """
+import sys
 import warnings
 import jax
 jax.config.update("jax_enable_x64", True)
@@ -39,7 +40,7 @@ options = {
     "networks": dict(family="mlp", chart="midpoint", ensemble=3, max_iterations=6,
                      max_seconds=None),
 }
-for name, own in pairs.items():
+for name, own in ((kind, pairs[kind]) for kind in sys.argv[1:]):
     found = {n: gfnn.fit(own, devices=n, **options[name]) for n in (None, 1, 2, 4, 8)}
     bits = {n: [np.asarray(a).tobytes() for a in jax.tree.leaves(f.map)] for n, f in found.items()}
     assert all(bits[n] == bits[1] for n in (2, 4, 8)), f"{name}: bits depend on the devices"
@@ -82,11 +83,15 @@ def quartic(number):
     return gfnn.Pairs(z, images(family, np.array([0.5, 0.25]), z, DT, Steps(12, 8)).states, DT)
 
 
-def test_the_same_bits_on_any_number_of_devices():
+@pytest.mark.parametrize(
+    "kind",
+    ["map", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("law", "networks"))],
+)
+def test_the_same_bits_on_any_number_of_devices(kind):
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
     path = os.pathsep.join([os.path.dirname(__file__), *sys.path])
     ran = subprocess.run(
-        [sys.executable, "-c", FITS], capture_output=True, text=True, check=False,
+        [sys.executable, "-c", FITS, kind], capture_output=True, text=True, check=False,
         env={**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": path},
     )  # fmt: skip
     assert ran.returncode == 0, ran.stderr

@@ -90,6 +90,7 @@ def test_inverse_and_defect(newton):
 
 @pytest.mark.parametrize("newton", [False, True])
 def test_derivatives_in_everything_forward_and_reverse(newton):
+    @jax.jit
     def image(params, dt, z):
         piece = Flow(FAMILY, params, dt, jnp.ones(4), 3, 1 if newton else 2, newton)
         return piece.step(z[None])[0][0]
@@ -124,8 +125,9 @@ def test_newton_solves_what_the_fixed_point_does_not():
     stiff = given_terms(1, ["p**2", "q**2"])
     z = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (4, 2)))
     made = {n: Flow(stiff, np.array([0.5, 50.0]), 1.0, np.ones(2), 3, 1, n) for n in (False, True)}
-    assert (made[False].step(z)[1].status == NOT_CONVERGED).all()
-    assert (made[True].step(z)[1].status == OK).all()
+    step = jax.jit(lambda piece, z: piece.step(z))
+    assert (step(made[False], z)[1].status == NOT_CONVERGED).all()
+    assert (step(made[True], z)[1].status == OK).all()
 
 
 def test_no_states_have_no_images():
@@ -138,9 +140,9 @@ def test_a_plain_function_is_a_hamiltonian():
         return z[1] ** 2 / 2 - params * jnp.cos(z[0])
 
     same = given_terms(1, ["p**2/2", "-cos(q)"])
-    z = jnp.asarray(Z[:, :2])
-    one = Flow(pendulum, jnp.float64(1.0), 0.3, np.ones(2), 5).step(z)[0]
-    other = Flow(same, np.ones(2), 0.3, np.ones(2), 5).step(z)[0]
+    z, step = jnp.asarray(Z[:, :2]), jax.jit(lambda piece, z: piece.step(z)[0])
+    one = step(Flow(pendulum, jnp.float64(1.0), 0.3, np.ones(2), 5), z)
+    other = step(Flow(same, np.ones(2), 0.3, np.ones(2), 5), z)
     np.testing.assert_allclose(one, other, atol=1e-15)
 
 

@@ -107,6 +107,7 @@ def test_long_steps_from_the_logarithm():
     assert off(family, fit.coefficients) < 1e-12
 
 
+@pytest.mark.slow
 def test_standard_errors_are_those_of_noise():
     pairs, sigma = henon_heiles(2_000, 0.5), 1e-4
     pulls = []

@@ -212,6 +212,7 @@ def test_chaotic_statistics_are_those_of_the_exact_map(exact, k):
 # Precision
 
 
+@pytest.mark.slow
 def test_float32_keeps_six_digits_and_says_its_dtype(clean):
     single = jax.tree.map(
         lambda a: np.asarray(a, np.float32) if getattr(a, "dtype", None) == np.float64 else a, clean

@@ -1,6 +1,7 @@
 """The rooms of the house stand in one order, and each third-party library has one home."""
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -29,10 +30,15 @@ HOMES = {  # the module, and those whose names begin as its own does
 }
 
 
+@functools.cache
 def modules():
+    """(name, syntax tree) of every module."""
+    found = []
     for path in sorted(PACKAGE.rglob("*.py")):
         name = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
-        yield name.removesuffix(".__init__"), ast.parse(path.read_text(encoding="utf-8"))
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        found.append((name.removesuffix(".__init__"), tree))
+    return found
 
 
 def imports(tree):

@@ -81,6 +81,7 @@ def test_the_report_holds_the_formula(law):
     assert told["model"]["learns"] == "hamiltonian"
 
 
+@pytest.mark.slow
 def test_a_map_asked_for_is_a_map(pairs):
     fit = gfnn.fit(pairs, tolerance=1e-3, learn="map")
     assert fit.chosen.learns == "map"
@@ -252,6 +253,7 @@ def test_single_precision_data_give_a_law_too(pairs):
     assert len(fit.hamiltonian.terms) == 6
 
 
+@pytest.mark.slow
 def test_an_alias_is_named_and_the_map_is_had_in_time():
     """A quarter turn and more in a step: the slowest of many laws. Half a turn: none at all."""
 
@@ -296,6 +298,7 @@ def test_pairs_are_drawn_in_the_region_that_is_named(law):
         dataclasses.replace(law, hamiltonian=None).accelerate()
 
 
+@pytest.mark.slow
 def test_a_map_that_is_far_cheaper_than_the_law_is_fitted_to_pairs_of_the_law(pairs, monkeypatch):
     few = pairs.take(np.arange(60))
     for module in (searches, choose_law):  # as if the law's step were ten times as dear

@@ -60,8 +60,13 @@ LINEAR = {
     ),
 }
 
+# Each like two others: what is before a piece, and a map backwards.
+ALIKE = ("a flow before", "type 1, backwards")
 
-@pytest.mark.parametrize("name", LINEAR)
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow if n in ALIKE else ()) for n in LINEAR]
+)
 def test_of_a_linear_map_it_is_the_logarithm(name):
     map_ = LINEAR[name]
     at_zero, *units = np.asarray(map_.step(np.concatenate([np.zeros((1, 2)), np.eye(2)]))[0])
@@ -80,7 +85,7 @@ def test_of_a_linear_map_it_is_the_logarithm(name):
 def test_the_series_of_the_midpoint_rule():
     """Hairer, Lubich & Wanner, Geometric Numerical Integration, IX: H̃ = S − h²/24 S''(J∇S, J∇S) +
     O(h⁴)."""
-    z = WELL[:10]
+    z = WELL[:44]  # as many states as the rollout below saves: one program
     gradient, hessian = HENON_HEILES.gradient_and_hessian(C, z)
     field = apply_j(gradient)
     second = np.einsum("ni,nij,nj->n", field, hessian, field) / 24

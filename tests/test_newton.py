@@ -331,7 +331,11 @@ def rough_steps(chart, params, z):
     return image, info, error / (size * (1.0 + DT * largest(largest(jnp.abs(hessian)))))
 
 
-@pytest.mark.parametrize("chart", [TYPE2, MIDPOINT], ids=lambda chart: chart.name)
+@pytest.mark.parametrize(
+    "chart",
+    [pytest.param(TYPE2, marks=pytest.mark.slow), MIDPOINT],
+    ids=lambda chart: chart.name,
+)
 @hypothesis.settings(max_examples=60, deadline=None, derandomize=True, database=None)
 @hypothesis.given(
     seed=st.integers(0, 2**32 - 1),

@@ -40,7 +40,11 @@ def generated_pairs(chart, num, degree=4, seed=0):
     return z0, z1, family, params
 
 
-@pytest.mark.parametrize("chart", [MIDPOINT, TYPE2], ids=["midpoint", "type2"])
+@pytest.mark.parametrize(
+    "chart",
+    [MIDPOINT, pytest.param(TYPE2, marks=pytest.mark.slow)],
+    ids=["midpoint", "type2"],
+)
 def test_rows_of_the_nearest_states_have_no_bias(chart):
     """Coefficients of 100,000 noisy pairs against the S that made them, in standard errors."""
     z0, z1, family, params = generated_pairs(chart, 100_000)
@@ -172,6 +176,7 @@ def test_pairs_without_noise_are_fitted_as_measured(monkeypatch, tolerance):
     np.testing.assert_array_equal(fit.map.pieces[0].params, again.map.pieces[0].params)
 
 
+@pytest.mark.slow
 def test_noisy_pairs_are_fitted_to_their_nearest_states(monkeypatch):
     """Two pairs of fits: with as without the correction, error at a hundred steps."""
     scene = gfnn.scenes.henon_heiles()

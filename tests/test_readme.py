@@ -26,14 +26,17 @@ def gfnn_commands():
 
 @pytest.fixture(scope="module")
 def example():
-    """The names that the example leaves behind, and the line that its text is made of."""
+    """The text of the example and the names that it leaves behind, after a hundredth of its steps:
+    the programs of the tests are compiled quickly, and step slowly."""
     code, _ = blocks("python")
+    fewer = code.replace("num_steps=100_000, save_every=100", "num_steps=1_000, save_every=1")
+    assert fewer != code
     names: dict = {}
     strict = jax.config.jax_numpy_dtype_promotion  # pyright: ignore[reportAttributeAccessIssue]
     # As in a user's session, where nothing is strict.
     jax.config.update("jax_numpy_rank_promotion", "allow")
     jax.config.update("jax_numpy_dtype_promotion", "standard")
-    exec(compile(code, "README.md", "exec"), names)
+    exec(compile(fewer, "README.md", "exec"), names)
     yield code, names
     jax.config.update("jax_numpy_rank_promotion", "raise")
     jax.config.update("jax_numpy_dtype_promotion", strict)

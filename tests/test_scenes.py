@@ -115,8 +115,11 @@ def test_two_body_law():
 
 @pytest.mark.parametrize(
     "name",
-    ["two-body", "henon-heiles-regular", "henon-heiles-printed", "pcr3bp", "driven-pendulum"],
-)
+    [
+        "two-body", "henon-heiles-regular", "pcr3bp", "driven-pendulum",
+        pytest.param("henon-heiles-printed", marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
 def test_reversor(name):
     """ρᵀJρ = −J, and H∘ρ = H in the inner coordinates, so that φ∘ρ∘φ = ρ; features keep or flip."""
     scene = scenes.make(name)
@@ -224,10 +227,13 @@ def exponents(scene, states):
     return np.asarray(optimised(states)) / LYAPUNOV_TIME
 
 
+LONG = ("henon-heiles-printed", "pcr3bp", "toda", "fput")
+
+
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(n, marks=pytest.mark.slow if n in ("henon-heiles-printed", "pcr3bp") else ())
+        pytest.param(n, marks=pytest.mark.slow if n in LONG else ())
         for n in scenes.names()
         if n != "n-body"  # some of its bodies meet others: neither is claimed
     ],

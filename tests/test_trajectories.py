@@ -16,6 +16,16 @@ from gfnn_jax.phase_space import hamiltonian_vector_field
 
 KEY = jax.random.key(0)  # made once: that compiles as well
 INTEGRATED = ("henon-heiles-regular", "henon-heiles-printed", "pcr3bp")
+# Each like another, but for the energy, a term of H or the parameters, or drawn by other tests:
+# and long to compile.
+ALIKE = (
+    "henon-heiles-printed", "henon-heiles-chaotic", "pcr3bp", "driven-pendulum", "fput",
+    "henon-heiles-section",
+)  # fmt: skip
+
+
+def long_ones_slow(names):
+    return [pytest.param(n, marks=pytest.mark.slow if n in ALIKE else ()) for n in names]
 
 
 def integrated(name, **changes):
@@ -28,7 +38,7 @@ def neighbours(scene):
     return np.array([scene.sampling.start]) + 0.01 * np.arange(3.0)[:, None]
 
 
-@pytest.mark.parametrize("name", INTEGRATED)
+@pytest.mark.parametrize("name", long_ones_slow(INTEGRATED))
 def test_flow_agrees_with_another_solver(name):
     scene = scenes.make(name)
     z0 = neighbours(scene)
@@ -116,7 +126,7 @@ def test_integration_against_the_exact_kepler_solution():
     assert distance.max() < 2e-11
 
 
-@pytest.mark.parametrize("name", INTEGRATED)
+@pytest.mark.parametrize("name", long_ones_slow(INTEGRATED))
 def test_forward_and_back(name):
     """The reversor turns time round: ρ φ_t ρ φ_t = 1."""
     scene = scenes.make(name)
@@ -173,14 +183,7 @@ def test_time_dependent_hamiltonian():
     np.testing.assert_allclose(z[0, :, 0], (np.cos(t) - np.cos(2 * t)) / 3, atol=1e-13, rtol=0)
 
 
-# Each like another, but for the energy, a term of H or the parameters: and long to compile.
-ALIKE = ("henon-heiles-printed", "henon-heiles-chaotic", "pcr3bp", "driven-pendulum")
-
-
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=pytest.mark.slow if n in ALIKE else ()) for n in scenes.names()],
-)
+@pytest.mark.parametrize("name", long_ones_slow(scenes.names()))
 def test_pairs_are_the_same_bits_for_the_same_seed_and_conserve_the_invariants(name):
     scene = scenes.make(name)
     pairs, again, other = (tr.sample_pairs(scene, 16, jax.random.key(s)) for s in (3, 3, 4))
