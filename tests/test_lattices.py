@@ -382,7 +382,7 @@ def test_gmres_takes_any_matrix():
     np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("reduced", [False, True])
+@pytest.mark.parametrize("reduced", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_coupled_standard_maps(tmp_path, reduced):
     """No flow: S of every site, whichever turns the images of the angles are given with."""
     scene = scenes.froeschle(dim=24)
