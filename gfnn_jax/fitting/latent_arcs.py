@@ -1,0 +1,180 @@
+"""Gauss–Newton over arcs whose states are latent.
+
+An arc is a stretch of one run: states x_0 … x_{L−1} at its nodes, of which only
+
+    y_n = g(x_n; p) + noise,        x_{n+1} = F_n(x_n; p)
+
+is known. All nodes are kept as unknowns, so that every step F_n is evaluated at once, and an arc need not
+be followed from its first state (multiple shooting; Bock, 1981). An iteration linearises
+
+    δx_{n+1} = Φ_n δx_n + Γ_n δp + c_n,      c_n = F_n(x_n) − x_{n+1}   (the defect)
+
+which makes δx_n a function of δx_0 and δp alone. The arc's own δx_0 is eliminated by its own QR; what remains
+of all arcs are rows for δp. Where it converges the defects are zero, and each arc is an orbit of the law.
+Residuals enter in units of the noise through Huber's soft-L1 loss, ρ(r) = 2k²(√(1 + (r/k)²) − 1).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+ROBUST = 2.5  # k, in standard deviations
+_DEFECT = 0.1  # a defect of this many standard deviations costs as much as a residual of one
+_SHRINK, _GROW = 0.2, 5.0  # of the damping
+
+
+class Steps(NamedTuple):
+    """What a model gives for states (A, L, m): those after each step (A, L − 1, m), and derivatives
+    in the states before (…, m, m) and in the n coefficients (…, m, n)."""
+
+    states: np.ndarray
+    by_state: np.ndarray
+    by_coefficients: np.ndarray
+
+
+class Observed(NamedTuple):
+    """g at the states (A, L, k), and its derivatives (A, L, k, m) and (A, L, k, n)."""
+
+    values: np.ndarray
+    by_state: np.ndarray
+    by_coefficients: np.ndarray
+
+
+class Model(Protocol):
+    """States that move and are seen: what `fit_arcs` asks of a law, or of any other map."""
+
+    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps: ...
+
+    def observe(self, p: np.ndarray, x: np.ndarray) -> Observed: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Fitted:
+    """The fit of all arcs: coefficients p (n,), states x (A, L, m), residuals (A, L, k) in units of the noise
+    (NaN where nothing was seen), the triangle of δp (its R'R is the information matrix of p), and whether
+    it converged."""
+
+    p: np.ndarray
+    x: np.ndarray
+    residuals: np.ndarray
+    triangle: np.ndarray
+    cost: float
+    iterations: int
+    converged: bool
+
+    def covariance(self) -> np.ndarray:
+        """(RᵀR)⁻¹, for white residuals of unit variance."""
+        inverse = np.linalg.pinv(self.triangle)
+        return inverse @ inverse.T
+
+
+def fit_arcs(
+    model: Model,
+    p: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    sigma: np.ndarray,
+    state_scale: np.ndarray,
+    max_iterations: int = 30,
+    tolerance: float = 1e-4,
+    told: Callable[[str], Any] | None = None,
+) -> Fitted:
+    """Fit p (n,) and the states x (A, L, m), from what they start at, to y (A, L, k).
+
+    Entries of y that are NaN were not seen. ``sigma`` (k,) is the noise of y, ``state_scale`` (m,) the
+    defect that counts as one standard deviation. Ends where an iteration lowers the cost by less than
+    ``tolerance`` of itself and no defect matters.
+    """
+    seen = np.isfinite(y)
+    known = np.where(seen, y, 0.0)
+    damping = 1e-4
+
+    def evaluate(p, x):
+        with np.errstate(all="ignore"):
+            steps, observed = model.steps(p, x), model.observe(p, x)
+            residuals = np.where(seen, (known - observed.values) / sigma, 0.0)
+            defects = steps.states - x[:, 1:]
+            cost = float(np.sum(loss(residuals)) + np.sum((defects / (_DEFECT * state_scale)) ** 2))
+        return steps, observed, residuals, defects, cost if np.isfinite(cost) else np.inf
+
+    here = evaluate(p, x)
+    converged, iteration = False, 0
+    for iteration in range(1, max_iterations + 1):
+        steps, observed, residuals, defects, cost = here
+        rows = _reduced(steps, observed, residuals, defects, sigma)
+        while True:
+            dp, dx = _solve(rows, damping)
+            there = evaluate(p + dp, x + dx)
+            if there[-1] < cost * (1 + 1e-12) or damping > 1e8:
+                break
+            damping = max(damping, 1e-6) * _GROW
+        if damping > 1e8:
+            break
+        p, x, here, damping = p + dp, x + dx, there, max(damping * _SHRINK, 1e-12)
+        closed = np.max(np.abs(there[3]) / state_scale, initial=0.0) < 0.1
+        if told is not None:
+            told(f"{iteration} cost {there[-1]:.6g} damping {damping:.1g}")
+        if closed and cost - there[-1] <= tolerance * cost:
+            converged = True
+            break
+    steps, observed, residuals, defects, cost = here
+    triangle = _reduced(steps, observed, residuals, defects, sigma).triangle
+    found = np.where(seen, residuals, np.nan)
+    return Fitted(p, x, found, triangle[: len(p), : len(p)], cost, iteration, converged)
+
+
+def loss(residuals: np.ndarray) -> np.ndarray:
+    """ρ(r) = 2k²(√(1 + (r/k)²) − 1), which is r² where r is small."""
+    return 2 * ROBUST**2 * (np.sqrt(1 + (residuals / ROBUST) ** 2) - 1)
+
+
+class _Rows(NamedTuple):
+    """Rows of one iteration: each arc's triangle for its own δx_0 (A, m, m + n + 1), the triangle for δp
+    (n + 1, n + 1), and the sensitivities of the states (A, L, m, m + n + 1)."""
+
+    arcs: np.ndarray
+    triangle: np.ndarray
+    sensitivities: np.ndarray
+
+
+def _reduced(steps, observed, residuals, defects, sigma) -> _Rows:
+    num_arcs, length, k, m = observed.by_state.shape
+    n = observed.by_coefficients.shape[-1]
+    S = np.zeros((num_arcs, length, m, m + n + 1))
+    S[:, 0, range(m), range(m)] = 1.0
+    for i in range(length - 1):
+        S[:, i + 1] = steps.by_state[:, i] @ S[:, i]
+        S[:, i + 1, :, m : m + n] += steps.by_coefficients[:, i]
+        S[:, i + 1, :, -1] += defects[:, i]
+    J = observed.by_state @ S
+    J[..., m : m + n] += observed.by_coefficients
+    J /= sigma[:, None]
+    J[..., -1] = residuals - J[..., -1]
+    weight = (1 + (residuals / ROBUST) ** 2) ** -0.25  # the square root of ρ'(r)/2r
+    weight = weight * (np.abs(residuals) > 0)  # what was not seen has residual 0
+    J *= weight[..., None]
+    R = np.linalg.qr(J.reshape(num_arcs, length * k, -1), mode="r")
+    rest = R[:, m:, m:].reshape(-1, n + 1)
+    rest = np.concatenate([rest, np.zeros((max(0, n + 1 - len(rest)), n + 1))])
+    return _Rows(R[:, :m], np.linalg.qr(rest, mode="r"), S)
+
+
+def _solve(rows: _Rows, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """δp (n,) and δx (A, L, m), with Levenberg and Marquardt's damping of δp."""
+    m = rows.arcs.shape[1]
+    R = rows.triangle
+    n = R.shape[1] - 1
+    scale = np.linalg.norm(R[:, :n], axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    matrix = np.concatenate([R[:, :n] / scale, np.sqrt(damping) * np.eye(n)])
+    target = np.concatenate([R[:, n], np.zeros(n)])
+    dp = np.linalg.lstsq(matrix, target, rcond=1e-13)[0] / scale
+    right = rows.arcs[:, :, -1] - rows.arcs[:, :, m : m + n] @ dp
+    first = np.linalg.solve(rows.arcs[:, :, :m], right[..., None])[..., 0]
+    dx = np.einsum("alij,aj->ali", rows.sensitivities[..., :m], first)
+    dx += rows.sensitivities[..., m : m + n] @ dp + rows.sensitivities[..., -1]
+    return dp, dx
