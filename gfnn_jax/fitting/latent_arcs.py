@@ -17,13 +17,13 @@ Residuals enter in units of the noise through Huber's soft-L1 loss, ρ(r) = 2k²
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 ROBUST = 2.5  # k, in standard deviations
 _DEFECT = 0.1  # a defect of this many standard deviations costs as much as a residual of one
+_CLOSED = 0.1  # standard deviations, rms: arcs whose defects are smaller are orbits of the law
 _SHRINK, _GROW = 0.2, 5.0  # of the damping
 
 
@@ -81,55 +81,97 @@ def fit_arcs(
     state_scale: np.ndarray,
     max_iterations: int = 30,
     tolerance: float = 1e-4,
-    told: Callable[[str], Any] | None = None,
 ) -> Fitted:
     """Fit p (n,) and the states x (A, L, m), from what they start at, to y (A, L, k).
 
     Entries of y that are NaN were not seen. ``sigma`` (k,) is the noise of y, ``state_scale`` (m,) the
-    defect that counts as one standard deviation. Ends where an iteration lowers the cost by less than
-    ``tolerance`` of itself and no defect matters.
+    defect that counts as one standard deviation. While defects matter, an iteration has to close them;
+    then it has to lower the cost. Ends where it lowers it by less than ``tolerance`` of itself. The cost is
+    infinite where the defects could not be closed.
     """
     seen = np.isfinite(y)
     known = np.where(seen, y, 0.0)
-    damping = 1e-4
 
-    def evaluate(p, x):
+    def evaluate(p: np.ndarray, x: np.ndarray) -> _Iterate:
         with np.errstate(all="ignore"):
             steps, observed = model.steps(p, x), model.observe(p, x)
             residuals = np.where(seen, (known - observed.values) / sigma, 0.0)
             defects = steps.states - x[:, 1:]
-            cost = float(np.sum(loss(residuals)) + np.sum((defects / (_DEFECT * state_scale)) ** 2))
-        return steps, observed, residuals, defects, cost if np.isfinite(cost) else np.inf
+            cost, gap = float(np.sum(loss(residuals))), float(np.linalg.norm(defects / state_scale))
+        if not np.isfinite(cost + gap):
+            cost = gap = np.inf
+        return _Iterate(p, x, steps, observed, residuals, defects, cost, gap)
 
-    here = evaluate(p, x)
-    converged, iteration = False, 0
+    here = best = evaluate(p, x)
+    damping, converged, iteration = 1e-4, False, 0
+    closed = _CLOSED * np.sqrt(x.size)
     for iteration in range(1, max_iterations + 1):
-        steps, observed, residuals, defects, cost = here
-        rows = _reduced(steps, observed, residuals, defects, sigma)
-        while True:
-            dp, dx = _solve(rows, damping)
-            there = evaluate(p + dp, x + dx)
-            if there[-1] < cost * (1 + 1e-12) or damping > 1e8:
-                break
-            damping = max(damping, 1e-6) * _GROW
-        if damping > 1e8:
+        if not np.isfinite(here.cost):
             break
-        p, x, here, damping = p + dp, x + dx, there, max(damping * _SHRINK, 1e-12)
-        closed = np.max(np.abs(there[3]) / state_scale, initial=0.0) < 0.1
-        if told is not None:
-            told(f"{iteration} cost {there[-1]:.6g} damping {damping:.1g}")
-        if closed and cost - there[-1] <= tolerance * cost:
+        rows = _reduced(here, sigma)
+        there, share = here, 1.0
+        while share > 1e-3:
+            dp, dx = _solve(rows, damping)
+            there = evaluate(here.p + share * dp, here.x + share * dx)
+            if here.gap > closed:  # arcs that are not yet orbits of the law
+                better = there.gap < (1 - 0.5 * share) * here.gap
+            else:
+                better = there.merit < here.merit * (1 + 1e-9)
+            if better:
+                break
+            damping, share = max(damping, 1e-6) * _GROW, 0.5 * share
+        if share <= 1e-3:
+            converged = here.gap <= closed  # no step lowers the cost
+            break
+        damping = max(damping * _SHRINK, 1e-12) if share == 1.0 else damping
+        gained = here.merit - there.merit
+        settled = max(here.gap, there.gap) <= closed and gained <= tolerance * here.cost
+        here = there
+        if here.gap <= closed and (best.gap > closed or here.merit < best.merit):
+            best = here
+        if settled:
             converged = True
             break
-    steps, observed, residuals, defects, cost = here
-    triangle = _reduced(steps, observed, residuals, defects, sigma).triangle
-    found = np.where(seen, residuals, np.nan)
-    return Fitted(p, x, found, triangle[: len(p), : len(p)], cost, iteration, converged)
+    best = best if best.gap <= closed else here
+    triangle = _reduced(best, sigma).triangle
+    found = np.where(seen, best.residuals, np.nan)
+    cost = best.cost if best.gap <= closed else np.inf
+    return Fitted(best.p, best.x, found, triangle[:-1, :-1], cost, iteration, converged)
+
+
+def sensitivities(
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
+) -> np.ndarray:
+    """The triangle (n + 1, n + 1) of the coefficients and the residuals, the states of each arc
+    eliminated, at p and x: what a test of coefficients needs."""
+    seen = np.isfinite(y)
+    steps, observed = model.steps(p, x), model.observe(p, x)
+    residuals = np.where(seen, (np.where(seen, y, 0.0) - observed.values) / sigma, 0.0)
+    defects = steps.states - x[:, 1:]
+    return _reduced(_Iterate(p, x, steps, observed, residuals, defects, 0.0, 0.0), sigma).triangle
 
 
 def loss(residuals: np.ndarray) -> np.ndarray:
     """ρ(r) = 2k²(√(1 + (r/k)²) − 1), which is r² where r is small."""
     return 2 * ROBUST**2 * (np.sqrt(1 + (residuals / ROBUST) ** 2) - 1)
+
+
+class _Iterate(NamedTuple):
+    """Where an iteration stands: residuals in units of σ, defects, the cost of the residuals, and the
+    norm of the defects in units of ``state_scale``."""
+
+    p: np.ndarray
+    x: np.ndarray
+    steps: Steps
+    observed: Observed
+    residuals: np.ndarray
+    defects: np.ndarray
+    cost: float
+    gap: float
+
+    @property
+    def merit(self) -> float:
+        return self.cost + (self.gap / _DEFECT) ** 2
 
 
 class _Rows(NamedTuple):
@@ -141,7 +183,8 @@ class _Rows(NamedTuple):
     sensitivities: np.ndarray
 
 
-def _reduced(steps, observed, residuals, defects, sigma) -> _Rows:
+def _reduced(at: _Iterate, sigma: np.ndarray) -> _Rows:
+    steps, observed, residuals = at.steps, at.observed, at.residuals
     num_arcs, length, k, m = observed.by_state.shape
     n = observed.by_coefficients.shape[-1]
     S = np.zeros((num_arcs, length, m, m + n + 1))
@@ -149,7 +192,7 @@ def _reduced(steps, observed, residuals, defects, sigma) -> _Rows:
     for i in range(length - 1):
         S[:, i + 1] = steps.by_state[:, i] @ S[:, i]
         S[:, i + 1, :, m : m + n] += steps.by_coefficients[:, i]
-        S[:, i + 1, :, -1] += defects[:, i]
+        S[:, i + 1, :, -1] += at.defects[:, i]
     J = observed.by_state @ S
     J[..., m : m + n] += observed.by_coefficients
     J /= sigma[:, None]

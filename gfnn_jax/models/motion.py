@@ -36,8 +36,8 @@ class Step(NamedTuple):
     coefficients (N, 2d, n)."""
 
     states: np.ndarray
-    by_state: np.ndarray | None
-    by_coefficients: np.ndarray | None
+    by_state: np.ndarray
+    by_coefficients: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -70,17 +70,11 @@ class Form:
         theta = self.fixed + self.basis @ c
         return Lagrangian(self.terms, theta, self.friction, losses, 0.0, gains)
 
-    def residuals(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """r_k of each coefficient: (N, d, count)."""
-        columns = [self.terms.residuals(q, v, a).swapaxes(-1, -2) @ self.basis]
-        columns.append(self.friction.residuals(v).swapaxes(-1, -2))
-        if self.num_inputs:
-            pushed = -u[..., None, None, :] * np.eye(self.dim)[:, :, None]
-            columns.append(pushed.reshape(*v.shape, -1))
-        return np.concatenate(columns, axis=-1)
-
-    def accelerate(self, law: Lagrangian, q, v, u) -> tuple[np.ndarray, np.ndarray]:
-        """a (N, d), and its derivatives in q, v and the coefficients (N, d, 2d + count)."""
+    def accelerate(
+        self, law: Lagrangian, q: np.ndarray, v: np.ndarray, u: np.ndarray, sensitive: bool = True
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """a (N, d), and its derivatives in q, v and, where ``sensitive``, in the coefficients
+        (N, d, 2d + count)."""
         f, df, ddf = self.terms.potentials(q)
         g, dg = self.terms.motion(v)
         A, _, _ = self.terms.quadratic()
@@ -98,19 +92,23 @@ class Form:
         turned = dg.swapaxes(1, 2) @ weighted.swapaxes(1, 2)
         by_v = ((theta * along) @ A.reshape(-1, d * d)).reshape(-1, d, d)
         by_v = by_v + turned - turned.swapaxes(1, 2) + law.losses_by_v(v)
-        rows = push * f[..., None] + dg * along[..., None] - g[..., None] * df
-        columns = [by_q, by_v, rows.swapaxes(1, 2) @ self.basis]
-        columns.append(self.friction.residuals(v).swapaxes(1, 2))
-        if self.num_inputs:
+        columns = [by_q, by_v]
+        if sensitive:
+            rows = push * f[..., None] + dg * along[..., None] - g[..., None] * df
+            columns.append(rows.swapaxes(1, 2) @ self.basis)
+            columns.append(self.friction.residuals(v).swapaxes(1, 2))
+        if sensitive and self.num_inputs:
             pushed = -u[:, None, None, :] * np.eye(d)[:, :, None]
             columns.append(pushed.reshape(len(v), d, -1))
         return a, -inverse @ np.concatenate(columns, axis=-1)
 
-    def step(self, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray) -> Step:
-        """One step h (N,) of states x (N, 2d) with its derivatives; u (N, substeps, 6, inputs) are the
-        inputs at the nodes of each substep."""
+    def step(
+        self, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray, sensitive: bool = True
+    ) -> Step:
+        """One step h (N,) of states x (N, 2d) with its derivatives, those in the coefficients where
+        ``sensitive``; u (N, substeps, 6, inputs) are the inputs at the nodes of each substep."""
         law, d, substeps = self.lagrangian(p), self.dim, u.shape[1]
-        n, width = len(x), 2 * d + self.count
+        n, width = len(x), 2 * d + (self.count if sensitive else 0)
         h = (h / substeps)[:, None]
         wide = h[..., None]
         D = np.zeros((n, 2 * d, width))
@@ -121,7 +119,7 @@ class Form:
                 xi, Di = x, D
                 for j in np.flatnonzero(_A[i]):
                     xi, Di = xi + _A[i, j] * h * rates[j], Di + _A[i, j] * wide * slopes[j]
-                a, by = self.accelerate(law, xi[:, :d], xi[:, d:], u[:, k, i])
+                a, by = self.accelerate(law, xi[:, :d], xi[:, d:], u[:, k, i], sensitive)
                 slope = np.empty_like(D)
                 slope[:, :d] = Di[:, d:]
                 slope[:, d:] = by[..., : 2 * d] @ Di

@@ -1,0 +1,208 @@
+"""The search for a law: a linear start, arcs of growing length, terms dropped and added.
+
+Half a period, one, two and four periods: short arcs find the law from afar, long ones tell small forces.
+At each length terms that are not seen at four standard errors are dropped, and of those that the law
+lacks the one with the largest score is tried; it stays where arcs that the fit has not seen gain. Which
+friction there is, held-out arcs say in the end.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from gfnn_jax.dataset.stretches import PER_PERIOD, Nodes, Scales, arcs_of, with_states
+from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.models import libraries
+from gfnn_jax.models.law_fit import LawFit, Workbench
+from gfnn_jax.models.structure import Key, Structure
+from gfnn_jax.models.weak_start import protected, weak_start
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchOptions:
+    """Constants of the search, the same for all records (`python -m benchmarks measured`)."""
+
+    periods: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)  # lengths of arcs
+    significant: float = 4.0  # standard errors, below which a term may be dropped
+    nothing: float = 1.0  # standard errors, below which it is, without asking held-out arcs
+    asked_for: float = 5.0  # standard errors, above which a term is tried
+    tries: int = 3  # terms tried in a row
+    plain_is_enough: float = 1.5  # times the residual of the larger library, the textbook's may have
+    gain: float = 0.05  # of the held-out cost, that a term has to bring
+    dry_width: float = 0.05  # ε of dry friction, in rms speeds
+    frictions: tuple[str, ...] = ("linear", "quadratic", "dry")
+
+
+def search(
+    nodes: Sequence[Nodes],
+    scales: Scales,
+    angles: tuple[int, ...],
+    num_inputs: int,
+    inputs: Callable,
+    told: Callable[[str], object] = lambda line: None,
+    options: SearchOptions = SearchOptions(),
+) -> tuple[LawFit, Workbench, list[Nodes]]:
+    """The law of these nodes: its fit to the longest arcs, and the nodes with the states found."""
+    d = nodes[0].y.shape[1]
+    gauge = np.concatenate([n.x[:, :d] for n in nodes])
+    state_scale = np.repeat([1.0, scales.omega], d)
+    bench = Workbench(gauge, inputs, state_scale)
+    width = options.dry_width * float(np.mean(scales.speed))
+    linear = libraries.losses(d, (LINEAR,), 0.0)
+    starts = []
+    for rows in (libraries.textbook(d, angles), libraries.first(d, angles)):
+        library = Structure(d, tuple(rows), tuple(linear), (), num_inputs)
+        structure, known = weak_start(library, nodes, scales)
+        zeros = tuple(i for i in angles if any(row[2][i] for row in structure.terms))
+        structure = structure.plus(
+            [("loss", row) for row in linear[:d]] + [("zero", i) for i in zeros]
+        )
+        if not starts or structure.terms != starts[0].structure.terms:
+            arcs = arcs_of(nodes, round(options.periods[0] * PER_PERIOD))
+            starts.append(bench.fit(structure, known, arcs, scales.sigma))
+            told(f"{options.periods[0]:g} periods: {describe(starts[-1])}")
+    fit = starts[0]
+    if len(starts) > 1 and np.max(starts[0].rms() / starts[1].rms()) > options.plain_is_enough:
+        fit = starts[1]
+    every = Structure(
+        d, (*libraries.first(d, angles), *libraries.more(d, angles)),
+        tuple(libraries.losses(d, libraries.KINDS, width)), angles, num_inputs,
+    )  # fmt: skip
+    frictions = dataclasses.replace(every, terms=every.terms[:1])
+    nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+    for periods in options.periods[1:]:
+        arcs = arcs_of(nodes, round(periods * PER_PERIOD))
+        if arcs.t.shape == fit.arcs.t.shape:
+            break  # no run is longer
+        fit = bench.fit(fit.structure, fit.values, arcs, fit.sigma)
+        if periods == 1:
+            fit = grow(bench, nodes, fit, frictions, told, options)
+            fit = prune(bench, nodes, fit, told, options)
+            fit = grow(bench, nodes, fit, every, told, options)
+        nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+        told(f"{periods:g} periods: {describe(fit)}")
+    fit = choose_friction(bench, nodes, fit, width, told, options)
+    fit = prune(bench, nodes, fit, told, options)
+    fit = grow(bench, nodes, fit, every, told, options)
+    fit = prune(bench, nodes, fit, told, options)
+    return fit, bench, with_states(nodes, fit.arcs, fit.fitted.x)
+
+
+def describe(fit: LawFit) -> str:
+    rms = " ".join(f"{r:.3g}" for r in fit.rms())
+    return (
+        f"{len(fit.p)} coefficients, residual {rms}, correlated over {fit.correlation:.1f} nodes, "
+        f"{fit.fitted.iterations} iterations"
+        + ("" if fit.fitted.converged else ", not converged")
+    )
+
+
+def prune(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, told: Callable, options: SearchOptions
+) -> LawFit:
+    """The fit without terms that are not seen, the least seen first, as long as held-out arcs do not
+    lose; and without friction that would drive."""
+    refused: set[Key] = set()
+    costs = None
+    while True:
+        z = significance(fit)
+        fixed = protected(fit.structure) | refused
+        z = {k: size for k, size in z.items() if k not in fixed and size < options.significant}
+        if not z:
+            return fit
+        key = min(z, key=lambda k: z[k])
+        smaller = fit.structure.without({key})
+        if z[key] > options.nothing:
+            if costs is None:
+                costs = bench.cross_validate(nodes, fit, fit.structure, fit.values)
+            without = bench.cross_validate(nodes, fit, smaller, fit.values)
+            if gains(without, costs, options):
+                refused.add(key)
+                continue
+        told(f"  without {key}: {z[key]:.1f} standard errors")
+        arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+        fit, costs = bench.fit(smaller, fit.values, arcs, fit.sigma), None
+
+
+def significance(fit: LawFit) -> dict[Key, float]:
+    """Coefficients in units of their standard errors; friction that drives is below 0."""
+    error = np.sqrt(np.diag(fit.covariance()))
+    z = np.where(error > 0, np.abs(fit.p) / error, 0.0)
+    keys = fit.structure.keys()
+    drives = [k[0] == "loss" and p < 0 for k, p in zip(keys, fit.p, strict=True)]
+    return dict(zip(keys, np.where(drives, -z, z).tolist(), strict=True))
+
+
+def gains(costs: np.ndarray, others: np.ndarray, options: SearchOptions) -> bool:
+    """Whether ``others`` are lower in all than these held-out costs (A,)."""
+    return bool(np.sum(others) < np.sum(costs) * (1 - options.gain))
+
+
+def grow(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, every: Structure, told: Callable,
+    options: SearchOptions,
+) -> LawFit:  # fmt: skip
+    """The fit with terms that the residuals ask for, each kept where held-out arcs gain."""
+    refused: set[Key] = set()
+    costs = None
+    for _ in range(options.tries):
+        scores = bench.scores(fit, every)
+        scores = {k: z for k, z in scores.items() if k not in refused and z > options.asked_for}
+        if not scores:
+            break
+        key = max(scores, key=lambda k: scores[k])
+        if costs is None:
+            costs = bench.cross_validate(nodes, fit, fit.structure, fit.values)
+        larger = fit.structure.plus([key])
+        with_it = bench.cross_validate(nodes, fit, larger, fit.values)
+        kept = gains(costs, with_it, options)
+        told(
+            f"  {'with' if kept else 'not'} {key}: score {scores[key]:.1f}, held-out "
+            f"{np.sum(costs):.5g} → {np.sum(with_it):.5g}"
+        )
+        if not kept:
+            refused.add(key)
+            continue
+        arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+        fit = bench.fit(larger, fit.values, arcs, fit.sigma)
+        costs = None
+    return fit
+
+
+def choose_friction(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, width: float, told: Callable, options: SearchOptions
+) -> LawFit:
+    """The fit with the friction that predicts held-out arcs best; the smaller where two tie."""
+    d = fit.structure.dim
+    bare = dataclasses.replace(fit.structure, friction=())
+    kinds = [libraries.KINDS[("linear", "quadratic", "dry").index(k)] for k in options.frictions]
+    best, lowest = bare, np.full(1, np.inf)
+    for count in range(len(kinds) + 1):
+        for chosen in combinations(kinds, count):
+            rows = libraries.losses(d, chosen, width)
+            structure = dataclasses.replace(bare, friction=tuple(rows))
+            structure = without_drives(bench, fit, structure)
+            costs = bench.cross_validate(nodes, fit, structure, fit.values)
+            told(f"  friction {structure.friction}: held-out {np.sum(costs):.5g}")
+            if gains(lowest, costs, options):
+                best, lowest = structure, costs
+    arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+    return bench.fit(best, fit.values, arcs, fit.sigma)
+
+
+def without_drives(bench: Workbench, fit: LawFit, structure: Structure) -> Structure:
+    """The structure without friction that a fit would make negative, the worst first."""
+    arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+    known = fit.values
+    while structure.friction:
+        found = bench.fit(structure, known, arcs, fit.sigma, rescale=False)
+        z = significance(found)
+        worst = min((("loss", row) for row in structure.friction), key=lambda k: z[k])
+        if z[worst] >= 0:
+            break
+        structure, known = structure.without({worst}), found.values
+    return structure
