@@ -109,19 +109,19 @@ class Forced:
 
     def value(self, params, w, args=None):
         """H, shape (...)."""
-        own, _, _ = self._parts(params)
+        own, _, _ = self.parts(params)
         return self.family.value(own, w, self._inner(args))
 
     def gradient(self, params, w, args=None):
         """(∂H/∂q + ∂R/∂v − G u, ∂H/∂p), shape (..., 2d)."""
-        own, losses, gains = self._parts(params)
+        own, losses, gains = self.parts(params)
         gradient = self.family.gradient(own, w, self._inner(args))
         _, slope, _ = self.friction.tables(split(gradient)[1])
         return self._field(gradient, slope, losses, gains, args)
 
     def gradient_and_hessian(self, params, w, args=None):
         """That field, and its derivative (..., 2d, 2d), which is not symmetric."""
-        own, losses, gains = self._parts(params)
+        own, losses, gains = self.parts(params)
         gradient, hessian = self.family.gradient_and_hessian(own, w, self._inner(args))
         _, slope, curvature = self.friction.tables(split(gradient)[1])
         field = self._field(gradient, slope, losses, gains, args)
@@ -130,7 +130,7 @@ class Forced:
     def parameter_gradients(self, params, w, args=None, along=None):
         """∂/∂params of the field (..., 2d, m); of a family ``along`` of other terms of H those of
         its coefficients alone. NumPy."""
-        own, losses, _ = self._parts(params)
+        own, losses, _ = self.parts(params)
         inner, dim = self._inner(args), self.dim
         _, slope, curvature = self.friction.tables(split(self.family.gradient(own, w, inner))[1])
         columns = parameter_gradients(self.family, own, w, inner, along)
@@ -148,14 +148,14 @@ class Forced:
     def power(self, params, w, args=None):
         """Energy per unit of time at states w (..., 2d): lost by each friction (..., F), supplied
         by each input (..., k)."""
-        own, losses, gains = self._parts(params)
+        own, losses, gains = self.parts(params)
         v = split(self.family.gradient(own, w, self._inner(args)))[1]
         _, slope, _ = self.friction.tables(v)
         speeds = matmul(v, self.friction.directions.astype(v.dtype).T)
         lost = as_row(losses, slope) * slope * speeds
         return lost, matmul(v, gains) * self._inputs(args)
 
-    def _parts(self, params):
+    def parts(self, params) -> tuple[Any, Any, Any]:
         """The params of H, ρ (F,) and G (d, k)."""
         own, count = self.family.num_parameters, self.friction.count
         gains = params[own + count :].reshape(self.dim, self.num_inputs)
