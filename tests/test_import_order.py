@@ -19,7 +19,9 @@ ORDER = (
     "learn", "data", "baselines", "evaluate", "jobs", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
-SHORTHANDS = {("maps.symplectic_map", f"maps.{name}") for name in ("saved", "samples", "sharded")}
+SHORTHANDS = {
+    ("maps.symplectic_map", f"maps.{name}") for name in ("saved", "samples", "sharded", "energy")
+}
 HOMES = {  # the module, and those whose names begin as its own does
     "argparse": "cli",
     "diffrax": "scenes.trajectories",

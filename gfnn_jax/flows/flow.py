@@ -25,7 +25,7 @@ from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.gauss import gauss
-from gfnn_jax.flows.uniform import Uniform
+from gfnn_jax.flows.uniform import Uniform, power
 from gfnn_jax.generating.generated import two_sum
 from gfnn_jax.phase_space import apply_j, area, symplectic_form
 from gfnn_jax.solve import fixed_point, krylov, newton
@@ -192,6 +192,26 @@ class Flow:
 
         return self._repeated(substep, (z, jnp.zeros(z.shape[:1], z.dtype)), args)[0][1]
 
+    def work(self, z, args=None):
+        """(Z, Power) of the step from z (B, 2d): the energy that friction has taken and inputs have
+        brought, by the quadrature of the stages, of the order of the step."""
+
+        def substep(both, args):
+            z, done = both
+            slopes, info = self._slopes(z, args, False)
+            h, inside = self._substep, z[None] + _coupled(slopes)
+            at = _at_stages(self.family, args, h, self.stages)
+            if isinstance(self.family, Uniform):
+                since = jnp.asarray(gauss(self.stages).nodes, z.dtype)[:, None, None] * h
+                inside = self.family.from_canonical(self.params, inside, since)
+            rate = power(self.family, self.params, inside, at)
+            more = jax.tree.map(lambda a: jnp.sum(_weighted(h, a) * a, axis=0), rate)
+            moved = self._moved(z, slopes)
+            return (z + moved, jax.tree.map(jnp.add, done, more)), info
+
+        none = jax.tree.map(jnp.zeros_like, power(self.family, self.params, z, args))
+        return self._repeated(substep, (z, none), args)[0]
+
     def inverse(self) -> Flow:
         """The inverse map: the same flow backwards."""
         return dataclasses.replace(self, dt=-self.dt)
@@ -217,10 +237,14 @@ class Flow:
     def _increment(self, z, args, unrolled: bool | int):
         """(Z − z, Info) of one substep."""
         slopes, info = self._slopes(z, args, unrolled)
+        return self._moved(z, slopes), info
+
+    def _moved(self, z, slopes):
+        """Z − z of one substep."""
         moved = jnp.sum(slopes, axis=0)
         if isinstance(self.family, Uniform):
             moved = self.family.moved(self.params, z, moved, self._substep)
-        return moved, info
+        return moved
 
     @property
     def _substep(self):

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -112,11 +112,17 @@ class Uniform:
     def begun(self, args, lanes):
         """(family, args) of H̃ as a step begins from states ``lanes`` (B, 2d)."""
         xp = namespace(lanes)
-        shape = (1,) if args is None else args.shape[:-1]  # in NumPy each lane has its own
-        since = xp.zeros((len(lanes), 1) if xp is np else (*shape, 1), lanes.dtype)
-        if args is not None:
-            since = xp.concatenate([args, since], axis=-1)
-        return CaldirolaKanai(self.family), since
+        if args is None:
+            args = xp.zeros((len(lanes) if xp is np else 1, 0), lanes.dtype)
+        args = args if args.ndim > 1 else args[None]
+        since = xp.zeros((len(args), 1), lanes.dtype)
+        return CaldirolaKanai(self.family), xp.concatenate([args, since], axis=-1)
+
+    def from_canonical(self, params, w, since):
+        """(q, p) of states (q, p̃) (..., 2d) a time ``since`` (..., 1) after the step began."""
+        q, p = split(w)
+        shrunk = namespace(params, since).exp(-params[-1] * since)
+        return namespace(w).concatenate([q, shrunk * p], axis=-1)
 
     def moved(self, params, z, moved, h):
         """Z − z (B, 2d) of a step of h, a number or (B, 1), that moves (q, p̃) by ``moved``."""
@@ -134,6 +140,27 @@ class Uniform:
         if by_params.shape[-1] == self.num_parameters:
             by_params[:, dim:, -1] -= h * image[:, dim:]
         return by_state, by_params
+
+
+class Power(NamedTuple):
+    """Energy per unit of time: lost (..., F) by each friction, uniform friction the last where
+    there is such; supplied (..., k) by each input."""
+
+    lost: Any
+    supplied: Any
+
+
+def power(family, params, w, args=None) -> Power:
+    """What forces do at states w (..., 2d), where ``family`` holds any. NumPy or JAX."""
+    if isinstance(family, Uniform):
+        lost, supplied = power(family.family, params[:-1], w, args)
+        v = split(family.family.gradient(params[:-1], w, args))[1]
+        xp = namespace(w)
+        even = params[-1] * xp.sum(split(w)[1] * v, axis=-1, keepdims=True)
+        return Power(xp.concatenate([lost, even], axis=-1), supplied)
+    if isinstance(family, Forced):
+        return Power(*family.power(params, w, args))
+    return Power(w[..., :0], w[..., :0])
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("family",), meta_fields=())

@@ -30,6 +30,7 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated, two_sum
 from gfnn_jax.maps.bands import Bands, bands
 from gfnn_jax.maps.domain import Domain, Ranges
+from gfnn_jax.maps.inputs import Scheduled, Signals
 from gfnn_jax.maps.modified_hamiltonian import NUM_STEPS, Cells, ModifiedHamiltonian, of_cells
 from gfnn_jax.maps.parameters import Parameters, as_args
 from gfnn_jax.maps.posterior import Posterior
@@ -106,7 +107,7 @@ class RolloutInfo(NamedTuple):
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=("pieces", "domain", "scale", "angle_centre", "dt", "parameters", "dt_range"),
-    meta_fields=("coordinates",),
+    meta_fields=("coordinates", "signals"),
     drop_fields=("posterior",),
 )
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -122,15 +123,17 @@ class SymplecticMap:
     parameters:   what the system depends on beside its state, where it was learned with that.
     dt_range:     (2,) the lowest and highest dt of the data, of a map that was learned with dt as a
                   variable of S.
+    signals:      the inputs that act on the system, where it has any.
     posterior:    how well the coefficients are known, where that is; no leaf: what makes another
                   map of the leaves (``jit``, ``jax.tree.map``) leaves it out.
 
     Methods take states z (2d,) or (B, 2d), NumPy or JAX, and answer with JAX arrays. A map that was
     learned with parameters takes their values too: name -> a number or (B,), or an array (k,) or
     (B, k); that of a driven system takes t0, the time of the drive at z, a number or (B,), which
-    goes on with the steps. They can be differentiated, in forward and reverse mode, in z, in the
-    parameters' values and in the map's own leaves, by the implicit-function theorem; ``jax.vmap``
-    and ``jax.jit`` work over them.
+    goes on with the steps. One with inputs takes these: (k,) or (B, k) during a step, (N, k) or
+    (B, N, k) of the N steps of a rollout; where they are not given, none acts. They can be
+    differentiated, in forward and reverse mode, in z, in the parameters' values, the inputs and the
+    map's own leaves, by the implicit-function theorem; ``jax.vmap`` and ``jax.jit`` work over them.
     """
 
     pieces: tuple
@@ -142,6 +145,7 @@ class SymplecticMap:
     parameters: Parameters | None = None
     posterior: Posterior | None = None
     dt_range: Any = None
+    signals: Signals | None = None
 
     def __post_init__(self):
         if isinstance(self.dt, (int, float)):
@@ -176,11 +180,12 @@ class SymplecticMap:
 
         return sharded.Sharded(self, sharded.local_devices(devices))
 
-    def step(self, z, args=None, *, dt=None, t0=None):
-        """One step: (Z, Info); Info's leaves are () or (B,). dt: of `over`."""
+    def step(self, z, args=None, *, dt=None, t0=None, inputs=None):
+        """One step: (Z, Info); Info's leaves are () or (B,). dt: of `over`. inputs: that act
+        during the step."""
         z = self._states(z)
         map_ = self if dt is None else self.over(dt, z.shape[:-1])
-        return _step(map_, z, self._args(args, z, t0))
+        return _step(map_, z, self._args(args, z, t0, inputs))
 
     def inverse(self, z, args=None, *, t0=None):
         """One step back: (z, Info) of Z. t0: the time of z, as that of the step to Z."""
@@ -283,6 +288,19 @@ class SymplecticMap:
         z = self._states(z)
         return _hamiltonian(self, z, self._args(args, z, t0))
 
+    def power(self, z, args=None, *, inputs=None):
+        """Energy per unit of time at z: ``lost`` (..., F) by each friction and ``supplied``
+        (..., k) by each input: `maps.energy`. Raises ValueError for a map that is no flow."""
+        from gfnn_jax.maps import energy  # stands after this module: a shorthand for its function
+
+        return energy.power_of(self, z, args, inputs)
+
+    def linearise(self, z, inputs=None, args=None, *, t0=None):
+        """(A, B) of a step: ∂Z/∂z (..., 2d, 2d) and ∂Z/∂u (..., 2d, k), inputs u, (k,) or (B, k),
+        that do not change during the step."""
+        z = self._states(z)
+        return _linearised(self, z, self._args(args, z, t0, inputs))
+
     def modified_hamiltonian(self, z, args=None) -> ModifiedHamiltonian:
         """The Hamiltonian H̃ whose flow over dt is this map, at z: its value and the error of that,
         each () or (B,), in units of H. Its constant is that of S.
@@ -303,23 +321,26 @@ class SymplecticMap:
         return _start(self, z0, self._args(params, z0, t0), stop_outside)
 
     def advance(
-        self, lanes: Lanes, num_saved: int, *, params=None, t0=None, save_every: int = 1,
-        stop_outside: bool = False,
+        self, lanes: Lanes, num_saved: int, *, params=None, t0=None, inputs=None,
+        save_every: int = 1, stop_outside: bool = False,
     ) -> tuple[Lanes, Any]:  # fmt: skip
         """``num_saved`` blocks of ``save_every`` steps: the lanes after them, and the saved states
-        (B, num_saved, 2d). params, t0: those that the lanes were started with."""
-        args = self._args(params, lanes.y, t0)
+        (B, num_saved, 2d). params, t0: those that the lanes were started with; inputs: of all
+        steps from their start on."""
+        args = self._schedule(params, lanes.y, t0, inputs)
         return _advance(self, lanes, args, num_saved, save_every, stop_outside)
 
     def rollout(
-        self, z0, num_steps: int, *, params=None, t0=None, dt=None, save_every: int = 1,
-        stop_outside: bool = False, samples: int | None = None, key=None,
+        self, z0, num_steps: int, *, params=None, t0=None, inputs=None, dt=None,
+        save_every: int = 1, stop_outside: bool = False, samples: int | None = None, key=None,
     ) -> tuple[Any, RolloutInfo]:  # fmt: skip
         """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d).
 
         params: the values of a map's parameters. t0: the time of a drive at z0; it goes on with the
-        steps. dt: of `over`, for each step. samples, key: how many maps are drawn from the
-        posterior by which key of ``jax.random``; the states of all of them are held at once.
+        steps. inputs: of each step's begin, (num_steps, k) or (B, num_steps, k), and, as one row
+        more, at the last one's end. dt: of `over`, for each step. samples, key: how many maps are
+        drawn from the posterior by which key of ``jax.random``; the states of all of them are held
+        at once.
         Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first, and a
         RolloutInfo; with samples its ``bands`` have their std about the states, median and
         quantiles. A lane whose step fails, or that leaves the domain with ``stop_outside``,
@@ -340,13 +361,13 @@ class SymplecticMap:
             )
         z0 = self._states(z0)
         map_ = self if dt is None else self.over(dt, z0.shape[:-1])
-        args = self._args(params, z0, t0)
+        args = map_._schedule(params, z0, t0, inputs, num_steps)
         states, info = _rollout(map_, z0, args, num_steps // save_every, save_every, stop_outside)
         if samples is None:
             return states, info
         if key is None:
             raise ValueError("expected a key of jax.random beside samples")
-        options = {"params": params, "t0": t0, "save_every": save_every}
+        options = {"params": params, "t0": t0, "inputs": inputs, "save_every": save_every}
         drawn, _ = map_.sample(key, samples).rollout(
             np.atleast_2d(z0), num_steps, stop_outside=stop_outside, **options
         )
@@ -360,11 +381,28 @@ class SymplecticMap:
         """Indices of the user's coordinates that are angles."""
         return self.coordinates.angles if self.coordinates.forward is CARTESIAN.forward else ()
 
-    def _args(self, given, z, t0=None):
-        return as_args(self.parameters, given, z.shape, np.dtype(self.scale.dtype), t0)
+    def _args(self, given, z, t0=None, inputs=None):
+        """What a step of the states z takes."""
+        dtype = np.dtype(self.scale.dtype)
+        args = as_args(self.parameters, given, z.shape, dtype, t0)
+        if self.signals is not None:
+            return self.signals.constant(args, inputs, z.shape, dtype)
+        if inputs is not None:
+            raise ValueError("expected no inputs: the map was learned without")
+        return args
+
+    def _schedule(self, given, z, t0=None, inputs=None, num_steps: int | None = None):
+        """What rollouts from the states z take: as one step, or of each of ``num_steps``."""
+        if self.signals is None:
+            return self._args(given, z, t0, inputs)
+        dtype = np.dtype(self.scale.dtype)
+        args = as_args(self.parameters, given, z.shape, dtype, t0)
+        return self.signals.scheduled(args, inputs, z.shape, dtype, self.dt, num_steps)
 
     def _after(self, args, steps):
         """args that many steps (B,) later."""
+        if isinstance(args, Scheduled):
+            return args.at(self._after(args.params, steps), steps)
         return args if self.parameters is None else self.parameters.after(args, steps, self.dt)
 
     def _states(self, z):
@@ -424,7 +462,10 @@ class SymplecticMap:
         if self.dt_range is not None:
             low, high = self.dt_range[0] * (1 - _DT_EDGE), self.dt_range[1] * (1 + _DT_EDGE)
             inside = inside & (low <= abs(self.dt)) & (abs(self.dt) <= high)
-        return inside if self.parameters is None else inside & self.parameters.contains(args)
+        if self.parameters is None:
+            return inside
+        given = args.params if isinstance(args, Scheduled) else args
+        return inside & self.parameters.contains(given[..., : len(self.parameters.names)])
 
     def _apply(self, z, args, *, unrolled: bool | int = False):
         """(Z, Info) of the states z (B, 2d) in the user's coordinates."""
@@ -493,6 +534,27 @@ def _defect(map_, z, args, unrolled):
         return defect_of_pairs(before[:, None], after, map_.scale, multiplier)
     jacobian = jax.vmap(tangent, out_axes=-1)(jnp.eye(z.shape[1], dtype=z.dtype))
     return symplecticity_defect(jacobian, map_.scale, multiplier)
+
+
+@compiled_sooner
+@_or_one_state
+def _linearised(map_, z, args):
+    width, signals, given = z.shape[1], map_.signals, args
+    count = 0 if signals is None else len(signals.names)
+    if count:
+        given = jnp.broadcast_to(args, (len(z), args.shape[-1]))
+        first = args.shape[-1] - (signals.degree + 1) * count
+
+    def step(moved):
+        acting = given.at[:, first : first + count].add(moved[:, width:]) if count else given
+        return map_._apply(z + moved[:, :width], acting)[0]
+
+    def along(unit):
+        at = jnp.zeros((len(z), width + count), z.dtype)
+        return jax.jvp(step, (at,), (jnp.broadcast_to(unit, at.shape),))[1]
+
+    both = jax.vmap(along, out_axes=-1)(jnp.eye(width + count, dtype=z.dtype))
+    return both[..., :width], both[..., width:]
 
 
 @compiled_sooner
