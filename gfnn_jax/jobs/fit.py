@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gfnn_jax.data.files import iterate_pairs, read_sample, read_trajectories
+from gfnn_jax.data.files import iterate_pairs, read_trajectories
+from gfnn_jax.data.sample import read_sample
 from gfnn_jax.data.summary import summary
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import report
