@@ -316,7 +316,7 @@ def test_a_map_without_all_images_is_still_given(monkeypatch):
     """The most accurate there is, with a warning, even where no step could be judged."""
     from gfnn_jax.learn import candidates
 
-    def failing(error, spread, tolerance):
+    def failing(error, spread, tolerance, block=None):
         return candidates.OneStepError(np.inf, np.inf, np.inf, np.full(2, np.inf))
 
     monkeypatch.setattr(candidates, "one_step_error", failing)

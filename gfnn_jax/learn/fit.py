@@ -63,6 +63,8 @@ class Fit:
     chosen chart's determinant there, where it is closest to 0; NaN for a flow, which has no chart.
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
     scene: as given. stated_by: the pairs by which the chosen candidate's error was measured.
+    validation_pairs, test_pairs: that chose, and that stated the error; None where the pairs were
+    too few for these.
     """
 
     map: SymplecticMap
@@ -84,6 +86,8 @@ class Fit:
     pairs: Pairs | None = None
     scene: Scene | None = None
     stated_by: str = ""
+    validation_pairs: Pairs | None = None
+    test_pairs: Pairs | None = None
 
     def __repr__(self) -> str:
         """One line: the chosen map, its error and the tolerance."""
@@ -317,6 +321,8 @@ def fit(
         pairs=pairs,
         scene=scene,
         stated_by=error.words,
+        validation_pairs=pairs.take(found.judges.held_out),
+        test_pairs=pairs.take(found.judges.test) if len(found.judges.test) else None,
     )
 
 
