@@ -71,6 +71,7 @@ class Fit:
     candidates: tuple[Candidate, ...]
     asked: Tolerance
     num_pairs: int
+    validation_pairs: Pairs
     judgements: dict[str, ChartJudgement]
     data_defect: float
     base_map: bool
@@ -86,7 +87,6 @@ class Fit:
     pairs: Pairs | None = None
     scene: Scene | None = None
     stated_by: str = ""
-    validation_pairs: Pairs | None = None
     test_pairs: Pairs | None = None
 
     def __repr__(self) -> str:
@@ -306,6 +306,7 @@ def fit(
         candidates=_all_candidates(chosen, found),
         asked=request.tolerance,
         num_pairs=len(pairs),
+        validation_pairs=pairs.take(found.judges.held_out),
         judgements=found.charts.judgements,
         data_defect=seen.data_defect,
         base_map=bool(chosen.prepared.before or chosen.prepared.after),
@@ -321,7 +322,6 @@ def fit(
         pairs=pairs,
         scene=scene,
         stated_by=error.words,
-        validation_pairs=pairs.take(found.judges.held_out),
         test_pairs=pairs.take(found.judges.test) if len(found.judges.test) else None,
     )
 
