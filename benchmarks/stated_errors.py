@@ -25,6 +25,7 @@ from posteriors.calibration import noisy, pendulum
 
 import gfnn_jax as gfnn
 from gfnn_jax.scenes import Scene
+from gfnn_jax.scenes.trajectories import sample_sequences
 
 SIGMA, FRESH, FITS = 1e-3, 100_000, 22  # noise ÷ spread; fresh pairs; data sets a row
 SYSTEMS = {"henon-heiles": lambda: gfnn.scenes.make("henon-heiles-regular"), "pendulum": pendulum}
@@ -44,7 +45,7 @@ def learned_from(scene: Scene, size: int, in_sequences: bool, seed: int) -> gfnn
     key = jax.random.key(seed)
     if not in_sequences:
         return noisy(gfnn.sample_pairs(scene, size, key), SIGMA, seed)
-    states = gfnn.scenes.trajectories.sample_sequences(scene, size // LENGTH, LENGTH + 1, key)
+    states = sample_sequences(scene, size // LENGTH, LENGTH + 1, key)
     rng, width = np.random.default_rng(seed), states.shape[-1]
     spread = np.std(states.reshape(-1, width), axis=0)
     states = np.asarray(states) + SIGMA * spread * rng.normal(size=states.shape)
