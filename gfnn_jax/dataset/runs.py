@@ -92,14 +92,19 @@ def _chains(run: np.ndarray, z0: np.ndarray, z1: np.ndarray) -> tuple[np.ndarray
 def steps_between(pairs: Pairs) -> np.ndarray:
     """(N − 1,) steps from the state of each pair to that of the next row: 1 where its image is the
     next one's state, more where pairs between them were left out, 0 where the next row is of
-    another run, or far along it. pairs: with their runs and places."""
+    another run, or far along it; none where pairs have no run."""
+    if pairs.run is None:
+        return np.zeros(max(0, len(pairs) - 1), int)
     steps = np.diff(pairs.place)
     same = (np.diff(pairs.run) == 0) & (steps > 0) & (steps <= 1 + _BRIDGED)
     return np.where(same, steps, 0)
 
 
 def next_of(pairs: Pairs, rows: np.ndarray) -> np.ndarray:
-    """(n − 1,) whether the image of each of these rows (n,) is the state of the one after it."""
+    """(n − 1,) whether the image of each of these rows (n,) is the state of the one after it; none
+    where pairs have no run."""
+    if pairs.run is None:
+        return np.zeros(max(0, len(rows) - 1), bool)
     run, place = np.asarray(pairs.run)[rows], np.asarray(pairs.place)[rows]
     return (np.diff(run) == 0) & (np.diff(place) == 1)
 
