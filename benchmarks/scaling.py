@@ -137,7 +137,7 @@ def problem(task: str, quick: bool) -> Callable[[], Any]:
         terms = polynomial_terms(2, size)
         own = gauss_newton.Problem(z0, z1, dt, np.ones(4))
         c = gauss_newton.midpoint_start(terms, z0, z1, dt, np.ones(4))
-        return lambda: own.factor(terms, c, Steps(5, 1), np.arange(len(z0))).matrix
+        return lambda: own.linearised(terms, c, Steps(5, 1), np.arange(len(z0))).factor
     network = Mlp(box_inputs(w), (16, 16, 16), "gelu", amplitude_of(w, target))
     starts = [network.init(key, np.float64) for key in jax.random.split(jax.random.key(1), size)]
     held = len(w) // 5

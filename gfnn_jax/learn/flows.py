@@ -364,7 +364,7 @@ def _told_from_noise(
             return found
         few = _refitted(problem, few, rows, prepared, judges)
         # Twice the logarithm of the likelihood's ratio.
-        gained = 2 * few.fit.rows * np.log(found.fit.rms / few.fit.rms)
+        gained = 2 * few.fit.triangle.rows * np.log(found.fit.rms / few.fit.rms)
         if gained > options.certain**2 * more and few.error.relative <= found.error.relative:
             return few._replace(noisy=True)
     return found
@@ -384,10 +384,10 @@ def _significant(problem, full: FittedLaw, rows, options: Options) -> FittedLaw 
     """The terms that these pairs tell from noise, which one Gauss–Newton problem of all terms says,
     so that only a few are fitted to many pairs; None where it tells none."""
     resolved = np.setdiff1d(rows, np.setdiff1d(full.rows, full.fit.used))
-    found = problem.factor(full.family, full.fit.coefficients, full.fit.steps, resolved)
-    if not np.isfinite(found.cost):
+    found = problem.linearised(full.family, full.fit.coefficients, full.fit.steps, resolved)
+    if not np.isfinite(found.norm):
         return None
-    kept, start = significant(found.matrix, full.fit.coefficients, found.rows, options.certain)
+    kept, start = significant(found, full.fit.coefficients, options.certain)
     if not len(kept):
         return None
     return full._replace(

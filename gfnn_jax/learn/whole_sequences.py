@@ -84,13 +84,13 @@ def fitted_to_sequences(
     if found is None or not left(family, found.coefficients) <= _RISE * before:
         return None
     kept = tuple(range(len(c)))
-    few = significant(found.factor, found.coefficients, found.rows, _CERTAIN)[0]
+    few = significant(found.triangle, found.coefficients, _CERTAIN)[0]
     if 0 < len(few) < len(c):
         fewer = family.take(tuple(few.tolist()))
         again = train.fit(fewer, found.coefficients[few])
         if again is not None and left(fewer, again.coefficients) <= _RISE * before:
             kept, found, family = tuple(few.tolist()), again, fewer
-    if _ROWS_PER_TERM * len(kept) <= found.rows:
+    if _ROWS_PER_TERM * len(kept) <= found.triangle.rows:
         everyone = along(np.arange(len(prepared.y0)))
         again = everyone.fit(family, found.coefficients) if everyone is not None else None
         if everyone is not None and again is not None:
