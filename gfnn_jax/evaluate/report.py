@@ -69,6 +69,7 @@ def assemble(
             "validation_relative": chosen.validation_relative,
             "validation_bound": chosen.validation_bound,
             "deviations": np.asarray(chosen.deviations).tolist(),
+            "stated_by": fit.stated_by,
             "tolerance": fit.tolerance,
             "tolerance_is_relative": fit.asked.relative,
             "tolerance_met": fit.met,
@@ -77,6 +78,7 @@ def assemble(
         },
         "hamiltonian": _hamiltonian(fit),
         "map": {
+            "multiplier": fit.map.multiplier(),
             "symplecticity_defect": fit.symplecticity_defect,
             "chart_determinant_min": fit.model_determinant_min,
             "chart_determinants_of_data": {n: j.low for n, j in fit.judgements.items()},

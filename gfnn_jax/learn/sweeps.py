@@ -11,15 +11,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.dataset.runs import looked_at
+from gfnn_jax.dataset.split import outermost
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products, number_of_terms
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.learn.candidates import Candidate, Judges, validated
 from gfnn_jax.learn.clock import Clock
-from gfnn_jax.learn.held_out import looked_at, outermost
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.rows import of_rows, rows_of
 from gfnn_jax.maps.affine import Affine
@@ -100,10 +102,15 @@ class _Factors(NamedTuple):
     """Of the training rows, of those held out, and of the training rows without the outermost
     twentieth and of that twentieth alone."""
 
-    train: least_squares.Reduced
-    held: least_squares.Reduced
-    inner: least_squares.Reduced
-    outer: least_squares.Reduced
+    train: Triangle
+    held: Triangle
+    inner: Triangle
+    outer: Triangle
+
+    @classmethod
+    def of(cls, inner: Triangle, outer: Triangle, held: Triangle) -> _Factors:
+        """The rows of the outermost twentieth are appended to the others by their own triangle."""
+        return cls(inner.append(outer.factor, outer.rows), held, inner, outer)
 
 
 class LinearSweep:
@@ -229,8 +236,7 @@ class LinearSweep:
             ).coefficients
             for i in (0, 1)
         )  # fmt: skip
-        missed = np.linalg.norm(train.factor[:count, :count] @ (one - other))
-        return float(missed) / (2 * np.sqrt(train.rows))
+        return train.image_norm(one - other) / (2 * np.sqrt(train.rows))
 
     def root(self, size: Size) -> np.ndarray:
         """(m, m): rootᵀ root is the covariance of the size's coefficients.
@@ -356,7 +362,7 @@ class LinearSweep:
                 slopes = self._slopes(of.family, data[0], *data[2:])
                 scores = shared_noise.scores(slopes, *states)
                 freedom = shared_noise.freedom(slopes, states[0], scores)
-            square = float(np.sum(reduced.factor[count:, -1] ** 2)) / max(reduced.rows, 1)
+            square = reduced.residual_norm(count) ** 2 / max(reduced.rows, 1)
             return square, freedom, reduced.rows
 
         (of_all, taken, _), (of_rest, more, rows) = left(size), left(larger)
@@ -392,10 +398,10 @@ class LinearSweep:
         if stored is None:
             return None
         inner, outer, held = (
-            least_squares.Reduced(np.asfortranarray(stored[part]), int(stored[f"{part}_rows"]))
+            Triangle(stored[part], int(stored[f"{part}_rows"]))
             for part in ("inner", "outer", "held")
         )
-        return _Factors(least_squares.merged(inner, outer), held, inner, outer)
+        return _Factors.of(inner, outer, held)
 
     def _computed(self, group, clock: Clock, say) -> _Factors:
         # Shuffled rows: the first of them are a sample, where all would take too long.
@@ -419,7 +425,7 @@ class LinearSweep:
                 self._named(group), inner=inner.factor, inner_rows=inner.rows, outer=outer.factor,
                 outer_rows=outer.rows, held=held.factor, held_rows=held.rows,
             )  # fmt: skip
-        return _Factors(least_squares.merged(inner, outer), held, inner, outer)
+        return _Factors.of(inner, outer, held)
 
     def _named(self, group) -> str:
         return f"{self.chart.name} {self.kind} {group.num_parameters}"
