@@ -15,13 +15,13 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 # A module imports only from rooms before its own; the modules of a room share its place.
 ORDER = (
     "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes",
-    "storage", "data", "scenes", "families", "solve", "generating", "flows", "maps", "exports",
-    "dataset", "fitting", "models", "learn", "baselines", "evaluate", "jobs", "cli_columns", "cli",
+    "storage", "data", "dataset", "scenes", "families", "solve", "generating", "flows", "maps",
+    "exports", "fitting", "models", "learn", "baselines", "evaluate", "jobs", "cli_columns", "cli",
     "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {
-    ("maps.symplectic_map", f"maps.{name}") for name in ("saved", "samples", "sharded", "energy")
+    ("maps.symplectic_map", f"maps.{name}") for name in ("saved", "samples", "sharded", "energy", "estimates")
 }
 HOMES = {  # the module, and those whose names begin as its own does
     "argparse": "cli",

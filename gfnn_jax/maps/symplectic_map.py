@@ -34,6 +34,7 @@ from gfnn_jax.maps.inputs import Scheduled, Signals
 from gfnn_jax.maps.modified_hamiltonian import NUM_STEPS, Cells, ModifiedHamiltonian, of_cells
 from gfnn_jax.maps.parameters import Parameters, as_args
 from gfnn_jax.maps.posterior import Posterior
+from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.maps.rollout import scan_steps
 from gfnn_jax.phase_space import defect_of_pairs, require_x64, symplecticity_defect
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, Info
@@ -108,7 +109,7 @@ class RolloutInfo(NamedTuple):
     jax.tree_util.register_dataclass,
     data_fields=("pieces", "domain", "scale", "angle_centre", "dt", "parameters", "dt_range"),
     meta_fields=("coordinates", "signals"),
-    drop_fields=("posterior",),
+    drop_fields=("posterior", "sensors"),
 )
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class SymplecticMap:
@@ -124,6 +125,7 @@ class SymplecticMap:
     dt_range:     (2,) the lowest and highest dt of the data, of a map that was learned with dt as a
                   variable of S.
     signals:      the inputs that act on the system, where it has any.
+    sensors:      what was measured and how well, where the map was learned from a recording; no leaf.
     posterior:    how well the coefficients are known, where that is; no leaf: what makes another
                   map of the leaves (``jit``, ``jax.tree.map``) leaves it out.
 
@@ -146,6 +148,7 @@ class SymplecticMap:
     posterior: Posterior | None = None
     dt_range: Any = None
     signals: Signals | None = None
+    sensors: Sensors | None = None
 
     def __post_init__(self):
         if isinstance(self.dt, (int, float)):
@@ -294,6 +297,22 @@ class SymplecticMap:
         from gfnn_jax.maps import energy  # stands after this module: a shorthand for its function
 
         return energy.power_of(self, z, args, inputs)
+
+    def estimate(self, recording) -> tuple[np.ndarray, np.ndarray]:
+        """States z = (q, p) (runs, 2d) at each run's last time and their covariance (runs, 2d, 2d),
+        from the samples of the recording before it: `maps.estimates`. Raises InputError for a map
+        that was not learned from a recording, or where columns or samples are missing."""
+        from gfnn_jax.maps import estimates  # stands after this module: a shorthand for its function
+
+        return estimates.estimate(self, recording)
+
+    def forecast(self, recording, times, inputs=None):
+        """`maps.estimates.Forecast` of the positions at ``times`` (n,), the recording's clock, from
+        the state at each run's end; ``inputs`` are a recording of those ahead, matched by run where
+        it has several. Raises InputError as `estimate` does, and for times before a run's end."""
+        from gfnn_jax.maps import estimates  # stands after this module: a shorthand for its function
+
+        return estimates.forecast(self, recording, times, inputs)
 
     def linearise(self, z, inputs=None, args=None, *, t0=None):
         """(A, B) of a step: ∂Z/∂z (..., 2d, 2d) and ∂Z/∂u (..., 2d, k), inputs u, (k,) or (B, k),

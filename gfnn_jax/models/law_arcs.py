@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from gfnn_jax.fitting.latent_arcs import Observed, Steps
-from gfnn_jax.models.motion import Form
+from gfnn_jax.solve.latent_arcs import Observed, Steps
+from gfnn_jax.flows.motion import Form
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs, Nodes, arcs_of, with_states
-from gfnn_jax.fitting.latent_arcs import Fitted, fit_arcs, loss, sensitivities
+from gfnn_jax.solve.latent_arcs import Fitted, fit_arcs, loss, sensitivities
 from gfnn_jax.models.law_arcs import LawOnArcs
-from gfnn_jax.models.motion import Form
+from gfnn_jax.flows.motion import Form
 from gfnn_jax.models.structure import Key, Structure
 
 _SETTLED = 1.15  # a noise scale that changed by less needs no second fit

@@ -22,6 +22,9 @@ from gfnn_jax.models.structure import Key, Structure
 from gfnn_jax.models.weak_start import protected, weak_start
 
 
+FRICTIONS = ("linear", "quadratic", "dry")  # in the order of libraries.KINDS
+
+
 @dataclasses.dataclass(frozen=True)
 class SearchOptions:
     """Constants of the search, the same for all records (`python -m benchmarks measured`)."""
@@ -34,7 +37,8 @@ class SearchOptions:
     plain_is_enough: float = 1.5  # times the residual of the larger library, the textbook's may have
     gain: float = 0.05  # of the held-out cost, that a term has to bring
     dry_width: float = 0.05  # ε of dry friction, in rms speeds
-    frictions: tuple[str, ...] = ("linear", "quadratic", "dry")
+    frictions: tuple[str, ...] = FRICTIONS
+    choose_friction: bool = True  # by held-out arcs; else all of these
 
 
 def search(
@@ -72,6 +76,10 @@ def search(
         d, (*libraries.first(d, angles), *libraries.more(d, angles)),
         tuple(libraries.losses(d, libraries.KINDS, width)), angles, num_inputs,
     )  # fmt: skip
+    allowed = tuple(libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions)
+    every = dataclasses.replace(
+        every, friction=tuple(row for row in every.friction if row[1] in allowed)
+    )
     frictions = dataclasses.replace(every, terms=every.terms[:1])
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     for periods in options.periods[1:]:
@@ -179,9 +187,10 @@ def choose_friction(
     """The fit with the friction that predicts held-out arcs best; the smaller where two tie."""
     d = fit.structure.dim
     bare = dataclasses.replace(fit.structure, friction=())
-    kinds = [libraries.KINDS[("linear", "quadratic", "dry").index(k)] for k in options.frictions]
+    kinds = [libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions]
     best, lowest = bare, np.full(1, np.inf)
-    for count in range(len(kinds) + 1):
+    counts = range(len(kinds) + 1) if options.choose_friction else [len(kinds)]
+    for count in counts:
         for chosen in combinations(kinds, count):
             rows = libraries.losses(d, chosen, width)
             structure = dataclasses.replace(bare, friction=tuple(rows))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.families.lagrangian import Friction, Terms
-from gfnn_jax.models.motion import Form
+from gfnn_jax.flows.motion import Form
 
 Row = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...], float]
 Loss = tuple[tuple[int, ...], int, float]

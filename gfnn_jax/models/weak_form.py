@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gfnn_jax.models.motion import Form
+from gfnn_jax.flows.motion import Form
 
 _SPACING = 0.25  # of a window's length, from one window to the next
 

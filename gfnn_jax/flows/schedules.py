@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gfnn_jax.models.motion import NODES
+from gfnn_jax.flows.motion import NODES
 
 HOLDS = ("hold", "linear", "band")
 _TAPS = 32  # samples on either side, of band-limited interpolation

@@ -55,13 +55,15 @@ class Model(Protocol):
 @dataclasses.dataclass(frozen=True)
 class Fitted:
     """The fit of all arcs: coefficients p (n,), states x (A, L, m), residuals (A, L, k) in units of the noise
-    (NaN where nothing was seen), the triangle of δp (its R'R is the information matrix of p), and whether
-    it converged."""
+    (NaN where nothing was seen), the triangle of δp (RᵀR is the information matrix of p), those of
+    δx_0 (A, m, m) of each arc with p fixed, ∂x_{L−1}/∂x_0 (A, m, m), and whether it converged."""
 
     p: np.ndarray
     x: np.ndarray
     residuals: np.ndarray
     triangle: np.ndarray
+    arcs: np.ndarray
+    transports: np.ndarray
     cost: float
     iterations: int
     converged: bool
@@ -70,6 +72,11 @@ class Fitted:
         """(RᵀR)⁻¹, for white residuals of unit variance."""
         inverse = np.linalg.pinv(self.triangle)
         return inverse @ inverse.T
+
+    def last_covariance(self) -> np.ndarray:
+        """Of the last state of each arc (A, m, m), with p as it is."""
+        root = self.transports @ np.linalg.pinv(self.arcs)
+        return root @ root.swapaxes(1, 2)
 
 
 def fit_arcs(
@@ -133,10 +140,13 @@ def fit_arcs(
             converged = True
             break
     best = best if best.gap <= closed else here
-    triangle = _reduced(best, sigma).triangle
+    rows, m = _reduced(best, sigma), x.shape[-1]
     found = np.where(seen, best.residuals, np.nan)
     cost = best.cost if best.gap <= closed else np.inf
-    return Fitted(best.p, best.x, found, triangle[:-1, :-1], cost, iteration, converged)
+    own = rows.arcs[:, :, :m], rows.sensitivities[:, -1, :, :m]
+    return Fitted(
+        best.p, best.x, found, rows.triangle[:-1, :-1], *own, cost, iteration, converged
+    )
 
 
 def sensitivities(
