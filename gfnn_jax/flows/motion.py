@@ -79,24 +79,30 @@ class Form:
         g, dg = self.terms.motion(v)
         A, _, _ = self.terms.quadratic()
         theta, d = law.coefficients, self.dim
-        along = (df * v[:, None, :]).sum(-1)
-        force = ((theta * g)[..., None] * df - (theta * along)[..., None] * dg).sum(1)
-        masses = ((theta * f) @ A.reshape(-1, d * d)).reshape(-1, d, d)
-        inverse = np.linalg.inv(masses)
-        a = (inverse @ (force + law.forces(q, v, u))[..., None])[..., 0]
-        push = (a @ A.reshape(-1, d).T).reshape(*df.shape)
-        weighted = (theta[:, None] * df).swapaxes(1, 2)  # (N, d, P)
-        bent = theta[:, None] * (ddf * v[:, None, None, :]).sum(-1)
-        by_q = (push.swapaxes(1, 2) @ (theta[:, None] * df)) + dg.swapaxes(1, 2) @ bent
-        by_q = by_q - ((theta * g)[..., None, None] * ddf).sum(1)
-        turned = dg.swapaxes(1, 2) @ weighted.swapaxes(1, 2)
-        by_v = ((theta * along) @ A.reshape(-1, d * d)).reshape(-1, d, d)
-        by_v = by_v + turned - turned.swapaxes(1, 2) + law.losses_by_v(v)
+        A = A.reshape(-1, d * d)
+        _, pull, stiffness = self.friction.tables(v)
+        directions = self.friction.directions
+        along = np.einsum("npi,ni->np", df, v)
+        forced, turned = theta * g, np.einsum("np,npi->ni", theta * along, dg)
+        force = np.einsum("np,npi->ni", forced, df) - turned - (law.losses * pull) @ directions
+        if self.num_inputs:
+            force = force + u @ law.gains.T
+        inverse = np.linalg.inv(((theta * f) @ A).reshape(-1, d, d))
+        a = np.einsum("nij,nj->ni", inverse, force)
+        push = (a @ A.reshape(-1, d).T).reshape(df.shape)
+        weighted = theta[:, None] * df
+        by_q = push.swapaxes(1, 2) @ weighted
+        by_q += dg.swapaxes(1, 2) @ (theta[:, None] * np.einsum("npij,nj->npi", ddf, v))
+        by_q -= np.einsum("np,npij->nij", forced, ddf)
+        turned = dg.swapaxes(1, 2) @ weighted
+        outer = (directions[:, :, None] * directions[:, None, :]).reshape(-1, d * d)
+        by_v = ((theta * along) @ A + (law.losses * stiffness) @ outer).reshape(-1, d, d)
+        by_v = by_v + turned - turned.swapaxes(1, 2)
         columns = [by_q, by_v]
         if sensitive:
             rows = push * f[..., None] + dg * along[..., None] - g[..., None] * df
             columns.append(rows.swapaxes(1, 2) @ self.basis)
-            columns.append(self.friction.residuals(v).swapaxes(1, 2))
+            columns.append((pull[..., None] * directions).swapaxes(1, 2))
         if sensitive and self.num_inputs:
             pushed = -u[:, None, None, :] * np.eye(d)[:, :, None]
             columns.append(pushed.reshape(len(v), d, -1))
