@@ -12,13 +12,14 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
+from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.fitting import accelerated, gauss_newton, least_squares, row_blocks
 from gfnn_jax.fitting.triangle import folded
 from gfnn_jax.flows.collocation import Steps
-from gfnn_jax.learn.clock import Counted, OutOfTime
+from gfnn_jax.learn.clock import Counted
 
 FITS = """
 import sys
