@@ -54,7 +54,8 @@ from harness import (
 
 import gfnn_jax as gfnn
 from gfnn_jax import processes
-from gfnn_jax.data.files import iterate_pairs, read_sample
+from gfnn_jax.data.files import iterate_pairs
+from gfnn_jax.data.sample import read_sample
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.families.products import Products

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_user
+from gfnn_jax.dataset.bounds import bound_of_mean
+from gfnn_jax.dataset.split import split_rows
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.generating.generated import Generated
@@ -87,15 +89,19 @@ class OneStepError(NamedTuple):
     deviations: np.ndarray
 
 
-def one_step_error(error, spread, tolerance: Tolerance) -> OneStepError:
-    """The statistics of errors (N, 2d) of states whose coordinates have this spread (2d,)."""
+def one_step_error(error, spread, tolerance: Tolerance, block=None) -> OneStepError:
+    """The statistics of errors (N, 2d) of states whose coordinates have this spread (2d,). block:
+    (N,) which of them depend on each other; None: the central limit theorem's bound."""
     if not np.isfinite(error).all():
         width = error.shape[1]
         return OneStepError(np.inf, np.inf, np.inf, np.full(width, np.inf))
     squares = error**2
     deviations = np.sqrt(squares.mean(axis=0))
     measured = np.mean(squares / spread**2 if tolerance.relative else squares, axis=1)
-    bound = measured.mean() + _NORMAL_95 * measured.std() / np.sqrt(len(measured))
+    if block is None:
+        bound = measured.mean() + _NORMAL_95 * measured.std() / np.sqrt(len(measured))
+    else:
+        bound = bound_of_mean(measured, block)
     return OneStepError(
         float(np.sqrt(squares.mean())),
         float(np.sqrt(np.mean(squares / spread**2))),
@@ -106,12 +112,22 @@ def one_step_error(error, spread, tolerance: Tolerance) -> OneStepError:
 
 @dataclasses.dataclass(frozen=True)
 class Judges:
-    """The pairs, which of them train and which judge, and the error that is asked for."""
+    """The pairs, which of them train, which choose (``held_out``) and which state the error
+    (``test``, looked at once, at the end), and the error that is asked for. stretch: (N,) as that
+    of `dataset.split.Split`."""
 
     pairs: Pairs
     training: np.ndarray
     held_out: np.ndarray
     tolerance: Tolerance
+    test: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    stretch: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, pairs: Pairs, seed: int, tolerance: Tolerance) -> Judges:
+        """Of pairs with their runs and places, split by the seed."""
+        split = split_rows(pairs, seed)
+        return cls(pairs, split.training, split.validation, tolerance, split.test, split.stretch)
 
     @property
     def spread(self) -> np.ndarray:
@@ -122,11 +138,14 @@ class Judges:
         """Whether the candidate's error is within the tolerance, at 95 %."""
         return candidate.validation_bound <= self.tolerance.bound
 
-    def error_of(self, images: np.ndarray, coordinates) -> OneStepError:
-        """Of the held-out pairs' images (N, 2d) in the user's coordinates."""
+    def error_of(self, images: np.ndarray, coordinates, rows=None) -> OneStepError:
+        """Of the held-out pairs' images (N, 2d) in the user's coordinates, or of these rows', whose
+        bound then knows which of them depend on each other."""
         angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
-        error = nearest_image(images - np.asarray(self.pairs.z1)[self.held_out], angles)
-        return one_step_error(error, self.spread, self.tolerance)
+        own = self.held_out if rows is None else rows
+        error = nearest_image(images - np.asarray(self.pairs.z1)[own], angles)
+        block = None if rows is None or self.stretch is None else self.stretch[rows]
+        return one_step_error(error, self.spread, self.tolerance, block)
 
     def estimate(self, relative: float) -> OneStepError:
         """What a relative residual of the gradient lets expect of the step."""

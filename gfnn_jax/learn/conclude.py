@@ -13,7 +13,7 @@ from gfnn_jax.learn.check import not_radians
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.choose_law import long_step
 from gfnn_jax.learn.clock import Clock
-from gfnn_jax.learn.diagnose import differs_between_sequences, sequences_of, volume_change
+from gfnn_jax.learn.diagnose import differs_between_sequences, volume_change
 from gfnn_jax.learn.noise import noise_of_sites, state_noise
 from gfnn_jax.learn.propose import proposed
 from gfnn_jax.learn.request import Request
@@ -48,7 +48,11 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     if not searched.swept:
         ended = MET if met else _NO_MORE[request.of_network]
     if ended.startswith(MET) and not met:
-        ended = "the steps of a map that was to meet it do not converge from some of the states"
+        ended = (
+            "the pairs that chose the map meet it, those that state its error do not"
+            if np.isfinite(candidate.validation_relative)
+            else "the steps of a map that was to meet it do not converge from some of the states"
+        )
     if law is not None and searched.of_terms is None:
         on_law = chosen.entry is None or searched.met_by_law
         said = on_law or (law.fast and not met)
@@ -128,7 +132,7 @@ def _residuals_of_sample(
     rows = np.sort(judges.training)[:_RESIDUAL_PAIRS]
     y0, residual, solved = _residuals(candidate, entry, judges, rows)
     rows, y0, residual = rows[solved], y0[solved], residual[solved]
-    sequence = sequences_of(judges.pairs.z0, judges.pairs.z1)[rows]
+    sequence = np.asarray(judges.pairs.run)[rows]
     scale = judges.spread if entry is None else entry.sweep.prepared.scale
     return _Sample(rows, y0, residual, scale, sequence)
 

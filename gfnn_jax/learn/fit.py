@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.dataset.runs import identified
 from gfnn_jax.errors import FitError, FitWarning
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
@@ -30,12 +31,12 @@ from gfnn_jax.learn.diagnose import ChartJudgement
 from gfnn_jax.learn.diagnosed import diagnose_request
 from gfnn_jax.learn.draw import NUM_PAIRS, drawn
 from gfnn_jax.learn.gross_errors import without_gross_errors
-from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.posterior import with_posterior
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
+from gfnn_jax.learn.stated import stated
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -61,13 +62,16 @@ class Fit:
     test_states: (n, 2d) held-out states, test_args their parameters. model_determinant_min: the
     chosen chart's determinant there, where it is closest to 0; NaN for a flow, which has no chart.
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
-    scene: as given.
+    scene: as given. stated_by: the pairs by which the chosen candidate's error was measured.
+    validation_pairs, test_pairs: that chose, and that stated the error; None where the pairs were
+    too few for these.
     """
 
     map: SymplecticMap
     candidates: tuple[Candidate, ...]
     asked: Tolerance
     num_pairs: int
+    validation_pairs: Pairs
     judgements: dict[str, ChartJudgement]
     data_defect: float
     base_map: bool
@@ -82,6 +86,8 @@ class Fit:
     hamiltonian: LearnedHamiltonian | None = None
     pairs: Pairs | None = None
     scene: Scene | None = None
+    stated_by: str = ""
+    test_pairs: Pairs | None = None
 
     def __repr__(self) -> str:
         """One line: the chosen map, its error and the tolerance."""
@@ -275,17 +281,22 @@ def fit(
     warn(request.messages)
     on_progress("looking at the map's local Jacobians")
     with row_blocks.on_devices(_devices(devices)):
-        pairs, plain, about_pairs = clean(request.pairs, request.coordinates, request.structure)
+        pairs, plain, row, about_pairs = clean(
+            *identified(request.pairs), request.coordinates, request.structure
+        )
         warn(about_pairs)
         seen = diagnose_request(request, plain)
         warn(seen.messages)
-        judges = Judges(pairs, *split_rows(pairs, seed, plain.place), request.tolerance)
+        judges = Judges.of(pairs, seed, request.tolerance)
         found = searched(request, plain, seen, judges, on_better)
-        seen, found, about_pairs = without_gross_errors(request, seen, found)
+        seen, found, about_pairs = without_gross_errors(request, seen, found, row)
         warn(about_pairs)
         found = without_bias(found, request)
         pairs = found.judges.pairs
         chosen = with_posterior(choose(found, request), found)
+        on_progress("the test pairs: the error that is stated")
+        error = stated(chosen, found)
+        chosen = chosen._replace(candidate=error.candidate)
         conclusion = conclude(chosen, found, request)
         warn(conclusion.messages)
     judged = min(_JUDGED, block_of(2 * pairs.dim))
@@ -295,6 +306,7 @@ def fit(
         candidates=_all_candidates(chosen, found),
         asked=request.tolerance,
         num_pairs=len(pairs),
+        validation_pairs=pairs.take(found.judges.held_out),
         judgements=found.charts.judgements,
         data_defect=seen.data_defect,
         base_map=bool(chosen.prepared.before or chosen.prepared.after),
@@ -309,6 +321,8 @@ def fit(
         model_determinant_min=_smallest_determinant(chosen),
         pairs=pairs,
         scene=scene,
+        stated_by=error.words,
+        test_pairs=pairs.take(found.judges.test) if len(found.judges.test) else None,
     )
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.split import outermost
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms
@@ -31,7 +32,6 @@ from gfnn_jax.learn.arcs import arcs_of
 from gfnn_jax.learn.candidates import Judges, OneStepError
 from gfnn_jax.learn.centrifugal import centrifugal_terms
 from gfnn_jax.learn.clock import Clock, Counted, OutOfTime
-from gfnn_jax.learn.held_out import outermost
 from gfnn_jax.learn.law_libraries import (
     angles_and_others,
     check_finite,

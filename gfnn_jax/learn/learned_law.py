@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sums import Sums, matrix_free
@@ -32,7 +33,6 @@ from gfnn_jax.learn.cost_of_flow import (
     operations_of,
 )
 from gfnn_jax.learn.formula import Term, formula
-from gfnn_jax.learn.held_out import looked_at
 from gfnn_jax.learn.law_options import OPTIONS, Options
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.whole_sequences import Whole

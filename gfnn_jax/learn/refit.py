@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -67,17 +67,18 @@ def not_refitted(fitted: Fit) -> Fit:
 
 
 def refit(
-    fitted: Fit, chunks: Iterable[Pairs], held: Pairs, *, scene: Scene | None = None,
-    group: Group | None = None,
+    fitted: Fit, chunks: Iterable[Pairs], held: Pairs, *, test: Pairs | None = None,
+    scene: Scene | None = None, group: Group | None = None,
 ) -> Fit:  # fmt: skip
     """The chosen map of a fit, of a linear family, with its coefficients from all of these pairs.
 
     fitted: of a sample of them. chunks: all of the pairs, which need never be in memory together;
     of a law they are gone through once for each Gauss–Newton step. held: pairs that choose the
-    ridge and judge the result; they are left out of the fit, as are outliers, which the sample's
-    map misses by far, and what the steps of a law do not resolve. Charts, domain and noise remain
-    those that the sample gave, and so does the map where all pairs give a worse one. Warns
-    (FitWarning) of both, and where the tolerance is missed.
+    ridge, and between the new map and the sample's. test: pairs that state the error; None: those
+    held state it too. Both are left out of the fit, as are outliers, which the sample's map misses
+    by far, and what the steps of a law do not resolve. Charts, domain and noise remain those that
+    the sample gave, and so does the map where all pairs give a worse one. Warns (FitWarning) of
+    both, and where the tolerance is missed.
 
     group: the processes that have the pairs. This one is the first, with chunks of its own; the
     others call `help_refit`. scene: as `maps.saved.save` takes it.
@@ -93,12 +94,14 @@ def refit(
 
     old, law = fitted.chosen, fitted.hamiltonian
     most = _OUTLYING * np.maximum(old.deviations, _ROUNDOFF * np.asarray(old.map.scale))
-    worker = _Refit(old.map, {"most": most, "held": np.asarray(held.z0)})
-    held = held.take(np.flatnonzero(worker.close(held)))
-    chosen, num_pairs, before = None, fitted.num_pairs, old.validation_rms
-    if len(held):
+    apart = [held] if test is None else [held, test]
+    worker = _Refit(old.map, {"most": most, "held": _states_of(apart)})
+    apart = [pairs.take(np.flatnonzero(worker.close(pairs))) for pairs in apart]
+    held, test = apart[0], apart[-1]
+    chosen, num_pairs, before, after = None, fitted.num_pairs, old.validation_rms, np.inf
+    if len(held) and len(test):
         before = worker.error(old.map, held, tolerance).rms
-        worker.task["held"] = np.asarray(held.z0)
+        worker.task["held"] = _states_of(apart)
         worker.task |= worker.resolving(held)
         bare = dataclasses.replace(old.map, posterior=None)
         group.told({**packed(bare, scene), **{_OF_TASK + n: v for n, v in worker.task.items()}})
@@ -119,13 +122,14 @@ def refit(
                 "resolved by the steps of the law: they are left out"
             )
         if found.map is not None:
-            candidate = with_error(old, worker.error(found.map, held, tolerance))
+            after = worker.error(found.map, held, tolerance).rms
+            candidate = with_error(old, worker.error(found.map, test, tolerance))
             chosen = dataclasses.replace(candidate, map=found.map, train_rms=found.train_rms)
             num_pairs = found.count
     else:
         group.told({})
-    if chosen is None or not chosen.validation_rms <= _NO_WORSE * before:
-        found_map = "no map" if chosen is None else f"a worse map ({chosen.validation_rms:.2e})"
+    if chosen is None or not after <= _NO_WORSE * before:
+        found_map = "no map" if chosen is None else f"a worse map ({after:.2e})"
         warn(f"all pairs give {found_map}: that of the sample ({before:.2e}) is kept")
         chosen, num_pairs = old, fitted.num_pairs
     elif law is not None and found.law is not None and old.learns == "hamiltonian":
@@ -138,6 +142,11 @@ def refit(
         fitted, map=chosen.map, candidates=candidates, num_pairs=num_pairs, seconds=seconds,
         hamiltonian=law, messages=tuple(messages),
     )  # fmt: skip
+
+
+def _states_of(parts: Sequence[Pairs]) -> np.ndarray:
+    """The states z0 of all parts, one after the other."""
+    return np.concatenate([np.asarray(pairs.z0) for pairs in parts])
 
 
 def help_refit(

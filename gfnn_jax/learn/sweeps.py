@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.dataset.runs import looked_at
+from gfnn_jax.dataset.split import outermost
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products, number_of_terms
 from gfnn_jax.families.sines import Sines
@@ -20,7 +22,6 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.learn.candidates import Candidate, Judges, validated
 from gfnn_jax.learn.clock import Clock
-from gfnn_jax.learn.held_out import looked_at, outermost
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.rows import of_rows, rows_of
 from gfnn_jax.maps.affine import Affine

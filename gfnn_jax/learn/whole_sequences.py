@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.runs import steps_between
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem, significant
 from gfnn_jax.fitting.shooting import OPTIONS, Shooting, Shot, arcs_of, longest_arc
 from gfnn_jax.learn.candidates import Judges
-from gfnn_jax.learn.held_out import steps_between
 from gfnn_jax.learn.prepare import Prepared
 
 _SHORTEST = 3  # steps of an arc that says more than its pairs do
@@ -56,7 +56,7 @@ def fitted_to_sequences(
         return None
     resolved = _STEP_ERROR * rms
     steps = problem.fine_steps(family, c, judges.training, (resolved,))[0]
-    between = steps_between(judges.pairs, prepared.place)
+    between = steps_between(judges.pairs)
     longest = longest_arc(family, c, prepared.y0[some], prepared.dt, steps, rms)
 
     def along(rows) -> Shooting | None:
