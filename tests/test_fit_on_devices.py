@@ -253,16 +253,6 @@ def test_rows_go_to_an_accelerator_where_there_is_one(monkeypatch):
     same_factor(found.factor, plain.factor)
 
 
-@pytest.mark.parametrize("triangular", [False, True])
-def test_rows_are_folded_into_a_factor(triangular):
-    rng = np.random.default_rng(0)
-    top, more = np.triu(rng.normal(size=(70, 70))), rng.normal(size=(70, 70))
-    more = np.triu(more) if triangular else more
-    expected = np.linalg.qr(np.concatenate([top, more]), mode="r")
-    found = folded(np.asfortranarray(top), np.asfortranarray(more), triangular=triangular)
-    same_factor(found, expected)
-
-
 def test_other_threads_work_while_rows_are_folded():
     """With Python's lock held they would not count once."""
     rows = np.asfortranarray(np.random.default_rng(0).normal(size=(4_000, 600)))
