@@ -44,6 +44,7 @@ def check_request(
     ensemble=1,
     seed=0,
     max_seconds: float | None = None,
+    max_operations: int | None = None,
 ) -> None:
     """Raises FitError where the request or the pairs cannot give a map."""
     for name, value, known in (
@@ -58,6 +59,12 @@ def check_request(
     budget = isinstance(max_seconds, numbers.Real) and max_seconds > 0
     if max_seconds is not None and not budget:
         raise FitError(f"expected max_seconds above 0, or None for no limit; got {max_seconds!r}")
+    counted = isinstance(max_operations, numbers.Integral) and max_operations >= 0
+    if max_operations is not None and not counted:
+        raise FitError(
+            "expected a whole number of operations as max_operations, or None for no limit; got "
+            f"{max_operations!r}"
+        )
     if not (isinstance(seed, numbers.Integral) and 0 <= seed < 2**32):
         raise FitError(f"expected a whole number from 0 to 2**32 - 1 as seed, got {seed!r}")
     if not (isinstance(ensemble, numbers.Integral) and ensemble >= 1):

@@ -250,24 +250,32 @@ def _divergence(z, residual) -> tuple[float, float]:
     few = len(z) < _PAIRS_PER_TERM * math.comb(width + 3, 3)
     degrees = range(2 if few else 4)
     terms = [t for k in degrees for t in combinations_with_replacement(range(width), k)]
-    powers = np.array([[term.count(i) for i in range(width)] for term in terms])
 
-    def monomials(exponents):
-        return np.prod(x[:, None, :] ** exponents[None, :, :], axis=2)
+    def monomials(terms):
+        return np.stack([np.prod(x[:, list(term)], axis=1) for term in terms], axis=1)
 
-    design = monomials(powers)
+    design = monomials(terms)
     coefficients = np.linalg.lstsq(design, residual, rcond=None)[0]
     rest = residual - design @ coefficients
     if np.mean(rest**2) > 0.5 * np.mean(residual**2):
         return 0.0, np.inf
     covariance = np.linalg.pinv(design.T @ design)
     change, variance = 0.0, 0.0
-    for i, unit in enumerate(np.eye(width, dtype=int)):
-        lowered = monomials(np.maximum(powers - unit, 0))
-        slope = powers[:, i] * lowered.mean(axis=0) / size[i]  # of each term, in direction i
+    for i in range(width):
+        own = [j for j, term in enumerate(terms) if i in term]
+        powers = np.array([terms[j].count(i) for j in own])
+        lowered = monomials([_without(terms[j], i) for j in own])
+        slope = np.zeros(len(terms))  # of each term, in direction i
+        slope[own] = powers * lowered.mean(axis=0) / size[i]
         change += slope @ coefficients[:, i]
         variance += slope @ covariance @ slope * rest[:, i].var()
     return float(change), float(np.sqrt(variance))
+
+
+def _without(term: tuple[int, ...], i: int) -> tuple[int, ...]:
+    """The term with one factor of the i-th coordinate less."""
+    place = term.index(i)
+    return term[:place] + term[place + 1 :]
 
 
 def sampled_dimension(y, scale) -> int:

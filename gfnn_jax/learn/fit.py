@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -25,7 +26,7 @@ from gfnn_jax.learn.assemble import block_of
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance
 from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.clean import clean
-from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.conclude import conclude
 from gfnn_jax.learn.diagnose import ChartJudgement
 from gfnn_jax.learn.diagnosed import diagnose_request
@@ -65,6 +66,8 @@ class Fit:
     scene: as given. stated_by: the pairs by which the chosen candidate's error was measured.
     validation_pairs, test_pairs: that chose, and that stated the error; None where the pairs were
     too few for these.
+    operations: of the search, as counted; as ``max_operations`` they give this
+    map again, whatever the clock. budget: what is left of it.
     """
 
     map: SymplecticMap
@@ -88,6 +91,8 @@ class Fit:
     scene: Scene | None = None
     stated_by: str = ""
     test_pairs: Pairs | None = None
+    operations: int = 0
+    budget: Budget = dataclasses.field(default_factory=Budget, repr=False)
 
     def __repr__(self) -> str:
         """One line: the chosen map, its error and the tolerance."""
@@ -211,6 +216,8 @@ def fit(
     angles: tuple[int, ...] = (),
     seed: int = 0,
     max_seconds: float | None = MAX_SECONDS,
+    max_operations: int | None = None,
+    clock: Callable[[], float] = time.perf_counter,
     max_iterations: int = 250,
     devices: int | str | None = None,
     checkpoints: Any = None,
@@ -247,7 +254,11 @@ def fit(
                posterior; with family="mlp".
     angles:    without a scene, the indices of z that have period 2π.
     max_seconds: for all of it; the search ends with the best map so far while there is time to
-               compile its step. None: no budget.
+               compile its step. None: no budget, and the same map on a busy machine and an idle
+               one.
+    max_operations: of the search, as counted: what a fit reports as ``operations`` gives its map
+               again, whatever the clock has ended. None: no bound.
+    clock:     gives the seconds that max_seconds is held against.
     max_iterations: of the training of "mlp".
     devices:   of this process, among which the rows of the least-squares and Gauss–Newton problems,
                the steps of held-out pairs and the networks of an ensemble are shared out: "all" or
@@ -263,7 +274,8 @@ def fit(
     meets the tolerance, where a chart is close to singular, where pairs contradict their neighbours
     (a few are left out), and where the pairs do not look symplectic.
     """
-    clock = Clock(max_seconds, pairs.dim if isinstance(pairs, Pairs) else None)
+    dim = pairs.dim if isinstance(pairs, Pairs) else None
+    budget = Budget(max_seconds, max_operations, clock, dim)
     require_x64("a fit")
     messages: list[str] = []
 
@@ -275,7 +287,7 @@ def fit(
     request = checked(
         pairs, scene, tolerance=tolerance, absolute_tolerance=absolute_tolerance, learn=learn,
         terms=terms, base=base, structure=structure, family=family, chart=chart,
-        ensemble=ensemble, angles=angles, seed=seed, clock=clock, max_iterations=max_iterations,
+        ensemble=ensemble, angles=angles, seed=seed, budget=budget, max_iterations=max_iterations,
         checkpoints=checkpoints, factors=factors, say=on_progress, tell=on_candidate,
     )  # fmt: skip
     warn(request.messages)
@@ -314,7 +326,7 @@ def fit(
         noise=conclusion.noise,
         messages=tuple(messages),
         ended=conclusion.ended,
-        seconds=clock.seconds,
+        seconds=budget.seconds,
         compile_seconds=chosen.compile_seconds,
         test_states=np.asarray(test.z0),
         test_args=test.args,
@@ -323,6 +335,8 @@ def fit(
         scene=scene,
         stated_by=error.words,
         test_pairs=pairs.take(found.judges.test) if len(found.judges.test) else None,
+        operations=budget.operations,
+        budget=budget,
     )
 
 
