@@ -36,6 +36,7 @@ class SearchOptions:
     tries: int = 3  # terms tried in a row
     plain_is_enough: float = 1.5  # times the residual of the larger library, the textbook's may have
     gain: float = 0.05  # of the held-out cost, that a term has to bring
+    friction_gain: float = 0.1  # of the held-out cost, that another kind of friction has to bring
     dry_width: float = 0.05  # ε of dry friction, in rms speeds
     frictions: tuple[str, ...] = FRICTIONS
     choose_friction: bool = True  # by held-out arcs; else all of these
@@ -124,11 +125,11 @@ def prune(
             return fit
         key = min(z, key=lambda k: z[k])
         smaller = fit.structure.without({key})
-        if z[key] > options.nothing:
+        if z[key] > options.nothing or (key[0] == "loss" and z[key] >= 0):
             if costs is None:
                 costs = bench.cross_validate(nodes, fit, fit.structure, fit.values)
             without = bench.cross_validate(nodes, fit, smaller, fit.values)
-            if gains(without, costs, options):
+            if gains(without, costs, options.gain):
                 refused.add(key)
                 continue
         told(f"  without {key}: {z[key]:.1f} standard errors")
@@ -145,9 +146,9 @@ def significance(fit: LawFit) -> dict[Key, float]:
     return dict(zip(keys, np.where(drives, -z, z).tolist(), strict=True))
 
 
-def gains(costs: np.ndarray, others: np.ndarray, options: SearchOptions) -> bool:
-    """Whether ``others`` are lower in all than these held-out costs (A,)."""
-    return bool(np.sum(others) < np.sum(costs) * (1 - options.gain))
+def gains(costs: np.ndarray, others: np.ndarray, share: float) -> bool:
+    """Whether ``others`` are lower in all than these held-out costs (A,), by this share of them."""
+    return bool(np.sum(others) < np.sum(costs) * (1 - share))
 
 
 def grow(
@@ -167,7 +168,7 @@ def grow(
             costs = bench.cross_validate(nodes, fit, fit.structure, fit.values)
         larger = fit.structure.plus([key])
         with_it = bench.cross_validate(nodes, fit, larger, fit.values)
-        kept = gains(costs, with_it, options)
+        kept = gains(costs, with_it, options.gain)
         told(
             f"  {'with' if kept else 'not'} {key}: score {scores[key]:.1f}, held-out "
             f"{np.sum(costs):.5g} → {np.sum(with_it):.5g}"
@@ -197,7 +198,7 @@ def choose_friction(
             structure = without_drives(bench, fit, structure)
             costs = bench.cross_validate(nodes, fit, structure, fit.values)
             told(f"  friction {structure.friction}: held-out {np.sum(costs):.5g}")
-            if gains(lowest, costs, options):
+            if gains(lowest, costs, options.friction_gain):
                 best, lowest = structure, costs
     arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
     return bench.fit(best, fit.values, arcs, fit.sigma)
