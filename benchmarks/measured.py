@@ -82,15 +82,16 @@ def measure(name: str, path: Path, fold: int, told: Any = None) -> dict[str, Any
     times, unit, asked, most = RECORDS[name]
     errors, within = forecasts(fit.map, held, times)
     rest = rest_of_record(fit.map, held)
-    spread = {
+    return {
         "formula": fit.formula, "friction": fit.friction.formula, "text": fit.table.split("\n")[:2],
-        "seconds": seconds, "most_seconds": most, "unit": unit, "asked": {str(k): v for k, v in asked.items()},
+        "seconds": seconds, "most_seconds": most, "unit": unit,
+        "asked": {str(k): v for k, v in asked.items()},
         "median": {str(t): e * unit for t, e in zip(times, errors, strict=True)},
         "within_two_deviations": {str(t): w for t, w in zip(times, within, strict=True)},
-        "rest": [r * unit for r in rest], "residual": {k: v * unit for k, v in fit.residual.items()},
+        "rest": [r * unit for r in rest],
+        "residual": {k: v * unit for k, v in fit.residual.items()},
         "horizon": [h._asdict() for h in fit.horizon], "num_training": len(training),
     }  # fmt: skip
-    return spread
 
 
 def split(recording: Any, fold: int) -> tuple[Any, list[Any]]:
@@ -98,7 +99,9 @@ def split(recording: Any, fold: int) -> tuple[Any, list[Any]]:
     if len(recording.runs) > 4:
         kept = [r for k, r in enumerate(recording.runs) if k % 3 != fold]
         held = [recording.slice(run=r) for k, r in enumerate(recording.runs) if k % 3 == fold]
-        return gfnn.Recording([table(recording.slice(run=r), r, r) for r in kept], **roles(recording)), held
+        return gfnn.Recording(
+            [table(recording.slice(run=r), r, r) for r in kept], **roles(recording)
+        ), held
     tables, held = [], []
     for run in recording.runs:
         t = recording.times(run)
@@ -113,7 +116,11 @@ def split(recording: Any, fold: int) -> tuple[Any, list[Any]]:
 
 
 def roles(recording: Any) -> dict[str, Any]:
-    return {"positions": recording.positions, "inputs": recording.inputs, "angles": recording.angles}
+    return {
+        "positions": recording.positions,
+        "inputs": recording.inputs,
+        "angles": recording.angles,
+    }
 
 
 def table(part: Any, run: str, label: str) -> dict[str, Any]:
@@ -122,9 +129,11 @@ def table(part: Any, run: str, label: str) -> dict[str, Any]:
     return {"run": np.full(len(t), label), "t": t, **{n: part.values(n, run) for n in names}}
 
 
-def forecasts(map_: Any, held: list[Any], times: tuple[float, ...]) -> tuple[list[float], list[float]]:
-    """Median over windows of the worst coordinate's error at each time ahead, and the share within two
-    standard deviations."""
+def forecasts(
+    map_: Any, held: list[Any], times: tuple[float, ...]
+) -> tuple[list[float], list[float]]:
+    """Median over windows of the worst coordinate's error at each time ahead, and the share within
+    two standard deviations."""
     law = law_of(map_)
     parts = [s for recording in held for s in stretches(recording)]
     places = [(s, k) for s in parts for k in range(SAMPLES - 1, len(s.t) - 1)
@@ -178,7 +187,8 @@ def line(name: str, m: dict[str, Any]) -> str:
     rest = ", ".join(f"{r:.3g}" for r in m["rest"])
     limit = f" (≤ {m['asked']['rest']:g})" if "rest" in m["asked"] else ""
     return (
-        f"{name}: {'; '.join(told)}; rest {rest}{limit}; {m['seconds']:.1f} s (≤ {m['most_seconds']})\n"
+        f"{name}: {'; '.join(told)}; rest {rest}{limit}; {m['seconds']:.1f} s (≤ "
+        f"{m['most_seconds']})\n"
         f"    {m['text'][0]}\n    {m['text'][1]}"
     )
 

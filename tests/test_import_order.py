@@ -21,7 +21,8 @@ ORDER = (
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {
-    ("maps.symplectic_map", f"maps.{name}") for name in ("saved", "samples", "sharded", "energy", "estimates")
+    ("maps.symplectic_map", f"maps.{name}")
+    for name in ("saved", "samples", "sharded", "energy", "estimates")
 }
 HOMES = {  # the module, and those whose names begin as its own does
     "argparse": "cli",

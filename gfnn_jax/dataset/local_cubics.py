@@ -48,8 +48,9 @@ def smooth(
 
 
 def choose_half(stretches: list[tuple[np.ndarray, np.ndarray]]) -> tuple[int, np.ndarray]:
-    """The window (samples to either side) for these stretches (t (n,), y (n, d)) of a recording, and
-    the noise σ (d,) of the channels: the smallest leave-one-out error, less the cubic's own part."""
+    """The window (samples to either side) for these stretches (t (n,), y (n, d)) of a recording,
+    and the noise σ (d,) of the channels: the smallest leave-one-out error, less the cubic's own
+    part."""
     total = sum(len(t) for t, _ in stretches)
     every = max(1, total // _SAMPLES)
     halves = [h for h in _HALVES if any(len(t) >= 2 * h + 1 for t, _ in stretches)]

@@ -1,14 +1,15 @@
 """A recording as a fit of its law sees it: stretches without gaps, thinned to nodes, cut into arcs.
 
-A *stretch* is a part of one run without a gap, angles lifted. Its *nodes* are samples of it, some forty to
-a period of the fastest motion, each with the state (q, v) that local cubics give. An *arc* is a row of
-nodes. All is NumPy, made once.
+A *stretch* is a part of one run without a gap, angles lifted. Its *nodes* are samples of it, some
+forty to a period of the fastest motion, each with the state (q, v) that local cubics give. An
+*arc* is a row of nodes. All is NumPy, made once.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -18,7 +19,11 @@ from gfnn_jax.errors import FitError, InputError
 
 GAP = 3.5  # median steps: a longer one ends a stretch
 PER_PERIOD = 40  # nodes
-_SHORTEST = 9  # samples of a stretch, nodes of an arc: shorter ones tell less than their state needs
+MOST_STEPS = 6_000  # of a fit: more tell little more
+_BLOCK = 8.0  # periods of a block, where only some blocks of a long recording are taken
+_SHORTEST = (
+    9  # samples of a stretch, nodes of an arc: shorter ones tell less than their state needs
+)
 _SHORTEST_ARC = 5
 
 
@@ -34,7 +39,8 @@ class Stretch:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Nodes:
-    """Samples ``at`` (m,) of a stretch, with their times t (m,), positions y (m, d) and states x (m, 2d)."""
+    """Samples ``at`` (m,) of a stretch, with their times t (m,), positions y (m, d) and states x
+    (m, 2d)."""
 
     stretch: Stretch
     at: np.ndarray
@@ -63,11 +69,22 @@ class Scales:
         """Samples from one node to the next."""
         return max(1, round(self.period / self.dt / PER_PERIOD))
 
+    @property
+    def per_period(self) -> float:
+        """Nodes to a period: some forty, fewer of a recording with fewer samples."""
+        return self.period / (self.dt * self.every)
+
+    @property
+    def substeps(self) -> int:
+        """Runge–Kutta steps between two nodes, each at most a quarter of a radian."""
+        return max(1, int(np.ceil(2 * np.pi / self.per_period / 0.25)))
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Arcs:
-    """Arcs of one length L: times (A, L), y (A, L, d), states x (A, L, 2d), and where they come from:
-    (stretch, first node, node after the last). A shorter arc repeats its last node, unseen (NaN)."""
+    """Arcs of one length L: times (A, L), y (A, L, d), states x (A, L, 2d), and where they come
+    from: (stretch, first node, node after the last). A shorter arc repeats its last node, unseen
+    (NaN)."""
 
     t: np.ndarray
     y: np.ndarray
@@ -123,13 +140,21 @@ def measure(found: Sequence[Stretch]) -> Scales:
 
 
 def nodes_of(found: Sequence[Stretch], scales: Scales) -> list[Nodes]:
-    nodes = []
-    for s in found:
-        at = np.arange(0, len(s.t), scales.every)
-        if len(at) < _SHORTEST_ARC:
-            continue
-        q, v, _ = smooth(s.t, s.y, scales.half, at)[0]
-        nodes.append(Nodes(s, at, s.t[at], s.y[at], np.concatenate([q, v], axis=1)))
+    """The nodes of all stretches; of a long recording those of blocks, spread evenly over it."""
+    rows = [np.arange(0, len(s.t), scales.every) for s in found]
+    total = sum(map(len, rows))
+    length = round(_BLOCK * scales.period / scales.dt / scales.every)
+    keep = -(-total * scales.substeps // MOST_STEPS)  # every so many blocks
+    nodes, count = [], 0
+    for s, at in zip(found, rows, strict=True):
+        blocks = [at] if keep == 1 else [at[k : k + length] for k in range(0, len(at), length)]
+        for block in blocks:
+            count += 1
+            if len(block) < _SHORTEST_ARC or (count - 1) % keep:
+                continue
+            q, v, _ = smooth(s.t, s.y, scales.half, block)[0]
+            x = np.concatenate([q, v], axis=1)
+            nodes.append(Nodes(s, block, s.t[block], s.y[block], x))
     return nodes
 
 
@@ -139,11 +164,7 @@ def arcs_of(nodes: Sequence[Nodes], length: int) -> Arcs:
     for i, node in enumerate(nodes):
         count = max(1, round(len(node.t) / length))
         edges = np.linspace(0, len(node.t), count + 1).round().astype(int)
-        home += [
-            (i, int(a), int(b))
-            for a, b in zip(edges[:-1], edges[1:], strict=True)
-            if b - a >= _SHORTEST_ARC
-        ]
+        home += [(i, int(a), int(b)) for a, b in pairwise(edges) if b - a >= _SHORTEST_ARC]
     longest = max(b - a for _, a, b in home)
     t, y, x = [], [], []
     for i, a, b in home:

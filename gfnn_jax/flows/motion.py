@@ -5,8 +5,8 @@ acceleration known all its derivatives are explicit:
 
     ∂a/∂x = −M⁻¹ ∂r/∂x,      ∂a/∂p_k = −M⁻¹ r_k,      r_k the residual of term k alone
 
-One step between two samples is a Runge–Kutta step of Dormand and Prince (order 5), with as many substeps
-as the fastest motion asks; all steps of a recording are taken at once, as one batch.
+One step between two samples is a Runge–Kutta step of Dormand and Prince (order 5), with as many
+substeps as the fastest motion asks; all steps of a recording are taken at once, as one batch.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ _B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
 
 
 class Step(NamedTuple):
-    """States after a step (N, 2d), and their derivatives in the states before (N, 2d, 2d) and in the
-    coefficients (N, 2d, n)."""
+    """States after a step (N, 2d), and their derivatives in the states before (N, 2d, 2d) and in
+    the coefficients (N, 2d, n)."""
 
     states: np.ndarray
     by_state: np.ndarray
@@ -42,8 +42,8 @@ class Step(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Form:
-    """A law whose coefficients are free: terms with θ = ``fixed`` + ``basis`` c (the gauge), friction,
-    and gains of the inputs. Its coefficients are (c, ρ, G row by row)."""
+    """A law whose coefficients are free: terms with θ = ``fixed`` + ``basis`` c (the gauge),
+    friction, and gains of the inputs. Its coefficients are (c, ρ, G row by row)."""
 
     terms: Terms
     fixed: np.ndarray

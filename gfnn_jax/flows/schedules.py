@@ -1,4 +1,5 @@
-"""Inputs between their samples: held, linear, or band-limited, at the nodes of the Runge–Kutta steps."""
+"""Inputs between their samples: held, linear, or band-limited, at the nodes of the Runge–Kutta
+steps."""
 
 from __future__ import annotations
 
@@ -26,8 +27,12 @@ def interpolate(
     if u.shape[1] == 0:
         return np.zeros((*at.shape, 0))
     if hold == "hold":
-        when = flat if starts is None else np.minimum(flat, np.broadcast_to(starts, at.shape).ravel())
-        index = np.clip(np.searchsorted(t, when + 1e-9 * (t[1] - t[0]), side="right") - 1, 0, len(t) - 1)
+        when = (
+            flat if starts is None else np.minimum(flat, np.broadcast_to(starts, at.shape).ravel())
+        )
+        index = np.clip(
+            np.searchsorted(t, when + 1e-9 * (t[1] - t[0]), side="right") - 1, 0, len(t) - 1
+        )
         found = u[index]
     elif hold == "linear":
         found = np.stack([np.interp(flat, t, column) for column in u.T], axis=1)
@@ -37,8 +42,8 @@ def interpolate(
 
 
 def _band_limited(t: np.ndarray, u: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Windowed sinc (Kaiser, β = 8) over the samples around: exact for what is sampled evenly, and well
-    below its Nyquist frequency; the ends repeat their last value."""
+    """Windowed sinc (Kaiser, β = 8) over the samples around: exact for what is sampled evenly, and
+    well below its Nyquist frequency; the ends repeat their last value."""
     step = (t[-1] - t[0]) / (len(t) - 1)
     x = (at - t[0]) / step
     nearest = np.floor(x).astype(int)

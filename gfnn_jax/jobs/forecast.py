@@ -1,7 +1,7 @@
 """What ``gfnn predict MODEL --initial RECORDING`` does: forecasts from the end of each run.
 
-The file written has times (R, n), values and std (R, n, d) by runs and columns; with .csv at its end,
-columns run, t, each position and std_ of each. Angles are in radians.
+The file written has times (R, n), values and std (R, n, d) by runs and columns; with .csv at its
+end, columns run, t, each position and std_ of each. Angles are in radians.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from gfnn_jax.storage.outputs import atomic_write, ensure_new
 
 
 class Judged(NamedTuple):
-    """A forecast against what was measured: column -> (root mean square error, its median size, share
-    of samples within two standard deviations), and the number of samples."""
+    """A forecast against what was measured: column -> (root mean square error, its median size,
+    share of samples within two standard deviations), and the number of samples."""
 
     columns: dict[str, tuple[float, float, float]]
     num_samples: int
@@ -62,7 +62,7 @@ def forecast_recording(
         if measured is not None:
             own = measured.times(run if len(measured.runs) > 1 else measured.runs[0])
             times = own[own > last]
-            times = times[: num_steps] if num_steps else times
+            times = times[:num_steps] if num_steps else times
             if not len(times):
                 raise InputError(f"{compare}: run {run}: holds no sample after {last:g} s")
         else:

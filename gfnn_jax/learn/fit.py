@@ -18,8 +18,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from gfnn_jax.dataset.runs import identified
 from gfnn_jax.data.recording import Recording
+from gfnn_jax.dataset.runs import identified
 from gfnn_jax.errors import FitError, FitWarning, InputError
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
@@ -234,8 +234,9 @@ def fit(
     """Learn the map of these pairs: the cheapest candidate within the tolerance, else the best.
 
     Of a `Recording` learn its law, a Lagrangian with friction and inputs, from its positions: a
-    `models.learned_law.LearnedLaw`; of the options ``learn`` ("auto" or "lagrangian"), ``friction``,
-    ``input_hold``, ``mass`` and ``on_progress`` apply (`learn.recordings`). Of pairs a `Fit`.
+    `models.learned_law.LearnedLaw`; of the options ``learn`` ("auto" or "lagrangian"),
+    ``friction``, ``input_hold``, ``mass`` and ``on_progress`` apply (`learn.recordings`). Of pairs
+    a `Fit`.
 
     pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order.
                Of different dt, S is a function of dt too, in the midpoint chart. With parameters

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -55,9 +56,12 @@ def fit_recording(
     scales = measure(found)
     nodes = nodes_of(found, scales)
     angles = tuple(i for i, n in enumerate(recording.positions) if n in recording.angles)
-    hold = "linear" if input_hold == "auto" else input_hold
-    inputs = ArcInputs(nodes, substeps_of(scales), hold)
-    fit, _, nodes = search(nodes, scales, angles, len(recording.inputs), inputs, told, options)
+    if not recording.inputs:
+        holds: tuple[str, ...] = ("hold",)
+    else:
+        holds = HOLDS if input_hold == "auto" else (input_hold,)
+    inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
+    fit, hold, nodes = search(nodes, scales, angles, len(recording.inputs), inputs, told, options)
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
         raise FitError("no law of the library follows this recording: its arcs could not be closed")
     law, covariance = in_columns(fit)
@@ -74,7 +78,8 @@ def fit_recording(
     q, v = x[:, :d] + zeros, x[:, d:]
     root = _root(covariance)
     sensors = Sensors(
-        recording.positions, recording.inputs, recording.angles, scales.sigma, scales.omega,
+        recording.positions, recording.inputs, recording.angles,
+        np.minimum(scales.sigma, fit.rms()), scales.omega,
         scales.period, hold, 0.0, np.array([scales.period]), np.zeros((1, d)),
     )  # fmt: skip
     told("bands: forecasts from windows of the record")
@@ -89,11 +94,6 @@ def fit_recording(
     map_ = _with_sensors(map_, used.sensors)
     return _described(recording, fit, map_, law, covariance, horizons, gauge, tuple(steps), scales,
                       (q, v, u), [n.t for n in nodes], time.process_time() - started)  # fmt: skip
-
-
-def substeps_of(scales: Scales) -> int:
-    """Runge–Kutta steps between nodes: each at most a fortieth of a period, and a half more."""
-    return max(1, int(np.ceil(scales.every * scales.dt * scales.omega / 0.25)))
 
 
 def _options(friction: str) -> SearchOptions:
@@ -139,7 +139,7 @@ def _described(
     times: list[np.ndarray], seconds: float,
 ) -> LearnedLaw:  # fmt: skip
     """The law in the words of the recording."""
-    names, d = recording.positions, fit.form.dim
+    names = recording.positions
     speeds = speed_names(names, recording.velocities)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     count, lost = law.terms.count, law.friction.count
@@ -161,7 +161,7 @@ def _described(
     return LearnedLaw(
         map=map_, lagrangian=lagrangian, friction=friction, gains=gains,
         hamiltonian=hamiltonian_of(law.terms, lagrangian, names), zeros=zeros,
-        noise=dict(zip(names, map(float, scales.sigma), strict=True)),
+        noise=dict(zip(names, map(float, map_.sensors.sigma), strict=True)),
         residual=dict(zip(names, map(float, fit.rms()), strict=True)), gauge=gauge,
         alike=_alike(fit, lagrangian, friction), horizon=tuple(horizons),
         energy=_energy(law, friction, recording.inputs, states, times),
@@ -178,7 +178,7 @@ def _alike(fit: LawFit, lagrangian: Expression, friction: Expression) -> tuple[s
         correlation = covariance / scale / scale[:, None]
     texts = dict(zip(fit.structure.terms, (t.term for t in lagrangian.terms), strict=True))
     texts |= dict(zip(fit.structure.friction, (t.term for t in friction.terms), strict=True))
-    names = [texts.get(key[1], " ".join(map(str, key))) for key in fit.structure.keys()]
+    names = [texts.get(key[1], " ".join(map(str, key))) for key in fit.values]
     return tuple(
         f"{names[i]} and {names[j]} ({correlation[i, j]:+.3f})"
         for i, j in zip(*np.nonzero(np.triu(np.abs(correlation) > _ALIKE, 1)), strict=True)
@@ -200,7 +200,7 @@ def _energy(
         parts = zip(times, ends[:-1], ends[1:], strict=True)
         return float(sum(np.trapezoid(rate[a:b], t) for t, a, b in parts) / total)
 
-    stored = float(sum(energy[b - 1] - energy[a] for a, b in zip(ends[:-1], ends[1:], strict=True)))
+    stored = float(sum(energy[b - 1] - energy[a] for a, b in pairwise(ends)))
     by_friction = {t.term: mean(lost[:, k]) for k, t in enumerate(friction.terms)}
     by_input = {name: mean(supplied[:, k]) for k, name in enumerate(inputs)}
     closure = stored / total - sum(by_input.values()) + sum(by_friction.values())

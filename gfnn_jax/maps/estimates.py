@@ -2,8 +2,8 @@
 
 The samples before a time are fitted by one arc of the law, its first state unknown: that gives the
 state there with its covariance. A forecast is the orbit from it. Its band holds the error of that
-state, of the law's coefficients, the noise of a sample, and the law's own misfit, as forecasts of the
-data that it was learned from have shown it.
+state, of the law's coefficients, the noise of a sample, and the law's own misfit, as forecasts of
+the data that it was learned from have shown it.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class Window(NamedTuple):
 
 
 class Law(NamedTuple):
-    """A law in use: its form with all coefficients given, a root of their covariance (rootᵀ root), and
-    its sensors."""
+    """A law in use: its form with all coefficients given, a root of their covariance (rootᵀ root),
+    and its sensors."""
 
     form: Form
     p: np.ndarray
@@ -57,7 +57,8 @@ class Law(NamedTuple):
 
 
 def law_in_use(law: Lagrangian, root: np.ndarray | None, sensors: Sensors) -> Law:
-    """Of a Lagrangian without uniform friction and the root (m, n) of the covariance of (θ, ρ, G)."""
+    """Of a Lagrangian without uniform friction and the root (m, n) of the covariance of (θ, ρ,
+    G)."""
     count = law.terms.count
     form = Form(law.terms, np.zeros(count), np.eye(count), law.friction, law.num_inputs)
     p = np.concatenate([law.coefficients, law.losses, np.ravel(law.gains)])
@@ -67,7 +68,9 @@ def law_in_use(law: Lagrangian, root: np.ndarray | None, sensors: Sensors) -> La
 def law_of(map_: Any) -> Law:
     """Of a map that was learned from a recording. Raises InputError for any other."""
     if map_.sensors is None:
-        raise InputError("expected a map that was learned from a recording, which knows its sensors")
+        raise InputError(
+            "expected a map that was learned from a recording, which knows its sensors"
+        )
     law = law_of_map(map_)
     law = Lagrangian(*(_numpy(getattr(law, f.name)) for f in dataclasses.fields(law)))
     root = None if map_.posterior is None else map_.posterior.root
@@ -76,9 +79,7 @@ def law_of(map_: Any) -> Law:
 
 def _numpy(value: Any) -> Any:
     if dataclasses.is_dataclass(value):
-        return type(value)(
-            *(np.asarray(getattr(value, f.name)) for f in dataclasses.fields(value))
-        )
+        return type(value)(*(np.asarray(getattr(value, f.name)) for f in dataclasses.fields(value)))
     return np.asarray(value)
 
 
@@ -159,7 +160,8 @@ def windows_of(sensors: Sensors, recording: Recording) -> list[Window]:
 
 
 def thinned(window: Window) -> Window:
-    """The window with every so many of its samples, counted from the last one: more tell no more."""
+    """The window with every so many of its samples, counted from the last one: more tell no
+    more."""
     every = -(-len(window.t) // _MOST)
     return window._replace(t=window.t[::-every][::-1], y=window.y[::-every][::-1])
 
@@ -191,7 +193,9 @@ class _Windows:
         start = x[:, :-1].reshape(num, m)
         step = self.law.form.step(self.law.p, start, self.h.reshape(num), u, sensitive=False)
         shape = (arcs, length - 1, m)
-        return Steps(step.states.reshape(shape), step.by_state.reshape(*shape, m), np.zeros((*shape, 0)))
+        return Steps(
+            step.states.reshape(shape), step.by_state.reshape(*shape, m), np.zeros((*shape, 0))
+        )
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         d = self.law.form.dim
@@ -201,7 +205,8 @@ class _Windows:
 
 
 def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np.ndarray]:
-    """(q, v) (B, 2d) at the last sample of each window, and its covariance (B, 2d, 2d) in the law."""
+    """(q, v) (B, 2d) at the last sample of each window, and its covariance (B, 2d, 2d) in the
+    law."""
     d, sensors = law.form.dim, law.sensors
     length = max(len(w.t) for w in windows)
     t, y, x = [], [], []
@@ -227,7 +232,8 @@ def _near(sensors: Sensors, t: np.ndarray) -> int:
 
 
 class Orbits(NamedTuple):
-    """Positions (B, n, d) at the times asked, their standard deviations, and the states (B, n, 2d)."""
+    """Positions (B, n, d) at the times asked, their standard deviations, and the states (B, n,
+    2d)."""
 
     values: np.ndarray
     std: np.ndarray
@@ -238,7 +244,8 @@ def propagate(
     law: Law, windows: Sequence[Window], x: np.ndarray, covariance: np.ndarray, last: np.ndarray,
     times: np.ndarray,
 ) -> Orbits:  # fmt: skip
-    """Orbits from states x (B, 2d) with their covariance at times ``last`` (B,), to times (B, n)."""
+    """Orbits from states x (B, 2d) with their covariance at times ``last`` (B,), to times (B,
+    n)."""
     d, sensors, count = law.form.dim, law.sensors, len(law.p)
     steps = np.diff(np.concatenate([last[:, None], times], axis=1), axis=1)
     root = np.linalg.cholesky(covariance + 1e-300 * np.eye(2 * d)) if len(x) else covariance

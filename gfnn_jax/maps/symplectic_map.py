@@ -34,8 +34,8 @@ from gfnn_jax.maps.inputs import Scheduled, Signals
 from gfnn_jax.maps.modified_hamiltonian import NUM_STEPS, Cells, ModifiedHamiltonian, of_cells
 from gfnn_jax.maps.parameters import Parameters, as_args
 from gfnn_jax.maps.posterior import Posterior
-from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.maps.rollout import scan_steps
+from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.phase_space import defect_of_pairs, require_x64, symplecticity_defect
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, Info
 
@@ -124,9 +124,9 @@ class SymplecticMap:
     parameters:   what the system depends on beside its state, where it was learned with that.
     dt_range:     (2,) the lowest and highest dt of the data, of a map that was learned with dt as a
                   variable of S.
-    signals:      the inputs that act on the system, where it has any.
-    sensors:      what was measured and how well, where the map was learned from a recording; no leaf.
-    posterior:    how well the coefficients are known, where that is; no leaf: what makes another
+    signals:      the inputs that act on the system, where it has any. sensors:      what was
+    measured and how well, where the map was learned from a recording; no leaf. posterior:    how
+    well the coefficients are known, where that is; no leaf: what makes another
                   map of the leaves (``jit``, ``jax.tree.map``) leaves it out.
 
     Methods take states z (2d,) or (B, 2d), NumPy or JAX, and answer with JAX arrays. A map that was
@@ -301,7 +301,9 @@ class SymplecticMap:
         """States z = (q, p) (runs, 2d) at each run's last time and their covariance (runs, 2d, 2d),
         from the samples of the recording before it: `maps.estimates`. Raises InputError for a map
         that was not learned from a recording, or where columns or samples are missing."""
-        from gfnn_jax.maps import estimates  # stands after this module: a shorthand for its function
+        from gfnn_jax.maps import (
+            estimates,
+        )  # stands after this module: a shorthand for its function
 
         return estimates.estimate(self, recording)
 
@@ -309,7 +311,9 @@ class SymplecticMap:
         """`maps.estimates.Forecast` of the positions at ``times`` (n,), the recording's clock, from
         the state at each run's end; ``inputs`` are a recording of those ahead, matched by run where
         it has several. Raises InputError as `estimate` does, and for times before a run's end."""
-        from gfnn_jax.maps import estimates  # stands after this module: a shorthand for its function
+        from gfnn_jax.maps import (
+            estimates,
+        )  # stands after this module: a shorthand for its function
 
         return estimates.forecast(self, recording, times, inputs)
 

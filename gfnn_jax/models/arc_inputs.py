@@ -11,8 +11,8 @@ from gfnn_jax.flows.schedules import interpolate, stage_times
 
 
 class ArcInputs:
-    """u (A, L − 1, substeps, 6, k) of arcs, interpolated once for all nodes; of arcs without inputs an
-    array without columns. ``delay``: seconds by which an input acts later."""
+    """u (A, L − 1, substeps, 6, k) of arcs, interpolated once for all nodes; of arcs without
+    inputs an array without columns. ``delay``: seconds by which an input acts later."""
 
     def __init__(self, nodes: Sequence[Nodes], substeps: int, hold: str, delay: float = 0.0):
         self.substeps, self._of_nodes = substeps, []
@@ -25,7 +25,7 @@ class ArcInputs:
     def __call__(self, arcs: Arcs) -> np.ndarray:
         steps = arcs.t.shape[1] - 1
         found = []
-        for i, a, b in arcs.home:
+        for i, a, _ in arcs.home:
             index = np.minimum(np.arange(a, a + steps), len(self._of_nodes[i]) - 1)
             found.append(self._of_nodes[i][index])
         return np.stack(found)

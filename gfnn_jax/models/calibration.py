@@ -1,8 +1,9 @@
 """How well a law forecasts the data that it was learned from: bands and the horizon.
 
-From many samples of the record the state is estimated and the orbit followed. What the forecasts miss,
-beyond what noise and the errors of state and coefficients explain, is the law's own misfit, by the time
-ahead; the time when the median error passes 1 %, 5 % and 20 % of the spread is the horizon.
+From many samples of the record the state is estimated and the orbit followed. What the forecasts
+miss, beyond what noise and the errors of state and coefficients explain, is the law's own misfit,
+by the time ahead; the time when the median error passes 1 %, 5 % and 20 % of the spread is the
+horizon.
 """
 
 from __future__ import annotations
@@ -90,15 +91,15 @@ def _starts(found: Sequence[Stretch], scales: Scales) -> list[tuple[int, int]]:
     fewest = max(_SHORT, round(0.25 * scales.period / scales.dt))
     places = [(i, k) for i, s in enumerate(found) for k in range(fewest - 1, len(s.t) - 1)]
     every = max(1, len(places) // _WINDOWS)
-    return places[:: every] if places else []
+    return places[::every] if places else []
 
 
 def _forecasts(
     law: Law, found: Sequence[Stretch], starts: Sequence[tuple[int, int]], window: float,
     leads: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Errors (B, n, d) of forecasts, NaN where the record ends before, and their standard deviations
-    without a misfit; times are those of the samples nearest to the leads."""
+    """Errors (B, n, d) of forecasts, NaN where the record ends before, and their standard
+    deviations without a misfit; times are those of the samples nearest to the leads."""
     windows, times, measured = [], [], []
     for i, k in starts:
         s = found[i]

@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from gfnn_jax.solve.latent_arcs import Observed, Steps
 from gfnn_jax.flows.motion import Form
+from gfnn_jax.solve.latent_arcs import Observed, Steps
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,4 +1,5 @@
-"""One structure of a law fitted to arcs: coefficients, latent states, noise, errors, held-out cost."""
+"""One structure of a law fitted to arcs: coefficients, latent states, noise, errors, held-out
+cost."""
 
 from __future__ import annotations
 
@@ -8,10 +9,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs, Nodes, arcs_of, with_states
-from gfnn_jax.solve.latent_arcs import Fitted, fit_arcs, loss, sensitivities
-from gfnn_jax.models.law_arcs import LawOnArcs
 from gfnn_jax.flows.motion import Form
+from gfnn_jax.models.law_arcs import LawOnArcs
 from gfnn_jax.models.structure import Key, Structure
+from gfnn_jax.solve.latent_arcs import Fitted, fit_arcs, loss, sensitivities
 
 _SETTLED = 1.15  # a noise scale that changed by less needs no second fit
 FOLDS = 3
@@ -94,9 +95,9 @@ class Workbench:
     def cross_validate(
         self, nodes: Sequence[Nodes], fit: LawFit, structure: Structure, known: Mapping[Key, float]
     ) -> np.ndarray:
-        """Held-out cost (A,) of each arc: of three blocks of arcs, each left out of a fit. All in the
-        noise scale of ``fit``; infinite where a fit fails. Arcs are as long as those of the fit, or
-        as long as three of them can be."""
+        """Held-out cost (A,) of each arc: of three blocks of arcs, each left out of a fit. All in
+        the noise scale of ``fit``; infinite where a fit fails. Arcs are as long as those of the
+        fit, or as long as three of them can be."""
         total = sum(len(n.t) for n in nodes)
         length = min(fit.arcs.t.shape[1], total // FOLDS)
         arcs = arcs_of(with_states(nodes, fit.arcs, fit.fitted.x), length)
@@ -111,7 +112,7 @@ class Workbench:
         """How many standard errors each coefficient of ``candidates`` that the fit lacks would be
         from zero, were it alone added; 0 for those that the others imitate."""
         known = fit.values
-        new = [k for k in candidates.keys() if k not in known]
+        new = [k for k in candidates.keys() if k not in known]  # noqa: SIM118
         larger = fit.structure.plus(new)
         keys = larger.keys()
         p = larger.start(known)
@@ -119,7 +120,7 @@ class Workbench:
         R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, fit.sigma)
         old = [keys.index(k) for k in known]
         own = [keys.index(k) for k in new]
-        Q, upper = np.linalg.qr(R[:, old]) if old else (np.zeros((len(R), 0)), None)
+        Q = np.linalg.qr(R[:, old])[0] if old else np.zeros((len(R), 0))
         rest = R - Q @ (Q.T @ R)
         length = np.linalg.norm(R, axis=0)
         scores = {}

@@ -1,26 +1,26 @@
 """The search for a law: a linear start, arcs of growing length, terms dropped and added.
 
-Half a period, one, two and four periods: short arcs find the law from afar, long ones tell small forces.
-At each length terms that are not seen at four standard errors are dropped, and of those that the law
-lacks the one with the largest score is tried; it stays where arcs that the fit has not seen gain. Which
-friction there is, held-out arcs say in the end.
+Half a period, one, two and four periods: short arcs find the law from afar, long ones tell small
+forces. At each length terms that are not seen at four standard errors are dropped, and of those
+that the law lacks the one with the largest score is tried; it stays where arcs that the fit has
+not seen gain. Which friction there is, held-out arcs say in the end.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 
-from gfnn_jax.dataset.stretches import PER_PERIOD, Nodes, Scales, arcs_of, with_states
+from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of, with_states
+from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import LINEAR
 from gfnn_jax.models import libraries
 from gfnn_jax.models.law_fit import LawFit, Workbench
 from gfnn_jax.models.structure import Key, Structure
 from gfnn_jax.models.weak_start import protected, weak_start
-
 
 FRICTIONS = ("linear", "quadratic", "dry")  # in the order of libraries.KINDS
 
@@ -34,7 +34,9 @@ class SearchOptions:
     nothing: float = 1.0  # standard errors, below which it is, without asking held-out arcs
     asked_for: float = 5.0  # standard errors, above which a term is tried
     tries: int = 3  # terms tried in a row
-    plain_is_enough: float = 1.5  # times the residual of the larger library, the textbook's may have
+    plain_is_enough: float = (
+        1.5  # times the residual of the larger library, the textbook's may have
+    )
     gain: float = 0.05  # of the held-out cost, that a term has to bring
     friction_gain: float = 0.1  # of the held-out cost, that another kind of friction has to bring
     dry_width: float = 0.05  # ε of dry friction, in rms speeds
@@ -47,32 +49,52 @@ def search(
     scales: Scales,
     angles: tuple[int, ...],
     num_inputs: int,
-    inputs: Callable,
+    inputs: Mapping[str, Callable],
     told: Callable[[str], object] = lambda line: None,
     options: SearchOptions = SearchOptions(),
-) -> tuple[LawFit, Workbench, list[Nodes]]:
-    """The law of these nodes: its fit to the longest arcs, and the nodes with the states found."""
+) -> tuple[LawFit, str, list[Nodes]]:
+    """The law of these nodes: its fit to the longest arcs; of the rules between samples of the
+    ``inputs`` (hold -> inputs of arcs) the best; and the nodes with the states found."""
     d = nodes[0].y.shape[1]
     gauge = np.concatenate([n.x[:, :d] for n in nodes])
     state_scale = np.repeat([1.0, scales.omega], d)
-    bench = Workbench(gauge, inputs, state_scale)
+    benches = {hold: Workbench(gauge, u, state_scale) for hold, u in inputs.items()}
+
+    def length(periods: float) -> int:
+        return max(6, round(periods * scales.per_period))
+
     width = options.dry_width * float(np.mean(scales.speed))
     linear = libraries.losses(d, (LINEAR,), 0.0)
     starts = []
-    for rows in (libraries.textbook(d, angles), libraries.first(d, angles)):
+    plain = [libraries.textbook(d, angles)]
+    if d > 1 and len(angles) == d:
+        plain.append(libraries.relative(d, angles))
+    for rows in (*plain, libraries.first(d, angles)):
         library = Structure(d, tuple(rows), tuple(linear), (), num_inputs)
-        structure, known = weak_start(library, nodes, scales)
+        try:
+            structure, known = weak_start(library, nodes, scales)
+        except FitError:
+            continue
         zeros = tuple(i for i in angles if any(row[2][i] for row in structure.terms))
         structure = structure.plus(
             [("loss", row) for row in linear[:d]] + [("zero", i) for i in zeros]
         )
-        if not starts or structure.terms != starts[0].structure.terms:
-            arcs = arcs_of(nodes, round(options.periods[0] * PER_PERIOD))
-            starts.append(bench.fit(structure, known, arcs, scales.sigma))
+        if all(structure.terms != other.structure.terms for other in starts):
+            arcs = arcs_of(nodes, length(options.periods[0]))
+            fits = {
+                hold: bench.fit(structure, known, arcs, scales.sigma)
+                for hold, bench in benches.items()
+            }
+            hold = min(fits, key=lambda hold: float(np.max(fits[hold].rms() / scales.sigma)))
+            benches = {hold: benches[hold]}  # inputs go on between samples as fits best
+            starts.append(fits[hold])
             told(f"{options.periods[0]:g} periods: {describe(starts[-1])}")
-    fit = starts[0]
-    if len(starts) > 1 and np.max(starts[0].rms() / starts[1].rms()) > options.plain_is_enough:
-        fit = starts[1]
+    if not starts:
+        raise FitError("no library of terms follows this recording: do its positions move freely?")
+    (hold, bench), *_ = benches.items()
+    misfit = np.array([float(np.max(start.rms() / scales.sigma)) for start in starts])
+    enough = misfit <= options.plain_is_enough * misfit.min()
+    fit = starts[int(np.flatnonzero(enough)[0])]
     every = Structure(
         d, (*libraries.first(d, angles), *libraries.more(d, angles)),
         tuple(libraries.losses(d, libraries.KINDS, width)), angles, num_inputs,
@@ -84,7 +106,7 @@ def search(
     frictions = dataclasses.replace(every, terms=every.terms[:1])
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     for periods in options.periods[1:]:
-        arcs = arcs_of(nodes, round(periods * PER_PERIOD))
+        arcs = arcs_of(nodes, length(periods))
         if arcs.t.shape == fit.arcs.t.shape:
             break  # no run is longer
         fit = bench.fit(fit.structure, fit.values, arcs, fit.sigma)
@@ -98,23 +120,22 @@ def search(
     fit = prune(bench, nodes, fit, told, options)
     fit = grow(bench, nodes, fit, every, told, options)
     fit = prune(bench, nodes, fit, told, options)
-    return fit, bench, with_states(nodes, fit.arcs, fit.fitted.x)
+    return fit, hold, with_states(nodes, fit.arcs, fit.fitted.x)
 
 
 def describe(fit: LawFit) -> str:
     rms = " ".join(f"{r:.3g}" for r in fit.rms())
     return (
         f"{len(fit.p)} coefficients, residual {rms}, correlated over {fit.correlation:.1f} nodes, "
-        f"{fit.fitted.iterations} iterations"
-        + ("" if fit.fitted.converged else ", not converged")
+        f"{fit.fitted.iterations} iterations" + ("" if fit.fitted.converged else ", not converged")
     )
 
 
 def prune(
     bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, told: Callable, options: SearchOptions
 ) -> LawFit:
-    """The fit without terms that are not seen, the least seen first, as long as held-out arcs do not
-    lose; and without friction that would drive."""
+    """The fit without terms that are not seen, the least seen first, as long as held-out arcs do
+    not lose; and without friction that would drive."""
     refused: set[Key] = set()
     costs = None
     while True:
@@ -183,7 +204,12 @@ def grow(
 
 
 def choose_friction(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, width: float, told: Callable, options: SearchOptions
+    bench: Workbench,
+    nodes: Sequence[Nodes],
+    fit: LawFit,
+    width: float,
+    told: Callable,
+    options: SearchOptions,
 ) -> LawFit:
     """The fit with the friction that predicts held-out arcs best; the smaller where two tie."""
     d = fit.structure.dim

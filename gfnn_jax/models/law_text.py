@@ -75,8 +75,8 @@ def friction_of(
     """Rayleigh's R."""
     listed = []
     for (c, kind, width), rho, s in zip(friction.rows(), losses, std, strict=True):
-        speed = _sum(f"{e}*{v}" if abs(e) != 1 else ("-" if e < 0 else "") + v
-                     for e, v in zip(reversed(c), reversed(list(speeds)), strict=True) if e)  # fmt: skip
+        parts = zip(reversed(c), reversed(list(speeds)), strict=True)
+        speed = _sum(("-" if e < 0 else "") + _times(abs(e), v) for e, v in parts if e)
         speed = f"({speed})" if sum(map(bool, c)) > 1 else speed
         if kind == LINEAR:
             listed.append(Term(f"{speed}**2", rho / 2, s / 2))
@@ -103,11 +103,15 @@ def _wave(m: Sequence[int], phase: float, names: Sequence[str]) -> str:
     """cos or sin of m·q + φ, whichever has the smaller |φ|."""
     sine = abs(phase + np.pi / 2) < np.pi / 4
     rest = phase + np.pi / 2 if sine else phase
-    inside = _sum(("-" if e < 0 else "") + (f"{abs(e)}*" if abs(e) != 1 else "") + q
-                  for e, q in zip(m, names, strict=True) if e)  # fmt: skip
+    parts = zip(m, names, strict=True)
+    inside = _sum(("-" if e < 0 else "") + _times(abs(e), q) for e, q in parts if e)
     if abs(rest) > 1e-12:
         inside = _sum([inside, f"{rest:.5g}"])
     return f"{'sin' if sine else 'cos'}({inside})"
+
+
+def _times(number: int, name: str) -> str:
+    return name if number == 1 else f"{number}*{name}"
 
 
 def _power(name: str, exponent: int) -> str:

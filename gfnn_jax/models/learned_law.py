@@ -62,7 +62,9 @@ class LearnedLaw:
             told = ", ".join(f"{q} {g:.6g} ± {s:.2g}" for q, (g, s) in forces.items())
             lines.append(f"force of {name}: {told}")
         for name, sigma in self.noise.items():
-            lines.append(f"{name}: noise {sigma:.3g}, residual of the law {self.residual[name]:.3g}")
+            lines.append(
+                f"{name}: noise {sigma:.3g}, residual of the law {self.residual[name]:.3g}"
+            )
         for fraction, measured, predicted in self.horizon:
             lines.append(
                 f"forecasts within {fraction:.0%} of the spread for {measured:.3g} s (by the bands "

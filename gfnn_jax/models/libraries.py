@@ -1,9 +1,10 @@
-"""Candidates for the terms of a law, by what its coordinates are: angles come in modes, lengths in powers.
+"""Candidates for the terms of a law, by what its coordinates are: angles come in modes, lengths in
+powers.
 
 The first library is that of textbooks: masses that are constant or depend on one angle, a sum or a
-difference of two, potentials of the same modes, and potentials of lengths to degree 2. One degree of
-freedom has T = ½v². `more` are the
-next orders, of which a fit takes only those that the record asks for.
+difference of two, potentials of the same modes, and potentials of lengths to degree 2. One degree
+of freedom has T = ½v². `more` are the next orders, of which a fit takes only those that the record
+asks for.
 """
 
 from __future__ import annotations
@@ -36,11 +37,33 @@ def textbook(dim: int, angles: tuple[int, ...]) -> list[Row]:
         if max(speeds) == 2 or (sum(speeds) == 2 and speeds not in coupled):
             wanted = not any(wave)
         elif sum(speeds) == 2:
-            wanted = wave in differences and all(a == abs(b) for a, b in zip(speeds, wave))
+            wanted = wave in differences and all(
+                a == abs(b) for a, b in zip(speeds, wave, strict=True)
+            )
         else:
             wanted = any(powers) or sum(map(abs, wave)) == 1
         kept += [row] if wanted else []
     return kept
+
+
+def relative(dim: int, angles: tuple[int, ...]) -> list[Row]:
+    """The same chain where each angle is measured from the link before it: with φ_i = q_1 + … + q_i
+    masses v_k v_l, v_k v_l cos(φ_j − φ_i), and cos φ_i."""
+    none = (0,) * dim
+
+    def link(a: int, b: int) -> tuple[int, ...]:
+        return tuple(int(a < k <= b) for k in range(dim))
+
+    masses = [
+        (unit(dim, k, j), none, link(i, e), 0.0)
+        for i in range(dim)
+        for e in range(i, dim)
+        for k in range(i + 1)
+        for j in range(k, e + 1)
+    ]
+    potentials = [(none, none, link(-1, i), 0.0) for i in range(dim)]
+    start = (unit(dim, 0, 0), none, none, 0.0)
+    return list(dict.fromkeys([start, *masses, *potentials]))
 
 
 def first(dim: int, angles: tuple[int, ...]) -> list[Row]:
@@ -61,7 +84,8 @@ def first(dim: int, angles: tuple[int, ...]) -> list[Row]:
 
 
 def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
-    """Modes up to |m| = 3 and their sines in V, up to 2 in T; powers of lengths up to 6 in V, 2 in T."""
+    """Modes up to |m| = 3 and their sines in V, up to 2 in T; powers of lengths up to 6 in V, 2 in
+    T."""
     none = (0,) * dim
     lengths = [i for i in range(dim) if i not in angles]
     rows: list[Row] = []

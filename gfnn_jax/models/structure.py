@@ -1,8 +1,9 @@
 """The structure of a law: which terms, frictions, gains and zeros of angles it has, and its gauge.
 
-L → c L + const moves nothing, so one coefficient has to be given: the mean of M₁₁ over the data is 1. (To
-set the coefficient of ½v₁² alone would admit M₁₁ = 1 − 1.3 cos q + 0.3 cos 2q, which is nearly zero where
-the data are, and fits any record with nothing.) In a law whose M₁₁ is constant that is ½ of v₁².
+L → c L + const moves nothing, so one coefficient has to be given: the mean of M₁₁ over the data is
+1. (To set the coefficient of ½v₁² alone would admit M₁₁ = 1 − 1.3 cos q + 0.3 cos 2q, which is
+nearly zero where the data are, and fits any record with nothing.) In a law whose M₁₁ is constant
+that is ½ of v₁².
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ Key = tuple[Any, ...]
 
 @dataclasses.dataclass(frozen=True)
 class Structure:
-    """Terms of L (the first is ½v₁²·2, whose coefficient the gauge gives), friction, the coordinates
-    whose zero is unknown, and the number of inputs, each with a gain for each coordinate."""
+    """Terms of L (the first is ½v₁²·2, whose coefficient the gauge gives), friction, the
+    coordinates whose zero is unknown, and the number of inputs, each with a gain for each
+    coordinate."""
 
     dim: int
     terms: tuple[Row, ...]

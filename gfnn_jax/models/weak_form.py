@@ -3,7 +3,8 @@
     ∫ (−φ̇ ∂ℓ_j/∂v − φ ∂ℓ_j/∂q) dt        for a term of L,
     ∫ φ ∂r_k/∂v dt                         for a friction,      −∫ φ u dt   for a gain
 
-with bumps φ = (s(1 − s))³ along windows of the record, in which the term d/dt was integrated by parts.
+with bumps φ = (s(1 − s))³ along windows of the record, in which the term d/dt was integrated by
+parts.
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Nodes, Scales
+from gfnn_jax.errors import FitError
 from gfnn_jax.models.structure import Key, Structure
 from gfnn_jax.models.weak_form import weak_rows
 
@@ -27,7 +28,10 @@ def protected(structure: Structure) -> set[Key]:
 def weak_start(
     structure: Structure, nodes: Sequence[Nodes], scales: Scales
 ) -> tuple[Structure, dict[Key, float]]:
-    """The structure less what is not seen at four standard errors, and its coefficients."""
+    """The structure less what is not seen at four standard errors, and its coefficients.
+
+    Raises FitError where a coordinate without mass and force solves the equations.
+    """
     d = structure.dim
     form = structure.form(np.concatenate([n.x[:, :d] for n in nodes]))
     rows, targets = [], []
@@ -46,7 +50,10 @@ def weak_start(
     while True:
         for _ in range(2):  # each coordinate's rows in units of their own residual
             c, residual, inverse = _solve(X[..., keep] * weight[:, None], Y * weight)
-            weight = weight / np.sqrt(np.mean(residual**2, axis=0))
+            size = np.sqrt(np.mean(residual**2, axis=0))
+            if not np.min(size) > 1e-9 * np.linalg.norm(X[..., keep] * c):
+                raise FitError("the weak form has a solution without motion: a wrong library")
+            weight = weight / size
         error = np.sqrt(_OVERLAP * np.mean(residual**2)) * np.linalg.norm(inverse, axis=1)
         z = [
             np.inf if keys[k] in fixed else abs(value) / e

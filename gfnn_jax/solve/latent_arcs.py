@@ -4,14 +4,15 @@ An arc is a stretch of one run: states x_0 … x_{L−1} at its nodes, of which 
 
     y_n = g(x_n; p) + noise,        x_{n+1} = F_n(x_n; p)
 
-is known. All nodes are kept as unknowns, so that every step F_n is evaluated at once, and an arc need not
-be followed from its first state (multiple shooting; Bock, 1981). An iteration linearises
+is known. All nodes are kept as unknowns, so that every step F_n is evaluated at once, and an arc
+need not be followed from its first state (multiple shooting; Bock, 1981). An iteration linearises
 
     δx_{n+1} = Φ_n δx_n + Γ_n δp + c_n,      c_n = F_n(x_n) − x_{n+1}   (the defect)
 
-which makes δx_n a function of δx_0 and δp alone. The arc's own δx_0 is eliminated by its own QR; what remains
-of all arcs are rows for δp. Where it converges the defects are zero, and each arc is an orbit of the law.
-Residuals enter in units of the noise through Huber's soft-L1 loss, ρ(r) = 2k²(√(1 + (r/k)²) − 1).
+which makes δx_n a function of δx_0 and δp alone. The arc's own δx_0 is eliminated by its own QR;
+what remains of all arcs are rows for δp. Where it converges the defects are zero, and each arc is
+an orbit of the law. Residuals enter in units of the noise through Huber's soft-L1 loss, ρ(r) =
+2k²(√(1 + (r/k)²) − 1).
 """
 
 from __future__ import annotations
@@ -54,9 +55,10 @@ class Model(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Fitted:
-    """The fit of all arcs: coefficients p (n,), states x (A, L, m), residuals (A, L, k) in units of the noise
-    (NaN where nothing was seen), the triangle of δp (RᵀR is the information matrix of p), those of
-    δx_0 (A, m, m) of each arc with p fixed, ∂x_{L−1}/∂x_0 (A, m, m), and whether it converged."""
+    """The fit of all arcs: coefficients p (n,), states x (A, L, m), residuals (A, L, k) in units
+    of the noise (NaN where nothing was seen), the triangle of δp (RᵀR is the information matrix of
+    p), those of δx_0 (A, m, m) of each arc with p fixed, ∂x_{L−1}/∂x_0 (A, m, m), and whether it
+    converged."""
 
     p: np.ndarray
     x: np.ndarray
@@ -91,10 +93,10 @@ def fit_arcs(
 ) -> Fitted:
     """Fit p (n,) and the states x (A, L, m), from what they start at, to y (A, L, k).
 
-    Entries of y that are NaN were not seen. ``sigma`` (k,) is the noise of y, ``state_scale`` (m,) the
-    defect that counts as one standard deviation. While defects matter, an iteration has to close them;
-    then it has to lower the cost. Ends where it lowers it by less than ``tolerance`` of itself. The cost is
-    infinite where the defects could not be closed.
+    Entries of y that are NaN were not seen. ``sigma`` (k,) is the noise of y, ``state_scale`` (m,)
+    the defect that counts as one standard deviation. While defects matter, an iteration has to
+    close them; then it has to lower the cost. Ends where it lowers it by less than ``tolerance``
+    of itself. The cost is infinite where the defects could not be closed.
     """
     seen = np.isfinite(y)
     known = np.where(seen, y, 0.0)
@@ -112,7 +114,8 @@ def fit_arcs(
     here = best = evaluate(p, x)
     damping, converged, iteration = 1e-4, False, 0
     closed = _CLOSED * np.sqrt(x.size)
-    for iteration in range(1, max_iterations + 1):
+    while iteration < max_iterations:
+        iteration += 1
         if not np.isfinite(here.cost):
             break
         rows = _reduced(here, sigma)
@@ -144,9 +147,7 @@ def fit_arcs(
     found = np.where(seen, best.residuals, np.nan)
     cost = best.cost if best.gap <= closed else np.inf
     own = rows.arcs[:, :, :m], rows.sensitivities[:, -1, :, :m]
-    return Fitted(
-        best.p, best.x, found, rows.triangle[:-1, :-1], *own, cost, iteration, converged
-    )
+    return Fitted(best.p, best.x, found, rows.triangle[:-1, :-1], *own, cost, iteration, converged)
 
 
 def sensitivities(
@@ -167,8 +168,8 @@ def loss(residuals: np.ndarray) -> np.ndarray:
 
 
 class _Iterate(NamedTuple):
-    """Where an iteration stands: residuals in units of σ, defects, the cost of the residuals, and the
-    norm of the defects in units of ``state_scale``."""
+    """Where an iteration stands: residuals in units of σ, defects, the cost of the residuals, and
+    the norm of the defects in units of ``state_scale``."""
 
     p: np.ndarray
     x: np.ndarray
@@ -185,8 +186,8 @@ class _Iterate(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Rows of one iteration: each arc's triangle for its own δx_0 (A, m, m + n + 1), the triangle for δp
-    (n + 1, n + 1), and the sensitivities of the states (A, L, m, m + n + 1)."""
+    """Rows of one iteration: each arc's triangle for its own δx_0 (A, m, m + n + 1), the triangle
+    for δp (n + 1, n + 1), and the sensitivities of the states (A, L, m, m + n + 1)."""
 
     arcs: np.ndarray
     triangle: np.ndarray
