@@ -48,7 +48,7 @@ SAMPLES, WINDOWS = 20, 120
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, metavar="DIR")
     parser.add_argument("--only", nargs="*", default=[], metavar="NAME")
     parser.add_argument("--fold", type=int, choices=(0, 1, 2), default=2)
@@ -70,7 +70,7 @@ def main() -> None:
 
 def measure(name: str, path: Path, fold: int, told: Any = None) -> dict[str, Any]:
     """Fit two thirds of a record, and judge forecasts of the rest."""
-    columns = {"inputs": ["u"], "positions": ["y"]} if name == "silverbox" else {}
+    columns: dict[str, Any] = {"inputs": ["u"], "positions": ["y"]} if name == "silverbox" else {}
     if name == "robot_arm":
         columns = {"positions": ["theta1", "theta2"], "inputs": ["tau1", "tau2"],
                    "angles": ["theta1", "theta2"]}  # fmt: skip

@@ -66,12 +66,12 @@ class Terms:
     @staticmethod
     def of(rows: Sequence[Sequence[Any]], dim: int) -> Terms:
         """Of rows (k, n, m, φ). Raises ValueError for more than two factors v, or a power > 8."""
-        whole = [np.array([r[i] for r in rows], dtype=int).reshape(-1, dim) for i in range(3)]
-        if (whole[0].sum(1) > 2).any() or whole[0].min(initial=0) < 0:
+        k, n, m = (np.array([r[i] for r in rows], dtype=int).reshape(-1, dim) for i in range(3))
+        if (k.sum(1) > 2).any() or k.min(initial=0) < 0:
             raise ValueError("a term of a Lagrangian has at most two factors v")
-        if whole[1].max(initial=0) > MAX_POWER or whole[1].min(initial=0) < 0:
+        if n.max(initial=0) > MAX_POWER or n.min(initial=0) < 0:
             raise ValueError(f"powers of coordinates are from 0 to {MAX_POWER}")
-        return Terms(*whole, np.array([float(r[3]) for r in rows]))
+        return Terms(k, n, m, np.array([float(r[3]) for r in rows]))
 
     @property
     def count(self) -> int:
@@ -96,10 +96,8 @@ class Terms:
     def padded(self, count: int) -> Terms:
         """With constants behind, which move nothing, ``count`` terms in all."""
         more = count - self.count
-        whole = (self.speeds, self.powers, self.modes)
-        return Terms(
-            *(np.pad(a, ((0, more), (0, 0))) for a in whole), np.pad(self.phases, (0, more))
-        )
+        k, n, m = (np.pad(a, ((0, more), (0, 0))) for a in (self.speeds, self.powers, self.modes))
+        return Terms(k, n, m, np.pad(self.phases, (0, more)))
 
     def quadratic(self) -> tuple[Any, Any, Any]:
         """A (P, d, d), b (P, d), c (P,) of ∏ v_i^k_i = ½ vᵀA v + b·v + c."""

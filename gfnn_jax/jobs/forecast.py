@@ -58,9 +58,9 @@ def forecast_recording(
     found: dict[str, Forecast] = {}
     for run in recording.runs:
         part = _last_samples(recording.slice(run=run), run, estimate_from)
-        last = part.times(run)[-1]
+        last = float(np.max(part.times(run)))
         if measured is not None:
-            own = measured.times(run if len(measured.runs) > 1 else measured.runs[0])
+            own = measured.times(run if len(measured.runs) > 1 else next(iter(measured.runs)))
             times = own[own > last]
             times = times[:num_steps] if num_steps else times
             if not len(times):
@@ -78,7 +78,7 @@ def _last_samples(recording: Recording, run: str, count: int | None) -> Recordin
     if count is None:
         return recording
     times = recording.times(run)
-    return recording.slice(start=times[max(0, len(times) - count)])
+    return recording.slice(start=float(np.sort(times)[-min(count, len(times)) :].min()))
 
 
 def _judged(sensors: Any, found: dict[str, Forecast], measured: Recording) -> Judged:
@@ -86,7 +86,7 @@ def _judged(sensors: Any, found: dict[str, Forecast], measured: Recording) -> Ju
     for name in sensors.positions:
         errors, stds = [], []
         for run, one in found.items():
-            own = run if len(measured.runs) > 1 else measured.runs[0]
+            own = run if len(measured.runs) > 1 else next(iter(measured.runs))
             at = np.searchsorted(measured.times(own), one.times)
             error = one.values[name][0] - measured.values(name, own)[at]
             if name in sensors.angles:

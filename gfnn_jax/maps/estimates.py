@@ -105,7 +105,7 @@ def forecast(
     sensors = law.sensors
     times = np.atleast_1d(np.asarray(times, float))
     windows = windows_of(sensors, recording)
-    last = np.array([w.t[-1] for w in windows])
+    last = np.array([np.max(w.t) for w in windows])
     if times.ndim != 1 or not np.all(np.diff(times) > 0) or not np.all(times[0] >= last):
         raise InputError(
             f"expected rising times from the end of each run on ({last.max():g} s), got "
@@ -146,16 +146,15 @@ def windows_of(sensors: Sensors, recording: Recording) -> list[Window]:
         u = np.stack(u, axis=1) if u else np.zeros((len(t), 0))
         known = np.isfinite(u).all(axis=1)
         seen = np.isfinite(y).all(axis=1)
-        recent = seen & (t >= t[seen][-1] - sensors.window) if seen.any() else seen
-        if recent.sum() < FEWEST:
-            recent = seen & (np.cumsum(seen[::-1])[::-1] <= FEWEST)
-        if recent.sum() < FEWEST:
+        if np.sum(seen) < FEWEST:
             raise InputError(
                 f"{recording.source}: run {run}: expected at least {FEWEST} samples to estimate "
-                f"the state from, got {int(recent.sum())}"
+                f"the state from, got {np.sum(seen)}"
             )
-        t_seen, y_seen = t[recent], y[recent]
-        windows.append(thinned(Window(t_seen, y_seen, t[known], u[known])))
+        times, places = t[seen], y[seen]
+        recent = times >= times[-FEWEST:].min()
+        recent |= times >= times.max() - sensors.window
+        windows.append(thinned(Window(times[recent], places[recent], t[known], u[known])))
     return windows
 
 
@@ -168,10 +167,10 @@ def thinned(window: Window) -> Window:
 
 def _with_inputs(window: Window, inputs: Recording, sensors: Sensors, run: str) -> Window:
     """The window with inputs behind its own."""
-    run = run if len(inputs.runs) > 1 else inputs.runs[0]
+    run = run if len(inputs.runs) > 1 else next(iter(inputs.runs))
     t = inputs.times(run)
     u = np.stack([inputs.values(n, run) for n in sensors.inputs], axis=1)
-    later = t > window.inputs_t[-1] if len(window.inputs_t) else np.ones(len(t), bool)
+    later = t > np.max(window.inputs_t, initial=-np.inf)
     return window._replace(
         inputs_t=np.concatenate([window.inputs_t, t[later]]),
         inputs=np.concatenate([window.inputs, u[later]]),

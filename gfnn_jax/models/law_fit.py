@@ -4,7 +4,7 @@ cost."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -52,7 +52,7 @@ class Workbench:
     """What all fits of one recording share: positions of the gauge, the inputs of arcs, scales."""
 
     gauge: np.ndarray
-    inputs: object
+    inputs: Callable[[Arcs], np.ndarray]
     state_scale: np.ndarray  # (2d,) per unit of σ: 1 and ω
 
     def model(self, structure: Structure, arcs: Arcs, given: np.ndarray, free: np.ndarray):

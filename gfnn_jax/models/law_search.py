@@ -144,7 +144,7 @@ def prune(
         z = {k: size for k, size in z.items() if k not in fixed and size < options.significant}
         if not z:
             return fit
-        key = min(z, key=lambda k: z[k])
+        key: Key = min(z.items(), key=lambda item: item[1])[0]
         smaller = fit.structure.without({key})
         if z[key] > options.nothing or (key[0] == "loss" and z[key] >= 0):
             if costs is None:

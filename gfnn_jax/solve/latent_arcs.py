@@ -109,7 +109,7 @@ def fit_arcs(
             cost, gap = float(np.sum(loss(residuals))), float(np.linalg.norm(defects / state_scale))
         if not np.isfinite(cost + gap):
             cost = gap = np.inf
-        return _Iterate(p, x, steps, observed, residuals, defects, cost, gap)
+        return _Iterate(p, x, steps, observed, seen, residuals, defects, cost, gap)
 
     here = best = evaluate(p, x)
     damping, converged, iteration = 1e-4, False, 0
@@ -159,7 +159,9 @@ def sensitivities(
     steps, observed = model.steps(p, x), model.observe(p, x)
     residuals = np.where(seen, (np.where(seen, y, 0.0) - observed.values) / sigma, 0.0)
     defects = steps.states - x[:, 1:]
-    return _reduced(_Iterate(p, x, steps, observed, residuals, defects, 0.0, 0.0), sigma).triangle
+    return _reduced(
+        _Iterate(p, x, steps, observed, seen, residuals, defects, 0.0, 0.0), sigma
+    ).triangle
 
 
 def loss(residuals: np.ndarray) -> np.ndarray:
@@ -175,6 +177,7 @@ class _Iterate(NamedTuple):
     x: np.ndarray
     steps: Steps
     observed: Observed
+    seen: np.ndarray
     residuals: np.ndarray
     defects: np.ndarray
     cost: float
@@ -209,12 +212,12 @@ def _reduced(at: _Iterate, sigma: np.ndarray) -> _Rows:
     J /= sigma[:, None]
     J[..., -1] = residuals - J[..., -1]
     weight = (1 + (residuals / ROBUST) ** 2) ** -0.25  # the square root of ρ'(r)/2r
-    weight = weight * (np.abs(residuals) > 0)  # what was not seen has residual 0
+    weight = np.where(at.seen, weight, 0.0)
     J *= weight[..., None]
-    R = np.linalg.qr(J.reshape(num_arcs, length * k, -1), mode="r")
+    R = np.asarray(np.linalg.qr(J.reshape(num_arcs, length * k, -1), mode="r"))
     rest = R[:, m:, m:].reshape(-1, n + 1)
     rest = np.concatenate([rest, np.zeros((max(0, n + 1 - len(rest)), n + 1))])
-    return _Rows(R[:, :m], np.linalg.qr(rest, mode="r"), S)
+    return _Rows(R[:, :m], np.asarray(np.linalg.qr(rest, mode="r")), S)
 
 
 def _solve(rows: _Rows, damping: float) -> tuple[np.ndarray, np.ndarray]:
