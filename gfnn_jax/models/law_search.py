@@ -19,7 +19,7 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import LINEAR
 from gfnn_jax.models import libraries
 from gfnn_jax.models.law_fit import LawFit, Workbench
-from gfnn_jax.models.structure import Key, Structure
+from gfnn_jax.models.structure import Key, Loss, Structure
 from gfnn_jax.models.weak_start import protected, weak_start
 
 FRICTIONS = ("linear", "quadratic", "dry")  # in the order of libraries.KINDS
@@ -97,7 +97,7 @@ def search(
     fit = starts[int(np.flatnonzero(enough)[0])]
     every = Structure(
         d, (*libraries.first(d, angles), *libraries.more(d, angles)),
-        tuple(libraries.losses(d, libraries.KINDS, width)), angles, num_inputs,
+        _with_opposites(libraries.losses(d, libraries.KINDS, width)), angles, num_inputs,
     )  # fmt: skip
     allowed = tuple(libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions)
     every = dataclasses.replace(
@@ -231,7 +231,8 @@ def choose_friction(
 
 
 def without_drives(bench: Workbench, fit: LawFit, structure: Structure) -> Structure:
-    """The structure without friction that a fit would make negative, the worst first."""
+    """The structure without friction that a fit would make negative, the worst first; that of a
+    relative speed gives way to that of the sum."""
     arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
     known = fit.values
     while structure.friction:
@@ -240,5 +241,13 @@ def without_drives(bench: Workbench, fit: LawFit, structure: Structure) -> Struc
         worst = min((("loss", row) for row in structure.friction), key=lambda k: z[k])
         if z[worst] >= 0:
             break
+        turned = libraries.opposite(worst[1])
         structure, known = structure.without({worst}), found.values
+        if turned is not None:
+            structure = structure.plus([("loss", turned)])
     return structure
+
+
+def _with_opposites(rows: list[Loss]) -> tuple[Loss, ...]:
+    turned = (libraries.opposite(row) for row in rows)
+    return (*rows, *(row for row in turned if row is not None))

@@ -121,12 +121,19 @@ def modes(dim: int, angles: tuple[int, ...], order: int) -> list[tuple[int, ...]
 
 
 def losses(dim: int, kinds: tuple[int, ...], width: float) -> list[Loss]:
-    """Friction of each coordinate, of the relative speed of neighbours (a joint), and of the sum of
-    their speeds (the drag on an arm that hangs from another)."""
+    """Friction of each coordinate, and of the relative speed of neighbours (a joint)."""
     directions = [unit(dim, i) for i in range(dim)]
-    for sign in (-1, 1):
-        for i in range(dim - 1):
-            wave = [0] * dim
-            wave[i], wave[i + 1] = sign, 1
-            directions.append(tuple(wave))
+    for i in range(dim - 1):
+        wave = [0] * dim
+        wave[i], wave[i + 1] = -1, 1
+        directions.append(tuple(wave))
     return [(c, kind, width if kind == DRY else 0.0) for kind in kinds for c in directions]
+
+
+def opposite(row: Loss) -> Loss | None:
+    """Friction of the sum of two speeds for that of their difference: the drag on an arm that hangs
+    from another, and what a negative coefficient of the difference stands for. Else None."""
+    direction, kind, width = row
+    if min(direction) >= 0:
+        return None
+    return tuple(map(abs, direction)), kind, width
