@@ -68,9 +68,9 @@ def stop(_):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"chart": "type4"}, "expected a chart among"),
-        ({"family": "spline"}, "expected a family among"),
-        ({"learn": "everything"}, "expected a learn among"),
+        ({"chart": "type4"}, "expected chart to be one of"),
+        ({"family": "spline"}, "expected family to be one of"),
+        ({"learn": "everything"}, "expected learn to be one of"),
         ({"family": "features"}, "needs a scene that declares features"),
         ({"tolerance": 0.0}, "tolerance > 0"),
         ({"tolerance": math.nan}, "tolerance > 0"),

@@ -210,7 +210,7 @@ def fit(
     terms: Sequence[str | Callable] = (),
     base: str | Callable | None = None,
     structure: str | None = None,
-    family: str = "auto",
+    family: Any = "auto",
     chart: str = "auto",
     ensemble: int = 1,
     angles: tuple[int, ...] = (),
@@ -248,7 +248,9 @@ def fit(
                species; of sites, S where learn is "map" or no H meets the tolerance.
                None: the scene's own.
     family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp";
-               with learn="hamiltonian" H is a sum of terms, or a network with "mlp".
+               with learn="hamiltonian" H is a sum of terms, or a network with "mlp". Or a family
+               of one's own that is linear in its parameters, or a function of `Inputs` that gives
+               such families by rising number of terms (`families.own`).
     chart:     "auto" or one of type1, type2, type3, midpoint.
     ensemble:  so many networks trained together, of which the map is the mean and their spread the
                posterior; with family="mlp".
