@@ -113,6 +113,7 @@ def measured_here(system: str, budget: float) -> Numbers:
         warnings.simplefilter("ignore", gfnn.FitWarning)  # kept in fit.messages
         found = fit(pairs, seed=SEED, max_seconds=budget, clock=clock)
         fitted = clock() - started
+        found = found.settled()
         report.assemble(found, scene=None, dt=float(pairs.dt), seed=SEED, rollout=None, data={})
         reported = clock() - started
         saved.save(found.map, Path(folder) / "model")

@@ -17,11 +17,19 @@ _PANEL = 32  # columns per panel of LAPACK's QR: a third faster than 64
 
 def folded(factor: np.ndarray, rows: np.ndarray, *, triangular: bool = False) -> np.ndarray:
     """R of the stacked [factor; rows], (n, n) and (m, n), float64 in Fortran's order; both are
-    overwritten. Costs 2 m n² operations; a third of that where the rows are ``triangular`` too."""
+    overwritten. Costs 2 m n² operations; a third of that where the rows are ``triangular`` too.
+
+    Raises ValueError for arrays of another shape, kind or order.
+    """
     m, n = rows.shape
-    assert factor.shape == (n, n)
-    assert factor.dtype == rows.dtype == np.float64
-    assert all(array.flags.f_contiguous for array in (factor, rows))
+    # LAPACK is told addresses: what it would read or write beside them must never get there.
+    for name, array, shape in (("factor", factor, (n, n)), ("rows", rows, (m, n))):
+        if array.shape != shape or array.dtype != np.float64 or not array.flags.f_contiguous:
+            raise ValueError(
+                f"expected the {name} as float64 of shape {shape} in Fortran's order, got "
+                f"{array.dtype} of shape {array.shape}"
+                + ("" if array.flags.f_contiguous else ", not contiguous")
+            )
     panel = min(_PANEL, n)
     numbers = np.array([m, n, n if triangular else 0, panel, n, max(m, 1), panel, 0], np.intc)
     rows_, columns, zeros, panel_, of_factor, of_rows, of_table, status = (
@@ -32,7 +40,8 @@ def folded(factor: np.ndarray, rows: np.ndarray, *, triangular: bool = False) ->
         rows_, columns, zeros, panel_, factor.ctypes.data, of_factor, rows.ctypes.data, of_rows,
         table.ctypes.data, of_table, work.ctypes.data, status,
     )  # fmt: skip
-    assert numbers[-1] == 0  # an argument of the wrong shape, which it is not
+    if numbers[-1]:
+        raise ValueError(f"expected arguments that LAPACK's dtpqrt takes, got info = {numbers[-1]}")
     return factor
 
 
