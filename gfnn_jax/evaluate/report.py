@@ -112,7 +112,13 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
     """H as it was learned, where its flow meets the tolerance or was chosen."""
     if fit.hamiltonian is None or fit.formula is None:
         return None
-    return {"formula": fit.formula, "terms": [term._asdict() for term in fit.hamiltonian.terms]}
+    law = fit.hamiltonian
+    return {
+        "formula": fit.formula,
+        "terms": [term._asdict() for term in law.terms],
+        "dropped": law.dropped._asdict() if law.dropped is not None else None,
+        "search_cut_short": law.ended or None,
+    }
 
 
 def rollout_part(
