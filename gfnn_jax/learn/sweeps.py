@@ -46,7 +46,7 @@ _MOST_OPERATIONS = 3.2e11
 _SCARCE_FROM_DIM, _PARITY_ROWS, _ODD_DEGREE, _NO_GAIN = 3, 6, 3, 0.98
 _WORTH_KEEPING = 1.0  # seconds
 # Operations of singular values, ÷ terms³; and of a step in NumPy, in units that take as long.
-OF_SOLVE, OF_STEPS = 22.0, 300.0
+OF_SOLVE, OF_STEPS = 22.0, 20.0
 # Pairs of a block that goes to one of two halves: long beside the noise that neighbours share.
 _HALVES_BLOCK = 50
 # Rows per term of a larger size, by which noise is told from misfit.
@@ -519,9 +519,12 @@ def is_even(prepared: Prepared, judges: Judges) -> bool:
     if not degrees:
         return False
     even = Products(inputs, degrees[-1], signs)
+    odd = number_of_terms(inputs.is_angle, _ODD_DEGREE) - even.terms_of(_ODD_DEGREE)
+    if even.num_parameters + odd > _MOST_TERMS:
+        return False
     family = _WithOdd(even)
     pairs = -(-_PARITY_ROWS * family.num_parameters // w.shape[1])
-    if family.num_parameters > _MOST_TERMS or pairs > len(w):
+    if pairs > len(w):
         return False
     train, held = (
         least_squares.reduce(family, [tuple(a[:pairs] for a in rows)], weight)
