@@ -52,7 +52,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         ended = MET if met else cut or _NO_MORE[request.of_network]
     if ended.startswith(MET) and not met:
         ended = "the steps of a map that was to meet it do not converge from some of the states"
-    if law is not None and searched.of_terms is None:
+    if law is not None and searched.of_terms is None and searched.linear is None:
         on_law = chosen.entry is None or searched.met_by_law
         said = on_law or (law.fast and not met)
         messages += law.messages if said else ()
@@ -61,7 +61,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         return Conclusion(ended, None, [*messages, *request.budget.left_out])
     diagnosis: list[str] = []
     structured = request.structure is not None  # too few pairs to look at their neighbours
-    if candidate.validation_relative > _ROUNDOFF:
+    if candidate.validation_relative > _ROUNDOFF and searched.linear is None:
         stalled = _stalled(candidate, chosen.entry, searched)
         left = _left_of_sites if structured else _what_is_left
         work = _work(chosen.entry or next(iter(found.ranking), None))
