@@ -57,7 +57,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
             if np.isfinite(candidate.validation_relative)
             else "the steps of a map that was to meet it do not converge from some of the states"
         )
-    if law is not None and searched.of_terms is None:
+    if law is not None and searched.of_terms is None and searched.linear is None:
         on_law = chosen.entry is None or searched.met_by_law
         said = on_law or (law.fast and not met)
         messages += law.messages if said else ()
@@ -66,7 +66,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         return Conclusion(ended, searched.judges.pairs.std, [*messages, *request.budget.left_out])
     diagnosis: list[str] = []
     structured = request.structure is not None  # too few pairs to look at their neighbours
-    if candidate.validation_relative > _ROUNDOFF:
+    if candidate.validation_relative > _ROUNDOFF and searched.linear is None:
         stalled = _stalled(candidate, chosen.entry, searched)
         left = _left_of_sites if structured else _what_is_left
         work = _work(chosen.entry or next(iter(found.ranking), None))

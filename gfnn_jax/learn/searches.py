@@ -41,9 +41,9 @@ OnBetter = Callable[[SymplecticMap, Candidate], Any]
 
 class Searched(NamedTuple):
     """law: H, or None. of_terms: S with parameters or of a structure, or None. linear: the linear
-    map, where there is nothing else. found: the generated maps. swept: whether any were looked for.
-    charts: theirs. plain: the pairs as prepared, without a base map or law factored out. judges: of
-    the user's pairs."""
+    map, where the budget has left nothing that is as accurate. found: the generated maps. swept:
+    whether any were looked for. charts: theirs. plain: the pairs as prepared, without a base map or
+    law factored out. judges: of the user's pairs."""
 
     law: LearnedHamiltonian | None
     of_terms: LearnedMap | None
@@ -115,12 +115,17 @@ def searched(
         around = search_around(law, plain, judges, scene, budget, say, tell, better, request.seed)
         if around is not None and better_than(around.found, found, law):
             found, charts = around
+    known = [f.candidate for f in (law, of_terms, *found.ranking[:1]) if f is not None]
+    best = min((c.validation_bound for c in known), default=np.inf)
     linear = None
-    if not found.ranking and law is None and of_terms is None:
-        linear = linear_map(plain, judges) if budget.over else None
-        if linear is None:
-            raise failed or FitError(_nothing_found(len(judges.pairs), budget))
-        tell(linear)
+    if budget.over and best > bound.bound:
+        linear = linear_map(plain, judges)
+        if linear is not None and linear.validation_bound < best:
+            tell(linear)
+        elif known:
+            linear = None
+    if not known and linear is None:
+        raise failed or FitError(_nothing_found(len(judges.pairs), budget))
     if of_terms is not None and found.ranking and not _met(of_terms, judges):
         best = found.ranking[0].candidate
         if best.validation_bound < of_terms.candidate.validation_bound:
