@@ -222,15 +222,13 @@ class Shooting:
             block = slice(first, first + size)
             by_state, by_c, residual = self._along(family, c, x[block], block)
             weight = np.sqrt(self._weights(residual, noise, block)) / noise
-            rest = np.concatenate([by_c, residual[..., None]], axis=-1)
-            own, rest = weight[..., None] * by_state, weight[..., None] * rest
-            rows = residual.shape[1] * width
-            rest = rest.reshape(-1, rows, count + 1)
-            t, inside, rest = eliminated(own.reshape(-1, rows, width), rest)
+            rows = np.concatenate([by_state, by_c, residual[..., None]], axis=-1)
+            rows = (weight[..., None] * rows).reshape(len(residual), length * width, -1)
+            own, inside, rest = eliminated(rows, width)
             triangle = triangle.append(rest.reshape(-1, count + 1))
-            parts.append((t, inside, rest[..., :-1].swapaxes(1, 2) @ rest[..., -1:]))
-        t, inside, scores = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return _Arrow(triangle, t, inside, scores[..., 0])
+            parts.append((own, inside, rest[..., :-1].swapaxes(1, 2) @ rest[..., -1:]))
+        own, inside, scores = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return _Arrow(triangle, own, inside, scores[..., 0])
 
     def _along(self, family, c, x, block) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """∂z_k/∂x, ∂z_k/∂c and the residuals along the arcs from x (b, 2d)."""
