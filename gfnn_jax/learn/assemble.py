@@ -23,6 +23,7 @@ from gfnn_jax.maps.symplectic_map import Piece, SymplecticMap
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.solve.status import LEFT_DOMAIN
 
+_TIMING = "the time of a step, and the error of compiled ones"
 _PREDICTOR_PAIRS = 2_000
 # States are stepped in blocks of one shape, whatever their number: compiled once for a kind of map.
 # A block of wide states is of so many numbers.
@@ -58,7 +59,7 @@ def measured(
     run, as long as compiling them fits into the budget."""
     held, compiling = judges.pairs.take(judges.held_out), budget.compiling
     try:
-        with budget.last("the time of a step and the error of compiled steps", COMPILE, compiling):
+        with budget.last(_TIMING, COMPILE, compiling, decides=True):
             steps = stepped(map_, np.asarray(held.z0), held.dt, held.args)
     except OutOfTime:
         return Assembled(dataclasses.replace(candidate, map=map_), 0.0, compiled=False)

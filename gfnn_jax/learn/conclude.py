@@ -28,6 +28,7 @@ _NO_MORE = {
 }
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _SHARE = 0.1  # of the residual, that a change of volume must explain
+_KNOWN = 1.5  # times the noise that was given: up to it, what is left over is that noise
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 _RESIDUAL_PAIRS = 2_000  # whose residuals are looked at
 _NOISE_PAIRS = 1_024  # from which the noise of the states is measured
@@ -62,7 +63,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         messages += law.messages if said else ()
         unmet = law.unmet if said else ""
     if met:
-        return Conclusion(ended, None, [*messages, *request.budget.left_out])
+        return Conclusion(ended, searched.judges.pairs.std, [*messages, *request.budget.left_out])
     diagnosis: list[str] = []
     structured = request.structure is not None  # too few pairs to look at their neighbours
     if candidate.validation_relative > _ROUNDOFF:
@@ -209,6 +210,8 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     if law is not None and law.noise is not None and candidate.learns == "hamiltonian":
         # Along an arc what the law misses adds up, and looks like noise.
         noise = np.minimum(law.noise, noise)
+    if judges.pairs.std is not None:
+        return _beside_known(noise, judges.pairs.std)
     own = ""
     if candidate.learns == "map" and entry is not None:
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))
@@ -225,6 +228,20 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         f"{hidden}or to have a structure that these functions cannot represent"
     )
     return _LeftOver(noise, [message])
+
+
+def _beside_known(found: np.ndarray, known: np.ndarray) -> _LeftOver:
+    """Noise (2d,) that was given, beside what the residuals suggest (2d,)."""
+    ratio = float(np.max(found / known))
+    if ratio <= _KNOWN:
+        reason = "what is left over is the noise that was given"
+        return _LeftOver(known, [f"larger models are no more accurate: {reason}"], reason)
+    message = (
+        f"larger models are no more accurate, and leave up to {ratio:.2g} times the noise that was "
+        "given: std is too small, or the pairs have a structure that these functions cannot "
+        "represent"
+    )
+    return _LeftOver(known, [message])
 
 
 def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOver:

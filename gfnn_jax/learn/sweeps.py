@@ -14,7 +14,8 @@ import numpy as np
 from gfnn_jax.dataset.noise import of_pairs
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.dataset.split import outermost
-from gfnn_jax.families.inputs import box_inputs, variable_signs
+from gfnn_jax.families.inputs import Inputs, box_inputs, variable_signs
+from gfnn_jax.families.own import own_families
 from gfnn_jax.families.products import Products, number_of_terms
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.time_step import OfTimeStep
@@ -46,7 +47,7 @@ _MOST_OPERATIONS = 3.2e11
 _SCARCE_FROM_DIM, _PARITY_ROWS, _ODD_DEGREE, _NO_GAIN = 3, 6, 3, 0.98
 _WORTH_KEEPING = 1.0  # seconds
 # Operations of singular values, ÷ terms³; and of a step in NumPy, in units that take as long.
-OF_SOLVE, OF_STEPS = 22.0, 300.0
+OF_SOLVE, OF_STEPS = 22.0, 20.0
 # Pairs of a block that goes to one of two halves: long beside the noise that neighbours share.
 _HALVES_BLOCK = 50
 # Rows per term of a larger size, by which noise is told from misfit.
@@ -71,13 +72,20 @@ class Size:
 
 
 def sweeps_for(
-    request: str, charts: Sequence[AnyChart], prepared, scene, judges, factors=None
+    request: Any, charts: Sequence[AnyChart], prepared, scene, judges, factors=None
 ) -> Iterator:
     """The sweeps of the families that apply, chart by chart.
 
-    request: "auto", "polynomial", "features" (the scene's) or "sines"; with "auto" random sines
-    are tried where polynomials have too many terms. factors: as ``LinearSweep`` takes them.
+    request: "auto", "polynomial", "features" (the scene's), "sines", or a user's own; with "auto"
+    random sines are tried where polynomials have too many terms. factors: as ``LinearSweep`` takes
+    them.
     """
+    if not isinstance(request, str):
+        for chart in charts:
+            yield LinearSweep(
+                prepared, chart, judges, "own", None, None, own=lambda i: own_families(request, i)
+            )  # fmt: skip
+        return
     features = scene.features if scene is not None else None
     polynomials = request in ("auto", "polynomial")
     even = polynomials and (scene is None or scene.reversor is None) and is_even(prepared, judges)
@@ -119,12 +127,13 @@ class LinearSweep:
     """The sizes of one linear family in one chart.
 
     factors: a ``KeptFactors``, where factors that took long are kept for a fit that goes on. even:
-    whether S(−w) = S(w), and has even terms only.
+    whether S(−w) = S(w), and has even terms only. own: a user's families, of the inputs, by rising
+    number of terms.
     """
 
     def __init__(
         self, prepared: Prepared, chart: AnyChart, judges: Judges, kind: str, features, reversor,
-        factors=None, even=False,
+        factors=None, even=False, own: Callable[[Inputs], Iterable[Any]] | None = None,
     ):  # fmt: skip
         reversor = (-1,) * 2 * prepared.dim if even else reversor
         self._kept, self._prefix = factors, "even " if even else ""
@@ -144,15 +153,17 @@ class LinearSweep:
         )  # fmt: skip
         degrees = _EVEN_DEGREES if even else _DEGREES
         signs = None
-        if kind != "sines" and reversor is not None:
+        if kind != "sines" and own is None and reversor is not None:
             signs = variable_signs(inputs, reversor, w)
 
         def groups() -> Iterator[Iterable[Any]]:
+            if own is not None:
+                return ([family] for family in own(inputs))
             if kind == "sines":
                 return ([Sines(inputs, count)] for count in _SINES)
             return ((of(inputs, degree, signs) for degree in g) for g in degrees)
 
-        known = len(_SINES) if kind == "sines" else sum(map(len, degrees))
+        known = len(_SINES) if kind == "sines" or own is not None else sum(map(len, degrees))
         self._groups, rows = groups, self._train[1].size
         self.sizes = [
             Size(family, group[-1], _extent(family))
@@ -216,7 +227,7 @@ class LinearSweep:
     def at(self, extent: float) -> str:
         """What the size of this extent is, how many terms it has, and how many pairs they take."""
         family = self.sizes[0].family
-        if isinstance(family, Sines):
+        if not hasattr(family, "degree"):
             label = f"{family.name} {(terms := round(2**extent))}"
         else:
             degree = round(extent)
@@ -467,8 +478,9 @@ class LinearSweep:
 
 
 def _extent(family) -> float:
-    """The degree of products, or log₂ of the number of sines."""
-    return float(np.log2(family.num_parameters) if isinstance(family, Sines) else family.degree)
+    """The degree of products, or log₂ of the number of terms."""
+    degree = getattr(family, "degree", None)
+    return float(np.log2(family.num_parameters) if degree is None else degree)
 
 
 class _WithOdd:
@@ -507,9 +519,12 @@ def is_even(prepared: Prepared, judges: Judges) -> bool:
     if not degrees:
         return False
     even = Products(inputs, degrees[-1], signs)
+    odd = number_of_terms(inputs.is_angle, _ODD_DEGREE) - even.terms_of(_ODD_DEGREE)
+    if even.num_parameters + odd > _MOST_TERMS:
+        return False
     family = _WithOdd(even)
     pairs = -(-_PARITY_ROWS * family.num_parameters // w.shape[1])
-    if family.num_parameters > _MOST_TERMS or pairs > len(w):
+    if pairs > len(w):
         return False
     train, held = (
         least_squares.reduce(family, [tuple(a[:pairs] for a in rows)], weight)
