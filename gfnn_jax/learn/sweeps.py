@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.noise import of_pairs
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.dataset.split import outermost
 from gfnn_jax.families.inputs import Inputs, box_inputs, variable_signs
@@ -393,8 +394,7 @@ class LinearSweep(Generates):
         residual = slopes @ solved.coefficients - target * self._weight
         first, second = self.by_states(size.family, params, w, *args)
         step = np.linalg.solve(second, np.concatenate([residual[..., None], -first], axis=-1))
-        found = shared_noise.variances(step[..., 0], step[..., 1:], np.flatnonzero(goes_on))
-        return np.sqrt(found)
+        return of_pairs(step[..., 0], step[..., 1:], np.flatnonzero(goes_on))
 
     def freedoms(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
         """Degrees of freedom that noise takes of a fit of so many of the leading terms of a size:
