@@ -23,7 +23,7 @@ from gfnn_jax.compiling import enable_compile_cache
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new
-from gfnn_jax.storage.partial import told_of
+from gfnn_jax.storage.partial import unfinished_note
 
 # Those of `learn.check` and `exports.export`, which would bring JAX; a test compares them.
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
@@ -85,7 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as stop:
         terminated = isinstance(stop, _Terminated)
         # Notes of who keeps something; before its work begins, an earlier job may have.
-        before = told_of(arguments.out) if getattr(arguments, "out", None) else None
+        before = unfinished_note(arguments.out) if getattr(arguments, "out", None) else None
         kept = getattr(stop, "__notes__", [before or "nothing was kept"])
         return _fail(
             143 if terminated else 130,

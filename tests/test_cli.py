@@ -409,9 +409,9 @@ def test_a_training_that_was_stopped(fitted, tmp_path, capsys, monkeypatch):
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.endswith("m.partial keeps step_000000000007: --resume goes on with it")
     assert gfnn(*fit) == 2
-    assert "m.partial: an unfinished fit" in capsys.readouterr().err
+    assert "m.partial: holds an unfinished fit" in capsys.readouterr().err
     assert gfnn(*fit, "--resume", "--seed", 1) == 2
-    assert "m.partial: of another fit: seed differ" in capsys.readouterr().err
+    assert "m.partial: belongs to another fit: seed differ" in capsys.readouterr().err
     assert gfnn(*fit, "--overwrite") == 130
     assert gfnn(*fit, "--resume") == 0
     assert started_from == [None, None, 7]
@@ -431,7 +431,7 @@ def test_resuming_another_job_discards_no_training(fitted, tmp_path, capsys, mon
     before = files(tmp_path)
     monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
     assert gfnn(*fit, "--resume") == 2
-    assert "m.partial: of another fit: family differ" in capsys.readouterr().err
+    assert "m.partial: belongs to another fit: family differ" in capsys.readouterr().err
     assert files(tmp_path) == before
 
 

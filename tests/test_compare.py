@@ -48,7 +48,7 @@ def test_an_interrupted_comparison_keeps_what_is_finished_and_reports_all(small,
     kept = json.loads((out.with_name("out.partial") / "hnn.json").read_text())
     with pytest.raises(InputError, match="an unfinished comparison"):
         compare(out)
-    with pytest.raises(InputError, match="of another comparison: seed differ"):
+    with pytest.raises(InputError, match="belongs to another comparison: seed differ"):
         compare(out, resume=True, seed=1)
     told = []
     compared = compare(out, resume=True, progress=Progress(told.append))

@@ -142,7 +142,7 @@ def test_an_interrupted_job_says_what_it_keeps(tmp_path):
     assert stop(tmp_path) == [f"{tmp_path}/out.partial keeps part: --resume goes on with it"]
     with pytest.raises(InputError, match="an unfinished job"), job(tmp_path):
         pass
-    with pytest.raises(InputError, match="of another job: seed, more differ"):
+    with pytest.raises(InputError, match="belongs to another job: seed, more differ"):
         stop(tmp_path, resume=True, seed=1, more=2)
     with job(tmp_path, resume=True) as folder:
         assert kept(folder) == ["part"]

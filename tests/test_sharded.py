@@ -209,7 +209,7 @@ def test_a_killed_process_ends_the_others(killed, folder):
     assert status != 0
     lines = [line for line in told.splitlines() if not line.startswith("[")]  # but progress
     assert len(lines) == 1, told
-    assert lines[0].startswith("gfnn: this process or another one of the job was lost: what they")
+    assert lines[0].startswith("gfnn: this process or another one of the job was lost: their fin")
     for journal in journals:
         assert journal.read_bytes().count(b"\n") > 3
     assert parts.number_of_parts(out, Share(0, 3), resume=True) == 2
@@ -268,7 +268,7 @@ def test_parts_of_everything_that_a_prediction_can_hold(tmp_path):
 @pytest.mark.parametrize(
     ("told", "line"),
     [
-        ({}, "expected a launcher that JAX knows, as srun and mpirun, or JAX_COORDINATOR_ADDRESS"),
+        ({}, "needs a launcher that JAX knows, such as srun or mpirun, or the variables JAX_COORD"),
         ({"JAX_PROCESS_ID": "one"}, "expected a whole number as JAX_PROCESS_ID, got 'one'"),
     ],
 )
