@@ -334,7 +334,7 @@ DT = np.linspace(0.1, 0.2, 40)
         (DT[:7], None, {}, "one number or one of each pair (40,), got (7,)"),
         (0.1, {"l": DT[:7]}, {}, "expected args['l'] of shape (40,), got (7,)"),
         (0.1, DT[:7], {}, "as name -> (40,) or as an array (40, k)"),
-        (0.1, {"q1": DT}, {}, "a name for a parameter that has no meaning yet, got 'q1'"),
+        (0.1, {"q1": DT}, {}, "'q1' cannot name a parameter"),
         (0.1, {"arm length": DT}, {}, "letters, digits and _ as a parameter's name"),
         (0.1, {"l": np.where(DT > 0.19, np.nan, DT)}, {}, "finite values of l, got 4 of 40"),
         (DT, {"l": DT}, {"learn": "map"}, "the pairs differ in their dt: expected learn='auto'"),

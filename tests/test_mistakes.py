@@ -55,7 +55,7 @@ MISTAKES = {
     "times instead of dt": (lambda: fit(Z0, Z1, np.arange(3.0)), "(200,), got (3,)"),
     "a parameter of few": (lambda: fit(Z0, Z1, DT, {"l": np.ones(3)}), "args['l'] of shape (200,)"),
     "parameters without names or shape": (lambda: fit(Z0, Z1, DT, [1, 2]), "name -> (200,)"),
-    "a parameter called q1": (lambda: fit(Z0, Z1, DT, {"q1": LENGTH}), "has no meaning yet"),
+    "a parameter called q1": (lambda: fit(Z0, Z1, DT, {"q1": LENGTH}), "'q1' cannot name"),
     "a drive without its period": (
         lambda: gfnn.fit(gfnn.Pairs(Z0, Z1, DT, t0=LENGTH)), "together with its period"),
     "a drive of period < 0": (
