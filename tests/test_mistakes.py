@@ -122,7 +122,7 @@ WITH_A_MAP = {
         lambda m: m.rollout(Z0[:3], 9, params={"l": 1.0}), "learned without"),
     "the time of no drive": (lambda m: m.rollout(Z0[:3], 9, t0=np.zeros(3)), "without a drive"),
     "no samples": (lambda m: m.sample(KEY, 0), "a number of samples above 0"),
-    "more devices than there are": (lambda m: m.sharded(99), "devices, which there are; got 99"),
+    "more devices than there are": (lambda m: m.sharded(99), "all that exist here; got 99"),
 }  # fmt: skip
 
 

@@ -131,7 +131,7 @@ def test_parameters_go_with_their_lanes():
 
 
 def test_more_devices_than_there_are():
-    with pytest.raises(ValueError, match="expected 1 to 1 devices, which there are; got 2"):
+    with pytest.raises(ValueError, match="expected 1 to 1 devices, all that exist here; got 2"):
         local_devices(2)
 
 

@@ -94,7 +94,7 @@ class Inputs:
         return feature_tables(self.features, w, order=order)
 
     def pull_back_gradient(self, gradient, slope):
-        """∇ with respect to w (..., 2d) from that with respect to x (..., k)."""
+        """Gradient in w (..., 2d) from the gradient in x (..., k), by the chain rule."""
         if slope is not None:
             return matmul(gradient[..., None, :], slope)[..., 0, :]
         xp = namespace(gradient)
@@ -103,7 +103,7 @@ class Inputs:
         )
 
     def pull_back_hessian(self, hessian, gradient, slope, curvature):
-        """The Hessian with respect to w (..., 2d, 2d) from that with respect to x (..., k, k)."""
+        """Hessian in w (..., 2d, 2d) from the Hessian in x (..., k, k), by the chain rule."""
         xp = namespace(hessian)
         if slope is not None:
             bent = xp.sum(gradient[..., None, None] * curvature, axis=-3)
@@ -113,7 +113,7 @@ class Inputs:
         return self._spread(xp.swapaxes(self._spread(hessian), -1, -2))
 
     def pull_back_terms(self, gradients, slope):
-        """∇ of many functions with respect to w (..., 2d, m) from (..., k, m)."""
+        """Gradients of m functions in w (..., 2d, m) from those in x (..., k, m)."""
         xp = namespace(gradients)
         if slope is not None:
             return matmul(xp.swapaxes(slope, -1, -2), gradients)

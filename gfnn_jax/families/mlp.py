@@ -99,13 +99,13 @@ class Mlp(DifferentiatedByJax):
     def value(self, params, w, args=None):
         """S(params, w), shape (...): w (..., 2d) of any float dtype, computed in that of params."""
         dtype = jax.tree.leaves(params)[0].dtype
-        x = self.seen(w).astype(dtype)
+        x = self.network_inputs(w).astype(dtype)
         amplitude = jnp.asarray(self.amplitude, dtype)
         out: Any = self._network(dtype).apply({"params": params}, x)
         return amplitude * out[..., 0]
 
-    def seen(self, w):
-        """What the network sees at w (..., 2d): (..., num_inputs)."""
+    def network_inputs(self, w):
+        """Inputs of the network (..., num_inputs) at w (..., 2d), each angle as (cos, sin)."""
         x = self.inputs(w)
         angles = np.array(self.inputs.angles, dtype=int)
         others = np.setdiff1d(np.arange(self.inputs.num_variables), angles)

@@ -1,4 +1,4 @@
-"""How well the coefficients of a map are known."""
+"""Posterior of the coefficients of a map."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Posterior:
-    """A normal distribution about a map's own coefficients, those of one of its pieces.
+    """Normal distribution about the coefficients of one piece of a map.
 
-    piece: its index. root: (k, m), NumPy: the covariance is rootᵀ root. Directions that the data do
-    not tell are 0.
+    piece: index of the piece. root: (k, m) covariance root, NumPy: the covariance is rootᵀ root.
+    Directions that the data do not determine are 0.
     """
 
     piece: int
