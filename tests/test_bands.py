@@ -249,5 +249,5 @@ def test_what_is_no_noise_of_initial_states_is_refused(noisy, tmp_path):
         with pytest.raises(InputError, match="z0_std"):
             read_initial_noise(path, (2, 4))
     noisy[1].map.save(tmp_path / "model")
-    with pytest.raises(InputError, match="--samples beside --horizon"):
+    with pytest.raises(InputError, match="--horizon needs --samples"):
         predict(tmp_path / "model", path, num_steps=2, out=tmp_path / "out.npz", horizon_size=1.0)

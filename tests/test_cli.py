@@ -384,7 +384,7 @@ def test_a_model_is_kept_and_known_again(fitted, tmp_path, capsys, monkeypatch):
     assert gfnn(*fit) == 2
     capsys.readouterr()
     assert gfnn(*fit, "--resume") == 0
-    assert "from this very job" in capsys.readouterr().out
+    assert "already holds the result of this job" in capsys.readouterr().out
     assert gfnn(*fit, "--resume", "--seed", 1) == 2
     assert files(tmp_path) == before
     assert gfnn(*fit, "--overwrite", "--seed", 1) == 0
