@@ -1,4 +1,4 @@
-"""What a step depends on beside the state: its own dt, and parameters of the system."""
+"""Arguments of a step beside the state: its own dt, and parameters of the system."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""How sure: the posterior of the coefficients, maps drawn from it, bands of predictions."""
+"""Posterior of the coefficients, maps drawn from it, bands of predictions."""
 
 import jax
 import numpy as np

@@ -392,7 +392,7 @@ def test_a_model_is_kept_and_known_again(fitted, tmp_path, capsys, monkeypatch):
 
 
 def test_a_training_that_was_stopped(fitted, tmp_path, capsys, monkeypatch):
-    """It leaves its checkpoints beside the output; they are resumed or discarded, as asked."""
+    """Stop a training: its checkpoints stay beside the output, and are resumed or discarded."""
     started_from = []
 
     def training(*args, checkpoints, **kwargs):
@@ -504,7 +504,7 @@ def test_an_interrupted_fit_publishes_the_best_of_all_its_runs(
     ["polynomial", *(pytest.param(f, marks=pytest.mark.slow) for f in ("sines", "mlp"))],
 )
 def test_a_fit_survives_two_of_each_signal(family, tmp_path, monkeypatch):
-    """At different moments of a fit that is resumed each time: the map of one that nothing met."""
+    """Send signals to a fit that is resumed each time: the map is that of an undisturbed fit."""
     data = pairs_file(tmp_path / "d.npz", oscillator(300, [0, 1.0]), dt=1.0)
     # Tolerances that take several sizes, and a training that ends in seconds.
     tolerance = {"polynomial": 1e-14, "sines": 1e-14, "mlp": 1e-2}[family]

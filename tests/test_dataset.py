@@ -99,7 +99,7 @@ def test_a_permuted_fit_is_the_same_fit():
 
 
 def continued(sample):
-    """How many of the sample's rows go on with the next one."""
+    """Number of rows of the sample whose image is the next row's state."""
     return int(np.sum(steps_between(identified(sample.pairs()).pairs) == 1))
 
 

@@ -137,7 +137,7 @@ def test_an_existing_model_is_kept(tmp_path):
 
 
 def test_a_scene_of_ones_own(tmp_path):
-    """Its features can be saved where the scene is given, and loaded where it is given again."""
+    """Save and load a map with features of one's own scene, given both times."""
 
     def features(z):
         return z**2

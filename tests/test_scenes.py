@@ -307,7 +307,7 @@ def test_a_new_scene_needs_its_own_file_only(tmp_path):
 
 
 def test_the_same_scene_made_twice_has_the_same_functions():
-    """What is compiled for the one serves the other."""
+    """Check that a program compiled for one serves the other."""
     for name in scenes.names():
         one, other = scenes.make(name), scenes.make(name)
         assert one == other
