@@ -125,8 +125,8 @@ class Pairs:
     run: the run (trajectory, sequence) of each pair, (N,) numbers or text. place: the number of z0
     along its run, (N,) integers. A fit sorts pairs that have a run by run and place. Where places
     are missing, it finds them by the images that are states of other pairs.
-    std: standard deviation of the measured coordinates, (2d,), or (N, 2d) per pair, in the user's
-    units. With None it is estimated.
+    std: standard deviation of the noise on each measured coordinate, (2d,), in the user's units.
+    With None it is estimated.
 
     Raises FitError where the arrays do not have these shapes.
     """
@@ -166,9 +166,9 @@ class Pairs:
         self._set_identities()
         if self.std is not None and not isinstance(self.std, jax.Array):
             self._set("std", np.asarray(self.std, np.float64))
-            if self.std.shape not in ((self.z0.shape[1],), self.z0.shape):
+            if self.std.shape != (self.z0.shape[1],):
                 raise FitError(
-                    f"expected std of shape ({self.z0.shape[1]},) or {self.z0.shape}, got "
+                    f"expected std of shape ({self.z0.shape[1]},), one of each coordinate, got "
                     f"{self.std.shape}"
                 )
             if not (np.isfinite(self.std) & (self.std > 0)).all():
@@ -240,10 +240,9 @@ class Pairs:
         dt = self.dt[rows] if np.ndim(self.dt) else self.dt
         args = self.args and {name: values[rows] for name, values in self.args.items()}
         run, place = (None if of is None else of[rows] for of in (self.run, self.place))
-        std = self.std[rows] if np.ndim(self.std) == 2 else self.std
         return Pairs(
             self.z0[rows], self.z1[rows], dt, args, period=self.period, run=run, place=place,
-            std=std,
+            std=self.std,
         )  # fmt: skip
 
 

@@ -331,7 +331,7 @@ DT = np.linspace(0.1, 0.2, 40)
     ("dt", "args", "options", "message"),
     [
         (np.where(DT > 0.19, -DT, DT), None, {}, "time steps above 0, got 4 of 40 that are not"),
-        (DT[:7], None, {}, "one number or one of each pair (40,), got (7,)"),
+        (DT[:7], None, {}, "one number or one per pair (40,), got shape (7,)"),
         (0.1, {"l": DT[:7]}, {}, "expected args['l'] of shape (40,), got (7,)"),
         (0.1, DT[:7], {}, "as name -> (40,) or as an array (40, k)"),
         (0.1, {"q1": DT}, {}, "'q1' cannot name a parameter"),

@@ -68,7 +68,7 @@ MISTAKES = {
     "a chart with a capital": (lambda: fit(chart="Midpoint"), "type3, midpoint; got 'Midpoint'"),
     "an unknown family": (lambda: fit(family="nn"), "sines, mlp; got 'nn'"),
     "an unknown thing to learn": (lambda: fit(learn="H"), "auto, map, hamiltonian; got 'H'"),
-    "the scene's name": (lambda: fit(scene="two-body"), "as gfnn.scenes.make('two-body'), got"),
+    "the scene's name": (lambda: fit(scene="two-body"), "e.g. gfnn.scenes.make('two-body'), got"),
     "another scene's data": (lambda: fit(scene=SCENE), "has dim 2, the pairs have 1"),
     "an angle that is no index": (lambda: fit(angles=("q1",)), "angles as a tuple of indices"),
     "an angle beyond the last": (lambda: fit(angles=(2,)), "different angles among 0..1, got (2,)"),
@@ -83,9 +83,9 @@ MISTAKES = {
     "a scene by a wrong name": (
         lambda: gfnn.scenes.make("twobody"), "unknown scene 'twobody', did you mean 'two-body'?"),
     "a name to draw from": (
-        lambda: gfnn.sample_pairs("two-body", 10, KEY), "as gfnn.scenes.make('two-body'), got"),
-    "no pairs": (lambda: gfnn.sample_pairs(SCENE, 0, KEY), "number of states from 1 on, got 0"),
-    "a number as key": (lambda: gfnn.sample_pairs(SCENE, 10, 0), "as jax.random.key(0), got 0"),
+        lambda: gfnn.sample_pairs("two-body", 10, KEY), "e.g. gfnn.scenes.make('two-body'), got"),
+    "no pairs": (lambda: gfnn.sample_pairs(SCENE, 0, KEY), "number of states ≥ 1, got 0"),
+    "a number as key": (lambda: gfnn.sample_pairs(SCENE, 10, 0), "e.g. jax.random.key(0), got 0"),
     "a folder that is not there": (lambda: gfnn.load("nowhere"), "nowhere: no such folder"),
     "a file instead of the folder": (lambda: gfnn.load(__file__), "no such folder"),
 }  # fmt: skip

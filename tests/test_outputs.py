@@ -50,7 +50,7 @@ def test_the_current_folder_cannot_be_exchanged(tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     for name in (".", "..", tmp_path, "../here"):
-        with pytest.raises(InputError, match="the folder you are in"):
+        with pytest.raises(InputError, match="is the current folder or one above it"):
             outputs.ensure_new(name, True, folder=True)
 
 

@@ -64,13 +64,8 @@ class Triangle:
         return cls(factor, rows)
 
     @property
-    def terms(self) -> int:
-        """The number of columns of A."""
-        return self.factor.shape[1] - 1
-
-    @property
     def finite(self) -> bool:
-        """Whether every row was finite."""
+        """True where every row was finite."""
         return bool(np.isfinite(self.factor).all())
 
     # Rows.
@@ -151,8 +146,10 @@ class Triangle:
 
         Raises numpy.linalg.LinAlgError where an entry of A is not finite.
         """
-        a, b = self.leading(size) if size is not None else (self.factor[:, :-1], self.factor[:, -1])
-        return Spectrum.of(a, b, _EPS * len(self.factor))
+        cutoff = _EPS * len(self.factor)
+        if size is None:
+            return Spectrum.of(self.factor[:, :-1], self.factor[:, -1], 0.0, cutoff)
+        return Spectrum.of(*self.leading(size), self.residual_norm(size), cutoff)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -161,7 +158,7 @@ class Spectrum:
 
     Every solution is c = D⁻¹ V f Uᵀt, with f (n,) the *filters* of the singular values: their
     reciprocals, or s / (s² + (λ s₀)²) of the ridge λ, which minimise ‖A c − b‖² + (λ s₀)² ‖D c‖².
-    column: D (n,). vt: Vᵀ (n, n). b: t (n,). cutoff: up to which s is rounding.
+    column: D (n,). vt: Vᵀ (n, n). b: t (n,). rest: ρ. cutoff: up to which s is rounding.
     """
 
     column: np.ndarray
@@ -169,15 +166,16 @@ class Spectrum:
     s: np.ndarray
     vt: np.ndarray
     b: np.ndarray
+    rest: float
     cutoff: float
 
     @classmethod
-    def of(cls, a: np.ndarray, b: np.ndarray, cutoff: float) -> Spectrum:
-        """cutoff: relative to the largest singular value."""
+    def of(cls, a: np.ndarray, b: np.ndarray, rest: float, cutoff: float) -> Spectrum:
+        """T, t and ρ. cutoff: relative to the largest singular value."""
         column = np.linalg.norm(a, axis=0)
         column = np.where(column > 0, column, 1.0)
         u, s, vt = np.linalg.svd(a / column, full_matrices=False)
-        return cls(column, u, s, vt, b, float(cutoff * s[0]))
+        return cls(column, u, s, vt, b, rest, float(cutoff * s[0]))
 
     @cached_property
     def known(self) -> np.ndarray:
@@ -201,9 +199,9 @@ class Spectrum:
 
     @property
     def residual_norm(self) -> float:
-        """‖A c − b‖ of the solution along the directions that are known."""
+        """‖A c − b‖ of the plain solution, to half of the digits of ‖b‖."""
         told = np.sum(self.along[self.known] ** 2)
-        return float(np.sqrt(max(np.sum(self.b**2) - told, 0.0)))
+        return float(np.sqrt(max(np.sum(self.b**2) - told, 0.0) + self.rest**2))
 
     @cached_property
     def inverse(self) -> np.ndarray:

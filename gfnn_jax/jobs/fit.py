@@ -36,7 +36,8 @@ def fit(
     dt: float | None = None,
     tolerance: float = 1e-6,
     absolute_tolerance: float | None = None,
-    max_seconds: float = 120.0,
+    max_seconds: float | None = 120.0,
+    max_operations: int | None = None,
     chart: str = "auto",
     learn: str = "auto",
     terms: tuple[str, ...] = (),
@@ -103,7 +104,8 @@ def fit(
         try:
             fitted = search(
                 trajectories.pairs(), scene, angles=angles, max_seconds=max_seconds,
-                progress=progress, kept_in=kept_in, job=job, devices=devices, **options,
+                max_operations=max_operations, progress=progress, kept_in=kept_in, job=job,
+                devices=devices, **options,
             )  # fmt: skip
             if large and can_be_refitted(fitted.map):
                 progress.say("all pairs, for the chosen candidate")
@@ -115,7 +117,8 @@ def fit(
             else:
                 group.told({})
                 fitted = not_refitted(fitted) if large else fitted
-            progress.say("the report: compiling the derivative of a step")
+            progress.say("the report: the posterior, and the derivative of a step")
+            fitted = fitted.settled()
             result = report.assemble(
                 fitted, scene=scene_name, dt=float(np.asarray(fitted.map.dt)), seed=seed,
                 rollout=None,

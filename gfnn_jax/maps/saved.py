@@ -51,6 +51,23 @@ _TYPES: dict[str, type] = {
         Windows, Groups, Ranges, OfTimeStep, Ensemble,
     )
 }  # fmt: skip
+
+
+def register(kind: type) -> type:
+    """Register a dataclass of one's own, a family or a piece, for `save` and `load`, by its name.
+
+    It is a decorator of the class, in a module that is imported before such a map is loaded. Fields
+    of the class are arrays, numbers, text, tuples of these, or of other registered types. Raises
+    InputError where it is no dataclass, or another type has its name.
+    """
+    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+        raise InputError(f"expected a dataclass to register, got {kind!r}")
+    if _TYPES.get(kind.__name__, kind).__module__ != kind.__module__:
+        raise InputError(f"another type is registered as {kind.__name__}: choose another name")
+    _TYPES[kind.__name__] = kind
+    return kind
+
+
 # Names in models that earlier releases saved.
 _FORMER_TYPES = {"Start": "PolynomialModel"}
 _FORMER_FIELDS = {
@@ -212,7 +229,8 @@ def _encode(value: Any) -> tuple[Any, Any]:
         return value, None
     kind = "function" if callable(value) else type(value).__name__
     raise InputError(
-        f"a map that holds a {kind} of your own cannot be saved: keep the data and fit it again"
+        f"a map that holds a {kind} of your own cannot be saved: gfnn_jax.register makes a "
+        "dataclass known"
     )
 
 
@@ -250,6 +268,11 @@ def _decode(text: Any, arrays: Any, scene: Scene | None) -> Any:
             items[name] = numbers
     if kind == "tuple":
         return tuple(items[str(i)] for i in range(len(items)))
+    if kind not in _TYPES:
+        raise InputError(
+            f"holds a {kind}, which is not known: import the module that registers it "
+            "(gfnn_jax.register)"
+        )
     return _TYPES[kind](**items)
 
 
