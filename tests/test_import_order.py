@@ -42,7 +42,7 @@ def modules():
 
 
 def imports(tree):
-    """Every module that is imported anywhere in the file, in functions too."""
+    """List all modules that a file imports, also inside functions."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
