@@ -9,6 +9,7 @@ import pytest
 
 from gfnn_jax.errors import FitError
 from gfnn_jax.fitting import least_squares
+from gfnn_jax.fitting.triangular import folded
 
 RNG = np.random.default_rng(0)
 W = RNG.uniform(-1, 1, (900, 4)) * np.array([1.0, 2.0, 0.5, 1.0]) + 0.3
@@ -270,3 +271,17 @@ def test_gradients_that_are_not_finite_are_refused():
     broken[3, 1] = np.nan
     with pytest.raises(FitError, match="finite"):
         least_squares.reduce(FAMILY, [(W, broken)], ONE)
+
+
+@pytest.mark.parametrize(
+    ("factor", "rows"),
+    [
+        (np.zeros((3, 3)), np.zeros((5, 3), order="F")),
+        (np.zeros((3, 3), order="F"), np.zeros((5, 3))),
+        (np.zeros((2, 2), order="F"), np.zeros((5, 3), order="F")),
+        (np.zeros((3, 3), np.float32, order="F"), np.zeros((5, 3), order="F")),
+    ],
+)
+def test_lapack_is_never_told_an_address_of_another_kind(factor, rows):
+    with pytest.raises(ValueError, match="expected the (factor|rows) as float64 of shape"):
+        folded(factor, rows)
