@@ -283,5 +283,5 @@ def test_gradients_that_are_not_finite_are_refused():
     ],
 )
 def test_lapack_is_never_told_an_address_of_another_kind(factor, rows):
-    with pytest.raises(ValueError, match="expected the (factor|rows) as float64 of shape"):
+    with pytest.raises(ValueError, match=r"expected the .* as float64 of shape"):
         folded(factor, rows)
