@@ -284,7 +284,8 @@ REPORT_KEYS = {
     "data": {"num_pairs"},
     "model": {"learns", "family", "chart", "num_parameters", "label"},
     "fit": {"seconds", "total_seconds", "compile_seconds", "train_rms", "validation_rms",
-            "validation_relative", "tolerance", "tolerance_met", "ended"},
+            "validation_relative", "tolerance", "tolerance_met", "ended", "operations",
+            "max_operations"},
     "map": {"symplecticity_defect", "chart_determinant_min", "newton_iterations_max"},
     "rollout": {"num_trajectories", "num_excluded", "num_steps", "seconds",
                 "microseconds_per_step", "status_counts", "error", "error_median",
@@ -306,7 +307,7 @@ def read_report(folder):
     assert all(set(candidate) >= CANDIDATE_KEYS for candidate in report["candidates"])
     assert [c["chosen"] for c in report["candidates"]].count(True) == 1
     law = report["hamiltonian"]
-    assert law is None or {"formula", "terms"} == set(law)
+    assert law is None or {"formula", "terms", "dropped", "search_cut_short"} == set(law)
     assert report["fit"]["ended"]
     return report
 

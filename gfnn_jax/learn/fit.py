@@ -26,9 +26,9 @@ from gfnn_jax.learn.assemble import block_of
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance
 from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.clean import clean
-from gfnn_jax.learn.clock import COMPILE, SOLVE, Budget
+from gfnn_jax.learn.clock import COMPILE, ROWS, Budget
 from gfnn_jax.learn.conclude import conclude
-from gfnn_jax.learn.diagnose import ChartJudgement
+from gfnn_jax.learn.diagnose import ChartJudgement, looked_for_errors
 from gfnn_jax.learn.diagnosed import diagnose_request
 from gfnn_jax.learn.draw import NUM_PAIRS, drawn
 from gfnn_jax.learn.gross_errors import without_gross_errors
@@ -151,7 +151,7 @@ class Fit:
         if map_.posterior is not None and not map_.posterior.known:
             work = work_of_posterior(self.chosen.num_parameters)
             try:
-                with self.budget.last("the posterior, which bands are drawn from", SOLVE, work):
+                with self.budget.last("the posterior, which bands are drawn from", ROWS, work):
                     _ = map_.posterior.root
             except OutOfTime:
                 map_ = dataclasses.replace(map_, posterior=None)
@@ -343,6 +343,12 @@ def fit(
             *identified(request.pairs), request.coordinates, request.structure
         )
         warn(about_pairs)
+        looked_at = len(looked_for_errors(len(request.pairs)))
+        if looked_at < len(request.pairs):
+            budget.leave_out(
+                f"a look for gross errors at all but {looked_at:,} of {len(request.pairs):,} pairs",
+                "those that the map misses by far are found in the end",
+            )
         seen = diagnose_request(request, plain)
         warn(seen.messages)
         judges = Judges.of(pairs, seed, request.tolerance)

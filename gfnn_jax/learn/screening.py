@@ -24,6 +24,7 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.dataset.noise import robust
+from gfnn_jax.learn.diagnose import looked_for_errors
 from gfnn_jax.learn.prepare import Prepared
 
 # Times the median residual: beyond the second, a pair is a gross error. Those between the two are
@@ -55,6 +56,10 @@ def gross_errors(prepared: Prepared, goes_on: np.ndarray, left_out: np.ndarray) 
     none = np.zeros(0, int)
     if prepared.varied or prepared.structure is not None:
         return none
+    rows = looked_for_errors(len(prepared.y0))
+    if len(rows) < len(prepared.y0):
+        within = goes_on[rows[:-1]] & (np.diff(rows) == 1)
+        return rows[gross_errors(prepared.take(rows), within, left_out[rows])]
     best = None
     for model in _models(prepared, ~left_out):
         if best is not None and not model.left < _GAINED * best.left:
