@@ -1,4 +1,4 @@
-"""Command line: ``gfnn scenes | run | fit | predict | export | compare``.
+"""The command line: ``gfnn scenes | run | fit | predict | export | compare``.
 
 Each exit status but 0 comes with one line that gives the reason (`EXIT_STATUS`). JAX is imported
 only after the usage has been checked.
