@@ -7,6 +7,7 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
+from gfnn_jax.dataset.runs import identified
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting.gauss_newton import Problem
@@ -15,7 +16,6 @@ from gfnn_jax.learn import choose_law, flows
 from gfnn_jax.learn.arcs import arcs_of
 from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.clock import Counted
-from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.prepare import prepare
 
 LAW, TRUE = given_terms(1, ["p**2", "q**2", "q**4"]), np.array([0.5, 0.5, 0.25])
@@ -34,7 +34,7 @@ def sequences(dt, noise=1e-3, count=20, length=60, seed=0):
 
 
 def arcs(pairs, coordinates=CARTESIAN):
-    judges = Judges(pairs, *split_rows(pairs, 0), Tolerance(1e-6))
+    judges = Judges.of(identified(pairs).pairs, 0, Tolerance(1e-6))
     return arcs_of(prepare(pairs, coordinates), judges), judges
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.dataset.runs import identified
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
@@ -13,7 +14,6 @@ from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.learn import sweeps
 from gfnn_jax.learn.candidates import Judges, Tolerance, one_step_error
 from gfnn_jax.learn.clock import Budget
-from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.search import search
 from gfnn_jax.phase_space import Pairs
@@ -89,7 +89,7 @@ def of_kicks(num=2_000, factors=None):
     """The sweep of polynomials in type 2, without any compilation."""
     pairs = kicked(num)
     prepared = prepare(pairs, Coordinates("plain"))
-    judges = Judges(pairs, *split_rows(pairs, 0), Tolerance(1e-11))
+    judges = Judges.of(identified(pairs).pairs, 0, Tolerance(1e-11))
     return sweeps.LinearSweep(prepared, TYPE2, judges, "polynomial", None, None, factors)
 
 
@@ -161,7 +161,7 @@ def test_an_even_generating_function_is_known_by_its_pairs(odd, even, monkeypatc
     p = p - 0.1 * (q + q**3 / 2 + odd * q**2)
     pairs = Pairs(z, np.concatenate([q + 0.1 * p, p], axis=1), 0.1)
     prepared = prepare(pairs, Coordinates("cartesian"))
-    judges = Judges(pairs, *split_rows(pairs, 0), Tolerance(1e-6))
+    judges = Judges.of(identified(pairs).pairs, 0, Tolerance(1e-6))
     assert sweeps.is_even(prepared, judges) == even
     (found,) = sweeps.sweeps_for("polynomial", [MIDPOINT], prepared, None, judges)
     assert [size.family.degree for size in found.sizes] == ([2, 4] if even else [2, 3, 4])

@@ -9,7 +9,7 @@ import pytest
 
 from gfnn_jax.errors import FitError
 from gfnn_jax.fitting import least_squares
-from gfnn_jax.fitting.triangular import folded
+from gfnn_jax.fitting.triangle import Triangle
 
 RNG = np.random.default_rng(0)
 W = RNG.uniform(-1, 1, (900, 4)) * np.array([1.0, 2.0, 0.5, 1.0]) + 0.3
@@ -259,10 +259,7 @@ def test_nothing_is_dropped_that_held_out_pairs_need(monkeypatch):
     one = rng.standard_normal(800)
     columns = np.stack([one, one + 1e-14 * rng.standard_normal(800)], axis=1)
     rows = np.column_stack([columns, columns @ np.array([0.05, 1.95])])
-    train, held = (
-        least_squares.Reduced(np.linalg.qr(part, mode="r"), len(part))
-        for part in (rows[:600], rows[600:])
-    )
+    train, held = (Triangle.of(part) for part in (rows[:600], rows[600:]))
     assert least_squares.solve(train, held, 2).validation_rms < 1e-12
 
 
@@ -271,17 +268,3 @@ def test_gradients_that_are_not_finite_are_refused():
     broken[3, 1] = np.nan
     with pytest.raises(FitError, match="finite"):
         least_squares.reduce(FAMILY, [(W, broken)], ONE)
-
-
-@pytest.mark.parametrize(
-    ("factor", "rows"),
-    [
-        (np.zeros((3, 3)), np.zeros((5, 3), order="F")),
-        (np.zeros((3, 3), order="F"), np.zeros((5, 3))),
-        (np.zeros((2, 2), order="F"), np.zeros((5, 3), order="F")),
-        (np.zeros((3, 3), np.float32, order="F"), np.zeros((5, 3), order="F")),
-    ],
-)
-def test_lapack_is_never_told_an_address_of_another_kind(factor, rows):
-    with pytest.raises(ValueError, match=r"expected the .* as float64 of shape"):
-        folded(factor, rows)

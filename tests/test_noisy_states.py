@@ -13,6 +13,7 @@ from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.nearest_states import Whitened, nearest
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn import noisy_sweeps
@@ -140,7 +141,7 @@ def test_misfit_weighs_as_much_as_in_the_posterior(misfit, count):
     sizes = [Size(SimpleNamespace(num_parameters=n), larger, float(n)) for n in counts]
     sweep = SimpleNamespace(
         sizes=sizes,
-        factors=lambda *_: SimpleNamespace(train=least_squares.Reduced(factor, rows)),
+        factors=lambda *_: SimpleNamespace(train=Triangle(factor, rows)),
         freedoms=lambda near, most, counts: list(map(float, counts)),
     )
     found = best_size(cast(LinearSweep, sweep), sizes[0], sizes[-1], Budget(), print)

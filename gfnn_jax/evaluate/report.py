@@ -69,6 +69,7 @@ def assemble(
             "validation_relative": chosen.validation_relative,
             "validation_bound": chosen.validation_bound,
             "deviations": np.asarray(chosen.deviations).tolist(),
+            "stated_by": fit.stated_by,
             "tolerance": fit.tolerance,
             "tolerance_is_relative": fit.asked.relative,
             "tolerance_met": fit.met,

@@ -9,6 +9,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.own import is_own
 from gfnn_jax.families.sums import site_terms
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.generating.charts import CHARTS
@@ -50,8 +51,10 @@ def check_request(
     for name, value, known in (
         ("chart", chart, CHART_NAMES), ("family", family, FAMILIES), ("learn", learn, LEARNS)
     ):  # fmt: skip
-        if value not in known:
-            raise FitError(f"expected a {name} among {', '.join(known)}; got '{value}'")
+        if name == "family" and is_own(value):
+            continue
+        if not isinstance(value, str) or value not in known:
+            raise FitError(f"expected {name} to be one of {', '.join(known)}; got {value!r}")
     if not isinstance(pairs, Pairs):
         raise FitError(f"expected gfnn.Pairs(z0, z1, dt), got {type(pairs).__name__}")
     if scene is not None and not isinstance(scene, Scene):

@@ -14,7 +14,7 @@ from gfnn_jax.learn.check import not_radians
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.choose_law import long_step
 from gfnn_jax.learn.clock import SOLVE, Budget
-from gfnn_jax.learn.diagnose import differs_between_sequences, sequences_of, volume_change
+from gfnn_jax.learn.diagnose import differs_between_sequences, volume_change
 from gfnn_jax.learn.noise import noise_of_sites, state_noise
 from gfnn_jax.learn.propose import proposed
 from gfnn_jax.learn.request import Request
@@ -28,6 +28,7 @@ _NO_MORE = {
 }
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _SHARE = 0.1  # of the residual, that a change of volume must explain
+_KNOWN = 1.5  # times the noise that was given: up to it, what is left over is that noise
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 _RESIDUAL_PAIRS = 2_000  # whose residuals are looked at
 _NOISE_PAIRS = 1_024  # from which the noise of the states is measured
@@ -51,14 +52,18 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         cut = request.budget.ended or (law.ended if law is not None else "")
         ended = MET if met else cut or _NO_MORE[request.of_network]
     if ended.startswith(MET) and not met:
-        ended = "the steps of a map that was to meet it do not converge from some of the states"
+        ended = (
+            "the pairs that chose the map meet it, those that state its error do not"
+            if np.isfinite(candidate.validation_relative)
+            else "the steps of a map that was to meet it do not converge from some of the states"
+        )
     if law is not None and searched.of_terms is None and searched.linear is None:
         on_law = chosen.entry is None or searched.met_by_law
         said = on_law or (law.fast and not met)
         messages += law.messages if said else ()
         unmet = law.unmet if said else ""
     if met:
-        return Conclusion(ended, None, [*messages, *request.budget.left_out])
+        return Conclusion(ended, searched.judges.pairs.std, [*messages, *request.budget.left_out])
     diagnosis: list[str] = []
     structured = request.structure is not None  # too few pairs to look at their neighbours
     if candidate.validation_relative > _ROUNDOFF and searched.linear is None:
@@ -148,7 +153,7 @@ def _residuals_of_sample(
     rows = np.sort(judges.training)[:_RESIDUAL_PAIRS]
     y0, residual, solved = _residuals(candidate, entry, judges, rows)
     rows, y0, residual = rows[solved], y0[solved], residual[solved]
-    sequence = sequences_of(judges.pairs.z0, judges.pairs.z1)[rows]
+    sequence = np.asarray(judges.pairs.run)[rows]
     scale = judges.spread if entry is None else entry.sweep.prepared.scale
     return _Sample(rows, y0, residual, scale, sequence)
 
@@ -205,6 +210,8 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     if law is not None and law.noise is not None and candidate.learns == "hamiltonian":
         # Along an arc what the law misses adds up, and looks like noise.
         noise = np.minimum(law.noise, noise)
+    if judges.pairs.std is not None:
+        return _beside_known(noise, judges.pairs.std)
     own = ""
     if candidate.learns == "map" and entry is not None:
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))
@@ -221,6 +228,20 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         f"{hidden}or to have a structure that these functions cannot represent"
     )
     return _LeftOver(noise, [message])
+
+
+def _beside_known(found: np.ndarray, known: np.ndarray) -> _LeftOver:
+    """Noise (2d,) that was given, beside what the residuals suggest (2d,)."""
+    ratio = float(np.max(found / known))
+    if ratio <= _KNOWN:
+        reason = "what is left over is the noise that was given"
+        return _LeftOver(known, [f"larger models are no more accurate: {reason}"], reason)
+    message = (
+        f"larger models are no more accurate, and leave up to {ratio:.2g} times the noise that was "
+        "given: std is too small, or the pairs have a structure that these functions cannot "
+        "represent"
+    )
+    return _LeftOver(known, [message])
 
 
 def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOver:

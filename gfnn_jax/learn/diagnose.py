@@ -319,13 +319,6 @@ def sampled_dimension(y, scale) -> int:
     return int(np.median(np.sum(spread > _THIN * spread[:, :1], axis=1)))
 
 
-def sequences_of(z0, z1) -> np.ndarray:
-    """The number (N,) of the sequence that each pair is of: a pair goes on with the next one where
-    its image is the next one's state."""
-    goes_on = np.all(np.asarray(z1)[:-1] == np.asarray(z0)[1:], axis=1)
-    return np.concatenate([[0], np.cumsum(~goes_on)])
-
-
 def differs_between_sequences(z, residual, sequence) -> bool:
     """Whether what a fit left over agrees within a sequence and differs between sequences: then
     something that the states do not hold, a parameter, differs between them.

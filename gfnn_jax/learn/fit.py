@@ -18,6 +18,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.dataset.runs import identified
 from gfnn_jax.errors import FitError, FitWarning, OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
@@ -31,12 +32,12 @@ from gfnn_jax.learn.diagnose import ChartJudgement, looked_for_errors
 from gfnn_jax.learn.diagnosed import diagnose_request
 from gfnn_jax.learn.draw import NUM_PAIRS, drawn
 from gfnn_jax.learn.gross_errors import without_gross_errors
-from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.posterior import with_posterior, work_of_posterior
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
+from gfnn_jax.learn.stated import stated
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -63,7 +64,9 @@ class Fit:
     test_states: (n, 2d) held-out states, test_args their parameters. model_determinant_min: the
     chosen chart's determinant there, where it is closest to 0; NaN for a flow, which has no chart.
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
-    scene: as given. operations: of the search, as counted; as ``max_operations`` they give this
+    scene: as given. stated_by: the pairs by which the chosen candidate's error was measured.
+    validation_pairs, test_pairs: that chose, and that stated the error; None where the pairs were
+    too few for these. operations: of the search, as counted; as ``max_operations`` they give this
     map again, whatever the clock. budget: what is left of it. tells_defect: whether there is
     time in it to compile the derivative of a step.
     """
@@ -72,6 +75,7 @@ class Fit:
     candidates: tuple[Candidate, ...]
     asked: Tolerance
     num_pairs: int
+    validation_pairs: Pairs
     judgements: dict[str, ChartJudgement]
     data_defect: float
     base_map: bool
@@ -86,6 +90,8 @@ class Fit:
     hamiltonian: LearnedHamiltonian | None = None
     pairs: Pairs | None = None
     scene: Scene | None = None
+    stated_by: str = ""
+    test_pairs: Pairs | None = None
     operations: int = 0
     budget: Budget = dataclasses.field(default_factory=Budget, repr=False)
     tells_defect: bool = True
@@ -245,7 +251,7 @@ def fit(
     terms: Sequence[str | Callable] = (),
     base: str | Callable | None = None,
     structure: str | None = None,
-    family: str = "auto",
+    family: Any = "auto",
     chart: str = "auto",
     ensemble: int = 1,
     angles: tuple[int, ...] = (),
@@ -283,7 +289,9 @@ def fit(
                species; of sites, S where learn is "map" or no H meets the tolerance.
                None: the scene's own.
     family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp";
-               with learn="hamiltonian" H is a sum of terms, or a network with "mlp".
+               with learn="hamiltonian" H is a sum of terms, or a network with "mlp". Or a family
+               of one's own that is linear in its parameters, or a function of `Inputs` that gives
+               such families by rising number of terms (`families.own`).
     chart:     "auto" or one of type1, type2, type3, midpoint.
     ensemble:  so many networks trained together, of which the map is the mean and their spread the
                posterior; with family="mlp".
@@ -328,7 +336,9 @@ def fit(
     warn(request.messages)
     on_progress("looking at the map's local Jacobians")
     with row_blocks.on_devices(_devices(devices)):
-        pairs, plain, about_pairs = clean(request.pairs, request.coordinates, request.structure)
+        pairs, plain, row, about_pairs = clean(
+            *identified(request.pairs), request.coordinates, request.structure
+        )
         warn(about_pairs)
         looked_at = len(looked_for_errors(len(request.pairs)))
         if looked_at < len(request.pairs):
@@ -338,13 +348,16 @@ def fit(
             )
         seen = diagnose_request(request, plain)
         warn(seen.messages)
-        judges = Judges(pairs, *split_rows(pairs, seed, plain.place), request.tolerance)
+        judges = Judges.of(pairs, seed, request.tolerance)
         found = searched(request, plain, seen, judges, on_better)
-        seen, found, about_pairs = without_gross_errors(request, seen, found)
+        seen, found, about_pairs = without_gross_errors(request, seen, found, row)
         warn(about_pairs)
         found = without_bias(found, request)
         pairs = found.judges.pairs
         chosen = with_posterior(choose(found, request), found)
+        on_progress("the test pairs: the error that is stated")
+        error = stated(chosen, found)
+        chosen = chosen._replace(candidate=error.candidate)
         conclusion = conclude(chosen, found, request)
         warn(conclusion.messages)
     judged = min(_JUDGED, block_of(2 * pairs.dim))
@@ -354,6 +367,7 @@ def fit(
         candidates=_all_candidates(chosen, found),
         asked=request.tolerance,
         num_pairs=len(pairs),
+        validation_pairs=pairs.take(found.judges.held_out),
         judgements=found.charts.judgements,
         data_defect=seen.data_defect,
         base_map=bool(chosen.prepared.before or chosen.prepared.after),
@@ -368,6 +382,8 @@ def fit(
         model_determinant_min=_smallest_determinant(chosen),
         pairs=pairs,
         scene=scene,
+        stated_by=error.words,
+        test_pairs=pairs.take(found.judges.test) if len(found.judges.test) else None,
         operations=budget.operations,
         budget=budget,
     )

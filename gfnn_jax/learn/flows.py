@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.split import outermost
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms
@@ -31,7 +32,6 @@ from gfnn_jax.learn.arcs import arcs_of
 from gfnn_jax.learn.candidates import Judges, OneStepError
 from gfnn_jax.learn.centrifugal import centrifugal_terms
 from gfnn_jax.learn.clock import Budget
-from gfnn_jax.learn.held_out import outermost
 from gfnn_jax.learn.law_libraries import (
     angles_and_others,
     check_finite,
@@ -390,7 +390,7 @@ def _told_from_noise(
         return found
     few = _refitted(problem, few, rows, prepared, judges)
     # Twice the logarithm of the likelihood's ratio.
-    gained = 2 * few.fit.rows * np.log(found.fit.rms / few.fit.rms)
+    gained = 2 * few.fit.triangle.rows * np.log(found.fit.rms / few.fit.rms)
     if gained > options.certain**2 * more and few.error.relative <= found.error.relative:
         return few._replace(noisy=True)
     return found
@@ -410,10 +410,10 @@ def _significant(problem, full: FittedLaw, rows, options: Options) -> FittedLaw 
     """The terms that these pairs tell from noise, which one Gauss–Newton problem of all terms says,
     so that only a few are fitted to many pairs; None where it tells none."""
     resolved = np.setdiff1d(rows, np.setdiff1d(full.rows, full.fit.used))
-    found = problem.factor(full.family, full.fit.coefficients, full.fit.steps, resolved)
-    if not np.isfinite(found.cost):
+    found = problem.linearised(full.family, full.fit.coefficients, full.fit.steps, resolved)
+    if not np.isfinite(found.norm):
         return None
-    kept, start = significant(found.matrix, full.fit.coefficients, found.rows, options.certain)
+    kept, start = significant(found, full.fit.coefficients, options.certain)
     if not len(kept):
         return None
     return full._replace(

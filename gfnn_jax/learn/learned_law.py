@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sums import Sums, matrix_free
@@ -21,7 +22,6 @@ from gfnn_jax.fitting.gauss_newton import (
     Problem,
     rates,
 )
-from gfnn_jax.fitting.least_squares import Reduced
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.learn.assemble import Assembled, composed, measured
@@ -35,7 +35,6 @@ from gfnn_jax.learn.cost_of_flow import (
     operations_of,
 )
 from gfnn_jax.learn.formula import Term, formula
-from gfnn_jax.learn.held_out import looked_at
 from gfnn_jax.learn.law_options import OPTIONS, Options
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.whole_sequences import Whole
@@ -260,9 +259,8 @@ def covariance_root(
             states = first, second, goes_on
         degree = int(np.max(np.sum(found.family.powers, axis=1)))
         noise = unexplained(prepared, rows, residual, count, degree, states)
-    train = Reduced(np.asfortranarray(fit.factor), fit.rows)
     return uncertainty.root(
-        train, count, slopes.reshape(-1, count), np.hypot(left, _NEAR_ROUNDOFF).ravel(),
+        fit.triangle, count, slopes.reshape(-1, count), np.hypot(left, _NEAR_ROUNDOFF).ravel(),
         noise=noise, scores=scores,
     )  # fmt: skip
 
@@ -300,7 +298,7 @@ def unexplained(
             slopes, weight * target, to_target @ first, to_target @ second, goes_on
         )
         freedom = shared_noise.freedom(slopes, weight * target, scores)
-    left = np.sum(reduced.factor[:, -1] ** 2) / max(reduced.rows - taken, 1)
+    left = reduced.norm**2 / max(reduced.rows - taken, 1)
     if left == 0:
         return 1.0
     part = float(uncertainty.variance(reduced, count, freedom) / left)

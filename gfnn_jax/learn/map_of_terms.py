@@ -23,7 +23,7 @@ from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.gauss_newton import fitted_gradients, null_terms, significant
-from gfnn_jax.fitting.least_squares import Reduced
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import CHARTS, AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.assemble import Assembled, composed, measured
@@ -288,8 +288,7 @@ def _root(piece: Generated, prepared: Prepared, judges: Judges) -> np.ndarray:
             part = uncertainty.variance(both, known.num_parameters)
             left = float(np.sum(residual**2)) / max(target.size - count, 1)
             noise = min(part / left, 1.0) if left > 0 else 1.0
-    factor = np.linalg.qr(np.column_stack([slopes, aim]), mode="r")
-    train = Reduced(np.asfortranarray(factor), target.size)
+    train = Triangle.of(np.column_stack([slopes, aim]))
     return uncertainty.root(train, count, slopes, residual, noise=noise)
 
 
@@ -300,10 +299,10 @@ def _sparse(full: _Tried, prepared: Prepared, judges: Judges) -> _Tried:
     weight = _weight(prepared)
     terms = (piece.family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
     residual = terms @ piece.params - (target * weight).ravel()
-    factor = np.linalg.qr(np.column_stack([terms, residual]), mode="r")
+    triangle = Triangle.of(np.column_stack([terms, residual]))
     tried: set[int] = set()
     for threshold in _THRESHOLDS:
-        kept, _ = significant(factor, piece.params, len(residual), threshold)
+        kept, _ = significant(triangle, piece.params, threshold)
         if not 0 < len(kept) < piece.family.num_parameters or len(kept) in tried:
             continue
         tried.add(len(kept))

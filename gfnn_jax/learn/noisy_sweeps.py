@@ -115,7 +115,7 @@ def best_size(sweep: LinearSweep, near: Size, most: Size, budget: Budget, say) -
         place = sweep.sizes.index(most)
         sizes = sweep.sizes[: place + 1]
         counts = [size.family.num_parameters for size in sizes]
-        left = [float(np.sum(train.factor[count:, -1] ** 2)) for count in counts]
+        left = [train.residual_norm(count) ** 2 for count in counts]
         taken = np.array(sweep.freedoms(near, most, counts))
         noise = left[-1] / (train.rows - taken[-1])
         # What each size leaves out of the next, beyond what that one makes of noise.

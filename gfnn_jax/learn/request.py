@@ -33,7 +33,7 @@ class Request:
     terms: Sequence[str | Callable]
     base: str | Callable | None
     structure: Structure | None
-    family: str
+    family: Any
     chart: str
     ensemble: int
     seed: int

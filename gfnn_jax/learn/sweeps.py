@@ -11,15 +11,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.inputs import box_inputs, variable_signs
+from gfnn_jax.dataset.runs import looked_at
+from gfnn_jax.dataset.split import outermost
+from gfnn_jax.families.inputs import Inputs, box_inputs, variable_signs
+from gfnn_jax.families.own import own_families
 from gfnn_jax.families.products import Products, number_of_terms
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.learn.candidates import Candidate, Judges, validated
 from gfnn_jax.learn.clock import Budget
-from gfnn_jax.learn.held_out import looked_at, outermost
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.rows import of_rows, rows_of
 from gfnn_jax.maps.affine import Affine
@@ -68,13 +71,20 @@ class Size:
 
 
 def sweeps_for(
-    request: str, charts: Sequence[AnyChart], prepared, scene, judges, factors=None
+    request: Any, charts: Sequence[AnyChart], prepared, scene, judges, factors=None
 ) -> Iterator:
     """The sweeps of the families that apply, chart by chart.
 
-    request: "auto", "polynomial", "features" (the scene's) or "sines"; with "auto" random sines
-    are tried where polynomials have too many terms. factors: as ``LinearSweep`` takes them.
+    request: "auto", "polynomial", "features" (the scene's), "sines", or a user's own; with "auto"
+    random sines are tried where polynomials have too many terms. factors: as ``LinearSweep`` takes
+    them.
     """
+    if not isinstance(request, str):
+        for chart in charts:
+            yield LinearSweep(
+                prepared, chart, judges, "own", None, None, own=lambda i: own_families(request, i)
+            )  # fmt: skip
+        return
     features = scene.features if scene is not None else None
     polynomials = request in ("auto", "polynomial")
     even = polynomials and (scene is None or scene.reversor is None) and is_even(prepared, judges)
@@ -101,22 +111,28 @@ class _Factors(NamedTuple):
     """Of the training rows, of those held out, and of the training rows without the outermost
     twentieth and of that twentieth alone."""
 
-    train: least_squares.Reduced
-    held: least_squares.Reduced
-    inner: least_squares.Reduced
-    outer: least_squares.Reduced
+    train: Triangle
+    held: Triangle
+    inner: Triangle
+    outer: Triangle
+
+    @classmethod
+    def of(cls, inner: Triangle, outer: Triangle, held: Triangle) -> _Factors:
+        """The rows of the outermost twentieth are appended to the others by their own triangle."""
+        return cls(inner.append(outer.factor, outer.rows), held, inner, outer)
 
 
 class LinearSweep:
     """The sizes of one linear family in one chart.
 
     factors: a ``KeptFactors``, where factors that took long are kept for a fit that goes on. even:
-    whether S(−w) = S(w), and has even terms only.
+    whether S(−w) = S(w), and has even terms only. own: a user's families, of the inputs, by rising
+    number of terms.
     """
 
     def __init__(
         self, prepared: Prepared, chart: AnyChart, judges: Judges, kind: str, features, reversor,
-        factors=None, even=False,
+        factors=None, even=False, own: Callable[[Inputs], Iterable[Any]] | None = None,
     ):  # fmt: skip
         reversor = (-1,) * 2 * prepared.dim if even else reversor
         self._kept, self._prefix = factors, "even " if even else ""
@@ -136,15 +152,17 @@ class LinearSweep:
         )  # fmt: skip
         degrees = _EVEN_DEGREES if even else _DEGREES
         signs = None
-        if kind != "sines" and reversor is not None:
+        if kind != "sines" and own is None and reversor is not None:
             signs = variable_signs(inputs, reversor, w)
 
         def groups() -> Iterator[Iterable[Any]]:
+            if own is not None:
+                return ([family] for family in own(inputs))
             if kind == "sines":
                 return ([Sines(inputs, count)] for count in _SINES)
             return ((of(inputs, degree, signs) for degree in g) for g in degrees)
 
-        known = len(_SINES) if kind == "sines" else sum(map(len, degrees))
+        known = len(_SINES) if kind == "sines" or own is not None else sum(map(len, degrees))
         self._groups, rows = groups, self._train[1].size
         self.sizes = [
             Size(family, group[-1], _extent(family))
@@ -208,7 +226,7 @@ class LinearSweep:
     def at(self, extent: float) -> str:
         """What the size of this extent is, how many terms it has, and how many pairs they take."""
         family = self.sizes[0].family
-        if isinstance(family, Sines):
+        if not hasattr(family, "degree"):
             label = f"{family.name} {(terms := round(2**extent))}"
         else:
             degree = round(extent)
@@ -254,8 +272,7 @@ class LinearSweep:
             ).coefficients
             for i in (0, 1)
         )  # fmt: skip
-        missed = np.linalg.norm(train.factor[:count, :count] @ (one - other))
-        return float(missed) / (2 * np.sqrt(train.rows))
+        return train.image_norm(one - other) / (2 * np.sqrt(train.rows))
 
     def root(self, size: Size) -> np.ndarray:
         """(m, m): rootᵀ root is the covariance of the size's coefficients.
@@ -387,7 +404,7 @@ class LinearSweep:
                 slopes = self._slopes(of.family, data[0], *data[2:])
                 scores = shared_noise.scores(slopes, *states)
                 freedom = shared_noise.freedom(slopes, states[0], scores)
-            square = float(np.sum(reduced.factor[count:, -1] ** 2)) / max(reduced.rows, 1)
+            square = reduced.residual_norm(count) ** 2 / max(reduced.rows, 1)
             return square, freedom, reduced.rows
 
         (of_all, taken, _), (of_rest, more, rows) = left(size), left(larger)
@@ -423,10 +440,10 @@ class LinearSweep:
         if stored is None:
             return None
         inner, outer, held = (
-            least_squares.Reduced(np.asfortranarray(stored[part]), int(stored[f"{part}_rows"]))
+            Triangle(stored[part], int(stored[f"{part}_rows"]))
             for part in ("inner", "outer", "held")
         )
-        return _Factors(least_squares.merged(inner, outer), held, inner, outer)
+        return _Factors.of(inner, outer, held)
 
     def _computed(self, group, budget: Budget, say) -> _Factors:
         taken, _ = self._rows_of(group)
@@ -444,7 +461,7 @@ class LinearSweep:
                 self._named(group), inner=inner.factor, inner_rows=inner.rows, outer=outer.factor,
                 outer_rows=outer.rows, held=held.factor, held_rows=held.rows,
             )  # fmt: skip
-        return _Factors(least_squares.merged(inner, outer), held, inner, outer)
+        return _Factors.of(inner, outer, held)
 
     def _named(self, group) -> str:
         return f"{self.chart.name} {self.kind} {group.num_parameters}"
@@ -461,8 +478,9 @@ class LinearSweep:
 
 
 def _extent(family) -> float:
-    """The degree of products, or log₂ of the number of sines."""
-    return float(np.log2(family.num_parameters) if isinstance(family, Sines) else family.degree)
+    """The degree of products, or log₂ of the number of terms."""
+    degree = getattr(family, "degree", None)
+    return float(np.log2(family.num_parameters) if degree is None else degree)
 
 
 class _WithOdd:
