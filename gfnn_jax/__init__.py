@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from gfnn_jax.maps.saved import load, register
     from gfnn_jax.maps.stroboscopic import stroboscopic
     from gfnn_jax.maps.symplectic_map import SymplecticMap
+    from gfnn_jax.models.model import Fitted, TrainingData
     from gfnn_jax.phase_space import Pairs
     from gfnn_jax.scenes import Scene
     from gfnn_jax.scenes.trajectories import (
@@ -43,10 +44,12 @@ _HOMES = {
     "Fit": "learn.fit",
     "FitError": "errors",
     "FitWarning": "errors",
+    "Fitted": "models.model",
     "InputError": "errors",
     "Pairs": "phase_space",
     "Scene": "scenes",
     "SymplecticMap": "maps.symplectic_map",
+    "TrainingData": "models.model",
     "WorkError": "errors",
     "enable_compile_cache": "compiling",
     "export": "exports.export",
@@ -67,10 +70,12 @@ __all__ = [
     "Fit",
     "FitError",
     "FitWarning",
+    "Fitted",
     "InputError",
     "Pairs",
     "Scene",
     "SymplecticMap",
+    "TrainingData",
     "WorkError",
     "enable_compile_cache",
     "export",

@@ -41,6 +41,7 @@ from gfnn_jax.learn.stated import stated
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.model import Model
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
 
@@ -252,6 +253,7 @@ def fit(
     base: str | Callable | None = None,
     structure: str | None = None,
     family: Any = "auto",
+    model: Model | None = None,
     chart: str = "auto",
     ensemble: int = 1,
     angles: tuple[int, ...] = (),
@@ -292,6 +294,7 @@ def fit(
                with learn="hamiltonian" H is a sum of terms, or a network with "mlp". Or a family
                of one's own that is linear in its parameters, or a function of `Inputs` that gives
                such families by rising number of terms (`families.own`).
+    model:     a model of one's own (`models.model.Model`), which is then all that is learned.
     chart:     "auto" or one of type1, type2, type3, midpoint.
     ensemble:  so many networks trained together, of which the map is the mean and their spread the
                posterior; with family="mlp".
@@ -329,7 +332,7 @@ def fit(
 
     request = checked(
         pairs, scene, tolerance=tolerance, absolute_tolerance=absolute_tolerance, learn=learn,
-        terms=terms, base=base, structure=structure, family=family, chart=chart,
+        terms=terms, base=base, structure=structure, family=family, model=model, chart=chart,
         ensemble=ensemble, angles=angles, seed=seed, budget=budget, max_iterations=max_iterations,
         checkpoints=checkpoints, factors=factors, say=on_progress, tell=on_candidate,
     )  # fmt: skip

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.errors import FitError
-from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.assemble import composed, with_predictor
+from gfnn_jax.learn.assemble import composed
 from gfnn_jax.learn.candidates import Candidate, Judges
 from gfnn_jax.learn.choose_charts import Charts
 from gfnn_jax.learn.choose_law import DEARER, law_of
@@ -26,6 +25,7 @@ from gfnn_jax.learn.law_maps import (
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.linear_map import linear_map
 from gfnn_jax.learn.map_of_terms import LearnedMap, map_of
+from gfnn_jax.learn.model_sweep import ModelSweep
 from gfnn_jax.learn.network_sweep import NetworkSweep
 from gfnn_jax.learn.networks import learn_network
 from gfnn_jax.learn.prepare import Prepared
@@ -69,13 +69,13 @@ def searched(
     better = _Better(on_better) if on_better is not None else None
     given = bound.bound, budget, say, tell, better
     # Small sizes first: a map is then there, however long the search for H.
-    early = not prepared.of_terms
-    climb = Search(_sweeps(request, seen, judges) if early else [], *given)
+    early = not prepared.of_terms or request.model is not None
+    climb = Search(_sweeps(request, plain, seen, judges) if early else [], *given)
     climb.climb(most=_SMALL)
     law = _law(request, plain, judges, better)
     of_terms, failed = None, None
     met_by_law = law is not None and judges.met_by(law.candidate)
-    wanted = prepared.of_terms and request.learn != "hamiltonian" and not met_by_law
+    wanted = not early and request.learn != "hamiltonian" and not met_by_law
     if wanted and request.family == "auto":
         try:
             of_terms = map_of(prepared, judges, scene, request.chart, law, budget, say)
@@ -88,7 +88,7 @@ def searched(
             failed = failed or error
         prepared, charts = seen.prepared, seen.charts
     if not early:
-        climb = Search(_sweeps(request, seen, judges), *given)
+        climb = Search(_sweeps(request, plain, seen, judges), *given)
     dearest = law.candidate.operations if law is not None and met_by_law else np.inf
     climb.climb(dearest)
     found = climb.found()
@@ -159,15 +159,17 @@ def _law(
     return law
 
 
-def _sweeps(request: Request, seen: Diagnosis, judges: Judges) -> list[Any]:
+def _sweeps(request: Request, plain: Prepared, seen: Diagnosis, judges: Judges) -> list[Any]:
     """The sweeps of S over the charts that cover the data; none where H alone is learned, or the
     pairs are driven, or differ in dt and in parameters too."""
+    if request.model is not None:
+        return [ModelSweep(request.model, plain, judges)]
     charts, prepared = seen.charts.charts, seen.prepared
     if request.learn == "hamiltonian" or prepared.period is not None:
         return []
     if prepared.own_dt is not None:
-        plain = prepared.structure is None and prepared.args is None
-        return [sweep_of_dt(prepared, request.scene, judges, request.factors)] if plain else []
+        alone = prepared.structure is None and prepared.args is None
+        return [sweep_of_dt(prepared, request.scene, judges, request.factors)] if alone else []
     if request.family == "mlp":
         given = (prepared, charts[0], judges, request.max_iterations, request.seed,
                  request.checkpoints)  # fmt: skip
@@ -202,10 +204,5 @@ class _Better:
 
 
 def _map_of(entry: Entry) -> SymplecticMap:
-    sweep, family = entry.sweep, entry.size.family
-    prepared, judges = sweep.prepared, sweep.judges
-    _, params = sweep.solve(entry.size, Budget(), lambda message: None)
-    generated = Generated(family, params, sweep.chart, prepared.dt, prepared.scale)
-    features = getattr(getattr(family, "inputs", None), "features", None)
-    generated = with_predictor(generated, prepared, judges.training, features)
-    return composed(generated, prepared, judges)
+    sweep = entry.sweep
+    return composed(sweep.piece(entry.size), sweep.prepared, sweep.judges)
