@@ -20,7 +20,7 @@ from gfnn_jax.learn.propose import proposed
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import AS_FAR, MET, Entry
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.learn.sweeps import OF_SOLVE, OF_STEPS
+from gfnn_jax.learn.sweeps import OF_SOLVE, OF_STEPS, LinearSweep
 
 _NO_MORE = {
     False: "no larger library of terms promised to meet it",

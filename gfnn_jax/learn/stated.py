@@ -84,11 +84,12 @@ def _images_of(chosen: Chosen, found: Searched, rows: np.ndarray) -> np.ndarray:
     if candidate.microseconds_per_step is None and found.linear is not None:
         linear = jax.tree.map(np.asarray, candidate.map.pieces[0])
         return to_user(prepared.coordinates, linear.image(prepared.y0[rows]))
-    if candidate.microseconds_per_step is None and entry is not None:
-        if entry.sweep.judges.pairs is found.judges.pairs:
-            images, solved = entry.sweep.images(entry.size, rows)
-            images = prepared.whole_image(np.where(solved[:, None], images, np.nan))
-            return to_user(prepared.coordinates, images)
+    sweep = None if entry is None else entry.sweep
+    own = sweep is not None and sweep.judges.pairs is found.judges.pairs
+    if candidate.microseconds_per_step is None and entry is not None and own:
+        images, solved = entry.sweep.images(entry.size, rows)
+        images = prepared.whole_image(np.where(solved[:, None], images, np.nan))
+        return to_user(prepared.coordinates, images)
     steps = stepped(candidate.map, np.asarray(pairs.z0), pairs.dt, pairs.args, timed=False)
     return np.where(steps.failed[:, None], np.nan, steps.images)
 
