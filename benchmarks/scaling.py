@@ -54,7 +54,8 @@ from harness import (
 
 import gfnn_jax as gfnn
 from gfnn_jax import processes
-from gfnn_jax.data.files import iterate_pairs, read_sample
+from gfnn_jax.data.files import iterate_pairs
+from gfnn_jax.data.sample import read_sample
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.families.products import Products
@@ -136,7 +137,7 @@ def problem(task: str, quick: bool) -> Callable[[], Any]:
         terms = polynomial_terms(2, size)
         own = gauss_newton.Problem(z0, z1, dt, np.ones(4))
         c = gauss_newton.midpoint_start(terms, z0, z1, dt, np.ones(4))
-        return lambda: own.factor(terms, c, Steps(5, 1), np.arange(len(z0))).matrix
+        return lambda: own.linearised(terms, c, Steps(5, 1), np.arange(len(z0))).factor
     network = Mlp(box_inputs(w), (16, 16, 16), "gelu", amplitude_of(w, target))
     starts = [network.init(key, np.float64) for key in jax.random.split(jax.random.key(1), size)]
     held = len(w) // 5

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gfnn_jax.families import from_function
     from gfnn_jax.generating.charts import CHARTS, Chart
     from gfnn_jax.learn.fit import Fit, fit
-    from gfnn_jax.maps.saved import load
+    from gfnn_jax.maps.saved import load, register
     from gfnn_jax.maps.stroboscopic import stroboscopic
     from gfnn_jax.maps.symplectic_map import SymplecticMap
     from gfnn_jax.phase_space import Pairs
@@ -57,6 +57,7 @@ _HOMES = {
     "load": "maps.saved",
     "read": "data.recording",
     "reference_trajectories": "scenes.trajectories",
+    "register": "maps.saved",
     "sample_pairs": "scenes.trajectories",
     "sample_states": "scenes.trajectories",
     "sample_test_states": "scenes.trajectories",
@@ -84,6 +85,7 @@ __all__ = [
     "metrics",
     "read",
     "reference_trajectories",
+    "register",
     "sample_pairs",
     "sample_states",
     "sample_test_states",

@@ -95,6 +95,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
 
 
+_MAX_SECONDS = 120.0  # of a fit
+
+
 def _fail(status: int, why: object) -> int:
     print(f"gfnn: {why}", file=sys.stderr)
     processes.abandon(status)
@@ -315,8 +318,14 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
     )  # fmt: skip
     command.add_argument("--seed", type=_seed, default=0, metavar="N")
     command.add_argument(
-        "--max-seconds", type=_positive, default=120.0, metavar="S",
-        help="for the fit: the best map by then is kept (default 120)",
+        "--max-seconds", type=_positive, default=None, metavar="S",
+        help="for the fit: the best map by then is kept (default 120, or none where operations are "
+        "bounded)",
+    )  # fmt: skip
+    command.add_argument(
+        "--max-operations", type=_count, default=None, metavar="N",
+        help="for the fit, counted: a report's fit.max_operations gives its model again, whatever "
+        "the clock has ended",
     )  # fmt: skip
     command.add_argument(
         "--strict", action="store_true", help="exit status 1 where the tolerance is not met"
@@ -396,6 +405,12 @@ def _indices(text: str) -> tuple[int, ...]:
     return found
 
 
+def _max_seconds(arguments: argparse.Namespace) -> float | None:
+    """The budget of a fit: where operations are bounded nothing else is, unless told."""
+    given = arguments.max_seconds
+    return _MAX_SECONDS if given is None and arguments.max_operations is None else given
+
+
 # The commands. The heavy imports are here, after the checks that need none of them.
 
 
@@ -417,7 +432,8 @@ def _run(arguments: argparse.Namespace) -> None:
     with progress.on_stderr() as shown:
         ran = run(
             arguments.scene, out=out, quick=arguments.quick, seed=arguments.seed, dt=arguments.dt,
-            tolerance=arguments.tolerance, max_seconds=arguments.max_seconds,
+            tolerance=arguments.tolerance, max_seconds=_max_seconds(arguments),
+            max_operations=arguments.max_operations,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
             base=arguments.base, structure=arguments.structure,
             family=arguments.family, ensemble=arguments.ensemble, overwrite=arguments.overwrite,
@@ -475,7 +491,8 @@ def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) 
         ran = fit(
             arguments.data, out=arguments.out, dt=arguments.dt,
             tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
-            absolute_tolerance=arguments.absolute_tolerance, max_seconds=arguments.max_seconds,
+            absolute_tolerance=arguments.absolute_tolerance, max_seconds=_max_seconds(arguments),
+            max_operations=arguments.max_operations,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
             base=arguments.base, structure=arguments.structure,
             family=arguments.family, ensemble=arguments.ensemble, scene_name=arguments.scene,
@@ -582,11 +599,12 @@ def _summarise(ran: Any, out: Path) -> None:
 
     _print_table(candidates_table(ran.fit))
     report = ran.report
-    fit = report["fit"]
+    fit, defect = report["fit"], report["map"]["symplecticity_defect"]
     print(
         f"{report['model']['chart']} {report['model']['label']}: one-step error "
         f"{fit['validation_rms']:.2e}, {fit['validation_relative']:.2e} of the spread (tolerance "
-        f"{fit['tolerance']:g}), symplecticity defect {report['map']['symplecticity_defect']:.1e}"
+        f"{fit['tolerance']:g}), symplecticity defect "
+        + (f"{defect:.1e}" if defect is not None else "not looked at")
     )
     if report["hamiltonian"] is not None:
         also = "" if report["model"]["learns"] == "hamiltonian" else "not chosen: "

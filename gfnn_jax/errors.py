@@ -24,5 +24,9 @@ class FitError(ValueError):
         super().__init__(" ".join(message.split()))
 
 
+class OutOfTime(Exception):
+    """The budget of a fit is spent; what was found so far stands."""
+
+
 class FitWarning(UserWarning):
     """The fit went on, but its user should know."""

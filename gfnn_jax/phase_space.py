@@ -117,6 +117,11 @@ class Pairs:
     (N,) stands for parameters of the names a1, a2, …
     t0, period: of a driven system, the time of z0 (N,), or one of all pairs, and the drive's
     period. t0 is one of the args too, by the name t.
+    run: the run (trajectory, sequence) that each pair is of, (N,) numbers or text. place: the
+    number of z0 along its run, (N,) integers. A fit puts pairs with a run into the order of their
+    runs and places; it finds the places of a run that has none by its images that are states.
+    std: the standard deviation of the noise on each measured coordinate, (2d,), in the user's
+    units; None: it is estimated.
 
     Raises FitError where these are no arrays of such shapes.
     """
@@ -127,6 +132,9 @@ class Pairs:
     args: Any = None
     t0: Any = None
     period: float | None = None
+    run: Any = None
+    place: Any = None
+    std: Any = None
 
     def __post_init__(self):
         # JAX makes pairs of whatever it maps arrays to; a user's are lists or arrays.
@@ -150,6 +158,35 @@ class Pairs:
             self._set("args", _named(self.args, len(self)))
         if self.t0 is not None or TIME in (self.args or {}):
             self._set_time()
+        self._set_identities()
+        if self.std is not None and not isinstance(self.std, jax.Array):
+            self._set("std", np.asarray(self.std, np.float64))
+            if self.std.shape != (self.z0.shape[1],):
+                raise FitError(
+                    f"expected std of shape ({self.z0.shape[1]},), one of each coordinate, got "
+                    f"{self.std.shape}"
+                )
+            if not (np.isfinite(self.std) & (self.std > 0)).all():
+                raise FitError("expected std that is finite and above 0")
+
+    def _set_identities(self) -> None:
+        """``run`` and ``place`` as arrays (N,)."""
+        if self.place is not None and self.run is None:
+            raise FitError("expected the run of each pair beside its place, got none")
+        for name, kinds, what in (
+            ("run", "iufUSO", "numbers or text"),
+            ("place", "iu", "integers"),
+        ):
+            given = getattr(self, name)
+            if given is None or (isinstance(given, jax.Array) and given.shape == (len(self),)):
+                continue
+            values = np.asarray(given)
+            if values.shape != (len(self),) or values.dtype.kind not in kinds:
+                raise FitError(
+                    f"expected {name} as {what} of shape ({len(self)},), got {values.dtype} of "
+                    f"shape {values.shape}"
+                )
+            self._set(name, values.astype(str) if values.dtype.kind in "SO" else values)
 
     def _set_time(self) -> None:
         """The time of the drive both as ``t0`` and as the last of the args."""
@@ -165,16 +202,25 @@ class Pairs:
         object.__setattr__(self, name, value)
 
     def tree_flatten(self):
-        """Arrays are leaves; a dt of all pairs is not."""
+        """Arrays are leaves; a dt of all pairs is not, nor are names of runs."""
         own = bool(np.ndim(self.dt))
-        leaves = (self.z0, self.z1, self.args, *([self.dt] if own else []))
-        return leaves, (None if own else self.dt, self.period)
+        text = isinstance(self.run, np.ndarray) and self.run.dtype.kind == "U"
+        run = (None, tuple(self.run.tolist())) if text else (self.run, None)
+        leaves = (self.z0, self.z1, self.args, run[0], self.place, self.std)
+        return (*leaves, *([self.dt] if own else [])), (
+            None if own else self.dt,
+            self.period,
+            run[1],
+        )
 
     @classmethod
     def tree_unflatten(cls, fixed, leaves) -> Pairs:
         """The inverse."""
-        (dt, period), (z0, z1, args, *own) = fixed, leaves
-        return cls(z0, z1, own[0] if own else dt, args, period=period)
+        (dt, period, names), (z0, z1, args, run, place, std, *own) = fixed, leaves
+        run = run if names is None else np.array(names)
+        return cls(
+            z0, z1, own[0] if own else dt, args, period=period, run=run, place=place, std=std
+        )
 
     def __len__(self) -> int:
         return self.z0.shape[0]
@@ -188,7 +234,11 @@ class Pairs:
         """The pairs of these rows (an index array or a slice)."""
         dt = self.dt[rows] if np.ndim(self.dt) else self.dt
         args = self.args and {name: values[rows] for name, values in self.args.items()}
-        return Pairs(self.z0[rows], self.z1[rows], dt, args, period=self.period)
+        run, place = (None if of is None else of[rows] for of in (self.run, self.place))
+        return Pairs(
+            self.z0[rows], self.z1[rows], dt, args, period=self.period, run=run, place=place,
+            std=self.std,
+        )  # fmt: skip
 
 
 def _named(args: Any, count: int) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.data.files import read_initial_noise
 from gfnn_jax.errors import InputError
 from gfnn_jax.fitting import shared_noise, uncertainty
-from gfnn_jax.fitting.least_squares import Reduced
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.jobs.predict import predict
 from gfnn_jax.learn.candidates import Judges, Tolerance
@@ -48,8 +48,7 @@ def test_a_law_is_fitted_to_whole_sequences(noisy):
 
 
 def factored(rows, target):
-    matrix = np.linalg.qr(np.column_stack([rows, target]), mode="r")
-    return Reduced(np.asfortranarray(matrix), len(rows))
+    return Triangle.of(np.column_stack([rows, target]))
 
 
 def test_covariance_is_that_of_the_textbook_where_all_rows_are_alike():

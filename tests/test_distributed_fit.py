@@ -14,7 +14,8 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax import processes
-from gfnn_jax.data.files import iterate_pairs, read_sample
+from gfnn_jax.data.files import iterate_pairs
+from gfnn_jax.data.sample import read_sample
 from gfnn_jax.errors import InputError
 from gfnn_jax.jobs import fit as fit_job
 from gfnn_jax.learn.refit import help_refit, refit

@@ -12,7 +12,8 @@ import scipy.integrate
 
 import gfnn_jax as gfnn
 from gfnn_jax import cli
-from gfnn_jax.data.files import read_initial, read_sample, read_trajectories
+from gfnn_jax.data.files import read_initial, read_trajectories
+from gfnn_jax.data.sample import read_sample
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow

@@ -6,6 +6,7 @@ import pytest
 from analytic import exact_oscillator, generated, map_of, oscillator, rotated
 
 import gfnn_jax as gfnn
+from gfnn_jax.dataset.runs import identified
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.learn.noise import noise_of_sites, state_noise
 from gfnn_jax.scenes import froeschle
@@ -21,7 +22,7 @@ def noisy_turns(angle, sigma, num_steps):
     states += sigma * rng.normal(size=states.shape)
     z0, z1 = states[:, :-1].reshape(-1, 2), states[:, 1:].reshape(-1, 2)
     piece = generated(oscillator, exact_oscillator(angle), MIDPOINT, angle)
-    return map_of(piece, z0), gfnn.Pairs(z0, z1, angle)
+    return map_of(piece, z0), identified(gfnn.Pairs(z0, z1, angle)).pairs
 
 
 @pytest.mark.parametrize("num_steps", [1, 50])

@@ -169,7 +169,7 @@ def test_a_function_of_ones_own_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d["map"].update(type="Popen"), "does not describe a map"),
+        (lambda d: d["map"].update(type="Popen"), "holds a Popen, which is not known"),
         (lambda d: d["map"].pop("dt"), "does not describe a map"),
         (lambda d: d["map"]["pieces"]["0"].update(surprise=1), "does not describe a map"),
         (lambda d: d.pop("map"), "does not describe a map"),

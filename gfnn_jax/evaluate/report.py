@@ -69,15 +69,18 @@ def assemble(
             "validation_relative": chosen.validation_relative,
             "validation_bound": chosen.validation_bound,
             "deviations": np.asarray(chosen.deviations).tolist(),
+            "stated_by": fit.stated_by,
             "tolerance": fit.tolerance,
             "tolerance_is_relative": fit.asked.relative,
             "tolerance_met": fit.met,
             "ended": fit.ended,
+            "operations": fit.operations,
+            "max_operations": fit.max_operations,
             "messages": list(fit.messages),
         },
         "hamiltonian": _hamiltonian(fit),
         "map": {
-            "symplecticity_defect": fit.symplecticity_defect,
+            "symplecticity_defect": fit.symplecticity_defect if fit.tells_defect else None,
             "chart_determinant_min": fit.model_determinant_min,
             "chart_determinants_of_data": {n: j.low for n, j in fit.judgements.items()},
             "newton_iterations_max": chosen.newton_iterations_max,
@@ -110,7 +113,13 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
     """H as it was learned, where its flow meets the tolerance or was chosen."""
     if fit.hamiltonian is None or fit.formula is None:
         return None
-    return {"formula": fit.formula, "terms": [term._asdict() for term in fit.hamiltonian.terms]}
+    law = fit.hamiltonian
+    return {
+        "formula": fit.formula,
+        "terms": [term._asdict() for term in law.terms],
+        "dropped": law.dropped._asdict() if law.dropped is not None else None,
+        "search_cut_short": law.ended or None,
+    }
 
 
 def rollout_part(

@@ -78,6 +78,7 @@ def _product(f, picks):
     return sum(f[..., k : k + 1] * as_row(picks[k], f) for k in range(len(picks)))
 
 
+@cache
 def number_of_terms(is_angle: tuple[bool, ...], degree: int, signs=None, still: int = 0) -> int:
     """How many products a basis of this degree has, counted without making it; as `Basis`."""
     counts = np.zeros((2, degree + 1), dtype=object)  # by parity and total degree
@@ -311,7 +312,7 @@ class Products:
 
     @property
     def num_parameters(self) -> int:
-        return len(self.basis.terms)
+        return self.terms_of(self.degree)
 
     def terms_of(self, degree: int) -> int:
         """How many parameters it would have of another degree."""

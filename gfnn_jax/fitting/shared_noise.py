@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import nnls
 
+from gfnn_jax.fitting.triangle import Triangle
+
 # Where the residuals cannot tell two coordinates' noise apart, each is given half of its own
 # residual's variance, by this weight beside the moments' own.
 _PRIOR = 0.1
@@ -62,6 +64,6 @@ def scores(
 def freedom(slopes: np.ndarray, residual: np.ndarray, scores: np.ndarray) -> float:
     """Degrees of freedom that the noise of these scores (k, m) takes of the residual (n, 2d) in a
     fit of A = slopes (n, 2d, m): as many as there are terms, were the rows independent."""
-    _, s, vt = np.linalg.svd(slopes.reshape(-1, slopes.shape[-1]), full_matrices=False)
-    known = s > np.finfo(np.float64).eps * slopes.size * s[0]
-    return float(np.sum((scores @ vt[known].T / s[known]) ** 2) / np.mean(residual**2))
+    rows = np.concatenate([slopes, residual[..., None]], axis=-1)
+    root = Triangle.of(rows.reshape(-1, rows.shape[-1])).spectrum().root()
+    return float(np.sum((scores @ root) ** 2) / np.mean(residual**2))

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gfnn_jax.data.files import iterate_pairs, read_sample, read_trajectories
+from gfnn_jax.data.files import iterate_pairs, read_trajectories
+from gfnn_jax.data.sample import read_sample
 from gfnn_jax.data.summary import summary
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import report
@@ -26,7 +27,6 @@ from gfnn_jax.storage.partial import unfinished
 # A larger file is never in memory whole, nor are several: candidates are chosen on a sample of the
 # pairs, and the chosen one is fitted to all of them chunk by chunk.
 _LARGE_BYTES, _FIT_CHUNK = 2**29, 50_000
-_HELD, _HELD_PART = 2_000, 5  # pairs of the sample that judge, at most; at most a fifth
 
 
 def fit(
@@ -36,7 +36,8 @@ def fit(
     dt: float | None = None,
     tolerance: float = 1e-6,
     absolute_tolerance: float | None = None,
-    max_seconds: float = 120.0,
+    max_seconds: float | None = 120.0,
+    max_operations: int | None = None,
     chart: str = "auto",
     learn: str = "auto",
     terms: tuple[str, ...] = (),
@@ -103,18 +104,21 @@ def fit(
         try:
             fitted = search(
                 trajectories.pairs(), scene, angles=angles, max_seconds=max_seconds,
-                progress=progress, kept_in=kept_in, job=job, devices=devices, **options,
+                max_operations=max_operations, progress=progress, kept_in=kept_in, job=job,
+                devices=devices, **options,
             )  # fmt: skip
             if large and can_be_refitted(fitted.map):
                 progress.say("all pairs, for the chosen candidate")
-                sampled = trajectories.pairs()
-                held = sampled.take(slice(min(_HELD, len(sampled) // _HELD_PART)))
                 with failures_of_arithmetic(), row_blocks.on_devices(own):
-                    fitted = refit(fitted, pairs, held, scene=scene, group=group)
+                    fitted = refit(
+                        fitted, pairs, fitted.validation_pairs, test=fitted.test_pairs,
+                        scene=scene, group=group,
+                    )  # fmt: skip
             else:
                 group.told({})
                 fitted = not_refitted(fitted) if large else fitted
-            progress.say("the report: compiling the derivative of a step")
+            progress.say("the report: the posterior, and the derivative of a step")
+            fitted = fitted.settled()
             result = report.assemble(
                 fitted, scene=scene_name, dt=float(np.asarray(fitted.map.dt)), seed=seed,
                 rollout=None,

@@ -48,7 +48,8 @@ def run(
     seed: int = 0,
     dt: float | None = None,
     tolerance: float | None = None,
-    max_seconds: float = MAX_SECONDS,
+    max_seconds: float | None = MAX_SECONDS,
+    max_operations: int | None = None,
     chart: str = "auto",
     learn: str = "auto",
     terms: tuple[str, ...] = (),
@@ -98,9 +99,9 @@ def run(
             "t0": sample_t0(scene, num_trajectories, key_test),
         }
         fitted = search(
-            pairs, scene, max_seconds=max_seconds, progress=progress, kept_in=kept_in, job=job,
-            **options, **more,
-        )  # fmt: skip
+            pairs, scene, max_seconds=max_seconds, max_operations=max_operations,
+            progress=progress, kept_in=kept_in, job=job, **options, **more,
+        ).settled()  # fmt: skip
         progress.say(f"reference trajectories of {NUM_STEPS} steps")
         reference = np.asarray(reference_trajectories(scene, z0, NUM_STEPS, **given))
         progress.say(f"rollouts of {NUM_STEPS} steps")

@@ -9,6 +9,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.own import is_own
 from gfnn_jax.families.sums import site_terms
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.generating.charts import CHARTS
@@ -44,13 +45,16 @@ def check_request(
     ensemble=1,
     seed=0,
     max_seconds: float | None = None,
+    max_operations: int | None = None,
 ) -> None:
     """Raises FitError where the request or the pairs cannot give a map."""
     for name, value, known in (
         ("chart", chart, CHART_NAMES), ("family", family, FAMILIES), ("learn", learn, LEARNS)
     ):  # fmt: skip
-        if value not in known:
-            raise FitError(f"expected a {name} among {', '.join(known)}; got '{value}'")
+        if name == "family" and is_own(value):
+            continue
+        if not isinstance(value, str) or value not in known:
+            raise FitError(f"expected {name} to be one of {', '.join(known)}; got {value!r}")
     if not isinstance(pairs, Pairs):
         raise FitError(f"expected gfnn.Pairs(z0, z1, dt), got {type(pairs).__name__}")
     if scene is not None and not isinstance(scene, Scene):
@@ -58,6 +62,12 @@ def check_request(
     budget = isinstance(max_seconds, numbers.Real) and max_seconds > 0
     if max_seconds is not None and not budget:
         raise FitError(f"expected max_seconds above 0, or None for no limit; got {max_seconds!r}")
+    counted = isinstance(max_operations, numbers.Integral) and max_operations >= 0
+    if max_operations is not None and not counted:
+        raise FitError(
+            "expected a whole number of operations as max_operations, or None for no limit; got "
+            f"{max_operations!r}"
+        )
     if not (isinstance(seed, numbers.Integral) and 0 <= seed < 2**32):
         raise FitError(f"expected a whole number from 0 to 2**32 - 1 as seed, got {seed!r}")
     if not (isinstance(ensemble, numbers.Integral) and ensemble >= 1):

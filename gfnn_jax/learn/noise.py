@@ -6,6 +6,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
+from gfnn_jax.dataset.runs import next_of
 from gfnn_jax.fitting.shared_noise import variances
 from gfnn_jax.learn.assemble import stepped
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -19,7 +20,8 @@ _PRIOR = 0.1  # weight of the guess that the noise of each half is half of what 
 def state_noise(map_: SymplecticMap, pairs: Pairs, taken: float) -> np.ndarray:
     """Standard deviation (2d,) of each coordinate's noise, from the residuals of these pairs.
 
-    taken: the part of the residuals' degrees of freedom that the map's coefficients took.
+    pairs: with their runs and places, in the order of these. taken: the part of the residuals'
+    degrees of freedom that the map's coefficients took.
     """
     z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
     width, size = z0.shape[1], sizes(z0)
@@ -29,9 +31,8 @@ def state_noise(map_: SymplecticMap, pairs: Pairs, taken: float) -> np.ndarray:
         offset = apart * (np.arange(width) == j)
         jacobian[:, :, j] = _change(map_, pairs, offset) / apart
     known = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
-    z0, z1, r, m = z0[known], z1[known], residual[known], jacobian[known]
-    shared = np.flatnonzero(np.all(z1[:-1] == z0[1:], axis=1))
-    return np.sqrt(variances(r, m, shared) / (1.0 - taken))
+    shared = np.flatnonzero(next_of(pairs, np.flatnonzero(known)))
+    return np.sqrt(variances(residual[known], jacobian[known], shared) / (1.0 - taken))
 
 
 def noise_of_sites(map_: SymplecticMap, pairs: Pairs) -> np.ndarray:

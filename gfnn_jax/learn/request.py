@@ -11,7 +11,7 @@ import numpy as np
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.learn.candidates import Candidate, Tolerance
 from gfnn_jax.learn.check import check_request, coarse_tolerance, unlike_the_scene
-from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.structures import Structure, structure_of
 from gfnn_jax.learn.varied import as_varied
 from gfnn_jax.phase_space import Pairs
@@ -33,11 +33,11 @@ class Request:
     terms: Sequence[str | Callable]
     base: str | Callable | None
     structure: Structure | None
-    family: str
+    family: Any
     chart: str
     ensemble: int
     seed: int
-    clock: Clock
+    budget: Budget
     max_iterations: int
     checkpoints: Any
     factors: Any
@@ -71,7 +71,7 @@ def lent(scene: Scene, learn: str, chart: str) -> str | None:
 
 def checked(
     pairs: Pairs, scene: Scene | None, *, tolerance, absolute_tolerance, learn, terms, base,
-    structure, family, chart, ensemble, angles, seed, clock: Clock, **others: Any,
+    structure, family, chart, ensemble, angles, seed, budget: Budget, **others: Any,
 ) -> Request:  # fmt: skip
     """The request, with what is constant in the pairs as a constant.
 
@@ -85,7 +85,7 @@ def checked(
     check_request(
         pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, angles=angles,
         terms=terms, base=base, structure=structure, ensemble=ensemble, seed=seed,
-        max_seconds=clock.max_seconds,
+        max_seconds=budget.max_seconds, max_operations=budget.max_operations,
     )  # fmt: skip
     coordinates = scene.coordinates if scene else Coordinates("cartesian", angles=tuple(angles))
     found = structure_of(structure, pairs.dim, coordinates)
@@ -99,6 +99,6 @@ def checked(
     messages += coarse_tolerance(pairs, bound)
     return Request(
         pairs, scene, coordinates, bound, learn, terms, base, found, family, chart, ensemble, seed,
-        clock,
+        budget,
         messages=messages, **others,
     )  # fmt: skip

@@ -51,6 +51,23 @@ _TYPES: dict[str, type] = {
         Windows, Groups, Ranges, OfTimeStep, Ensemble,
     )
 }  # fmt: skip
+
+
+def register(kind: type) -> type:
+    """Make a dataclass of one's own, a family or a piece, known to `save` and `load`, by its name.
+
+    A decorator of the class, in a module that is imported before a map of it is loaded. Its fields
+    are arrays, numbers, text, tuples of these, or of other types that are known. Raises InputError
+    where it is no dataclass, or another type has its name.
+    """
+    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+        raise InputError(f"expected a dataclass to register, got {kind!r}")
+    if _TYPES.get(kind.__name__, kind).__module__ != kind.__module__:
+        raise InputError(f"expected another name than {kind.__name__}, which is a type's already")
+    _TYPES[kind.__name__] = kind
+    return kind
+
+
 # Names that were used before, in models that may still be about.
 _FORMER_TYPES = {"Start": "PolynomialModel"}
 _FORMER_FIELDS = {
@@ -209,7 +226,10 @@ def _encode(value: Any) -> tuple[Any, Any]:
     if value is None or isinstance(value, (bool, int, float, str)):
         return value, None
     kind = "function" if callable(value) else type(value).__name__
-    raise InputError(f"a map that holds a {kind} of your own cannot be saved")
+    raise InputError(
+        f"a map that holds a {kind} of your own cannot be saved: gfnn_jax.register makes a "
+        "dataclass known"
+    )
 
 
 def _encode_all(items: dict[str, Any], text: dict[str, Any]) -> tuple[Any, Any]:
@@ -246,6 +266,11 @@ def _decode(text: Any, arrays: Any, scene: Scene | None) -> Any:
             items[name] = numbers
     if kind == "tuple":
         return tuple(items[str(i)] for i in range(len(items)))
+    if kind not in _TYPES:
+        raise InputError(
+            f"holds a {kind}, which is not known: import the module that registers it "
+            "(gfnn_jax.register)"
+        )
     return _TYPES[kind](**items)
 
 

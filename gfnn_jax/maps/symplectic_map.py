@@ -233,8 +233,7 @@ class SymplecticMap:
         pieces = tuple(piece.inverse() for piece in reversed(self.pieces))
         posterior = self.posterior
         if posterior is not None:
-            last = len(pieces) - 1
-            posterior = dataclasses.replace(posterior, piece=last - posterior.piece)
+            posterior = posterior.of_piece(len(pieces) - 1 - posterior.piece)
         return dataclasses.replace(self, pieces=pieces, dt=-self.dt, posterior=posterior)
 
     def defect(self, z, args=None, *, t0=None):
