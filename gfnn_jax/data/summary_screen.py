@@ -87,7 +87,7 @@ def _loss(summary: RecordingSummary) -> str:
         return f"no friction seen{beside} ({size})"
     if loss.per_period < 0:
         return f"a gain of {size}{beside}: a drive that no input explains"
-    kind = f", {loss.kind} friction" if loss.kind else ", of linear, dry and quadratic none clearer"
+    kind = f"; {loss.kind} friction fits best" if loss.kind else ""
     return f"friction takes {size}{beside}{kind}"
 
 

@@ -23,7 +23,7 @@ from gfnn_jax.signals.local_polynomials import LocalFits
 POWERS = {"dry": 1, "linear": 2, "quadratic": 3}
 _STRETCHES = (0.25, 0.6, 1.0, 2.0)  # periods
 _BLOCKS = 12  # of stretches, whose scatter tells errors
-_CLEARLY = 5.0  # standard errors, by which one kind of friction leaves less than the others
+_CLEARLY = 3.0  # standard errors, by which one kind of friction leaves less than the others
 _BALANCED = 0.9  # part of the changes of ½v₁² that the balance must explain
 _RIDGE = 1e-9
 
@@ -122,11 +122,11 @@ class _Balance:
 
 
 def _kind(found: dict[str, _Balance]) -> str | None:
-    """The friction that leaves less than each other one in nearly all blocks."""
+    """The friction that leaves less than each other one, block by block."""
     best = min(found, key=lambda kind: found[kind].squares.sum())
     for kind, balance in found.items():
-        more = balance.squares - found[best].squares
-        if kind != best and more.sum() < _CLEARLY * np.std(more) * np.sqrt(len(more)):
+        more = np.log(np.maximum(balance.squares, 1e-300) / np.maximum(found[best].squares, 1e-300))
+        if kind != best and more.mean() < _CLEARLY * more.std() / np.sqrt(len(more)):
             return None
     return best
 

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.polynomial.polynomial import polyvander
 
 _WIDEST = 1.5  # of the median duration of windows of so many samples; wider ones hold a gap
 _MOST_NUMBERS = 60_000  # in the windows of one fit, for time and memory
@@ -55,12 +56,11 @@ def local_fits(
     x = columns[:, rows]
     half = 0.5 * (t[:, -1] - t[:, 0])
     scaled = (t - centres[:, None]) / half[:, None]
-    basis = scaled[..., None] ** np.arange(degree + 1)
-    q, r = np.linalg.qr(basis)
-    coefficients = np.einsum("wnk,cwn->cwk", q, x)
-    residuals = x - np.einsum("wnk,cwk->cwn", q, coefficients)
+    q, r = np.linalg.qr(polyvander(scaled, degree))
+    coefficients = (x[..., None, :] @ q)[..., 0, :]
+    residuals = x - (q @ coefficients[..., None])[..., 0]
     inverse = np.linalg.inv(r)
-    powers = np.einsum("wjk,cwk->cwj", inverse, coefficients)
+    powers = (inverse @ coefficients[..., None])[..., 0]
     gains = np.sqrt(np.sum(inverse**2, axis=2))  # (W, k), of the coefficient of each power
     return LocalFits(
         rows, centres, run, powers[..., 0], powers[..., 1] / half, 2 * powers[..., 2] / half**2,

@@ -3,8 +3,9 @@
 Where the motion is smooth and well sampled, polynomials of degree 5 in windows of n samples leave
 the noise: their residual variance s²(n), divided by its degrees of freedom, does not depend on n.
 Wider windows leave the motion's own sixth derivative, and s² grows as n¹². Noise that is correlated
-over some samples makes s² grow too, but no faster than n. So σ is s at the widest n up to which s²
-grows more slowly than n^1.5.
+over some samples makes s² grow too, but no faster than n. So σ is s at the widest n but one up to
+which s² grows more slowly than n^1.5. Outliers are found first, in narrow windows, and replaced by
+what their neighbours say.
 
 Where a record has few samples a period, no window is wide enough: s² grows from the narrowest on.
 If the samples are even, σ is then what a linear autoregression leaves of a sample, predicted from
@@ -26,6 +27,9 @@ _SIZES = (9, 11, 13, 15, 19, 23, 29, 37, 45, 57, 71, 89, 111, 139, 173, 217, 271
 _GROWTH = 1.5  # exponent of s²(n) above which it is the motion that grows
 _TRIMMED = 0.02  # of the windows, those with the largest residuals: they may hold outliers
 _FEWEST = 8  # windows
+_NARROW = 15  # samples of the windows in which outliers are looked for
+_RARE = 3e-3  # of the samples, that outliers are at most
+_UNRESOLVED = 0.3  # of a column's spread: what polynomials leave is the motion itself then
 _OUTLIER = 8.0  # standard deviations, of a residual that the sample itself did not pull down
 _LAGS = 16  # of an autoregression
 _MOST_ROWS = 20_000  # that it is fitted to
@@ -56,30 +60,44 @@ def noise(
     times: Sequence[np.ndarray], columns: np.ndarray, inputs: np.ndarray | None = None
 ) -> list[Noise]:
     """The noise of each column (C, T). inputs: (k, T), what drives the motion."""
-    variances = np.full((len(columns), len(_SIZES)), np.nan)
-    fits: list[LocalFits | None] = []
     shortest = max((len(t) for t in times), default=0) // 2
-    for k, size in enumerate(_SIZES):
-        fit = local_fits(times, columns, size, DEGREE) if size <= shortest else None
-        fits.append(fit)
-        if fit is not None:
-            variances[:, k] = [_trimmed(v) for v in fit.variances]
+    sizes = [size for size in _SIZES if size <= shortest]
+    columns, outliers = _without_outliers(times, columns) if sizes else (columns, [])
+    fits = [local_fits(times, columns, size, DEGREE) for size in sizes]
     found = []
     for c, column in enumerate(columns):
-        k = _widest(variances[c])
-        fit = None if k is None else fits[k]
-        if k is None or fit is None:
+        variances = np.array([np.nan if f is None else _trimmed(f.variances[c]) for f in fits])
+        widest = _widest(variances)
+        if widest is None:
             found.append(Noise(None, None, np.empty(0, int), _SIZES[0]))
             continue
-        sigma = float(np.sqrt(variances[c, k]))
-        correlation = _correlation(fit, c)
-        if k == 0:
+        k = max(widest - 1, 0)
+        fit = fits[k]
+        assert fit is not None
+        sigma, correlation = float(np.sqrt(variances[k])), _correlation(fit, c)
+        if widest == 0 or sigma > _UNRESOLVED * np.nanstd(column):
             predicted = _unpredicted(times, [column, *(() if inputs is None else inputs)])
             if predicted is not None and predicted < sigma:
                 sigma, correlation = predicted, None
-        outliers = np.empty(0, int) if k == 0 else _outliers(fit, c, sigma)
-        found.append(Noise(sigma, correlation, outliers, _SIZES[k]))
+        found.append(Noise(sigma, correlation, outliers[c], _SIZES[widest]))
     return found
+
+
+def _without_outliers(
+    times: Sequence[np.ndarray], columns: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """(columns with outliers replaced, sample numbers of the outliers of each)."""
+    fit = local_fits(times, columns, _NARROW, DEGREE)
+    if fit is None:
+        return columns, [np.empty(0, int)] * len(columns)
+    columns, found = columns.copy(), []
+    for c, column in enumerate(columns):
+        rows, off = _outliers(fit, c)
+        if len(rows) > _RARE * column.size:  # noise with long tails, as of a sensor's single counts
+            rows, off = rows[:0], off[:0]
+        column[rows] -= off
+        found.append(rows)
+    return columns, found
 
 
 def _trimmed(variances: np.ndarray) -> float:
@@ -141,21 +159,25 @@ def _unpredicted(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> 
     return float(np.sqrt(np.sum(left**2) / (len(left) - table.shape[1])))
 
 
-def _outliers(fit: LocalFits, column: int, sigma: float) -> np.ndarray:
-    """Samples that lie far off the polynomial of their neighbours, in most windows they are in."""
+def _outliers(fit: LocalFits, column: int) -> tuple[np.ndarray, np.ndarray]:
+    """(samples that lie far off the polynomial of their neighbours, how far)."""
+    variances = fit.variances[column]
+    of_run = np.array([_trimmed(variances[fit.run == r]) for r in range(fit.run.max() + 1)])
+    sigma = np.sqrt(np.nan_to_num(of_run, nan=np.inf))[fit.run]
     leverage = np.sum(fit.projection**2, axis=2)
     apart = fit.residuals[column] / (1 - leverage)
-    middle = slice(fit.rows.shape[1] // 4, -(fit.rows.shape[1] // 4))
-    worst = np.abs(apart[:, middle]).argmax(axis=1) + middle.start
-    lines = np.arange(len(apart))
-    squares = np.nansum(fit.residuals[column] ** 2, axis=1)
-    free = fit.residuals.shape[2] - fit.projection.shape[2] - 1
+    size = fit.rows.shape[1]
+    middle = slice(size // 4, size - size // 4)
+    lines = np.flatnonzero(np.isfinite(apart).all(axis=1))
+    worst = np.abs(apart[lines, middle]).argmax(axis=1) + middle.start
     at = apart[lines, worst]
     # Without that sample the squares fall by (1 - leverage) × (its residual apart)².
-    rest = squares - (1 - leverage[lines, worst]) * at**2
-    scale = np.sqrt(np.maximum(rest, 0) / free)
-    far = np.abs(at) > _OUTLIER * np.maximum(scale, sigma)
-    return np.unique(fit.rows[lines[far], worst[far]])
+    rest = np.sum(fit.residuals[column][lines] ** 2, axis=1)
+    rest -= (1 - leverage[lines, worst]) * at**2
+    scale = np.sqrt(np.maximum(rest, 0) / (size - fit.projection.shape[2] - 1))
+    far = np.abs(at) > _OUTLIER * np.maximum(scale, sigma[lines])
+    rows, first = np.unique(fit.rows[lines[far], worst[far]], return_index=True)
+    return rows, at[far][first]
 
 
 def resolution(values: np.ndarray) -> float | None:

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.polynomial import legendre
+from scipy import ndimage
 
 _GAP = 1.5  # of the 95th percentile of the steps; a longer step is a gap
 _FEWEST = 100  # samples of a run whose drift is told
+_NEARBY = 101  # steps whose median counts those in a gap
 _PARABOLA = 0.97  # of the squares of times' deviations from even ones, that a drift explains
 _EVEN = 0.05  # of a step, that times may be off
 
@@ -46,7 +48,7 @@ def drift(times: np.ndarray) -> float:
     if len(times) < _FEWEST:
         return 0.0
     steps = np.diff(times)
-    usual = np.median(steps)
+    usual = ndimage.median_filter(steps, _NEARBY, mode="nearest")
     number = np.concatenate([[0], np.cumsum(np.maximum(np.round(steps / usual), 1))])
     place = 2 * number / number[-1] - 1
     _, slope, bend = coefficients = legendre.legfit(place, times, 2)
