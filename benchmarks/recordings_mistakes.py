@@ -72,8 +72,8 @@ def tables() -> None:
     files = found["clean"]["files"] + sum(of["files"] for of in found["mistakes"]["of"].values())
     text = markdown(("mistake", "named", "said beside it"), rows)
     text += (
-        f"\n\nFalse alarms: {len(found['clean']['alarms'])} of {found['clean']['files']} clean files; "
-        f"{number(seconds / files)} CPU seconds a file, generating it included."
+        f"\n\nFalse alarms: {len(found['clean']['alarms'])} of {found['clean']['files']} clean "
+        f"files; {number(seconds / files)} CPU seconds a file, generating it included."
     )
     between_markers(TABLES, "recordings", text)
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from gfnn_jax.maps.saved import load, register
     from gfnn_jax.maps.stroboscopic import stroboscopic
     from gfnn_jax.maps.symplectic_map import SymplecticMap
+    from gfnn_jax.models.model import Fitted, TrainingData
     from gfnn_jax.phase_space import Pairs
     from gfnn_jax.scenes import Scene
     from gfnn_jax.scenes.trajectories import (
@@ -44,11 +45,13 @@ _HOMES = {
     "Fit": "learn.fit",
     "FitError": "errors",
     "FitWarning": "errors",
+    "Fitted": "models.model",
     "InputError": "errors",
     "Pairs": "phase_space",
     "Recording": "data.recording",
     "Scene": "scenes",
     "SymplecticMap": "maps.symplectic_map",
+    "TrainingData": "models.model",
     "WorkError": "errors",
     "enable_compile_cache": "compiling",
     "export": "exports.export",
@@ -70,11 +73,13 @@ __all__ = [
     "Fit",
     "FitError",
     "FitWarning",
+    "Fitted",
     "InputError",
     "Pairs",
     "Recording",
     "Scene",
     "SymplecticMap",
+    "TrainingData",
     "WorkError",
     "enable_compile_cache",
     "export",

@@ -1,7 +1,7 @@
 """The command line: ``gfnn scenes | run | look | fit | predict | export | compare``.
 
-Each exit status but 0 comes with one line that says why (`EXIT_STATUS`). Nothing heavy is imported
-before the usage has been found good.
+Each exit status but 0 comes with one line that gives the reason (`EXIT_STATUS`). JAX is imported
+only after the usage has been checked.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ from gfnn_jax.compiling import enable_compile_cache
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new
-from gfnn_jax.storage.partial import told_of
+from gfnn_jax.storage.partial import unfinished_note
 
-# Those of `learn.check` and `exports.export`, which would bring JAX; a test compares them.
+# Copies of the choices in `learn.check` and `exports.export`, whose import would load JAX; a test
+# compares them.
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
 FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
 LEARN = ("auto", "map", "hamiltonian")
@@ -53,7 +54,7 @@ the table of candidates:
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM, as clean a stop as Ctrl-C."""
+    """Stop by SIGTERM, as clean as one by Ctrl-C."""
 
 
 _TO_BEGIN = (
@@ -86,8 +87,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt as stop:
         terminated = isinstance(stop, _Terminated)
-        # Notes of who keeps something; before its work begins, an earlier job may have.
-        before = told_of(arguments.out) if getattr(arguments, "out", None) else None
+        # The job's notes name what it has kept; before its work, an earlier job may have kept some.
+        before = unfinished_note(arguments.out) if getattr(arguments, "out", None) else None
         kept = getattr(stop, "__notes__", [before or "nothing was kept"])
         return _fail(
             143 if terminated else 130,
@@ -113,7 +114,7 @@ class _Version(argparse.Action):
 
 
 def _with_status(options: dict[str, Any]) -> dict[str, Any]:
-    """The options of a command that has --distributed."""
+    """Extend the options of a command that has --distributed."""
     return {**options, "epilog": f"{options['epilog']}\n{DISTRIBUTED_STATUS}"}
 
 
@@ -141,7 +142,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/SCENE)")
     command.add_argument("--quick", action="store_true", help="fewer pairs and rollouts")
     command.add_argument("--dt", type=_positive, metavar="H", help="another time step")
-    _add_fit_options(command, "the scene's own, close to the best there is")
+    _add_fit_options(command, "the scene's own, close to the best attainable")
 
     command = commands.add_parser(
         "look", help="what a recording holds, before anything is learned",
@@ -174,7 +175,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--dt", type=_positive, metavar="H", help="time step, if DATA has none")
     command.add_argument(
         "--scene", metavar="NAME",
-        help="lends its coordinates and features; the features assume the scene's units",
+        help="scene whose coordinates and features are used; features assume the scene's units",
     )  # fmt: skip
     command.add_argument(
         "--angles", type=_indices, default=(), metavar="0,2", help="indices in z with period 2π"
@@ -182,7 +183,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_fit_options(command, "1e-6")
     command.add_argument(
         "--devices", type=_devices, metavar="all|N",
-        help="share the rows, and the networks of an ensemble, out among so many devices; on a CPU "
+        help="number of devices that share the rows, and the networks of an ensemble; on a CPU "
         "these are its cores",
     )  # fmt: skip
     command.add_argument(
@@ -204,7 +205,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
     command.add_argument(
         "--initial", type=Path, metavar="FILE", required=True,
-        help="initial states, or a trajectory file, whose sequences go on from their last states",
+        help="initial states, or a trajectory file: its sequences continue from their last states",
     )  # fmt: skip
     command.add_argument("--num-steps", type=_count, metavar="N", required=True)
     command.add_argument(
@@ -213,8 +214,8 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument(
         "--dt", type=_positive, metavar="H",
-        help="another time step than the data's, of a model that learned a Hamiltonian, or pairs "
-        "of several time steps",
+        help="another time step than that of the data, for a model of a Hamiltonian or of pairs "
+        "with several time steps",
     )  # fmt: skip
     command.add_argument("--out", type=Path, metavar="FILE", required=True, help=".npz to write")
     command.add_argument(
@@ -223,7 +224,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument(
         "--horizon", type=_positive, metavar="SIZE",
-        help="with --samples: adds the step at which the band of the position passes SIZE",
+        help="with --samples: adds the step at which the band of the position exceeds SIZE",
     )  # fmt: skip
     command.add_argument(
         "--outside", choices=("continue", "stop"), default="continue",
@@ -231,7 +232,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument(
         "--devices", type=_devices, metavar="all|N",
-        help="share the trajectories out among so many devices; on a CPU these are its cores",
+        help="number of devices that share the trajectories; on a CPU these are its cores",
     )  # fmt: skip
     command.add_argument(
         "--distributed", action="store_true",
@@ -288,19 +289,18 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
     )
     command.add_argument(
         "--terms", type=_texts, default=(), metavar="TEXT",
-        help='of H, that you know: "p1**2; 1/sqrt(q1**2 + q2**2)"',
+        help='known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"',
     )  # fmt: skip
     command.add_argument(
         "--base", metavar="TEXT",
-        help='an H that you know a part of the map by: "p1**2/2 - cos(q1)"; its flow is factored '
-        "out, and S learns what it leaves over",
+        help='known part of H: "p1**2/2 - cos(q1)"; its flow is factored out, and S learns the '
+        "remainder",
     )  # fmt: skip
     command.add_argument(
         "--structure", type=_structure, metavar="|".join(STRUCTURES),
-        help="of many degrees of freedom: H is a sum over equal sites, whose --terms are text in "
-        "q1, p1 of a site and q2, p2, … of the next ones (ring:2: two q at every site, side by "
-        "side); or over bodies and pairs, of which bodies:4:abbb says that the last three are "
-        "alike",
+        help="structure of many degrees of freedom: H is a sum over equal sites, with --terms in "
+        "q1, p1 of a site and q2, p2, … of the next ones (ring:2 has two q at every site, side by "
+        "side); or over bodies and pairs of bodies (bodies:4:abbb: the last three are alike)",
     )  # fmt: skip
     command.add_argument("--chart", choices=CHARTS, default="auto", help="default %(default)s")
     command.add_argument(
@@ -313,19 +313,19 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
     )  # fmt: skip
     command.add_argument(
         "--ensemble", type=_count, default=1, metavar="N",
-        help="with --family mlp: so many networks trained together; their mean is the map, and "
-        "their spread its bands",
+        help="with --family mlp: number of networks trained together; their mean is the map, their "
+        "spread its bands",
     )  # fmt: skip
     command.add_argument("--seed", type=_seed, default=0, metavar="N")
     command.add_argument(
         "--max-seconds", type=_positive, default=None, metavar="S",
-        help="for the fit: the best map by then is kept (default 120, or none where operations are "
-        "bounded)",
+        help="time for the fit, after which the best map so far is kept (default 120, or none with "
+        "--max-operations)",
     )  # fmt: skip
     command.add_argument(
         "--max-operations", type=_count, default=None, metavar="N",
-        help="for the fit, counted: a report's fit.max_operations gives its model again, whatever "
-        "the clock has ended",
+        help="counted operations for the fit: the value of fit.max_operations in a report gives "
+        "the same model again, also where time had ended that fit",
     )  # fmt: skip
     command.add_argument(
         "--strict", action="store_true", help="exit status 1 where the tolerance is not met"
@@ -335,7 +335,7 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
 
 def _add_output_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--overwrite", action="store_true", help="replace an existing output")
-    command.add_argument("--resume", action="store_true", help="go on with an unfinished one")
+    command.add_argument("--resume", action="store_true", help="continue an unfinished output")
 
 
 def _positive(text: str) -> float:
@@ -400,7 +400,7 @@ def _indices(text: str) -> tuple[int, ...]:
     found = tuple(int(part) for part in parts if part.strip().isdecimal())
     if len(set(found)) < len(parts):
         raise argparse.ArgumentTypeError(
-            f"expected different whole numbers separated by commas, as 0,2; got '{text}'"
+            f"expected different whole numbers separated by commas, e.g. 0,2; got '{text}'"
         )
     return found
 
@@ -512,11 +512,11 @@ def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) 
 
 
 def _hold_to(strict: bool, model: Path) -> None:
-    """Raises WorkError where a strict user's model misses the tolerance."""
+    """Raise WorkError where ``strict`` is set and the model misses the tolerance."""
     from gfnn_jax.maps.saved import record
 
     if strict and not record(model)["fit"]["tolerance_met"]:
-        raise WorkError(f"{model}: is written, but misses the tolerance (--strict)")
+        raise WorkError(f"{model}: was written, but misses the tolerance (--strict)")
 
 
 def _predict(arguments: argparse.Namespace) -> None:
@@ -556,7 +556,7 @@ def _predict_and_tell(arguments: argparse.Namespace, share: processes.Share | No
     if predicted.horizon is not None:
         passed = predicted.horizon[predicted.horizon >= 0]
         first = f", the first at step {passed.min()}" if passed.size else ""
-        print(f"{passed.size} of {num_lanes} bands pass {arguments.horizon:g}{first}")
+        print(f"{passed.size} of {num_lanes} bands exceed {arguments.horizon:g}{first}")
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -585,7 +585,7 @@ def _compare(arguments: argparse.Namespace) -> None:
             resume=arguments.resume, progress=shown,
         )  # fmt: skip
     if compared is None:
-        print(f"{out}: is there already, from this very job")
+        print(f"{out}: already holds the result of this job")
         return
     _print_table(table(compared.report))
     print(f"written to {out}")
@@ -593,7 +593,7 @@ def _compare(arguments: argparse.Namespace) -> None:
 
 def _summarise(ran: Any, out: Path) -> None:
     if ran is None:
-        print(f"{out}: is there already, from this very job")
+        print(f"{out}: already holds the result of this job")
         return
     from gfnn_jax.learn.fit import candidates_table
 
@@ -623,7 +623,7 @@ def _summarise(ran: Any, out: Path) -> None:
 
 
 def _holds(fit: Any) -> str:
-    """Where the map may be trusted, in one sentence."""
+    """Describe where the map may be trusted, in one sentence."""
     parts = ["valid where the data are; a prediction names the trajectories that leave them"]
     outside = fit.chosen.outside
     if outside is not None and math.isfinite(outside):
@@ -641,7 +641,7 @@ def _print_table(table: Any) -> None:
 
 
 def _print_status(status, left_at) -> None:
-    """Lanes by status, and where those that left the domain did so."""
+    """Print the number of lanes by status, and the steps at which lanes left the domain."""
     from gfnn_jax.evaluate.report import status_counts
 
     print(", ".join(f"{n} {name}" for name, n in status_counts(status).items() if n))
@@ -652,12 +652,14 @@ def _print_status(status, left_at) -> None:
         print(f"left the data's domain: trajectory {shown}{more}")
 
 
-# The surroundings.
+# The process: JAX, signals, warnings.
 
 
 def _set_up_jax(devices: int | str | None = None) -> None:
-    """Float64, and compiled programs kept between runs in the user's cache folder. devices: of a
-    CPU that are asked for; it has a single one unless told otherwise."""
+    """Switch on float64, and keep compiled programs in the user's cache folder.
+
+    devices: number of devices that a CPU shall have, or "all" its cores; by default it has one.
+    """
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -670,7 +672,7 @@ def _set_up_jax(devices: int | str | None = None) -> None:
 
 
 def _cores() -> int:
-    """Processor cores that this process may use."""
+    """Number of processor cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -678,7 +680,7 @@ def _cores() -> int:
 
 @contextlib.contextmanager
 def _sigterm() -> Iterator[None]:
-    """SIGTERM stops as Ctrl-C does. Elsewhere than in the main thread nothing can be set."""
+    """Let SIGTERM stop the work as Ctrl-C does. Nothing is done outside the main thread."""
 
     def stop(*_):
         raise _Terminated

@@ -68,10 +68,10 @@ def test_a_periodic_orbit_is_a_chain_too():
     ("given", "message"),
     [
         ({"run": np.zeros(3)}, r"expected run as numbers or text of shape \(23,\), got float64"),
-        ({"place": PLACES}, "expected the run of each pair beside its place, got none"),
+        ({"place": PLACES}, "expected run as well as place"),
         ({"run": LABELS, "place": PLACES + 0.5}, "expected place as integers"),
         ({"std": [1e-3]}, r"expected std of shape \(2,\), one of each coordinate, got \(1,\)"),
-        ({"std": [1e-3, 0.0]}, "expected std that is finite and above 0"),
+        ({"std": [1e-3, 0.0]}, "expected every std finite and above 0"),
     ],
 )
 def test_identities_and_noise_that_are_none(given, message):
@@ -99,7 +99,7 @@ def test_a_permuted_fit_is_the_same_fit():
 
 
 def continued(sample):
-    """How many of the sample's rows go on with the next one."""
+    """Number of rows of the sample whose image is the next row's state."""
     return int(np.sum(steps_between(identified(sample.pairs()).pairs) == 1))
 
 

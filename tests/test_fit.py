@@ -504,17 +504,17 @@ def test_a_linear_map_far_from_the_identity_needs_a_base_map():
 
 
 def test_where_steps_do_not_bear_the_search_out_a_larger_map_is_taken(monkeypatch):
-    assemble, refused = choose.assemble, []
+    measured, refused = choose.measured, []
 
     def the_first_fails(candidate, *rest):
-        assembled = assemble(candidate, *rest)
+        assembled = measured(candidate, *rest)
         if not refused:
             refused.append(candidate)
             worse = dataclasses.replace(assembled.candidate, validation_bound=np.inf)
             return assembled._replace(candidate=worse)
         return assembled
 
-    monkeypatch.setattr(choose, "assemble", the_first_fails)
+    monkeypatch.setattr(choose, "measured", the_first_fails)
     fit = gfnn.fit(pendulum_pairs(), learn="map", tolerance=1e-4)
     assert fit.met
     assert (fit.chosen.chart, fit.chosen.family) == (refused[0].chart, refused[0].family)

@@ -16,8 +16,8 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 ORDER = (
     "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes",
     "storage", "signals", "data", "dataset", "scenes", "families", "solve", "generating", "flows",
-    "maps", "exports", "fitting", "learn", "baselines", "evaluate", "jobs", "cli_columns", "cli",
-    "__main__",
+    "maps", "exports", "fitting", "models", "learn", "baselines", "evaluate", "jobs", "cli_columns",
+    "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {("maps.symplectic_map", f"maps.{name}") for name in ("saved", "samples", "sharded")}
@@ -48,7 +48,7 @@ def modules():
 
 
 def imports(tree):
-    """Every module that is imported anywhere in the file, in functions too."""
+    """List all modules that a file imports, also inside functions."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

@@ -1,6 +1,6 @@
-"""report.json: what was done, how accurate it is, how fast, and with what.
+"""Report ``report.json`` of a fit: data, model, accuracy, speed, versions.
 
-Every key is always there; what does not apply, or is not finite, is null.
+All keys are always present. A value that does not apply, or is not finite, is null.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ STEPS_REPORTED = (1, 10, 100, 1000)
 
 
 def device() -> str:
-    """The device that JAX computes on by default."""
+    """Name of the device that JAX computes on by default."""
     first = jax.devices()[0]
     return f"{first.platform}: {first.device_kind}"
 
@@ -34,9 +34,9 @@ def assemble(
     data: dict[str, Any],
     rollout: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """The report of a fit, and of the rollouts with it where there were any (see `rollout_part`).
+    """Assemble the report of a fit, and of rollouts with it (see `rollout_part`) where there are.
 
-    data: what is known of the pairs beside their number: source, digest, precision, units.
+    data: facts about the pairs beside their number: source, digest, precision, units.
     """
     chosen = fit.chosen
     return {
@@ -110,7 +110,7 @@ def assemble(
 
 
 def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
-    """H as it was learned, where its flow meets the tolerance or was chosen."""
+    """Learned H as formula and terms, where its flow meets the tolerance or was chosen."""
     if fit.hamiltonian is None or fit.formula is None:
         return None
     law = fit.hamiltonian
@@ -132,7 +132,7 @@ def rollout_part(
     growth,
     drift,
 ) -> dict[str, Any]:
-    """The report's ``rollout``.
+    """Assemble the report's ``rollout``.
 
     seconds: without compilation. status: (B,) codes. statistics: ErrorStatistics of the position
     error at every step (num_steps + 1,). growth, drift: Estimates, or None where they do not apply.
@@ -157,18 +157,18 @@ def rollout_part(
 
 
 def status_counts(status) -> dict[str, int]:
-    """How many lanes ended with each status, by its name."""
+    """Number of lanes that ended with each status, by its name."""
     counts = np.bincount(np.asarray(status), minlength=len(STATUS_NAMES))
     return {name: int(n) for name, n in zip(STATUS_NAMES, counts, strict=True)}
 
 
 def to_json(report: dict[str, Any]) -> str:
-    """Strict JSON: numbers that are not finite become null."""
+    """Write the report as strict JSON: numbers that are not finite become null."""
     return json.dumps(finite(report), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def finite(value: Any) -> Any:
-    """The same tree of dicts and lists with None for numbers that are not finite."""
+    """Copy a tree of dicts and lists, with None for numbers that are not finite."""
     if isinstance(value, dict):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

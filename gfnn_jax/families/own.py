@@ -1,4 +1,4 @@
-"""A user's own family in a fit: what it must have, and what is said where it has not.
+"""Families of a user's own in a fit: the members that they need, and the errors where one lacks.
 
 ``gfnn.fit(pairs, family=OWN)`` takes a family that is linear in its parameters
 (`families.family.LinearFamily`), or a function of the fit's `Inputs`, the variables of w scaled to
@@ -21,12 +21,15 @@ _NEEDED = (
 
 
 def is_own(given: Any) -> bool:
-    """Whether this is a family of a user's, or a function that gives some."""
+    """Return whether this is a user's family, or a function that gives such families."""
     return not isinstance(given, str) and (isinstance(given, LinearFamily) or callable(given))
 
 
 def own_families(given: Any, inputs: Inputs) -> Iterator[Any]:
-    """The families, by rising number of terms. Raises FitError where one lacks what a fit needs."""
+    """Iterate over the families, by rising number of terms.
+
+    Raises FitError where a family lacks a member that a fit needs.
+    """
     families = [given] if isinstance(given, LinearFamily) else given(inputs)
     last = 0
     for family in families:
@@ -38,8 +41,8 @@ def own_families(given: Any, inputs: Inputs) -> Iterator[Any]:
             )
         if type(family).__hash__ is None:
             raise FitError(
-                f"expected families that are told apart by identity, as dataclass(frozen=True, "
-                f"eq=False) makes them; {type(family).__name__} is compared by its fields"
+                f"{type(family).__name__} is compared by its fields, a fit needs families compared "
+                "by identity: declare it with dataclass(frozen=True, eq=False)"
             )
         if family.num_parameters <= last:
             raise FitError(

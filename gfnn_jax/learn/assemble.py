@@ -12,7 +12,6 @@ import numpy as np
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.flows.collocation import of_lanes
-from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
 from gfnn_jax.learn.candidates import Candidate, Judges, refined_images, with_error
@@ -40,18 +39,6 @@ class Assembled(NamedTuple):
     compiled: bool = True
 
 
-def assemble(
-    candidate: Candidate, prepared: Prepared, chart: AnyChart, family, params, features,
-    judges: Judges, budget: Budget,
-) -> Assembled:  # fmt: skip
-    """The candidate's map, measured."""
-    generated = with_predictor(
-        Generated(family, params, chart, prepared.dt, prepared.scale), prepared, judges.training,
-        features,
-    )  # fmt: skip
-    return measured(candidate, composed(generated, prepared, judges), prepared, judges, budget)
-
-
 def measured(
     candidate: Candidate, map_: SymplecticMap, prepared: Prepared, judges: Judges, budget: Budget
 ) -> Assembled:
@@ -74,7 +61,7 @@ def measured(
     return Assembled(candidate, steps.compile_seconds)
 
 
-def with_predictor(generated: Generated, prepared: Prepared, rows, features=None) -> Generated:
+def with_predictor(generated: Generated, prepared: Prepared, rows) -> Generated:
     """The piece with predictors fitted to its own images of the data's states: where S is coarse,
     the data are no closer to its roots than S is to the data."""
     rows = rows[:_PREDICTOR_PAIRS]
@@ -84,6 +71,7 @@ def with_predictor(generated: Generated, prepared: Prepared, rows, features=None
     if solved.sum() < 2:  # nothing to learn from: the data's own images
         images, solved = prepared.y1[rows], np.ones(len(rows), bool)
     coordinates, args = prepared.coordinates, prepared.given(rows[solved])[1]
+    features = getattr(getattr(generated.family, "inputs", None), "features", None)
     fitted = fit_predictors(
         generated.chart, prepared.y0[rows][solved], images[solved],
         of_lanes(prepared.given(rows)[0], solved),

@@ -36,6 +36,8 @@ _SLOPE_ERROR = 0.05
 _KNOWN, _ERRORS, _MISSED = 0.06, 3.0, 0.1
 # A pair is an outlier that its neighbours' fit misses by so many standard deviations.
 _OUTLYING, _OUTLIER_ROUNDS = 30.0, 5
+# Pairs that are looked at for gross errors, in blocks of a sequence: 50,000 take two seconds.
+_MOST_LOOKED_AT, _BLOCK = 50_000, 1_000
 # Of more terms than a few (above) only pairs are looked at that an affine map of all misses by so
 # many times the median, and so many that tell what is usual: 2,000 pairs of 32 degrees of freedom
 # take a second instead of eight.
@@ -130,7 +132,7 @@ def outliers(y0, y1, scale, given=None) -> np.ndarray:
     """
     x, move = np.asarray(y0) / scale, (np.asarray(y1) - np.asarray(y0)) / scale
     x = x if given is None else np.concatenate([x, given], axis=1)
-    rows, found = np.arange(len(x)), []
+    rows, found = looked_for_errors(len(x)), []
     for _ in range(_OUTLIER_ROUNDS):
         outlying = _studentised(x[rows], move[rows]) > _OUTLYING
         if not outlying.any():
@@ -165,6 +167,13 @@ def _studentised(x, move):
         error[block] = np.linalg.norm(move[block] - solution[:, 0], axis=1) / growth
     # With so few neighbours a fit is now and then exact by chance.
     return error / (np.maximum(deviation, np.median(deviation[rows])) + floor)
+
+
+def looked_for_errors(count: int) -> np.ndarray:
+    """Rows of so many pairs that are looked at for gross errors: all, or blocks of every part."""
+    blocks = -(-count // _BLOCK)
+    apart = -(-blocks // (_MOST_LOOKED_AT // _BLOCK))
+    return np.flatnonzero(np.arange(count) // _BLOCK % apart == 0)
 
 
 def _suspect(x, move) -> np.ndarray:

@@ -26,9 +26,9 @@ from gfnn_jax.learn.assemble import block_of
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance
 from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.clean import clean
-from gfnn_jax.learn.clock import COMPILE, SOLVE, Budget
+from gfnn_jax.learn.clock import COMPILE, ROWS, Budget
 from gfnn_jax.learn.conclude import conclude
-from gfnn_jax.learn.diagnose import ChartJudgement
+from gfnn_jax.learn.diagnose import ChartJudgement, looked_for_errors
 from gfnn_jax.learn.diagnosed import diagnose_request
 from gfnn_jax.learn.draw import NUM_PAIRS, drawn
 from gfnn_jax.learn.gross_errors import without_gross_errors
@@ -41,6 +41,7 @@ from gfnn_jax.learn.stated import stated
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.model import Model
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
 
@@ -150,7 +151,7 @@ class Fit:
         if map_.posterior is not None and not map_.posterior.known:
             work = work_of_posterior(self.chosen.num_parameters)
             try:
-                with self.budget.last("the posterior, which bands are drawn from", SOLVE, work):
+                with self.budget.last("the posterior, which bands are drawn from", ROWS, work):
                     _ = map_.posterior.root
             except OutOfTime:
                 map_ = dataclasses.replace(map_, posterior=None)
@@ -252,6 +253,7 @@ def fit(
     base: str | Callable | None = None,
     structure: str | None = None,
     family: Any = "auto",
+    model: Model | None = None,
     chart: str = "auto",
     ensemble: int = 1,
     angles: tuple[int, ...] = (),
@@ -292,6 +294,7 @@ def fit(
                with learn="hamiltonian" H is a sum of terms, or a network with "mlp". Or a family
                of one's own that is linear in its parameters, or a function of `Inputs` that gives
                such families by rising number of terms (`families.own`).
+    model:     a model of one's own (`models.model.Model`), which is then all that is learned.
     chart:     "auto" or one of type1, type2, type3, midpoint.
     ensemble:  so many networks trained together, of which the map is the mean and their spread the
                posterior; with family="mlp".
@@ -329,7 +332,7 @@ def fit(
 
     request = checked(
         pairs, scene, tolerance=tolerance, absolute_tolerance=absolute_tolerance, learn=learn,
-        terms=terms, base=base, structure=structure, family=family, chart=chart,
+        terms=terms, base=base, structure=structure, family=family, model=model, chart=chart,
         ensemble=ensemble, angles=angles, seed=seed, budget=budget, max_iterations=max_iterations,
         checkpoints=checkpoints, factors=factors, say=on_progress, tell=on_candidate,
     )  # fmt: skip
@@ -340,6 +343,12 @@ def fit(
             *identified(request.pairs), request.coordinates, request.structure
         )
         warn(about_pairs)
+        looked_at = len(looked_for_errors(len(request.pairs)))
+        if looked_at < len(request.pairs):
+            budget.leave_out(
+                f"a look for gross errors at all but {looked_at:,} of {len(request.pairs):,} pairs",
+                "those that the map misses by far are found in the end",
+            )
         seen = diagnose_request(request, plain)
         warn(seen.messages)
         judges = Judges.of(pairs, seed, request.tolerance)

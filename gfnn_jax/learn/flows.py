@@ -439,10 +439,8 @@ def _sparse(problem, full: FittedLaw, prepared, judges, options: Options, say) -
         before = full.error.relative
         if error.relative <= max(options.rise * before, options.rounding):
             dropped = Dropped(full.family.num_parameters - len(kept), before, error.relative)
-            say(
-                f"H: error {error.relative:.2e} without {dropped.terms} terms, {before:.2e} with "
-                "them"
-            )
+            told = f"error {error.relative:.2e}, before {before:.2e}"
+            say(f"H without {dropped.terms} terms: {told}")
             return full._replace(family=family, fit=fit, error=error, dropped=dropped)
     return full
 

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.noise import of_pairs
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.dataset.split import outermost
 from gfnn_jax.families.inputs import Inputs, box_inputs, variable_signs
@@ -21,7 +23,9 @@ from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
-from gfnn_jax.learn.candidates import Candidate, Judges, validated
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.learn.assemble import with_predictor
+from gfnn_jax.learn.candidates import Candidate, Judges, refined_images, validated
 from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.rows import of_rows, rows_of
@@ -122,7 +126,33 @@ class _Factors(NamedTuple):
         return cls(inner.append(outer.factor, outer.rows), held, inner, outer)
 
 
-class LinearSweep:
+class Generates:
+    """What sweeps of S have in common: a solved size makes a piece."""
+
+    prepared: Prepared
+    chart: AnyChart
+    judges: Judges
+
+    def solve(self, size: Size, budget: Budget, say) -> tuple[Any, Any]:
+        """What is known of the solution, and the params of the size's family."""
+        raise NotImplementedError
+
+    def piece(self, size: Size) -> Generated:
+        """The piece that the size's S generates, with its predictor."""
+        prepared, params = self.prepared, self._params_of(size)
+        piece = Generated(size.family, params, self.chart, prepared.dt, prepared.scale)
+        return with_predictor(piece, prepared, self.judges.training)
+
+    def images(self, size: Size, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Images of these rows (n, 2d), as prepared, and which steps were solved (n,)."""
+        params = self._params_of(size)
+        return refined_images(self.prepared, self.chart, size.family, params, rows)
+
+    def _params_of(self, size: Size) -> Any:
+        return self.solve(size, Budget(), lambda message: None)[1]
+
+
+class LinearSweep(Generates):
     """The sizes of one linear family in one chart.
 
     factors: a ``KeptFactors``, where factors that took long are kept for a fit that goes on. even:
@@ -247,6 +277,20 @@ class LinearSweep:
         solved = self._solved[count]
         return solved, size.family.unflatten(solved.coefficients)
 
+    def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Images (n, 2d) of these rows, in the user's coordinates, by a fit to other rows; NaN
+        where a step is not solved."""
+        prepared, family = self.prepared, self.in_rows(size.family)
+        train = least_squares.reduce(
+            family, [rows_of(prepared, self.chart, others)[0]], self._weight
+        )
+        held = least_squares.reduce(family, [self._held], self._weight)
+        solved = least_squares.solve(train, held, size.family.num_parameters)
+        params = size.family.unflatten(solved.coefficients)
+        images, known = refined_images(prepared, self.chart, size.family, params, rows)
+        images = prepared.whole_image(np.where(known[:, None], images, np.nan))
+        return to_user(prepared.coordinates, images)
+
     def left_over(self, size: Size) -> np.ndarray:
         """(N, 2d): what the size leaves of ∇S of every pair, unit-free as train_rms."""
         _, params = self.solve(size, Budget(), lambda message: None)
@@ -350,8 +394,7 @@ class LinearSweep:
         residual = slopes @ solved.coefficients - target * self._weight
         first, second = self.by_states(size.family, params, w, *args)
         step = np.linalg.solve(second, np.concatenate([residual[..., None], -first], axis=-1))
-        found = shared_noise.variances(step[..., 0], step[..., 1:], np.flatnonzero(goes_on))
-        return np.sqrt(found)
+        return of_pairs(step[..., 0], step[..., 1:], np.flatnonzero(goes_on))
 
     def freedoms(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
         """Degrees of freedom that noise takes of a fit of so many of the leading terms of a size:
