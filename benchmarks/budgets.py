@@ -13,6 +13,7 @@ looks at, and the seconds, are the processor's: other work on the machine change
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -23,7 +24,7 @@ from functools import partial
 from pathlib import Path
 
 # Sets float64, so it comes before all of JAX.
-from harness import SEED, TABLES, Numbers, between_markers, main, markdown, number, provenance
+from harness import HERE, SEED, TABLES, Numbers, between_markers, main, markdown, number, provenance
 from harness import results as results_of
 
 # isort: split
@@ -113,6 +114,7 @@ def measured_here(system: str, budget: float) -> Numbers:
         warnings.simplefilter("ignore", gfnn.FitWarning)  # kept in fit.messages
         found = fit(pairs, seed=SEED, max_seconds=budget, clock=clock)
         fitted = clock() - started
+        found = found.settled()
         report.assemble(found, scene=None, dt=float(pairs.dt), seed=SEED, rollout=None, data={})
         reported = clock() - started
         saved.save(found.map, Path(folder) / "model")
@@ -131,7 +133,8 @@ def measured_here(system: str, budget: float) -> Numbers:
 def measure(system: str, budget: float, quick: bool) -> Numbers:
     """The same in a process of its own."""
     command = [sys.executable, __file__, "--here", system, str(budget)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     return json.loads(done.stdout.splitlines()[-1])
 
 

@@ -1,13 +1,14 @@
-"""The command line: ``gfnn scenes | run | fit | predict | export | compare``.
+"""The command line: ``gfnn scenes | run | look | fit | predict | export | compare``.
 
-Each exit status but 0 comes with one line that says why (`EXIT_STATUS`). Nothing heavy is imported
-before the usage has been found good.
+Each exit status but 0 comes with one line that gives the reason (`EXIT_STATUS`). JAX is imported
+only after the usage has been checked.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import math
 import os
 import re
@@ -25,9 +26,10 @@ from gfnn_jax.data.kinds import are_recordings
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new
-from gfnn_jax.storage.partial import told_of
+from gfnn_jax.storage.partial import unfinished_note
 
-# Those of `learn.check` and `exports.export`, which would bring JAX; a test compares them.
+# Copies of the choices in `learn.check` and `exports.export`, whose import would load JAX; a test
+# compares them.
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
 FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
 LEARN = ("auto", "map", "hamiltonian", "lagrangian")
@@ -53,7 +55,7 @@ the table of candidates:
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM, as clean a stop as Ctrl-C."""
+    """Stop by SIGTERM, as clean as one by Ctrl-C."""
 
 
 _TO_BEGIN = (
@@ -86,13 +88,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt as stop:
         terminated = isinstance(stop, _Terminated)
-        # Notes of who keeps something; before its work begins, an earlier job may have.
-        before = told_of(arguments.out) if getattr(arguments, "out", None) else None
+        # The job's notes name what it has kept; before its work, an earlier job may have kept some.
+        before = unfinished_note(arguments.out) if getattr(arguments, "out", None) else None
         kept = getattr(stop, "__notes__", [before or "nothing was kept"])
         return _fail(
             143 if terminated else 130,
             "; ".join(["terminated" if terminated else "stopped", *kept]),
         )
+
+
+_MAX_SECONDS = 120.0  # of a fit
 
 
 def _fail(status: int, why: object) -> int:
@@ -110,7 +115,7 @@ class _Version(argparse.Action):
 
 
 def _with_status(options: dict[str, Any]) -> dict[str, Any]:
-    """The options of a command that has --distributed."""
+    """Extend the options of a command that has --distributed."""
     return {**options, "epilog": f"{options['epilog']}\n{DISTRIBUTED_STATUS}"}
 
 
@@ -138,7 +143,25 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/SCENE)")
     command.add_argument("--quick", action="store_true", help="fewer pairs and rollouts")
     command.add_argument("--dt", type=_positive, metavar="H", help="another time step")
-    _add_fit_options(command, "the scene's own, close to the best there is")
+    _add_fit_options(command, "the scene's own, close to the best attainable")
+
+    command = commands.add_parser(
+        "look", help="what a recording holds, before anything is learned",
+        description="Runs, rates, gaps, noise, friction and mistakes of a recording, told by the "
+        "file itself: .csv and other text, .npz, .npy.", **others,
+    )  # fmt: skip
+    command.set_defaults(command=_look)
+    command.add_argument("data", type=Path, metavar="FILE", nargs="+", help="one file or several")
+    add_column_options(command)
+    command.add_argument("--dt", type=_positive, metavar="H", help="seconds between rows")
+    command.add_argument("--json", action="store_true", help="print plain data, and draw nothing")
+    command.add_argument(
+        "--figure", type=Path, metavar="FILE", help="default runs/look-NAME.png, written anew"
+    )
+    command.add_argument("--overwrite", action="store_true", help="replace an existing --figure")
+    command.add_argument(
+        "--strict", action="store_true", help="exit status 1 where something is wrong"
+    )
 
     command = commands.add_parser(
         "fit", help="learn the map of your own trajectories",
@@ -153,7 +176,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--dt", type=_positive, metavar="H", help="time step, if DATA has none")
     command.add_argument(
         "--scene", metavar="NAME",
-        help="lends its coordinates and features; the features assume the scene's units",
+        help="scene whose coordinates and features are used; features assume the scene's units",
     )  # fmt: skip
     _add_fit_options(command, "1e-6")
     add_column_options(command)
@@ -168,7 +191,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument(
         "--devices", type=_devices, metavar="all|N",
-        help="share the rows, and the networks of an ensemble, out among so many devices; on a CPU "
+        help="number of devices that share the rows, and the networks of an ensemble; on a CPU "
         "these are its cores",
     )  # fmt: skip
     command.add_argument(
@@ -190,7 +213,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
     command.add_argument(
         "--initial", type=Path, metavar="FILE", required=True,
-        help="initial states, or a trajectory file, whose sequences go on from their last states",
+        help="initial states, or a trajectory file: its sequences continue from their last states",
     )  # fmt: skip
     command.add_argument("--num-steps", type=_count, metavar="N")
     command.add_argument(
@@ -210,8 +233,8 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument(
         "--dt", type=_positive, metavar="H",
-        help="another time step than the data's, of a model that learned a Hamiltonian, or pairs "
-        "of several time steps",
+        help="another time step than that of the data, for a model of a Hamiltonian or of pairs "
+        "with several time steps",
     )  # fmt: skip
     command.add_argument("--out", type=Path, metavar="FILE", required=True, help=".npz to write")
     command.add_argument(
@@ -220,7 +243,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument(
         "--horizon", type=_positive, metavar="SIZE",
-        help="with --samples: adds the step at which the band of the position passes SIZE",
+        help="with --samples: adds the step at which the band of the position exceeds SIZE",
     )  # fmt: skip
     command.add_argument(
         "--outside", choices=("continue", "stop"), default="continue",
@@ -228,7 +251,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument(
         "--devices", type=_devices, metavar="all|N",
-        help="share the trajectories out among so many devices; on a CPU these are its cores",
+        help="number of devices that share the trajectories; on a CPU these are its cores",
     )  # fmt: skip
     command.add_argument(
         "--distributed", action="store_true",
@@ -285,19 +308,18 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
     )
     command.add_argument(
         "--terms", type=_texts, default=(), metavar="TEXT",
-        help='of H, that you know: "p1**2; 1/sqrt(q1**2 + q2**2)"',
+        help='known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"',
     )  # fmt: skip
     command.add_argument(
         "--base", metavar="TEXT",
-        help='an H that you know a part of the map by: "p1**2/2 - cos(q1)"; its flow is factored '
-        "out, and S learns what it leaves over",
+        help='known part of H: "p1**2/2 - cos(q1)"; its flow is factored out, and S learns the '
+        "remainder",
     )  # fmt: skip
     command.add_argument(
         "--structure", type=_structure, metavar="|".join(STRUCTURES),
-        help="of many degrees of freedom: H is a sum over equal sites, whose --terms are text in "
-        "q1, p1 of a site and q2, p2, … of the next ones (ring:2: two q at every site, side by "
-        "side); or over bodies and pairs, of which bodies:4:abbb says that the last three are "
-        "alike",
+        help="structure of many degrees of freedom: H is a sum over equal sites, with --terms in "
+        "q1, p1 of a site and q2, p2, … of the next ones (ring:2 has two q at every site, side by "
+        "side); or over bodies and pairs of bodies (bodies:4:abbb: the last three are alike)",
     )  # fmt: skip
     command.add_argument("--chart", choices=CHARTS, default="auto", help="default %(default)s")
     command.add_argument(
@@ -310,13 +332,19 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
     )  # fmt: skip
     command.add_argument(
         "--ensemble", type=_count, default=1, metavar="N",
-        help="with --family mlp: so many networks trained together; their mean is the map, and "
-        "their spread its bands",
+        help="with --family mlp: number of networks trained together; their mean is the map, their "
+        "spread its bands",
     )  # fmt: skip
     command.add_argument("--seed", type=_seed, default=0, metavar="N")
     command.add_argument(
-        "--max-seconds", type=_positive, default=120.0, metavar="S",
-        help="for the fit: the best map by then is kept (default 120)",
+        "--max-seconds", type=_positive, default=None, metavar="S",
+        help="time for the fit, after which the best map so far is kept (default 120, or none with "
+        "--max-operations)",
+    )  # fmt: skip
+    command.add_argument(
+        "--max-operations", type=_count, default=None, metavar="N",
+        help="counted operations for the fit: the value of fit.max_operations in a report gives "
+        "the same model again, also where time had ended that fit",
     )  # fmt: skip
     command.add_argument(
         "--strict", action="store_true", help="exit status 1 where the tolerance is not met"
@@ -326,7 +354,7 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
 
 def _add_output_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--overwrite", action="store_true", help="replace an existing output")
-    command.add_argument("--resume", action="store_true", help="go on with an unfinished one")
+    command.add_argument("--resume", action="store_true", help="continue an unfinished output")
 
 
 def _positive(text: str) -> float:
@@ -391,9 +419,15 @@ def _indices(text: str) -> tuple[int, ...]:
     found = tuple(int(part) for part in parts if part.strip().isdecimal())
     if len(set(found)) < len(parts):
         raise argparse.ArgumentTypeError(
-            f"expected different whole numbers separated by commas, as 0,2; got '{text}'"
+            f"expected different whole numbers separated by commas, e.g. 0,2; got '{text}'"
         )
     return found
+
+
+def _max_seconds(arguments: argparse.Namespace) -> float | None:
+    """The budget of a fit: where operations are bounded nothing else is, unless told."""
+    given = arguments.max_seconds
+    return _MAX_SECONDS if given is None and arguments.max_operations is None else given
 
 
 # The commands. The heavy imports are here, after the checks that need none of them.
@@ -417,7 +451,8 @@ def _run(arguments: argparse.Namespace) -> None:
     with progress.on_stderr() as shown:
         ran = run(
             arguments.scene, out=out, quick=arguments.quick, seed=arguments.seed, dt=arguments.dt,
-            tolerance=arguments.tolerance, max_seconds=arguments.max_seconds,
+            tolerance=arguments.tolerance, max_seconds=_max_seconds(arguments),
+            max_operations=arguments.max_operations,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
             base=arguments.base, structure=arguments.structure,
             family=arguments.family, ensemble=arguments.ensemble, overwrite=arguments.overwrite,
@@ -425,6 +460,30 @@ def _run(arguments: argparse.Namespace) -> None:
         )  # fmt: skip
     _summarise(ran, out)
     _hold_to(arguments.strict, out / "model")
+
+
+def _look(arguments: argparse.Namespace) -> None:
+    if arguments.figure is not None:
+        ensure_new(arguments.figure, arguments.overwrite)
+    for path in arguments.data:
+        _check_exists(path)
+    figure = arguments.figure
+    if figure is None and not arguments.json:
+        figure = Path("runs") / f"look-{arguments.data[0].stem}.png"
+    options = column_options(arguments)
+    given = {"dt": arguments.dt, "mass": masses(arguments)}
+    options |= {name: value for name, value in given.items() if value}
+    from gfnn_jax.jobs.look import look
+
+    summary = look(arguments.data, options, figure)
+    if arguments.json:
+        print(json.dumps(summary.as_json(), indent=2, ensure_ascii=False))
+    else:
+        _print_table(summary)
+        print(f"figure: {figure}")
+    wrong = sum(fault.wrong for fault in summary.faults)
+    if arguments.strict and wrong:
+        raise WorkError(f"{arguments.data[0]}: wrong in {wrong} ways (--strict)")
 
 
 def _fit(arguments: argparse.Namespace) -> None:
@@ -476,7 +535,8 @@ def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) 
         ran = fit(
             arguments.data, out=arguments.out, dt=arguments.dt,
             tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
-            absolute_tolerance=arguments.absolute_tolerance, max_seconds=arguments.max_seconds,
+            absolute_tolerance=arguments.absolute_tolerance, max_seconds=_max_seconds(arguments),
+            max_operations=arguments.max_operations,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
             base=arguments.base, structure=arguments.structure,
             family=arguments.family, ensemble=arguments.ensemble, scene_name=arguments.scene,
@@ -504,11 +564,11 @@ def _as_indices(columns: dict[str, Any]) -> tuple[int, ...]:
 
 
 def _hold_to(strict: bool, model: Path) -> None:
-    """Raises WorkError where a strict user's model misses the tolerance."""
+    """Raise WorkError where ``strict`` is set and the model misses the tolerance."""
     from gfnn_jax.maps.saved import record
 
     if strict and not record(model)["fit"]["tolerance_met"]:
-        raise WorkError(f"{model}: is written, but misses the tolerance (--strict)")
+        raise WorkError(f"{model}: was written, but misses the tolerance (--strict)")
 
 
 def _predict(arguments: argparse.Namespace) -> None:
@@ -571,7 +631,7 @@ def _predict_and_tell(arguments: argparse.Namespace, share: processes.Share | No
     if predicted.horizon is not None:
         passed = predicted.horizon[predicted.horizon >= 0]
         first = f", the first at step {passed.min()}" if passed.size else ""
-        print(f"{passed.size} of {num_lanes} bands pass {arguments.horizon:g}{first}")
+        print(f"{passed.size} of {num_lanes} bands exceed {arguments.horizon:g}{first}")
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -600,7 +660,7 @@ def _compare(arguments: argparse.Namespace) -> None:
             resume=arguments.resume, progress=shown,
         )  # fmt: skip
     if compared is None:
-        print(f"{out}: is there already, from this very job")
+        print(f"{out}: already holds the result of this job")
         return
     _print_table(table(compared.report))
     print(f"written to {out}")
@@ -608,17 +668,18 @@ def _compare(arguments: argparse.Namespace) -> None:
 
 def _summarise(ran: Any, out: Path) -> None:
     if ran is None:
-        print(f"{out}: is there already, from this very job")
+        print(f"{out}: already holds the result of this job")
         return
     from gfnn_jax.learn.fit import candidates_table
 
     _print_table(candidates_table(ran.fit))
     report = ran.report
-    fit = report["fit"]
+    fit, defect = report["fit"], report["map"]["symplecticity_defect"]
     print(
         f"{report['model']['chart']} {report['model']['label']}: one-step error "
         f"{fit['validation_rms']:.2e}, {fit['validation_relative']:.2e} of the spread (tolerance "
-        f"{fit['tolerance']:g}), symplecticity defect {report['map']['symplecticity_defect']:.1e}"
+        f"{fit['tolerance']:g}), symplecticity defect "
+        + (f"{defect:.1e}" if defect is not None else "not looked at")
     )
     if report["hamiltonian"] is not None:
         also = "" if report["model"]["learns"] == "hamiltonian" else "not chosen: "
@@ -637,7 +698,7 @@ def _summarise(ran: Any, out: Path) -> None:
 
 
 def _holds(fit: Any) -> str:
-    """Where the map may be trusted, in one sentence."""
+    """Describe where the map may be trusted, in one sentence."""
     parts = ["valid where the data are; a prediction names the trajectories that leave them"]
     outside = fit.chosen.outside
     if outside is not None and math.isfinite(outside):
@@ -655,7 +716,7 @@ def _print_table(table: Any) -> None:
 
 
 def _print_status(status, left_at) -> None:
-    """Lanes by status, and where those that left the domain did so."""
+    """Print the number of lanes by status, and the steps at which lanes left the domain."""
     from gfnn_jax.evaluate.report import status_counts
 
     print(", ".join(f"{n} {name}" for name, n in status_counts(status).items() if n))
@@ -666,12 +727,14 @@ def _print_status(status, left_at) -> None:
         print(f"left the data's domain: trajectory {shown}{more}")
 
 
-# The surroundings.
+# The process: JAX, signals, warnings.
 
 
 def _set_up_jax(devices: int | str | None = None) -> None:
-    """Float64, and compiled programs kept between runs in the user's cache folder. devices: of a
-    CPU that are asked for; it has a single one unless told otherwise."""
+    """Switch on float64, and keep compiled programs in the user's cache folder.
+
+    devices: number of devices that a CPU shall have, or "all" its cores; by default it has one.
+    """
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -684,7 +747,7 @@ def _set_up_jax(devices: int | str | None = None) -> None:
 
 
 def _cores() -> int:
-    """Processor cores that this process may use."""
+    """Number of processor cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -692,7 +755,7 @@ def _cores() -> int:
 
 @contextlib.contextmanager
 def _sigterm() -> Iterator[None]:
-    """SIGTERM stops as Ctrl-C does. Elsewhere than in the main thread nothing can be set."""
+    """Let SIGTERM stop the work as Ctrl-C does. Nothing is done outside the main thread."""
 
     def stop(*_):
         raise _Terminated

@@ -49,8 +49,8 @@ def test_a_unit_that_does_not_fit_is_not_begun_nor_anything_smaller_in_its_stead
     with pytest.raises(OutOfTime):
         moved(budget, hand, 5 * LARGE, 0.0, "degree 4")  # of 10 s, at 2 s each
     assert budget.ended == (
-        "the clock ended it: the budget of 10 s is spent after unit 1, degree 3, and the next, "
-        "degree 4, would take about 10 s"
+        "the clock ended it: the budget of 10 s is spent after unit 1, degree 3: degree 4 and what "
+        "follows would take about 10 s, and 8 s are left"
     )
     with pytest.raises(OutOfTime):
         moved(budget, hand, 1, 0.0)
@@ -108,21 +108,26 @@ def test_what_follows_the_search_takes_the_place_of_no_unit():
     moved(first, hand, LARGE, 1.0)
     with pytest.raises(OutOfTime):
         moved(first, hand, 20 * LARGE, 0.0)
-    with first.last("the compiled step", COMPILE, 5.0):
+    with first.last("the compiled step", COMPILE, 5.0, decides=True):
         hand.now += 5.0
     with pytest.raises(OutOfTime), first.last("its derivative", COMPILE, 7.0):
         pass
+    with pytest.raises(OutOfTime), first.last("a figure", COMPILE, 1.0):
+        pass
     assert first.left_out == [
-        "left out: its derivative: it does not fit into what is left of the budget"
+        f"left out: {what}: it does not fit into what is left of the budget"
+        for what in ("its derivative", "a figure")
     ]
     again = Budget(max_operations=first.operations)
     with again.unit("the same", ROWS, LARGE):
         pass
     with pytest.raises(OutOfTime), again.unit("the next", ROWS, 2):
         pass
-    with again.last("the compiled step", COMPILE, 5.0):
+    with again.last("the compiled step", COMPILE, 5.0, decides=True):
         pass
-    with pytest.raises(OutOfTime), again.last("its derivative", COMPILE, 7.0):
+    with pytest.raises(OutOfTime), again.last("that of the next", COMPILE, 5.0, decides=True):
+        pass
+    with again.last("its derivative", COMPILE, 7.0):  # changes nothing that is chosen
         pass
 
 

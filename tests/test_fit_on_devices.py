@@ -204,8 +204,8 @@ def rows(number=900):
 
 
 def same_factor(one, other):
-    """Of the same rows: up to the signs of its own, and where columns depend on each other up to
-    more."""
+    """Assert factors of the same rows: up to the signs of rows, and up to more where columns are
+    dependent."""
     squares = [np.triu(factor).T @ np.triu(factor) for factor in (one, other)]
     np.testing.assert_allclose(*squares, rtol=0, atol=1e-13 * np.abs(squares[1]).max())
 

@@ -15,14 +15,18 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 # A module imports only from rooms before its own; the modules of a room share its place.
 ORDER = (
     "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes",
-    "storage", "data", "dataset", "scenes", "families", "solve", "generating", "flows", "maps",
-    "exports", "fitting", "models", "learn", "baselines", "evaluate", "jobs", "cli_columns", "cli",
-    "__main__",
+    "storage", "signals", "data", "dataset", "scenes", "families", "solve", "generating", "flows",
+    "maps", "exports", "fitting", "models", "learn", "baselines", "evaluate", "jobs", "cli_columns",
+    "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {
     ("maps.symplectic_map", f"maps.{name}")
     for name in ("saved", "samples", "sharded", "energy", "estimates")
+}
+SHORTHANDS |= {
+    ("data.recording", "data.recording_summary"),
+    ("data.recording_summary", "data.summary_screen"),
 }
 HOMES = {  # the module, and those whose names begin as its own does
     "argparse": "cli",
@@ -47,7 +51,7 @@ def modules():
 
 
 def imports(tree):
-    """Every module that is imported anywhere in the file, in functions too."""
+    """List all modules that a file imports, also inside functions."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

@@ -190,8 +190,8 @@ def test_what_was_found_before_the_budget_was_spent_stands():
     assert sweep.judged == [10, 100]
     assert order(found) == [100]
     assert found.ended.startswith(
-        "the budget of 2,000 operations is spent after unit 2, polynomial 100, and the next, "
-        "polynomial 1000, would take"
+        "the budget of 2,000 operations is spent after unit 2, polynomial 100: polynomial 1000 "
+        "would take"
     )
 
 

@@ -122,8 +122,8 @@ def test_own_unknowns_of_blocks_are_eliminated():
     every = np.zeros((6, 15, 6, 2))
     every[np.arange(6), :, np.arange(6)] = own
     both = lstsq(np.column_stack([every.reshape(90, 12), A]), B)
-    t, inside, rest = eliminated(own, ROWS.reshape(6, 15, 8))
-    triangle = Triangle.of(rest.reshape(90, 8))
+    t, inside, rest = eliminated(np.concatenate([own, ROWS.reshape(6, 15, 8)], axis=-1), 2)
+    triangle = Triangle.of(rest.reshape(-1, 8))
     c = plain(triangle)
     np.testing.assert_allclose(c, both[12:], rtol=1e-9)
     x = np.linalg.solve(t, -(inside @ np.append(c, -1.0))[..., None])[..., 0]

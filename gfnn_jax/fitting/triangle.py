@@ -239,20 +239,16 @@ class Spectrum:
         return np.where(self.known, 1.0 / square, 0.0)
 
 
-def eliminated(
-    own: np.ndarray, rest: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """(T, S, rest'): the unknowns x that these rows alone have, eliminated from ‖X x + Y c − b‖.
+def eliminated(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(T, S, rest) of rows of [X Y b] (..., N, k + n + 1), X those of k = ``count`` unknowns x that
+    no other rows have, for any number of blocks at once. By the QR of each block,
 
-    own: X (..., N, k), rest: [Y b] (..., N, n + 1), for any number of blocks at once. With X = Q T,
+        min over x  is  ‖rest (c, −1)‖,        T x = −S (c, −1):
 
-        min over x  is  ‖rest' (c, −1)‖,        rest' = (1 − QQᵀ) rest,        T x = −S (c, −1),
-
-    S = Qᵀ rest: rest' (..., N, n + 1) are rows for the triangle of c, and x follows from c.
+    rest (..., M, n + 1) are the rows of c alone, and x follows from c. N is at least k.
     """
-    q, t = np.linalg.qr(own)
-    inside = q.swapaxes(-1, -2) @ rest
-    return t, inside, rest - q @ inside
+    r = np.asarray(np.linalg.qr(rows, mode="r"))
+    return r[..., :count, :count], r[..., :count, count:], r[..., count:, count:]
 
 
 def folded(factor: np.ndarray, rows: np.ndarray, *, triangular: bool = False) -> np.ndarray:

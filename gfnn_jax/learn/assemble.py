@@ -12,7 +12,6 @@ import numpy as np
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.flows.collocation import of_lanes
-from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
 from gfnn_jax.learn.candidates import Candidate, Judges, refined_images, with_error
@@ -23,6 +22,7 @@ from gfnn_jax.maps.symplectic_map import Piece, SymplecticMap
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.solve.status import LEFT_DOMAIN
 
+_TIMING = "the time of a step, and the error of compiled ones"
 _PREDICTOR_PAIRS = 2_000
 # States are stepped in blocks of one shape, whatever their number: compiled once for a kind of map.
 # A block of wide states is of so many numbers.
@@ -39,18 +39,6 @@ class Assembled(NamedTuple):
     compiled: bool = True
 
 
-def assemble(
-    candidate: Candidate, prepared: Prepared, chart: AnyChart, family, params, features,
-    judges: Judges, budget: Budget,
-) -> Assembled:  # fmt: skip
-    """The candidate's map, measured."""
-    generated = with_predictor(
-        Generated(family, params, chart, prepared.dt, prepared.scale), prepared, judges.training,
-        features,
-    )  # fmt: skip
-    return measured(candidate, composed(generated, prepared, judges), prepared, judges, budget)
-
-
 def measured(
     candidate: Candidate, map_: SymplecticMap, prepared: Prepared, judges: Judges, budget: Budget
 ) -> Assembled:
@@ -58,7 +46,7 @@ def measured(
     run, as long as compiling them fits into the budget."""
     held, compiling = judges.pairs.take(judges.held_out), budget.compiling
     try:
-        with budget.last("the time of a step and the error of compiled steps", COMPILE, compiling):
+        with budget.last(_TIMING, COMPILE, compiling, decides=True):
             steps = stepped(map_, np.asarray(held.z0), held.dt, held.args)
     except OutOfTime:
         return Assembled(dataclasses.replace(candidate, map=map_), 0.0, compiled=False)
@@ -73,7 +61,7 @@ def measured(
     return Assembled(candidate, steps.compile_seconds)
 
 
-def with_predictor(generated: Generated, prepared: Prepared, rows, features=None) -> Generated:
+def with_predictor(generated: Generated, prepared: Prepared, rows) -> Generated:
     """The piece with predictors fitted to its own images of the data's states: where S is coarse,
     the data are no closer to its roots than S is to the data."""
     rows = rows[:_PREDICTOR_PAIRS]
@@ -83,6 +71,7 @@ def with_predictor(generated: Generated, prepared: Prepared, rows, features=None
     if solved.sum() < 2:  # nothing to learn from: the data's own images
         images, solved = prepared.y1[rows], np.ones(len(rows), bool)
     coordinates, args = prepared.coordinates, prepared.given(rows[solved])[1]
+    features = getattr(getattr(generated.family, "inputs", None), "features", None)
     fitted = fit_predictors(
         generated.chart, prepared.y0[rows][solved], images[solved],
         of_lanes(prepared.given(rows)[0], solved),

@@ -9,6 +9,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.own import is_own
 from gfnn_jax.families.sums import site_terms
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.generating.charts import CHARTS
@@ -38,6 +39,7 @@ def check_request(
     learn,
     family,
     angles,
+    model=None,
     terms=(),
     base=None,
     structure=None,
@@ -50,8 +52,10 @@ def check_request(
     for name, value, known in (
         ("chart", chart, CHART_NAMES), ("family", family, FAMILIES), ("learn", learn, LEARNS)
     ):  # fmt: skip
-        if value not in known:
-            raise FitError(f"expected a {name} among {', '.join(known)}; got '{value}'")
+        if name == "family" and is_own(value):
+            continue
+        if not isinstance(value, str) or value not in known:
+            raise FitError(f"expected {name} to be one of {', '.join(known)}; got {value!r}")
     if not isinstance(pairs, Pairs):
         raise FitError(f"expected gfnn.Pairs(z0, z1, dt), got {type(pairs).__name__}")
     if scene is not None and not isinstance(scene, Scene):
@@ -69,6 +73,8 @@ def check_request(
         raise FitError(f"expected a whole number from 0 to 2**32 - 1 as seed, got {seed!r}")
     if not (isinstance(ensemble, numbers.Integral) and ensemble >= 1):
         raise FitError(f"expected a whole number of 1 or more as ensemble, got {ensemble!r}")
+    if model is not None:
+        _check_model(model, learn, terms, base, structure, family, chart)
     if ensemble > 1 and (family != "mlp" or learn == "hamiltonian"):
         raise FitError("an ensemble is of networks S: expected family='mlp', and S to be learned")
     own_dt = bool(np.ndim(pairs.dt))
@@ -141,6 +147,21 @@ def check_request(
         check_number(pairs)
     elif len(pairs) < FEWEST:
         raise FitError(f"expected at least {FEWEST} pairs, got {len(pairs)}")
+
+
+def _check_model(model, learn, terms, base, structure, family, chart) -> None:
+    """Raises FitError for what is no model, or does not go with one."""
+    missing = [name for name in ("name", "sizes", "fit") if not hasattr(model, name)]
+    if missing:
+        raise FitError(
+            f"expected a model with a name, sizes(data) and fit(data, size); {model!r} has no "
+            f"{', '.join(missing)}"
+        )
+    if (learn, family, chart, base) != ("auto", "auto", "auto", None) or terms or structure:
+        raise FitError(
+            "a model of one's own is all that is learned: expected no learn, terms, base, "
+            "structure, family or chart beside it"
+        )
 
 
 def check_number(pairs: Pairs) -> None:

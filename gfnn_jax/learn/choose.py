@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from gfnn_jax.errors import OutOfTime
-from gfnn_jax.learn.assemble import assemble
+from gfnn_jax.learn.assemble import composed, measured
 from gfnn_jax.learn.candidates import Candidate, Judges
 from gfnn_jax.learn.choose_law import preferred
 from gfnn_jax.learn.clock import ROWS, Budget
@@ -65,13 +65,9 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     larger = _larger(first, budget, say) if first.candidate.validation_bound <= bound else ()
     for entry in itertools.chain([first], larger, ranking[1:]):
         say(f"compiling the step of {entry.candidate.chart} {entry.candidate.label}")
-        sweep, size = entry.sweep, entry.size
-        _, params = sweep.solve(size, Budget(), say)
-        inputs = getattr(size.family, "inputs", None)
-        assembled = assemble(
-            entry.candidate, sweep.prepared, sweep.chart, size.family, params,
-            getattr(inputs, "features", None), sweep.judges, budget,
-        )  # fmt: skip
+        sweep = entry.sweep
+        map_ = composed(sweep.piece(entry.size), sweep.prepared, sweep.judges)
+        assembled = measured(entry.candidate, map_, sweep.prepared, sweep.judges, budget)
         compile_seconds += assembled.compile_seconds
         tried.append((assembled.candidate, entry))
         expected = max(bound, _BORNE_OUT * entry.candidate.validation_bound)

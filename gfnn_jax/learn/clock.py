@@ -93,34 +93,39 @@ class Budget:
             self._reserved[then[0]] = max(self._reserved.get(then[0], 0.0), then[1])
         most = self.max_operations
         if most is not None and self.operations + count > most:
-            self._end(name, f"the budget of {most:,} operations is spent", f"{count:.1e} more")
+            spent = f"the budget of {most:,} operations is spent"
+            self._end(spent, f"{name} would take {count:.1e} operations more")
         if self.max_seconds is not None:
-            seconds = self._foretold(kind, count)
-            if self.seconds + seconds + self._set_apart > self.max_seconds:
-                self._end(name, self._spent, f"about {seconds:.2g} s")
+            seconds, now = self._foretold(kind, count) + self._set_apart, self.seconds
+            if now + seconds > self.max_seconds:
+                left = max(self.max_seconds - now, 0.0)
+                needed = f"{name} and what follows would take about {seconds:.2g} s"
+                self._end(self._spent, f"{needed}, and {left:.2g} s are left")
         with self._timed(kind, count):
             yield
         self.operations += count
         self._done, self._last = self._done + 1, name
 
     @contextlib.contextmanager
-    def last(self, name: str, kind: str, seconds_or_operations: float) -> Iterator[None]:
+    def last(
+        self, name: str, kind: str, operations: float, *, decides: bool = False
+    ) -> Iterator[None]:
         """A unit after the search, which the search's end is no reason to leave out. Raises
-        OutOfTime where it does not fit, as do those after it.
+        OutOfTime where there is no time for it, and then for those after it too.
 
-        It counts as one operation: none of the search's units could be done in its stead.
+        decides: whether the choice depends on it. It counts as one operation then: none of the
+        search's units could be done in its stead.
         """
-        most, amount = self.max_operations, seconds_or_operations
-        fits = not self._closed and (most is None or self.operations < most)
-        if fits and self.max_seconds is not None:
-            fits = self.seconds + self._foretold(kind, amount) <= self.max_seconds
-        if not fits:
-            self._closed = True
+        if self.max_seconds is not None:
+            late = self.seconds + self._foretold(kind, operations) > self.max_seconds
+            self._closed = self._closed or late
+        spent = self.max_operations is not None and self.operations >= self.max_operations
+        if self._closed or (decides and spent):
             self.leave_out(name, "it does not fit into what is left of the budget")
             raise OutOfTime
-        with self._timed(kind, amount):
+        with self._timed(kind, operations):
             yield
-        self.operations += 1
+        self.operations += decides
 
     def free(self, kind: str, operations: float) -> contextlib.AbstractContextManager[None]:
         """Work that is done in any case, and counts as no operation; its time is measured."""
@@ -139,8 +144,8 @@ class Budget:
             self.ended = f"{self._spent}{self._after}"
             raise OutOfTime
 
-    def _end(self, name: str, spent: str, more: str) -> None:
-        self.ended = f"{spent}{self._after}, and the next, {name}, would take {more}"
+    def _end(self, spent: str, needed: str) -> None:
+        self.ended = f"{spent}{self._after}: {needed}"
         raise OutOfTime
 
     @property

@@ -43,6 +43,7 @@ from gfnn_jax.learn.law_options import OPTIONS, Options
 from gfnn_jax.learn.law_starts import starts
 from gfnn_jax.learn.law_work import LawWork
 from gfnn_jax.learn.learned_law import (
+    Dropped,
     FittedLaw,
     LearnedHamiltonian,
     bound_of,
@@ -228,7 +229,10 @@ def _beside_centrifugal(
     options = dataclasses.replace(options, given_degrees=options.given_degrees[1:])
     try:
         found = _searched(problem, work, prepared, judges, None, own, options, say)
-    except (OutOfTime, FitError):
+    except OutOfTime:
+        work.budget.leave_out("libraries of H with centrifugal terms", work.ended)
+        return before
+    except FitError:
         return before
     return found if found[0].error.relative < best.error.relative else before
 
@@ -432,8 +436,12 @@ def _sparse(problem, full: FittedLaw, prepared, judges, options: Options, say) -
         start = full.fit.coefficients[list(kept)]
         fit = problem.fit(family, start, full.fit.used, rounds=False, steps=full.fit.steps)
         error = held_out_error(family, fit, prepared, judges)
-        if error.relative <= max(options.rise * full.error.relative, options.rounding):
-            return full._replace(family=family, fit=fit, error=error)
+        before = full.error.relative
+        if error.relative <= max(options.rise * before, options.rounding):
+            dropped = Dropped(full.family.num_parameters - len(kept), before, error.relative)
+            told = f"error {error.relative:.2e}, before {before:.2e}"
+            say(f"H without {dropped.terms} terms: {told}")
+            return full._replace(family=family, fit=fit, error=error, dropped=dropped)
     return full
 
 

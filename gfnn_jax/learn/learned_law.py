@@ -59,7 +59,8 @@ class LearnedHamiltonian:
     null_terms: that the data do not tell from the others. left_out: pairs that the flow does not
     resolve. stalled: whether larger libraries were no more accurate. covariance: makes ``root``;
     None of a network. unmet: that the tolerance is missed, and what that may be from; "" where it
-    is met. ended: what cut the search for it short, "" where nothing did.
+    is met. ended: what cut the search for it short, "" where nothing did. dropped: terms that went
+    in the end.
     """
 
     candidate: Candidate
@@ -79,6 +80,7 @@ class LearnedHamiltonian:
     arcs: int = 0
     unmet: str = ""
     ended: str = ""
+    dropped: Dropped | None = None
 
     @cached_property
     def root(self) -> np.ndarray | None:
@@ -92,12 +94,21 @@ class LearnedHamiltonian:
         return self.omega_h > FAST
 
 
+class Dropped(NamedTuple):
+    """Terms that went because the pairs do not ask for them, and what that cost: the held-out error
+    ÷ spread with them and without."""
+
+    terms: int
+    error_with: float
+    error_without: float
+
+
 class FittedLaw(NamedTuple):
     """rows: that the fit was given; it has left out those that the flow does not resolve.
     undetermined: of the null terms, those that other states would tell from the rest. ended: why a
     library that grew did so no longer. stalled: whether larger libraries were no better. noisy:
     whether their errors were the same, which is that of the pairs; larger: the largest
-    of those. whole:
+    of those. dropped: terms that went in the end. whole:
     what whole sequences tell, where they were fitted."""
 
     family: Terms | Sums
@@ -110,6 +121,7 @@ class FittedLaw(NamedTuple):
     stalled: bool = False
     noisy: bool = False
     larger: FittedLaw | None = None
+    dropped: Dropped | None = None
     whole: Whole | None = None
 
 
@@ -166,7 +178,7 @@ def learned_from(
         stalled=found.stalled,
         covariance=covariance, noise=None if whole is None else whole.noise,
         arcs=0 if whole is None else whole.arcs,
-        unmet=_unmet(error, omega_h, prepared, judges, found),
+        dropped=found.dropped, unmet=_unmet(error, omega_h, prepared, judges, found),
     )  # fmt: skip
 
 

@@ -15,14 +15,14 @@ from gfnn_jax.fitting.levenberg_marquardt import LMResult, LMState, levenberg_ma
 from gfnn_jax.learn.candidates import Candidate, Judges, validated
 from gfnn_jax.learn.clock import NETWORK, Budget
 from gfnn_jax.learn.rows import rows_of
-from gfnn_jax.learn.sweeps import OF_STEPS, Size
+from gfnn_jax.learn.sweeps import OF_STEPS, Generates, Size
 
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
 _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
 _CHECKPOINT_SECONDS = 10.0
 
 
-class NetworkSweep:
+class NetworkSweep(Generates):
     """The one size of a network, trained by Levenberg–Marquardt."""
 
     kind = "mlp"

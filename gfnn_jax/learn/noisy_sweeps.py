@@ -48,7 +48,7 @@ def without_bias(found: Searched, request: Request) -> Searched:
     if met or (law is not None and preferred(law.candidate, best.candidate, np.inf)):
         return found
     rivals = _as_far(found)
-    if not rivals:
+    if not rivals or request.budget.over:
         return found
     work = sum(3 * e.sweep.work_of_factor(e.sweep.largest_known) for e in rivals)
     try:

@@ -13,9 +13,9 @@ from gfnn_jax.learn.searches import Searched
 from gfnn_jax.learn.sweeps import LinearSweep
 from gfnn_jax.maps.posterior import Posterior
 
-# Operations of a root of m terms, ÷ m³, in those of singular values: these, of the terms and of
-# a size two further, and the factors of their rows.
-_OF_ROOT = 60.0
+# Operations of a root of m terms, ÷ m³: nearly all of them make the factor of a size two further,
+# of twice as many terms and twelve times as many rows, which tells noise from misfit.
+_OF_ROOT = 200.0
 
 
 def with_posterior(chosen: Chosen, searched: Searched) -> Chosen:

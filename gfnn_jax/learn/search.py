@@ -103,15 +103,16 @@ class Search:
         self._cheapest, self._kept, self._unfinished = np.inf, np.inf, False
 
     def climb(self, dearest: float = np.inf, most: float = np.inf) -> None:
-        """Judge size after size, up to the first that takes more than ``most`` operations to judge,
-        or as far as the budget goes. dearest: operations of a step from which a size is of no use,
-        because something else meets the tolerance with so many."""
+        """Judge size after size, one at least, up to the first that takes more than ``most``
+        operations to judge, or as far as the budget goes. dearest: operations of a step from which
+        a size is of no use, because something else meets the tolerance with so many."""
         self._cheapest = min(self._cheapest, dearest)
         try:
             while self._queue:
                 operations, i, n = self._queue[0]
                 if i not in self._left and operations < self._cheapest:
-                    if self.sweeps[i].work(self.sweeps[i].sizes[n]) > most:
+                    work = self.sweeps[i].work(self.sweeps[i].sizes[n])
+                    if work > most and self._entries:
                         return
                     self._look_at(i, n)
                 self._queue.pop(0)

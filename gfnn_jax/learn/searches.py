@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.errors import FitError
-from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.assemble import composed, with_predictor
+from gfnn_jax.learn.assemble import composed
 from gfnn_jax.learn.candidates import Candidate, Judges
 from gfnn_jax.learn.choose_charts import Charts
 from gfnn_jax.learn.choose_law import DEARER, law_of
@@ -26,6 +25,7 @@ from gfnn_jax.learn.law_maps import (
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.linear_map import linear_map
 from gfnn_jax.learn.map_of_terms import LearnedMap, map_of
+from gfnn_jax.learn.model_sweep import ModelSweep
 from gfnn_jax.learn.network_sweep import NetworkSweep
 from gfnn_jax.learn.networks import learn_network
 from gfnn_jax.learn.prepare import Prepared
@@ -41,9 +41,9 @@ OnBetter = Callable[[SymplecticMap, Candidate], Any]
 
 class Searched(NamedTuple):
     """law: H, or None. of_terms: S with parameters or of a structure, or None. linear: the linear
-    map, where there is nothing else. found: the generated maps. swept: whether any were looked for.
-    charts: theirs. plain: the pairs as prepared, without a base map or law factored out. judges: of
-    the user's pairs."""
+    map, where the budget has left nothing that is as accurate. found: the generated maps. swept:
+    whether any were looked for. charts: theirs. plain: the pairs as prepared, without a base map or
+    law factored out. judges: of the user's pairs."""
 
     law: LearnedHamiltonian | None
     of_terms: LearnedMap | None
@@ -69,13 +69,13 @@ def searched(
     better = _Better(on_better) if on_better is not None else None
     given = bound.bound, budget, say, tell, better
     # Small sizes first: a map is then there, however long the search for H.
-    early = not prepared.of_terms
-    climb = Search(_sweeps(request, seen, judges) if early else [], *given)
+    early = not prepared.of_terms or request.model is not None
+    climb = Search(_sweeps(request, plain, seen, judges) if early else [], *given)
     climb.climb(most=_SMALL)
     law = _law(request, plain, judges, better)
     of_terms, failed = None, None
     met_by_law = law is not None and judges.met_by(law.candidate)
-    wanted = prepared.of_terms and request.learn != "hamiltonian" and not met_by_law
+    wanted = not early and request.learn != "hamiltonian" and not met_by_law
     if wanted and request.family == "auto":
         try:
             of_terms = map_of(prepared, judges, scene, request.chart, law, budget, say)
@@ -88,7 +88,7 @@ def searched(
             failed = failed or error
         prepared, charts = seen.prepared, seen.charts
     if not early:
-        climb = Search(_sweeps(request, seen, judges), *given)
+        climb = Search(_sweeps(request, plain, seen, judges), *given)
     dearest = law.candidate.operations if law is not None and met_by_law else np.inf
     climb.climb(dearest)
     found = climb.found()
@@ -115,12 +115,17 @@ def searched(
         around = search_around(law, plain, judges, scene, budget, say, tell, better, request.seed)
         if around is not None and better_than(around.found, found, law):
             found, charts = around
+    known = [f.candidate for f in (law, of_terms, *found.ranking[:1]) if f is not None]
+    best = min((c.validation_bound for c in known), default=np.inf)
     linear = None
-    if not found.ranking and law is None and of_terms is None:
-        linear = linear_map(plain, judges) if budget.over else None
-        if linear is None:
-            raise failed or FitError(_nothing_found(len(judges.pairs), budget))
-        tell(linear)
+    if budget.over and best > bound.bound:
+        linear = linear_map(plain, judges)
+        if linear is not None and linear.validation_bound < best:
+            tell(linear)
+        elif known:
+            linear = None
+    if not known and linear is None:
+        raise failed or FitError(_nothing_found(len(judges.pairs), budget))
     if of_terms is not None and found.ranking and not _met(of_terms, judges):
         best = found.ranking[0].candidate
         if best.validation_bound < of_terms.candidate.validation_bound:
@@ -154,15 +159,17 @@ def _law(
     return law
 
 
-def _sweeps(request: Request, seen: Diagnosis, judges: Judges) -> list[Any]:
+def _sweeps(request: Request, plain: Prepared, seen: Diagnosis, judges: Judges) -> list[Any]:
     """The sweeps of S over the charts that cover the data; none where H alone is learned, or the
     pairs are driven, or differ in dt and in parameters too."""
+    if request.model is not None:
+        return [ModelSweep(request.model, plain, judges)]
     charts, prepared = seen.charts.charts, seen.prepared
     if request.learn == "hamiltonian" or prepared.period is not None:
         return []
     if prepared.own_dt is not None:
-        plain = prepared.structure is None and prepared.args is None
-        return [sweep_of_dt(prepared, request.scene, judges, request.factors)] if plain else []
+        alone = prepared.structure is None and prepared.args is None
+        return [sweep_of_dt(prepared, request.scene, judges, request.factors)] if alone else []
     if request.family == "mlp":
         given = (prepared, charts[0], judges, request.max_iterations, request.seed,
                  request.checkpoints)  # fmt: skip
@@ -197,10 +204,5 @@ class _Better:
 
 
 def _map_of(entry: Entry) -> SymplecticMap:
-    sweep, family = entry.sweep, entry.size.family
-    prepared, judges = sweep.prepared, sweep.judges
-    _, params = sweep.solve(entry.size, Budget(), lambda message: None)
-    generated = Generated(family, params, sweep.chart, prepared.dt, prepared.scale)
-    features = getattr(getattr(family, "inputs", None), "features", None)
-    generated = with_predictor(generated, prepared, judges.training, features)
-    return composed(generated, prepared, judges)
+    sweep = entry.sweep
+    return composed(sweep.piece(entry.size), sweep.prepared, sweep.judges)

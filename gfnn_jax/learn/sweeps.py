@@ -11,16 +11,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.noise import of_pairs
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.dataset.split import outermost
-from gfnn_jax.families.inputs import box_inputs, variable_signs
+from gfnn_jax.families.inputs import Inputs, box_inputs, variable_signs
+from gfnn_jax.families.own import own_families
 from gfnn_jax.families.products import Products, number_of_terms
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
-from gfnn_jax.learn.candidates import Candidate, Judges, validated
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.learn.assemble import with_predictor
+from gfnn_jax.learn.candidates import Candidate, Judges, refined_images, validated
 from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.rows import of_rows, rows_of
@@ -45,7 +50,7 @@ _MOST_OPERATIONS = 3.2e11
 _SCARCE_FROM_DIM, _PARITY_ROWS, _ODD_DEGREE, _NO_GAIN = 3, 6, 3, 0.98
 _WORTH_KEEPING = 1.0  # seconds
 # Operations of singular values, ÷ terms³; and of a step in NumPy, in units that take as long.
-OF_SOLVE, OF_STEPS = 22.0, 300.0
+OF_SOLVE, OF_STEPS = 22.0, 20.0
 # Pairs of a block that goes to one of two halves: long beside the noise that neighbours share.
 _HALVES_BLOCK = 50
 # Rows per term of a larger size, by which noise is told from misfit.
@@ -70,13 +75,20 @@ class Size:
 
 
 def sweeps_for(
-    request: str, charts: Sequence[AnyChart], prepared, scene, judges, factors=None
+    request: Any, charts: Sequence[AnyChart], prepared, scene, judges, factors=None
 ) -> Iterator:
     """The sweeps of the families that apply, chart by chart.
 
-    request: "auto", "polynomial", "features" (the scene's) or "sines"; with "auto" random sines
-    are tried where polynomials have too many terms. factors: as ``LinearSweep`` takes them.
+    request: "auto", "polynomial", "features" (the scene's), "sines", or a user's own; with "auto"
+    random sines are tried where polynomials have too many terms. factors: as ``LinearSweep`` takes
+    them.
     """
+    if not isinstance(request, str):
+        for chart in charts:
+            yield LinearSweep(
+                prepared, chart, judges, "own", None, None, own=lambda i: own_families(request, i)
+            )  # fmt: skip
+        return
     features = scene.features if scene is not None else None
     polynomials = request in ("auto", "polynomial")
     even = polynomials and (scene is None or scene.reversor is None) and is_even(prepared, judges)
@@ -114,16 +126,43 @@ class _Factors(NamedTuple):
         return cls(inner.append(outer.factor, outer.rows), held, inner, outer)
 
 
-class LinearSweep:
+class Generates:
+    """What sweeps of S have in common: a solved size makes a piece."""
+
+    prepared: Prepared
+    chart: AnyChart
+    judges: Judges
+
+    def solve(self, size: Size, budget: Budget, say) -> tuple[Any, Any]:
+        """What is known of the solution, and the params of the size's family."""
+        raise NotImplementedError
+
+    def piece(self, size: Size) -> Generated:
+        """The piece that the size's S generates, with its predictor."""
+        prepared, params = self.prepared, self._params_of(size)
+        piece = Generated(size.family, params, self.chart, prepared.dt, prepared.scale)
+        return with_predictor(piece, prepared, self.judges.training)
+
+    def images(self, size: Size, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Images of these rows (n, 2d), as prepared, and which steps were solved (n,)."""
+        params = self._params_of(size)
+        return refined_images(self.prepared, self.chart, size.family, params, rows)
+
+    def _params_of(self, size: Size) -> Any:
+        return self.solve(size, Budget(), lambda message: None)[1]
+
+
+class LinearSweep(Generates):
     """The sizes of one linear family in one chart.
 
     factors: a ``KeptFactors``, where factors that took long are kept for a fit that goes on. even:
-    whether S(−w) = S(w), and has even terms only.
+    whether S(−w) = S(w), and has even terms only. own: a user's families, of the inputs, by rising
+    number of terms.
     """
 
     def __init__(
         self, prepared: Prepared, chart: AnyChart, judges: Judges, kind: str, features, reversor,
-        factors=None, even=False,
+        factors=None, even=False, own: Callable[[Inputs], Iterable[Any]] | None = None,
     ):  # fmt: skip
         reversor = (-1,) * 2 * prepared.dim if even else reversor
         self._kept, self._prefix = factors, "even " if even else ""
@@ -143,15 +182,17 @@ class LinearSweep:
         )  # fmt: skip
         degrees = _EVEN_DEGREES if even else _DEGREES
         signs = None
-        if kind != "sines" and reversor is not None:
+        if kind != "sines" and own is None and reversor is not None:
             signs = variable_signs(inputs, reversor, w)
 
         def groups() -> Iterator[Iterable[Any]]:
+            if own is not None:
+                return ([family] for family in own(inputs))
             if kind == "sines":
                 return ([Sines(inputs, count)] for count in _SINES)
             return ((of(inputs, degree, signs) for degree in g) for g in degrees)
 
-        known = len(_SINES) if kind == "sines" else sum(map(len, degrees))
+        known = len(_SINES) if kind == "sines" or own is not None else sum(map(len, degrees))
         self._groups, rows = groups, self._train[1].size
         self.sizes = [
             Size(family, group[-1], _extent(family))
@@ -164,7 +205,7 @@ class LinearSweep:
 
     def named(self, size: Size) -> str:
         """What is done to judge the size."""
-        return f"{self.chart.name} {self._prefix}{size.group.label}"
+        return f"{self.chart.name} {self._prefix}{size.family.label}"
 
     def work(self, size: Size) -> float:
         """Operations that judging the size takes: its group's factor, if that is not there yet."""
@@ -215,7 +256,7 @@ class LinearSweep:
     def at(self, extent: float) -> str:
         """What the size of this extent is, how many terms it has, and how many pairs they take."""
         family = self.sizes[0].family
-        if isinstance(family, Sines):
+        if not hasattr(family, "degree"):
             label = f"{family.name} {(terms := round(2**extent))}"
         else:
             degree = round(extent)
@@ -235,6 +276,20 @@ class LinearSweep:
             self._solved[count] = least_squares.solve(train, held, count)
         solved = self._solved[count]
         return solved, size.family.unflatten(solved.coefficients)
+
+    def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Images (n, 2d) of these rows, in the user's coordinates, by a fit to other rows; NaN
+        where a step is not solved."""
+        prepared, family = self.prepared, self.in_rows(size.family)
+        train = least_squares.reduce(
+            family, [rows_of(prepared, self.chart, others)[0]], self._weight
+        )
+        held = least_squares.reduce(family, [self._held], self._weight)
+        solved = least_squares.solve(train, held, size.family.num_parameters)
+        params = size.family.unflatten(solved.coefficients)
+        images, known = refined_images(prepared, self.chart, size.family, params, rows)
+        images = prepared.whole_image(np.where(known[:, None], images, np.nan))
+        return to_user(prepared.coordinates, images)
 
     def left_over(self, size: Size) -> np.ndarray:
         """(N, 2d): what the size leaves of ∇S of every pair, unit-free as train_rms."""
@@ -339,8 +394,7 @@ class LinearSweep:
         residual = slopes @ solved.coefficients - target * self._weight
         first, second = self.by_states(size.family, params, w, *args)
         step = np.linalg.solve(second, np.concatenate([residual[..., None], -first], axis=-1))
-        found = shared_noise.variances(step[..., 0], step[..., 1:], np.flatnonzero(goes_on))
-        return np.sqrt(found)
+        return of_pairs(step[..., 0], step[..., 1:], np.flatnonzero(goes_on))
 
     def freedoms(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
         """Degrees of freedom that noise takes of a fit of so many of the leading terms of a size:
@@ -467,8 +521,9 @@ class LinearSweep:
 
 
 def _extent(family) -> float:
-    """The degree of products, or log₂ of the number of sines."""
-    return float(np.log2(family.num_parameters) if isinstance(family, Sines) else family.degree)
+    """The degree of products, or log₂ of the number of terms."""
+    degree = getattr(family, "degree", None)
+    return float(np.log2(family.num_parameters) if degree is None else degree)
 
 
 class _WithOdd:
@@ -507,9 +562,12 @@ def is_even(prepared: Prepared, judges: Judges) -> bool:
     if not degrees:
         return False
     even = Products(inputs, degrees[-1], signs)
+    odd = number_of_terms(inputs.is_angle, _ODD_DEGREE) - even.terms_of(_ODD_DEGREE)
+    if even.num_parameters + odd > _MOST_TERMS:
+        return False
     family = _WithOdd(even)
     pairs = -(-_PARITY_ROWS * family.num_parameters // w.shape[1])
-    if family.num_parameters > _MOST_TERMS or pairs > len(w):
+    if pairs > len(w):
         return False
     train, held = (
         least_squares.reduce(family, [tuple(a[:pairs] for a in rows)], weight)
