@@ -20,7 +20,10 @@ ORDER = (
     "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
-SHORTHANDS = {("maps.symplectic_map", f"maps.{name}") for name in ("saved", "samples", "sharded")}
+SHORTHANDS = {
+    ("maps.symplectic_map", f"maps.{name}")
+    for name in ("saved", "samples", "sharded", "energy", "estimates")
+}
 SHORTHANDS |= {
     ("data.recording", "data.recording_summary"),
     ("data.recording_summary", "data.summary_screen"),

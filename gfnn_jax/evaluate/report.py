@@ -80,6 +80,7 @@ def assemble(
         },
         "hamiltonian": _hamiltonian(fit),
         "map": {
+            "multiplier": fit.map.multiplier(),
             "symplecticity_defect": fit.symplecticity_defect if fit.tells_defect else None,
             "chart_determinant_min": fit.model_determinant_min,
             "chart_determinants_of_data": {n: j.low for n, j in fit.judgements.items()},

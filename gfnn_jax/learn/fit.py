@@ -11,15 +11,16 @@ import dataclasses
 import io
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
 import jax
 import numpy as np
 
+from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.runs import identified
-from gfnn_jax.errors import FitError, FitWarning, OutOfTime
+from gfnn_jax.errors import FitError, FitWarning, InputError, OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.assemble import block_of
@@ -35,6 +36,7 @@ from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.posterior import with_posterior, work_of_posterior
+from gfnn_jax.learn.recordings import fit_recording
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.learn.stated import stated
@@ -226,8 +228,8 @@ class Fit:
 
     @cached_property
     def symplecticity_defect(self) -> float:
-        """The largest defect of the chosen map's unrolled step at the test states. Compiled when it
-        is first asked for."""
+        """The largest defect ‖AᵀJA − μJ‖ of the chosen map's unrolled step at the test states, by
+        its multiplier μ; NaN where it has none. Compiled when it is first asked for."""
         return float(np.max(np.asarray(self.map.defect(self.test_states, self.test_args))))
 
     @property
@@ -243,7 +245,7 @@ class Fit:
 
 
 def fit(
-    pairs: Pairs,
+    pairs: Pairs | Recording,
     scene: Scene | None = None,
     *,
     tolerance: float = 1e-6,
@@ -262,14 +264,22 @@ def fit(
     max_operations: int | None = None,
     clock: Callable[[], float] = time.perf_counter,
     max_iterations: int = 250,
+    friction: str = "auto",
+    input_hold: str = "auto",
+    mass: Mapping[str, float] | None = None,
     devices: int | str | None = None,
     checkpoints: Any = None,
     factors: Any = None,
     on_progress: Callable[[str], Any] = lambda message: None,
     on_candidate: Callable[[Candidate], Any] = lambda candidate: None,
     on_better: Callable[[SymplecticMap, Candidate], Any] | None = None,
-) -> Fit:
+) -> Any:
     """Learn the map of these pairs: the cheapest candidate within the tolerance, else the best.
+
+    Of a `Recording` learn its law, a Lagrangian with friction and inputs, from its positions: a
+    `models.learned_law.LearnedLaw`; of the options ``learn`` ("auto" or "lagrangian"),
+    ``friction``, ``input_hold``, ``mass`` and ``on_progress`` apply (`learn.recordings`). Of pairs
+    a `Fit`.
 
     pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order.
                Of different dt, S is a function of dt too, in the midpoint chart. With parameters
@@ -320,6 +330,14 @@ def fit(
     meets the tolerance, where a chart is close to singular, where pairs contradict their neighbours
     (a few are left out), and where the pairs do not look symplectic.
     """
+    if isinstance(pairs, Recording):
+        if learn not in ("auto", "lagrangian"):
+            raise InputError(f"expected learn auto or lagrangian of a recording, got {learn!r}")
+        if scene is not None or terms or base is not None or structure is not None:
+            raise InputError("expected no scene, terms, base or structure of a recording")
+        return fit_recording(
+            pairs, friction=friction, input_hold=input_hold, mass=mass, on_progress=on_progress
+        )
     dim = pairs.dim if isinstance(pairs, Pairs) else None
     budget = Budget(max_seconds, max_operations, clock, dim)
     require_x64("a fit")
