@@ -112,7 +112,11 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
     """H as it was learned, where its flow meets the tolerance or was chosen."""
     if fit.hamiltonian is None or fit.formula is None:
         return None
-    return {"formula": fit.formula, "terms": [term._asdict() for term in fit.hamiltonian.terms]}
+    terms, friction = (
+        [term._asdict() for term in part]
+        for part in (fit.hamiltonian.terms, fit.hamiltonian.friction)
+    )
+    return {"formula": fit.formula, "terms": terms, "friction": friction}
 
 
 def rollout_part(

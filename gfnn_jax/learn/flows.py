@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from gfnn_jax.learn.arcs import arcs_of
 from gfnn_jax.learn.candidates import Judges, OneStepError
 from gfnn_jax.learn.centrifugal import centrifugal_terms
 from gfnn_jax.learn.clock import Clock, Counted, OutOfTime
+from gfnn_jax.learn.friction import Forces, beside_friction, libraries_with
 from gfnn_jax.learn.law_libraries import (
     angles_and_others,
     check_finite,
@@ -78,7 +80,7 @@ def learn_hamiltonian(
 
     Raises FitError where no library can be tried, OutOfTime where the budget ends before the first.
     """
-    basis = modes_of(prepared, scene, terms)
+    asked, basis = options, modes_of(prepared, scene, terms)
     if basis is not None and not terms:
         own = centrifugal_terms(prepared, judges.training, basis.terms(basis.box()))
         basis = modes_of(prepared, scene, own)
@@ -115,6 +117,10 @@ def learn_hamiltonian(
         if not terms and prepared.structure is None:
             found = _beside_centrifugal(problem, found, prepared, judges, options, say)
         best, options = found
+    best, options = beside_friction(
+        problem, (best, options), prepared, judges,
+        lambda forces: _searched(problem, prepared, judges, scene, terms, asked, say, forces),
+    )  # fmt: skip
     everyone = np.arange(len(prepared.y0))
     if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
         raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
@@ -151,17 +157,25 @@ def learn_hamiltonian(
 
 
 def _searched(
-    problem, prepared, judges: Judges, scene, terms, options: Options, say
+    problem,
+    prepared,
+    judges: Judges,
+    scene,
+    terms,
+    options: Options,
+    say,
+    forces: Forces | None = None,
 ) -> tuple[FittedLaw, Options]:
     """The smallest library that meets the tolerance, else the best; and the options, which try no
-    fewer terms where the tolerance is out of reach."""
+    fewer terms where the tolerance is out of reach. forces: friction, that libraries have too."""
     bound = judges.tolerance.bound
     best: FittedLaw | None = None
     structured = prepared.structure is not None
     most_poor = _POOR_STRUCTURED if structured else _POOR_GIVEN if terms else _POOR
     tried: list[FittedLaw] = []
     poor, errors = 0, []
-    libraries = list(libraries_of(prepared, judges, scene, terms, options))
+    known = libraries_of if forces is None else partial(libraries_with, forces)
+    libraries = list(known(prepared, judges, scene, terms, options))
     if len(libraries) > 1 and libraries[0].quadratic and not prepared.varied:
         affine = affine_error(prepared, judges).bound
         if affine > _HOPELESS * bound:

@@ -23,6 +23,7 @@ from gfnn_jax.fitting.gauss_newton import (
 )
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.learn.assemble import Assembled, composed, stepped
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
 from gfnn_jax.learn.cost_of_flow import (
@@ -57,7 +58,8 @@ class LearnedHamiltonian:
     null_terms: that the data do not tell from the others. left_out: pairs that the flow does not
     resolve. stalled: whether larger libraries were no more accurate. root: (m, m), rootᵀ root is
     the coefficients' covariance; None of a network. unmet: that the tolerance is missed, and what
-    that may be from; "" where it is met.
+    that may be from; "" where it is met. friction: γ where that is uniform, else the terms of
+    Rayleigh's R; of a system without, ().
     """
 
     candidate: Candidate
@@ -76,6 +78,7 @@ class LearnedHamiltonian:
     noise: np.ndarray | None = None
     arcs: int = 0
     unmet: str = ""
+    friction: tuple[Term, ...] = ()
 
     @property
     def fast(self) -> bool:
@@ -129,7 +132,7 @@ def learned_from(
     of_all = dataclasses.replace(steps, substeps=longest)
     error = error_of_steps(family, fit.coefficients, of_all, prepared, judges)
     candidate = Candidate(
-        label=f"H, {family.num_parameters} terms", family=family.name, chart="flow",
+        label=_label(family), family=family.name, chart="flow",
         num_parameters=family.num_parameters,
         operations=operations_of(family, 2 * family.dim, fastest, prepared.dt, steps),
         validation_rms=error.rms, validation_relative=error.relative,
@@ -143,6 +146,8 @@ def learned_from(
             family.term_names, fit.coefficients.tolist(), fit.standard_errors.tolist(), strict=True
         )
     )
+    of_h = without_forces(family).num_parameters
+    terms, friction = terms[:of_h], terms[of_h:]
     omega_h = omega_h_of(family, fit.coefficients, prepared, fastest)
     left_out = len(np.setdiff1d(found.rows, fit.used))
     resolved = np.abs(off).max(axis=1) <= bound_of(judges, prepared.scale)
@@ -151,15 +156,21 @@ def learned_from(
     elif root is None:
         root = covariance_root(found, problem, prepared, steps, judges.pairs)
     return LearnedHamiltonian(
-        with_error(candidate, error), flow, terms, getattr(family, "prefix", "") + formula(terms),
+        with_error(candidate, error), flow, terms,
+        getattr(family, "prefix", "") + formula(terms),
         float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(error, omega_h, prepared, judges, found, left_out, int((~resolved).sum()))),
         stalled=found.stalled,
         root=root, noise=None if whole is None else whole.noise,
         arcs=0 if whole is None else whole.arcs,
-        unmet=_unmet(error, omega_h, prepared, judges, found),
+        unmet=_unmet(error, omega_h, prepared, judges, found), friction=friction,
     )  # fmt: skip
+
+
+def _label(family) -> str:
+    of_h = without_forces(family)
+    return f"H, {of_h.num_parameters} terms" + (", friction" if of_h is not family else "")
 
 
 def held_out_error(family, fit: FlowFit, prepared, judges: Judges) -> OneStepError:
@@ -229,7 +240,8 @@ def covariance_root(
         return np.full((count, count), np.nan)
     slopes = images.by_coefficient / scale[:, None]
     left, scores, states, noise = residual / scale, None, None, None
-    if isinstance(found.family, Terms):  # of many coordinates both would take too much
+    family = without_forces(found.family)
+    if isinstance(family, Terms):  # of many coordinates both would take too much
         if goes_on.any():
             first = images.by_state * scale
             second = np.broadcast_to(-np.diag(scale), first.shape)
@@ -237,7 +249,7 @@ def covariance_root(
                 slopes, left, first / scale[:, None], second / scale[:, None], goes_on
             )
             states = first, second, goes_on
-        degree = int(np.max(np.sum(found.family.powers, axis=1)))
+        degree = int(np.max(np.sum(family.powers, axis=1)))
         noise = unexplained(prepared, rows, residual, count, degree, states)
     return uncertainty.root(
         fit.triangle, count, slopes.reshape(-1, count), np.hypot(left, _NEAR_ROUNDOFF).ravel(),

@@ -81,7 +81,8 @@ def searched(
     dearest = law.candidate.operations if law is not None and met_by_law else np.inf
     found = search(sweeps, bound.bound, clock, say, tell, better, dearest)
     dearest /= DEARER  # of maps that would be chosen
-    if plain.varied:  # pairs of a law's flow are drawn, and factored out, at one dt
+    lossy = law is not None and bool(law.friction)
+    if plain.varied or lossy:  # pairs of H's flow are drawn, and factored out, at one dt
         pass
     elif law is not None and met_by_law and more_pairs_would_help(sweeps, found, bound, dearest):
         say("drawing pairs from the flow of H")

@@ -16,6 +16,7 @@ from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre, family_of, law_of
+from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.posterior import Posterior
@@ -70,10 +71,8 @@ def map_of_law(
 def law_of_map(map_: SymplecticMap) -> Lagrangian:
     """The law whose flow the map is. Raises ValueError for any other map."""
     piece = map_.pieces[0]
-    inner = getattr(piece, "family", None)
-    while hasattr(inner, "family"):
-        inner = inner.family
-    if len(map_.pieces) != 1 or not isinstance(inner, Legendre):
+    flow = len(map_.pieces) == 1 and isinstance(piece, Flow)
+    if not flow or not isinstance(without_forces(piece.family), Legendre):
         raise ValueError("expected the map of a Lagrangian")
     return law_of(piece.family, np.asarray(piece.params))
 

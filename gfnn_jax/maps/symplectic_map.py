@@ -308,10 +308,13 @@ class SymplecticMap:
         From 32 steps to either side of z (`maps.modified_hamiltonian`). The error is small where
         the orbit turns slowly against a step (Hénon–Heiles: 1e-12 at dt 0.4, 1e-8 at 0.8), and of
         the size of H̃ for a map that is near no flow. NaN where one of these steps fails. Raises
-        ValueError for a driven map, which keeps no energy.
+        ValueError for a driven map, and for one with friction, which keep no energy.
         """
         if self.parameters is not None and self.parameters.period is not None:
             raise ValueError("expected a map without a drive: a driven one keeps no energy")
+        multiplier = self.multiplier()
+        if not (isinstance(multiplier, float) and multiplier == 1.0):
+            raise ValueError("expected a map without friction: one with it keeps no energy")
         z = self._states(z)
         return _modified(self, z, self._args(args, z))
 
@@ -539,14 +542,15 @@ def _defect(map_, z, args, unrolled):
 @compiled_sooner
 @_or_one_state
 def _linearised(map_, z, args):
-    width, signals, given = z.shape[1], map_.signals, args
+    width, signals = z.shape[1], map_.signals
     count = 0 if signals is None else len(signals.names)
-    if count:
-        given = jnp.broadcast_to(args, (len(z), args.shape[-1]))
-        first = args.shape[-1] - (signals.degree + 1) * count
 
     def step(moved):
-        acting = given.at[:, first : first + count].add(moved[:, width:]) if count else given
+        acting = args
+        if signals is not None:  # the constant coefficients of the inputs come first of theirs
+            first = args.shape[-1] - (signals.degree + 1) * count
+            acting = jnp.broadcast_to(args, (len(z), args.shape[-1]))
+            acting = acting.at[:, first : first + count].add(moved[:, width:])
         return map_._apply(z + moved[:, :width], acting)[0]
 
     def along(unit):
