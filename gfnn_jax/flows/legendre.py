@@ -111,6 +111,8 @@ class Legendre:
     def parameter_gradients(self, params, w, args=None, along=None):
         """∂/∂θ of the gradient (..., 2d, P), or in the coefficients of a family ``along`` of other
         terms: ∂v/∂θ_j = −M⁻¹ ∂ℓ_j/∂v and −∂ℓ_j/∂q − L_qv ∂v/∂θ_j. NumPy."""
+        if along is not None and not isinstance(along, Legendre):
+            return along.term_gradients(w, args)
         q = split(w)[0]
         v, found = self._derivatives(params, w)
         terms = self.terms if along is None else along.terms

@@ -33,7 +33,7 @@ from gfnn_jax.learn.arcs import arcs_of
 from gfnn_jax.learn.candidates import Judges, OneStepError
 from gfnn_jax.learn.centrifugal import centrifugal_terms
 from gfnn_jax.learn.clock import Clock, Counted, OutOfTime
-from gfnn_jax.learn.friction import Forces, beside_friction, libraries_with
+from gfnn_jax.learn.friction import Forces, beside_friction, libraries_with, mechanical
 from gfnn_jax.learn.law_libraries import (
     angles_and_others,
     check_finite,
@@ -80,7 +80,7 @@ def learn_hamiltonian(
 
     Raises FitError where no library can be tried, OutOfTime where the budget ends before the first.
     """
-    asked, basis = options, modes_of(prepared, scene, terms)
+    basis = modes_of(prepared, scene, terms)
     if basis is not None and not terms:
         own = centrifugal_terms(prepared, judges.training, basis.terms(basis.box()))
         basis = modes_of(prepared, scene, own)
@@ -108,19 +108,18 @@ def learn_hamiltonian(
     else:  # a state of many sites is in the middle and far out at once
         outer = np.zeros(len(judges.training), bool)
     judges = dataclasses.replace(everywhere, training=everywhere.training[~outer])
-    if prepared.args is not None:
-        best = _walked(problem, prepared, judges, scene, terms, options, say)
-    elif basis is not None:
-        best = _grown(problem, basis, prepared, judges, searching, options, say)
-    else:
-        found = _searched(problem, prepared, judges, scene, terms, options, say)
-        if not terms and prepared.structure is None:
-            found = _beside_centrifugal(problem, found, prepared, judges, options, say)
-        best, options = found
-    best, options = beside_friction(
-        problem, (best, options), prepared, judges,
-        lambda forces: _searched(problem, prepared, judges, scene, terms, asked, say, forces),
-    )  # fmt: skip
+    with_masses = None if terms or scene is not None else mechanical(problem, prepared, judges)
+    best = with_masses
+    if best is None or not best.error.bound <= judges.tolerance.bound:
+        try:
+            best, options = _of_libraries(
+                problem, basis, prepared, judges, searching, scene, terms, options, say
+            )
+        except (OutOfTime, FitError):
+            if best is None:
+                raise
+        if with_masses is not None and with_masses.error.relative <= best.error.relative:
+            best = with_masses._replace(noisy=True)
     everyone = np.arange(len(prepared.y0))
     if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
         raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
@@ -154,6 +153,26 @@ def learn_hamiltonian(
     learned = learned_from(best, problem, prepared, everywhere, seconds, options, root)
     candidate = dataclasses.replace(learned.candidate, outside=outside)
     return dataclasses.replace(learned, candidate=candidate)
+
+
+def _of_libraries(
+    problem, basis: Modes | None, prepared, judges: Judges, clock: Clock, scene, terms,
+    options: Options, say,
+) -> tuple[FittedLaw, Options]:  # fmt: skip
+    """The best library of terms of H, without friction or with it, and the options for fewer."""
+
+    def search(forces: Forces | None = None) -> tuple[FittedLaw, Options]:
+        return _searched(problem, prepared, judges, scene, terms, options, say, forces)
+
+    if prepared.args is not None:
+        found = _walked(problem, prepared, judges, scene, terms, options, say), options
+    elif basis is not None:
+        found = _grown(problem, basis, prepared, judges, clock, options, say), options
+    else:
+        found = search()
+        if not terms and prepared.structure is None:
+            found = _beside_centrifugal(problem, found, prepared, judges, options, say)
+    return beside_friction(problem, found, prepared, judges, search)
 
 
 def _searched(

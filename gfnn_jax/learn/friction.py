@@ -22,8 +22,9 @@ from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.uniform import Uniform, without_forces
 from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.clock import OutOfTime
+from gfnn_jax.learn.lagrangians import lagrangian_of
 from gfnn_jax.learn.law_libraries import libraries_of, modes_of
-from gfnn_jax.learn.law_options import Options
+from gfnn_jax.learn.law_options import OPTIONS, Options
 from gfnn_jax.learn.learned_law import FittedLaw
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.phase_space import split
@@ -57,7 +58,7 @@ def beside_friction(
     for forces in (Uniform, linear_in_velocities)[: 1 if prepared.dim == 1 else 2]:
         try:
             found = search(forces)
-        except (OutOfTime, FitError):
+        except (OutOfTime, FitError, np.linalg.LinAlgError):
             continue
         law = found[0]
         met = law.error.bound <= bound
@@ -69,6 +70,24 @@ def beside_friction(
         if met:
             break
     return best
+
+
+def mechanical(problem: Problem, prepared: Prepared, judges: Judges) -> FittedLaw | None:
+    """The law of a Lagrangian, without friction or with it, as `beside_friction` would have it;
+    None where the pairs are of no such system."""
+    try:
+        alone = lagrangian_of(problem, prepared, judges)
+    except (OutOfTime, np.linalg.LinAlgError):
+        return None
+    if alone is None:
+        return None
+
+    def search(forces: Forces) -> Searched:
+        found = lagrangian_of(problem, prepared, judges, forces)
+        assert found is not None
+        return found, OPTIONS
+
+    return beside_friction(problem, (alone, OPTIONS), prepared, judges, search)[0]
 
 
 def libraries_with(

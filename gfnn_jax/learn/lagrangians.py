@@ -29,17 +29,13 @@ _POTENTIAL = 4  # degree of the powers of lengths in a potential
 _SINE = -np.pi / 2
 _ROWS_PER_TERM = 2.0
 _NULL = 1e-8  # of the largest singular value of the linear start
-_UNSEEN = 1e-9  # of the strongest term: what a start makes of a term that is not there
 
 
 def lagrangian_of(
     problem: Problem, prepared: Prepared, judges: Judges, forces: Callable[[Any], Any] | None = None
 ) -> FittedLaw | None:
-    """The law of all terms, with these forces, that the training pairs tell; None where the system
-    has no masses that depend on angles, or the pairs are too few.
-
-    Angles that are reduced enter by their modes.
-    """
+    """The law of all terms, with these forces, fitted to the training pairs; None where there are
+    not several degrees of freedom with an angle among them, or the pairs are too few."""
     coordinates, dim = prepared.coordinates, prepared.dim
     angles = tuple(a for a in coordinates.angles if a < dim)
     mechanical = coordinates.forward is CARTESIAN.forward and len(angles) == len(coordinates.angles)

@@ -9,6 +9,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.errors import FitError
+from gfnn_jax.families.family import LinearFamily
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.flow import Flow
@@ -138,6 +139,8 @@ def strongest(
     """The law's one, two … strongest terms, with coefficients fitted anew, as far as their flow
     explains most of the motion."""
     family, c = law.flow.family, np.asarray(law.flow.params)
+    if not isinstance(family, LinearFamily):  # of a Lagrangian: its terms are none of H
+        return []
     rows = judges.training[:TRIAL_PAIRS]
     slopes = family.term_gradients(plain.y0[rows]) * plain.scale[:, None]
     strength = np.abs(c) * np.sqrt(np.mean(np.sum(slopes**2, axis=1), axis=0))

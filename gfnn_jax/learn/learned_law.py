@@ -23,6 +23,7 @@ from gfnn_jax.fitting.gauss_newton import (
 )
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.learn.assemble import Assembled, composed, stepped
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
@@ -157,7 +158,7 @@ def learned_from(
         root = covariance_root(found, problem, prepared, steps, judges.pairs)
     return LearnedHamiltonian(
         with_error(candidate, error), flow, terms,
-        getattr(family, "prefix", "") + formula(terms),
+        getattr(without_forces(family), "prefix", "") + formula(terms),
         float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(error, omega_h, prepared, judges, found, left_out, int((~resolved).sum()))),
@@ -170,7 +171,8 @@ def learned_from(
 
 def _label(family) -> str:
     of_h = without_forces(family)
-    return f"H, {of_h.num_parameters} terms" + (", friction" if of_h is not family else "")
+    what = "L" if isinstance(of_h, Legendre) else "H"
+    return f"{what}, {of_h.num_parameters} terms" + (", friction" if of_h is not family else "")
 
 
 def held_out_error(family, fit: FlowFit, prepared, judges: Judges) -> OneStepError:
