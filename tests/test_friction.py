@@ -5,6 +5,7 @@ import pytest
 import scipy.integrate
 
 import gfnn_jax as gfnn
+from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
 
 
 def pairs_of(field, z, dt):
@@ -97,3 +98,39 @@ def test_a_system_that_keeps_its_energy_gets_no_friction(noise):
     fit = gfnn.fit(gfnn.Pairs(pairs.z0, image, 0.5), tolerance=1e-10, learn="hamiltonian")
     assert fit.hamiltonian.friction == ()
     assert fit.map.multiplier() == 1.0
+
+
+def double_pendulum(gamma, count=200, dt=0.2):
+    """Pairs of two equal rods, from the accelerations of their Lagrangian."""
+    z0 = np.random.default_rng(0).uniform(-1, 1, (count, 4)) * [1.5, 1.5, 0.7, 0.7]
+    none = (0, 0)
+    terms = Terms.of(
+        [((2, 0), none, none, 0.0), ((0, 2), none, none, 0.0), ((1, 1), none, (1, -1), 0.0),
+         (none, none, (1, 0), 0.0), (none, none, (0, 1), 0.0)], 2,
+    )  # fmt: skip
+    law = Lagrangian(
+        terms, np.array([1.0, 0.5, 1.0, 2.0, 1.0]), Friction.of([], 2), np.zeros(0), gamma,
+        np.zeros((2, 0)),
+    )  # fmt: skip
+
+    def field(_, y):
+        return np.concatenate([y[2:], law.acceleration(y[None, :2], y[None, 2:])[0]])
+
+    z1 = pairs_of(field, z0, dt).z1
+    both = (np.c_[z[:, :2], law.momentum(z[:, :2], z[:, 2:])] for z in (z0, z1))
+    return gfnn.Pairs(*both, dt)
+
+
+@pytest.mark.slow
+def test_a_double_pendulum_is_a_lagrangian_of_five_terms():
+    fit = gfnn.fit(
+        double_pendulum(0.01), tolerance=1e-10, angles=(0, 1), learn="hamiltonian",
+        max_seconds=None,
+    )  # fmt: skip
+    expected = {"v1²": 1, "v2²": 0.5, "v1 v2 cos(q1 - q2)": 1, "cos(q1)": 2, "cos(q2)": 1}
+    assert law_of(fit) == pytest.approx(expected, rel=1e-11)
+    assert fit.hamiltonian.friction[0].coefficient == pytest.approx(0.01, abs=1e-12)
+    assert fit.chosen.validation_relative < 1e-12
+    assert fit.symplecticity_defect < 1e-14
+    assert fit.formula is not None
+    assert fit.formula.startswith("Legendre transform of L = ")
