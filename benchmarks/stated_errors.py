@@ -21,7 +21,7 @@ from harness import TABLES, Numbers, between_markers, main, markdown, number, pr
 # isort: split
 import jax
 import numpy as np
-from posteriors.calibration import noisy, pendulum
+from posteriors.calibration import pendulum
 
 import gfnn_jax as gfnn
 from gfnn_jax.scenes import Scene
@@ -40,15 +40,26 @@ def fresh(system: str) -> gfnn.Pairs:
     return gfnn.sample_pairs(SYSTEMS[system](), FRESH, jax.random.key(SEED))
 
 
-def learned_from(scene: Scene, size: int, in_sequences: bool, seed: int) -> gfnn.Pairs:
+def noise_of(system: str) -> np.ndarray:
+    """Standard deviation (2d,) of the noise: that of the sensor, whatever the data set."""
+    return SIGMA * np.std(np.asarray(fresh(system).z0), axis=0)
+
+
+def noisy(pairs: gfnn.Pairs, noise: np.ndarray, seed: int) -> gfnn.Pairs:
+    """The pairs with noise on both states."""
+    rng = np.random.default_rng(seed)
+    z0, z1 = (np.asarray(z) + noise * rng.normal(size=z.shape) for z in (pairs.z0, pairs.z1))
+    return gfnn.Pairs(z0, z1, pairs.dt)
+
+
+def learned_from(system: str, scene: Scene, size: int, in_sequences: bool, seed: int) -> gfnn.Pairs:
     """Noisy pairs, single ones or those of sequences, whose states have one noise each."""
-    key = jax.random.key(seed)
+    key, noise = jax.random.key(seed), noise_of(system)
     if not in_sequences:
-        return noisy(gfnn.sample_pairs(scene, size, key), SIGMA, seed)
+        return noisy(gfnn.sample_pairs(scene, size, key), noise, seed)
     states = sample_sequences(scene, size // LENGTH, LENGTH + 1, key)
     rng, width = np.random.default_rng(seed), states.shape[-1]
-    spread = np.std(states.reshape(-1, width), axis=0)
-    states = np.asarray(states) + SIGMA * spread * rng.normal(size=states.shape)
+    states = np.asarray(states) + noise * rng.normal(size=states.shape)
     run = np.repeat(np.arange(len(states)), LENGTH)
     z0, z1 = states[:, :-1].reshape(-1, width), states[:, 1:].reshape(-1, width)
     return gfnn.Pairs(z0, z1, scene.dt, run=run)
@@ -58,12 +69,12 @@ def row(system: str, size: int, in_sequences: bool, quick: bool) -> Numbers:
     """Bounds and true errors of fits to independent data sets."""
     scene, found = SYSTEMS[system](), []
     for seed in range(SEED + size, SEED + size + (2 if quick else FITS)):
-        pairs = learned_from(scene, size, in_sequences, seed)
+        pairs = learned_from(system, scene, size, in_sequences, seed)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", gfnn.FitWarning)  # kept in fit.messages
             # The angle is not named: its states stay within half a turn.
             fit = gfnn.fit(pairs, tolerance=1e-2, max_seconds=None, seed=seed)
-        judged = noisy(fresh(system), SIGMA, seed + 1)
+        judged = noisy(fresh(system), noise_of(system), seed + 1)
         error = np.asarray(fit.map.step(judged.z0)[0]) - np.asarray(judged.z1)
         truth = float(np.sqrt(np.mean((error / np.std(pairs.z0, axis=0)) ** 2)))
         found.append({

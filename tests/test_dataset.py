@@ -68,10 +68,10 @@ def test_a_periodic_orbit_is_a_chain_too():
     ("given", "message"),
     [
         ({"run": np.zeros(3)}, r"expected run as numbers or text of shape \(23,\), got float64"),
-        ({"place": PLACES}, "expected the run of each pair beside its place, got none"),
+        ({"place": PLACES}, "expected run as well as place"),
         ({"run": LABELS, "place": PLACES + 0.5}, "expected place as integers"),
-        ({"std": [1e-3]}, r"expected std of shape \(2,\) or \(23, 2\), got \(1,\)"),
-        ({"std": [1e-3, 0.0]}, "expected std that is finite and above 0"),
+        ({"std": [1e-3]}, r"expected std of shape \(2,\), one of each coordinate, got \(1,\)"),
+        ({"std": [1e-3, 0.0]}, "expected every std finite and above 0"),
     ],
 )
 def test_identities_and_noise_that_are_none(given, message):
@@ -99,7 +99,7 @@ def test_a_permuted_fit_is_the_same_fit():
 
 
 def continued(sample):
-    """How many of the sample's rows go on with the next one."""
+    """Number of rows of the sample whose image is the next row's state."""
     return int(np.sum(steps_between(identified(sample.pairs()).pairs) == 1))
 
 
@@ -236,3 +236,19 @@ def test_the_stated_error_is_of_pairs_that_chose_nothing():
         error = (np.asarray(one.map.step(fresh)[0]) - image) / np.std(z, axis=0)
         assert 0.5 < one.chosen.validation_relative / np.sqrt(np.mean(error**2)) < 2
         assert one.chosen.validation_bound > one.chosen.validation_relative
+
+
+def test_noise_that_was_given_is_told_from_what_a_map_cannot_represent():
+    rng = np.random.default_rng(0)
+    z = rng.uniform(-1, 1, (400, 2))
+    c, s = np.cos(0.3), np.sin(0.3)
+    image = z @ np.array([[c, -s], [s, c]]) + 1e-3 * rng.normal(size=z.shape)
+    said = {}
+    for std in (1e-3, 1e-4):
+        pairs = gfnn.Pairs(z, image, 0.3, std=[std, std])
+        with pytest.warns(gfnn.FitWarning):
+            fit = gfnn.fit(pairs, tolerance=1e-6, learn="map", chart="midpoint")
+        np.testing.assert_array_equal(fit.noise, std)
+        said[std] = " ".join(fit.messages)
+    assert "what is left over is the noise that was given" in said[1e-3]
+    assert "std is too small" in said[1e-4]

@@ -16,7 +16,7 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 ORDER = (
     "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes",
     "storage", "scenes", "families", "solve", "generating", "flows", "maps", "exports", "data",
-    "dataset", "fitting", "learn", "baselines", "evaluate", "jobs", "cli", "__main__",
+    "dataset", "fitting", "models", "learn", "baselines", "evaluate", "jobs", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {
@@ -44,7 +44,7 @@ def modules():
 
 
 def imports(tree):
-    """Every module that is imported anywhere in the file, in functions too."""
+    """List all modules that a file imports, also inside functions."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

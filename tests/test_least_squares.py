@@ -188,7 +188,7 @@ def test_fewer_rows_than_terms():
 
 
 class Twice(Monomials):
-    """Every term given twice: the copies cannot be told apart, and need not be."""
+    """Family with every term twice: the data do not determine the copies apart."""
 
     @property
     def num_parameters(self):

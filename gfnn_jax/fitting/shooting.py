@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import nearest_image
+from gfnn_jax.dataset.noise import of_residuals
 from gfnn_jax.fitting.triangle import Spectrum, Triangle, eliminated
 from gfnn_jax.flows.collocation import Steps, images
 
@@ -53,7 +54,6 @@ class Options:
 
 
 OPTIONS = Options()
-_NORMAL = 1.4826  # a normal deviation over the median of its size
 
 
 class Arcs(NamedTuple):
@@ -199,14 +199,8 @@ class Shooting:
     def _deviations(self, residual) -> np.ndarray:
         """(2d,) of the noise, from the residuals that are no gross errors."""
         known = residual[self.arcs.measured]
-        middle = _NORMAL * np.median(np.abs(known), axis=0)
-        inside = np.abs(known) <= self.options.outlying * middle
-        width = known.shape[1]
-        free = 1.0 - len(residual) * width / known.size
-        square = np.sum(np.where(inside, known, 0.0) ** 2, axis=0) / np.maximum(
-            inside.sum(axis=0), 1
-        )
-        return np.hypot(np.sqrt(square / max(free, 0.5 / width)), self.least)
+        free = max(1.0 - residual[:, 0].size / known.size, 0.5 / known.shape[1])
+        return np.hypot(of_residuals(known, free, self.options.outlying), self.least)
 
     def _weights(self, residual, noise, block=slice(None)) -> np.ndarray:
         size = np.minimum(np.abs(residual) / (self.options.biweight * noise), 1.0)
@@ -228,15 +222,13 @@ class Shooting:
             block = slice(first, first + size)
             by_state, by_c, residual = self._along(family, c, x[block], block)
             weight = np.sqrt(self._weights(residual, noise, block)) / noise
-            rest = np.concatenate([by_c, residual[..., None]], axis=-1)
-            own, rest = weight[..., None] * by_state, weight[..., None] * rest
-            rows = residual.shape[1] * width
-            rest = rest.reshape(-1, rows, count + 1)
-            t, inside, rest = eliminated(own.reshape(-1, rows, width), rest)
+            rows = np.concatenate([by_state, by_c, residual[..., None]], axis=-1)
+            rows = (weight[..., None] * rows).reshape(len(residual), length * width, -1)
+            own, inside, rest = eliminated(rows, width)
             triangle = triangle.append(rest.reshape(-1, count + 1))
-            parts.append((t, inside, rest[..., :-1].swapaxes(1, 2) @ rest[..., -1:]))
-        t, inside, scores = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return _Arrow(triangle, t, inside, scores[..., 0])
+            parts.append((own, inside, rest[..., :-1].swapaxes(1, 2) @ rest[..., -1:]))
+        own, inside, scores = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return _Arrow(triangle, own, inside, scores[..., 0])
 
     def _along(self, family, c, x, block) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """∂z_k/∂x, ∂z_k/∂c and the residuals along the arcs from x (b, 2d)."""

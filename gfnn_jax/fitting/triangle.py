@@ -64,13 +64,8 @@ class Triangle:
         return cls(factor, rows)
 
     @property
-    def terms(self) -> int:
-        """The number of columns of A."""
-        return self.factor.shape[1] - 1
-
-    @property
     def finite(self) -> bool:
-        """Whether every row was finite."""
+        """True where every row was finite."""
         return bool(np.isfinite(self.factor).all())
 
     # Rows.
@@ -151,8 +146,10 @@ class Triangle:
 
         Raises numpy.linalg.LinAlgError where an entry of A is not finite.
         """
-        a, b = self.leading(size) if size is not None else (self.factor[:, :-1], self.factor[:, -1])
-        return Spectrum.of(a, b, _EPS * len(self.factor))
+        cutoff = _EPS * len(self.factor)
+        if size is None:
+            return Spectrum.of(self.factor[:, :-1], self.factor[:, -1], 0.0, cutoff)
+        return Spectrum.of(*self.leading(size), self.residual_norm(size), cutoff)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -161,7 +158,7 @@ class Spectrum:
 
     Every solution is c = D⁻¹ V f Uᵀt, with f (n,) the *filters* of the singular values: their
     reciprocals, or s / (s² + (λ s₀)²) of the ridge λ, which minimise ‖A c − b‖² + (λ s₀)² ‖D c‖².
-    column: D (n,). vt: Vᵀ (n, n). b: t (n,). cutoff: up to which s is rounding.
+    column: D (n,). vt: Vᵀ (n, n). b: t (n,). rest: ρ. cutoff: up to which s is rounding.
     """
 
     column: np.ndarray
@@ -169,15 +166,16 @@ class Spectrum:
     s: np.ndarray
     vt: np.ndarray
     b: np.ndarray
+    rest: float
     cutoff: float
 
     @classmethod
-    def of(cls, a: np.ndarray, b: np.ndarray, cutoff: float) -> Spectrum:
-        """cutoff: relative to the largest singular value."""
+    def of(cls, a: np.ndarray, b: np.ndarray, rest: float, cutoff: float) -> Spectrum:
+        """T, t and ρ. cutoff: relative to the largest singular value."""
         column = np.linalg.norm(a, axis=0)
         column = np.where(column > 0, column, 1.0)
         u, s, vt = np.linalg.svd(a / column, full_matrices=False)
-        return cls(column, u, s, vt, b, float(cutoff * s[0]))
+        return cls(column, u, s, vt, b, rest, float(cutoff * s[0]))
 
     @cached_property
     def known(self) -> np.ndarray:
@@ -201,9 +199,9 @@ class Spectrum:
 
     @property
     def residual_norm(self) -> float:
-        """‖A c − b‖ of the solution along the directions that are known."""
+        """‖A c − b‖ of the plain solution, to half of the digits of ‖b‖."""
         told = np.sum(self.along[self.known] ** 2)
-        return float(np.sqrt(max(np.sum(self.b**2) - told, 0.0)))
+        return float(np.sqrt(max(np.sum(self.b**2) - told, 0.0) + self.rest**2))
 
     @cached_property
     def inverse(self) -> np.ndarray:
@@ -241,20 +239,16 @@ class Spectrum:
         return np.where(self.known, 1.0 / square, 0.0)
 
 
-def eliminated(
-    own: np.ndarray, rest: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """(T, S, rest'): the unknowns x that these rows alone have, eliminated from ‖X x + Y c − b‖.
+def eliminated(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(T, S, rest) of rows of [X Y b] (..., N, k + n + 1), X those of k = ``count`` unknowns x that
+    no other rows have, for any number of blocks at once. By the QR of each block,
 
-    own: X (..., N, k), rest: [Y b] (..., N, n + 1), for any number of blocks at once. With X = Q T,
+        min over x  is  ‖rest (c, −1)‖,        T x = −S (c, −1):
 
-        min over x  is  ‖rest' (c, −1)‖,        rest' = (1 − QQᵀ) rest,        T x = −S (c, −1),
-
-    S = Qᵀ rest: rest' (..., N, n + 1) are rows for the triangle of c, and x follows from c.
+    rest (..., M, n + 1) are the rows of c alone, and x follows from c. N is at least k.
     """
-    q, t = np.linalg.qr(own)
-    inside = q.swapaxes(-1, -2) @ rest
-    return t, inside, rest - q @ inside
+    r = np.asarray(np.linalg.qr(rows, mode="r"))
+    return r[..., :count, :count], r[..., :count, count:], r[..., count:, count:]
 
 
 def folded(factor: np.ndarray, rows: np.ndarray, *, triangular: bool = False) -> np.ndarray:

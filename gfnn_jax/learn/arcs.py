@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.dataset.noise import of_differences
 from gfnn_jax.dataset.runs import steps_between
 from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.prepare import Prepared
@@ -60,7 +61,8 @@ def arcs_of(prepared: Prepared, judges: Judges, options: Options = OPTIONS) -> A
         return None
     moved = (prepared.y1 - prepared.y0) / prepared.scale
     displacement = float(np.sqrt(np.mean(moved**2)))
-    noise = _noise(moved, starts, lengths, options)
+    runs = [moved[first : first + count] for first, count in zip(starts, lengths, strict=True)]
+    noise = of_differences(runs, options.order, options.alike)
     if noise is None or displacement > options.short:
         return None
     wanted = int(np.ceil(options.quiet * np.sqrt(2) * noise / displacement))
@@ -74,27 +76,6 @@ def _runs(pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
     """First row and number of rows of each stretch of a run without a gap."""
     starts = np.flatnonzero(np.append(True, steps_between(pairs) != 1))
     return starts, np.diff(np.append(starts, len(pairs)))
-
-
-def _noise(moved, starts, lengths, options: Options) -> float | None:
-    """Standard deviation of the noise, in units of the sizes, by differences of the states along
-    sequences: a high one leaves nothing of a smooth orbit, and √C(2n, n) times the noise. None
-    where two orders disagree."""
-    found = []
-    for order in (options.order - 1, options.order):
-        differences = [
-            np.diff(moved[first : first + count], order - 1, axis=0)
-            for first, count in zip(starts, lengths, strict=True) if count > order
-        ]  # fmt: skip
-        size = np.sqrt(np.mean(np.concatenate(differences) ** 2))
-        found.append(float(size / np.sqrt(_central(order))))
-    low, high = min(found), max(found)
-    return found[-1] if 0 < high <= options.alike * low else None
-
-
-def _central(n: int) -> float:
-    """C(2n, n)."""
-    return float(np.prod([(n + i) / i for i in range(1, n + 1)]))
 
 
 def _strided(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -18,33 +19,35 @@ import jax
 import numpy as np
 
 from gfnn_jax.dataset.runs import identified
-from gfnn_jax.errors import FitError, FitWarning
+from gfnn_jax.errors import FitError, FitWarning, OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.assemble import block_of
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance
 from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.clean import clean
-from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.clock import COMPILE, ROWS, Budget
 from gfnn_jax.learn.conclude import conclude
-from gfnn_jax.learn.diagnose import ChartJudgement
+from gfnn_jax.learn.diagnose import ChartJudgement, looked_for_errors
 from gfnn_jax.learn.diagnosed import diagnose_request
 from gfnn_jax.learn.draw import NUM_PAIRS, drawn
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.noisy_sweeps import without_bias
-from gfnn_jax.learn.posterior import with_posterior
+from gfnn_jax.learn.posterior import with_posterior, work_of_posterior
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.learn.stated import stated
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.model import Model
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
 
 MAX_SECONDS = 120.0
 
+_OF_DERIVATIVE = 3.0  # times a step's: the time that compiling its derivative takes
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken
 
 
@@ -64,7 +67,9 @@ class Fit:
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
     scene: as given. stated_by: the pairs by which the chosen candidate's error was measured.
     validation_pairs, test_pairs: that chose, and that stated the error; None where the pairs were
-    too few for these.
+    too few for these. operations: of the search, as counted; as ``max_operations`` they give this
+    map again, whatever the clock. budget: what is left of it. tells_defect: whether there is
+    time in it to compile the derivative of a step.
     """
 
     map: SymplecticMap
@@ -88,6 +93,9 @@ class Fit:
     scene: Scene | None = None
     stated_by: str = ""
     test_pairs: Pairs | None = None
+    operations: int = 0
+    budget: Budget = dataclasses.field(default_factory=Budget, repr=False)
+    tells_defect: bool = True
 
     def __repr__(self) -> str:
         """One line: the chosen map, its error and the tolerance."""
@@ -137,6 +145,38 @@ class Fit:
             tolerance=self.relative_tolerance if tolerance is None else tolerance,
         )  # fmt: skip
 
+    def settled(self) -> Fit:
+        """With what a report and a saved model hold beside the map, as far as the budget goes: the
+        posterior, which is left out of the map where it does not fit, and the defect of a step.
+        Warns (FitWarning) of what is left out."""
+        told, map_, tells = len(self.budget.left_out), self.map, True
+        if map_.posterior is not None and not map_.posterior.known:
+            work = work_of_posterior(self.chosen.num_parameters)
+            try:
+                with self.budget.last("the posterior, which bands are drawn from", ROWS, work):
+                    _ = map_.posterior.root
+            except OutOfTime:
+                map_ = dataclasses.replace(map_, posterior=None)
+        try:
+            seconds = _OF_DERIVATIVE * self.budget.compiling
+            with self.budget.last("the symplecticity defect of a step", COMPILE, seconds):
+                defect = self.symplecticity_defect
+        except OutOfTime:
+            tells, defect = False, float("nan")
+        messages = self.budget.left_out[told:]
+        for message in messages:
+            warnings.warn(message, FitWarning, stacklevel=2)
+        candidates = tuple(
+            dataclasses.replace(c, map=map_) if c.chosen else c for c in self.candidates
+        )
+        found = dataclasses.replace(
+            self, map=map_, candidates=candidates, messages=(*self.messages, *messages),
+            tells_defect=tells, seconds=self.budget.seconds,
+        )  # fmt: skip
+        if tells:
+            found.__dict__["symplecticity_defect"] = defect
+        return found
+
     def sample(self, key, num: int):
         """``num`` maps drawn from the posterior of the chosen map's coefficients, as one pytree,
         each exactly symplectic: `maps.samples.Samples`. key: of ``jax.random``.
@@ -145,6 +185,13 @@ class Fit:
         drawn from a law.
         """
         return self.map.sample(key, num)
+
+    @property
+    def max_operations(self) -> int:
+        """A bound on operations that gives this map again: the one that was asked for, or those
+        that were done."""
+        asked = self.budget.max_operations
+        return self.operations if asked is None else asked
 
     @property
     def relative_tolerance(self) -> float:
@@ -207,12 +254,15 @@ def fit(
     terms: Sequence[str | Callable] = (),
     base: str | Callable | None = None,
     structure: str | None = None,
-    family: str = "auto",
+    family: Any = "auto",
+    model: Model | None = None,
     chart: str = "auto",
     ensemble: int = 1,
     angles: tuple[int, ...] = (),
     seed: int = 0,
     max_seconds: float | None = MAX_SECONDS,
+    max_operations: int | None = None,
+    clock: Callable[[], float] = time.perf_counter,
     max_iterations: int = 250,
     devices: int | str | None = None,
     checkpoints: Any = None,
@@ -243,13 +293,20 @@ def fit(
                species; of sites, S where learn is "map" or no H meets the tolerance.
                None: the scene's own.
     family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp";
-               with learn="hamiltonian" H is a sum of terms, or a network with "mlp".
+               with learn="hamiltonian" H is a sum of terms, or a network with "mlp". Or a family
+               of one's own that is linear in its parameters, or a function of `Inputs` that gives
+               such families by rising number of terms (`families.own`).
+    model:     a model of one's own (`models.model.Model`), which is then all that is learned.
     chart:     "auto" or one of type1, type2, type3, midpoint.
     ensemble:  so many networks trained together, of which the map is the mean and their spread the
                posterior; with family="mlp".
     angles:    without a scene, the indices of z that have period 2π.
     max_seconds: for all of it; the search ends with the best map so far while there is time to
-               compile its step. None: no budget.
+               compile its step. None: no budget, and the same map on a busy machine and an idle
+               one.
+    max_operations: of the search, as counted: what a fit reports as ``operations`` gives its map
+               again, whatever the clock has ended. None: no bound.
+    clock:     gives the seconds that max_seconds is held against.
     max_iterations: of the training of "mlp".
     devices:   of this process, among which the rows of the least-squares and Gauss–Newton problems,
                the steps of held-out pairs and the networks of an ensemble are shared out: "all" or
@@ -265,7 +322,8 @@ def fit(
     meets the tolerance, where a chart is close to singular, where pairs contradict their neighbours
     (a few are left out), and where the pairs do not look symplectic.
     """
-    clock = Clock(max_seconds, pairs.dim if isinstance(pairs, Pairs) else None)
+    dim = pairs.dim if isinstance(pairs, Pairs) else None
+    budget = Budget(max_seconds, max_operations, clock, dim)
     require_x64("a fit")
     messages: list[str] = []
 
@@ -276,8 +334,8 @@ def fit(
 
     request = checked(
         pairs, scene, tolerance=tolerance, absolute_tolerance=absolute_tolerance, learn=learn,
-        terms=terms, base=base, structure=structure, family=family, chart=chart,
-        ensemble=ensemble, angles=angles, seed=seed, clock=clock, max_iterations=max_iterations,
+        terms=terms, base=base, structure=structure, family=family, model=model, chart=chart,
+        ensemble=ensemble, angles=angles, seed=seed, budget=budget, max_iterations=max_iterations,
         checkpoints=checkpoints, factors=factors, say=on_progress, tell=on_candidate,
     )  # fmt: skip
     warn(request.messages)
@@ -287,6 +345,12 @@ def fit(
             *identified(request.pairs), request.coordinates, request.structure
         )
         warn(about_pairs)
+        looked_at = len(looked_for_errors(len(request.pairs)))
+        if looked_at < len(request.pairs):
+            budget.leave_out(
+                f"a look for gross errors at all but {looked_at:,} of {len(request.pairs):,} pairs",
+                "those that the map misses by far are found in the end",
+            )
         seen = diagnose_request(request, plain)
         warn(seen.messages)
         judges = Judges.of(pairs, seed, request.tolerance)
@@ -316,7 +380,7 @@ def fit(
         noise=conclusion.noise,
         messages=tuple(messages),
         ended=conclusion.ended,
-        seconds=clock.seconds,
+        seconds=budget.seconds,
         compile_seconds=chosen.compile_seconds,
         test_states=np.asarray(test.z0),
         test_args=test.args,
@@ -325,6 +389,8 @@ def fit(
         scene=scene,
         stated_by=error.words,
         test_pairs=pairs.take(found.judges.test) if len(found.judges.test) else None,
+        operations=budget.operations,
+        budget=budget,
     )
 
 

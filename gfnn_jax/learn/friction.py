@@ -15,16 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.errors import FitError
+from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.lagrangian import LINEAR, Friction
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.uniform import Uniform, without_forces
 from gfnn_jax.learn.candidates import Judges
-from gfnn_jax.learn.clock import OutOfTime
 from gfnn_jax.learn.lagrangians import lagrangian_of
 from gfnn_jax.learn.law_libraries import libraries_of, modes_of
 from gfnn_jax.learn.law_options import OPTIONS, Options
+from gfnn_jax.learn.law_work import LawWork
 from gfnn_jax.learn.learned_law import FittedLaw
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.phase_space import split
@@ -46,19 +46,30 @@ def linear_in_velocities(family) -> Forced:
 
 
 def beside_friction(
-    problem: Problem, before: Searched, prepared: Prepared, judges: Judges,
+    problem: Problem, work: LawWork, before: Searched, prepared: Prepared, judges: Judges,
     search: Callable[[Forces], Searched],
 ) -> Searched:  # fmt: skip
     """The best that ``search`` finds with friction, where H alone, ``before``, misses the tolerance
     and friction is certain and worth it; else ``before``."""
     best, bound, rows = before, judges.tolerance.bound, judges.training[:_LOOKED_AT]
     simple = prepared.args is None and prepared.structure is None
-    if not simple or best[0].error.bound <= bound or not _explains(problem, best[0], rows):
+    if not simple or best[0].error.bound <= bound:
+        return before
+    work.capped(before[1].max_operations)
+    try:
+        with work.again("whether friction explains anything", best[0].family, len(rows)):
+            if not _explains(problem, best[0], rows):
+                return before
+    except OutOfTime:
+        work.budget.leave_out("H with friction", work.ended)
         return before
     for forces in (Uniform, linear_in_velocities)[: 1 if prepared.dim == 1 else 2]:
         try:
             found = search(forces)
-        except (OutOfTime, FitError, np.linalg.LinAlgError):
+        except OutOfTime:
+            work.budget.leave_out("H with friction", work.ended)
+            break
+        except (FitError, np.linalg.LinAlgError):
             continue
         law = found[0]
         met = law.error.bound <= bound
@@ -72,22 +83,27 @@ def beside_friction(
     return best
 
 
-def mechanical(problem: Problem, prepared: Prepared, judges: Judges) -> FittedLaw | None:
+def mechanical(
+    problem: Problem, work: LawWork, prepared: Prepared, judges: Judges
+) -> FittedLaw | None:
     """The law of a Lagrangian, without friction or with it, as `beside_friction` would have it;
     None where the pairs are of no such system."""
     try:
-        alone = lagrangian_of(problem, prepared, judges)
-    except (OutOfTime, np.linalg.LinAlgError):
+        alone = lagrangian_of(problem, work, prepared, judges)
+    except OutOfTime:
+        work.budget.leave_out("the Lagrangian", work.ended)
+        return None
+    except np.linalg.LinAlgError:
         return None
     if alone is None:
         return None
 
     def search(forces: Forces) -> Searched:
-        found = lagrangian_of(problem, prepared, judges, forces)
+        found = lagrangian_of(problem, work, prepared, judges, forces)
         assert found is not None
         return found, OPTIONS
 
-    return beside_friction(problem, (alone, OPTIONS), prepared, judges, search)[0]
+    return beside_friction(problem, work, (alone, OPTIONS), prepared, judges, search)[0]
 
 
 def libraries_with(

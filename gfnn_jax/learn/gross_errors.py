@@ -59,7 +59,7 @@ def without_gross_errors(
         if size is None:
             break
         rows = _standing_alone(found.plain, size)
-        if not len(rows) or gone + len(rows) > _MOST * count or request.clock.left <= 0:
+        if not len(rows) or gone + len(rows) > _MOST * count or request.budget.over:
             break
         others = np.setdiff1d(np.arange(len(size)), rows)
         if not _rms(size) > _SPOILT * _rms(size[others]):

@@ -20,6 +20,7 @@ from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.learn.candidates import Judges
+from gfnn_jax.learn.law_work import LawWork
 from gfnn_jax.learn.learned_law import FittedLaw, held_out_error
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.phase_space import split
@@ -32,8 +33,9 @@ _NULL = 1e-8  # of the largest singular value of the linear start
 
 
 def lagrangian_of(
-    problem: Problem, prepared: Prepared, judges: Judges, forces: Callable[[Any], Any] | None = None
-) -> FittedLaw | None:
+    problem: Problem, work: LawWork, prepared: Prepared, judges: Judges,
+    forces: Callable[[Any], Any] | None = None,
+) -> FittedLaw | None:  # fmt: skip
     """The law of all terms, with these forces, fitted to the training pairs; None where there are
     not several degrees of freedom with an angle among them, or the pairs are too few."""
     coordinates, dim = prepared.coordinates, prepared.dim
@@ -48,7 +50,7 @@ def lagrangian_of(
     if forces is not None:
         family = forces(family)
         start = np.concatenate([start, np.zeros(family.num_parameters - len(start))])
-    with np.errstate(all="ignore"):
+    with work.library(family.label, family, len(rows)), np.errstate(all="ignore"):
         fit = problem.fit(family, start, rows)
     return FittedLaw(family, fit, rows, held_out_error(family, fit, prepared, judges), ())
 

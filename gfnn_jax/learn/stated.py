@@ -13,16 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
-from gfnn_jax.fitting import least_squares
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.learn.assemble import stepped
-from gfnn_jax.learn.candidates import Candidate, refined_images, with_error
+from gfnn_jax.learn.candidates import Candidate, with_error
 from gfnn_jax.learn.choose import Chosen
-from gfnn_jax.learn.rows import rows_of
+from gfnn_jax.learn.network_sweep import NetworkSweep
 from gfnn_jax.learn.search import Entry
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.learn.sweeps import LinearSweep
 
 _FOLDS = 5
 
@@ -88,31 +86,18 @@ def _predictor(chosen: Chosen, found: Searched) -> Predicts | None:
     """Fits the chosen model to all pairs but some, and predicts these; None where that is not
     known how."""
     entry, law = chosen.entry, found.law
-    if entry is not None and isinstance(entry.sweep, LinearSweep):
-        return _linear(entry) if entry.sweep.judges.pairs is found.judges.pairs else None
+    if entry is not None:
+        return _of_entry(entry) if entry.sweep.judges.pairs is found.judges.pairs else None
     flow = law is not None and chosen.candidate.learns == "hamiltonian" and law.terms
     return _of_law(found) if flow else None
 
 
-def _linear(entry: Entry) -> Predicts:
-    sweep, size = entry.sweep, entry.size
-    prepared, judges = sweep.prepared, sweep.judges
-    everyone = np.concatenate([judges.training, judges.held_out])
-
-    def predicts(rows: np.ndarray) -> np.ndarray:
-        others = np.setdiff1d(everyone, rows)
-        data, weight = rows_of(prepared, sweep.chart, others)
-        train = least_squares.reduce(sweep.in_rows(size.family), [data], weight)
-        held = least_squares.reduce(
-            sweep.in_rows(size.family), [rows_of(prepared, sweep.chart, judges.held_out)[0]], weight
-        )
-        solved = least_squares.solve(train, held, size.family.num_parameters)
-        params = size.family.unflatten(solved.coefficients)
-        images, known = refined_images(prepared, sweep.chart, size.family, params, rows)
-        images = prepared.whole_image(np.where(known[:, None], images, np.nan))
-        return to_user(prepared.coordinates, images)
-
-    return predicts
+def _of_entry(entry: Entry) -> Predicts | None:
+    sweep = entry.sweep
+    if isinstance(sweep, NetworkSweep):  # each would be trained as long as the first
+        return None
+    everyone = np.concatenate([sweep.judges.training, sweep.judges.held_out])
+    return lambda rows: sweep.predicted(entry.size, np.setdiff1d(everyone, rows), rows)
 
 
 def _of_law(found: Searched) -> Predicts:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.noise import robust
 from gfnn_jax.dataset.runs import steps_between
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem, significant
 from gfnn_jax.fitting.shooting import OPTIONS, Shooting, Shot, arcs_of, longest_arc
@@ -21,7 +22,6 @@ _RISE = 1.01  # of the held-out arcs' noise, by chance
 # fitted to these too: what judges it then is off by less than 1 / 200 of the noise's variance.
 _ROWS_PER_TERM = 200
 _STATES = 100  # from which the noise and its growth along an arc are measured
-_NORMAL = 1.4826  # a normal deviation over the median of its size
 _STEP_ERROR = 0.01  # of a step's own error ÷ the noise
 
 
@@ -51,7 +51,7 @@ def fitted_to_sequences(
         return None
     c = fit.coefficients
     some = judges.training[:_STATES]
-    rms = _NORMAL * float(np.median(np.abs(problem.residuals(family, c, fit.steps, some))))
+    rms = float(robust(problem.residuals(family, c, fit.steps, some)))
     if not 0 < rms < np.inf:
         return None
     resolved = _STEP_ERROR * rms
