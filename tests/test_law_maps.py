@@ -52,7 +52,7 @@ def forecast(z, input_at):
 @pytest.mark.parametrize(
     ("hold", "input_at"),
     [
-        ("hold", lambda t: U[int(t / DT + 1e-6), 0]),
+        pytest.param("hold", lambda t: U[int(t / DT + 1e-6), 0], marks=pytest.mark.slow),
         ("linear", lambda t: np.interp(t, TIMES, U[:, 0])),
     ],
 )
@@ -158,6 +158,7 @@ def test_signals_that_are_not_the_laws():
         Signals(("u",), "cubic")
 
 
+@pytest.mark.slow
 def test_a_forecast_across_a_stop():
     """A block on a spring, held by dry friction: half turns about ±μ until it sticks (exact)."""
     friction, dt, count = 0.05, 0.1, 300
