@@ -225,7 +225,7 @@ def _encode(value: Any) -> tuple[Any, Any]:
         text = {"name": value.name, "angles": list(value.angles), "cyclic": list(value.cyclic)}
         change = None if value.forward is CARTESIAN.forward else _OF_SCENE
         return {"type": "Coordinates", **text, "change": change}, None
-    if type(value) in _NAMES:
+    if type(value) in _TYPES.values():
         items = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
         if items.get("features") is not None:
             items["features"] = _OF_SCENE  # _lender has found whose they are
