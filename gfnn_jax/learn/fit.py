@@ -26,6 +26,7 @@ from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.clean import clean
 from gfnn_jax.learn.clock import Clock
 from gfnn_jax.learn.conclude import conclude
+from gfnn_jax.learn.damping import LearnedDamping
 from gfnn_jax.learn.diagnose import ChartJudgement
 from gfnn_jax.learn.diagnosed import diagnose_request
 from gfnn_jax.learn.draw import NUM_PAIRS, drawn
@@ -61,7 +62,7 @@ class Fit:
     test_states: (n, 2d) held-out states, test_args their parameters. model_determinant_min: the
     chosen chart's determinant there, where it is closest to 0; NaN for a flow, which has no chart.
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
-    scene: as given.
+    scene: as given. damping: of a map that loses area, by how much of it in a step.
     """
 
     map: SymplecticMap
@@ -82,6 +83,7 @@ class Fit:
     hamiltonian: LearnedHamiltonian | None = None
     pairs: Pairs | None = None
     scene: Scene | None = None
+    damping: LearnedDamping | None = None
 
     def __repr__(self) -> str:
         """One line: the chosen map, its error and the tolerance."""
@@ -277,8 +279,12 @@ def fit(
     with row_blocks.on_devices(_devices(devices)):
         pairs, plain, about_pairs = clean(request.pairs, request.coordinates, request.structure)
         warn(about_pairs)
-        seen = diagnose_request(request, plain)
+        seen = diagnose_request(request, plain, pairs)
         warn(seen.messages)
+        damping, plain = seen.damping, seen.plain
+        if damping is not None:  # H of an autonomous system keeps areas
+            on_progress(str(damping))
+            request = dataclasses.replace(request, learn="map")
         judges = Judges(pairs, *split_rows(pairs, seed, plain.place), request.tolerance)
         found = searched(request, plain, seen, judges, on_better)
         seen, found, about_pairs = without_gross_errors(request, seen, found)
@@ -309,6 +315,7 @@ def fit(
         model_determinant_min=_smallest_determinant(chosen),
         pairs=pairs,
         scene=scene,
+        damping=damping,
     )
 
 

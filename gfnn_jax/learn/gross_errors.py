@@ -69,7 +69,7 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
             plain = dataclasses.replace(plain, place=places(pairs))
         pairs, plain = pairs.take(others), plain.take(others)
         request.say(f"without {gone + len(rows)} of {count} pairs that are gross errors")
-        diagnosis = diagnose_request(request, plain)
+        diagnosis = diagnose_request(request, plain, pairs)
         judges = Judges(pairs, *split_rows(pairs, request.seed, plain.place), request.tolerance)
         again = searched(request, plain, diagnosis, judges, None)
         left = _residuals(again)

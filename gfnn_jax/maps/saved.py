@@ -33,6 +33,7 @@ from gfnn_jax.generating.charts import Chart, TypeOne
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import PolynomialModel, Predictor
 from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.damping import Damping
 from gfnn_jax.maps.domain import Domain, Ranges
 from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.posterior import Posterior
@@ -48,7 +49,7 @@ _TYPES: dict[str, type] = {
     for kind in (
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
         Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
-        Windows, Groups, Ranges, OfTimeStep, Ensemble,
+        Windows, Groups, Ranges, OfTimeStep, Ensemble, Damping,
     )
 }  # fmt: skip
 # Names that were used before, in models that may still be about.
