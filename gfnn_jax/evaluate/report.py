@@ -77,6 +77,7 @@ def assemble(
         },
         "hamiltonian": _hamiltonian(fit),
         "map": {
+            "multiplier": fit.map.multiplier(),
             "symplecticity_defect": fit.symplecticity_defect,
             "chart_determinant_min": fit.model_determinant_min,
             "chart_determinants_of_data": {n: j.low for n, j in fit.judgements.items()},

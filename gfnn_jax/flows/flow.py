@@ -195,6 +195,10 @@ class Flow:
         """The inverse map: the same flow backwards."""
         return dataclasses.replace(self, dt=-self.dt)
 
+    def multiplier(self, args=None) -> float:
+        """1.0: the piece is symplectic."""
+        return 1.0
+
     def _repeated(self, substep, carry, args):
         """All substeps of carry, the time among the args going on with them."""
         if self.substeps == 1:

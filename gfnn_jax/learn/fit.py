@@ -175,8 +175,8 @@ class Fit:
 
     @cached_property
     def symplecticity_defect(self) -> float:
-        """The largest defect of the chosen map's unrolled step at the test states. Compiled when it
-        is first asked for."""
+        """The largest defect ‖AᵀJA − μJ‖ of the chosen map's unrolled step at the test states, by
+        its multiplier μ; NaN where it has none. Compiled when it is first asked for."""
         return float(np.max(np.asarray(self.map.defect(self.test_states, self.test_args))))
 
     @property

@@ -53,3 +53,7 @@ class Affine:
         """E⁻¹, which of a symplectic E is −J Eᵀ J."""
         inverse = apply_j(apply_j(self.matrix).T)
         return Affine(inverse, self.centre + self.shift, -self.shift)
+
+    def multiplier(self, args=None) -> float:
+        """1.0: the piece is symplectic."""
+        return 1.0

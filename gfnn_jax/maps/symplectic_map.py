@@ -2,6 +2,9 @@
 
     coordinates⁻¹ ∘ R^½ ∘ generated(S, chart) ∘ R^½ ∘ coordinates
 
+Of a system with friction a piece multiplies the symplectic form by a factor μ, its multiplier, or
+keeps no multiple of it; so does the map.
+
 Maps are pytrees: their numbers can be passed through ``jit`` and differentiated; what is static
 (the kind of family, chart, coordinates) is a hashable constant, and what is compiled for one map
 serves all of its kind.
@@ -10,6 +13,7 @@ serves all of its kind.
 from __future__ import annotations
 
 import dataclasses
+import math
 from functools import partial, wraps
 from numbers import Integral
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -41,7 +45,7 @@ _TWO_PI_REST = 2.4492935982947064e-16  # what float64 leaves out of 2π
 
 @runtime_checkable
 class Piece(Protocol):
-    """One symplectic map of a row, batch first: z (B, 2d), by JAX.
+    """One map of a row, batch first: z (B, 2d), by JAX.
 
     A piece is a pytree. ``unrolled`` makes derivatives those of the iterations that ran; a number
     says that at most so many updates ran.
@@ -62,6 +66,12 @@ class Piece(Protocol):
 
     def inverse(self) -> Any:
         """The inverse piece."""
+        ...
+
+    def multiplier(self, args: Any = None) -> Any:
+        """μ of AᵀJA = μJ, which holds for the derivative A of every step: 1.0 of a symplectic
+        piece; another number, or one of each lane (B,), of a conformally symplectic one; None where
+        there is no such number."""
         ...
 
 
@@ -237,9 +247,17 @@ class SymplecticMap:
             posterior = dataclasses.replace(posterior, piece=last - posterior.piece)
         return dataclasses.replace(self, pieces=pieces, dt=-self.dt, posterior=posterior)
 
+    def multiplier(self, args=None):
+        """μ of AᵀJA = μJ, which holds for the derivative A of every step: the product of those of
+        the pieces. 1.0 where the map is symplectic, e^(−γ dt) with uniform friction γ, None where
+        the map keeps no multiple of the form: with other friction, or with inputs."""
+        factors = [piece.multiplier(args) for piece in self.pieces]
+        return None if any(factor is None for factor in factors) else math.prod(factors, start=1.0)
+
     def defect(self, z, args=None, *, t0=None):
-        """Symplecticity defect () or (B,) of the step's unrolled derivative at z, in units of
-        ``scale``; of many degrees of freedom by random pairs of tangent vectors.
+        """Symplecticity defect ‖AᵀJA − μJ‖ () or (B,) of the step's unrolled derivative A at z, in
+        units of ``scale``, μ the multiplier; NaN where there is none. Of many degrees of freedom by
+        random pairs of tangent vectors.
 
         By forward differentiation through the iterations that ran, never by the implicit rule,
         which would look symplectic however badly the solve had converged.
@@ -459,6 +477,10 @@ def _step(map_, z, args):
 @partial(compiled_sooner, static_argnums=(3,), seldom_run=True)
 @_or_one_state
 def _defect(map_, z, args, unrolled):
+    multiplier = map_.multiplier(args)
+    if multiplier is None:
+        return jnp.full(z.shape[0], jnp.nan, z.dtype)
+
     def tangent(unit):
         step = partial(map_._apply, args=args, unrolled=unrolled)
         return jax.jvp(lambda y: step(y)[0], (z,), (jnp.broadcast_to(unit, z.shape),))[1]
@@ -467,9 +489,10 @@ def _defect(map_, z, args, unrolled):
     if width > _WIDEST:
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (2 * _TANGENT_PAIRS, width))
         before = jnp.asarray(signs / np.sqrt(width), z.dtype) * map_.scale[None]
-        return defect_of_pairs(before[:, None], jax.vmap(tangent)(before), map_.scale)
+        after = jax.vmap(tangent)(before)
+        return defect_of_pairs(before[:, None], after, map_.scale, multiplier)
     jacobian = jax.vmap(tangent, out_axes=-1)(jnp.eye(z.shape[1], dtype=z.dtype))
-    return symplecticity_defect(jacobian, map_.scale)
+    return symplecticity_defect(jacobian, map_.scale, multiplier)
 
 
 @compiled_sooner
