@@ -30,13 +30,15 @@ from gfnn_jax.learn.rows import rows_of
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping
 from gfnn_jax.phase_space import Pairs, split, symplectic_form
+from gfnn_jax.threads import one_thread
 
 _CERTAIN = 5.0  # standard errors that make a factor other than 1 certain
 _DEGREES = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20, 24, 28)  # of S, that are tried in turn
 _ROWS_PER_TERM = 3
-_MOST_OPERATIONS = 4e9  # rows × terms² of one solve: about a second on one core
-_UPDATES = 12  # of Gauss–Newton, which converges in four or five
-_WORSE = 2  # degrees in a row that leave more of the held-out rows: the end
+_MOST_OPERATIONS = 1e9  # rows × terms² of one solve: a quarter of a second on one core
+_UPDATES = 10  # of Gauss–Newton, which converges in four or five
+_CLOSE = 0.01  # standard errors: an update that is smaller is the last
+_BETTER, _WORSE = 0.9, 2  # of the held-out rows' residual: degrees in a row that leave more end it
 _GAIN = 0.5  # of the held-out residual: what another unknown must lower it to
 _ROUNDOFF = 1e-15  # of the spread
 _EXPLAINED = 0.3  # of the factors' variance, by one coordinate that is named
@@ -111,7 +113,7 @@ def learn_damping(
         if own.held_out < _GAIN * found.held_out:
             found, problem = own, its
     certain = np.abs(found.factor - 1) > _CERTAIN * found.std
-    if not certain.any():
+    if found.family is None or not certain.any():
         return None
     kept = problem.fitted(found.family, np.zeros((0, dim)), np.zeros(0))  # areas are
     if not found.held_out < _GAIN * kept.held_out:
@@ -166,8 +168,10 @@ class _Problem:
         """
         best, worse = _Fitted(factor, np.full(len(factor), np.inf), self._drift(0.0), np.inf), 0
         for family in self._families(spread, factor):
-            found = self.fitted(family, spread, best.factor)
-            best, worse = (found, 0) if found.held_out < best.held_out else (best, worse + 1)
+            with one_thread():
+                found = self.fitted(family, spread, best.factor)
+            worse = 0 if found.held_out < _BETTER * best.held_out else worse + 1
+            best = found if worse == 0 else best
             if worse == _WORSE or best.held_out < _ROUNDOFF:
                 break
         return best
@@ -188,29 +192,22 @@ class _Problem:
 
     def fitted(self, family: Products, spread: np.ndarray, factor: np.ndarray) -> _Fitted:
         """b, c and S by Gauss–Newton, from this b and c = 0."""
-        k, shift, last = len(factor), np.zeros(len(self._angles)), np.inf
-        infinite = np.full(k, np.inf)
-        while True:
+        k, shift = len(factor), np.zeros(len(self._angles))
+        for _ in range(_UPDATES):
             b, c = _momenta(spread, factor), self._drift(shift)
             undamped = self._undamped(b, c)
             terms, target = self._design(family, undamped, self.training)
             solved = _solved(terms, target)
             columns = self._columns(family, solved, undamped, spread, b, c)
-            design = np.column_stack([terms, columns])
-            change = _solved(design, target)[len(solved) :]
-            size = float(np.max(np.abs(change), initial=0.0))
-            if not size < last:  # roundoff, or no convergence
+            change, std = _last_unknowns(np.column_stack([terms, columns, target]), terms.shape[1])
+            if not (np.abs(change) > _CLOSE * std).any():
                 break
-            factor, shift, last = factor + change[:k], shift + change[k:], size
+            factor, shift = factor + change[:k], shift + change[k:]
             if not (factor > 0).all():
-                return _Fitted(factor, infinite, self._drift(shift), np.inf)
-        triangle = np.linalg.qr(np.column_stack([design, target]), mode="r")
-        deviation = abs(triangle[-1, -1]) / np.sqrt(max(1, len(target) - design.shape[1]))
-        own = triangle[len(solved) : -1, len(solved) : -1]
-        std = deviation * np.linalg.norm(np.linalg.pinv(own), axis=1)[:k]
+                return _Fitted(factor, np.full(k, np.inf), c, np.inf)
         held, wanted = self._design(family, undamped, self.held_out)
         rms = float(np.sqrt(np.mean((held @ solved - wanted) ** 2)))
-        return _Fitted(factor, std, c, rms, family)
+        return _Fitted(factor, std[:k], c, rms, family)
 
     def _design(self, family: Products, undamped: Prepared, rows) -> tuple[np.ndarray, np.ndarray]:
         """The terms' gradients (n, m) and what they must add up to (n,), each row without unit."""
@@ -255,7 +252,18 @@ class _Problem:
 
 def _solved(design: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Least squares by a pivoted QR: a quarter of the time of singular values."""
-    return scipy.linalg.lstsq(design, target, lapack_driver="gelsy", check_finite=False)[0]
+    found = scipy.linalg.lstsq(design, target, lapack_driver="gelsy", check_finite=False)
+    assert found is not None
+    return found[0]
+
+
+def _last_unknowns(rows: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of the least-squares problem [A b], (n, m + 1), the unknowns from ``first`` on and their
+    standard errors, those of independent residuals."""
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
+    inverse = np.linalg.pinv(triangle[first:-1, first:-1])
+    deviation = abs(triangle[-1, -1]) / np.sqrt(max(1, len(rows) - len(triangle) + 1))
+    return inverse @ triangle[first:-1, -1], deviation * np.linalg.norm(inverse, axis=1)
 
 
 def _momenta(spread, factor) -> np.ndarray:

@@ -63,9 +63,7 @@ def diagnosed(
     damped: the pairs, where a map that loses area is looked for: its D_b is factored out too.
     """
     plain = prepared
-    jacobians, error = local_jacobians(
-        plain.y0, plain.y1, plain.scale, given_by(plain), seed=seed
-    )
+    jacobians, error = local_jacobians(plain.y0, plain.y1, plain.scale, given_by(plain), seed=seed)
     defect, messages, damping = data_defect(jacobians, plain.scale), _thin(plain), None
     if damped is not None:
         damping = learn_damping(plain, damped, jacobians, error, chart, reversor, seed)

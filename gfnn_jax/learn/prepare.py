@@ -17,7 +17,6 @@ from gfnn_jax.maps.damping import Damping
 from gfnn_jax.maps.domain import Domain, Ranges, covering
 from gfnn_jax.phase_space import Pairs, sizes
 
-
 Factored = Affine | Damping | Flow  # pieces that can be factored out of pairs
 
 
@@ -29,8 +28,9 @@ class Prepared:
     of the inner coordinates. angle_centre: (a,) of each angle's interval. whole: the angles that
     cover their circle. before, after: pieces that were factored out, in the order in which they
     are applied around what is learned: R^½ on both sides for an affine base map R, the flow of a
-    law, D_b behind a map that loses area. dt: of all pairs, or in the middle of those that differ, which are ``own_dt`` (N,). args:
-    (N, k) values of the ``parameters``, or None. period: of a drive, whose time is their last.
+    law, D_b behind a map that loses area. dt: of all pairs, or in the middle of those that differ,
+    which are ``own_dt`` (N,). args: (N, k) values of the ``parameters``, or None. period: of a
+    drive, whose time is their last.
     structure: of many degrees of freedom, whose sizes and domain are then those of its parts.
     place: (N,) of pairs some of which were left out, else None: consecutive numbers along a
     sequence, of all pairs that there were, and sequences far apart.

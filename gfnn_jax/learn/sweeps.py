@@ -293,7 +293,9 @@ class LinearSweep:
     @property
     def moved_by_states(self) -> bool:
         """Whether ``of_states`` is all that states' noise does: not behind the flow of a law."""
-        return all(isinstance(p, (Affine, Damping)) for p in (*self.prepared.before, *self.prepared.after))
+        return all(
+            isinstance(p, (Affine, Damping)) for p in (*self.prepared.before, *self.prepared.after)
+        )
 
     @property
     def largest_known(self) -> Size:
