@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gfnn_jax import scenes
     from gfnn_jax.compiling import enable_compile_cache
+    from gfnn_jax.data.recording import Recording, read
     from gfnn_jax.errors import FitError, FitWarning, InputError, WorkError
     from gfnn_jax.evaluate import figures, metrics
     from gfnn_jax.exports.export import export
@@ -45,6 +46,7 @@ _HOMES = {
     "FitWarning": "errors",
     "InputError": "errors",
     "Pairs": "phase_space",
+    "Recording": "data.recording",
     "Scene": "scenes",
     "SymplecticMap": "maps.symplectic_map",
     "WorkError": "errors",
@@ -53,6 +55,7 @@ _HOMES = {
     "fit": "learn.fit",
     "from_function": "families",
     "load": "maps.saved",
+    "read": "data.recording",
     "reference_trajectories": "scenes.trajectories",
     "sample_pairs": "scenes.trajectories",
     "sample_states": "scenes.trajectories",
@@ -68,6 +71,7 @@ __all__ = [
     "FitWarning",
     "InputError",
     "Pairs",
+    "Recording",
     "Scene",
     "SymplecticMap",
     "WorkError",
@@ -78,6 +82,7 @@ __all__ = [
     "from_function",
     "load",
     "metrics",
+    "read",
     "reference_trajectories",
     "sample_pairs",
     "sample_states",

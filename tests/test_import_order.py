@@ -15,8 +15,8 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 # A module imports only from rooms before its own; the modules of a room share its place.
 ORDER = (
     "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes",
-    "storage", "scenes", "families", "solve", "generating", "flows", "maps", "exports", "fitting",
-    "learn", "data", "baselines", "evaluate", "jobs", "cli", "__main__",
+    "storage", "data", "scenes", "families", "solve", "generating", "flows", "maps", "exports",
+    "fitting", "learn", "baselines", "evaluate", "jobs", "cli_columns", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {("maps.symplectic_map", f"maps.{name}") for name in ("saved", "samples", "sharded")}
@@ -27,6 +27,7 @@ HOMES = {  # the module, and those whose names begin as its own does
     "matplotlib": "evaluate.figures",
     "optax": "fitting.adam",
     "orbax": "storage.checkpoints",
+    "pandas": "data.tables",
 }
 
 
