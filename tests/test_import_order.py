@@ -16,10 +16,12 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 ORDER = (
     "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes",
     "storage", "data", "scenes", "families", "solve", "generating", "flows", "maps", "exports",
-    "fitting", "learn", "baselines", "evaluate", "jobs", "cli_columns", "cli", "__main__",
+    "fitting", "models", "learn", "baselines", "evaluate", "jobs", "cli_columns", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
-SHORTHANDS = {("maps.symplectic_map", f"maps.{name}") for name in ("saved", "samples", "sharded")}
+SHORTHANDS = {
+    ("maps.symplectic_map", f"maps.{name}") for name in ("positions", "saved", "samples", "sharded")
+}
 HOMES = {  # the module, and those whose names begin as its own does
     "argparse": "cli",
     "diffrax": "scenes.trajectories",

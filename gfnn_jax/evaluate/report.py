@@ -79,6 +79,7 @@ def assemble(
         "map": {
             "multiplier": fit.map.multiplier(),
             "damping": _damping(fit),
+            "positions": None if fit.positions is None else vars(fit.positions),
             "symplecticity_defect": fit.symplecticity_defect,
             "chart_determinant_min": fit.model_determinant_min,
             "chart_determinants_of_data": {n: j.low for n, j in fit.judgements.items()},

@@ -92,7 +92,7 @@ def learn_damping(
     factors, dim = area_factors(jacobians, prepared.scale), prepared.dim
     b = float(np.median(factors))
     deviation = 1.5 * float(np.median(np.abs(factors - b))) / np.sqrt(len(factors))
-    if not b > 0 or not abs(b - 1) > max(error, _CERTAIN * deviation):
+    if not b > 0 or not abs(b - 1) > max(3 * error, _CERTAIN * deviation):
         return None
     start = LearnedDamping(np.asarray(b), np.asarray(np.inf), np.zeros(dim))
     undamped = prepared.without(None, start.piece)

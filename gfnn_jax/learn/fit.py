@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import FitError, FitWarning
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
@@ -34,6 +35,7 @@ from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.noisy_sweeps import without_bias
+from gfnn_jax.learn.positions import OfPositions, learn_positions
 from gfnn_jax.learn.posterior import with_posterior
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
@@ -62,7 +64,8 @@ class Fit:
     test_states: (n, 2d) held-out states, test_args their parameters. model_determinant_min: the
     chosen chart's determinant there, where it is closest to 0; NaN for a flow, which has no chart.
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
-    scene: as given. damping: of a map that loses area, by how much of it in a step.
+    scene: as given. damping: of a map that loses area, by how much of it in a step. positions: of a
+    map that was learned from positions alone, what its S is like; num_pairs are then triples.
     """
 
     map: SymplecticMap
@@ -84,6 +87,7 @@ class Fit:
     pairs: Pairs | None = None
     scene: Scene | None = None
     damping: LearnedDamping | None = None
+    positions: OfPositions | None = None
 
     def __repr__(self) -> str:
         """One line: the chosen map, its error and the tolerance."""
@@ -192,7 +196,7 @@ class Fit:
 
 
 def fit(
-    pairs: Pairs,
+    pairs: Pairs | Recording,
     scene: Scene | None = None,
     *,
     tolerance: float = 1e-6,
@@ -217,7 +221,8 @@ def fit(
 ) -> Fit:
     """Learn the map of these pairs: the cheapest candidate within the tolerance, else the best.
 
-    pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order.
+    pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order. Or
+               a recording of positions, whose map learn="map" asks for: see `fit_positions`.
                Of different dt, S is a function of dt too, in the midpoint chart. With parameters
                (args) H is learned, or an S of state and parameters, which family="polynomial" or
                learn="map" ask for.
@@ -259,8 +264,16 @@ def fit(
     meets the tolerance, where a chart is close to singular, where pairs contradict their neighbours
     (a few are left out), and where the pairs do not look symplectic.
     """
-    clock = Clock(max_seconds, pairs.dim if isinstance(pairs, Pairs) else None)
     require_x64("a fit")
+    if isinstance(pairs, Recording):
+        if learn != "map":
+            raise FitError("expected learn='map' with a recording of positions")
+        return fit_positions(
+            pairs, tolerance=tolerance, absolute_tolerance=absolute_tolerance,
+            structure=structure, seed=seed, max_seconds=max_seconds, on_progress=on_progress,
+            on_candidate=on_candidate,
+        )  # fmt: skip
+    clock = Clock(max_seconds, pairs.dim if isinstance(pairs, Pairs) else None)
     messages: list[str] = []
 
     def warn(new: Sequence[str]) -> None:
@@ -317,6 +330,45 @@ def fit(
         scene=scene,
         damping=damping,
     )
+
+
+def fit_positions(
+    recording: Recording, *, tolerance: float = 1e-6, absolute_tolerance: float | None = None,
+    structure: str | None = None, seed: int = 0, max_seconds: float | None = MAX_SECONDS,
+    on_progress: Callable[[str], Any] = lambda message: None,
+    on_candidate: Callable[[Candidate], Any] = lambda candidate: None,
+) -> Fit:  # fmt: skip
+    """Learn the map behind positions alone, at even times or by turns: S(q, Q) of chart type 1.
+
+    recording: its positions, of one run or many; an angle's values outside one turn are a lift and
+    trusted, others known modulo 2π. structure: "ring" or "chain" of equal sites. The rest as of
+    `fit`; errors are those of the next position.
+
+    The map acts on z = (q, p), p = −h ∂S/∂q: ``map.from_positions`` and
+    ``map.rollout(positions=(q, Q), …)`` start it. Positions of one place tell p but for a factor
+    and a gauge, which `models.discrete_lagrangian` fixes: frequencies, positions and stability do
+    not depend on them, the size of p, energies and areas do.
+    Raises FitError where the recording is none of positions at even times, or too short.
+    """
+    relative = absolute_tolerance is None
+    asked = Tolerance(tolerance if absolute_tolerance is None else absolute_tolerance, relative)
+    found = learn_positions(
+        recording, tolerance=asked, structure=structure, seed=seed, max_seconds=max_seconds,
+        say=on_progress, tell=on_candidate,
+    )  # fmt: skip
+    for message in found.messages:
+        warnings.warn(message, FitWarning, stacklevel=3)
+    test = found.states.take(found.held_out[: min(_JUDGED, block_of(2 * found.map.dim))])
+    determinant = np.asarray(found.map.determinant(test.z0))
+    return Fit(
+        map=found.map, candidates=found.candidates, asked=found.asked,
+        num_pairs=found.positions.num_triples, judgements={}, data_defect=float("nan"),
+        base_map=False, noise=None, messages=tuple(found.messages), ended=found.ended,
+        seconds=found.seconds, compile_seconds=found.compile_seconds,
+        test_states=np.asarray(test.z0),
+        model_determinant_min=float(determinant[np.argmin(np.abs(determinant))]),
+        pairs=found.states, positions=found.positions,
+    )  # fmt: skip
 
 
 def _devices(devices: int | str | None) -> tuple[Any, ...]:

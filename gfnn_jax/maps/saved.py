@@ -20,6 +20,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.errors import InputError
+from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.ensemble import Ensemble
 from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.mlp import Mlp
@@ -50,6 +51,7 @@ _TYPES: dict[str, type] = {
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
         Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
         Windows, Groups, Ranges, OfTimeStep, Ensemble, Damping,
+        OfDisplacement,
     )
 }  # fmt: skip
 # Names that were used before, in models that may still be about.
