@@ -149,7 +149,7 @@ def irregular(quick: bool) -> Numbers:
 
 
 def of_step(quick: bool, scene: Scene, num_pairs: int, dt_range, dt: float) -> Numbers:
-    """The same by S, a function of dt² too, with the scene's coordinates and reversor."""
+    """Learn S as a function of w and dt², with the scene's coordinates and reversor."""
     return learned(
         scene, num_pairs, quick, dt_range=dt_range, dt=dt, lend=True, learn="map", tolerance=1e-12
     )

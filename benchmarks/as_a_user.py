@@ -1,4 +1,4 @@
-"""What a new user meets: pairs of their own, what the fit says of them, and whether it is true.
+"""Cases of a new user: their own pairs, the messages of the fit, and whether these are true.
 
     python benchmarks/as_a_user.py                          cases that have no result yet, table
     python benchmarks/as_a_user.py --only friction,degrees  these cases again
@@ -65,7 +65,7 @@ Field = Callable[[np.ndarray], np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """What a user brings, and what is true of it.
+    """Case: the data and the request of a user, and the facts about them.
 
     pairs: to learn from. fresh: exact pairs of the same law, to judge by. tolerance, max_seconds,
     angles: as in `gfnn.fit`. meets: whether the tolerance can be met, None where it may be.
@@ -90,7 +90,7 @@ class Case:
 
 
 class Learned(NamedTuple):
-    """What came of a case, by either way. noise: (2d,) as `fit.noise`, or None."""
+    """Result of a case, by Python or the command line. noise: (2d,) as `fit.noise`, or None."""
 
     map: gfnn.SymplecticMap
     seconds: float
@@ -119,7 +119,7 @@ def flow(field: Field, z: np.ndarray, duration: float) -> np.ndarray:
 
 
 def independent(field: Field, z: np.ndarray, dt: float) -> gfnn.Pairs:
-    """Each state (N, 2d) with its image."""
+    """Make independent pairs of states z (N, 2d) and their images."""
     return gfnn.Pairs(z, flow(field, z, dt), dt)
 
 
@@ -241,7 +241,7 @@ def swings(num_pairs: int, **options) -> tuple[gfnn.Pairs, gfnn.Pairs]:
 
 
 def single_orbit() -> Case:
-    """All pairs on one curve: a recording of one swing."""
+    """Recording of one swing: all pairs lie on one curve."""
     start = np.array([[0.9, 0.1]])
     orbit = sequences(pendulum, start, 0.2, 400)
     between = flow(pendulum, start, 0.1)
@@ -256,7 +256,7 @@ def micro_units() -> Case:
 
 
 def satellites(highest: float, meets: bool | None) -> Case:
-    """In metres and seconds, a minute a step."""
+    """Satellites of the Earth in metres and seconds, a minute a step."""
     laws = drawn(satellite, partial(low_orbits, highest), 60.0, 5_000)
     return Case(*laws, meets=meets, never=(_MORE_PAIRS,))
 
@@ -269,7 +269,7 @@ def penning(quartic: float, max_seconds: float) -> Case:
 
 
 def double_pendula() -> Case:
-    """Both arms may turn over."""
+    """Double pendula whose arms may both turn over."""
     laws = drawn(double_pendulum, box([np.pi, np.pi, 1.0, 1.0]), 0.1, 5_000)
     return Case(*laws, angles=(0, 1), meets=None, never=(_MORE_PAIRS,))
 
@@ -434,7 +434,7 @@ def true_error(map_: gfnn.SymplecticMap, case: Case) -> float:
 
 
 def untruths(case: Case, learned: Learned, error: float) -> list[str]:
-    """What was said and is wrong, or was not said."""
+    """List what the fit said wrongly, or did not say."""
     said = " ".join([*learned.messages, learned.ended])
     found = [f"not said: {pattern}" for pattern in case.words if not re.search(pattern, said)]
     found += [f"said: {pattern}" for pattern in case.never if re.search(pattern, said)]
@@ -460,7 +460,7 @@ def wrong_claims(case: Case, learned: Learned, error: float) -> list[str]:
 
 
 def wrong_noise(case: Case, learned: Learned, error: float, said: str) -> list[str]:
-    """What differs from the noise that was put on the states, and from the error that it leaves."""
+    """List differences between reported noise and error and the true ones."""
     if not case.sigma:
         return []
     ratios, told = noise_ratio(case, learned), re.search(r"own error is then about (\S+) of", said)

@@ -1,4 +1,4 @@
-"""How sure: whether bands hold the true error, what samples cost, and fits to noisy sequences.
+"""Bands: their coverage of the true error, the cost of samples, and fits to noisy sequences.
 
     python benchmarks/bands.py                       pieces that have no result yet, tables, figure
     python benchmarks/bands.py --only cost,henon-heiles-1e-4 --overwrite
@@ -124,7 +124,7 @@ def _cell(cell: Cell | str) -> str:
 
 
 def _marked(value: float, low: float, high: float, form: str) -> str:
-    """In bold where it misses its target."""
+    """Format a value, in bold where it misses its target."""
     text = format(value, form)
     return text if low <= value <= high else f"**{text}**"
 

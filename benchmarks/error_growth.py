@@ -134,7 +134,7 @@ def slope(rows: list[Numbers], key: str) -> Numbers:
 
 
 def actions(quick: bool) -> Numbers:
-    """Two bodies: the action √a (Delaunay's L) over 1/(ε dt) steps, at most LONGEST."""
+    """Measure the action √a (Delaunay's L) of two bodies over 1/(ε dt) steps, at most LONGEST."""
     scene, maps = perturbed("two-body", quick)
     z0 = gfnn.sample_test_states(scene, 8, jax.random.fold_in(jax.random.key(SEED), 2))
     start = np.sqrt(np.asarray(metrics.semi_major_axis(z0)))
@@ -156,8 +156,10 @@ def actions(quick: bool) -> Numbers:
 
 
 def vfnn(quick: bool) -> Numbers:
-    """Two bodies: a learned vector field beside the map of about the same one-step error, and the
-    same with errors so small that the orbit is not lost."""
+    """Measure a learned vector field of two bodies beside a map of about the same one-step error.
+
+    A second comparison has errors so small that the orbit is not lost.
+    """
     scene = gfnn.scenes.two_body()
     key = jax.random.key(SEED)
     num = 5_000 if quick else 100_000

@@ -65,7 +65,7 @@ SCENES: dict[str, tuple[Callable[[], Scene], dict]] = {
 
 
 def measured(quick: bool, name: str) -> Numbers:
-    """One map: agreement over its states, and times of a step."""
+    """Measure one map: agreement over its states, and times of a step."""
     if shutil.which("cc") is None:
         raise SystemExit("expected a C compiler named cc")
     make, options = SCENES[name]

@@ -1,4 +1,4 @@
-"""What happens on hard cases: how many digits are kept, what is flagged, what fails and how.
+"""Hard cases: the digits that are kept, the flags that are raised, and the failures.
 
     python benchmarks/hard_cases.py                          pieces that have no result yet, tables
     python benchmarks/hard_cases.py --only chaos --overwrite one piece again

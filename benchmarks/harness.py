@@ -1,6 +1,6 @@
-"""What the benchmarks share: data and fits, times, results as JSON, tables between markers.
+"""Tools of all benchmarks: data and fits, times, results as JSON, tables between markers.
 
-Sets float64, so it comes before all of JAX.
+The import sets float64, so it comes before all of JAX.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ Pieces = Mapping[str, Callable[[bool], Numbers]]
 
 
 class Timed(NamedTuple):
-    """What a call returned, seconds of the fastest call, and what the first took longer."""
+    """Result of a call, seconds of the fastest call, and extra seconds of the first."""
 
     out: Any
     seconds: float
@@ -68,8 +68,10 @@ def timed(function: Callable[[], Any], repeats: int | None = None) -> Timed:
 
 
 class Once(NamedTuple):
-    """What a single call returned, the seconds that passed, and the processor seconds of all of its
-    threads: other work on the machine changes these less."""
+    """Result of a single call, its seconds, and the processor seconds of all its threads.
+
+    Other work on the machine changes processor seconds less.
+    """
 
     out: Any
     seconds: float
@@ -94,7 +96,7 @@ def angles_of(scene: Scene | None) -> tuple[int, ...]:
 
 
 def finite(pairs: gfnn.Pairs) -> gfnn.Pairs:
-    """Without the states that collide or escape within the step."""
+    """Leave out the pairs whose state collides or escapes within the step."""
     return pairs.take(np.flatnonzero(np.isfinite(np.asarray(pairs.z1)).all(axis=1)))
 
 
@@ -106,12 +108,12 @@ def drawn(scene: Scene, num_pairs: int, quick: bool) -> tuple[gfnn.Pairs, gfnn.P
 
 
 def one_step_rms(map_: SymplecticMap, fresh: gfnn.Pairs, angles=()) -> float:
-    """Per-component RMS of the one-step state error."""
+    """RMS per component of the one-step state error."""
     return metrics.one_step_rms(np.asarray(map_.step(fresh.z0)[0]), fresh.z1, angles)
 
 
 def in_float32(map_: SymplecticMap) -> SymplecticMap:
-    """The same map, all of its arrays rounded to float32."""
+    """Round all arrays of a map to float32."""
 
     def rounded(leaf):
         is_double = getattr(leaf, "dtype", None) == np.float64
@@ -178,7 +180,7 @@ def cores() -> int | None:
 
 
 def circumstances() -> Numbers:
-    """Where, when and with what a result was measured."""
+    """Seed, machine, versions and date of a measurement."""
     return {
         "seed": SEED,
         "dtype": "float64",
@@ -257,7 +259,7 @@ def main(
 
 
 def number(value) -> str:
-    """As the tables show it."""
+    """Format a number for the tables."""
     if value is None:
         return "–"
     if isinstance(value, int) or (isinstance(value, float) and 99.5 <= value < 1e6):
@@ -280,7 +282,7 @@ def between_markers(path: Path, name: str, text: str) -> None:
 
 
 def provenance(found: Mapping[str, Numbers]) -> str:
-    """One sentence on where and when the numbers were taken."""
+    """Sentence on where and when the numbers were taken."""
     cores: dict[str, set[int]] = {}
     for r in found.values():
         machine = r["machine"]

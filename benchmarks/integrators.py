@@ -1,7 +1,7 @@
-"""What integrates a scene whose H is known: the limit that learned maps are compared with.
+"""Integrators of a scene whose H is known, the limit that learned maps are compared with.
 
-Each integrator is a `Runner`, whose precision is a number handed to it when it runs, so that a
-sweep over precisions compiles once.
+Each integrator is a `Runner`. Its precision is an argument of the run, so that a sweep over
+precisions compiles once.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ MAX_SECONDS = 60
 
 
 def interrupted(family: str, quick: bool) -> Numbers:
-    """Every signal at random moments of fits of this family."""
+    """Send every signal at random moments of fits of this family."""
     signals = list(SIGNALS) if quick else [n for n, count in SIGNALS.items() for _ in range(count)]
     # The three families share the signals between them.
     signals = signals if quick else signals[list(OPTIONS).index(family) :: len(OPTIONS)]
@@ -84,7 +84,7 @@ def data_of(folder: Path) -> tuple[Path, np.ndarray]:
 
 
 def prediction(model: Path, states: np.ndarray) -> np.ndarray:
-    """One step of the saved map."""
+    """Step the states by the saved map."""
     return np.asarray(gfnn.load(model).step(states)[0])
 
 

@@ -88,7 +88,7 @@ def coefficient_error(fit, expected: dict[str, float]) -> float | None:
 
 
 def orbits(scene, num_orbits: int) -> np.ndarray:
-    """Where the orbits of `rolled_out` start."""
+    """Initial states of the orbits of `rolled_out`."""
     return np.asarray(gfnn.sample_test_states(scene, num_orbits, jax.random.key(SEED + 2)))
 
 
@@ -147,9 +147,12 @@ def henon_heiles(name: str, quick: bool) -> Numbers:
 
 
 def drift(fit, scene) -> Numbers:
-    """How the energy error of 128 orbits grows over a million steps: the exponents of its mean size
-    and of its deviation between orbits, ½ of a random walk, with standard errors, by orbits drawn
-    again; and the mean error in the end with its sign, which a bias of the rounding leaves."""
+    """Growth of the energy error of 128 orbits over a million steps.
+
+    The exponents are those of its mean size and of its deviation between orbits, ½ for a random
+    walk, with standard errors by the bootstrap over orbits. The mean error at the end has its sign,
+    and is left by a bias of the rounding.
+    """
     z0 = np.asarray(gfnn.sample_test_states(scene, DRIFT_ORBITS, jax.random.key(SEED + 3)))
     saved = 200
     states, _ = fit.map.rollout(z0, DRIFT_STEPS, save_every=DRIFT_STEPS // saved)
@@ -175,7 +178,7 @@ def drift(fit, scene) -> Numbers:
 
 
 def drift_of_law(quick: bool) -> Numbers:
-    """The same of the law of Hénon–Heiles by itself."""
+    """Growth of the energy error of the law of Hénon–Heiles."""
     scene = gfnn.scenes.make("henon-heiles-regular")
     pairs, fresh = pairs_of(scene, 100)
     fit, found = learned(pairs, fresh, tolerance=1e-13)
@@ -204,8 +207,11 @@ def three_bodies(quick: bool) -> Numbers:
 
 
 def closest_approaches(scene, z0) -> np.ndarray:
-    """How near to one of the two bodies each orbit (N, 2d) comes within its 1,000 steps: where a
-    reference by scipy's DOP853 evaluates its field, which is dense where the orbit is near."""
+    """Smallest distance (N,) of each orbit from either body within its 1,000 steps.
+
+    It is taken over the points where scipy's DOP853 evaluates the field, which are dense where the
+    orbit is near a body.
+    """
     dim, near = scene.dim, np.full(len(z0), np.inf)
 
     @jax.jit
@@ -225,10 +231,10 @@ def closest_approaches(scene, z0) -> np.ndarray:
 
 
 def two_body_pairs(most: float = 0.6) -> tuple[gfnn.Pairs, gfnn.Pairs]:
-    """Two bodies in Cartesian coordinates, e up to ``most``: 500 pairs, and fresh ones."""
+    """Pairs of two bodies in Cartesian coordinates, e up to ``most``: 500, and fresh ones."""
 
     def draw(rng, num):
-        """At the pericentre of orbits of semi-major axis 1, turned by any angle, both senses."""
+        """Draw states of orbits of semi-major axis 1, of any phase, orientation and sense."""
         e, angle, phase = rng.uniform(0, most, num), *rng.uniform(0, 2 * np.pi, (2, num))
         # The eccentric anomaly, so that all of the orbit is seen.
         r = 1 - e * np.cos(phase)
@@ -245,7 +251,7 @@ def two_body_pairs(most: float = 0.6) -> tuple[gfnn.Pairs, gfnn.Pairs]:
 
 
 def cartesian_two_body(quick: bool) -> Numbers:
-    """Two bodies in Cartesian coordinates, 1/r among thirty terms, e up to 0.6."""
+    """Learn two bodies in Cartesian coordinates, 1/r among thirty terms, e up to 0.6."""
     pairs, fresh = two_body_pairs()
     fit, found = learned(pairs, fresh, tolerance=1e-13, terms=["1/sqrt(q1**2 + q2**2)"])
     exact = {"1/sqrt(q1**2 + q2**2)": -1.0, "p1²": 0.5, "p2²": 0.5}
@@ -253,7 +259,7 @@ def cartesian_two_body(quick: bool) -> Numbers:
 
 
 def double_pendulum(dt: float, terms: Sequence[str], quick: bool) -> Numbers:
-    """Two equal rods and masses; the angles cover their circles."""
+    """Learn the double pendulum of equal rods and masses; the angles cover their circles."""
 
     def hamiltonian(_, z):
         q1, q2, p1, p2 = z[0], z[1], z[2], z[3]
@@ -387,7 +393,7 @@ def far_too_long_a_step():
 
 
 def close_passages():
-    """Two bodies, e up to 0.98 at the semi-major axis 1: passages at 0.02."""
+    """Data of two bodies, e up to 0.98 at the semi-major axis 1: passages at 0.02."""
     pairs, fresh = two_body_pairs(most=0.98)
     return pairs, fresh, {"tolerance": 1e-8, "terms": ["1/sqrt(q1**2 + q2**2)"]}
 
@@ -526,7 +532,7 @@ def tables() -> None:
 
 
 def lost(m: Numbers) -> str:
-    """How many orbits were lost, and how near they come to a body, where that is known."""
+    """Number of lost orbits as text, with their distance from a body where it is known."""
     if not m.get("closest_of_lost"):
         return number(m.get("lost"))
     within = max(m["closest_of_lost"])
@@ -537,7 +543,7 @@ def lost(m: Numbers) -> str:
 
 
 def hard_table(cases: list[Numbers]) -> str:
-    """One row a case: what came out, how accurate it is, what was said."""
+    """Table of a row per case: the model, its accuracy, the messages."""
     rows = [
         [c["case"], number(c["pairs"]), c["chosen"] + (f": {c['label']}" if "label" in c else ""),
          number(c.get("one_step_rms")), "yes" if c.get("met") else "no",

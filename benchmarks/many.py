@@ -109,7 +109,7 @@ def fitted_to(pairs: gfnn.Pairs, structure: str, tolerance: float = 1e-12) -> gf
 
 
 def by_law(law, z0, dt: float, structure: str, fresh, num_steps: int) -> Numbers:
-    """As `judged`, of pairs drawn at z0 (N, 2d), all images and states being those of the law."""
+    """Measure as `judged` does, with pairs drawn at z0 (N, 2d) and all images by the law."""
     exact = moved(law, fresh, dt), moved(law, fresh, dt, num_steps)
     return judged(law, gfnn.Pairs(z0, moved(law, z0, dt), dt), structure, fresh, exact, num_steps)
 

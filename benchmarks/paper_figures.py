@@ -44,7 +44,7 @@ SCENES: dict[str, tuple[tuple[int, ...], str]] = {
 
 
 def pieces() -> list[tuple[str, int]]:
-    """Every scene's first seed before any second one."""
+    """List (scene, seed), each scene's first seed before any second one."""
     most = max(len(seeds) for seeds, _ in SCENES.values())
     return [
         (name, seeds[i]) for i in range(most) for name, (seeds, _) in SCENES.items()
@@ -57,7 +57,7 @@ def result_path(folder: Path, name: str, seed: int) -> Path:
 
 
 def run(name: str, seed: int, folder: Path, work: Path, **options) -> None:
-    """One piece: compared in ``work``, its report and its figures taken from there."""
+    """Compare one piece in ``work``, and copy its report and its figures from there."""
     print(f"{name}, seed {seed}", flush=True)
     started = time.perf_counter()
     out = work / f"{name}-{seed}"
@@ -137,7 +137,7 @@ def ranking(reports: list[Numbers], *path: str) -> list[str]:
 
 
 def place(order: list[str], method: str, without: Sequence[str] = ()) -> str:
-    """Where a method stands, in words."""
+    """Rank of a method, in words."""
     rest = [m for m in order if m not in without]
     if method not in rest:
         return "was not run"

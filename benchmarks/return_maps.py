@@ -61,7 +61,7 @@ def distance(states, reference) -> float:
 
 
 def seconds(iterate, z0, iterations, precision, repeats) -> float:
-    """Per iteration and trajectory: the best of several, after one that compiles."""
+    """Seconds per iteration and trajectory, the best of several after one that compiles."""
     taken = timed(lambda: iterate(z0, iterations, precision), repeats)
     return taken.seconds / taken.out[1]
 

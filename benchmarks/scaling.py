@@ -54,7 +54,8 @@ from harness import (
 
 import gfnn_jax as gfnn
 from gfnn_jax import processes
-from gfnn_jax.data.files import iterate_pairs, read_sample
+from gfnn_jax.data.files import iterate_pairs
+from gfnn_jax.data.sample import read_sample
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.families.products import Products
@@ -100,7 +101,7 @@ def in_this_process(learns: str, steps: int) -> Numbers:
 
 
 def measure(quick: bool, *, learns: str) -> Numbers:
-    """Each number of devices in a process of its own."""
+    """Measure each number of devices in a process of its own."""
     rows = []
     for devices in DEVICES:
         flags = f"--xla_force_host_platform_device_count={devices}"
@@ -136,7 +137,7 @@ def problem(task: str, quick: bool) -> Callable[[], Any]:
         terms = polynomial_terms(2, size)
         own = gauss_newton.Problem(z0, z1, dt, np.ones(4))
         c = gauss_newton.midpoint_start(terms, z0, z1, dt, np.ones(4))
-        return lambda: own.factor(terms, c, Steps(5, 1), np.arange(len(z0))).matrix
+        return lambda: own.linearised(terms, c, Steps(5, 1), np.arange(len(z0))).factor
     network = Mlp(box_inputs(w), (16, 16, 16), "gelu", amplitude_of(w, target))
     starts = [network.init(key, np.float64) for key in jax.random.split(jax.random.key(1), size)]
     held = len(w) // 5
@@ -168,7 +169,7 @@ def on_devices_here(count: int, quick: bool) -> Numbers:
 
 
 def measure_fits_on_devices(quick: bool) -> Numbers:
-    """No devices told, then each number of them in a process of its own."""
+    """Measure without a given number of devices, then each number in a process of its own."""
     rows = []
     for count in (0, *DEVICES):
         flags = f"--xla_force_host_platform_device_count={max(count, 1)}"
@@ -225,7 +226,7 @@ def peak_bytes() -> int:
 
 
 def in_group(task: str, file: str) -> Numbers:
-    """What one of several processes does with its own rows of a file."""
+    """Work of one of several processes on its own rows of a file."""
     gfnn.enable_compile_cache()
     group = processes.Group(processes.join())
     chunks = _Chunks(Path(file), group.share)
@@ -264,7 +265,7 @@ class _Chunks:
 
 
 def run_group(task: str, file: Path, count: int) -> list[Numbers]:
-    """What so many processes have found."""
+    """Run ``count`` processes on a file, and return their results."""
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{one.getsockname()[1]}"
@@ -284,7 +285,7 @@ def run_group(task: str, file: Path, count: int) -> list[Numbers]:
 
 
 def measure_group(quick: bool, *, task: str) -> Numbers:
-    """The same work by each number of processes."""
+    """Measure the same work by each number of processes."""
     rows, states = [], []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "pairs.npz"

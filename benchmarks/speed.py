@@ -1,4 +1,4 @@
-"""How fast: the first answer, predicted steps, a training step, growth with the size.
+"""Speed of the first answer, of predicted steps and of a training step; growth with the size.
 
     python benchmarks/speed.py                    pieces that have no result yet, then the tables
     python benchmarks/speed.py --only step --overwrite

@@ -173,7 +173,7 @@ def polynomial(before, after, degree: int):
 
 
 def turn(quick: bool) -> Numbers:
-    """One turn of the ring with errors, by one and by two generated pieces."""
+    """Measure one turn of the ring with errors, by one and by two generated pieces."""
     err = ring("err.mat")
     half = err.half_axes(AMPLITUDE, AMPLITUDE)
     count = 600 if quick else NUM_PAIRS + FRESH
@@ -283,12 +283,12 @@ def tunes(quick: bool) -> Numbers:
 
 
 def deviation(quick: bool) -> Numbers:
-    """One turn of the ring with errors, δ a parameter; the tunes against δ."""
+    """Measure one turn of the ring with errors, δ a parameter; the tunes against δ."""
     return of_region(AMPLITUDE, quick)
 
 
 def small_deviation(quick: bool) -> Numbers:
-    """The same within half the amplitude."""
+    """Measure one turn with δ as a parameter, within half the amplitude."""
     return of_region(AMPLITUDE / 2, quick)
 
 
@@ -349,8 +349,11 @@ def tunes_of(machine: Ring, states) -> np.ndarray:
 
 
 def frequencies(quick: bool) -> Numbers:
-    """Of one cell: the change of the tunes from the first half of an orbit to the second, over the
-    plane of amplitudes; sections of orbits in the mid-plane. Of map and tracking code."""
+    """Compare frequency maps and sections of one cell, by map and by tracking code.
+
+    A frequency map is the change of the tunes from the first half of an orbit to the second, over
+    the plane of amplitudes. The sections are of orbits in the mid-plane.
+    """
     cell = ring("hmba.mat")
     half = cell.half_axes(1.2 * REGION[0], 1.2 * REGION[1])
     z = ellipsoid(half, 800 if quick else NUM_PAIRS, 0)
@@ -427,8 +430,11 @@ def long(quick: bool) -> Numbers:
 
 
 def aperture(quick: bool) -> Numbers:
-    """Where orbits of one cell get lost within 1,000 passages, along nine rays: of the map and of
-    the tracking code, both by a scan in steps of 0.1 mm."""
+    """Compare the dynamic aperture of one cell, by map and by tracking code.
+
+    It is the amplitude at which orbits get lost within 1,000 passages, along nine rays, by a scan
+    in steps of 0.1 mm.
+    """
     cell = ring("hmba.mat")
     half, turns = cell.half_axes(14e-3, 9e-3), 100 if quick else 1_000
     z = ellipsoid(half, 800 if quick else NUM_PAIRS, 0)

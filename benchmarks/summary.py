@@ -16,7 +16,7 @@ from posteriors.calibration import WIDEST, Cell, cells
 
 
 def measured(name: str) -> Numbers:
-    """What results/``name``.json holds."""
+    """Read the measurements in results/``name``.json."""
     return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))["measured"]
 
 

@@ -1,4 +1,4 @@
-"""How accurate the chosen maps are, and what they cost: every target of the project, measured.
+"""Targets of the project: accuracy and cost of the chosen maps, measured.
 
     python benchmarks/targets.py                            rows without a result, then the tables
     python benchmarks/targets.py --only pcr3bp --overwrite  one row again

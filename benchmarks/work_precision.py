@@ -84,7 +84,7 @@ OURS, KNOWN, OTHERS = "ours", "H known", "baseline"
 
 
 class Bench:
-    """What all methods of a scene are judged by: states, their reference, the horizon."""
+    """Test of all methods of a scene: states, their reference, the horizon."""
 
     def __init__(self, scene: Scene, num_steps: int, lanes: int, quick: bool):
         self.scene, self.num_steps = scene, num_steps
@@ -113,7 +113,7 @@ class Bench:
         }
 
     def together(self, batch: Callable, num_steps: int) -> tuple[Any, Numbers]:
-        """What a call returns that takes all states so many steps, and its time."""
+        """Time a call that takes all states ``num_steps`` steps; return result and times."""
         out, seconds, compiling = timed(batch)
         per_unit = 1e6 * seconds / (len(self.z0) * num_steps * self.scene.dt)
         return out, {"microseconds_batch": per_unit, "compile_seconds_batch": compiling}
@@ -158,7 +158,7 @@ def front_of(cost, error) -> list[int]:
 
 
 def thinned(items: list, most: int) -> list:
-    """At most so many of them, evenly, the first and the last among them."""
+    """Thin out items evenly to at most ``most``, keeping the first and the last."""
     places = np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)
     return [items[i] for i in np.unique(places)]
 
@@ -175,7 +175,7 @@ def kinds_of(scene: Scene, quick: bool) -> Iterator[tuple[str, str]]:
 
 
 def our_maps(bench: Bench, num_pairs: int, quick: bool, omit) -> Iterator[Numbers]:
-    """Every chart and family, a few sizes along the front of each, in both precisions."""
+    """Measure a few sizes of every chart and family along its front, in both precisions."""
     scene = bench.scene
     pairs, _ = drawn(scene, num_pairs, quick=True)
     for chart, family in kinds_of(scene, quick):
@@ -344,7 +344,7 @@ def others(name: str, result: Numbers) -> list[Numbers]:
 
 
 def panel(points: list[Numbers], time_of: str) -> Numbers:
-    """One panel of the figure: group -> name -> (cost, error, size)."""
+    """Data of a panel of the figure: group -> name -> (cost, error, size)."""
     groups: Numbers = {"ours": {}, "float32": {}, "known": {}, "others": {}}
     for p in points:
         if p["error_median"] is None or p.get(time_of) is None or p["error_median"] > DRAWN:
@@ -386,7 +386,7 @@ def called(point: Numbers) -> str:
 
 
 def advice(name: str, result: Numbers) -> str:
-    """Which map to take for an error, and what is as accurate where H is known."""
+    """Table of the fastest map for each error, and of integrators as accurate."""
     m = result["measured"]
     ours_all, known_all = ([p for p in m["points"] if p["group"] == g] for g in (OURS, KNOWN))
     rows = []
@@ -420,7 +420,7 @@ def advice(name: str, result: Numbers) -> str:
 
 
 def pair_of(together: Numbers | None, alone: Numbers | None, of: Numbers | None = None) -> str:
-    """Both times of a method, or how many of them the times of another one are."""
+    """Both times of a method, or the ratios of another method's times to them, as text."""
     if together is None or alone is None:
         return "–"
     times = [together["microseconds_batch"], alone.get("microseconds_single")]
@@ -431,7 +431,7 @@ def pair_of(together: Numbers | None, alone: Numbers | None, of: Numbers | None 
 
 
 def in_words(name: str, result: Numbers) -> str:
-    """Which map to take, and what is faster, in a few sentences."""
+    """Advice on which map to take, and on what is faster, in a few sentences."""
     points = result["measured"]["points"]
     ours, known = ([p for p in points if p["group"] == g] for g in (OURS, KNOWN))
     takes: dict[str, float] = {}
@@ -460,7 +460,7 @@ def in_words(name: str, result: Numbers) -> str:
 
 
 def failures(name: str, result: Numbers) -> str:
-    """What was left out, what failed, and where lanes were lost: one line of text."""
+    """Line of text on methods left out, failures, and lost lanes."""
     m = result["measured"]
     reasons: dict[str, list[str]] = {}
     for o in m["omitted"]:
@@ -479,7 +479,7 @@ def failures(name: str, result: Numbers) -> str:
 
 
 def law_table(result: Numbers) -> str:
-    """What was learned as a law, by rising error."""
+    """Table of the learned laws, the largest error first."""
     rows = [
         [p["method"], p["label"], number(p["num_parameters"]), number(p["pairs"]),
          number(p["one_step_rms"]), number(p["error_median"]), pair_of(p, p)]

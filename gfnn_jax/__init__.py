@@ -23,9 +23,10 @@ if TYPE_CHECKING:
     from gfnn_jax.families import from_function
     from gfnn_jax.generating.charts import CHARTS, Chart
     from gfnn_jax.learn.fit import Fit, fit
-    from gfnn_jax.maps.saved import load
+    from gfnn_jax.maps.saved import load, register
     from gfnn_jax.maps.stroboscopic import stroboscopic
     from gfnn_jax.maps.symplectic_map import SymplecticMap
+    from gfnn_jax.models.model import Fitted, TrainingData
     from gfnn_jax.phase_space import Pairs
     from gfnn_jax.scenes import Scene
     from gfnn_jax.scenes.trajectories import (
@@ -44,11 +45,13 @@ _HOMES = {
     "Fit": "learn.fit",
     "FitError": "errors",
     "FitWarning": "errors",
+    "Fitted": "models.model",
     "InputError": "errors",
     "Pairs": "phase_space",
     "Recording": "data.recording",
     "Scene": "scenes",
     "SymplecticMap": "maps.symplectic_map",
+    "TrainingData": "models.model",
     "WorkError": "errors",
     "enable_compile_cache": "compiling",
     "export": "exports.export",
@@ -57,6 +60,7 @@ _HOMES = {
     "load": "maps.saved",
     "read": "data.recording",
     "reference_trajectories": "scenes.trajectories",
+    "register": "maps.saved",
     "sample_pairs": "scenes.trajectories",
     "sample_states": "scenes.trajectories",
     "sample_test_states": "scenes.trajectories",
@@ -69,11 +73,13 @@ __all__ = [
     "Fit",
     "FitError",
     "FitWarning",
+    "Fitted",
     "InputError",
     "Pairs",
     "Recording",
     "Scene",
     "SymplecticMap",
+    "TrainingData",
     "WorkError",
     "enable_compile_cache",
     "export",
@@ -84,6 +90,7 @@ __all__ = [
     "metrics",
     "read",
     "reference_trajectories",
+    "register",
     "sample_pairs",
     "sample_states",
     "sample_test_states",

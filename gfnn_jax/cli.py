@@ -1,7 +1,7 @@
-"""The command line: ``gfnn scenes | run | fit | predict | export | compare``.
+"""Command line: ``gfnn scenes | run | fit | predict | export | compare``.
 
-Each exit status but 0 comes with one line that says why (`EXIT_STATUS`). Nothing heavy is imported
-before the usage has been found good.
+Each exit status but 0 comes with one line that gives the reason (`EXIT_STATUS`). JAX is imported
+only after the usage has been checked.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from gfnn_jax.compiling import enable_compile_cache
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new
-from gfnn_jax.storage.partial import told_of
+from gfnn_jax.storage.partial import unfinished_note
 
-# Those of `learn.check` and `exports.export`, which would bring JAX; a test compares them.
+# Copies of the choices in `learn.check` and `exports.export`, whose import would load JAX; a test
+# compares them.
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
 FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
 LEARN = ("auto", "map", "hamiltonian")
@@ -51,7 +52,7 @@ the table of candidates:
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM, as clean a stop as Ctrl-C."""
+    """Stop by SIGTERM, as clean as one by Ctrl-C."""
 
 
 _TO_BEGIN = (
@@ -84,13 +85,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt as stop:
         terminated = isinstance(stop, _Terminated)
-        # Notes of who keeps something; before its work begins, an earlier job may have.
-        before = told_of(arguments.out) if getattr(arguments, "out", None) else None
+        # The job's notes name what it has kept; before its work, an earlier job may have kept some.
+        before = unfinished_note(arguments.out) if getattr(arguments, "out", None) else None
         kept = getattr(stop, "__notes__", [before or "nothing was kept"])
         return _fail(
             143 if terminated else 130,
             "; ".join(["terminated" if terminated else "stopped", *kept]),
         )
+
+
+_MAX_SECONDS = 120.0  # of a fit
 
 
 def _fail(status: int, why: object) -> int:
@@ -108,7 +112,7 @@ class _Version(argparse.Action):
 
 
 def _with_status(options: dict[str, Any]) -> dict[str, Any]:
-    """The options of a command that has --distributed."""
+    """Extend the options of a command that has --distributed."""
     return {**options, "epilog": f"{options['epilog']}\n{DISTRIBUTED_STATUS}"}
 
 
@@ -295,8 +299,14 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
     )  # fmt: skip
     command.add_argument("--seed", type=_seed, default=0, metavar="N")
     command.add_argument(
-        "--max-seconds", type=_positive, default=120.0, metavar="S",
-        help="for the fit: the best map by then is kept (default 120)",
+        "--max-seconds", type=_positive, default=None, metavar="S",
+        help="for the fit: the best map by then is kept (default 120, or none where operations are "
+        "bounded)",
+    )  # fmt: skip
+    command.add_argument(
+        "--max-operations", type=_count, default=None, metavar="N",
+        help="for the fit, counted: a report's fit.max_operations gives its model again, whatever "
+        "the clock has ended",
     )  # fmt: skip
     command.add_argument(
         "--strict", action="store_true", help="exit status 1 where the tolerance is not met"
@@ -371,9 +381,15 @@ def _indices(text: str) -> tuple[int, ...]:
     found = tuple(int(part) for part in parts if part.strip().isdecimal())
     if len(set(found)) < len(parts):
         raise argparse.ArgumentTypeError(
-            f"expected different whole numbers separated by commas, as 0,2; got '{text}'"
+            f"expected different whole numbers separated by commas, e.g. 0,2; got '{text}'"
         )
     return found
+
+
+def _max_seconds(arguments: argparse.Namespace) -> float | None:
+    """The budget of a fit: where operations are bounded nothing else is, unless told."""
+    given = arguments.max_seconds
+    return _MAX_SECONDS if given is None and arguments.max_operations is None else given
 
 
 # The commands. The heavy imports are here, after the checks that need none of them.
@@ -397,7 +413,8 @@ def _run(arguments: argparse.Namespace) -> None:
     with progress.on_stderr() as shown:
         ran = run(
             arguments.scene, out=out, quick=arguments.quick, seed=arguments.seed, dt=arguments.dt,
-            tolerance=arguments.tolerance, max_seconds=arguments.max_seconds,
+            tolerance=arguments.tolerance, max_seconds=_max_seconds(arguments),
+            max_operations=arguments.max_operations,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
             base=arguments.base, structure=arguments.structure,
             family=arguments.family, ensemble=arguments.ensemble, overwrite=arguments.overwrite,
@@ -431,7 +448,8 @@ def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) 
         ran = fit(
             arguments.data, out=arguments.out, dt=arguments.dt,
             tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
-            absolute_tolerance=arguments.absolute_tolerance, max_seconds=arguments.max_seconds,
+            absolute_tolerance=arguments.absolute_tolerance, max_seconds=_max_seconds(arguments),
+            max_operations=arguments.max_operations,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
             base=arguments.base, structure=arguments.structure,
             family=arguments.family, ensemble=arguments.ensemble, scene_name=arguments.scene,
@@ -451,11 +469,11 @@ def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) 
 
 
 def _hold_to(strict: bool, model: Path) -> None:
-    """Raises WorkError where a strict user's model misses the tolerance."""
+    """Raise WorkError where ``strict`` is set and the model misses the tolerance."""
     from gfnn_jax.maps.saved import record
 
     if strict and not record(model)["fit"]["tolerance_met"]:
-        raise WorkError(f"{model}: is written, but misses the tolerance (--strict)")
+        raise WorkError(f"{model}: was written, but misses the tolerance (--strict)")
 
 
 def _predict(arguments: argparse.Namespace) -> None:
@@ -495,7 +513,7 @@ def _predict_and_tell(arguments: argparse.Namespace, share: processes.Share | No
     if predicted.horizon is not None:
         passed = predicted.horizon[predicted.horizon >= 0]
         first = f", the first at step {passed.min()}" if passed.size else ""
-        print(f"{passed.size} of {num_lanes} bands pass {arguments.horizon:g}{first}")
+        print(f"{passed.size} of {num_lanes} bands exceed {arguments.horizon:g}{first}")
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -524,7 +542,7 @@ def _compare(arguments: argparse.Namespace) -> None:
             resume=arguments.resume, progress=shown,
         )  # fmt: skip
     if compared is None:
-        print(f"{out}: is there already, from this very job")
+        print(f"{out}: already holds the result of this job")
         return
     _print_table(table(compared.report))
     print(f"written to {out}")
@@ -532,17 +550,18 @@ def _compare(arguments: argparse.Namespace) -> None:
 
 def _summarise(ran: Any, out: Path) -> None:
     if ran is None:
-        print(f"{out}: is there already, from this very job")
+        print(f"{out}: already holds the result of this job")
         return
     from gfnn_jax.learn.fit import candidates_table
 
     _print_table(candidates_table(ran.fit))
     report = ran.report
-    fit = report["fit"]
+    fit, defect = report["fit"], report["map"]["symplecticity_defect"]
     print(
         f"{report['model']['chart']} {report['model']['label']}: one-step error "
         f"{fit['validation_rms']:.2e}, {fit['validation_relative']:.2e} of the spread (tolerance "
-        f"{fit['tolerance']:g}), symplecticity defect {report['map']['symplecticity_defect']:.1e}"
+        f"{fit['tolerance']:g}), symplecticity defect "
+        + (f"{defect:.1e}" if defect is not None else "not looked at")
     )
     if report["hamiltonian"] is not None:
         also = "" if report["model"]["learns"] == "hamiltonian" else "not chosen: "
@@ -561,7 +580,7 @@ def _summarise(ran: Any, out: Path) -> None:
 
 
 def _holds(fit: Any) -> str:
-    """Where the map may be trusted, in one sentence."""
+    """Describe where the map may be trusted, in one sentence."""
     parts = ["valid where the data are; a prediction names the trajectories that leave them"]
     outside = fit.chosen.outside
     if outside is not None and math.isfinite(outside):
@@ -579,7 +598,7 @@ def _print_table(table: Any) -> None:
 
 
 def _print_status(status, left_at) -> None:
-    """Lanes by status, and where those that left the domain did so."""
+    """Print the number of lanes by status, and the steps at which lanes left the domain."""
     from gfnn_jax.evaluate.report import status_counts
 
     print(", ".join(f"{n} {name}" for name, n in status_counts(status).items() if n))
@@ -590,12 +609,14 @@ def _print_status(status, left_at) -> None:
         print(f"left the data's domain: trajectory {shown}{more}")
 
 
-# The surroundings.
+# The process: JAX, signals, warnings.
 
 
 def _set_up_jax(devices: int | str | None = None) -> None:
-    """Float64, and compiled programs kept between runs in the user's cache folder. devices: of a
-    CPU that are asked for; it has a single one unless told otherwise."""
+    """Switch on float64, and keep compiled programs in the user's cache folder.
+
+    devices: number of devices that a CPU shall have, or "all" its cores; by default it has one.
+    """
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -608,7 +629,7 @@ def _set_up_jax(devices: int | str | None = None) -> None:
 
 
 def _cores() -> int:
-    """Processor cores that this process may use."""
+    """Number of processor cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -616,7 +637,7 @@ def _cores() -> int:
 
 @contextlib.contextmanager
 def _sigterm() -> Iterator[None]:
-    """SIGTERM stops as Ctrl-C does. Elsewhere than in the main thread nothing can be set."""
+    """Let SIGTERM stop the work as Ctrl-C does. Nothing is done outside the main thread."""
 
     def stop(*_):
         raise _Terminated

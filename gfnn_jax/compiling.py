@@ -1,4 +1,4 @@
-"""How programs are compiled: in little time, and kept between processes."""
+"""Compilation by XLA: options that shorten it, and a cache on disk between processes."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from typing import Any
 # XLA's emitters of fused loops take a third to a half of what a step takes to compile, and its
 # steps run no faster by them (jaxlib 0.10.2 on two cores; benchmarks/speed.py --only start).
 _SOONER = {"xla_cpu_use_fusion_emitters": False}
-# Half of the rest; such programs run several times slower.
+# This option halves what is left of the compile time; such programs run several times slower.
 _SOONEST = {**_SOONER, "xla_backend_optimization_level": 0}
 
 
 def enable_compile_cache(folder: str | Path | None = None) -> Path:
     """Keep compiled programs in ``folder``, so that the next process need not compile them again.
 
-    folder: None: the one that JAX is configured for, else ``gfnn_jax`` in ``$XDG_CACHE_HOME`` or
-    ``~/.cache``. Returns the folder. What was compiled before the call is not kept.
+    folder: with None, the folder that JAX is configured for, else ``gfnn_jax`` in
+    ``$XDG_CACHE_HOME`` or ``~/.cache``. Returns the folder. Programs compiled before the call are
+    not kept.
     """
     import jax  # loaded when first used: `gfnn --help` needs none
     from jax.experimental.compilation_cache import compilation_cache
@@ -38,10 +39,11 @@ def enable_compile_cache(folder: str | Path | None = None) -> Path:
 def compiled_sooner(
     function: Callable, static_argnums: tuple[int, ...] = (), *, seldom_run: bool = False
 ) -> Callable:
-    """As ``jax.jit(function, static_argnums)``; on a CPU compiled in less time where it is called
-    with numbers. Inside another transformation it is that one's to say how it is compiled.
+    """Compile like ``jax.jit(function, static_argnums)``, on a CPU with options that save time.
 
-    seldom_run: whether to compile counts and to run does not.
+    The options apply where the function is called with numbers. Inside another transformation, the
+    outer function's options apply.
+    seldom_run: True prefers a short compilation to a fast program.
     """
     import jax  # loaded when first used: `gfnn --help` needs none
     from jax.core import Tracer

@@ -1,6 +1,6 @@
-"""Coordinates in which a map is learned: what is an angle, what is cyclic, canonical changes.
+"""Coordinates in which a map is learned: angles, cyclic coordinates, canonical changes.
 
-A scene declares its coordinates and a fit uses them; the user sees his own. A change of
+A scene declares its coordinates and a fit uses them; the user sees their own. A change of
 coordinates must be canonical (its Jacobian D satisfies Dᵀ J D = J), so that a map which is
 symplectic in the inner coordinates is symplectic in the user's.
 """
@@ -19,8 +19,8 @@ from gfnn_jax.arrays import namespace
 from gfnn_jax.phase_space import sizes, split
 
 TWO_PI = 2 * np.pi
-_NEAR = 8  # neighbours that are looked at first when states are joined to a tree
-# States that are transformed at once: batches are padded to a power of two, at most this one.
+_NEAR = 8  # neighbours of a state that are tried first when states are joined to a tree
+# States that are transformed at once: batches are padded to a power of two between these.
 _FEWEST, _MOST = 64, 2**16
 
 
@@ -65,8 +65,8 @@ def _from_polar(y):
 def polar(*, cyclic: bool) -> Coordinates:
     """Plane polar coordinates (r, φ, p_r, p_φ) of (x, y, p_x, p_y); p_φ is the angular momentum.
 
-    ``cyclic`` says that the dynamics is invariant under rotation, so that φ does not enter S and
-    p_φ is conserved to roundoff. Not defined at r = 0.
+    cyclic: True where the dynamics is invariant under rotation: φ does not enter S, and p_φ is
+    conserved to roundoff. The change is not defined at r = 0.
     """
     return Coordinates(
         "polar", angles=(1,), cyclic=(1,) if cyclic else (), forward=_to_polar, inverse=_from_polar
@@ -74,12 +74,12 @@ def polar(*, cyclic: bool) -> Coordinates:
 
 
 def to_inner(coordinates: Coordinates, z) -> np.ndarray:
-    """y = forward(z) of states z (..., 2d): NumPy, float64. NaN where a state has no such y."""
+    """Compute y = forward(z) of states z (..., 2d), NumPy float64. NaN where y does not exist."""
     return _batch(coordinates.forward, z)
 
 
 def to_user(coordinates: Coordinates, y) -> np.ndarray:
-    """z = inverse(y) of states y (..., 2d): NumPy, float64."""
+    """Compute z = inverse(y) of states y (..., 2d), NumPy float64."""
     return _batch(coordinates.inverse, y)
 
 
@@ -102,14 +102,14 @@ def _changed(z, *, change):
 
 
 def whole_turns(angle):
-    """The multiple of 2π nearest to an angle of any shape. NumPy or JAX."""
+    """Multiple of 2π nearest to an angle of any shape. NumPy or JAX."""
     return TWO_PI * namespace(angle).round(angle / TWO_PI)
 
 
 def nearest_image(difference, angles: tuple[int, ...]) -> np.ndarray:
-    """Differences of states (..., 2d), those of the ``angles`` brought to [−π, π]. A NumPy copy.
+    """Copy differences of states (..., 2d), with those of angles brought to [−π, π]. NumPy.
 
-    ``angles`` are the indices of what has period 2π. An infinite difference of an angle is NaN.
+    angles: indices of the coordinates of period 2π. An infinite difference of an angle becomes NaN.
     """
     difference, index = np.array(difference, dtype=np.float64), list(angles)
     if index:
@@ -119,11 +119,11 @@ def nearest_image(difference, angles: tuple[int, ...]) -> np.ndarray:
 
 
 def circle_centre(angle) -> tuple[float, bool]:
-    """Centre of the shortest arc that holds all values of an angle (N,); whether it is a circle.
+    """Centre of the shortest arc that holds all values of an angle (N,), and True for a circle.
 
-    The angle jumps by 2π opposite to the centre. Data count as the whole circle where no gap is
-    wider than an eighth of it. Its centre is 0: there numbers are finest, and alike on both sides,
-    so that what rounding does to a kick averages out.
+    The angle jumps by 2π opposite to the centre. Data cover the whole circle where no gap is wider
+    than an eighth of it. The centre is then 0, where floating-point numbers are densest and
+    symmetric, so that rounding errors of a kick average out.
     """
     wrapped = np.sort(np.mod(angle, TWO_PI))
     gaps = np.diff(wrapped, append=wrapped[0] + TWO_PI)
@@ -136,12 +136,12 @@ def circle_centre(angle) -> tuple[float, bool]:
 
 
 def lift(y0, y1, coordinates: Coordinates):
-    """Pairs with angles lifted: y0 reduced, y1 − y0 continuous over the data.
+    """Lift the angles of pairs: y0 is reduced, and y1 − y0 is continuous over the data.
 
     y0, y1: (N, 2d) in the inner coordinates, angles wrapped or not. Returns y0, y1, the centre of
-    each angle's interval (a,), and which angles cover the circle (a,). The multiples of 2π in
-    y1 − y0 are found along a minimal spanning tree of neighbouring states: taking the nearest
-    image of every pair alone would tear a map whose angle moves by more than π.
+    each angle's interval (a,), and a flag for each angle that covers the circle (a,). The multiples
+    of 2π in y1 − y0 are found along a minimal spanning tree of neighbouring states. The nearest
+    image of each pair alone would tear a map whose angle moves by more than π.
     """
     y0, y1 = np.array(y0, dtype=np.float64), np.array(y1, dtype=np.float64)
     centres, covered = [], []
@@ -165,8 +165,11 @@ def lift(y0, y1, coordinates: Coordinates):
 
 
 def lift_sites(y0, y1, coordinates: Coordinates):
-    """As `lift`, of states of equal sites whose q are all angles, and whose p are all or none: one
-    pair is one of each site, which moves much as others do that are near it in its own (q, p)."""
+    """Lift the angles of pairs of equal sites, as `lift` does, with each site as a pair of its own.
+
+    The q of all sites are angles, and all or none of their p. The step of a site is assumed
+    continuous in that site's own (q, p).
+    """
     count, dim = y0.shape[0], y0.shape[1] // 2
     own = Coordinates("site", angles=tuple(sorted({a // dim for a in coordinates.angles})))
 
@@ -181,7 +184,7 @@ def lift_sites(y0, y1, coordinates: Coordinates):
 
 
 def _embedded(y, coordinates: Coordinates):
-    """States as points of a plain space: unit-sized, angles of a q as points of a circle."""
+    """Embed states in a Euclidean space: unit-sized, each angle of a q as a point of a circle."""
     dim, unit = y.shape[1] // 2, sizes(y)
     columns = []
     for i in range(y.shape[1]):
@@ -195,7 +198,7 @@ def _embedded(y, coordinates: Coordinates):
 
 
 def _spanning_order(points):
-    """Nodes of a minimal spanning tree of neighbours in breadth-first order, and their parents."""
+    """Order the nodes of a minimal spanning tree of the points breadth-first; with parents."""
     from scipy.sparse import csr_array  # loaded when first used
     from scipy.sparse.csgraph import (
         breadth_first_order,
@@ -218,10 +221,10 @@ def _spanning_order(points):
 
 
 def _bridges(points, part):
-    """The shortest edge from each part of the points (``part`` numbers them) to another part.
+    """Shortest edge from each part of the points (``part`` numbers them) to another part.
 
-    Any two parts differ in some bit of their numbers: for each bit, one side is sought among the
-    other. Memory is that of the points, however far apart the parts are.
+    Any two parts differ in some bit of their numbers. For each bit, the points of one value are
+    searched among those of the other. Memory stays that of the points.
     """
     from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 

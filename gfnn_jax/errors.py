@@ -1,28 +1,32 @@
-"""How a job or a fit ends early, and what it warns of, each told in one line."""
+"""Errors and the warning of the package, each a message of one line."""
 
 from __future__ import annotations
 
 
 class InputError(ValueError):
-    """Bad usage or bad input, in one line: what was expected and what came."""
+    """Error of usage or input. The message names what was expected and what came."""
 
     def __init__(self, message: str):
         super().__init__(" ".join(message.split()))
 
 
 class WorkError(RuntimeError):
-    """A failure during the work (a full disk), in one line; what was there before is as it was."""
+    """Failure during the work, such as a full disk. Files that existed before are unchanged."""
 
     def __init__(self, message: str):
         super().__init__(" ".join(message.split()))
 
 
 class FitError(ValueError):
-    """The data or the request cannot give a map: what was expected and what came."""
+    """Error of data or of a request that can give no map: what was expected and what came."""
 
     def __init__(self, message: str):
         super().__init__(" ".join(message.split()))
 
 
+class OutOfTime(Exception):
+    """The budget of a fit is spent; what was found so far stands."""
+
+
 class FitWarning(UserWarning):
-    """The fit went on, but its user should know."""
+    """Warning about a fit that continued: what was found and what it means for the result."""

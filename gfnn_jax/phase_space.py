@@ -25,7 +25,7 @@ TIME = "t"  # the name, among args, of the time of a drive; it is the last of th
 
 
 def require_x64(what: str) -> None:
-    """Raises RuntimeError where JAX would silently compute ``what`` in float32."""
+    """Raise RuntimeError where JAX would silently compute ``what`` in float32."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise RuntimeError(
             f"{what} needs float64: call jax.config.update('jax_enable_x64', True) first"
@@ -33,14 +33,16 @@ def require_x64(what: str) -> None:
 
 
 def split(z):
-    """z of shape (..., 2d) -> q, p of shape (..., d). NumPy or JAX arrays."""
+    """Split z of shape (..., 2d) into q and p of shape (..., d). NumPy or JAX arrays."""
     dim = z.shape[-1] // 2
     return z[..., :dim], z[..., dim:]
 
 
 def sizes(z):
-    """Size of each column of z (N, k): its standard deviation; of a constant one its magnitude,
-    or 1 where it is zero. NumPy."""
+    """Size of each column of z (N, k), in NumPy: its standard deviation.
+
+    The size of a constant column is its magnitude, or 1 where it is zero.
+    """
     z = np.asarray(z)
     deviation, largest = z.std(axis=0), np.abs(z).max(axis=0)
     # The deviation of a constant column is roundoff, not zero.
@@ -55,13 +57,15 @@ def apply_j(g):
 
 
 def area(z, moved):
-    """½ (p·δq − q·δp) (...) of states z and changes δ (..., 2d), NumPy or JAX: the integral of
-    ½ (p dq − q dp) along the straight line from z to z + δ."""
+    """Area ½ (p·δq − q·δp) (...) of states z and changes δ (..., 2d), NumPy or JAX.
+
+    It is the integral of ½ (p dq − q dp) along the straight line from z to z + δ.
+    """
     return -0.5 * namespace(z, moved).sum(z * apply_j(moved), axis=-1)
 
 
 def symplectic_form(dim: int) -> Float[np.ndarray, "phase phase"]:
-    """The matrix J of shape (2d, 2d), float64 NumPy."""
+    """Matrix J of shape (2d, 2d), float64 NumPy."""
     zero, one = np.zeros((dim, dim)), np.eye(dim)
     return np.block([[zero, one], [-one, zero]])
 
@@ -90,12 +94,12 @@ def symplecticity_defect(jacobian, scale=None, multiplier: Any = 1.0):
 
 
 def defect_of_pairs(before, after, scale, multiplier: Any = 1.0):
-    """The largest |after_uᵀ J after_v − μ before_uᵀ J before_v| (...) over pairs of tangent
-    vectors, the first half with the second: (2k, ..., 2d) each, ÷ the largest of scale_q scale_p
-    (2d,).
+    """Largest |after_uᵀ J after_v − μ before_uᵀ J before_v| (...) over pairs (u, v) of tangents.
 
-    For random signs of length 1 in units of ``scale`` it is about ‖MᵀJM − J‖ ÷ √(2d), Frobenius'
-    norm: what the entries of a row come to. NumPy or JAX.
+    before, after: tangent vectors (2k, ..., 2d); u runs over the first half, v over the second.
+    The result is divided by the largest product of scale_q and scale_p, scale (2d,). For tangents
+    of random signs, of length 1 in units of ``scale``, it is about ‖MᵀJM − J‖ ÷ √(2d) in
+    Frobenius' norm, the size of a row. NumPy or JAX.
     """
     xp, half, dim = namespace(after), len(before) // 2, len(scale) // 2
     form = [xp.sum(t[:half] * apply_j(t[half:]), axis=-1) for t in (after, before)]
@@ -105,7 +109,7 @@ def defect_of_pairs(before, after, scale, multiplier: Any = 1.0):
 
 
 def hamiltonian_vector_field(hamiltonian: Callable) -> Callable:
-    """``field(z, t=0.0)`` = J ∇H(z, t) of shape (2d,), the right-hand side of the paper's (1)."""
+    """Vector field ``field(z, t=0.0)`` = J ∇H(z, t) (2d,), the right-hand side of paper eq. (1)."""
 
     def field(z, t=0.0):
         return apply_j(jax.grad(hamiltonian)(z, t))
@@ -116,16 +120,21 @@ def hamiltonian_vector_field(hamiltonian: Callable) -> Callable:
 @jax.tree_util.register_pytree_node_class
 @dataclasses.dataclass(frozen=True)
 class Pairs:
-    """States and their images one time step later: what a map is learned from.
+    """States and their images one time step later, the data from which a map is learned.
 
     z0, z1: shape (N, 2d), q first; NumPy or JAX arrays. dt: the time between them (the paper's h),
-    in the user's unit of time; 1 for a map that has no time. One number, or one of each pair (N,).
+    in the user's unit of time; 1 for a map that has no time. One number, or one per pair (N,).
     args: parameters of the system in which each pair was measured, name -> (N,); an array (N, k) or
-    (N,) stands for parameters of the names a1, a2, …
-    t0, period: of a driven system, the time of z0 (N,), or one of all pairs, and the drive's
-    period. t0 is one of the args too, by the name t.
+    (N,) holds parameters that are named a1, a2, …
+    t0, period: of a driven system, the time of z0 (N,), or one for all pairs, and the period of the
+    drive. t0 is also one of the args, by the name t.
+    run: the run (trajectory, sequence) of each pair, (N,) numbers or text. place: the number of z0
+    along its run, (N,) integers. A fit sorts pairs that have a run by run and place. Where places
+    are missing, it finds them by the images that are states of other pairs.
+    std: standard deviation of the noise on each measured coordinate, (2d,), in the user's units.
+    With None it is estimated.
 
-    Raises FitError where these are no arrays of such shapes.
+    Raises FitError where the arrays do not have these shapes.
     """
 
     z0: Any
@@ -134,6 +143,9 @@ class Pairs:
     args: Any = None
     t0: Any = None
     period: float | None = None
+    run: Any = None
+    place: Any = None
+    std: Any = None
 
     def __post_init__(self):
         # JAX makes pairs of whatever it maps arrays to; a user's are lists or arrays.
@@ -150,16 +162,45 @@ class Pairs:
             self._set("dt", np.asarray(self.dt) if np.ndim(self.dt) else self.dt)
             if np.ndim(self.dt) and np.shape(self.dt) != (len(self),):
                 raise FitError(
-                    f"expected dt, one number or one of each pair ({len(self)},), got "
+                    f"expected dt as one number or one per pair ({len(self)},), got shape "
                     f"{np.shape(self.dt)}"
                 )
         if self.args is not None:
             self._set("args", _named(self.args, len(self)))
         if self.t0 is not None or TIME in (self.args or {}):
             self._set_time()
+        self._set_identities()
+        if self.std is not None and not isinstance(self.std, jax.Array):
+            self._set("std", np.asarray(self.std, np.float64))
+            if self.std.shape != (self.z0.shape[1],):
+                raise FitError(
+                    f"expected std of shape ({self.z0.shape[1]},), one of each coordinate, got "
+                    f"{self.std.shape}"
+                )
+            if not (np.isfinite(self.std) & (self.std > 0)).all():
+                raise FitError("expected every std finite and above 0; leave std out if unknown")
+
+    def _set_identities(self) -> None:
+        """Make ``run`` and ``place`` arrays (N,). Raises FitError on other shapes or types."""
+        if self.place is not None and self.run is None:
+            raise FitError("expected run as well as place: a place is counted along a run")
+        for name, kinds, what in (
+            ("run", "iufUSO", "numbers or text"),
+            ("place", "iu", "integers"),
+        ):
+            given = getattr(self, name)
+            if given is None or (isinstance(given, jax.Array) and given.shape == (len(self),)):
+                continue
+            values = np.asarray(given)
+            if values.shape != (len(self),) or values.dtype.kind not in kinds:
+                raise FitError(
+                    f"expected {name} as {what} of shape ({len(self)},), got {values.dtype} of "
+                    f"shape {values.shape}"
+                )
+            self._set(name, values.astype(str) if values.dtype.kind in "SO" else values)
 
     def _set_time(self) -> None:
-        """The time of the drive both as ``t0`` and as the last of the args."""
+        """Store the time of the drive both as ``t0`` and as the last of the args."""
         others = {name: values for name, values in (self.args or {}).items() if name != TIME}
         t0: Any = (self.args or {})[TIME] if self.t0 is None else self.t0
         if np.ndim(t0) == 0:
@@ -172,34 +213,47 @@ class Pairs:
         object.__setattr__(self, name, value)
 
     def tree_flatten(self):
-        """Arrays are leaves; a dt of all pairs is not."""
+        """Return the arrays as leaves; one dt for all pairs and names of runs are static."""
         own = bool(np.ndim(self.dt))
-        leaves = (self.z0, self.z1, self.args, *([self.dt] if own else []))
-        return leaves, (None if own else self.dt, self.period)
+        text = isinstance(self.run, np.ndarray) and self.run.dtype.kind == "U"
+        run = (None, tuple(self.run.tolist())) if text else (self.run, None)
+        leaves = (self.z0, self.z1, self.args, run[0], self.place, self.std)
+        return (*leaves, *([self.dt] if own else [])), (
+            None if own else self.dt,
+            self.period,
+            run[1],
+        )
 
     @classmethod
     def tree_unflatten(cls, fixed, leaves) -> Pairs:
-        """The inverse."""
-        (dt, period), (z0, z1, args, *own) = fixed, leaves
-        return cls(z0, z1, own[0] if own else dt, args, period=period)
+        """Invert ``tree_flatten``."""
+        (dt, period, names), (z0, z1, args, run, place, std, *own) = fixed, leaves
+        run = run if names is None else np.array(names)
+        return cls(
+            z0, z1, own[0] if own else dt, args, period=period, run=run, place=place, std=std
+        )
 
     def __len__(self) -> int:
         return self.z0.shape[0]
 
     @property
     def dim(self) -> int:
-        """Degrees of freedom d."""
+        """Number d of degrees of freedom."""
         return self.z0.shape[-1] // 2
 
     def take(self, rows) -> Pairs:
-        """The pairs of these rows (an index array or a slice)."""
+        """Select the pairs of these rows (an index array or a slice)."""
         dt = self.dt[rows] if np.ndim(self.dt) else self.dt
         args = self.args and {name: values[rows] for name, values in self.args.items()}
-        return Pairs(self.z0[rows], self.z1[rows], dt, args, period=self.period)
+        run, place = (None if of is None else of[rows] for of in (self.run, self.place))
+        return Pairs(
+            self.z0[rows], self.z1[rows], dt, args, period=self.period, run=run, place=place,
+            std=self.std,
+        )  # fmt: skip
 
 
 def _named(args: Any, count: int) -> dict[str, Any]:
-    """Parameters by their names, each (N,)."""
+    """Return the parameters by name, each (N,). Raises FitError on other shapes."""
     if not isinstance(args, Mapping):
         if np.ndim(args) not in (1, 2) or len(args) != count:
             raise FitError(

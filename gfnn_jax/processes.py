@@ -1,8 +1,8 @@
-"""One job in several processes, on one host or many, by JAX's own runtime (``jax.distributed``).
+"""Jobs shared by several processes, on one host or many, by JAX's runtime (``jax.distributed``).
 
-Every process has the same request and does its own share of it. Those of a rollout say nothing to
-each other while they work, and wait for each other once, at the end. Those of a fit are a `Group`:
-the first tells the others what to do, and their answers become one up a binary tree.
+Every process has the same request and does its own share of it. The processes of a rollout do not
+communicate while they work, and wait for each other once, at the end. The processes of a fit are a
+`Group`: the first tells the others what to do, and their answers are merged along a binary tree.
 """
 
 from __future__ import annotations
@@ -21,23 +21,26 @@ import numpy as np
 
 from gfnn_jax.errors import InputError, WorkError
 
-# Seconds: a process that is silent for so long is taken for dead, and the others end; how long the
-# first to finish waits for the last.
+# Seconds. A process that is silent for _HEARTBEAT is taken for dead, and the others end. The first
+# to finish waits at most _PATIENCE for the last.
 _HEARTBEAT, _PATIENCE = 10, 14 * 24 * 3600
 LOST = (
-    "this process or another one of the job was lost: what they had done is kept, --resume goes on "
-    "with it, in any number of processes"
+    "this process or another one of the job was lost: their finished work is kept, and --resume "
+    "continues it with any number of processes"
 )
 
 
 class Share(NamedTuple):
-    """Which of how many equal shares of a job this process does."""
+    """Share ``index`` of ``count`` equal shares of a job, the one that this process does."""
 
     index: int
     count: int
 
     def of(self, number: int, block: int) -> slice:
-        """Those of so many things that are its own: whole blocks, the last one but for its end."""
+        """Slice of this share among ``number`` items, in whole blocks of ``block`` items.
+
+        Only the last block of all may be incomplete.
+        """
         blocks = -(-number // block)
         ends = (i * blocks // self.count * block for i in (self.index, self.index + 1))
         return slice(*(min(end, number) for end in ends))
@@ -47,7 +50,7 @@ WHOLE = Share(0, 1)
 
 
 class Group:
-    """The processes of one job, who send each other arrays by name.
+    """Processes of one job, which send each other arrays by name.
 
     All of them make the same calls in the same order. sent: bytes that this process has sent.
     """
@@ -58,12 +61,14 @@ class Group:
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that decides."""
+        """True in the process of index 0, which decides."""
         return self.share.index == 0
 
     def told(self, arrays: dict[str, Any] | None = None) -> dict[str, Any]:
-        """What the first process says; the others give nothing. It remains in the runtime's store:
-        let it be small."""
+        """Broadcast the arrays of the first process; the others pass None and receive them.
+
+        The arrays remain in the runtime's store, so they should be small.
+        """
         call = next(self._calls)
         if self.share.count == 1:
             assert arrays is not None
@@ -75,8 +80,11 @@ class Group:
         return _received(f"gfnn/{call}")
 
     def folded(self, own: dict[str, Any], merge: Callable[[Any, Any], Any]) -> dict[str, Any]:
-        """In the first process ``merge`` of what all have, neighbours first: a binary tree, at each
-        level of which half of those that are left send theirs. In the others whatever they sent."""
+        """Reduce the arrays of all processes by ``merge`` along a binary tree, neighbours first.
+
+        At each level half of the remaining processes send theirs. The first process returns the
+        result, every other one what it sent.
+        """
         call, (index, count), step = next(self._calls), self.share, 1
         while step < count:
             if index % (2 * step):
@@ -96,7 +104,7 @@ class Group:
 
 
 def _received(key: str, *, delete: bool = False) -> dict[str, Any]:
-    """The arrays that another process sends, or has sent, under this key."""
+    """Receive the arrays that another process sends under this key, waiting for them."""
     with _lost_in_one_line():
         content = _store().blocking_key_value_get_bytes(key, 1000 * _PATIENCE)
         if delete:
@@ -106,10 +114,12 @@ def _received(key: str, *, delete: bool = False) -> dict[str, Any]:
 
 
 def _store() -> Any:
-    """The runtime's own store of keys and values, kept by the first process. JAX has no public name
-    for it. Arrays of any size go through it, nothing is compiled, and it waits for as long as the
-    first process searches: Gloo, XLA's collectives on a CPU, gives up after 30 s. 2 MB take 0.02 to
-    0.3 s, several times what a collective takes."""
+    """Return the runtime's store of keys and values, which the first process keeps.
+
+    JAX has no public name for it. It takes arrays of any size, compiles nothing, and waits for as
+    long as the first process searches; Gloo, XLA's collectives on a CPU, gives up after 30 s. 2 MB
+    take 0.02 to 0.3 s, several times as long as by a collective.
+    """
     from jax._src import distributed
 
     return distributed.global_state.client
@@ -128,10 +138,10 @@ def _lost_in_one_line() -> Iterator[None]:
 def join() -> Share:
     """Become one of the processes of a job, and wait until all are there.
 
-    How many there are, which one this is and where the first listens comes from the launcher, where
-    JAX knows it (SLURM, Open MPI, Kubernetes, cloud TPUs), else from the environment:
-    JAX_COORDINATOR_ADDRESS (host:port), JAX_NUM_PROCESSES, JAX_PROCESS_ID. Raises InputError where
-    that is missing or wrong.
+    The number of processes, the index of this one and the address of the first come from the
+    launcher where JAX knows it (SLURM, Open MPI, Kubernetes, cloud TPUs), else from the
+    environment: JAX_COORDINATOR_ADDRESS (host:port), JAX_NUM_PROCESSES, JAX_PROCESS_ID. Raises
+    InputError where these are missing or wrong.
     """
     import jax  # loaded when first used: refusing bad usage needs none
 
@@ -148,8 +158,8 @@ def join() -> Share:
         jax.local_devices()  # all processes tell each other what they have: none may leave it out
     except (ValueError, TypeError, RuntimeError) as error:
         raise InputError(
-            "expected a launcher that JAX knows, as srun and mpirun, or JAX_COORDINATOR_ADDRESS, "
-            f"JAX_NUM_PROCESSES and JAX_PROCESS_ID for --distributed ({error})"
+            "--distributed needs a launcher that JAX knows, such as srun or mpirun, or the "
+            f"variables JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID ({error})"
         ) from error
     atexit.register(abandon, 1)  # of an exception that nobody expects
     return Share(jax.process_index(), jax.process_count())
@@ -163,8 +173,11 @@ def wait_for_all() -> None:
 
 
 def abandon(status: int) -> None:
-    """End a process of a job that failed, at once; nothing where it is not one of several. At the
-    usual end of a program JAX would wait for the others, who would never know."""
+    """End this process at once with the exit status ``status``, where it is one of several.
+
+    At the usual end of a program JAX would wait for the others, which would never know of the
+    failure.
+    """
     jax = sys.modules.get("jax")
     if jax is not None and jax.distributed.is_initialized():
         sys.stdout.flush()
@@ -174,11 +187,11 @@ def abandon(status: int) -> None:
 
 @contextlib.contextmanager
 def watched(line: str) -> Iterator[None]:
-    """``line`` on stderr if this process is aborted or killed inside the block.
+    """Print ``line`` on stderr if this process is aborted or killed inside the block.
 
-    JAX's runtime aborts a process whose fellow is lost, with a page of native messages and no
-    exception. Those go nowhere; Python's own go on. The line comes from a process that does nothing
-    else, and does so where the system can fork.
+    JAX's runtime aborts a process when another one is lost, with a page of native messages and no
+    exception. The native messages are discarded; Python's own still appear. A forked process prints
+    the line; nothing is done where the system cannot fork.
     """
     if not hasattr(os, "fork"):
         yield

@@ -7,10 +7,10 @@ from functools import cache
 
 
 def one_thread() -> AbstractContextManager:
-    """A context in which BLAS and LAPACK use one thread.
+    """Context in which BLAS and LAPACK use one thread.
 
-    Factorisations by many small panels gain little from threads, and where other processes want the
-    same cores the threads wait for each other: 34 s instead of 2 s for 500 terms, measured.
+    Factorisations by many small panels gain little from threads. Where other processes use the same
+    cores, threads wait for each other: 34 s instead of 2 s for 500 terms, measured.
     """
     return _controller().limit(limits=1, user_api="blas")
 

@@ -69,7 +69,7 @@ def _interruptible():
 
 @pytest.fixture(autouse=True, scope="module")
 def _no_more_programs_than_a_module_needs():
-    """All of the suite's would fill gigabytes."""
+    """Drop compiled programs after each module: all of the suite's would fill gigabytes."""
     yield
     jax.clear_caches()
 

@@ -27,7 +27,7 @@ def pendulum(w):
 @partial(jax.tree_util.register_dataclass, data_fields=("amplitude",), meta_fields=())
 @dataclasses.dataclass(frozen=True)
 class Network(DifferentiatedByJax):
-    """One hidden layer of tanh, its gradient in closed form."""
+    """Network of one hidden layer of tanh, with its gradient in closed form."""
 
     amplitude: float = 1.0
     operations = (0, 0)

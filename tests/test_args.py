@@ -1,4 +1,4 @@
-"""What a step depends on beside the state: its own dt, and parameters of the system."""
+"""Arguments of a step beside the state: its own dt, and parameters of the system."""
 
 import re
 import warnings
@@ -319,7 +319,7 @@ def test_a_dt_that_a_map_does_not_serve(learned):
     for dt in (0.0, -1.0, np.nan, "long"):
         with pytest.raises(ValueError, match="finite and above 0"):
             learned.map.step(np.zeros(2), {"l": 1.0}, dt=dt)
-    with pytest.raises(ValueError, match="one time step, or one of each state"):
+    with pytest.raises(ValueError, match="one time step, or one per state"):
         learned.map.step(np.zeros((3, 2)), {"l": 1.0}, dt=np.ones(2))
 
 
@@ -331,10 +331,10 @@ DT = np.linspace(0.1, 0.2, 40)
     ("dt", "args", "options", "message"),
     [
         (np.where(DT > 0.19, -DT, DT), None, {}, "time steps above 0, got 4 of 40 that are not"),
-        (DT[:7], None, {}, "one number or one of each pair (40,), got (7,)"),
+        (DT[:7], None, {}, "one number or one per pair (40,), got shape (7,)"),
         (0.1, {"l": DT[:7]}, {}, "expected args['l'] of shape (40,), got (7,)"),
         (0.1, DT[:7], {}, "as name -> (40,) or as an array (40, k)"),
-        (0.1, {"q1": DT}, {}, "a name for a parameter that has no meaning yet, got 'q1'"),
+        (0.1, {"q1": DT}, {}, "'q1' cannot name a parameter"),
         (0.1, {"arm length": DT}, {}, "letters, digits and _ as a parameter's name"),
         (0.1, {"l": np.where(DT > 0.19, np.nan, DT)}, {}, "finite values of l, got 4 of 40"),
         (DT, {"l": DT}, {"learn": "map"}, "the pairs differ in their dt: expected learn='auto'"),

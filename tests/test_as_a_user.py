@@ -1,4 +1,4 @@
-"""What a new user meets: each case of the benchmark ends with a verdict that is true."""
+"""Benchmark of a new user: each case ends with a verdict that is true."""
 
 import sys
 from pathlib import Path

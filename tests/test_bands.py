@@ -1,4 +1,4 @@
-"""How sure: the posterior of the coefficients, maps drawn from it, bands of predictions."""
+"""Posterior of the coefficients, maps drawn from it, bands of predictions."""
 
 import jax
 import numpy as np
@@ -9,7 +9,7 @@ from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.data.files import read_initial_noise
 from gfnn_jax.errors import InputError
 from gfnn_jax.fitting import shared_noise, uncertainty
-from gfnn_jax.fitting.least_squares import Reduced
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.jobs.predict import predict
 from gfnn_jax.learn.candidates import Judges, Tolerance
@@ -48,8 +48,7 @@ def test_a_law_is_fitted_to_whole_sequences(noisy):
 
 
 def factored(rows, target):
-    matrix = np.linalg.qr(np.column_stack([rows, target]), mode="r")
-    return Reduced(np.asfortranarray(matrix), len(rows))
+    return Triangle.of(np.column_stack([rows, target]))
 
 
 def test_covariance_is_that_of_the_textbook_where_all_rows_are_alike():
@@ -152,7 +151,7 @@ def test_every_sample_is_a_symplectic_map_and_rolls_out_as_it(noisy):
 
 def test_a_map_without_posterior_says_so(noisy):
     bare = jax.tree.map(lambda leaf: leaf, noisy[1].map)
-    with pytest.raises(ValueError, match="with a posterior"):
+    with pytest.raises(ValueError, match="no posterior to draw from"):
         bare.sample(jax.random.key(0), 3)
 
 
@@ -250,5 +249,5 @@ def test_what_is_no_noise_of_initial_states_is_refused(noisy, tmp_path):
         with pytest.raises(InputError, match="z0_std"):
             read_initial_noise(path, (2, 4))
     noisy[1].map.save(tmp_path / "model")
-    with pytest.raises(InputError, match="--samples beside --horizon"):
+    with pytest.raises(InputError, match="--horizon needs --samples"):
         predict(tmp_path / "model", path, num_steps=2, out=tmp_path / "out.npz", horizon_size=1.0)

@@ -49,7 +49,7 @@ def test_symplectic_whatever_the_parameters(name):
 
 @pytest.mark.parametrize("name", SYMPLECTIC)
 def test_gradients_with_respect_to_the_parameters(name):
-    """What a training follows, against finite differences."""
+    """Gradients that a training follows, against finite differences."""
     step, params = SYMPLECTIC[name]
     check_grads(lambda params: step(params, STATES[0]), (roughened(params),), 1, modes=("rev",))
 
@@ -75,7 +75,7 @@ def test_la_module_by_module():
 
 
 def test_a_gradient_module_is_a_shear_by_a_gradient():
-    """One module moves p by the gradient of Σ aᵢ softplus(kᵢ·q + bᵢ)."""
+    """Check that a module moves p by the gradient of Σ aᵢ softplus(kᵢ·q + bᵢ)."""
     params = roughened(g_init(KEY, 2, 1, 9))
     inner, bias, outer = (params[k][0] for k in ("inner", "bias", "outer"))
     for z in STATES[:3]:
@@ -87,7 +87,7 @@ def test_a_gradient_module_is_a_shear_by_a_gradient():
 
 
 def test_a_ridge_is_the_exact_flow():
-    """One layer against the flow of H = f(w·z), by many small steps of its own field."""
+    """Compare a layer with the flow of H = f(w·z), by many small steps of its own field."""
     params = roughened(p_init(KEY, 2, 1, 4))
     direction, coefficients = params["direction"][0], params["coefficient"][0]
 
@@ -130,7 +130,7 @@ def hamiltonian_step(step_of, scene):
 
 @pytest.mark.parametrize(("step_of", "make"), [(leapfrog, henon_heiles), (tao, pcr3bp)])
 def test_integrators_are_of_second_order(step_of, make):
-    """With the exact H: the error of a step is that of order 2, eight times less at half the dt."""
+    """Check with the exact H that the error of a step falls eightfold at half the dt."""
     scene = make()
     states = sample_states(scene, 8, jax.random.key(3))
     errors = []
@@ -154,7 +154,7 @@ def test_leapfrog_is_symplectic_and_reversible():
 
 
 def test_taos_step_is_symplectic_in_the_doubled_phase_space_only():
-    """Of the plain state the defect is of the order of dt³, the distance between the copies."""
+    """Check that the defect of the plain state is of order dt³, the copies' distance."""
     scene = pcr3bp()
     states = sample_states(scene, 8, jax.random.key(3))
     defects = []

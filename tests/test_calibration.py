@@ -1,4 +1,4 @@
-"""What benchmarks/bands.py makes of errors and bands of several data sets."""
+"""Statistics in benchmarks/bands.py of errors and bands of several data sets."""
 
 import sys
 from pathlib import Path

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.dataset.runs import identified
+from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.learn import sweeps
 from gfnn_jax.learn.candidates import Judges, Tolerance, one_step_error
-from gfnn_jax.learn.clock import Clock, OutOfTime
-from gfnn_jax.learn.held_out import split_rows
+from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.search import search
 from gfnn_jax.phase_space import Pairs
@@ -88,7 +89,7 @@ def of_kicks(num=2_000, factors=None):
     """The sweep of polynomials in type 2, without any compilation."""
     pairs = kicked(num)
     prepared = prepare(pairs, Coordinates("plain"))
-    judges = Judges(pairs, *split_rows(pairs, 0), Tolerance(1e-11))
+    judges = Judges.of(identified(pairs).pairs, 0, Tolerance(1e-11))
     return sweeps.LinearSweep(prepared, TYPE2, judges, "polynomial", None, None, factors)
 
 
@@ -99,7 +100,7 @@ def quiet(_):
 def test_the_right_degree_is_found_without_compiling(compilations):
     with compilations() as found:
         sweep = of_kicks()
-        result = search([sweep], 1e-11, Clock(), quiet, quiet)
+        result = search([sweep], 1e-11, Budget(), quiet, quiet)
     assert found.count == 0
     best = result.ranking[0]
     assert best.candidate.label == "polynomial 4"
@@ -114,8 +115,8 @@ def test_the_estimate_is_of_the_size_of_the_error():
     """The held-out residual of the gradient is the step's error to first order."""
     sweep = of_kicks()
     for size in sweep.sizes[:2]:
-        judged = sweep.judge(size, Clock(), quiet)
-        measured = sweep.validate(size, judged, Clock(), quiet)
+        judged = sweep.judge(size, Budget(), quiet)
+        measured = sweep.validate(size, judged, Budget(), quiet)
         assert 0.5 < measured.validation_relative / judged.validation_relative < 2
         assert 0.5 < judged.train_rms / judged.validation_relative < 2
 
@@ -123,7 +124,7 @@ def test_the_estimate_is_of_the_size_of_the_error():
 def test_more_pairs_never_take_a_candidate_away(monkeypatch):
     """Where a factorisation of all rows would take too long, it is of a sample of them."""
     monkeypatch.setattr(sweeps, "_MOST_OPERATIONS", 300 * 27**2)
-    found = search([of_kicks()], 1e-11, Clock(), quiet, quiet)
+    found = search([of_kicks()], 1e-11, Budget(), quiet, quiet)
     assert found.ranking[0].candidate.label == "polynomial 4"
     assert found.ranking[0].candidate.validation_bound < 1e-11
 
@@ -131,15 +132,15 @@ def test_more_pairs_never_take_a_candidate_away(monkeypatch):
 def test_a_factorisation_stops_when_the_time_is_spent():
     sweep = of_kicks()
     with pytest.raises(OutOfTime):
-        sweep.judge(sweep.sizes[0], Clock(max_seconds=0.0), quiet)
+        sweep.judge(sweep.sizes[0], Budget(max_seconds=1e-9), quiet)
 
 
 def test_a_fit_that_goes_on_takes_the_factors_that_were_kept(monkeypatch, tmp_path):
     monkeypatch.setattr(sweeps, "_WORTH_KEEPING", 0.0)
-    first = search([of_kicks(factors=KeptFactors(tmp_path))], 1e-11, Clock(), quiet, quiet)
+    first = search([of_kicks(factors=KeptFactors(tmp_path))], 1e-11, Budget(), quiet, quiet)
 
     def again():
-        return search([of_kicks(factors=KeptFactors(tmp_path))], 1e-11, Clock(), quiet, quiet)
+        return search([of_kicks(factors=KeptFactors(tmp_path))], 1e-11, Budget(), quiet, quiet)
 
     with monkeypatch.context() as without:
         without.setattr(sweeps.least_squares, "reduce", None)
@@ -160,11 +161,11 @@ def test_an_even_generating_function_is_known_by_its_pairs(odd, even, monkeypatc
     p = p - 0.1 * (q + q**3 / 2 + odd * q**2)
     pairs = Pairs(z, np.concatenate([q + 0.1 * p, p], axis=1), 0.1)
     prepared = prepare(pairs, Coordinates("cartesian"))
-    judges = Judges(pairs, *split_rows(pairs, 0), Tolerance(1e-6))
+    judges = Judges.of(identified(pairs).pairs, 0, Tolerance(1e-6))
     assert sweeps.is_even(prepared, judges) == even
     (found,) = sweeps.sweeps_for("polynomial", [MIDPOINT], prepared, None, judges)
     assert [size.family.degree for size in found.sizes] == ([2, 4] if even else [2, 3, 4])
     if even:
-        judged = found.judge(found.sizes[-1], Clock(), lambda message: None)
+        judged = found.judge(found.sizes[-1], Budget(), lambda message: None)
         assert judged.label == "even polynomial 4"
         assert judged.num_parameters == 21 + 126

@@ -14,7 +14,7 @@ from gfnn_jax.learn.prepare import prepare
 
 
 def spherical_pendulum_pairs(count, latitude=False):
-    """At dt = 0.1, from another solver; the angle from the lower pole, or the latitude."""
+    """Pairs at dt = 0.1, by another solver; the angle from the lower pole, or the latitude."""
     rng = np.random.default_rng(0)
     q1, q2 = rng.uniform(0.4, 2.7, count), rng.uniform(-np.pi, np.pi, count)
     p1, p2 = rng.uniform(-1, 1, (2, count))

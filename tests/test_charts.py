@@ -51,7 +51,7 @@ STATES = 0.7 * np.random.default_rng(1).standard_normal((BATCH, 4))
 
 
 def states_of(chart):
-    """Of two degrees of freedom for types 1 and 2, where two entries of w are free, else of one."""
+    """States with d = 2 for types 1 and 2, where two entries of w are free, else with d = 1."""
     return STATES if chart in (TYPE1, TYPE2) else STATES[:, :2]
 
 
@@ -112,7 +112,7 @@ def test_pair_asks_for_its_own_gradient_from_either_side(chart):
 
 @EVERY
 def test_jacobian_of_the_residual_and_determinant_are_those_of_the_formulas(chart):
-    """For two degrees of freedom, in NumPy, against finite differences."""
+    """Compare with finite differences, in NumPy, for two degrees of freedom."""
     family = Products(box_inputs(STATES), 3)
     c = np.random.default_rng(8).standard_normal(family.num_parameters)
     params, free = family.unflatten(c), chart.free(2)
@@ -269,7 +269,7 @@ def test_midpoint_rule_is_of_second_order():
 
 @from_function
 def exact_type_2(time, w):
-    """Of the oscillator, without q P, which the chart has; h = 1."""
+    """Exact S of the oscillator in type 2 at h = 1, without q P, which the chart has."""
     q, p = w
     return q * p * (1 / jnp.cos(time) - 1) + 0.5 * (q**2 + p**2) * jnp.tan(time)
 
@@ -295,7 +295,7 @@ def there_and_back(piece, z):
     ids=["type 2", "type 1"],
 )
 def test_exact_functions_of_the_oscillator(chart, family, times, expected):
-    """Also far beyond the fold at a quarter turn."""
+    """Compare S with the exact one, also far beyond the fold at a quarter turn."""
     z = np.random.default_rng(6).standard_normal((20, 2))
     for time in times:
         image, back, determinant = there_and_back(generated(family, time, chart, 1.0), z)

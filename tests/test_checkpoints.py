@@ -39,7 +39,7 @@ DESCRIPTION = {"chart": "midpoint", "dt": 0.1, "angles": [0, 2], "name": "θ", "
 
 
 def assert_same(a, b):
-    """The same structure, types, dtypes and bits."""
+    """Assert that two trees have the same structure, types, dtypes and bits."""
     assert jax.tree.structure(a) == jax.tree.structure(b)
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         assert np.shape(x) == np.shape(y)

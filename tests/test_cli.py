@@ -284,7 +284,8 @@ REPORT_KEYS = {
     "data": {"num_pairs"},
     "model": {"learns", "family", "chart", "num_parameters", "label"},
     "fit": {"seconds", "total_seconds", "compile_seconds", "train_rms", "validation_rms",
-            "validation_relative", "tolerance", "tolerance_met", "ended"},
+            "validation_relative", "tolerance", "tolerance_met", "ended", "operations",
+            "max_operations"},
     "map": {"symplecticity_defect", "chart_determinant_min", "newton_iterations_max"},
     "rollout": {"num_trajectories", "num_excluded", "num_steps", "seconds",
                 "microseconds_per_step", "status_counts", "error", "error_median",
@@ -306,7 +307,7 @@ def read_report(folder):
     assert all(set(candidate) >= CANDIDATE_KEYS for candidate in report["candidates"])
     assert [c["chosen"] for c in report["candidates"]].count(True) == 1
     law = report["hamiltonian"]
-    assert law is None or {"formula", "terms"} == set(law)
+    assert law is None or {"formula", "terms", "dropped", "search_cut_short"} == set(law)
     assert report["fit"]["ended"]
     return report
 
@@ -384,7 +385,7 @@ def test_a_model_is_kept_and_known_again(fitted, tmp_path, capsys, monkeypatch):
     assert gfnn(*fit) == 2
     capsys.readouterr()
     assert gfnn(*fit, "--resume") == 0
-    assert "from this very job" in capsys.readouterr().out
+    assert "already holds the result of this job" in capsys.readouterr().out
     assert gfnn(*fit, "--resume", "--seed", 1) == 2
     assert files(tmp_path) == before
     assert gfnn(*fit, "--overwrite", "--seed", 1) == 0
@@ -392,7 +393,7 @@ def test_a_model_is_kept_and_known_again(fitted, tmp_path, capsys, monkeypatch):
 
 
 def test_a_training_that_was_stopped(fitted, tmp_path, capsys, monkeypatch):
-    """It leaves its checkpoints beside the output; they are resumed or discarded, as asked."""
+    """Stop a training: its checkpoints stay beside the output, and are resumed or discarded."""
     started_from = []
 
     def training(*args, checkpoints, **kwargs):
@@ -409,9 +410,9 @@ def test_a_training_that_was_stopped(fitted, tmp_path, capsys, monkeypatch):
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.endswith("m.partial keeps step_000000000007: --resume goes on with it")
     assert gfnn(*fit) == 2
-    assert "m.partial: an unfinished fit" in capsys.readouterr().err
+    assert "m.partial: holds an unfinished fit" in capsys.readouterr().err
     assert gfnn(*fit, "--resume", "--seed", 1) == 2
-    assert "m.partial: of another fit: seed differ" in capsys.readouterr().err
+    assert "m.partial: belongs to another fit: seed differ" in capsys.readouterr().err
     assert gfnn(*fit, "--overwrite") == 130
     assert gfnn(*fit, "--resume") == 0
     assert started_from == [None, None, 7]
@@ -431,7 +432,7 @@ def test_resuming_another_job_discards_no_training(fitted, tmp_path, capsys, mon
     before = files(tmp_path)
     monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
     assert gfnn(*fit, "--resume") == 2
-    assert "m.partial: of another fit: family differ" in capsys.readouterr().err
+    assert "m.partial: belongs to another fit: family differ" in capsys.readouterr().err
     assert files(tmp_path) == before
 
 
@@ -504,7 +505,7 @@ def test_an_interrupted_fit_publishes_the_best_of_all_its_runs(
     ["polynomial", *(pytest.param(f, marks=pytest.mark.slow) for f in ("sines", "mlp"))],
 )
 def test_a_fit_survives_two_of_each_signal(family, tmp_path, monkeypatch):
-    """At different moments of a fit that is resumed each time: the map of one that nothing met."""
+    """Send signals to a fit that is resumed each time: the map is that of an undisturbed fit."""
     data = pairs_file(tmp_path / "d.npz", oscillator(300, [0, 1.0]), dt=1.0)
     # Tolerances that take several sizes, and a training that ends in seconds.
     tolerance = {"polynomial": 1e-14, "sines": 1e-14, "mlp": 1e-2}[family]

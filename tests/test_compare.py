@@ -48,7 +48,7 @@ def test_an_interrupted_comparison_keeps_what_is_finished_and_reports_all(small,
     kept = json.loads((out.with_name("out.partial") / "hnn.json").read_text())
     with pytest.raises(InputError, match="an unfinished comparison"):
         compare(out)
-    with pytest.raises(InputError, match="of another comparison: seed differ"):
+    with pytest.raises(InputError, match="belongs to another comparison: seed differ"):
         compare(out, resume=True, seed=1)
     told = []
     compared = compare(out, resume=True, progress=Progress(told.append))
@@ -142,7 +142,7 @@ def test_a_runaway_is_lost_from_there_on():
 
 @pytest.mark.slow
 def test_the_papers_recipe_on_the_standard_map(small):
-    """Its map commutes with the shifts by 2π, and S sees no more of θ than cos and sin."""
+    """Check that the map commutes with shifts by 2π: S depends on θ by cos and sin alone."""
     data = SharedData(scenes.make("standard-map-regular"), 0, True)
     budget = Budget(jax.random.key(0), cap=0.1)
     learned = paper_gfnn(data.sequences(2), budget)

@@ -1,4 +1,4 @@
-"""How many XLA programs an answer takes: most of the time to a first answer goes into them."""
+"""Number of XLA programs of an answer, which take most of the time to a first answer."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What neighbouring pairs say of a map, where they are many and noisy, or on a single orbit."""
+"""Diagnosis of data by neighbouring pairs: many, noisy, or on a single orbit."""
 
 import numpy as np
 import pytest

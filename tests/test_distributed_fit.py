@@ -14,7 +14,8 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax import processes
-from gfnn_jax.data.files import iterate_pairs, read_sample
+from gfnn_jax.data.files import iterate_pairs
+from gfnn_jax.data.sample import read_sample
 from gfnn_jax.errors import InputError
 from gfnn_jax.jobs import fit as fit_job
 from gfnn_jax.learn.refit import help_refit, refit
@@ -47,7 +48,7 @@ class Store:
 
 @pytest.fixture
 def in_threads(monkeypatch):
-    """What ``work(group)`` answers in each of so many processes."""
+    """Results of ``work(group)`` in each of ``count`` processes, simulated by threads."""
 
     def run(count, work):
         store = Store()
@@ -83,7 +84,7 @@ def image(z):
 
 
 def flow(z):
-    """Of H = p²/2 + q⁴/4, in small steps of fourth order."""
+    """Flow of H = p²/2 + q⁴/4, by small steps of fourth order."""
     q, p = z.T
     x = 1 / (2 - 2 ** (1 / 3))
     for _ in range(200):
@@ -232,7 +233,7 @@ def in_files(folder, pairs, parts):
 
 
 def turned(z, dt):
-    """By the flow of p²/2 + q²/2 over dt, each its own."""
+    """Images by the flow of p²/2 + q²/2, each over its own dt."""
     (q, p), cos, sin = z.T, np.cos(dt), np.sin(dt)
     return np.stack([cos * q + sin * p, cos * p - sin * q], axis=1)
 

@@ -87,7 +87,7 @@ def test_ignored_coordinates_do_not_matter_unless_they_are_not_finite():
 
 
 def test_constant_coordinate():
-    """No spread at all in one coordinate: the data are inside, another value is not."""
+    """Check a coordinate without spread: its value is inside, another one is not."""
     y = np.concatenate([annulus(), np.full((2000, 2), 5.0)], axis=1)
     domain = covering(y)
     assert domain.contains(y[:50]).all()

@@ -12,7 +12,8 @@ import scipy.integrate
 
 import gfnn_jax as gfnn
 from gfnn_jax import cli
-from gfnn_jax.data.files import read_initial, read_sample, read_trajectories
+from gfnn_jax.data.files import read_initial, read_trajectories
+from gfnn_jax.data.sample import read_sample
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
@@ -109,7 +110,7 @@ def test_s_is_that_of_the_time_in_the_middle(name):
 
 
 def test_the_time_is_counted_and_not_summed():
-    """After 10⁷ steps the phase of a period that no step divides is right to its last digits."""
+    """Check the phase after 10⁷ steps, to its last digits, where no step divides the period."""
     known = Parameters(("l", "t"), np.zeros(2), np.ones(2), np.float64(PERIOD))
     dt, steps, t0 = 0.1, 10_000_001, 1.3
     exact = float((Fraction(t0) + steps * Fraction(dt)) % Fraction(PERIOD))
@@ -245,7 +246,7 @@ def test_times_that_are_not_the_maps(learned):
     ):
         with pytest.raises(ValueError, match=re.escape(message)):
             learned.map.step(np.zeros((2, 2)), **given)
-    with pytest.raises(ValueError, match="a driven one keeps no energy"):
+    with pytest.raises(ValueError, match="a driven one conserves no energy"):
         learned.map.modified_hamiltonian(np.zeros(2))
 
 

@@ -226,7 +226,7 @@ def test_c_of_a_map_with_parameters(kind, tmp_path):
 def test_a_driven_map_has_no_c(tmp_path):
     map_, _, lengths = with_length("law")
     driven = dataclasses.replace(map_, parameters=sampled(("t",), lengths, DT, 2 * np.pi))
-    with pytest.raises(gfnn.InputError, match=r"the map is driven.*--to stablehlo takes any map"):
+    with pytest.raises(gfnn.InputError, match=r"the map is driven.*use --to stablehlo"):
         gfnn.export(driven, "c", tmp_path / "a.c")
 
 
@@ -299,7 +299,7 @@ def test_what_has_no_c_is_refused(tmp_path):
     map_, _ = map_in(MIDPOINT, 1, 3)
     single = jax.tree.map(lambda a: np.asarray(a, np.float32), map_)
     for bad, why in ((network, "one of a function"), (single, "not of float64")):
-        with pytest.raises(gfnn.InputError, match=rf"{why}.*--to stablehlo takes any map"):
+        with pytest.raises(gfnn.InputError, match=rf"{why}.*use --to stablehlo"):
             gfnn.export(bad, "c", tmp_path / "a.c")
     for to, out, why in (("c", "a.txt", "is written as .c"), ("c", "a-1.c", "C functions are"),
                          ("c", "double.c", "C functions are"), ("onnx", "a", "c or stablehlo"),

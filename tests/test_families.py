@@ -84,7 +84,7 @@ def test_derivatives_are_those_of_the_value_in_numpy_and_in_jax(kind, inputs):
 
 @jax.jit
 def automatic(family, params, w):
-    """What JAX makes of the value at the states w (B, 4)."""
+    """Derivatives of the value by JAX at the states w (B, 4)."""
     over = functools.partial(jax.vmap, in_axes=(None, 0))
     return (
         over(jax.grad(family, argnums=1))(params, w),
@@ -105,7 +105,7 @@ def test_closed_derivatives_are_those_of_autodiff(kind, inputs):
 
 @pytest.mark.parametrize("kind", ["products", "sines"])
 def test_the_gradients_derivative_is_symmetric_to_the_last_bit(kind):
-    """And the same as JAX's to rounding, in w as in the parameters."""
+    """Compare it with JAX's as well, to rounding, in w and in the parameters."""
     family, params = case(kind, "angles and cyclic")
     w, dot = jnp.asarray(W[0]), np.random.default_rng(2).normal(size=W[0].shape)
 
@@ -117,7 +117,7 @@ def test_the_gradients_derivative_is_symmetric_to_the_last_bit(kind):
     np.testing.assert_allclose(found, jacobian(family.gradient), rtol=1e-11, atol=1e-12)
 
     def along(gradient):
-        """Of the gradient and the Hessian, along a direction of all arguments."""
+        """Derivatives of gradient and Hessian along a direction of all arguments."""
         dots = (jax.tree.map(lambda a: 0.1 * jnp.ones_like(a), params), dot)
         return jax.jit(lambda: jax.jvp(gradient, (params, w), dots)[1])()
 
@@ -168,7 +168,7 @@ def test_float32_stays_float32_and_dots_are_not_tf32(kind, inputs):
 
 
 def test_derivatives_in_the_parameters():
-    """What training and sensitivities need, through every kind of family."""
+    """Check derivatives in the parameters of every kind of family."""
     for kind in ("products", "sines", "mlp", "from_function"):
         family, params = case(kind, "angle")
 
@@ -215,7 +215,7 @@ def test_a_plain_function_becomes_a_family_and_a_family_stays():
 
 
 def test_a_function_may_hold_numbers_and_take_args():
-    """What a callable pytree holds are leaves of the family."""
+    """Check that the leaves of a callable pytree are leaves of the family."""
 
     def driven(strength, params, w, args):
         return strength * jnp.sum(w**2) + args * w[0]

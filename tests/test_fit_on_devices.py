@@ -12,13 +12,14 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
+from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.fitting import accelerated, gauss_newton, least_squares, row_blocks
-from gfnn_jax.fitting.triangular import folded
+from gfnn_jax.fitting.triangle import folded
 from gfnn_jax.flows.collocation import Steps
-from gfnn_jax.learn.clock import Counted, OutOfTime
+from gfnn_jax.learn.clock import Counted
 
 FITS = """
 import sys
@@ -175,11 +176,11 @@ def test_operations_are_spent_as_by_one(count, sharing):
             options=gauss_newton.Options(block_bytes=2**20, part_bytes=2**20),
         )  # fmt: skip
         with sharing(devices):
-            found = problem.factor(family, c, Steps(4, 1), np.arange(5_000))
+            found = problem.linearised(family, c, Steps(4, 1), np.arange(5_000))
             size = problem.residuals(family, c, Steps(4, 1), np.arange(5_000))
         spent.append((budget.spent, found.rows, size.tobytes()))
         assert found.rows == 10_000
-        np.testing.assert_allclose(found.cost, np.linalg.norm(size), rtol=1e-12)
+        np.testing.assert_allclose(found.norm, np.linalg.norm(size), rtol=1e-12)
     assert spent[0] == spent[1] == spent[2]
 
 
@@ -194,7 +195,7 @@ def test_a_flow_that_fails_has_no_cost(sharing):
         z0, pairs.z1, DT, np.ones(2), options=gauss_newton.Options(part_bytes=2**18)
     )
     with sharing(2):
-        assert problem.factor(family, np.ones(2), Steps(4, 1), np.arange(3_000)).cost == np.inf
+        assert problem.linearised(family, np.ones(2), Steps(4, 1), np.arange(3_000)).norm == np.inf
 
 
 def rows(number=900):
@@ -203,8 +204,8 @@ def rows(number=900):
 
 
 def same_factor(one, other):
-    """Of the same rows: up to the signs of its own, and where columns depend on each other up to
-    more."""
+    """Assert factors of the same rows: up to the signs of rows, and up to more where columns are
+    dependent."""
     squares = [np.triu(factor).T @ np.triu(factor) for factor in (one, other)]
     np.testing.assert_allclose(*squares, rtol=0, atol=1e-13 * np.abs(squares[1]).max())
 
@@ -250,16 +251,6 @@ def test_rows_go_to_an_accelerator_where_there_is_one(monkeypatch):
     assert found.rows == plain.rows
     assert len(shapes) == 1
     same_factor(found.factor, plain.factor)
-
-
-@pytest.mark.parametrize("triangular", [False, True])
-def test_rows_are_folded_into_a_factor(triangular):
-    rng = np.random.default_rng(0)
-    top, more = np.triu(rng.normal(size=(70, 70))), rng.normal(size=(70, 70))
-    more = np.triu(more) if triangular else more
-    expected = np.linalg.qr(np.concatenate([top, more]), mode="r")
-    found = folded(np.asfortranarray(top), np.asfortranarray(more), triangular=triangular)
-    same_factor(found, expected)
 
 
 def test_other_threads_work_while_rows_are_folded():

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
+from gfnn_jax.dataset.runs import identified
 from gfnn_jax.families.terms import Terms, given_terms, polynomial_terms
 from gfnn_jax.fitting.gauss_newton import Problem, log_start, midpoint_start, null_terms
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.flows import learn_hamiltonian
 from gfnn_jax.learn.formula import Term, formula
-from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.learned_law import assembled
 from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.phase_space import Pairs
@@ -30,7 +30,7 @@ def henon_heiles(count, dt, seed=0, size=0.3):
 
 def learned(pairs, *, tolerance=1e-12, terms=(), coordinates=CARTESIAN):
     prepared = prepare(pairs, coordinates)
-    judges = Judges(pairs, *split_rows(pairs, 0), Tolerance(tolerance))
+    judges = Judges.of(identified(pairs).pairs, 0, Tolerance(tolerance))
     return learn_hamiltonian(prepared, judges, terms=terms), prepared, judges
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
+from gfnn_jax.dataset.runs import identified
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.modes import Mode, Modes
 from gfnn_jax.families.terms import Terms, given_terms, multiplied
@@ -14,7 +15,6 @@ from gfnn_jax.fitting.growth import grow
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.flows import learn_hamiltonian
-from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.phase_space import Pairs
 
@@ -32,7 +32,7 @@ def pairs_of(terms, coefficients, count, dt, seed=0):
 
 def learned(pairs, tolerance, terms=(), angles=(0,)):
     coordinates = Coordinates("angles", angles=angles) if angles else CARTESIAN
-    judges = Judges(pairs, *split_rows(pairs, 0), Tolerance(tolerance))
+    judges = Judges.of(identified(pairs).pairs, 0, Tolerance(tolerance))
     return learn_hamiltonian(prepare(pairs, coordinates), judges, terms=terms)
 
 

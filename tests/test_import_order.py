@@ -16,7 +16,8 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 ORDER = (
     "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes",
     "storage", "data", "scenes", "families", "solve", "generating", "flows", "maps", "exports",
-    "fitting", "models", "learn", "baselines", "evaluate", "jobs", "cli_columns", "cli", "__main__",
+    "dataset", "fitting", "models", "learn", "baselines", "evaluate", "jobs", "cli_columns", "cli",
+    "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {
@@ -45,7 +46,7 @@ def modules():
 
 
 def imports(tree):
-    """Every module that is imported anywhere in the file, in functions too."""
+    """List all modules that a file imports, also inside functions."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

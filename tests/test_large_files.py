@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax.data.files import iterate_pairs, read_sample, read_trajectories
+from gfnn_jax.data.files import iterate_pairs, read_trajectories
+from gfnn_jax.data.sample import read_sample
 from gfnn_jax.jobs import fit as fit_job
 
 

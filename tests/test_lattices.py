@@ -342,7 +342,7 @@ def test_where_the_fixed_point_diverges():
 
 @pytest.mark.slow
 def test_a_flow_whose_fixed_point_diverges():
-    """By Newton–Krylov as by Newton's method with matrices; tangents of both kinds agree."""
+    """Compare Newton–Krylov with Newton's method by matrices, states and tangents."""
     family, params = springs(20)
     scale, (z, v) = np.ones(40), 0.4 * jnp.asarray(RNG.normal(size=(2, 2, 40)))
     free = Flow(family, params, 2.0, scale, 3)
@@ -487,7 +487,7 @@ def test_a_structure_is_proposed_and_not_used():
 
 @pytest.mark.parametrize("kind", ["ring", "chain"])
 def test_mode_energies_add_up(kind):
-    """To the energy of unit springs, less that of the whole's motion; and one wave is one mode."""
+    """Check the sum: the energy of unit springs without the mean motion; one wave is one mode."""
     family, params = springs(8, "ring" if kind == "ring" else "free")
     harmonic, z = family.take([0, 1]), RNG.normal(size=(3, 16))
     z -= np.repeat(z.reshape(3, 2, 8).mean(axis=2), 8, axis=1)

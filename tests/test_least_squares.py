@@ -9,6 +9,7 @@ import pytest
 
 from gfnn_jax.errors import FitError
 from gfnn_jax.fitting import least_squares
+from gfnn_jax.fitting.triangle import Triangle
 
 RNG = np.random.default_rng(0)
 W = RNG.uniform(-1, 1, (900, 4)) * np.array([1.0, 2.0, 0.5, 1.0]) + 0.3
@@ -187,7 +188,7 @@ def test_fewer_rows_than_terms():
 
 
 class Twice(Monomials):
-    """Every term given twice: the copies cannot be told apart, and need not be."""
+    """Family with every term twice: the data do not determine the copies apart."""
 
     @property
     def num_parameters(self):
@@ -258,10 +259,7 @@ def test_nothing_is_dropped_that_held_out_pairs_need(monkeypatch):
     one = rng.standard_normal(800)
     columns = np.stack([one, one + 1e-14 * rng.standard_normal(800)], axis=1)
     rows = np.column_stack([columns, columns @ np.array([0.05, 1.95])])
-    train, held = (
-        least_squares.Reduced(np.linalg.qr(part, mode="r"), len(part))
-        for part in (rows[:600], rows[600:])
-    )
+    train, held = (Triangle.of(part) for part in (rows[:600], rows[600:]))
     assert least_squares.solve(train, held, 2).validation_rms < 1e-12
 
 

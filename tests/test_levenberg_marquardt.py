@@ -1,6 +1,7 @@
 """Levenberg–Marquardt on S: exact where S is representable, equal to SciPy's optimum, resumable."""
 
 import dataclasses
+from contextlib import nullcontext
 from functools import partial
 
 import jax
@@ -10,15 +11,16 @@ import pytest
 import scipy.optimize
 from jax.flatten_util import ravel_pytree
 
+from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.family import DifferentiatedByJax, from_function
 from gfnn_jax.fitting import levenberg_marquardt as lm
-from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
+from gfnn_jax.fitting.levenberg_marquardt import BLOCK, levenberg_marquardt
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("amplitude",), meta_fields=())
 @dataclasses.dataclass(frozen=True)
 class Network(DifferentiatedByJax):
-    """One hidden layer of tanh, its gradient in closed form."""
+    """Network of one hidden layer of tanh, with its gradient in closed form."""
 
     amplitude: float = 1.0
     operations = (0, 0)
@@ -159,13 +161,21 @@ def test_a_second_fit_of_the_same_shapes_compiles_nothing(compilations):
     assert result.iterations == 2
 
 
-def test_stops_at_the_target_and_on_time():
+def test_stops_at_the_target_and_where_a_block_of_iterations_does_not_fit():
     result = fit_pendulum(target_rms=0.05)
     assert result.stopped_because == "target"
     assert result.validation_rms <= 0.05
     assert result.iterations < 12
-    result = fit_pendulum(max_seconds=0.0)
-    assert (result.stopped_because, result.iterations) == ("seconds", 0)
+    blocks = iter([nullcontext()])
+
+    def block(iterations):
+        try:
+            return next(blocks)
+        except StopIteration:
+            raise OutOfTime from None
+
+    result = fit_pendulum(block=block)
+    assert (result.stopped_because, result.iterations) == ("budget", BLOCK)
 
 
 def test_a_step_into_non_finite_values_is_rejected():

@@ -141,7 +141,7 @@ def in_units(units, w):
 
 
 def test_defect_is_in_units_of_the_scale():
-    """The same map in units where q is a million times larger and p as much smaller."""
+    """Compare the map with itself in units where q is 10⁶ times larger and p as much smaller."""
     units = np.array([1e6, 1e-6])
     piece = generated(in_units, units, MIDPOINT, 0.3)
     assert map_of(piece, DATA * units, scale=units).defect(Z * units).max() < 1e-12

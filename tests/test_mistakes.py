@@ -55,7 +55,7 @@ MISTAKES = {
     "times instead of dt": (lambda: fit(Z0, Z1, np.arange(3.0)), "(200,), got (3,)"),
     "a parameter of few": (lambda: fit(Z0, Z1, DT, {"l": np.ones(3)}), "args['l'] of shape (200,)"),
     "parameters without names or shape": (lambda: fit(Z0, Z1, DT, [1, 2]), "name -> (200,)"),
-    "a parameter called q1": (lambda: fit(Z0, Z1, DT, {"q1": LENGTH}), "has no meaning yet"),
+    "a parameter called q1": (lambda: fit(Z0, Z1, DT, {"q1": LENGTH}), "'q1' cannot name"),
     "a drive without its period": (
         lambda: gfnn.fit(gfnn.Pairs(Z0, Z1, DT, t0=LENGTH)), "together with its period"),
     "a drive of period < 0": (
@@ -68,7 +68,7 @@ MISTAKES = {
     "a chart with a capital": (lambda: fit(chart="Midpoint"), "type3, midpoint; got 'Midpoint'"),
     "an unknown family": (lambda: fit(family="nn"), "sines, mlp; got 'nn'"),
     "an unknown thing to learn": (lambda: fit(learn="H"), "auto, map, hamiltonian; got 'H'"),
-    "the scene's name": (lambda: fit(scene="two-body"), "as gfnn.scenes.make('two-body'), got"),
+    "the scene's name": (lambda: fit(scene="two-body"), "e.g. gfnn.scenes.make('two-body'), got"),
     "another scene's data": (lambda: fit(scene=SCENE), "has dim 2, the pairs have 1"),
     "an angle that is no index": (lambda: fit(angles=("q1",)), "angles as a tuple of indices"),
     "an angle beyond the last": (lambda: fit(angles=(2,)), "different angles among 0..1, got (2,)"),
@@ -83,9 +83,9 @@ MISTAKES = {
     "a scene by a wrong name": (
         lambda: gfnn.scenes.make("twobody"), "unknown scene 'twobody', did you mean 'two-body'?"),
     "a name to draw from": (
-        lambda: gfnn.sample_pairs("two-body", 10, KEY), "as gfnn.scenes.make('two-body'), got"),
-    "no pairs": (lambda: gfnn.sample_pairs(SCENE, 0, KEY), "number of states from 1 on, got 0"),
-    "a number as key": (lambda: gfnn.sample_pairs(SCENE, 10, 0), "as jax.random.key(0), got 0"),
+        lambda: gfnn.sample_pairs("two-body", 10, KEY), "e.g. gfnn.scenes.make('two-body'), got"),
+    "no pairs": (lambda: gfnn.sample_pairs(SCENE, 0, KEY), "number of states ≥ 1, got 0"),
+    "a number as key": (lambda: gfnn.sample_pairs(SCENE, 10, 0), "e.g. jax.random.key(0), got 0"),
     "a folder that is not there": (lambda: gfnn.load("nowhere"), "nowhere: no such folder"),
     "a file instead of the folder": (lambda: gfnn.load(__file__), "no such folder"),
 }  # fmt: skip
@@ -122,7 +122,7 @@ WITH_A_MAP = {
         lambda m: m.rollout(Z0[:3], 9, params={"l": 1.0}), "learned without"),
     "the time of no drive": (lambda m: m.rollout(Z0[:3], 9, t0=np.zeros(3)), "without a drive"),
     "no samples": (lambda m: m.sample(KEY, 0), "a number of samples above 0"),
-    "more devices than there are": (lambda m: m.sharded(99), "devices, which there are; got 99"),
+    "more devices than there are": (lambda m: m.sharded(99), "all that exist here; got 99"),
 }  # fmt: skip
 
 

@@ -99,7 +99,7 @@ def test_every_activation_is_smooth_enough_for_newton(activation):
 
 
 def test_other_units_make_the_same_network():
-    """What the data are measured in is scaled away inside S."""
+    """Check that the units of the data are scaled away inside S."""
     units = np.array([1e3, 1e-4, 7.0, 0.2])
     there = dataclasses.replace(PLAIN, inputs=box_inputs(DATA * units))
     params = initial(PLAIN)

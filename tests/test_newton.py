@@ -53,7 +53,7 @@ def solved(equation, lanes, guess, most=40, shared=None):
 
 @functools.partial(jax.jit, static_argnums=0)
 def waited(equation, lanes, guess):
-    """The same, where every lane waits for the last."""
+    """Iterate without gathering: every lane waits for the last."""
     return iterate(equation, None, lanes, guess, most=40, gather=False)
 
 
@@ -170,8 +170,8 @@ def hard_and_easy(count, seed=0):
 
 @pytest.mark.parametrize("count", [1, 33, 3_000])
 def test_lanes_that_are_taken_out_of_a_batch_end_as_they_do_alone(count):
-    """Of a batch only those visit the loop that need to, some at a time: none is forgotten, mixed
-    up, or led elsewhere. The oracle is the loop in which all wait for the last."""
+    """Compare gathered lanes with the loop in which all wait for the last: no lane is forgotten,
+    mixed up, or led elsewhere."""
     theta, guess = hard_and_easy(count)
     found = solved(FOLDED, theta, guess)
     jax.tree.map(np.testing.assert_array_equal, found, waited(FOLDED, theta, guess))
@@ -244,7 +244,7 @@ def test_first_and_second_derivatives():
 
 
 def test_unrolled_derivative_of_an_unfinished_solve_is_wrong_and_the_implicit_one_cannot_tell():
-    """Why the symplecticity defect must go through the iterations."""
+    """Show why the symplecticity defect must go through the iterations."""
 
     @jax.jit
     def stopped(theta):
@@ -259,7 +259,7 @@ def test_unrolled_derivative_of_an_unfinished_solve_is_wrong_and_the_implicit_on
 
 @pytest.mark.parametrize(("bend", "dtype"), [(0.0, "float64"), (8.0, "float64"), (8.0, "float32")])
 def test_unrolled_derivative_of_a_damped_solve_is_finite(bend, dtype):
-    """Also where a step is exactly straight (bend 0), or a part of it leads to a straight one."""
+    """Check also where a step is exactly straight (bend 0), or leads to a straight one."""
     bent = PerLane(lambda b, theta, x: x + b * jnp.sin(x) - theta)
 
     @jax.jit
@@ -307,7 +307,7 @@ def test_batches_of_batches_and_their_derivatives():
 
 @from_function
 def rough(params, w):
-    """Two quartics and two of mixed arguments: folds, several branches, steep walls."""
+    """Sum of polynomials of q, of p and of two mixed arguments: folds, branches, steep walls."""
     q, p = w
     return (
         jnp.polyval(params[0], q)

@@ -6,6 +6,8 @@ import pytest
 from analytic import exact_oscillator, generated, map_of, oscillator, rotated
 
 import gfnn_jax as gfnn
+from gfnn_jax.dataset.noise import of_differences, of_residuals, robust
+from gfnn_jax.dataset.runs import identified
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.learn.noise import noise_of_sites, state_noise
 from gfnn_jax.scenes import froeschle
@@ -21,7 +23,7 @@ def noisy_turns(angle, sigma, num_steps):
     states += sigma * rng.normal(size=states.shape)
     z0, z1 = states[:, :-1].reshape(-1, 2), states[:, 1:].reshape(-1, 2)
     piece = generated(oscillator, exact_oscillator(angle), MIDPOINT, angle)
-    return map_of(piece, z0), gfnn.Pairs(z0, z1, angle)
+    return map_of(piece, z0), identified(gfnn.Pairs(z0, z1, angle)).pairs
 
 
 @pytest.mark.parametrize("num_steps", [1, 50])
@@ -71,3 +73,21 @@ def test_a_fit_with_a_structure_tells_the_noise():
     with pytest.warns(gfnn.FitWarning, match="noise of about .* on positions"):
         fit = gfnn.fit(gfnn.Pairs(z0, z1, pairs.dt), scene, learn="map")
     np.testing.assert_allclose(fit.noise, sigma, rtol=0.1)
+
+
+def test_differences_of_a_smooth_orbit_leave_the_noise():
+    rng, t = np.random.default_rng(0), 0.05 * np.arange(2_000)
+    orbit = np.stack([np.cos(t), -np.sin(t)], axis=1)
+    noisy = orbit + 1e-3 * rng.normal(size=orbit.shape)
+    runs = [np.diff(part, axis=0) for part in np.split(noisy, [4, 700])]  # of the first too few
+    assert of_differences(runs, 6, 1.5) == pytest.approx(1e-3, rel=0.05)
+    assert of_differences([np.diff(orbit, axis=0)], 3, 1.5) is None  # the orbit's own differences
+
+
+def test_residuals_tell_the_noise_without_gross_errors():
+    rng, sigma = np.random.default_rng(0), np.array([1e-3, 3e-3])
+    residual = sigma * rng.normal(size=(5_000, 2))
+    residual[::50] = 1.0
+    np.testing.assert_allclose(robust(residual, axis=0), sigma, rtol=0.05)
+    np.testing.assert_allclose(of_residuals(residual, 1.0, 5.0), sigma, rtol=0.03)
+    np.testing.assert_allclose(of_residuals(residual, 0.25, 5.0), 2 * sigma, rtol=0.03)

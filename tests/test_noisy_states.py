@@ -13,11 +13,12 @@ from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.nearest_states import Whitened, nearest
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn import noisy_sweeps
 from gfnn_jax.learn.candidates import Judges, Tolerance
-from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.noisy_sweeps import NoisySweep, best_size
 from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.sweeps import LinearSweep, Size
@@ -119,7 +120,7 @@ def sweep_of(chart, sigma, num=3_000):
 
 def test_the_size_of_smallest_expected_error_is_that_of_the_true_s():
     plain, *_ = sweep_of(MIDPOINT, SIGMA)
-    free = (Clock(), lambda message: None)
+    free = (Budget(), lambda message: None)
     most = next(s for s in plain.sizes if s.family.degree == 6)
     size = best_size(plain, plain.sizes[0], most, *free).size
     deviations = plain.state_deviations(size) * plain.prepared.scale
@@ -140,10 +141,10 @@ def test_misfit_weighs_as_much_as_in_the_posterior(misfit, count):
     sizes = [Size(SimpleNamespace(num_parameters=n), larger, float(n)) for n in counts]
     sweep = SimpleNamespace(
         sizes=sizes,
-        factors=lambda *_: SimpleNamespace(train=least_squares.Reduced(factor, rows)),
+        factors=lambda *_: SimpleNamespace(train=Triangle(factor, rows)),
         freedoms=lambda near, most, counts: list(map(float, counts)),
     )
-    found = best_size(cast(LinearSweep, sweep), sizes[0], sizes[-1], Clock(), print)
+    found = best_size(cast(LinearSweep, sweep), sizes[0], sizes[-1], Budget(), print)
     assert found.size.family.num_parameters == count
     assert found.noise == pytest.approx(1.0)
 

@@ -25,7 +25,7 @@ def test_has_no_outputs(path):
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_runs(path, tmp_path, monkeypatch):
-    """Its own assertions hold, and its figures are drawn."""
+    """Run a notebook: its assertions hold, and its figures are drawn."""
     if path.stem == "a_storage_ring":
         pytest.importorskip("at", reason="needs PyAT: pip install accelerator-toolbox")
     monkeypatch.setenv("GFNN_SMOKE", "1")

@@ -50,7 +50,7 @@ def test_defect_of_symplectic_matrices_is_roundoff_and_of_others_is_not(dim):
 
 
 def test_defect_does_not_depend_on_the_units_when_scaled():
-    """With y = z/s, s alike for all pairs (q_i, p_i), the defect is that of the matrix in y."""
+    """Check with y = z/s, s equal for all pairs (q_i, p_i), that the defect is that in y."""
     matrix = random_symplectic(np.random.default_rng(1), 2) + 1e-3
     scale = np.array([1e6, 2e6, 3e-3, 1.5e-3])
     in_units = matrix * scale[:, None] / scale[None, :]

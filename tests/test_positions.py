@@ -217,7 +217,7 @@ def test_the_family_of_displacements_is_differentiated_right():
 
 def test_what_no_map_can_be_learned_from_is_refused():
     read = turns(4, 2, 0)
-    with pytest.raises(gfnn.FitError, match="at least 8 triples of positions, got 4"):
+    with pytest.raises(gfnn.FitError, match="at least 20 triples of positions, got 4"):
         gfnn.fit(recorded(read, ["x"]), learn="map")
     with pytest.raises(gfnn.FitError, match="three positions in a row"):
         gfnn.fit(recorded(read[:, :2], ["x"]), learn="map")

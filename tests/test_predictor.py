@@ -1,4 +1,4 @@
-"""Where solves start: close on the data, harmless far from them, for both directions."""
+"""Predictors: close on the data, harmless far from them, for both directions."""
 
 import dataclasses
 
@@ -42,7 +42,7 @@ def test_of_an_affine_map_is_its_solution_either_way(chart):
 
 
 def kicked(z):
-    """Half a kick, a drift, half a kick, of a pendulum."""
+    """Step of a pendulum: half a kick, a drift, half a kick."""
     q, p = z.T
     p = p - 0.5 * DT * np.sin(q)
     q = q + DT * p
@@ -97,7 +97,7 @@ class Costing(PolynomialModel):
 
 
 def test_a_dear_model_is_taken_where_it_spares_updates():
-    """Of those that are close the closest that costs no more than what it spares."""
+    """Check the choice: the closest predictor that costs no more than it saves."""
     known = ((1e-3, 40), (1e-6, 600), (4e-8, 1_800), (5e-9, 2_600))
     fitted = [Fitted(Predictor(Costing(n), Costing(n)), error) for error, n in known]
     assert affordable(fitted, Costing((100, 400))).error == 4e-8
@@ -115,7 +115,7 @@ def test_noise_and_few_pairs_end_the_rise():
 
 
 def test_a_coordinate_at_rest_has_no_part_in_it():
-    """All its products vanish; a coordinate that is constant but not zero alike."""
+    """Check a coordinate at rest, whose products vanish, and a constant one that is not zero."""
     rest = np.zeros((600, 1))
     z0, z1 = (
         np.concatenate([z[:, :1], rest, z[:, 1:], rest + 0.1], axis=1)

@@ -89,7 +89,7 @@ def test_terms_by_count():
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_smaller_degree_has_the_first_terms_of_a_larger(case):
-    """What lets one factor of all rows judge every size."""
+    """Check the order of the terms, by which one factor of all rows serves every size."""
     smaller, larger = family_of(case, 2), family_of(case, 3)
     assert (np.diff(larger.basis.term_orders) >= 0).all()
     assert smaller.num_parameters == np.sum(larger.basis.term_orders <= 2)
@@ -188,7 +188,7 @@ def test_terms_are_counted_without_making_them(case, even):
 
 @pytest.mark.parametrize(("width", "num_args"), [(4, 1), (2, 1), (2, 3)])
 def test_products_of_state_and_args_have_the_gradients_of_jax(width, num_args):
-    """Also where one half of the variables is args alone."""
+    """Compare with JAX, also where one half of the variables is args alone."""
     rng = np.random.default_rng(3)
     w, args = rng.uniform(-2, 1, (6, width)), rng.uniform(0.1, 0.4, (6, num_args))
     family = Products(box_inputs(w, args=args), 3)

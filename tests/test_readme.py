@@ -1,4 +1,4 @@
-"""What the README shows runs as printed."""
+"""Code of the README: all blocks run as printed."""
 
 import re
 import shlex

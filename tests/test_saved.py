@@ -137,7 +137,7 @@ def test_an_existing_model_is_kept(tmp_path):
 
 
 def test_a_scene_of_ones_own(tmp_path):
-    """Its features can be saved where the scene is given, and loaded where it is given again."""
+    """Save and load a map with features of one's own scene, given both times."""
 
     def features(z):
         return z**2
@@ -148,7 +148,7 @@ def test_a_scene_of_ones_own(tmp_path):
         models.save(saved, tmp_path / "m")
     assert not (tmp_path / "m").exists()
     models.save(saved, tmp_path / "m", scene=mine)
-    with pytest.raises(InputError, match="learned in the scene 'mine': pass that scene"):
+    with pytest.raises(InputError, match="learned in the scene 'mine': pass it"):
         models.load(tmp_path / "m")
     with pytest.raises(InputError, match="learned in the scene 'mine', not in 'two-body'"):
         models.load(tmp_path / "m", scene=two_body())
@@ -169,11 +169,11 @@ def test_a_function_of_ones_own_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d["map"].update(type="Popen"), "does not describe a map"),
+        (lambda d: d["map"].update(type="Popen"), "holds a Popen, which is not known"),
         (lambda d: d["map"].pop("dt"), "does not describe a map"),
         (lambda d: d["map"]["pieces"]["0"].update(surprise=1), "does not describe a map"),
         (lambda d: d.pop("map"), "does not describe a map"),
-        (lambda d: d.update(scene="nowhere"), "pass that scene"),
+        (lambda d: d.update(scene="nowhere"), "pass it"),
     ],
 )
 def test_a_foreign_description(change, message, tmp_path):

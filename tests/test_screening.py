@@ -1,15 +1,18 @@
 """Gross errors that are many are found before a fit, and honest pairs never are."""
 
+import itertools
+
 import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.dataset.runs import identified, steps_between
+from gfnn_jax.dataset.split import split_rows
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting.shooting import arcs_of
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.learn.clean import clean
-from gfnn_jax.learn.held_out import places, split_rows, steps_between
 from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.screening import gross_errors
 
@@ -69,7 +72,7 @@ def named(pairs, angles=()):
     """Rows that are named, with nothing left out before."""
     prepared = prepare(pairs, Coordinates("cartesian", angles=angles))
     return gross_errors(
-        prepared, steps_between(pairs, None) > 0, np.zeros(len(prepared.y0), bool)
+        prepared, steps_between(identified(pairs).pairs) > 0, np.zeros(len(prepared.y0), bool)
     )  # fmt: skip
 
 
@@ -134,11 +137,9 @@ def test_a_jump_that_stays_is_no_gross_error_of_a_state():
 
 def test_what_was_left_out_is_bridged():
     states = henon_heiles(50)[:2, :8]
-    pairs = pairs_of(states)
     kept = np.setdiff1d(np.arange(14), [2, 3])  # the state 3 of the first sequence
-    place = places(pairs)[kept]
-    few = pairs.take(kept)
-    steps = steps_between(few, place)
+    few = identified(pairs_of(states)).pairs.take(kept)
+    steps = steps_between(few)
     assert steps.tolist() == [1, 3, 1, 1, 0, *[1] * 6]
     arcs = arcs_of(few.z0, few.z1, 100, steps)
     assert arcs is not None
@@ -150,12 +151,11 @@ def test_what_was_left_out_is_bridged():
 
 def test_sequences_are_held_out_whole_where_pairs_were_left_out():
     states, _ = spoilt(henon_heiles(50), 0.05, "box")
-    taken = clean(pairs_of(states), Coordinates("cartesian"))
+    taken = clean(*identified(pairs_of(states)), Coordinates("cartesian"))
     assert len(taken.pairs) < 1_850
-    training, held_out = split_rows(taken.pairs, 0, taken.prepared.place)
-    assert taken.prepared.place is not None
-    sequence = taken.prepared.place // 1_961
-    assert not set(sequence[training]) & set(sequence[held_out])
+    split = split_rows(taken.pairs, 0)
+    runs = [set(np.asarray(taken.pairs.run)[rows]) for rows in split[:3]]
+    assert not any(one & other for one, other in itertools.combinations(runs, 2))
 
 
 @pytest.mark.slow

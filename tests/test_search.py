@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from gfnn_jax.learn.candidates import Candidate
-from gfnn_jax.learn.clock import Clock, OutOfTime
-from gfnn_jax.learn.search import search
+from gfnn_jax.learn.clock import Budget
+from gfnn_jax.learn.search import Search, search
+
+WORK = 1_000  # operations that a made-up size takes, and its steps
 
 
 class Size(NamedTuple):
@@ -22,15 +24,22 @@ class Size(NamedTuple):
 class Sweep:
     """Sizes with an estimate and an error each; it notes what it is asked."""
 
-    def __init__(self, sizes, family="polynomial", chart="midpoint", most=np.inf):
+    def __init__(self, sizes, family="polynomial", chart="midpoint"):
         self.sizes = [Size(float(s[0]), s[1], s[-1], float(n)) for n, s in enumerate(sizes, 2)]
         self.short_of_pairs = True
-        self.family, self.chart, self.most = family, chart, most
+        self.family, self.chart = family, chart
         self.judged, self.validated = [], []
 
-    def judge(self, size, clock, say):
-        if len(self.judged) >= self.most:
-            raise OutOfTime
+    def named(self, size):
+        return f"{self.family} {size.operations:g}"
+
+    def work(self, size):
+        return WORK
+
+    def work_of_steps(self, size):
+        return WORK
+
+    def judge(self, size, budget, say):
         self.judged.append(size.operations)
         return Candidate(
             f"{self.family} {size.operations:g}", self.family, self.chart, 3, size.operations,
@@ -40,7 +49,7 @@ class Sweep:
     def at(self, extent):
         return f"{self.family} {extent:g}"
 
-    def validate(self, size, judged, clock, say):
+    def validate(self, size, judged, budget, say):
         self.validated.append(size.operations)
         return dataclasses.replace(
             judged, validation_rms=size.error, validation_relative=size.error,
@@ -48,9 +57,9 @@ class Sweep:
         )  # fmt: skip
 
 
-def found_in(*sweeps, bound=1e-6, clock=None, told=None, on_validated=None):
+def found_in(*sweeps, bound=1e-6, budget=None, told=None, on_validated=None):
     tell = (lambda c: None) if told is None else told.append
-    return search(sweeps, bound, clock or Clock(), lambda message: None, tell, on_validated)
+    return search(sweeps, bound, budget or Budget(), lambda message: None, tell, on_validated)
 
 
 def order(found):
@@ -175,24 +184,37 @@ def test_steps_that_belie_the_estimate_let_the_search_go_on():
     assert sweep.judged == [10, 20, 40]
 
 
-def test_what_was_found_before_the_time_was_spent_stands():
-    sweep = Sweep(FALLING, most=2)
-    found = found_in(sweep, bound=1e-9, clock=Clock(max_seconds=1_000.0))
-    assert order(found) == [100, 10]
-    assert found.ended == "the budget of 1000 s is spent"
+def test_what_was_found_before_the_budget_was_spent_stands():
+    sweep = Sweep(FALLING)
+    found = found_in(sweep, bound=1e-9, budget=Budget(max_operations=2 * WORK))
+    assert sweep.judged == [10, 100]
+    assert order(found) == [100]
+    assert found.ended.startswith(
+        "the budget of 2,000 operations is spent after unit 2, polynomial 100: polynomial 1000 "
+        "would take"
+    )
 
 
-def test_one_is_validated_however_little_time_there_is():
-    sweep, clock = Sweep(FALLING), Clock(max_seconds=1_000.0)
-    judge = sweep.judge
-
-    def slow(size, clock, say):
-        clock.max_seconds = 0.0
-        return judge(size, clock, say)
-
-    sweep.judge = slow
-    found = found_in(sweep, bound=1e-20, clock=clock)
+def test_one_is_validated_whatever_the_budget():
+    sweep = Sweep(FALLING)
+    found = found_in(sweep, bound=1e-20, budget=Budget(max_operations=WORK))
+    assert sweep.judged == sweep.validated == [10]
     assert order(found) == [10]
+
+
+def test_a_climb_in_parts_finds_what_one_in_one_go_does():
+    class Dearer(Sweep):
+        def work(self, size):
+            return size.operations
+
+    one, other = Dearer(FALLING), Dearer(FALLING)
+    whole = found_in(one, bound=1e-9)
+    parts = Search([other], 1e-9, Budget(), lambda message: None, lambda candidate: None)
+    parts.climb(most=500.0)
+    assert other.judged == [10, 100]
+    parts.climb()
+    assert other.judged == one.judged
+    assert order(parts.found()) == order(whole)
 
 
 def test_no_sizes_at_all():
@@ -260,20 +282,7 @@ def test_nothing_is_foretold_from_two_sizes_or_a_stall():
 
 
 def test_what_the_spent_budget_cut_off_is_foretold():
-    sweep = Sweep(geometric(1e-1, 1e-1, 9), most=4)
-    found = found_in(sweep, bound=1e-7, clock=Clock(max_seconds=1_000.0))
-    assert found.ended == (
-        "the budget of 1000 s is spent; extrapolated, polynomial 8 would meet the tolerance"
-    )
-
-
-# The clock
-
-
-def test_the_compilation_that_follows_the_search_is_reserved():
-    plain, of_three = Clock(max_seconds=60.0), Clock(max_seconds=60.0, dim=3)
-    assert plain.left - of_three.left == pytest.approx(9.0, abs=1.0)
-    assert of_three.left_in_all == pytest.approx(60.0, abs=1.0)
-    short = Clock(max_seconds=3.0, dim=3)
-    assert short.left > 2.0  # a fifth of a budget at most
-    assert Clock(dim=3).left == Clock(dim=3).left_in_all == np.inf
+    sweep = Sweep(geometric(1e-1, 1e-1, 9))
+    found = found_in(sweep, bound=1e-7, budget=Budget(max_operations=4 * WORK))
+    assert found.ended.startswith("the budget of 4,000 operations is spent after unit 4")
+    assert found.ended.endswith("; extrapolated, polynomial 8 would meet the tolerance")

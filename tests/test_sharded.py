@@ -118,7 +118,7 @@ def test_the_same_bits_on_any_number_of_devices(folder):
 
 
 def test_parameters_go_with_their_lanes():
-    """Of one block and a part of the next, as the map itself makes all of them."""
+    """Compare one block and a part of the next with the map's own rollout."""
     rng = np.random.default_rng(1)
     z, args = rng.uniform(-1, 1, (300, 2)), rng.uniform(0.5, 1.5, (300, 1))
     piece = Flow(Terms(1, ("p1", "q1", "k"), ((2, 0, 0), (0, 2, 1)), ("k",)), np.full(2, 0.5), DT,
@@ -131,7 +131,7 @@ def test_parameters_go_with_their_lanes():
 
 
 def test_more_devices_than_there_are():
-    with pytest.raises(ValueError, match="expected 1 to 1 devices, which there are; got 2"):
+    with pytest.raises(ValueError, match="expected 1 to 1 devices, all that exist here; got 2"):
         local_devices(2)
 
 
@@ -152,7 +152,7 @@ def port():
 
 
 def started(folder, out, *more, num_steps=STEPS, count=2, **flags):
-    """So many processes of one prediction. flags: of their environment."""
+    """Start ``count`` processes of one prediction. flags: of their environment."""
     address = f"127.0.0.1:{port()}"
     return [
         subprocess.Popen(
@@ -209,7 +209,7 @@ def test_a_killed_process_ends_the_others(killed, folder):
     assert status != 0
     lines = [line for line in told.splitlines() if not line.startswith("[")]  # but progress
     assert len(lines) == 1, told
-    assert lines[0].startswith("gfnn: this process or another one of the job was lost: what they")
+    assert lines[0].startswith("gfnn: this process or another one of the job was lost: their fin")
     for journal in journals:
         assert journal.read_bytes().count(b"\n") > 3
     assert parts.number_of_parts(out, Share(0, 3), resume=True) == 2
@@ -218,7 +218,7 @@ def test_a_killed_process_ends_the_others(killed, folder):
 
 
 def test_a_killed_job_resumes_to_the_same_bits(folder, alone, monkeypatch):
-    """Of one of two parts only the beginning is there."""
+    """Resume where only the beginning of one of two parts is there."""
     from gfnn_jax.jobs import predict as job
 
     append = PredictionWriter.append
@@ -268,7 +268,7 @@ def test_parts_of_everything_that_a_prediction_can_hold(tmp_path):
 @pytest.mark.parametrize(
     ("told", "line"),
     [
-        ({}, "expected a launcher that JAX knows, as srun and mpirun, or JAX_COORDINATOR_ADDRESS"),
+        ({}, "needs a launcher that JAX knows, such as srun or mpirun, or the variables JAX_COORD"),
         ({"JAX_PROCESS_ID": "one"}, "expected a whole number as JAX_PROCESS_ID, got 'one'"),
     ],
 )
@@ -299,7 +299,7 @@ def sampled_folder(folder, tmp_path_factory):
 
 
 def test_samples_of_any_number_of_processes(sampled_folder):
-    """And of one that stopped, on fewer processes than began it."""
+    """Compare numbers of processes; a stopped job resumes on fewer than began it."""
     from gfnn_jax.jobs import predict as job
 
     def predicted(name, **more):

@@ -9,8 +9,8 @@ import pytest
 import gfnn_jax as gfnn
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting import least_squares
-from gfnn_jax.fitting.least_squares import Reduced
 from gfnn_jax.fitting.shooting import Shooting, arcs_of, longest_arc
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.scenes import henon_heiles
 
@@ -105,7 +105,7 @@ def test_a_ridge_is_taken_for_more_than_chance_alone():
         def reduced(n):
             a = rng.normal(size=(n, terms))
             b = 0.05 * a.sum(axis=1) + rng.normal(size=n)
-            return Reduced(np.asfortranarray(np.linalg.qr(np.column_stack([a, b]), mode="r")), n)
+            return Triangle.of(np.column_stack([a, b]))
 
         return least_squares.solve(reduced(rows), reduced(rows // 9), terms).ridge
 

@@ -78,7 +78,7 @@ def test_a_reversor_leaves_the_even_terms():
 
 @pytest.mark.parametrize("name", ["pcr3bp", "henon-heiles-regular", "two-body"])
 def test_a_scenes_hamiltonian_is_traced_to_text(name):
-    """From a Python function to text, and back to a function of the same values."""
+    """Trace a Python function to text, and read it back as a function of the same values."""
     scene = SCENES[name]()
     (tree,) = traced(scene.hamiltonian, scene.dim)
     again = parse(to_text(tree, scene.dim), scene.dim)

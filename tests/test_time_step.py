@@ -112,7 +112,7 @@ def test_saved_and_predicted_at_any_dt(learned, tmp_path, capsys):
 
 
 def test_bands_of_samples(learned):
-    """What few and noisy pairs leave open of S is open at every dt."""
+    """Check bands at every dt, for S of few and noisy pairs."""
     pairs = sampled(300, seed=3)
     noise = 1e-4 * np.random.default_rng(4).normal(size=(300, 2))
     noisy = gfnn.Pairs(pairs.z0, pairs.z1 + noise, pairs.dt)

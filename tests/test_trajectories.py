@@ -85,11 +85,11 @@ def returned(z):
 
 
 def test_the_return_map():
-    """Against an event of another solver; its fixed point; area; what never comes back."""
+    """Check against an event of another solver; a fixed point; area; orbits without return."""
     scene = scenes.henon_heiles_section()
 
     def step(z):
-        """Of at most ten states: one compilation."""
+        """Step at most ten states: one compilation."""
         return tr.reference_trajectories(scene, np.resize(z, (10, 2)), 1)[: len(z), 1]
 
     z0 = tr.sample_states(scene, 8, jax.random.key(9))
@@ -206,7 +206,7 @@ def test_pairs_are_the_same_bits_for_the_same_seed_and_conserve_the_invariants(n
 
 
 def test_a_scene_with_a_parameter():
-    """Its energy is conserved for each length, and pairs at random times are those of its flow."""
+    """Check that each length conserves its energy; pairs at random times are those of the flow."""
     scene, key = scenes.pendulum_length(), jax.random.key(3)
     pairs = tr.sample_pairs(scene, 30, key, dt_range=(0.1, 0.5))
     length = pairs.args["l"]
@@ -226,7 +226,7 @@ def test_a_scene_with_a_parameter():
     with pytest.raises(ValueError, match="expected params l for the scene pendulum-length"):
         tr.reference_trajectories(scene, pairs.z0, 1)
     for unfit in (scenes.standard_map(), scenes.driven_pendulum()):
-        with pytest.raises(ValueError, match=r"of an autonomous flow; got 0\.1 and 0\.2"):
+        with pytest.raises(ValueError, match=r"a scene with a flow; got dt from 0\.1 to 0\.2"):
             tr.sample_pairs(unfit, 5, key, dt_range=(0.1, 0.2))
 
 

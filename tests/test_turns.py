@@ -1,4 +1,4 @@
-"""How far a step turns the states, which way, and what is made and said of it."""
+"""Turn of the states in a step: its size, its sense, its use and its messages."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What the work-precision benchmark rests on: its integrators, its front, its float32 rows."""
+"""Parts of the work-precision benchmark: integrators, front, float32 rows."""
 
 import sys
 from pathlib import Path
@@ -98,7 +98,7 @@ def test_the_figure_joins_the_best_of_ours_in_both_precisions():
 
 
 def test_a_name_looks_alike_in_all_panels():
-    """Also where a panel lacks the name before it."""
+    """Check also a panel that lacks the name before it."""
     points = ([1], [1e-3], ["3"])
     both, second = {"a": points, "b": points}, {"b": points}
     panels = {

@@ -22,7 +22,7 @@ from gfnn_jax.evaluate import metrics
 
 
 def fingerprint(quick: bool) -> Numbers:
-    """What two versions of JAX must agree on: a fit's step, and a rollout of a hundred steps."""
+    """Numbers on which two versions of JAX must agree: a step, and a rollout of 100 steps."""
     scene = gfnn.scenes.make("henon-heiles-regular")
     data, fresh = drawn(scene, 1_000, True)
     fit, _ = fitted(

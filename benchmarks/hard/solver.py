@@ -36,7 +36,7 @@ def rough_map(strength: float, chart, seed: int, dim: int = 2) -> SymplecticMap:
 
 
 def residuals(map_: SymplecticMap, z, image) -> np.ndarray:
-    """What the step's equation leaves over, computed anew from the states alone; (B,)."""
+    """Residuals (B,) of the step's equation, computed anew from the states alone."""
     piece = map_.pieces[0]
     w = piece.chart.evaluation_point(z, image)
     gradient, hessian = piece.family.gradient_and_hessian(piece.params, w)
@@ -49,15 +49,18 @@ def residuals(map_: SymplecticMap, z, image) -> np.ndarray:
 
 
 def stepped(map_: SymplecticMap, z) -> tuple[np.ndarray, Any]:
-    """One step of few states, padded to a few sizes, each of which is compiled once."""
+    """Step few states, padded to a few sizes, each of which is compiled once."""
     rows = np.resize(np.arange(len(z)), max(16, 1 << (len(z) - 1).bit_length()))
     image, info = jax.tree.map(np.asarray, map_.step(z[rows]))
     return image[: len(z)], jax.tree.map(lambda a: a[: len(z)], info)
 
 
 def branch_changes(map_: SymplecticMap, num_lines: int, num_points: int) -> tuple[int, int]:
-    """Along straight lines through the data: neighbouring states that are both ok and whose images
-    lie far apart, which further bisection does not bring together; and the number of neighbours."""
+    """Count changes of branch along straight lines through the data, and the neighbours compared.
+
+    A change is between neighbouring states that are both ok, whose images lie far apart and stay so
+    under further bisection.
+    """
     rng = np.random.default_rng(SEED)
     ends = rng.standard_normal((2, num_lines, 1, 2 * map_.dim))
     along = np.linspace(0, 1, num_points)[:, None]

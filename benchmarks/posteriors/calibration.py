@@ -146,14 +146,13 @@ def calibrated(
 
 
 def pooled(found: list[tuple[np.ndarray, np.ndarray]], spread) -> Numbers:
-    """Of errors and bands (B, len(STEPS), 2d) of each data set, at each of STEPS.
+    """Pool errors and bands (B, len(STEPS), 2d) of all data sets, at each of STEPS.
 
-    coverage: the part of all errors that lie inside; one of a prediction that is lost does not.
-    coverage_error: its standard error, from what data sets differ by, whose errors are independent
-    as those of one are not; None of a single one. width: the median band of all ÷ the RMS of all
-    errors. (One data set's RMS may be small by chance, and its own ratio says little.)
-    rms, relative: the RMS error, and that of errors ÷ ``spread`` (2d,). lost: predictions that are
-    not finite.
+    coverage: the part of all errors that lie inside; a lost prediction does not. coverage_error:
+    its standard error, from the scatter between data sets, because errors of one set are
+    correlated; None for a single set. width: the median band of all ÷ the RMS of all errors. (The
+    RMS of one data set may be small by chance, so that its own ratio means little.) rms, relative:
+    the RMS error, and that of errors ÷ ``spread`` (2d,). lost: predictions that are not finite.
     """
     if not found:
         return {}
@@ -199,13 +198,16 @@ class Cell:
 
     @property
     def meets(self) -> bool:
-        """Not too many, and bands that are not too wide, either."""
+        """True where neither coverage nor width is too large."""
         return self.covers and self.coverage <= COVERED[1] and self.width <= WIDEST
 
 
 def cells(row: dict[str, Any]) -> list[Cell | str]:
-    """Those of a row; in the place of one that is not judged, why: "roundoff", of which a posterior
-    knows nothing, or "large" errors at the last step; "" without a posterior."""
+    """Cells of a row, or the reason why there is none.
+
+    The reason is "roundoff", which no posterior describes, "large" errors at the last step, or ""
+    without a posterior.
+    """
     if "coverage" not in row:
         return [""] * len(STEPS)
     if row["relative"][0] < ROUNDOFF:

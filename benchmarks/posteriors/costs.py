@@ -1,4 +1,4 @@
-"""What samples cost, and networks that are trained together."""
+"""Costs of samples, and of networks that are trained together."""
 
 from __future__ import annotations
 

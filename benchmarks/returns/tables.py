@@ -41,7 +41,7 @@ def time_at(points: Sequence[Numbers], error: float, key: str, arrangement: str)
 
 
 def ratios(measured: Numbers, ours: Numbers, key: str, arrangement: str) -> dict[str, float | None]:
-    """How many times as fast our map is as each integrator, at our map's error."""
+    """Speed of our map ÷ that of each group of integrators, at our map's error."""
     found = {}
     for group, members in GROUPS.items():
         times = [
@@ -74,7 +74,7 @@ def fastest(measured: Numbers, ours: Numbers, arrangement: str) -> float | None:
 
 
 def passes(found: dict[int, Numbers], arrangement: str) -> str:
-    """For each tolerance the smallest number of periods at which the ratio is 10."""
+    """Smallest number of periods at which the ratio is 10, for each tolerance, in words."""
     said = []
     for tolerance in TOLERANCES:
         reached = []

@@ -22,8 +22,11 @@ ITERATIONS = 100  # after which the error is taken again
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """How much is measured: pairs of a fit, lanes of a batch, states whose error is taken, the few
-    of them that SciPy is given, steps of a timed rollout, calls of which the best counts."""
+    """Sizes of a measurement.
+
+    pairs: of a fit. lanes: of a batch. judged: states whose error is taken. few: those of them that
+    SciPy is given. steps: of a timed rollout. repeats: calls of which the best counts.
+    """
 
     pairs: int
     lanes: int
@@ -78,7 +81,7 @@ def section_by_scipy(z0, iterations, precision):
 
 
 def pendulum_by_scipy(z0, iterations, precision):
-    """One state as plain numbers; several as one system, whose step is common to all."""
+    """Integrate by SciPy: one state as plain numbers, several as one system with a common step."""
     tolerance, end = precision
 
     def rate(t, z):
@@ -126,8 +129,10 @@ def _iterated(step):
 
 
 def section_by_diffrax(solver):
-    """To the first step beyond the section, and back onto it with x as the independent variable
-    (Hénon's trick), which is as accurate as the steps are."""
+    """Integrate to the first step beyond the section, and back onto it with x as the variable.
+
+    This is Hénon's trick; it is as accurate as the steps.
+    """
 
     def field(_, x):
         return jnp.stack(henon_heiles_rate(*x))
@@ -197,7 +202,7 @@ def section_by_heyoka(hy, width):
 
 
 def pendulum_by_heyoka(hy, width):
-    """Through all periods without a stop."""
+    """Integrate by heyoka through all periods without a stop."""
     q, p = hy.make_vars("q", "p")
     equations = list(zip((q, p), pendulum_rate(q, p, hy.sin(q), hy.cos(hy.time)), strict=True))
 

@@ -43,7 +43,7 @@ def training(quick: bool) -> Numbers:
     layers = [(jnp.ones((200, m.shape[0]), jnp.float32), m) for m in weights]
 
     def products(_, carry):
-        """Every layer's product, its transpose and the one that gives the weights' slope."""
+        """Multiply the matrices of every layer: forward, transposed, and for the weights' slope."""
         out = carry
         for x, matrix in layers:
             x = x + out
@@ -69,7 +69,7 @@ def training(quick: bool) -> Numbers:
 
 
 def in_torch(w, target, dt: float, runs: int, length: int) -> Numbers | None:
-    """The same step in PyTorch, on as many threads; None where it is not installed."""
+    """Time the same training step in PyTorch, on as many threads; None where not installed."""
     try:
         import torch_loops
     except ImportError:

@@ -1,4 +1,4 @@
-"""The methods that the paper compares with, and one that came after. Each ends in a step function.
+"""Methods that the paper compares with, and a later one. Each gives a step function.
 
 `METHODS` names them; each is ``learn(sequences, budget) -> Learned``.
 """
@@ -17,9 +17,10 @@ from gfnn_jax.baselines.sympnets import g_sympnet, la_sympnet
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """title: as figures and tables show it. length: states in a sequence, 2 for pairs.
+    """Method of a comparison.
 
-    only_coupled: of use only where the system is not separable.
+    title: name in figures and tables. learn: the training. length: number of states in a sequence,
+    2 for pairs. only_coupled: True for a method that serves non-separable systems only.
     """
 
     title: str

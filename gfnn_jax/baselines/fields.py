@@ -1,12 +1,12 @@
-"""Learned vector fields: VFNN without structure, HNN as that of a learned Hamiltonian.
+"""Learned vector fields: VFNN without structure, HNN that of a learned Hamiltonian.
 
 Both learn ż ≈ (z₁ − z₀)/dt, the paper's finite differences, and predict with an adaptive
-Runge–Kutta method. The finite difference is off by dt/2 · z̈, which no network makes good.
+Runge–Kutta method. The finite difference has an error of dt/2 · z̈, which no network can remove.
 
 HNN: Greydanus, Dzamba & Yosinski, "Hamiltonian Neural Networks", NeurIPS 2019, and their public
 code, greydanus/hamiltonian-nn, experiment-2body: 200-200 tanh, Adam at 1e-3, batches of 200,
-10,000 iterations, RK45. VFNN is their baseline, the same network with 2d outputs. Ours beside that:
-inputs and outputs of unit size, and the rate's decay.
+10,000 iterations, RK45. VFNN is their baseline, the same network with 2d outputs. We add: inputs
+and outputs of unit size, and a decay of the rate.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from gfnn_jax.scenes.trajectories import flow_step
 
 HIDDEN, ACTIVATION = (200, 200), "tanh"
 RECIPE = Recipe(batch_size=200, epochs=40, epoch_length=250, rate=1e-3, schedule="cosine")
-TOLERANCE = 1e-9  # of a prediction's step, as in their experiments on two bodies
+TOLERANCE = 1e-9  # local error of a predicted step, as in their experiments on two bodies
 
 
 def vfnn(sequences: Sequences, budget: Budget) -> Learned:
-    """ż = N(z), a network with 2d outputs."""
+    """Learn ż = N(z), N a network with 2d outputs."""
     field, params = network_field(sequences, HIDDEN, budget.key)
     return _learn_field(field, params, sequences, budget, "vector field 200-200")
 
 
 def hnn(sequences: Sequences, budget: Budget) -> Learned:
-    """ż = J ∇H(z), H a network."""
+    """Learn ż = J ∇H(z), H a network."""
     z, velocity = sequences.derivatives()
     target_gradient = -apply_j(velocity)  # ∇H
     inputs = box_inputs(z, angles=q_angles(sequences))
@@ -50,7 +50,7 @@ def hnn(sequences: Sequences, budget: Budget) -> Learned:
 
 
 def network_field(sequences: Sequences, hidden: tuple[int, ...], key) -> tuple[Callable, Any]:
-    """``field(params, z)`` -> (2d,), a tanh network of the size of the data, and its start."""
+    """Make ``field(params, z)`` -> (2d,), a tanh network of unit size, and its first params."""
     z, velocity = sequences.derivatives()
     inputs, unit = Mlp(box_inputs(z, angles=q_angles(sequences)), hidden), sizes(velocity)
 
@@ -59,7 +59,7 @@ def network_field(sequences: Sequences, hidden: tuple[int, ...], key) -> tuple[C
 
     def field(params, z):
         dtype = jax.tree.leaves(params)[0].dtype
-        seen = inputs.seen(z).astype(dtype)
+        seen = inputs.network_inputs(z).astype(dtype)
         return jnp.asarray(unit, dtype) * net(dtype).apply({"params": params}, seen)
 
     params = initial(inputs.num_inputs, hidden, z.shape[1], ACTIVATION, jnp.float32, key)
@@ -67,7 +67,7 @@ def network_field(sequences: Sequences, hidden: tuple[int, ...], key) -> tuple[C
 
 
 def q_angles(sequences: Sequences) -> tuple[int, ...]:
-    """The angles among the q, which networks see as cosine and sine."""
+    """Indices of the angles among the q, which networks take as cosine and sine."""
     return tuple(i for i in sequences.angles if i < sequences.dim)
 
 

@@ -1,7 +1,7 @@
-"""What every baseline shares: sequences to learn from, a training of a map, what comes out.
+"""Parts that all baselines share: sequences of states, the training of a map, its result.
 
-A baseline ends in a step function z -> Z of one state (2d,), q first, which `maps.rollout` rolls
-out. It learns in float32, as the public codes do, and predicts in the dtype of the state.
+A baseline gives a step function z -> Z of one state (2d,), q first, which `maps.rollout` rolls out.
+It learns in float32, as the public codes do, and predicts in the dtype of the state.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ HELD = 2_000  # rows that validate, at most a tenth of all
 
 @dataclasses.dataclass(frozen=True)
 class Sequences:
-    """States (N, L, 2d) that are one ``dt`` apart, float64; L = 2 makes pairs.
+    """Sequences of states (N, L, 2d) that are one ``dt`` apart, float64; L = 2 makes pairs.
 
     angles: indices of z with period 2π for the map; z[:, 0] is reduced, the rest is continuous.
-    separable: whether the system may be taken as H = T(p) + V(q).
+    separable: True where the system is of the form H = T(p) + V(q).
     """
 
     z: np.ndarray
@@ -35,16 +35,16 @@ class Sequences:
 
     @property
     def dim(self) -> int:
-        """Degrees of freedom d."""
+        """Number d of degrees of freedom."""
         return self.z.shape[-1] // 2
 
     @property
     def num_pairs(self) -> int:
-        """States whose image is known."""
+        """Number of states whose image is known."""
         return self.z.shape[0] * (self.z.shape[1] - 1)
 
     def derivatives(self) -> tuple[np.ndarray, np.ndarray]:
-        """z and ż ≈ (z₁ − z₀)/dt, both (pairs, 2d): the paper's first-order finite differences."""
+        """Compute z and ż ≈ (z₁ − z₀)/dt, both (pairs, 2d): the paper's finite differences."""
         z0, z1 = self.z[:, :-1], self.z[:, 1:]
         width = self.z.shape[-1]
         return z0.reshape(-1, width), ((z1 - z0) / self.dt).reshape(-1, width)
@@ -52,8 +52,9 @@ class Sequences:
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """key: a ``jax.random.key``. cap: most seconds of training, compilation apart; None: no cap.
+    """Randomness and time of a training.
 
+    key: a ``jax.random.key``. cap: most seconds of training, compilation apart; None for no cap.
     say: called with a line on the progress of the training.
     """
 
@@ -63,7 +64,10 @@ class Budget:
 
 
 class Learned(NamedTuple):
-    """step: z (2d,) -> Z. params: float64. training: how it went; its errors are of its loss."""
+    """Result of a baseline: its step function, with the record of its training.
+
+    step: z (2d,) -> Z. params: float64. training: its errors are those of the method's own loss.
+    """
 
     step: Callable
     params: Any
@@ -76,7 +80,7 @@ class Learned(NamedTuple):
 
 
 def periodic(step: Callable, angles: tuple[int, ...]) -> Callable:
-    """``step(params, z)`` evaluated at the image of z in [0, 2π), where the data were."""
+    """Evaluate ``step(params, z)`` at the image of z in [0, 2π), where the data were."""
     if not angles:
         return step
     index = np.array(angles)
@@ -91,7 +95,10 @@ def periodic(step: Callable, angles: tuple[int, ...]) -> Callable:
 def train(
     loss: Callable, params: Any, rows: tuple, components: int, recipe: Recipe, budget: Budget
 ) -> tuple[Any, AdamFit]:
-    """Minimise ``loss(params, *batch)``; the first rows are kept apart. (params in float64, how)"""
+    """Minimise ``loss(params, *batch)``; the first rows validate.
+
+    Returns the params in float64 and the record of the training.
+    """
     held = min(HELD, len(rows[0]) // 10)
     trained = minimise(
         loss, params, tuple(r[held:] for r in rows), tuple(r[:held] for r in rows),
@@ -102,16 +109,16 @@ def train(
 
 
 def in_float64(params: Any) -> Any:
-    """The same parameters in NumPy's float64."""
+    """Convert the parameters to NumPy's float64."""
     return jax.tree.map(lambda a: np.asarray(a, np.float64), params)
 
 
 def learn_map(
     step: Callable, params: Any, sequences: Sequences, recipe: Recipe, budget: Budget, label: str
 ) -> Learned:
-    """Fit ``step(params, z) -> Z``, applied again and again, to all states of the sequences.
+    """Fit ``step(params, z) -> Z``, applied repeatedly, to all states of the sequences.
 
-    The loss is the squared distance, averaged over the states of a sequence but its first.
+    The loss is the squared distance, averaged over the states of a sequence after the first.
     """
     step = periodic(step, sequences.angles)
 

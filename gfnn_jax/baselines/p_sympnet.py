@@ -1,7 +1,7 @@
 """P-SympNet: a row of exact flows of ridge polynomials, each layer's H = f(w·z).
 
 Tapley, "Symplectic Neural Networks Based on Dynamical Systems" (arXiv:2408.09821, 2024), and the
-public code bentaps/strupnet, method P. w·z is conserved by its own layer, so that
+public code bentaps/strupnet, method P. A layer conserves its own w·z, so that
 
     z + dt f'(w·z) J w
 
@@ -26,7 +26,7 @@ RECIPE = Recipe(batch_size=200, epochs=1_200, epoch_length=500, rate=1e-2, sched
 
 
 def p_sympnet(sequences: Sequences, budget: Budget) -> Learned:
-    """``LAYERS`` ridge polynomials of the degrees 2 to ``DEGREE``."""
+    """Learn ``LAYERS`` ridge polynomials of the degrees 2 to ``DEGREE``."""
     largest = float(np.max(np.sqrt(np.mean(sequences.z**2, axis=(0, 1)))))
     params = p_init(budget.key, sequences.dim, LAYERS, DEGREE)
     # High powers of states much larger than 1 would overflow before the training begins.
@@ -42,7 +42,7 @@ def p_sympnet(sequences: Sequences, budget: Budget) -> Learned:
 
 @partial(jax.jit, static_argnums=(1, 2, 3))
 def p_init(key, dim: int, layers: int, degree: int):
-    """Parameters, float32: directions of unit size, small coefficients of the degrees 2, 3, ..."""
+    """Draw parameters, float32: unit-sized directions, small coefficients of degrees 2, 3, ..."""
     directions, coefficients = jax.random.split(key)
     size = (2 * dim) ** -0.5
     return {
@@ -52,7 +52,7 @@ def p_init(key, dim: int, layers: int, degree: int):
 
 
 def p_step(params, z, dt: float):
-    """All layers in a row."""
+    """Apply all layers in a row to z (2d,)."""
 
     def layer(z, ridge):
         direction, coefficients = ridge

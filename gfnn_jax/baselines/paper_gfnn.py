@@ -1,8 +1,8 @@
-"""The paper's own recipe for GFNN: its network as S, type 2, trained by Adam.
+"""Recipe of the paper for GFNN: its network as S, type 2, trained by Adam.
 
 Chen & Tao, ICML 2021, "Experimental Details": hidden layers 200-100-50-20 and batches of 200 from a
 rate of 0.01; for the standard map 500-500-200-20 and batches of 1,000 from 0.001; 20 passes through
-the pairs. The step is solved to roundoff, as everywhere here.
+the pairs. The step is solved to roundoff, as everywhere in this package.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import sizes
 
-_PART = 50  # iterations between looks at the clock
-_MOST_STATES = 20_000  # that describe the domain
+_PART = 50  # iterations between two readings of the clock
+_MOST_STATES = 20_000  # number of states from which the domain is made
 
 
 class PaperGfnn(NamedTuple):
-    """map: in the user's own coordinates. family: the network. training: of ∇S."""
+    """Result of the paper's recipe: map in the user's coordinates, network, training of ∇S."""
 
     map: SymplecticMap
     family: Mlp
@@ -38,7 +38,7 @@ class PaperGfnn(NamedTuple):
 
 
 def paper_gfnn(pairs: Sequences, budget: Budget) -> PaperGfnn:
-    """Learn S(q, P) from pairs; with periodic coordinates by the standard map's recipe."""
+    """Learn S(q, P) from pairs; where coordinates are periodic, by the standard map's recipe."""
     hidden, recipe = PAPER_HIDDEN, PAPER
     if pairs.angles:
         hidden, recipe = PAPER_HIDDEN_STANDARD_MAP, PAPER_STANDARD_MAP

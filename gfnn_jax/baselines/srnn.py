@@ -1,17 +1,17 @@
-"""SRNN: a learned Hamiltonian seen through a symplectic integrator, fitted to whole sequences.
+"""SRNN: a learned Hamiltonian with a symplectic integrator, fitted to whole sequences.
 
 Chen, Zhang, Arjovsky & Bottou, "Symplectic Recurrent Neural Networks", ICLR 2020, and their public
 code, zhengdao-chen/SRNN: H = T(p) + V(q), two tanh networks 256-256, one leapfrog step per time
-step, the squared error of all states of a sequence, Adam at 5e-3, batches of 32. Ours: inputs and
-outputs of unit size, and the rate's decay. Without their optimisation of initial
-states, which serves noisy data. For systems that are not separable, two variants:
+step, the squared error of all states of a sequence, Adam at 5e-3, batches of 32. We add inputs and
+outputs of unit size and a decay of the rate, and leave out their optimisation of initial states,
+which serves noisy data. There are two variants for systems that are not separable:
 
-- O-NET, theirs: leapfrog of a field N(z) with 2d outputs, which is not symplectic. The paper takes
+- O-NET, theirs: leapfrog of a field N(z) with 2d outputs, which is not symplectic. The paper uses
   it for the three bodies.
 - Tao's integrator of any H in a doubled phase space (Phys. Rev. E 94, 043303, 2016), the remedy
-  that the paper names; networks so trained are Xiong et al., "Nonseparable Symplectic Neural
-  Networks", ICLR 2021. Both copies of the state start each step equal, and the first is kept, so
-  that the step is symplectic up to the distance that the copies gain in one step.
+  that the paper names. Xiong et al., "Nonseparable Symplectic Neural Networks", ICLR 2021, train
+  networks with it. Both copies of the state start each step equal, and the first is kept, so that
+  the step is symplectic up to the distance that the copies gain in one step.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from gfnn_jax.phase_space import apply_j, split
 
 HIDDEN, ACTIVATION = (256, 256), "tanh"
 RECIPE = Recipe(batch_size=32, epochs=1_500, epoch_length=200, rate=5e-3, schedule="cosine")
-BINDING = 10.0  # Tao's ω: how strongly the two copies of the state are held together
+BINDING = 10.0  # Tao's ω, the strength with which the two copies of the state are bound
 
 
 def srnn(sequences: Sequences, budget: Budget) -> Learned:
-    """Leapfrog of T(p) + V(q) where the system is separable, else Tao's integrator of H(q, p)."""
+    """Learn a leapfrog of T(p) + V(q) for a separable system, else Tao's integrator of H(q, p)."""
     z, velocity = sequences.derivatives()
     gradient = -apply_j(velocity)
     dim, dt = sequences.dim, sequences.dt
     q, p = tuple(range(dim)), tuple(range(dim, 2 * dim))
 
     def family(columns):
-        """A scalar of these columns of z alone."""
+        """Make a scalar network of these columns of z alone."""
         others = tuple(i for i in range(2 * dim) if i not in columns)
         seen = list(columns)
         return Mlp(
@@ -74,7 +74,7 @@ def srnn(sequences: Sequences, budget: Budget) -> Learned:
 
 
 def o_net(sequences: Sequences, budget: Budget) -> Learned:
-    """Leapfrog of a network with 2d outputs."""
+    """Learn a leapfrog of a network with 2d outputs."""
     field, params = network_field(sequences, HIDDEN, budget.key)
     step = leapfrog(
         lambda params, z: split(field(params, z))[0],
@@ -85,9 +85,10 @@ def o_net(sequences: Sequences, budget: Budget) -> Learned:
 
 
 def leapfrog(velocity: Callable, force: Callable, dt: float) -> Callable:
-    """``step(params, z)``: half a kick, a drift, half a kick; q̇ and ṗ from (params, z) -> (d,).
+    """Make ``step(params, z)``: half a kick, a drift, half a kick.
 
-    Symplectic where q̇ depends on p alone and ṗ on q alone, both as gradients.
+    velocity, force: q̇ and ṗ, (params, z) -> (d,). The step is symplectic where q̇ depends on p alone
+    and ṗ on q alone, both as gradients.
     """
 
     def step(params, z):
@@ -101,7 +102,7 @@ def leapfrog(velocity: Callable, force: Callable, dt: float) -> Callable:
 
 
 def tao(hamiltonian: Callable, dt: float, binding: float = BINDING) -> Callable:
-    """``step(params, z)`` of any ``hamiltonian(params, z)``: Tao's second-order splitting of
+    """Make ``step(params, z)`` of any ``hamiltonian(params, z)``: Tao's second-order splitting of
 
     H(q, y) + H(x, p) + ω/2 (‖q − x‖² + ‖p − y‖²),        x = q and y = p at the start.
     """
@@ -110,17 +111,17 @@ def tao(hamiltonian: Callable, dt: float, binding: float = BINDING) -> Callable:
     cos, sin = float(np.cos(angle)), float(np.sin(angle))
 
     def first(params, q, p, x, y, h):
-        """Flow of H(q, y): q and y rest."""
+        """Flow of H(q, y): q and y are constant."""
         g_q, g_y = split(gradient(params, jnp.concatenate([q, y])))
         return q, p - h * g_q, x + h * g_y, y
 
     def second(params, q, p, x, y, h):
-        """Flow of H(x, p): x and p rest."""
+        """Flow of H(x, p): x and p are constant."""
         g_x, g_p = split(gradient(params, jnp.concatenate([x, p])))
         return q + h * g_p, p, x, y - h * g_x
 
     def bind(q, p, x, y):
-        """Flow of the binding: the difference of the copies turns by 2ω dt, their sum rests."""
+        """Flow of the binding: the copies' difference turns by 2ω dt, their sum is constant."""
         u, v = q - x, p - y
         u, v = cos * u + sin * v, cos * v - sin * u
         return (q + x + u) / 2, (p + y + v) / 2, (q + x - u) / 2, (p + y - v) / 2

@@ -1,10 +1,10 @@
-"""SympNets: networks whose every layer is a symplectic map.
+"""SympNets: networks of which each layer is a symplectic map.
 
 Jin, Zhang, Zhu, Tang & Karniadakis, "SympNets: Intrinsic structure-preserving symplectic networks
 for identifying Hamiltonian systems", Neural Networks 132 (2020), and their public code,
 jpzxshi/sympnets: sigmoid, Adam at 1e-3, weights drawn with a deviation of 0.01. LA: linear modules
-and activations in turn, at the paper's 30 layers × 10 sublayers; G: gradient modules. Ours beside
-that: batches instead of all pairs at once, and the rate's decay.
+and activations in turn, at the paper's 30 layers × 10 sublayers; G: gradient modules. We add:
+batches instead of all pairs at once, and a decay of the rate.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from gfnn_jax.baselines.learned import Budget, Learned, Sequences, learn_map
 from gfnn_jax.fitting.adam import Recipe
 from gfnn_jax.phase_space import split
 
-LAYERS, SUBLAYERS = 30, 10  # of LA, as in the paper
+LAYERS, SUBLAYERS = 30, 10  # sizes of LA, as in the paper
 G_LAYERS, G_WIDTH = 20, 50
 RECIPE = Recipe(batch_size=200, epochs=1_200, epoch_length=250, rate=1e-3, schedule="cosine")
 _DEVIATION = 0.01
-UNROLL = 5  # layers that are compiled in a row: all would take four times as long to compile
+UNROLL = 5  # layers compiled in a row; all layers would take four times as long to compile
 
 
 def la_sympnet(sequences: Sequences, budget: Budget) -> Learned:
-    """Linear and activation modules in turn, a linear one last."""
+    """Learn linear and activation modules in turn, a linear one last."""
     params = la_init(budget.key, sequences.dim, LAYERS, SUBLAYERS)
     label = f"{LAYERS} layers of {SUBLAYERS} sublayers"
     return learn_map(la_step, params, sequences, RECIPE, budget, label)
@@ -35,7 +35,7 @@ def la_sympnet(sequences: Sequences, budget: Budget) -> Learned:
 
 @partial(jax.jit, static_argnums=(1, 2, 3))
 def la_init(key, dim: int, layers: int, sublayers: int):
-    """Parameters, float32: symmetric halves and shifts of the linear modules, activations."""
+    """Draw parameters, float32: halves and shifts of the linear modules, activations."""
     linear, active = jax.random.split(key)
     shape = (layers, sublayers, dim, dim)
     return {
@@ -46,7 +46,7 @@ def la_init(key, dim: int, layers: int, sublayers: int):
 
 
 def la_step(params, z):
-    """One step of LA. A linear module's sublayers are multiplied out first: a matrix each."""
+    """Step z (2d,) by LA. The sublayers of a linear module are multiplied into one matrix first."""
     matrices = jax.vmap(partial(_linear, dim=z.shape[0] // 2))(params["half"])
 
     def layer(z, module):
@@ -60,12 +60,12 @@ def la_step(params, z):
 
 
 def _even(layers: int):
-    """Which layers shear p, (layers, 1): the first, the third, ..."""
+    """Flag (layers, 1), True for the layers that shear p: the first, the third, ..."""
     return jnp.arange(layers)[:, None] % 2 == 0
 
 
 def _sheared(z, even, shear: Callable):
-    """p + shear(q) where ``even``, else q + shear(p)."""
+    """Shear z: p + shear(q) where ``even``, else q + shear(p)."""
     q, p = split(z)
     change = shear(jnp.where(even, q, p))
     zero = jnp.zeros_like(change)
@@ -73,7 +73,7 @@ def _sheared(z, even, shear: Callable):
 
 
 def _linear(halves, dim: int):
-    """The matrix (2d, 2d) of shears p += (S + Sᵀ) q and q += (S + Sᵀ) p in turn."""
+    """Matrix (2d, 2d) of the shears p += (S + Sᵀ) q and q += (S + Sᵀ) p in turn."""
     q, p = jnp.split(jnp.eye(2 * dim, dtype=halves.dtype), 2)
     for i, half in enumerate(halves):
         symmetric = half + half.T
@@ -85,7 +85,7 @@ def _linear(halves, dim: int):
 
 
 def g_sympnet(sequences: Sequences, budget: Budget) -> Learned:
-    """Gradient modules: shears by the gradient of Σ aᵢ Σ(kᵢ·q + bᵢ), Σ' the sigmoid."""
+    """Learn gradient modules: shears by the gradient of Σᵢ aᵢ F(kᵢ·q + bᵢ), F' the sigmoid."""
     params = g_init(budget.key, sequences.dim, G_LAYERS, G_WIDTH)
     label = f"{G_LAYERS} layers of width {G_WIDTH}"
     return learn_map(g_step, params, sequences, RECIPE, budget, label)
@@ -93,7 +93,7 @@ def g_sympnet(sequences: Sequences, budget: Budget) -> Learned:
 
 @partial(jax.jit, static_argnums=(1, 2, 3))
 def g_init(key, dim: int, layers: int, width: int):
-    """Parameters, float32: inner weights, biases, outer weights of each module."""
+    """Draw parameters, float32: inner weights, biases, outer weights of each module."""
     inner, outer = jax.random.split(key)
     return {
         "inner": _DEVIATION * jax.random.normal(inner, (layers, width, dim), jnp.float32),
@@ -103,7 +103,7 @@ def g_init(key, dim: int, layers: int, width: int):
 
 
 def g_step(params, z):
-    """One step of G: p, q, p, ... sheared in turn."""
+    """Step z (2d,) by G: p, q, p, ... are sheared in turn."""
 
     def layer(z, module):
         inner, bias, outer, even = module

@@ -22,6 +22,8 @@ LARGEST = 1e100
 # Rows read at a time when no chunk is asked for; 16k rows of four numbers are 6 MB as text.
 BLOCK_ROWS = 16_384
 TIME = "t"  # `phase_space.TIME`, which brings JAX
+# Consecutive pairs of a run that a sample of a large file keeps or leaves together.
+ARC = 50
 # What flipped bits and cuts in files made zipfile, its decompressors, NumPy and the decoding of
 # text raise; a flipped bit in a header may ask for an unknown compression or for a password.
 _OF_DAMAGE = (
@@ -36,18 +38,20 @@ class DataWarning(UserWarning):
 
 @dataclasses.dataclass
 class Block:
-    """Consecutive rows. ``sequence`` (n,) changes where one sequence ends and the next begins;
-    ``locate(row, column)`` says where in the file a number stands. ``own`` (n, 1 + k): the row's
-    time and parameters, where the file has these."""
+    """Consecutive rows. ``sequence`` (n,) is the number, or the label, of the sequence that each is
+    of, ``place`` (n,) its number along that; ``locate(row, column)`` says where in the file a
+    number stands. ``own`` (n, 1 + k): the row's time and parameters, where the file has these."""
 
     states: np.ndarray
     sequence: np.ndarray
+    place: np.ndarray
     locate: Callable[[int, int], str]
     own: np.ndarray | None = None
 
     def rows(self, index: np.ndarray) -> Block:
         return Block(
-            self.states[index], self.sequence[index], lambda r, c: self.locate(int(index[r]), c),
+            self.states[index], self.sequence[index], self.place[index],
+            lambda r, c: self.locate(int(index[r]), c),
             None if self.own is None else self.own[index],
         )  # fmt: skip
 
@@ -74,7 +78,8 @@ class Source:
 
     uneven: whether the times that were read so far are not dt apart. parameters: names of those
     that the rows have. period: of a drive, whose time the rows' times are. timed: whether they have
-    times at all.
+    times at all. of_pairs_alone: whether the sequences are single pairs, z0 and z1, whose order in
+    the file is all that is known of their runs.
     """
 
     dim: int
@@ -87,6 +92,7 @@ class Source:
     uneven: bool = False
     period: float | None = None
     timed: bool = False
+    of_pairs_alone: bool = False
 
     def of_pairs(self, own: np.ndarray | None, rows) -> tuple[Any, dict[str, np.ndarray] | None]:
         """(dt, args) of the pairs that begin in these rows."""

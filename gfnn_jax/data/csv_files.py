@@ -99,7 +99,7 @@ def open_csv(path: Path, stream, dt, initial: bool, driven: bool) -> Source:
 
     def blocks(rows: int) -> Iterator[Block]:
         seen: set[float] = set()
-        last = np.full(2, np.nan)  # sequence and time of the row before
+        last, count = np.full(2, np.nan), 0  # sequence and time of the row before; its place
         for table, lines in _cut(itertools.chain([first], tables), rows):
             if each_row:
                 sequence = lines
@@ -125,10 +125,14 @@ def open_csv(path: Path, stream, dt, initial: bool, driven: bool) -> Source:
             values = table[:, beside]
             if not each_row:
                 _check_constant(path, parameters, values, sequence, lines)
+            begins = np.append(last[0], sequence[:-1]) != sequence
+            place = _places(begins, count)
             last = np.array([sequence[-1], time[-1] if with_time else np.nan])
+            count = int(place[-1]) + 1
             yield Block(
                 table[:, columns],
                 sequence,
+                place,
                 lambda r, c, lines=lines: f"line {lines[r]}, {wanted[c]}",
                 np.column_stack([time, values]),
             )
@@ -138,6 +142,13 @@ def open_csv(path: Path, stream, dt, initial: bool, driven: bool) -> Source:
         dim, float(dt), "float64", units, False, blocks, called, period=period, timed=with_time
     )
     return source
+
+
+def _places(begins: np.ndarray, first: int) -> np.ndarray:
+    """The number (n,) of each row along its sequence, which begins at some of the rows; the first
+    row has the number ``first`` if its sequence has begun before it."""
+    row = np.arange(len(begins))
+    return row - np.maximum.accumulate(np.where(begins, row, -first))
 
 
 def _check_constant(path, names: list[str], values, sequence, lines) -> None:

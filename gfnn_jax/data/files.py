@@ -31,11 +31,22 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.data.blocks import BLOCK_ROWS, TIME, Block, DataWarning, Source, check_dt, column
+from gfnn_jax.data.blocks import (
+    ARC,
+    BLOCK_ROWS,
+    TIME,
+    Block,
+    DataWarning,
+    Source,
+    check_dt,
+    column,
+)
 from gfnn_jax.data.csv_files import open_csv
 from gfnn_jax.data.npz_files import open_npy, open_npz
 from gfnn_jax.errors import InputError
-from gfnn_jax.processes import WHOLE, Group, Share
+from gfnn_jax.processes import WHOLE, Share
+
+FILE_STEP = 2**40  # between the labels of the runs of one file and those of the next
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +59,9 @@ class TrajectoryData:
                (num_pairs,) where it is not always the same.
     args:      parameters, name -> (num_pairs,), or None; by the name t the time of a drive.
     period:    of the drive.
+    run, place: of each pair the run that it is of, as the file labels it, and the number of its
+               first state along that (num_pairs,); None where the file holds single pairs, whose
+               runs are told by those that go on with the next.
     source:    the file it came from; digest: the SHA-256 of that file.
     precision: the dtype that the file stores, "float32" say; ``states`` is float64 always.
     units:     units by column name, as a CSV header gave them.
@@ -62,6 +76,8 @@ class TrajectoryData:
     units: dict[str, str] = dataclasses.field(default_factory=dict)
     args: dict[str, np.ndarray] | None = None
     period: float | None = None
+    run: np.ndarray | None = None
+    place: np.ndarray | None = None
 
     @property
     def dim(self) -> int:
@@ -85,8 +101,9 @@ class TrajectoryData:
         starts[np.cumsum(self.lengths) - 1] = False
         rows = np.flatnonzero(starts)
         return Pairs(
-            self.states[rows], self.states[rows + 1], self.dt, self.args, period=self.period
-        )
+            self.states[rows], self.states[rows + 1], self.dt, self.args, period=self.period,
+            run=self.run, place=self.place,
+        )  # fmt: skip
 
     def last_states(self) -> np.ndarray:
         """The last state of each sequence, (M, 2d)."""
@@ -103,10 +120,11 @@ def read_trajectories(
     Raises InputError where the file cannot be used; warns (DataWarning) about constant or
     duplicated columns and about states that never move.
     """
-    with _open(path, dt) as source:
+    with opened(path, dt) as source:
         blocks = list(source.blocks(2**62 if source.is_array else BLOCK_ROWS))
         states = np.concatenate([np.empty((0, 2 * source.dim)), *(b.states for b in blocks)])
         sequence = np.concatenate([np.empty(0), *(b.sequence for b in blocks)])
+        place = np.concatenate([np.empty(0, int), *(b.place for b in blocks)])
         own = joined([b.own for b in blocks])
     going = np.flatnonzero(sequence[1:] == sequence[:-1])
     dt, args = source.of_pairs(own, going)
@@ -120,121 +138,33 @@ def read_trajectories(
             f"{needed} are needed for d = {source.dim}"
         )
     _warn_of_odd_columns(path, states, sequence)
+    identities = (None, None) if source.of_pairs_alone else (labels(sequence[going]), place[going])
     return TrajectoryData(
-        states, lengths, dt, str(path), _digest(path), source.precision, source.units, args,
-        source.period,
+        states, lengths, dt, str(path), digest_of(path), source.precision, source.units, args,
+        source.period, *identities,
     )  # fmt: skip
 
 
-def read_sample(
-    paths, *, dt: float | None = None, num_pairs: int = 200_000, seed: int = 0,
-    group: Group | None = None,
-) -> TrajectoryData:  # fmt: skip
-    """As `read_trajectories`, of data larger than memory: a random sample of their pairs.
-
-    paths: a file, or several. group: the processes that each read their own pairs of them, as
-    `iterate_pairs` shares them out; the sample, the same for any number, is the first one's, and
-    the others get what they have sent.
-    The files are read once, block by block, and checked all through; each pair is kept with the
-    same probability, as a sequence of two states. Memory is that of the sample and a few blocks.
-    Which pairs are kept is told by a hash of their numbers. ``digest`` is that of the one file, or
-    of several or of a group's the sum of the hashes of all pairs, whatever their order.
-    """
-    alone, group = group is None, group or Group()
-    found, checksum, count, seen = None, np.zeros(1, np.uint64), 0, [np.inf, 0.0]
-    for pairs in iterate_pairs(paths, BLOCK_ROWS, dt=dt, share=group.share):
-        new = _table(pairs, seed)
-        checksum, count = checksum + new["hash"].sum(), count + len(pairs)
-        seen = [min(seen[0], new["dt"].min()), max(seen[1], new["dt"].max())]
-        found = _smallest(_both(found, new), num_pairs)
-    told = {"count": [count], "hash": checksum, "low": [seen[0]], "high": [seen[1]]}
-    all_told = group.folded({n: np.array(v) for n, v in told.items()}, _both)
-    total = group.told({"count": all_told["count"].sum()} if group.first else None)["count"]
-    if not total:
-        raise InputError(f"{_named(paths)}: no pair of consecutive states found")
-    if group.share.count > 1:  # those that the first will want, and a few more
-        part = (num_pairs + _MORE * np.sqrt(num_pairs)) / max(int(total), 1)
-        if found is not None and part < 1:
-            found = _taken(found, found["hash"] < np.uint64(part * 2.0**64))
-        found = group.folded(found or {}, _both)
-    with _open(_own(paths, group.share)[0][0], dt) as source:
-        precision, units, period = source.precision, source.units, source.period
-        none = np.empty((0, 2, 2 * source.dim))
-    if not found:  # this process has no pair, and sends none
-        found = {"pairs": none, "dt": none[:, 0, 0], "hash": np.empty(0, np.uint64)}
-    if total > num_pairs or not alone:
-        found = _taken(found, np.argsort(found["hash"], kind="stable")[:num_pairs])
-    alone = alone and len(_listed(paths)) == 1
-    digest = _digest(_listed(paths)[0]) if alone else f"{all_told['hash'].sum():016x}"
-    same = all_told["low"].min() == all_told["high"].max()
-    states = found["pairs"].reshape(-1, found["pairs"].shape[-1])
-    args = {n.removeprefix(_ARG): v for n, v in found.items() if n.startswith(_ARG)}
-    each = float(found["dt"][0]) if same and len(states) else found["dt"]
-    return TrajectoryData(
-        states, np.full(len(found["pairs"]), 2), each, _named(paths), digest, precision, units,
-        args or None, period,
-    )  # fmt: skip
+def labels(sequence: np.ndarray) -> np.ndarray:
+    """Labels of sequences (n,), as integers where they are whole numbers."""
+    whole = sequence.astype(np.int64)
+    return whole if np.array_equal(whole, sequence) else sequence
 
 
-_ARG = "arg "  # before the name of a parameter in a table
-_MORE = 10  # standard deviations of the number of pairs that fall below a bound
-
-
-def _table(pairs: Any, seed: int) -> dict[str, np.ndarray]:
-    """Pairs as arrays by name, with a hash of all numbers of each (N,)."""
-    rows = np.stack([pairs.z0, pairs.z1], axis=1)
-    each = np.broadcast_to(np.asarray(pairs.dt, np.float64), len(rows))
-    args = {_ARG + name: np.asarray(v, np.float64) for name, v in (pairs.args or {}).items()}
-    columns = [*rows.reshape(len(rows), -1).T, each, *args.values()]
-    mixed = np.full(len(rows), seed, np.uint64)
-    for numbers in columns:  # Steele, Lea & Flood, OOPSLA 2014: SplitMix64's finaliser
-        mixed = mixed + np.uint64(0x9E3779B97F4A7C15)
-        mixed ^= np.ascontiguousarray(numbers, np.float64).view(np.uint64)
-        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
-            mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
-        mixed ^= mixed >> np.uint64(31)
-    return {"pairs": rows, "dt": each, "hash": mixed, **args}
-
-
-def _both(one: dict[str, np.ndarray] | None, other: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The rows of both tables, either of which may have none. Raises InputError where they differ
-    in what they hold."""
-    if not one or not other:
-        return one or other
-    shapes = [{name: column.shape[1:] for name, column in table.items()} for table in (one, other)]
-    if shapes[0] != shapes[1]:
-        raise InputError(
-            "expected files with the same coordinates and parameters, found "
-            f"{' and '.join(str(s) for s in shapes)}"
-        )
-    return {name: np.concatenate([column, other[name]]) for name, column in one.items()}
-
-
-def _taken(table: dict[str, np.ndarray], rows) -> dict[str, np.ndarray]:
-    return {name: column[rows] for name, column in table.items()}
-
-
-def _smallest(table: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
-    """At most so many rows, those with the smallest hashes."""
-    if len(table["hash"]) <= most:
-        return table
-    return _taken(table, np.argpartition(table["hash"], most)[:most])
-
-
-def _listed(paths) -> list[Path]:
+def listed(paths) -> list[Path]:
     return [Path(paths)] if isinstance(paths, (str, Path)) else [Path(path) for path in paths]
 
 
-def _named(paths) -> str:
-    return ", ".join(str(path) for path in _listed(paths))
+def named(paths) -> str:
+    return ", ".join(str(path) for path in listed(paths))
 
 
-def _own(paths, share: Share) -> tuple[list[Path], Share]:
-    """The files of a process, and its share of each of them."""
-    listed = _listed(paths)
-    if len(listed) >= share.count:
-        return listed[share.of(len(listed), 1)], WHOLE
-    return listed, share
+def own_files(paths, share: Share) -> tuple[list[tuple[int, Path]], Share]:
+    """The files of a process, each with its number among all, and its share of each of them."""
+    files = list(enumerate(listed(paths)))
+    if len(files) >= share.count:
+        return files[share.of(len(files), 1)], WHOLE
+    return files, share
 
 
 def iterate_pairs(
@@ -249,29 +179,51 @@ def iterate_pairs(
     Memory stays within a few chunks, whatever the files' size, except for arrays stored in
     Fortran order, which are read whole, as are times and parameters. The same checks as in
     `read_trajectories`, block by block: a NaN far into the file is found only when it is reached.
+
+    Of several files the labels of runs begin with the file's number, times `FILE_STEP`. Single
+    pairs z0, z1 are in runs of at most `ARC` rows, each of which goes on with the next: they are
+    numbered by their first pair, and are the same for every number of processes.
     """
     from gfnn_jax.phase_space import Pairs
 
-    own, of_rows = _own(paths, share)
-    for path in own:
+    own, of_rows = own_files(paths, share)
+    for number, path in own:
         if of_rows.count > 1 and path.suffix.lower() == ".csv":
             raise InputError(
                 f"{path}: expected .npz or .npy, whose rows {share.count} processes can share, or "
                 "as many files as processes"
             )
-        with _open(path, dt) as source:
+        with opened(path, dt) as source:
             last_state, last_sequence = np.empty((0, 2 * source.dim)), np.empty(0)
+            last_place, last_arc = np.empty(0, int), (0, np.empty(2 * source.dim))
             last_own: list[np.ndarray | None] = []
             for block in source.blocks(chunk, *([of_rows] if of_rows.count > 1 else [])):
                 states = np.concatenate([last_state, block.states])
                 sequence = np.concatenate([last_sequence, block.sequence])
+                place = np.concatenate([last_place, block.place])
                 beside = joined([*last_own, block.own])
                 rows = np.flatnonzero(sequence[1:] == sequence[:-1])
                 if len(rows):
                     z0, z1, given = states[rows], states[rows + 1], source.of_pairs(beside, rows)
-                    yield Pairs(z0, z1, *given, period=source.period)
-                last_state, last_sequence = states[-1:], sequence[-1:]
+                    run, along = labels(sequence[rows]), place[rows]
+                    if source.of_pairs_alone:
+                        pair, run = run, _arcs_of_pairs(run, z0, z1, *last_arc)
+                        along, last_arc = pair - run, (int(run[-1]), z1[-1])
+                    yield Pairs(
+                        z0, z1, *given, period=source.period, run=run + number * FILE_STEP,
+                        place=along,
+                    )  # fmt: skip
+                last_state, last_sequence, last_place = states[-1:], sequence[-1:], place[-1:]
                 last_own = [None if beside is None else beside[-1:]]
+
+
+def _arcs_of_pairs(pair: np.ndarray, z0, z1, last_arc: int, last_image) -> np.ndarray:
+    """The number of the first pair of the arc that each pair (n,) is of: consecutive pairs, each
+    the state of the one before's image, cut where `ARC` divides their numbers. last_arc,
+    last_image: of the pair before these."""
+    before = np.concatenate([last_image[None], z1[:-1]])
+    begins = (pair % ARC == 0) | np.any(before != z0, axis=1)
+    return np.maximum.accumulate(np.where(begins, pair, last_arc))
 
 
 def joined(parts: list[np.ndarray | None]) -> np.ndarray | None:
@@ -296,7 +248,7 @@ def read_initial(
     parameters, which the file must hold; None where there are none. t among them is the time of a
     drive: t0 of the file, or the time of each sequence's last state."""
     driven = TIME in parameters
-    with _open(path, None, initial=True, driven=driven) as source:
+    with opened(path, None, initial=True, driven=driven) as source:
         if source.dim != dim:
             raise InputError(
                 f"{path}: expected states of {2 * dim} columns (d = {dim}), found "
@@ -356,7 +308,7 @@ def read_initial_noise(path, shape: tuple[int, int]) -> np.ndarray | None:
 
 
 @contextlib.contextmanager
-def _open(
+def opened(
     path, dt: float | None, *, initial: bool = False, driven: bool = False
 ) -> Iterator[Source]:
     """Open a trajectory file, its header checked. ``initial``: only its last states are wanted, and
@@ -413,6 +365,7 @@ def _warn_of_odd_columns(path, states: np.ndarray, sequence: np.ndarray) -> None
             )
 
 
-def _digest(path) -> str:
+def digest_of(path) -> str:
+    """SHA-256 of a file."""
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.data.blocks import (
+    ARC,
     TIME_TOLERANCE,
     Block,
     Source,
@@ -316,7 +317,7 @@ def _pairs_source(
     own = _own_columns(path, times, params, z0.shape[0], "pairs", 2)
 
     def blocks(rows: int, share: Share = WHOLE) -> Iterator[Block]:
-        part = share.of(z0.shape[0], 1)
+        part = share.of(z0.shape[0], ARC)
         pair = part.start
         # Two rows a pair, and at most ``rows`` pairs a block.
         for a, b in zip(z0.read_rows(rows, part), z1.read_rows(rows, part), strict=True):
@@ -324,14 +325,18 @@ def _pairs_source(
             sequence = np.repeat(np.arange(pair, pair + len(a)), 2)
             beside = None if own is None else own[2 * pair : 2 * (pair + len(a))]
             yield Block(
-                states, sequence, lambda r, c, n=pair: f"z{r % 2}[{n + r // 2}, {c}]", beside
-            )
+                states, sequence, np.tile([0, 1], len(a)),
+                lambda r, c, n=pair: f"z{r % 2}[{n + r // 2}, {c}]", beside,
+            )  # fmt: skip
             pair += len(a)
 
     precision = str(np.result_type(z0.dtype, z1.dtype))
     called = () if params is None else params[0]
     uneven = own_dt is not None
-    return Source(dim, dt, precision, {}, True, blocks, called, uneven, period, t0 is not None)
+    return Source(
+        dim, dt, precision, {}, True, blocks, called, uneven, period, t0 is not None,
+        of_pairs_alone=True,
+    )  # fmt: skip
 
 
 def _array_source(
@@ -360,11 +365,11 @@ def _array_source(
         # The pair that begins in the last row ends in the next.
         for states in array.read_rows(rows, slice(start, min(part.stop + 1, count * length))):
             row = np.arange(start, start + len(states))
-            sequence = row if each_row else row // length
+            sequence, place = (row, 0 * row) if each_row else (row // length, row % length)
             beside = None if own is None else own[start : start + len(states)]
-            block = Block(states, sequence, lambda r, c, n=start: locate(n + r, c), beside)
+            block = Block(states, sequence, place, lambda r, c, n=start: locate(n + r, c), beside)
             if lengths is not None:
-                block = block.rows(np.flatnonzero(row % length < lengths[sequence]))
+                block = block.rows(np.flatnonzero(place < lengths[sequence]))
             start += len(states)
             if len(block.states):
                 yield block

@@ -1,5 +1,7 @@
-"""Statistics of chaotic orbits: densities, sections, invariant curves. NumPy; the Lyapunov exponent
-is JAX."""
+"""Statistics of chaotic orbits: densities, sections, invariant curves, Lyapunov exponents.
+
+The Lyapunov exponent is JAX, all else is NumPy.
+"""
 
 from __future__ import annotations
 
@@ -7,19 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-# The even number of saved states that a section crossing is interpolated from, see
-# `section_crossings`.
+# Number of saved states, even, from which `section_crossings` interpolates a crossing.
 STENCIL = 16
 
 
 def kl_divergence(predicted, reference, bins: int, range) -> float:
-    """D(predicted ‖ reference) = Σ P log(P/R) in nats, of the histograms of two sets of samples.
+    """Divergence D(predicted ‖ reference) = Σ P log(P/R) in nats, of histograms of two samples.
 
-    The divergence of the predicted marginal *from* the reference, as the paper has it. ``bins``
-    equal bins over ``range`` and one more for all that lies outside, NaN included. Half a count
-    is added to every bin of both (Krichevsky & Trofimov's rule), so that a bin the reference
-    never visited costs much but not infinitely much. Two sets of N and M independent samples of
-    one law score about (bins − 1)/2 · (1/N + 1/M), not 0.
+    It is that of the predicted marginal *from* the reference, as in the paper. There are ``bins``
+    equal bins over ``range`` and one more for all samples outside, NaN included. Half a count is
+    added to each bin of both (Krichevsky & Trofimov's rule), so that a bin without a reference
+    sample costs much but not infinitely much. Two sets of N and M independent samples of one law
+    have a divergence of about (bins − 1)/2 · (1/N + 1/M), not 0.
     """
 
     def probabilities(samples):
@@ -36,12 +37,11 @@ def section_crossings(trajectory, index: int, direction: int = 1):
     """States (K, 2d) where z[index] passes 0, upwards for ``direction`` +1, downwards for −1.
 
     trajectory: (L, 2d), evenly sampled, its coordinates continuous (angles not reduced mod 2π).
-    Each change of sign is refined on the polynomial in time through the 16 saved states
-    around it, so that a map known only at its own time steps gives a sharp section and every
-    method is interpolated alike. Measured on Hénon–Heiles at dt = 0.5 (about 12 states a period):
-    crossings good to 6e-6 at E = 1/12 and to 2e-5 just below E = 1/6, where straight lines are
-    off by some 1e-2. Crossings within 7 steps of either end are left out, and so are two
-    crossings within one step.
+    Each change of sign is refined on the polynomial in time through the 16 saved states around it.
+    A map that is known at its own time steps only thus gives a sharp section, and all methods are
+    interpolated alike. Measured on Hénon–Heiles at dt = 0.5 (about 12 states a period), crossings
+    have errors of 6e-6 at E = 1/12 and of 2e-5 just below E = 1/6, where straight lines have some
+    1e-2. Crossings within 7 steps of either end are left out, and so are two within one step.
     """
     trajectory = np.asarray(trajectory, float)
     height = direction * trajectory[:, index]
@@ -73,9 +73,10 @@ def section_crossings(trajectory, index: int, direction: int = 1):
 def curve_distance(z, curve, harmonics: int = 64):
     """Distance of states (..., 2) of (θ, p) from an invariant curve that winds around the cylinder.
 
-    curve: (M, 2), points of the curve, an orbit of the reference: with M at least a few times
-    ``harmonics``, p as a trigonometric polynomial of θ is fitted to them by least squares, which
-    for an analytic curve is exact to roundoff. The distance is p's, times the cosine of the slope.
+    curve: (M, 2) points of the curve, an orbit of the reference, M at least a few times
+    ``harmonics``. p as a trigonometric polynomial of θ is fitted to them by least squares, which is
+    exact to roundoff for an analytic curve. The distance is that in p, times the cosine of the
+    slope.
     """
     z, curve = np.asarray(z, float), np.asarray(curve, float)
     k = np.arange(1, harmonics + 1)
@@ -96,10 +97,10 @@ def curve_distance(z, curve, harmonics: int = 64):
 def lyapunov_exponent(step, z0, num_steps: int):
     """Largest Lyapunov exponent per step of the map ``step(z) -> z`` along the orbit of z0 (2d,).
 
-    A tangent vector is carried along by the tangent map and brought back to unit length each step
-    (Benettin, Galgani, Giorgilli & Strelcyn 1980); the exponent is the mean logarithm of its
-    growth. Divide by dt for a rate in time. Differentiates, jits and vmaps (over z0). A regular
-    orbit gives about log(num_steps)/num_steps, not 0.
+    A tangent vector is propagated by the tangent map and normalised after each step (Benettin,
+    Galgani, Giorgilli & Strelcyn 1980). The exponent is the mean logarithm of its growth; divide by
+    dt for a rate in time. The function can be differentiated, jitted and vmapped (over z0). A
+    regular orbit gives about log(num_steps)/num_steps, not 0.
     """
 
     def body(carry, _):

@@ -9,15 +9,15 @@ from gfnn_jax.phase_space import split
 
 
 def semi_major_axis(z):
-    """a of states (..., 4), from the energy: |p|²/2 − 1/|q| = −1/(2a). Negative on a hyperbola."""
+    """Semi-major axis a of states (..., 4), from the energy −1/(2a). Negative on a hyperbola."""
     xp, (q, p) = namespace(z), split(z)
     return 1 / (2 / xp.linalg.norm(q, axis=-1) - xp.sum(p * p, axis=-1))
 
 
 def eccentricity(z):
-    """e of states (..., 4): the length of the Laplace–Runge–Lenz vector.
+    """Eccentricity e of states (..., 4): the length of the Laplace–Runge–Lenz vector.
 
-    Not √(1 + 2 E L²), which loses half the digits on a nearly circular orbit.
+    The formula √(1 + 2 E L²) would lose half the digits on a nearly circular orbit.
     """
     xp, (q, p) = namespace(z), split(z)
     speed = xp.sum(p * p, axis=-1, keepdims=True)

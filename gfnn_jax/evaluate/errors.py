@@ -1,7 +1,7 @@
 """Errors of a prediction against a reference, and their statistics over trajectories. NumPy.
 
-An error is NaN where there is no finite reference to compare with, and inf where there is one and
-the prediction is not finite: a prediction that was lost counts, one that cannot be judged does not.
+An error is NaN where there is no finite reference to compare with, and inf where the reference is
+finite and the prediction is not. A lost prediction counts; one without a reference does not.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from gfnn_jax.phase_space import split
 
 
 class ErrorStatistics(NamedTuple):
-    """Over the trajectories that can be judged; mean, std, median have shape (L,)."""
+    """Statistics over the trajectories with a finite reference; mean, std, median are (L,)."""
 
     mean: np.ndarray
     std: np.ndarray
     median: np.ndarray
-    num_excluded: int  # trajectories left out: their reference does not stay finite
-    num_lost: int  # trajectories kept in although their prediction becomes non-finite
+    num_excluded: int  # trajectories left out, whose reference does not stay finite
+    num_lost: int  # trajectories that count, whose prediction becomes non-finite
 
 
 def position_error(predicted, reference, angles=()):
@@ -39,14 +39,14 @@ def momentum_error(predicted, reference, angles=()):
 
 
 def absolute_error(predicted, reference):
-    """|predicted − reference| of an element or an invariant, elementwise."""
+    """Absolute error |predicted − reference| of an element or an invariant, elementwise."""
     return np.abs(_difference(predicted, reference))
 
 
 def one_step_rms(predicted, reference, angles=()) -> float:
-    """Per-component RMS of predicted − reference, both (N, 2d): the one-step state error.
+    """RMS per component of predicted − reference, both (N, 2d): the one-step state error.
 
-    ``angles`` as in `momentum_error`. inf where a prediction is not finite.
+    angles: argument of `momentum_error`. The result is inf where a prediction is not finite.
     """
     return float(np.sqrt(np.mean(_difference(predicted, reference, angles) ** 2)))
 
@@ -66,9 +66,9 @@ def _euclidean(difference):
 def error_statistics(error) -> ErrorStatistics:
     """Mean, (population) standard deviation and median over trajectories of errors (B, L).
 
-    A trajectory with a NaN error anywhere has no finite reference there; it is left out at every
-    step and counted in ``num_excluded``. A prediction that was lost (inf) is never left out: from
-    that step on the mean and the deviation are inf, and the median is inf once half are lost.
+    A trajectory with a NaN error anywhere has no finite reference there. It is left out at every
+    step and counted in ``num_excluded``. A lost prediction (inf) is never left out: from that step
+    on the mean and the deviation are inf, and the median is inf once half are lost.
     """
     error = np.asarray(error, float)
     judged = error[~np.isnan(error).any(axis=1)]

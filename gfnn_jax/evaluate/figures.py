@@ -1,9 +1,9 @@
-"""Figures that a paper would print: arrays in, Axes out.
+"""Figures in print quality: arrays in, Axes out.
 
-Every function draws on ``ax`` where one is given, else on a new figure (`save(ax.figure, path)`).
-Figures are matplotlib `Figure` objects of their own: pyplot and its global state are never touched.
-One style for all, for the colour-blind and for grey print: each method has its own colour, marker
-and line style, by its place in the mapping; the reference is black and first.
+Each function draws on ``ax`` where one is given, else on a new figure (`save(ax.figure, path)`).
+Figures are matplotlib `Figure` objects; pyplot and its global state are never touched. One style
+serves the colour-blind and grey print: each method has a colour, a marker and a line style, by its
+place in the mapping. The reference is black and comes first.
 """
 
 from __future__ import annotations
@@ -56,13 +56,13 @@ WIDTH, HEIGHT = 4.8, 3.2  # inches, of one panel; a column of a paper is about 3
 
 
 def style():
-    """The package's look as a context, and as a decorator; leaves matplotlib as it was."""
+    """Style of the package as a context and as a decorator; matplotlib's settings are restored."""
     return matplotlib.rc_context(STYLE)
 
 
 @style()
 def save(figure: Figure, path) -> None:
-    """Write a figure; the suffix says what, ``.png`` (200 dots per inch) or ``.pdf``."""
+    """Write a figure as ``.png`` (200 dots per inch) or ``.pdf``, by the suffix of ``path``."""
     figure.savefig(Path(path), dpi=200, bbox_inches="tight")
 
 
@@ -83,14 +83,14 @@ def _look(place: int) -> dict:
 
 @style()
 def error_growth(errors: Mapping, ylabel="position error", ax=None, band=None) -> Axes:
-    """Mean error over trajectories against step, log–log, with a band of one standard deviation.
+    """Draw mean error over trajectories against step, log–log, with one standard deviation.
 
-    errors: name -> (steps (L,), error (B, L)). Above the mean the band is mean + std. Below it is
-    mean / (1 + std/mean), the same factor down: mean − std to first order, and positive where
-    mean − std is not. Where a prediction is lost the mean ends, and the median goes on, thin, until
-    half are lost; the legend counts those. The dotted line grows as the step, the paper's theorem
-    for regular orbits. band: (steps (L,), two standard deviations of the posterior (B, L)), whose
-    mean over trajectories is shaded from below.
+    errors: name -> (steps (L,), error (B, L)). The shaded band goes from mean / (1 + std/mean) to
+    mean + std; the lower end is mean − std to first order, and always positive. Where a prediction
+    is lost the mean ends, and the median continues as a thin line until half are lost; the legend
+    counts the lost ones. The dotted line grows as the step, the paper's theorem for regular orbits.
+    band: (steps (L,), two standard deviations of the posterior (B, L)), whose mean over
+    trajectories is shaded from below.
     """
     ax = _axes(ax)
     _error_curves(ax, errors, ylabel)
@@ -103,8 +103,10 @@ def error_growth(errors: Mapping, ylabel="position error", ax=None, band=None) -
 
 @style()
 def proportionality(points: Mapping, xlabel, ylabel, ax=None) -> Axes:
-    """One positive quantity against another, log–log: name -> (x (K,), y (K,)). The dotted line is
-    proportional to x."""
+    """Draw a positive quantity against another, log–log, with a dotted line proportional to x.
+
+    points: name -> (x (K,), y (K,)).
+    """
     ax = _axes(ax)
     for place, (name, (x, y)) in enumerate(points.items()):
         ax.plot(x, y, label=name, **_look(place))
@@ -116,9 +118,9 @@ def proportionality(points: Mapping, xlabel, ylabel, ax=None) -> Axes:
 
 @style()
 def element_errors(errors: Mapping, axes=None) -> tuple[Axes, Axes]:
-    """Errors of semi-major axis and eccentricity against step (paper, Fig. 2, upper row).
+    """Draw errors of semi-major axis and eccentricity against step (paper, Fig. 2, upper row).
 
-    errors: name -> (steps (L,), error of a (B, L), error of e (B, L)). Bands as in `error_growth`.
+    errors: name -> (steps (L,), error of a (B, L), error of e (B, L)). Bands: see `error_growth`.
     """
     if axes is None:
         axes = Figure(figsize=(2 * WIDTH, HEIGHT)).subplots(1, 2)
@@ -131,9 +133,9 @@ def element_errors(errors: Mapping, axes=None) -> tuple[Axes, Axes]:
 
 @style()
 def energy_error(errors: Mapping, ax=None) -> Axes:
-    """Root mean square over trajectories of the energy error against step, log–log.
+    """Draw the root mean square over trajectories of the energy error against step, log–log.
 
-    errors: name -> (steps (L,), energy error (B, L)). The dotted line grows as √step: roundoff.
+    errors: name -> (steps (L,), energy error (B, L)). The dotted line grows as √step, as roundoff.
     """
     ax = _axes(ax)
     for place, (name, (steps, error)) in enumerate(errors.items()):
@@ -146,7 +148,7 @@ def energy_error(errors: Mapping, ax=None) -> Axes:
 
 
 def _shaded(ax, steps, upper):
-    """What lies below ``upper`` (L,), without a change of the limits downwards."""
+    """Shade the region below ``upper`` (L,), without extending the axis downwards."""
     shown = (steps > 0) & np.isfinite(upper) & (upper > 0)
     if not shown.any():
         return
@@ -181,7 +183,7 @@ def _error_curves(ax, errors, ylabel):
 
 
 def _log_curve(ax, place, name, steps, values):
-    """Draw what a log–log plot can show, with about eight markers; returns which points."""
+    """Draw a curve's positive points, log–log, with about eight markers; return their flags."""
     shown = (steps > 0) & np.isfinite(values) & (values > 0)
     x = np.log(steps[shown])
     marks = []
@@ -197,7 +199,7 @@ def _log_log(ax, ylabel):
 
 
 def _guide(ax, exponent, label):
-    """A dotted power law below the lowest curve, touching it: only its slope means something."""
+    """Draw a dotted power law just below the lowest curve; only its slope has a meaning."""
     data = (np.array(line.get_data(), float) for line in ax.get_lines())
     known = (xy[:, np.isfinite(xy).all(axis=0)] for xy in data)
     curves = [xy for xy in known if xy.shape[1] > 1]
@@ -215,9 +217,9 @@ def _guide(ax, exponent, label):
 def coordinates_against_time(
     times, reference, predictions: Mapping, ylabel, window=None, xlabel="time $t$", ax=None
 ) -> Axes:
-    """A coordinate against time: reference (L,) in black and predictions name -> (L,).
+    """Draw a coordinate against time: reference (L,) in black and predictions name -> (L,).
 
-    window: (first, last) time shown, for zooming in late (paper, Fig. 2, lower row).
+    window: (first, last) time shown, to show late times (paper, Fig. 2, lower row).
     """
     ax = _axes(ax, WIDTH * 1.3)
     times = np.asarray(times)
@@ -241,9 +243,9 @@ def coordinates_against_time(
 
 @style()
 def coordinates_in_two_panels(times, reference, predictions: Mapping, labels, window) -> Figure:
-    """Two coordinates of an orbit over each other: reference two of (L,), predictions name -> two.
+    """Draw two coordinates of an orbit in two panels, each as `coordinates_against_time` does.
 
-    The legend stands once, above both panels; see `coordinates_against_time`.
+    reference: two arrays (L,); predictions: name -> two arrays. One legend is above both panels.
     """
     figure = Figure(figsize=(WIDTH * 1.6, HEIGHT * 1.5))
     axes = figure.subplots(2, 1, sharex=True)
@@ -260,9 +262,9 @@ def coordinates_in_two_panels(times, reference, predictions: Mapping, labels, wi
 
 @style()
 def phase_portrait(orbits: Mapping, labels=("$q$", "$p$"), modulo=False, ax=None) -> Axes:
-    """Orbits over each other: name -> (x (N,), y (N,)); the one named "reference" in black.
+    """Draw orbits over each other: name -> (x (N,), y (N,)); the one named "reference" in black.
 
-    modulo: both coordinates reduced to [0, 2π), for the standard map.
+    modulo: True reduces both coordinates to [0, 2π), for the standard map.
     """
     ax = _axes(ax, HEIGHT * 1.35, HEIGHT * 1.2)
     place = 0
@@ -281,10 +283,10 @@ def phase_portrait(orbits: Mapping, labels=("$q$", "$p$"), modulo=False, ax=None
 
 @style()
 def sections(points: Mapping, labels=("$q_2$", "$p_2$"), modulo=False, axes=None) -> list[Axes]:
-    """Poincaré sections (or chaotic phase portraits, ``modulo`` 2π) side by side, three in a row.
+    """Draw Poincaré sections, or chaotic phase portraits (``modulo`` 2π), three in a row.
 
-    points: name -> (x (N,), y (N,)). All panels have the limits of the first, the reference;
-    what lies outside is counted in the title, not shown.
+    points: name -> (x (N,), y (N,)). All panels have the limits of the first, the reference. The
+    title counts the points outside, which are not shown.
     """
     columns = min(3, len(points))
     if axes is None:
@@ -331,10 +333,10 @@ def _plane(ax, labels, modulo):
 
 @style()
 def marginals(reference, samples: Mapping, bins: int, range, label, ax=None) -> Axes:
-    """Histograms of a coordinate of chaotic orbits, with KL divergences from the reference.
+    """Draw histograms of a coordinate of chaotic orbits, with KL divergences from the reference.
 
-    reference: (M,) samples; samples: name -> (N,). The bins drawn are those of the divergence, see
-    `metrics.kl_divergence`; densities are of all samples, also those outside the range.
+    reference: (M,) samples; samples: name -> (N,). The bins are those of `metrics.kl_divergence`.
+    Densities are relative to all samples, also those outside the range.
     """
     ax = _axes(ax)
 
@@ -363,7 +365,7 @@ def marginals(reference, samples: Mapping, bins: int, range, label, ax=None) -> 
 
 @style()
 def marginal_panels(panels: Mapping, bins: int) -> Figure:
-    """Histograms side by side: label -> (reference (M,), name -> samples (N,), range)."""
+    """Draw `marginals` side by side: label -> (reference (M,), name -> samples (N,), range)."""
     figure = Figure(figsize=(WIDTH * len(panels), HEIGHT * 1.3))
     for ax, (label, (reference, samples, limits)) in zip(
         np.ravel(figure.subplots(1, len(panels))), panels.items(), strict=True
@@ -379,11 +381,11 @@ def marginal_panels(panels: Mapping, bins: int) -> Figure:
 def speed_against_error(
     kilo_operations, errors, labels: Sequence[str], chosen, tolerance=None, ax=None, estimated=()
 ) -> Axes:
-    """Candidates: one-step error against the counted operations of a predicted step, log–log.
+    """Draw the one-step error of candidates against operations of a predicted step, log–log.
 
-    kilo_operations, errors: (K,). The points are numbered by rising cost and named on the right;
-    the chosen one is ringed, the staircase joins those that no other beats in both, and the dotted
-    line is the tolerance asked for. estimated: indices of errors that no step has measured; their
+    kilo_operations, errors: (K,). The points are numbered by rising cost and named on the right.
+    The chosen one has a ring. The staircase joins the points that no other beats in both. The
+    dotted line is the tolerance. estimated: indices of errors that no step has measured; their
     points are hollow.
     """
     ax = _axes(ax, WIDTH * 1.6, HEIGHT * 1.15)
@@ -477,7 +479,7 @@ def work_precision(
     xlabel="time per step and trajectory (µs)",
     ax=None,
 ) -> Axes:
-    """Error against time: name -> (microseconds (K,), errors (K,)), compile time apart."""
+    """Draw error against time: name -> (microseconds (K,), errors (K,)), compile time apart."""
     ax = _axes(ax)
     for place, (name, (cost, error)) in enumerate(curves.items()):
         ax.plot(cost, error, label=name, **_look(place))
@@ -488,12 +490,13 @@ def work_precision(
 
 @style()
 def work_precision_panels(panels: Mapping, ylabel) -> Figure:
-    """Learned maps among what else there is, error against time, both logarithmic; side by side.
+    """Draw error against time, log–log, of learned maps and other methods, in panels side by side.
 
     panels: title -> {"ours", "float32", "known", "others"}, each a mapping of name -> (cost (K,),
     error (K,), size (K,) as text). Ours have a colour and a filled marker each, with the size
-    beside it; the same names in float32 are hollow, and the thick line joins those of ours that no
-    other of ours beats. Grey: what is told H. Crosses, numbered: single results of other methods.
+    beside it; the same names in float32 are hollow. The thick line joins those of ours that no
+    other of ours beats. Methods that know H are grey. Numbered crosses are single results of other
+    methods.
     """
     figure = Figure(figsize=(WIDTH * 0.85 * len(panels) + 1.6, HEIGHT * 1.25))
     axes = np.ravel(figure.subplots(1, len(panels), sharey=True))
@@ -537,7 +540,7 @@ def work_precision_panels(panels: Mapping, ylabel) -> Figure:
 
 
 def _front(ax, curves):
-    """The staircase through the points that no other beats in both cost and error."""
+    """Draw the staircase through the points that no other beats in both cost and error."""
     cost, error = (np.concatenate([np.ravel(c[i]) for c in curves]) for i in (0, 1))
     order = np.lexsort((error, cost))
     best = np.minimum.accumulate(error[order])
@@ -550,7 +553,7 @@ def _front(ax, curves):
 
 @style()
 def training_curve(train_rms, validation_rms, ax=None) -> Axes:
-    """Residual on training and held-out pairs after each epoch, (E,) each; the best one marked."""
+    """Draw the residual on training and validation pairs after each epoch, (E,) each."""
     ax = _axes(ax)
     epochs = 1 + np.arange(len(train_rms))
     best = int(np.nanargmin(validation_rms))
@@ -572,7 +575,7 @@ def training_curve(train_rms, validation_rms, ax=None) -> Axes:
 
 
 def _legend_above(ax, ncols=3, **options):
-    """Above the axes, where it covers no data: for plots whose curves fill the frame."""
+    """Draw the legend above the axes, where it covers no data."""
     ax.legend(
         loc="lower left",
         bbox_to_anchor=(0, 1.0),
@@ -587,9 +590,9 @@ def _legend_above(ax, ncols=3, **options):
 
 @style()
 def digits_against_step_size(sweeps: Mapping, axes=None) -> list[Axes]:
-    """Digits kept against the time step, a panel for each system, a curve for each chart.
+    """Draw digits kept against the time step, a panel for each system, a curve for each chart.
 
-    sweeps: system -> {"dt": (K,), chart: digits (K,), ...}; a fit that was refused is None or NaN,
+    sweeps: system -> {"dt": (K,), chart: digits (K,), ...}. A fit that was refused is None or NaN,
     and is drawn as a cross on the axis.
     """
     if axes is None:

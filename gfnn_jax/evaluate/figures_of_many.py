@@ -1,7 +1,7 @@
 """Figures of many degrees of freedom: modes and space-time of lattices, orbits of bodies.
 
-As in `evaluate.figures`: arrays of one trajectory in, a Figure out. The reference stands in a panel
-of its own, so that nothing covers it, and what a prediction is off by in another.
+Each function takes arrays of one trajectory and returns a Figure. The reference has a panel of its
+own, so that nothing covers it, and the difference of the prediction has another.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from matplotlib.figure import Figure
 from gfnn_jax.evaluate.figures import COLOURS, HEIGHT, WIDTH, style
 from gfnn_jax.phase_space import split
 
-MODES = 4  # of the longest waves, that are drawn
-_ROUNDOFF = 1e-16  # of what is drawn on log axes: below it all is one colour
+MODES = 4  # number of modes that are drawn, those of the longest waves
+_ROUNDOFF = 1e-16  # lower end of log axes
 
 
 def mode_energies(z, ends: str = "ring") -> np.ndarray:
-    """Energies (..., modes) of the waves of sites between unit springs, at states z (..., 2d): of
-    wave numbers 1, 2, … to d/2 of a ring, to d − 1 of a chain with free ends.
+    """Energies (..., modes) of the normal modes of sites with unit springs, at states z (..., 2d).
 
-    ½(|P_k|² + ω_k²|Q_k|²) of the normal modes Q_k, a ring's two of one wave number together; ω_k =
-    2 sin(πk/d), of a chain 2 sin(πk/2d) (Fermi, Pasta & Ulam 1955).
+    They are ½(|P_k|² + ω_k²|Q_k|²) (Fermi, Pasta & Ulam 1955). For a ring k goes from 1 to d/2, ω_k
+    is 2 sin(πk/d), and the two modes of a wave number are summed. For a chain with free ends k goes
+    from 1 to d − 1, and ω_k is 2 sin(πk/2d).
     """
     dim = z.shape[-1] // 2
     if ends == "ring":
@@ -38,8 +38,10 @@ def mode_energies(z, ends: str = "ring") -> np.ndarray:
 
 @style()
 def modes(times, reference, predicted, ends: str = "ring") -> Figure:
-    """Energies of the longest waves against time, of the reference and of the prediction (L, 2d),
-    and what they differ by."""
+    """Draw the energies of the longest waves against time: reference, prediction, difference.
+
+    reference, predicted: (L, 2d).
+    """
     figure = Figure(figsize=(WIDTH, 2 * HEIGHT))
     above, middle, below = figure.subplots(3, 1, sharex=True)
     exact, found = (mode_energies(np.asarray(z), ends)[:, :MODES] for z in (reference, predicted))
@@ -61,10 +63,9 @@ def modes(times, reference, predicted, ends: str = "ring") -> Figure:
 
 @style()
 def space_time(times, reference, predicted, angles: str = "") -> Figure:
-    """p of every site against time, of the reference and of the prediction (L, 2d), and what their
-    states differ by.
+    """Draw p of each site against time, of reference and prediction (L, 2d), and their difference.
 
-    angles: those of a site, "", "q" or "qp": modulo 2π.
+    angles: the angles of a site, "", "q" or "qp", compared modulo 2π.
     """
     figure = Figure(figsize=(1.6 * WIDTH, 1.1 * HEIGHT))
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
@@ -101,9 +102,11 @@ def space_time(times, reference, predicted, angles: str = "") -> Figure:
 
 @style()
 def orbits(times, reference, predicted, bodies: int) -> Figure:
-    """Orbits of bodies in their first two coordinates, of the reference and of the prediction
-    (L, 2d), q body by body, and the distance of each body's two positions against time. Bodies on a
-    line are drawn against time."""
+    """Draw orbits of bodies in their first two coordinates, and the error of each against time.
+
+    reference, predicted: (L, 2d), q body by body. The error is the distance between a body's two
+    positions. Bodies on a line are drawn against time.
+    """
     figure = Figure(figsize=(1.9 * WIDTH, 1.1 * HEIGHT))
     panels = figure.subplots(1, 3)
     both = [split(np.asarray(z))[0] for z in (reference, predicted)]

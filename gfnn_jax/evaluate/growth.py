@@ -1,4 +1,4 @@
-"""How errors grow with the step: exponents, drifts, diffusion, each with its uncertainty. NumPy."""
+"""Growth of errors with the step: exponents, drifts, diffusion, with uncertainties. NumPy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ POINTS_PER_DECADE = 20
 
 
 class Estimate(NamedTuple):
-    """A number from trajectories, with its uncertainty and the range of steps it was read off."""
+    """Estimate from trajectories, with its uncertainty and the range of steps that it is from."""
 
     value: float
     standard_error: float
@@ -24,13 +24,13 @@ class Estimate(NamedTuple):
 def growth_exponent(steps, error, first=10, last=None, floor=1e-13) -> Estimate:
     """Exponent α of mean error ∝ stepᵅ: the least-squares slope on log–log axes.
 
-    error: (B, L) per trajectory, or (L,) of one. The paper's theorem on regular orbits says α = 1.
-    The fit uses about 20 points per decade, evenly in log(step), so that the many late steps do
-    not outvote the early ones, between the steps ``first`` and ``last`` (as used: see the result)
-    and only where the mean error is finite and above ``floor``, the plateau of roundoff and of the
-    reference's own error. Errors that have saturated at the size of the orbit must be kept out by
-    ``last``. The interval comes from the scatter over trajectories (jackknife); of a single one
-    only from the residuals of the fit, which are correlated, so that it is too narrow.
+    error: (B, L) per trajectory, or (L,) of one. The paper's theorem on regular orbits gives α = 1.
+    The fit uses about 20 points per decade, evenly in log(step), so that the many late steps do not
+    outweigh the early ones. The points lie between the steps ``first`` and ``last`` (those used are
+    in the result), where the mean error is finite and above ``floor``, the plateau of roundoff and
+    of the reference's own error. ``last`` must exclude errors that have saturated at the size of
+    the orbit. The interval comes from the scatter over trajectories (jackknife). For a single
+    trajectory it comes from the residuals of the fit; these are correlated, and it is too narrow.
     """
     error = np.atleast_2d(np.asarray(error, float))
     error = error[~np.isnan(error).any(axis=1)]
@@ -38,7 +38,7 @@ def growth_exponent(steps, error, first=10, last=None, floor=1e-13) -> Estimate:
 
 
 def energy_error(values):
-    """(H − H₀)/|H₀| of values of an invariant along trajectories, (B, L) -> (B, L); H₀ not 0."""
+    """Energy error (H − H₀)/|H₀| of an invariant along trajectories, (B, L) -> (B, L); H₀ ≠ 0."""
     values = np.asarray(values, float)
     start = values[..., :1]
     return (values - start) / np.abs(start)
@@ -47,8 +47,8 @@ def energy_error(values):
 def energy_drift(steps, energy_error) -> Estimate:
     """Secular trend of the energy error (B, L), per step: least squares on the mean trajectory.
 
-    The interval comes from the scatter of the trend over trajectories, which stays right where the
-    error of each is a random walk. Trajectories that do not stay finite are left out.
+    The interval comes from the scatter of the trend over trajectories, which is correct also where
+    the error of each is a random walk. Trajectories that do not stay finite are left out.
     """
     steps, lanes = np.asarray(steps, float), _finite(energy_error)
     return _slope(steps, lanes, steps, lambda mean: mean)
@@ -57,11 +57,11 @@ def energy_drift(steps, energy_error) -> Estimate:
 def drift_exponent(steps, energy_error, window: int) -> Estimate:
     """Exponent of the growth of the smoothed energy error (B, L): ½ for roundoff, 1 for a drift.
 
-    Brouwer's law (Hairer, McLachlan & Razakarivony 2008, "Achieving Brouwer's law"): roundoff of
-    a well made symplectic step is a random walk. The error is averaged over blocks of ``window``
-    saved states, several periods of the motion, which removes its bounded oscillation; what is
-    fitted is the root mean square over trajectories of a block's difference from the first block,
-    from ten blocks on. A single trajectory's exponent says nothing.
+    By Brouwer's law (Hairer, McLachlan & Razakarivony 2008, "Achieving Brouwer's law") the roundoff
+    of a well implemented symplectic step is a random walk. The error is averaged over blocks of
+    ``window`` saved states, several periods of the motion, which removes its bounded oscillation.
+    The fit is to the root mean square over trajectories of a block's difference from the first
+    block, from ten blocks on. The exponent of a single trajectory is meaningless.
     """
     steps, lanes = np.asarray(steps, float), _finite(energy_error)
     num_blocks = lanes.shape[1] // window
@@ -73,10 +73,10 @@ def drift_exponent(steps, energy_error, window: int) -> Estimate:
 
 
 def diffusion_coefficient(p) -> Estimate:
-    """D of ⟨(p_n − p_0)²⟩ = 2 D n, from momenta (B, L) at the steps 0 … L − 1, not reduced mod 2π.
+    """Diffusion coefficient D of ⟨(p_n − p_0)²⟩ = 2 D n, half the slope of the displacement.
 
-    The slope of the mean-square displacement, halved. For the standard map D → K²/4 at large K,
-    times 1 − 2 J₂(K) + 2 J₂(K)² to the next orders (Rechester & White 1980).
+    p: momenta (B, L) at the steps 0 … L − 1, not reduced mod 2π. For the standard map D → K²/4 at
+    large K, times 1 − 2 J₂(K) + 2 J₂(K)² to the next orders (Rechester & White 1980).
     """
     p = _finite(p)
     steps = np.arange(p.shape[1], dtype=float)
@@ -106,7 +106,7 @@ def _power_law(steps, lanes, first, last, floor, power=1.0):
 
 
 def _slope(x, lanes, steps, transform):
-    """Least-squares slope of transform(mean over lanes) against x, with its uncertainty."""
+    """Slope of transform(mean over lanes) against x by least squares, with its uncertainty."""
     num_lanes, num_points = lanes.shape
     if num_lanes == 0 or num_points < 3:
         nan = float("nan")

@@ -1,9 +1,9 @@
-"""How good a prediction is: errors, their growth, invariants, statistics of chaotic orbits.
+"""Measures of a prediction: errors, their growth, invariants, statistics of chaotic orbits.
 
-Arrays in, arrays out. B trajectories of L saved states are an array (B, L, 2d), q first;
-``steps`` (L,) are the step numbers of the saved states. Nothing here knows how a prediction was
-made, so every method is measured alike. Measures of saved arrays are NumPy in float64; orbital
-elements and Lyapunov exponents serve inside a jitted computation too.
+Arrays in, arrays out. B trajectories of L saved states are an array (B, L, 2d), q first; ``steps``
+(L,) are the step numbers of the saved states. The measures do not depend on how a prediction was
+made, so that all methods are measured alike. Measures of saved arrays are NumPy in float64. Orbital
+elements and Lyapunov exponents also work inside a jitted computation.
 """
 
 from gfnn_jax.evaluate.chaos import (

@@ -1,6 +1,6 @@
-"""report.json: what was done, how accurate it is, how fast, and with what.
+"""Report ``report.json`` of a fit: data, model, accuracy, speed, versions.
 
-Every key is always there; what does not apply, or is not finite, is null.
+All keys are always present. A value that does not apply, or is not finite, is null.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ STEPS_REPORTED = (1, 10, 100, 1000)
 
 
 def device() -> str:
-    """The device that JAX computes on by default."""
+    """Name of the device that JAX computes on by default."""
     first = jax.devices()[0]
     return f"{first.platform}: {first.device_kind}"
 
@@ -34,9 +34,9 @@ def assemble(
     data: dict[str, Any],
     rollout: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """The report of a fit, and of the rollouts with it where there were any (see `rollout_part`).
+    """Assemble the report of a fit, and of rollouts with it (see `rollout_part`) where there are.
 
-    data: what is known of the pairs beside their number: source, digest, precision, units.
+    data: facts about the pairs beside their number: source, digest, precision, units.
     """
     chosen = fit.chosen
     return {
@@ -69,10 +69,13 @@ def assemble(
             "validation_relative": chosen.validation_relative,
             "validation_bound": chosen.validation_bound,
             "deviations": np.asarray(chosen.deviations).tolist(),
+            "stated_by": fit.stated_by,
             "tolerance": fit.tolerance,
             "tolerance_is_relative": fit.asked.relative,
             "tolerance_met": fit.met,
             "ended": fit.ended,
+            "operations": fit.operations,
+            "max_operations": fit.max_operations,
             "messages": list(fit.messages),
         },
         "hamiltonian": _hamiltonian(fit),
@@ -80,7 +83,7 @@ def assemble(
             "multiplier": fit.map.multiplier(),
             "damping": _damping(fit),
             "positions": None if fit.positions is None else vars(fit.positions),
-            "symplecticity_defect": fit.symplecticity_defect,
+            "symplecticity_defect": fit.symplecticity_defect if fit.tells_defect else None,
             "chart_determinant_min": fit.model_determinant_min,
             "chart_determinants_of_data": {n: j.low for n, j in fit.judgements.items()},
             "newton_iterations_max": chosen.newton_iterations_max,
@@ -118,10 +121,16 @@ def _damping(fit: Fit) -> dict[str, Any] | None:
 
 
 def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
-    """H as it was learned, where its flow meets the tolerance or was chosen."""
+    """Learned H as formula and terms, where its flow meets the tolerance or was chosen."""
     if fit.hamiltonian is None or fit.formula is None:
         return None
-    return {"formula": fit.formula, "terms": [term._asdict() for term in fit.hamiltonian.terms]}
+    law = fit.hamiltonian
+    return {
+        "formula": fit.formula,
+        "terms": [term._asdict() for term in law.terms],
+        "dropped": law.dropped._asdict() if law.dropped is not None else None,
+        "search_cut_short": law.ended or None,
+    }
 
 
 def rollout_part(
@@ -134,7 +143,7 @@ def rollout_part(
     growth,
     drift,
 ) -> dict[str, Any]:
-    """The report's ``rollout``.
+    """Assemble the report's ``rollout``.
 
     seconds: without compilation. status: (B,) codes. statistics: ErrorStatistics of the position
     error at every step (num_steps + 1,). growth, drift: Estimates, or None where they do not apply.
@@ -159,18 +168,18 @@ def rollout_part(
 
 
 def status_counts(status) -> dict[str, int]:
-    """How many lanes ended with each status, by its name."""
+    """Number of lanes that ended with each status, by its name."""
     counts = np.bincount(np.asarray(status), minlength=len(STATUS_NAMES))
     return {name: int(n) for name, n in zip(STATUS_NAMES, counts, strict=True)}
 
 
 def to_json(report: dict[str, Any]) -> str:
-    """Strict JSON: numbers that are not finite become null."""
+    """Write the report as strict JSON: numbers that are not finite become null."""
     return json.dumps(finite(report), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def finite(value: Any) -> Any:
-    """The same tree of dicts and lists with None for numbers that are not finite."""
+    """Copy a tree of dicts and lists, with None for numbers that are not finite."""
     if isinstance(value, dict):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,7 +1,7 @@
-"""The C that is the same for every map: solvers of one lane, line by line as in ``solve/``.
+"""C code that is the same for every map: solvers of one lane, line by line those of ``solve/``.
 
-`solve.newton.iterate` and `flows.flow._fixed_point` say why they do what they do. Each is compiled
-into a file that needs it; their constants are those of these modules.
+`solve.newton.iterate` and `flows.flow._fixed_point` explain the algorithms. A file contains the
+solvers that it needs, with the constants of these modules.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ static void to_user(const double y[4], double z[4])
 
 
 def newton_solver(unknowns: int, width: int) -> str:
-    """Newton's method for up to so many unknowns of states (width,)."""
+    """Write Newton's method in C for at most ``unknowns`` unknowns of states (width,)."""
     bend = newton._BENT
     return f"""\
 enum {{ MOST = {MOST_UPDATES}, N = {unknowns}, WIDTH = {width} }};
@@ -249,8 +249,10 @@ static double eliminated(int n, const double *matrix, const double *rhs, double 
 
 
 def fixed_point_solver(width: int, stages: int, more: int = 0) -> str:
-    """The stages of Gauss collocation, up to so many, for states (width,), which ``more`` args
-    follow."""
+    """Write Gauss collocation by fixed point in C, for at most ``stages`` stages.
+
+    States have ``width`` entries, and ``more`` args follow them.
+    """
     room, follow = "", ""
     if more:
         room = f" + {more}"

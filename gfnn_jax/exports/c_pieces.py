@@ -1,6 +1,6 @@
-"""The pieces of a map in C: ``int PIECE_step(double *z)``, and ``PIECE_back``, its inverse.
+"""Pieces of a map in C: ``int PIECE_step(double *z)``, and ``PIECE_back``, its inverse.
 
-The values of a map's parameters, the args, follow the state in z and in w, and stay.
+The args, values of a map's parameters, follow the state in z and in w, and are not changed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gfnn_jax.solve.linear import COFACTORS_UP_TO, by_cofactors
 
 
 def why_not_piece(piece: Any) -> str | None:
-    """Why a piece cannot be written in C; None where it can."""
+    """Reason why a piece cannot be written in C; None where it can."""
     if isinstance(piece, (Affine, Damping)):
         return None
     if not isinstance(piece, (Generated, Flow)):
@@ -42,14 +42,16 @@ def why_not_piece(piece: Any) -> str | None:
 
 
 def unknowns(piece: Generated, dim: int) -> int:
-    """The number of unknowns of the implicit step."""
+    """Number of unknowns of the implicit step."""
     free = piece.chart.free(dim)
     return free.stop - free.start
 
 
 def piece_functions(name: str, piece: Any, back: Any, width: int, more: int = 0) -> list[str]:
-    """The functions of a piece and of its inverse ``back``, for states (width,), which ``more``
-    args follow."""
+    """Write the functions of a piece and of its inverse ``back``.
+
+    States have ``width`` entries, and ``more`` args follow them.
+    """
     if isinstance(piece, (Affine, Damping)):
         return [*_affine(f"{name}_step", piece, width), *_affine(f"{name}_back", back, width)]
     family, params = on_symbols(piece.family), np.asarray(piece.params)
@@ -68,7 +70,7 @@ def piece_functions(name: str, piece: Any, back: Any, width: int, more: int = 0)
 
 
 def _with_args(tape: Tape, name: str, width: int, more: int) -> tuple[np.ndarray, Any]:
-    """An input (1, width), and the args (1, more) that follow it, or None."""
+    """Make an input (1, width), and the args (1, more) that follow it, or None."""
     both = tape.inputs(name, width + more)
     return both[:, :width], both[:, width:] if more else None
 
@@ -88,7 +90,7 @@ static int {name}(double *z)
 
 
 class _Given:
-    """A family whose derivatives at w are inputs of a C function, whatever w is."""
+    """Family whose derivatives are inputs of a C function and do not depend on w."""
 
     operations = (0, 0)
 
@@ -106,7 +108,10 @@ class _Given:
 
 
 def _generated(name: str, family: str, piece: Generated, width: int, more: int) -> list[str]:
-    """What S generates, one way. family: of whose functions in C are the derivatives of S."""
+    """Write the step of a generated piece, or of its inverse.
+
+    family: name of the piece whose functions in C compute the derivatives of S.
+    """
     chart, n = piece.chart, unknowns(piece, width // 2)
     dt, scale = float(np.asarray(piece.dt)), np.asarray(piece.scale)
     equation = ImplicitStep(chart)
@@ -186,7 +191,7 @@ static int {name}(double *z)
 
 
 def _predicted(model: PolynomialModel, z, args):
-    """What the model adds to the chart's first guess at the symbols z (1, 2d), args (1, k)."""
+    """Evaluate the predictor's correction of the first guess at symbols z (1, 2d), args (1, k)."""
     variables = on_symbols(model.family).inputs(z, args)[0]
     within = [
         v if np.isinf(reach) else v.clipped(-reach, reach)
@@ -196,7 +201,7 @@ def _predicted(model: PolynomialModel, z, args):
 
 
 def _flow(name: str, piece: Flow, back: Flow) -> list[str]:
-    """Gauss collocation by fixed point; the gradient of H is in C already."""
+    """Write Gauss collocation by fixed point; the gradient of H is in C already."""
     rule, stages = gauss(piece.stages), piece.stages
     parts = [
         f"static const double {name}_coupling[{stages * stages}] = {_row(rule.coupling)};\n"
@@ -219,7 +224,7 @@ static int {name}_{way}(double *z)
 
 
 def _row(values) -> str:
-    """Numbers as C initialises an array with them, four in a line."""
+    """Write numbers as the initialiser of a C array, four in a line."""
     texts = [literal(v) for v in np.ravel(np.asarray(values)).tolist()]
     lines = [", ".join(texts[i : i + 4]) for i in range(0, len(texts), 4)]
     return "{\n    " + ",\n    ".join(lines) + "\n}"

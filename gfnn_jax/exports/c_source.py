@@ -1,7 +1,7 @@
-"""A map as one C99 file: step, inverse and status, of one state at a time.
+"""Export of a map as one C99 file: step, inverse and status, of one state at a time.
 
-Every formula is that of the package's own lines, run on symbols; the solvers are those of
-`c_parts`. Nothing is allocated and nothing is remembered, so threads may call at once.
+All formulas come from the package's own lines, run on symbols; the solvers are those of `c_parts`.
+The code allocates nothing and keeps no state, so that several threads may call it at once.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _POLAR = polar(cyclic=True).forward
 
 
 def why_not(map_: SymplecticMap) -> str | None:
-    """Why a map cannot be written in C; None where it can."""
+    """Reason why a map cannot be written in C; None where it can."""
     if np.dtype(map_.scale.dtype) != np.float64:
         return f"the map is of {np.dtype(map_.scale.dtype)}, not of float64"
     if map_.parameters is not None and map_.parameters.period is not None:
@@ -41,16 +41,16 @@ def why_not(map_: SymplecticMap) -> str | None:
 
 
 def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
-    """The text of the file, with ``int NAME_step(const double z[2d], double Z[2d])`` and
-    ``NAME_inverse``; of a map with k parameters both take ``const double args[k]`` after z.
+    """Write a map as C: ``int NAME_step(const double z[2d], double Z[2d])`` and ``NAME_inverse``.
 
-    about: what is told of the map in the comment at the top, name -> text. Raises InputError, in
-    one line, for a map that has no such file.
+    For a map with k parameters both take ``const double args[k]`` after z. about: entries of the
+    comment at the top, name -> text. Raises InputError, in one line, for a map that cannot be
+    written in C.
     """
     if (reason := why_not(map_)) is not None:
         raise InputError(
-            f"{reason}, and has no C: expected polynomials, Fourier harmonics or a formula (--to "
-            "stablehlo takes any map)"
+            f"{reason}, and cannot be written in C, which takes polynomials, Fourier harmonics and "
+            "formulas: use --to stablehlo"
         )
     map_ = jax.tree.map(np.asarray, map_)
     pieces, width, domain = map_.pieces, 2 * map_.dim, map_.domain
@@ -91,7 +91,7 @@ def _signature(map_: SymplecticMap, name: str) -> str:
 
 
 def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str]) -> str:
-    """The public function: `SymplecticMap._apply` of one state, which the args follow in y."""
+    """Write the public function: `SymplecticMap._apply` of one state; args follow it in y."""
     width, angles, domain = 2 * map_.dim, map_.coordinates.angles, map_.domain
     more = _num_args(map_)
     changed = map_.coordinates.forward is not CARTESIAN.forward
@@ -136,7 +136,7 @@ def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str]) -> str:
 
 
 def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
-    """What the file is, for who opens it."""
+    """Write the comment at the top of the file, which describes the map and its functions."""
     names = coordinate_names(map_.dim)
     sizes = ", ".join(f"{n} {s:.3g}" for n, s in zip(names, map_.scale, strict=True))
     angles = [names[i] for i in map_.coordinates.angles if map_.coordinates.forward is not _POLAR]

@@ -1,4 +1,4 @@
-"""``gfnn.export``: a map for programs that know nothing of this package."""
+"""Function ``gfnn.export``: a map for programs that know nothing of this package."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ def export(
     map_: SymplecticMap | str | Path, to: str, out: str | Path | None = None, *,
     overwrite: bool = False,
 ) -> Path:  # fmt: skip
-    """Write a map as one file, and return where it is.
+    """Write a map as one file, and return its path.
 
-    map_: a map, or the folder of a saved one, whose record the file then tells too.
+    map_: a map, or the folder of a saved one, whose record then goes into the file.
     to:   "c": a C99 file with ``int NAME_step(const double z[2d], double Z[2d])`` and
-          ``NAME_inverse``, NAME that of the file; float64 maps whose functions are polynomials,
+          ``NAME_inverse``, NAME that of the file; for float64 maps whose functions are polynomials,
           Fourier harmonics or formulas. "stablehlo": step and inverse of batches of any size, for
-          ``jax.export.deserialize``; any map.
-    out:  the file; None: that of the folder's name beside it, with .c or .zip.
+          ``jax.export.deserialize``; for any map.
+    out:  the file; with None a file beside the folder, of its name, with .c or .zip.
 
     Raises InputError, in one line, where the file exists (unless ``overwrite``) or the map cannot
-    be exported so, WorkError where writing fails.
+    be exported in this form, WorkError where writing fails.
     """
     if to not in SUFFIXES:
         raise InputError(f"expected {' or '.join(SUFFIXES)} to export to, got '{to}'")
     folder = None if isinstance(map_, SymplecticMap) else Path(map_)
     if out is None and folder is None:
-        raise InputError("expected a file to write (out) for a map that is in no folder")
+        raise InputError("expected a file to write (out=...): a map in memory has no folder")
     out = Path(out) if out is not None else default_out(Path(folder or ""), to)
     if out.suffix != SUFFIXES[to]:
-        raise InputError(f"{out}: is written as {SUFFIXES[to]}")
+        raise InputError(f"{out}: is written as {SUFFIXES[to]}, got the suffix '{out.suffix}'")
     ensure_new(out, overwrite)
     map_ = map_ if isinstance(map_, SymplecticMap) else saved.load(map_)
     about = _about(folder)
@@ -62,7 +62,7 @@ def export(
 
 
 def default_out(folder: Path, to: str) -> Path:
-    """The file beside a model's folder, of its name."""
+    """Path of the file beside a model's folder, of the folder's name."""
     folder = folder.absolute()
     return folder.with_name(folder.name + SUFFIXES[to])
 
@@ -71,13 +71,13 @@ def _identifier(out: Path) -> str:
     name = out.stem
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) or name in _NO_NAMES:
         raise InputError(
-            f"{out}: expected letters, digits and _ before .c, which C functions are named after"
+            f"{out}: expected a name of letters, digits and _: the C functions are named after it"
         )
     return name
 
 
 def _about(folder: Path | None) -> dict[str, Any]:
-    """Where a map comes from, by name."""
+    """Origin and accuracy of a map, by name, from the record of its folder."""
     about: dict[str, Any] = {"written by": f"gfnn_jax {saved.versions()['gfnn_jax']}"}
     if folder is None:
         return about

@@ -1,4 +1,4 @@
-"""What runs on symbols: families whose features, functions of JAX, are read as formulas."""
+"""Families that run on symbols: features, which are functions of JAX, are read as formulas."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from gfnn_jax.families.traced import traced
 
 
 class Formulas(Inputs):
-    """Inputs whose features are formulas: on symbols, where JAX cannot compute them."""
+    """Inputs whose features are formulas, for symbols, which JAX cannot take."""
 
     def feature_tables(self, w, order: int) -> tuple:
-        """Of w (1, 2d), symbols."""
+        """Features (1, k) and derivatives up to ``order`` at w (1, 2d), an array of symbols."""
         width = w.shape[-1]
         assert self.features is not None
         found = jets(traced(self.features, width // 2), w, order)
@@ -34,7 +34,7 @@ class Formulas(Inputs):
 
 
 def on_symbols(family: Any) -> Any:
-    """The family as it runs on symbols. Raises InputError for a feature that is no formula."""
+    """Make the family run on symbols. Raises InputError for a feature that is no formula."""
     if not isinstance(family, Products) or family.inputs.features is None:
         return family
     inputs = family.inputs

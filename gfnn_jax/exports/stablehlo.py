@@ -1,8 +1,9 @@
-"""A map as StableHLO, by ``jax.export``: step and inverse of a batch, without this package.
+"""Export of a map as StableHLO, by ``jax.export``: step and inverse of a batch.
 
-The artefact is a zip file. ``step.jax`` and ``inverse.jax`` are what ``jax.export.deserialize``
-reads: functions of states (B, 2d), for any B, and of the parameters' values (B, k) where the map
-has some, that answer with images (B, 2d) and statuses (B,). ``about.json`` says what they are.
+The file is a zip archive and needs nothing of this package. ``jax.export.deserialize`` reads
+``step.jax`` and ``inverse.jax``: functions of states (B, 2d), for any B, and of the parameters'
+values (B, k) where the map has some, which return images (B, 2d) and statuses (B,). ``about.json``
+describes the map.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ PLATFORMS = ("cpu", "cuda")
 
 
 def stablehlo(map_: SymplecticMap, about: dict[str, Any]) -> bytes:
-    """The zip file. about: JSON-able, what is told of the map."""
+    """Make the zip archive. about: JSON-able, the description of the map."""
     dtype = np.dtype(map_.scale.dtype)
     if dtype == np.float64:
         require_x64("a float64 map")

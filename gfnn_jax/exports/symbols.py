@@ -1,9 +1,9 @@
-"""Numbers that remember how they were made: what runs on them in NumPy becomes C.
+"""Symbols: numbers that record their operations, so that NumPy code run on them becomes C.
 
 Families, charts and domains are written once against the array namespace of their input. On an
-object array of symbols the very lines that a fit runs in NumPy leave behind the arithmetic that
-they would do: products with a zero and sums with one are gone, what occurs twice is computed once,
-and all else stands in the order of the original, so that the C rounds as NumPy does.
+object array of symbols, the lines that a fit runs in NumPy record their arithmetic. Products with
+zero and sums with zero are left out, and a repeated operation is computed once. All other
+operations keep their order, so that the C code rounds as NumPy does.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ _FUNCTIONS = {
 
 
 class Symbol:
-    """A number of the C function that ``tape`` records: one operation with its operands, symbols
-    or floats. NumPy's object arrays hold them."""
+    """Number of the C function that ``tape`` records: one operation with its operands.
+
+    Operands are symbols or floats. NumPy's object arrays hold symbols.
+    """
 
     __slots__ = ("number", "operands", "operation", "tape")
 
@@ -68,7 +70,7 @@ class Symbol:
         return self * self if exponent == 2 else self.tape.made("pow", self, exponent)
 
     def clipped(self, low: float, high: float) -> Symbol:
-        """This number brought between low and high; NaN stays."""
+        """Clip this number to [low, high]; NaN stays."""
         return self.tape.made("clip", self, low, high)
 
 
@@ -113,7 +115,7 @@ def _product(a, b):
 
 
 class Tape:
-    """The operations of one C function, each once, in an order in which they can be done."""
+    """Operations of one C function, each once, in an order in which they can be computed."""
 
     def __init__(self):
         self._known: dict[tuple, Symbol] = {}
@@ -121,14 +123,14 @@ class Tape:
         self._inputs: dict[str, int] = {}
 
     def inputs(self, name: str, *shape: int) -> np.ndarray:
-        """An input of the function, an array of C, as an object array (1, *shape): one lane."""
+        """Declare an input of the function, a C array; return it as an object array (1, *shape)."""
         size = int(np.prod(shape))
         self._inputs[name] = size
         values = [self.made("input", f"{name}[{i}]") for i in range(size)]
         return np.array(values, dtype=object).reshape(1, *shape)
 
     def made(self, operation: str, *operands: Any) -> Symbol:
-        """The symbol of this operation: the one that is known, or a new one."""
+        """Return the symbol of this operation, a known one or a new one."""
         operands = tuple(o if isinstance(o, (Symbol, str)) else float(o) for o in operands)
         names = tuple(("t", o.number) if isinstance(o, Symbol) else o for o in operands)
         key = (operation, *sorted(names, key=str)) if operation in "+*" else (operation, *names)
@@ -138,7 +140,7 @@ class Tape:
         return self._known[key]
 
     def function(self, name: str, outputs: Mapping[str, Any]) -> str:
-        """``static void name(inputs, outputs)`` in C; outputs: name -> values of any shape."""
+        """Write ``static void name(inputs, outputs)`` in C; outputs: name -> values, any shape."""
         results = {
             f"{output}[{i}]": value
             for output, values in outputs.items()
@@ -166,7 +168,7 @@ class Tape:
         return "\n".join([f"static void {name}({', '.join([*given, *taken])})", "{", *lines, "}\n"])
 
     def _uses(self, results) -> dict[int, int]:
-        """How often each symbol that matters is used."""
+        """Number of uses of each symbol that the results depend on."""
         uses: dict[int, int] = {}
         ahead = [value for value in results if isinstance(value, Symbol)]
         while ahead:
@@ -178,7 +180,7 @@ class Tape:
 
 
 def literal(value: Any) -> str:
-    """A number as C reads it back, a float64 to the last bit."""
+    """Write a number so that C reads it back, a float64 to the last bit."""
     return repr(float(value))
 
 

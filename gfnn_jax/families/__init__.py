@@ -1,4 +1,4 @@
-"""Families of scalar functions f(params, w, args): what S and H are made of."""
+"""Families of scalar functions f(params, w, args), of which S and H are made."""
 
 from gfnn_jax.families.family import Family, LinearFamily, as_family, from_function
 

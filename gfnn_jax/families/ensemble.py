@@ -24,9 +24,9 @@ from gfnn_jax.families.mlp import Mlp
 )  # fmt: skip
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ensemble(DifferentiatedByJax):
-    """Members of one network's shape; the params of the family are their weights (E,).
+    """Ensemble of E networks of one shape; the params of the family are their weights (E,).
 
-    network: the shape of all. members: their params, every leaf with a leading axis E.
+    network: the common shape. members: their params, every leaf with a leading axis E.
     """
 
     network: Mlp
@@ -40,7 +40,7 @@ class Ensemble(DifferentiatedByJax):
 
     @property
     def size(self) -> int:
-        """E."""
+        """Number E of members."""
         return jax.tree.leaves(self.members)[0].shape[0]
 
     @property
@@ -49,17 +49,17 @@ class Ensemble(DifferentiatedByJax):
 
     @property
     def num_parameters(self) -> int:
-        """Of all members; the weights are not learned."""
+        """Number of parameters of all members; the weights are not learned."""
         return self.size * self.network.num_parameters
 
     @property
     def operations(self) -> tuple[int, int]:
-        """Of all members: see `Mlp.operations`."""
+        """Floating-point operations of ∇S, and of ∇S with its Hessian, for all members."""
         gradient, with_hessian = self.network.operations
         return self.size * gradient, self.size * with_hessian
 
     def unflatten(self, coefficients):
-        """The weights (..., E) themselves."""
+        """Return the weights (..., E) themselves."""
         return coefficients
 
     def value(self, params, w, args=None):

@@ -25,11 +25,11 @@ _CONSTANTS = {"pi": math.pi, "e": math.e}
 
 @dataclasses.dataclass(frozen=True, eq=True)
 class Expression:
-    """A node: ``operation`` with its ``operands``.
+    """Node of a tree: ``operation`` with its ``operands``.
 
-    "number" holds a float, "coordinate" an index of z, "parameter" one of the args, "power" a base
-    and a float; "+", "*", "/" have two nodes, the name of a function one, as has "T3", a Chebyshev
-    polynomial.
+    "number" holds a float, "coordinate" an index of z, "parameter" an index of the args, "power" a
+    node and a float. "+", "*" and "/" hold two nodes. The name of a function holds one, and so does
+    "T3", a Chebyshev polynomial.
     """
 
     operation: str
@@ -74,7 +74,7 @@ class Expression:
 
     @property
     def value(self) -> float | None:
-        """The number that a constant is, else None."""
+        """Number of a constant; None for another node."""
         return self.operands[0] if self.operation == "number" else None
 
 
@@ -143,28 +143,29 @@ def call(name: str, operand: Expression) -> Expression:
 
 
 def coordinate_names(dim: int) -> tuple[str, ...]:
-    """q1..qd, p1..pd."""
+    """Names q1..qd, p1..pd of the coordinates."""
     return tuple(f"{letter}{i + 1}" for letter in "qp" for i in range(dim))
 
 
 def check_names(dim: int, names: Sequence[str]) -> None:
-    """Raises InputError where parameters of these names could not stand in an expression."""
+    """Raise InputError where these names of parameters could not be used in an expression."""
     taken = {*coordinate_names(dim), *FUNCTIONS, *_OTHER_NAMES, "q", "p", "t"}
     for name in names:
         if not name.isidentifier() or keyword.iskeyword(name):
             raise InputError(f"expected letters, digits and _ as a parameter's name, got '{name}'")
         if name in taken or CHEBYSHEV.fullmatch(name):
             raise InputError(
-                f"expected a name for a parameter that has no meaning yet, got '{name}'"
+                f"'{name}' cannot name a parameter: it already names a coordinate, the time or a "
+                "function; choose another name"
             )
 
 
 @cache
 def parse(text: str, dim: int, parameters: tuple[str, ...] = ()) -> Expression:
-    """The tree of an expression in q1..qd, p1..pd (q, p where d = 1) and the parameters.
+    """Parse an expression in q1..qd, p1..pd (q, p where d = 1) and the parameters into a tree.
 
-    Raises InputError, in one line, for anything but numbers, + - * / **, the coordinates and the
-    functions of the list.
+    Raises InputError, in one line, for anything but numbers, + - * / **, the coordinates, the
+    parameters and the functions of `FUNCTIONS`.
     """
     if len(text) > _LONGEST_TEXT:
         raise InputError(f"expected a term of at most {_LONGEST_TEXT} characters, got {len(text)}")
@@ -178,7 +179,7 @@ def parse(text: str, dim: int, parameters: tuple[str, ...] = ()) -> Expression:
     except (SyntaxError, ValueError, RecursionError, MemoryError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"the term '{text}' is no expression: {error}") from None
+        raise InputError(f"the term '{text}' is no expression that can be read: {error}") from None
 
 
 def _parsed(node, names, text, depth) -> Expression:
@@ -238,7 +239,7 @@ _SUM, _PRODUCT, _POWER, _ATOM = range(4)
 
 
 def to_text(tree: Expression, dim: int, parameters: tuple[str, ...] = ()) -> str:
-    """The tree as text that `parse` reads back, every number to its last digit."""
+    """Write the tree as text that `parse` reads back, every number to its last digit."""
     return _text(tree, (*coordinate_names(dim), *parameters), 2 * dim)[0]
 
 
@@ -274,14 +275,14 @@ def _text(tree: Expression, names, width: int) -> tuple[str, int]:
 
 
 def depends_on(tree: Expression) -> set[int]:
-    """Indices of the coordinates that the expression holds; parameters are none."""
+    """Indices of the coordinates in the expression; parameters do not count."""
     if tree.operation == "coordinate":
         return {tree.operands[0]}
     return set().union(*(depends_on(o) for o in tree.operands if isinstance(o, Expression)))
 
 
 def count_operations(tree: Expression) -> int:
-    """Floating-point operations of its value, a function counted as ten."""
+    """Count the floating-point operations of the value; a function counts as ten."""
     inner = sum(count_operations(o) for o in tree.operands if isinstance(o, Expression))
     cost = {"number": 0, "coordinate": 0, "parameter": 0, "+": 1, "*": 1, "/": 4, "power": 4}
     return inner + cost.get(tree.operation, 10)

@@ -1,8 +1,9 @@
-"""The protocol of a family: a pure scalar function f(params, w, args) and its derivatives in w.
+"""Protocol of a family: a pure scalar function f(params, w, args) and its derivatives in w.
 
 S of a chart and H of a flow are families. Batch first: w has shape (..., 2d). A family is a frozen
-dataclass registered as a pytree; what it knows of the data are its leaves, all else is static. The
-same lines compute in NumPy for NumPy arrays (a fit) and are traced once for JAX arrays (a step).
+dataclass registered as a pytree. Its leaves are numbers that come from the data; all else is
+static. The same lines compute in NumPy for NumPy arrays (a fit) and are traced once for JAX arrays
+(a step).
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from gfnn_jax.phase_space import TIME
 
 @runtime_checkable
 class Family(Protocol):
-    """What maps, fits and solvers need of a scalar function.
+    """Scalar function with the members that maps, fits and solvers need.
 
-    args: what the function depends on beside the state (parameters of a system, the time of a
+    args: further arguments of the function beside the state (parameters of a system, the time of a
     drive), or None. ``family(params, w, args)`` is ``value``, so that
     ``jax.grad(family, argnums=1)`` is the gradient at one w (2d,).
     """
@@ -36,21 +37,23 @@ class Family(Protocol):
         ...
 
     def value(self, params: Any, w: Any, args: Any = None) -> Any:
-        """f, shape (...)."""
+        """Value of f, shape (...)."""
         ...
 
     def gradient(self, params: Any, w: Any, args: Any = None) -> Any:
-        """∂f/∂w, shape (..., 2d)."""
+        """Gradient ∂f/∂w, shape (..., 2d)."""
         ...
 
     def gradient_and_hessian(self, params: Any, w: Any, args: Any = None) -> tuple[Any, Any]:
-        """∂f/∂w and ∂²f/∂w², shapes (..., 2d) and (..., 2d, 2d)."""
+        """Gradient ∂f/∂w and Hessian ∂²f/∂w², shapes (..., 2d) and (..., 2d, 2d)."""
         ...
 
 
 def at_time(family: Any, args: Any, after: Any) -> Any:
-    """args (..., k) as they are a time ``after`` (...) later: the last of them is the time where
-    the family depends on it, the others stay. NumPy or JAX."""
+    """Advance args (..., k) by a time ``after`` (...). NumPy or JAX.
+
+    Where the family depends on time, it is the last of the args and grows; the others stay.
+    """
     if getattr(family, "parameters", ())[-1:] != (TIME,):
         return args
     xp = namespace(args, after)
@@ -64,27 +67,26 @@ def at_time(family: Any, args: Any, after: Any) -> Any:
 
 @runtime_checkable
 class LinearFamily(Family, Protocol):
-    """A family f = Σ c_j φ_j(w) that is linear in its parameters."""
+    """Family f = Σ c_j φ_j(w) that is linear in its parameters."""
 
     @property
     def num_parameters(self) -> int:
-        """The number of terms."""
+        """Number of terms."""
         ...
 
     def term_gradients(self, w: Any, args: Any = None) -> Any:
-        """∂φ_j/∂w of every term, shape (..., 2d, num_parameters)."""
+        """Gradients ∂φ_j/∂w of all terms, shape (..., 2d, num_parameters)."""
         ...
 
     def unflatten(self, coefficients: Any) -> Any:
-        """The params of the family whose coefficients are (num_parameters,)."""
+        """Make the params of the family from coefficients (num_parameters,)."""
         ...
 
 
 class DifferentiatedByJax:
-    """Derivatives of a family that has no closed form: ``value`` is differentiated by ``jax.grad``.
+    """Derivatives by JAX for a family that has no closed form of them.
 
-    ``value`` must treat the rows of w independently. NumPy arrays are answered by one compiled
-    function.
+    ``value`` must treat the rows of w independently. One compiled function serves NumPy arrays.
     """
 
     def __call__(self, params, w, args=None):
@@ -94,13 +96,13 @@ class DifferentiatedByJax:
         raise NotImplementedError
 
     def gradient(self, params, w, args=None):
-        """∂f/∂w (..., 2d): one reverse sweep of the batch."""
+        """Gradient ∂f/∂w (..., 2d), by one reverse sweep of the batch."""
         if namespace(w) is np:
             return np.asarray(_compiled_gradient(self, params, w, args))
         return jax.grad(lambda v: jnp.sum(self.value(params, v, args)))(w)
 
     def gradient_and_hessian(self, params, w, args=None) -> tuple[Any, Any]:
-        """∂f/∂w and ∂²f/∂w²: a tangent of the reverse sweep for each entry of w."""
+        """Gradient ∂f/∂w and Hessian ∂²f/∂w², by a tangent of the reverse sweep per entry of w."""
         if namespace(w) is np:
             gradient, hessian = _compiled_hessian(self, params, w, args)
             return np.asarray(gradient), np.asarray(hessian)
@@ -123,25 +125,25 @@ def _compiled_hessian(family, params, w, args):
 @partial(jax.tree_util.register_dataclass, data_fields=("function",), meta_fields=())
 @dataclasses.dataclass(frozen=True, eq=False)
 class FromFunction(DifferentiatedByJax):
-    """A user's own S(params, w) of one state w (2d,) as a family."""
+    """Family of a user's own S(params, w) of one state w (2d,)."""
 
     function: Any
 
     name, label = "function", "a function"
-    # Unknown; the sizes of neither S nor its parameters tell.
+    # The number of operations of a user's function is unknown.
     operations = (0, 0)
 
     def value(self, params, w, args=None):
-        """S at each w of (..., 2d)."""
+        """Values of S (...) at w (..., 2d)."""
         one = self.function if args is None else lambda p, v: self.function(p, v, args)
         flat = w.reshape(-1, w.shape[-1])
         return jax.vmap(one, in_axes=(None, 0))(params, flat).reshape(w.shape[:-1])
 
 
 def from_function(function: Callable) -> Family:
-    """A family from a plain ``S(params, w)`` -> scalar, w (2d,): all derivatives by JAX.
+    """Make a family of a plain ``S(params, w)`` -> scalar, w (2d,), with all derivatives by JAX.
 
-    What a callable pytree holds are leaves of the family; a plain function is static.
+    The leaves of a callable pytree are leaves of the family; a plain function is static.
     """
     if jax.tree_util.all_leaves((function,)):
         function = jax.tree_util.Partial(function)
@@ -149,19 +151,21 @@ def from_function(function: Callable) -> Family:
 
 
 def as_family(function: Any) -> Any:
-    """A family as it is, any other callable by ``from_function``; what is neither stays: JAX puts
-    placeholders into pytrees."""
+    """Return a family as it is, and make one of any other callable by ``from_function``.
+
+    Anything else is returned as it is, because JAX puts placeholders into pytrees.
+    """
     if not callable(function) or hasattr(type(function), "gradient_and_hessian"):
         return function
     return from_function(function)
 
 
 def symmetric_gradient(family: Family, params: Any, w: Any, args: Any = None) -> Any:
-    """∂f/∂w (..., 2d), whose own derivative in w is the family's Hessian.
+    """Gradient ∂f/∂w (..., 2d), whose derivative in w is defined as the family's Hessian.
 
-    A derivative of ``gradient`` by JAX is symmetric only up to the rounding of its terms, and a
-    step is only as symplectic as S'' is symmetric; the Hessian is so to the last bit. A family
-    that does without matrices has that of JAX.
+    A step is only as symplectic as S'' is symmetric. The derivative of ``gradient`` by JAX is
+    symmetric up to the rounding of its terms; the Hessian is symmetric to the last bit. A
+    matrix-free family keeps the derivative by JAX.
     """
     if namespace(w) is np or getattr(family, "matrix_free", False):
         return family.gradient(params, w, args)
@@ -171,7 +175,7 @@ def symmetric_gradient(family: Family, params: Any, w: Any, args: Any = None) ->
 def symmetric_gradient_and_hessian(
     family: Family, params: Any, w: Any, args: Any = None
 ) -> tuple[Any, Any]:
-    """∂f/∂w, as ``symmetric_gradient`` has it, and ∂²f/∂w² (..., 2d, 2d)."""
+    """Gradient ∂f/∂w of ``symmetric_gradient``, and Hessian ∂²f/∂w² (..., 2d, 2d)."""
     if namespace(w) is np:
         return family.gradient_and_hessian(params, w, args)
     return _gradient_and_hessian(family, params, w, args)
@@ -204,7 +208,7 @@ def _gradient_and_hessian_jvp(primals, tangents):
 
 
 def _gradient_dot(gradient, hessian, primals, tangents):
-    """The tangent of the gradient: S'' ẇ, and what the other tangents add."""
+    """Tangent of the gradient: S'' ẇ plus the contributions of the other tangents."""
     family, params, w, args = primals
     family_dot, params_dot, w_dot, args_dot = tangents
     dot = jnp.zeros_like(gradient)
@@ -222,7 +226,7 @@ def _gradient_dot(gradient, hessian, primals, tangents):
 
 
 def _jvp(function, primals, tangents):
-    """``jax.jvp`` in those arguments alone whose tangents do not vanish: less to compile."""
+    """Apply ``jax.jvp`` in the arguments whose tangents do not vanish: less to compile."""
     moving = [i for i, tangent in enumerate(tangents) if not _vanish(tangent)]
 
     def of_moving(*given):

@@ -1,4 +1,4 @@
-"""The functions that a formula may hold, by name, with their first two derivatives."""
+"""Functions that a formula may contain, by name, with their first two derivatives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a family sees of w: the variables a scene leaves it, scaled from the data."""
+"""Variables of a family: the entries of w or the features that a scene declares, scaled."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from gfnn_jax.arrays import as_row, matmul, namespace
 
 _MARGIN = 1.0 + 1e-9  # the data's extremes lie just inside the box
-_PARITY_STATES = 64  # on so many states the parity of a feature is judged
+_PARITY_STATES = 64  # number of states on which the parity of a feature is judged
 _CHUNK = 4_096  # states for which features are compiled, whatever the number of data
 
 
@@ -25,18 +25,18 @@ _CHUNK = 4_096  # states for which features are compiled, whatever the number of
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Inputs:
-    """The variables x of a family: w without its cyclic entries, or the scene's features, scaled.
+    """Variables x of a family: w without its cyclic entries, or the scene's features, scaled.
 
-    keep:     indices of w that the family sees (all but the cyclic ones).
-    angles:   positions within the variables that are angles; they are neither shifted nor scaled.
+    keep:     indices of w that the family depends on (all but the cyclic ones).
+    angles:   positions of the angles within the variables; they are neither shifted nor scaled.
     width:    2d, the length of w.
     features: ``features(w)`` -> (k,) for one w (2d,), by JAX, where the family is a function of
               features of w instead of w itself.
     centre, scale: (k,) of the variables, so that the data fill [-1, 1]; any scaling inside S leaves
-              the map symplectic. They are leaves of the pytree that a family is: what is compiled
+              the map symplectic. They are leaves of the family's pytree, so that a program compiled
               for one set of data serves the next.
-    args_centre, args_scale: (a,) of the args, where the family depends on them: they are variables
-              too, behind those of w, which nothing is differentiated in.
+    args_centre, args_scale: (a,) of the args, where the family depends on them. The args are
+              variables too, after those of w; no derivative is taken in them.
 
     Every method takes w of shape (..., 2d), NumPy or JAX, and args (..., a) or (a,).
     """
@@ -60,22 +60,25 @@ class Inputs:
 
     @property
     def is_angle(self) -> tuple[bool, ...]:
-        """Of each variable, whether it is an angle."""
+        """Flag of each variable, True for an angle."""
         return tuple(j in self.angles for j in range(self.num_variables))
 
     def raw(self, w):
-        """The unscaled variables (..., k)."""
+        """Unscaled variables (..., k)."""
         if self.features is not None:
             return self.feature_tables(w, 0)[0]
         return w if len(self.keep) == w.shape[-1] else w[..., np.array(self.keep, dtype=int)]
 
     def __call__(self, w, args=None):
-        """The scaled variables (..., k + a)."""
+        """Scaled variables (..., k + a)."""
         return self._scaled(self.raw(w), w, args)
 
     def tables(self, w, order: int, args=None):
-        """The scaled variables (..., k + a), and for features their slopes (..., k, 2d) and, with
-        ``order`` 2, curvatures (..., k, 2d, 2d), else None for both."""
+        """Scaled variables (..., k + a), with slopes and curvatures of features in w.
+
+        The slopes (..., k, 2d) need ``order`` ≥ 1, the curvatures (..., k, 2d, 2d) ``order`` 2.
+        Both are None for variables that are entries of w.
+        """
         if self.features is None:
             return self(w, args), None, None
         raw, *derivatives = self.feature_tables(w, order)
@@ -85,13 +88,13 @@ class Inputs:
         return self._scaled(raw, w, args), slope, curvature
 
     def feature_tables(self, w, order: int) -> tuple:
-        """The features (..., k), with slopes (..., k, 2d) and curvatures (..., k, 2d, 2d) up to
+        """Features (..., k), with slopes (..., k, 2d) and curvatures (..., k, 2d, 2d) up to
         ``order``."""
         assert self.features is not None
         return feature_tables(self.features, w, order=order)
 
     def pull_back_gradient(self, gradient, slope):
-        """∇ with respect to w (..., 2d) from that with respect to x (..., k)."""
+        """Gradient in w (..., 2d) from the gradient in x (..., k), by the chain rule."""
         if slope is not None:
             return matmul(gradient[..., None, :], slope)[..., 0, :]
         xp = namespace(gradient)
@@ -100,7 +103,7 @@ class Inputs:
         )
 
     def pull_back_hessian(self, hessian, gradient, slope, curvature):
-        """The Hessian with respect to w (..., 2d, 2d) from that with respect to x (..., k, k)."""
+        """Hessian in w (..., 2d, 2d) from the Hessian in x (..., k, k), by the chain rule."""
         xp = namespace(hessian)
         if slope is not None:
             bent = xp.sum(gradient[..., None, None] * curvature, axis=-3)
@@ -110,7 +113,7 @@ class Inputs:
         return self._spread(xp.swapaxes(self._spread(hessian), -1, -2))
 
     def pull_back_terms(self, gradients, slope):
-        """∇ of many functions with respect to w (..., 2d, m) from (..., k, m)."""
+        """Gradients of m functions in w (..., 2d, m) from those in x (..., k, m)."""
         xp = namespace(gradients)
         if slope is not None:
             return matmul(xp.swapaxes(slope, -1, -2), gradients)
@@ -128,7 +131,7 @@ class Inputs:
         return xp.concatenate([x, given], axis=-1)
 
     def _spread(self, values):
-        """(..., k) placed at ``keep`` in (..., 2d), zeros elsewhere."""
+        """Place values (..., k) at ``keep`` in (..., 2d), with zeros elsewhere."""
         if len(self.keep) == self.width:
             return values
         xp = namespace(values)
@@ -146,7 +149,7 @@ def _in_box(values, centre, scale, dtype):
 def feature_tables(features: Callable, w, *, order: int) -> tuple:
     """Features (..., k) at w (..., 2d), with their slopes and curvatures up to ``order``.
 
-    NumPy arrays are answered by one compiled function of fixed size, JAX arrays are traced.
+    One compiled function of fixed size serves NumPy arrays; JAX arrays are traced.
     """
     if namespace(w) is jnp:
         return _feature_tables(features, order, w)
@@ -183,10 +186,10 @@ def box_inputs(
     reversor: tuple[int, ...] | None = None,
     args=None,
 ) -> Inputs:
-    """Inputs whose box is that of the data w (N, 2d), NumPy; with ``args`` (N, a) of theirs too.
+    """Make inputs scaled to the box of the data w (N, 2d), NumPy, and of their ``args`` (N, a).
 
-    ``reversor`` (signs of the entries of w): the box is made symmetric about 0 in the coordinates
-    that it flips, because an even or odd polynomial is so about 0 and nowhere else.
+    reversor: signs of the entries of w. The box is made symmetric about 0 in the coordinates that
+    it flips, because an even or odd polynomial has its parity about 0 only.
     """
     w = np.asarray(w)
     keep = tuple(i for i in range(w.shape[-1]) if i not in cyclic)
@@ -209,7 +212,7 @@ def box_inputs(
 
 
 def variable_signs(inputs: Inputs, reversor: tuple[int, ...], w) -> tuple[int, ...]:
-    """The sign of each variable under the reversor: f(ρw) = ±f(w), judged on the data w (N, 2d).
+    """Sign of each variable x under the reversor: x(ρw) = ±x(w), judged on the data w (N, 2d).
 
     Raises ValueError for a feature that is neither even nor odd.
     """
@@ -222,6 +225,6 @@ def variable_signs(inputs: Inputs, reversor: tuple[int, ...], w) -> tuple[int, .
         bad = int(np.argmax(np.minimum(even, odd)))
         raise ValueError(
             f"expected features that are even or odd under the reversor {reversor}; "
-            f"feature {bad} is neither"
+            f"feature {bad} (counted from 0) is neither: change it, or declare no reversor"
         )
     return tuple(np.where(even <= odd, 1, -1).tolist())

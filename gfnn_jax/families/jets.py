@@ -19,8 +19,11 @@ from gfnn_jax.families.functions import CHEBYSHEV, CIRCULAR, DERIVATIVES
 
 @dataclasses.dataclass(frozen=True)
 class Jet:
-    """An expression's value, its slopes {i: ∂/∂z_i} and curvatures {(i, j): ∂²/∂z_i∂z_j}, i ≤ j,
-    those that are not identically zero; each an array of the lanes' shape, or a number."""
+    """Value, slopes {i: ∂/∂z_i} and curvatures {(i, j): ∂²/∂z_i∂z_j}, i ≤ j, of an expression.
+
+    Slopes and curvatures that are identically zero are left out. Each entry is an array of the
+    lanes' shape, or a number.
+    """
 
     value: Any
     slope: dict[int, Any]
@@ -28,8 +31,10 @@ class Jet:
 
 
 def jets(trees: Sequence[Expression], w, order: int, args=None) -> list[Jet]:
-    """The expressions at states w (..., 2d), with derivatives in w up to ``order`` (0, 1, 2). args:
-    the parameters' values (k,) or, for lanes of w, (..., k)."""
+    """Evaluate expressions at states w (..., 2d), with derivatives in w up to ``order`` (0, 1, 2).
+
+    args: the parameters' values (k,) or, for lanes of w, (..., k).
+    """
     known: dict[Any, Any] = {}
     if args is not None:
         for i in range(args.shape[-1]):
@@ -51,7 +56,7 @@ def _jet_of(tree: Expression, w, order, known) -> Jet:
     if operation == "coordinate":
         return Jet(w[..., operands[0]], {operands[0]: 1.0} if order else {}, {})
     if operation == "parameter":
-        raise ValueError("expected the values of the parameters (args), got none")
+        raise ValueError("the terms depend on parameters: expected their values (args), got none")
     first = _jet(operands[0], w, order, known)
     if CHEBYSHEV.fullmatch(operation):
         return _chebyshev(first, operands[0], int(operation[1:]), order, known)
@@ -83,7 +88,7 @@ def _jet_of(tree: Expression, w, order, known) -> Jet:
 
 
 def _chebyshev(x: Jet, part: Expression, n: int, order: int, known) -> Jet:
-    """T_n(x) of the jet x of an expression: T_n = 2x T_n−1 − T_n−2."""
+    """Jet of T_n(x), x the jet of an expression, by T_n = 2x T_n−1 − T_n−2."""
     if n < 2:
         return x if n else Jet(1.0, {}, {})
     if ("T", part, n) not in known:
@@ -98,7 +103,7 @@ def _chebyshev(x: Jet, part: Expression, n: int, order: int, known) -> Jet:
 
 
 def _circle(part: Expression, n: int, w, order: int, known):
-    """cos and sin of n times an expression: of a multiple by products of those of smaller ones."""
+    """Compute cos and sin of n times an expression, from products of those of smaller multiples."""
     if (part, n) not in known:
         if n > 1:
             c, s = _circle(part, n // 2, w, order, known)
@@ -113,8 +118,10 @@ def _circle(part: Expression, n: int, w, order: int, known):
 
 @cache
 def _multiple(tree: Expression) -> tuple[Expression, int]:
-    """(part, n) with tree = n · part, n the greatest common divisor of a sum of whole multiples of
-    coordinates; (tree, 1) for anything else."""
+    """Factor a sum of whole multiples of coordinates: (part, n) with tree = n · part.
+
+    n is their greatest common divisor. Any other tree gives (tree, 1).
+    """
     found = _whole_multiples(tree)
     if not found or (n := math.gcd(*found.values())) < 2:
         return tree, 1
@@ -123,7 +130,7 @@ def _multiple(tree: Expression) -> tuple[Expression, int]:
 
 
 def _whole_multiples(tree: Expression) -> dict[int, int] | None:
-    """{i: m} of Σ m_i z_i, None for another tree."""
+    """Multiples {i: m} of a tree Σ m_i z_i; None for another tree."""
     operation, operands = tree.operation, tree.operands
     if operation == "coordinate":
         return {operands[0]: 1}
@@ -169,7 +176,7 @@ def _added(a: dict, b: dict) -> dict:
 
 
 def _composed(inner: Jet, order, value, slope, curvature) -> Jet:
-    """f(inner), f's value, slope and curvature there."""
+    """Jet of f(inner), from the value, slope and curvature of f there."""
     slopes = {i: slope * s for i, s in inner.slope.items()} if order else {}
     if order < 2:
         return Jet(value, slopes, {})

@@ -1,9 +1,9 @@
-"""S as a multilayer perceptron: the paper's networks and their kin. The one home of Flax.
+"""S as a multilayer perceptron: the paper's networks and similar ones. The one home of Flax.
 
     S(θ, w) = s N_θ(x),        x the scaled variables of ``Inputs``, each angle as (cos, sin)
 
-N_θ has unit size whatever the units of the data: ``Inputs`` scales what it sees and s what it says.
-Any such scaling inside S leaves the map symplectic.
+N_θ has unit size in any units of the data: ``Inputs`` scales its input and s its output. Any such
+scaling inside S leaves the map symplectic.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ ACTIVATIONS: dict[str, Callable] = {
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Mlp(DifferentiatedByJax):
-    """A fully connected network with one output, linear in its last layer.
+    """Fully connected network with one output, linear in its last layer.
 
     hidden:     widths of the hidden layers.
     activation: one of ``ACTIVATIONS``. On two bodies silu trains to half the error of tanh.
@@ -72,12 +72,12 @@ class Mlp(DifferentiatedByJax):
 
     @property
     def label(self) -> str:
-        """As candidates tables show it: what, and how large."""
+        """Name and size, as the table of candidates shows them."""
         return f"mlp {'-'.join(map(str, self.hidden))}"
 
     @property
     def num_inputs(self) -> int:
-        """Entries of what the network sees: an angle makes two."""
+        """Number of inputs of the network; an angle makes two."""
         return self.inputs.num_variables + len(self.inputs.angles)
 
     @property
@@ -88,24 +88,24 @@ class Mlp(DifferentiatedByJax):
 
     @property
     def operations(self) -> tuple[int, int]:
-        """Floating-point operations of ∇S (forward, back), with its Hessian (a tangent each)."""
+        """Floating-point operations of ∇S, and of ∇S with its Hessian (a tangent per variable)."""
         gradient = 4 * (self.num_parameters - sum(self.hidden))
         return gradient, gradient * (1 + self.inputs.num_variables)
 
     def init(self, key, dtype: Any) -> Any:
-        """Parameters of this dtype: orthogonal weights, zero biases."""
+        """Draw initial parameters of this dtype: orthogonal weights, zero biases."""
         return initial(self.num_inputs, self.hidden, 1, self.activation, dtype, key)
 
     def value(self, params, w, args=None):
         """S(params, w), shape (...): w (..., 2d) of any float dtype, computed in that of params."""
         dtype = jax.tree.leaves(params)[0].dtype
-        x = self.seen(w).astype(dtype)
+        x = self.network_inputs(w).astype(dtype)
         amplitude = jnp.asarray(self.amplitude, dtype)
         out: Any = self._network(dtype).apply({"params": params}, x)
         return amplitude * out[..., 0]
 
-    def seen(self, w):
-        """What the network sees at w (..., 2d): (..., num_inputs)."""
+    def network_inputs(self, w):
+        """Inputs of the network (..., num_inputs) at w (..., 2d), each angle as (cos, sin)."""
         x = self.inputs(w)
         angles = np.array(self.inputs.angles, dtype=int)
         others = np.setdiff1d(np.arange(self.inputs.num_variables), angles)
@@ -119,8 +119,10 @@ class Mlp(DifferentiatedByJax):
 
 
 def network(num_inputs: int, hidden: tuple[int, ...], num_outputs: int, activation: str, dtype):
-    """A fully connected network (num_inputs,) -> (num_outputs,): a Flax module. Orthogonal weights,
-    no bias in the last layer."""
+    """Make a fully connected network (num_inputs,) -> (num_outputs,), a Flax module.
+
+    Its weights start orthogonal. Its last layer has no bias.
+    """
     from flax import linen  # loaded when first used
 
     def dense(fan_in, width, use_bias=True):
@@ -145,13 +147,13 @@ def network(num_inputs: int, hidden: tuple[int, ...], num_outputs: int, activati
 def initial(
     num_inputs: int, hidden: tuple[int, ...], num_outputs: int, activation: str, dtype, key
 ):
-    """The first parameters of such a network."""
+    """Draw the initial parameters of such a network."""
     net = network(num_inputs, hidden, num_outputs, activation, dtype)
     return net.init(key, jnp.zeros(num_inputs, dtype))["params"]
 
 
 def amplitude_of(w, target_gradient) -> float:
-    """The size of a scalar whose gradient at w (N, 2d) is ``target_gradient`` (N, 2d), NumPy."""
+    """Size of a scalar whose gradient at w (N, 2d) is ``target_gradient`` (N, 2d), NumPy."""
     w, target = np.asarray(w, np.float64), np.asarray(target_gradient, np.float64)
     size = np.max(w.std(axis=0) * np.sqrt(np.mean(target**2, axis=0)))
     return float(size) if size > 0 else 1.0

@@ -1,10 +1,10 @@
-"""Terms of systems with angles: Fourier modes times powers of what is no angle.
+"""Terms of systems with angles: Fourier modes times powers of the other variables.
 
     cos(m·θ) Π_k x_k^a_k,      sin(m·θ) Π_k x_k^a_k
 
-θ are the angles, x_k the other coordinates and a user's own terms. Which modes m an H has is
-seldom a box: of two rods it is the differences m₁ + m₂ ∈ {0, ±1}. So a basis holds no list of
-terms; it names the neighbours of those that are known to matter.
+θ are the angles, x_k the other coordinates and a user's own terms. The modes m of an H seldom form
+a box; those of two rods are m₁ + m₂ ∈ {0, ±1}. A basis therefore holds no list of terms, and names
+the neighbours of those that are known to matter.
 """
 
 from __future__ import annotations
@@ -17,12 +17,14 @@ from typing import NamedTuple
 from gfnn_jax.families.expressions import Expression, call, coordinate, to_text
 from gfnn_jax.families.terms import Terms
 
-_ORDER, _DEGREE = 2, 2  # of the box: |m_i| of at most two angles at once, and powers in all
+_ORDER, _DEGREE = 2, 2  # largest |m_i| of the box, and largest total degree in the others
 
 
 class Mode(NamedTuple):
-    """One term: m (angles,), its first entry that is not 0 positive; sin or cos; powers of the
-    other variables."""
+    """Term of a mode: m (angles,), sin or cos, and powers of the other variables.
+
+    The first entry of m that is not 0 is positive.
+    """
 
     wave: tuple[int, ...]
     sine: bool
@@ -31,8 +33,10 @@ class Mode(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Modes:
-    """The basis over ``angles`` (indices of z) and ``others``, variables as text, of which the last
-    ``num_given`` are a user's own terms."""
+    """Basis over ``angles`` (indices of z) and ``others``, variables as text.
+
+    The last ``num_given`` of the others are a user's own terms.
+    """
 
     dim: int
     angles: tuple[int, ...]
@@ -40,7 +44,7 @@ class Modes:
     num_given: int = 0
 
     def terms(self, modes: Sequence[Mode]) -> Terms:
-        """The family of these modes, in their order."""
+        """Make the family of these modes, in their order."""
         waves = dict.fromkeys((m.wave, m.sine) for m in modes if any(m.wave))
         place = {wave: j for j, wave in enumerate(waves)}
         rows = []
@@ -53,8 +57,11 @@ class Modes:
         return Terms(self.dim, (*names, *self.others), tuple(rows))
 
     def box(self, order: int = _ORDER, degree: int = _DEGREE) -> list[Mode]:
-        """Waves of at most two angles with |m_i| ≤ order, times products of total degree up to
-        ``degree``; and the user's terms times these products."""
+        """List the modes of at most two angles with |m_i| ≤ order.
+
+        They are multiplied by products of the other variables of total degree up to ``degree``; so
+        are the user's terms.
+        """
         count = len(self.angles)
         waves = {(0,) * count}
         for pair in combinations(range(count), min(2, count)):
@@ -73,9 +80,11 @@ class Modes:
         ]
 
     def around(self, known: Iterable[Mode]) -> list[Mode]:
-        """Candidates beside the modes that are known to matter: sums and differences of their waves
-        with short ones among them, for every product of theirs; and for their waves those products
-        times one more variable."""
+        """List candidates next to the modes that are known to matter.
+
+        They are the sums and differences of the known m with the short ones among them, for every
+        known product of powers; and the known m with these products times one more variable.
+        """
         known = list(dict.fromkeys(known))
         waves = list(dict.fromkeys(m.wave for m in known))
         products = list(dict.fromkeys(m.powers for m in known))
@@ -112,7 +121,7 @@ class Modes:
 
 
 def _directed(wave: tuple[int, ...]) -> tuple[int, ...]:
-    """m or −m, which are the same wave."""
+    """Return m or −m, which are the same mode, with its first entry that is not 0 positive."""
     first = next((m for m in wave if m), 0)
     return tuple(-m for m in wave) if first < 0 else wave
 

@@ -1,12 +1,12 @@
-"""Linear in the parameters: products of Chebyshev polynomials and Fourier harmonics.
+"""Products of Chebyshev polynomials and Fourier harmonics, linear in the parameters.
 
     S(C, w) = Σ C_ab u_a(x_A) v_b(x_B)
 
-x are the scaled variables of ``Inputs``, cut into two halves A and B; u and v are the products of
-one-dimensional functions over a half, up to a total degree, and C holds a coefficient for each
-allowed term (total degree of the product, parity) and zero elsewhere. Values, gradients and second
-derivatives come from recurrences and from matrix products with C, which for a batch are two dense
-products of about (√terms)² each: many times faster than differentiating a thousand terms.
+x are the scaled variables of ``Inputs``, cut into two halves A and B. u and v are the products of
+one-dimensional functions over a half, up to a total degree. C holds a coefficient for each allowed
+term (total degree of the product, parity) and zero elsewhere. Values, gradients and second
+derivatives come from recurrences and from two dense matrix products of about (√terms)² each for a
+batch: many times faster than differentiating a thousand terms.
 """
 
 from __future__ import annotations
@@ -25,7 +25,10 @@ from gfnn_jax.families.inputs import Inputs
 
 
 def chebyshev(x, degree: int):
-    """T_0..T_degree of x (...), by doubling: T_{k+j} = 2 T_k T_j − T_{k−j}: (..., degree + 1)."""
+    """Chebyshev polynomials T_0..T_degree (..., degree + 1) of x (...).
+
+    They are computed by doubling, T_{k+j} = 2 T_k T_j − T_{k−j}.
+    """
     xp = namespace(x)
     t = xp.stack([xp.ones_like(x), x], axis=-1)
     while (k := t.shape[-1] - 1) < degree:
@@ -36,8 +39,10 @@ def chebyshev(x, degree: int):
 
 
 def fourier(x, degree: int):
-    """1, cos x, .., cos Dx, sin x, .., sin Dx of x (...), by e^{i(k+j)x} = e^{ikx} e^{ijx}:
-    (..., 2D + 1)."""
+    """Harmonics 1, cos x, .., cos Dx, sin x, .., sin Dx (..., 2D + 1) of x (...), D the degree.
+
+    They are computed by doubling, e^{i(k+j)x} = e^{ikx} e^{ijx}.
+    """
     xp = namespace(x)
     c = xp.stack([xp.ones_like(x), xp.cos(x)], axis=-1)
     s = xp.stack([xp.zeros_like(x), xp.sin(x)], axis=-1)
@@ -51,8 +56,7 @@ def fourier(x, degree: int):
 
 @cache
 def _differentiation(angle: bool, degree: int) -> np.ndarray:
-    """The matrix D with f' = f D, f the row of the functions above: differentiation is linear in
-    them and exact."""
+    """Matrix D with f' = f D, f the row of `chebyshev` or `fourier` functions. It is exact."""
     if not angle:
         d = np.zeros((degree + 1, degree + 1))
         for k in range(1, degree + 1):
@@ -70,7 +74,7 @@ _FEW_ROWS, _FEW_ENTRIES = 8, 128
 
 
 def _product(f, picks):
-    """f (..., K) @ picks (K, n)."""
+    """Matrix product f (..., K) @ picks (K, n)."""
     rows = math.prod(f.shape[:-1])  # no number where a batch of any size is exported
     few = isinstance(rows, int) and rows <= _FEW_ROWS and picks.size <= _FEW_ENTRIES
     if namespace(f) is np or not few:
@@ -78,8 +82,9 @@ def _product(f, picks):
     return sum(f[..., k : k + 1] * as_row(picks[k], f) for k in range(len(picks)))
 
 
+@cache
 def number_of_terms(is_angle: tuple[bool, ...], degree: int, signs=None, still: int = 0) -> int:
-    """How many products a basis of this degree has, counted without making it; as `Basis`."""
+    """Number of terms of a `Basis` with these arguments, counted without making it."""
     counts = np.zeros((2, degree + 1), dtype=object)  # by parity and total degree
     counts[0, 0] = 1
     for angle, sign in zip(is_angle, signs or (1,) * len(is_angle), strict=True):
@@ -91,27 +96,28 @@ def number_of_terms(is_angle: tuple[bool, ...], degree: int, signs=None, still: 
                 moved = counts[::-1] if flips and sign < 0 else counts
                 after[:, k:] += moved[:, : degree + 1 - k]
         counts = after
-    return int(counts[0].sum()) - math.comb(degree + still, still)  # they generate nothing
+    # Products without a coordinate generate nothing.
+    return int(counts[0].sum()) - math.comb(degree + still, still)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Half:
-    """The products of one-dimensional functions over one half of the variables."""
+    """Products of one-dimensional functions over one half of the variables."""
 
     is_angle: tuple[bool, ...]
     signs: tuple[int, ...]  # of each variable under the reversor
     degree: int
-    only_even: bool  # whether the other half has only even products to go with
-    still: int = 0  # so many of the last variables have no derivatives
+    only_even: bool  # True where the other half has even products only
+    still: int = 0  # number of variables, the last ones, without derivatives
 
     @property
     def moving(self) -> int:
-        """The number of variables that have."""
+        """Number of variables that have derivatives, the first ones."""
         return len(self.is_angle) - self.still
 
     @cached_property
     def indices(self) -> np.ndarray:
-        """Which function of each variable makes each product: (terms, variables)."""
+        """Index of each variable's function in each product: (terms, variables)."""
         terms = [()]
         for angle in self.is_angle:
             count = 2 * self.degree + 1 if angle else self.degree + 1
@@ -137,11 +143,11 @@ class _Half:
 
     @cached_property
     def depends(self) -> np.ndarray:
-        """Whether each product depends on a variable that has derivatives (terms,)."""
+        """Flag (terms,), True where the product depends on a variable that has derivatives."""
         return np.asarray((self.indices[:, : self.moving] > 0).any(axis=1))
 
     def _parity(self, term) -> int:
-        """Sign under the reversor: that of sines and odd degrees of the variables that flip."""
+        """Sign under the reversor: sines and odd degrees of the variables that flip change it."""
         odd = [
             k > self.degree if angle else k % 2
             for k, angle in zip(term, self.is_angle, strict=True)
@@ -155,15 +161,21 @@ class _Half:
 
     @cache  # noqa: B019, there are as many halves as kinds of bases
     def picks(self, variable: int, order: int) -> np.ndarray:
-        """What turns a variable's functions (..., K) into its factor of every product, and that
-        factor's derivatives up to ``order``, side by side: (K, (1 + order) terms)."""
+        """Matrix (K, (1 + order) terms) from a variable's functions to its factors in all products.
+
+        After the factors stand their derivatives up to ``order``. It multiplies the functions
+        (..., K) from the right.
+        """
         derivative = _differentiation(self.is_angle[variable], self.degree)
         powers = [np.linalg.matrix_power(derivative, r) for r in range(order + 1)]
         return np.concatenate([d[:, self.indices[:, variable]] for d in powers], axis=1)
 
     def tables(self, functions: list, order: int, like) -> list:
-        """Products u (..., terms), gradients (..., n, terms) and, with ``order`` 2, Hessians
-        (..., n, n, terms), from the functions (..., K) of each variable, n of them moving."""
+        """Products u (..., terms), gradients (..., n, terms), and Hessians (..., n, n, terms).
+
+        The gradients need ``order`` ≥ 1, the Hessians ``order`` 2. functions: those (..., K) of
+        each variable; the first n have derivatives.
+        """
         xp, n, terms = namespace(like), self.moving, len(self.indices)
         factors: list[Any] = []  # of each variable: its factor of every product, and derivatives
         for j, f in enumerate(functions):
@@ -174,10 +186,10 @@ class _Half:
             )
 
         def product(*raised) -> Any:
-            """Of the factors, each differentiated as often as its variable is among ``raised``."""
+            """Multiply the factors, each differentiated once per occurrence in ``raised``."""
             return reduce(mul, (f[raised.count(j)] for j, f in enumerate(factors)))
 
-        if n == 0:  # a single variable leaves the other half empty, or to what is still
+        if n == 0:  # no variable of this half has derivatives
             one = product() if factors else xp.ones_like(like[..., :1])
             tables = [one, one[..., None, :][..., :0, :], one[..., None, None, :][..., :0, :0, :]]
             return tables[: order + 1]
@@ -196,9 +208,10 @@ class _Half:
 
 @dataclasses.dataclass(frozen=True)
 class Basis:
-    """Which products exist: all that is static about a family, made once for each kind.
+    """Set of the products that exist: the static part of a family, made once for each kind.
 
-    still: so many of the last variables have no derivatives; products of them alone do not exist.
+    signs: of the variables under a reversor; only even products exist then. still: number of
+    variables, the last ones, that have no derivatives; products of them alone do not exist.
     """
 
     is_angle: tuple[bool, ...]
@@ -208,7 +221,7 @@ class Basis:
 
     @property
     def cut(self) -> int:
-        """The first variable of the second half."""
+        """Index of the first variable of the second half."""
         return (len(self.is_angle) + 1) // 2
 
     @cached_property
@@ -226,8 +239,11 @@ class Basis:
 
     @cached_property
     def corner(self) -> tuple[int, int]:
-        """Below so many rows and to the right of so many columns at once C is zero: a high degree
-        of one half leaves a low one for the other. For several matrices that is worth using."""
+        """Numbers (m, n) such that C[m:, n:] is zero.
+
+        A high degree of one half leaves a low one for the other. Products with several matrices C
+        are faster without this corner.
+        """
         a, b = self.halves
         low = self.degree // 2
         return int(np.sum(a.orders <= low)), int(np.sum(b.orders < self.degree - low))
@@ -254,7 +270,7 @@ class Basis:
         return np.argwhere(exists)[rising], order[exists][rising]
 
     def tables(self, x, order: int) -> tuple[list, list]:
-        """The tables of both halves at the variables x (..., k)."""
+        """Tables of both halves at the variables x (..., k), with derivatives up to ``order``."""
         angle, functions = np.array(self.is_angle, dtype=bool), [None] * len(self.is_angle)
         for of, family in ((np.flatnonzero(~angle), chebyshev), (np.flatnonzero(angle), fourier)):
             if of.size:
@@ -269,7 +285,7 @@ class Basis:
         )
 
     def placed(self, coefficients) -> np.ndarray:
-        """Coefficients (..., terms) as matrices (..., m, n), NumPy."""
+        """Place coefficients (..., terms) into matrices C (..., m, n), NumPy."""
         a, b = self.halves
         c = np.zeros((*coefficients.shape[:-1], len(a.indices), len(b.indices)), coefficients.dtype)
         c[..., self.terms[:, 0], self.terms[:, 1]] = coefficients
@@ -282,9 +298,9 @@ basis_of = cache(Basis)
 @partial(jax.tree_util.register_dataclass, data_fields=("inputs",), meta_fields=("degree", "signs"))
 @dataclasses.dataclass(frozen=True, eq=False)
 class Products:
-    """Chebyshev × Fourier products of total degree at most ``degree`` in the inputs' variables,
-    the args among them where S depends on some.
+    """Family of Chebyshev × Fourier products of total degree at most ``degree``.
 
+    The variables are those of the inputs, and include the args where S depends on some.
     signs: of the variables under a reversor; then only even terms exist (midpoint chart).
     """
 
@@ -300,7 +316,7 @@ class Products:
 
     @property
     def label(self) -> str:
-        """As candidates tables show it: what, and how large."""
+        """Name and size, as the table of candidates shows them."""
         return f"{self.name} {self.degree}"
 
     @property
@@ -311,10 +327,10 @@ class Products:
 
     @property
     def num_parameters(self) -> int:
-        return len(self.basis.terms)
+        return self.terms_of(self.degree)
 
     def terms_of(self, degree: int) -> int:
-        """How many parameters it would have of another degree."""
+        """Number of parameters of the same family of another degree."""
         basis = self.basis
         return number_of_terms(basis.is_angle, degree, basis.signs, basis.still)
 
@@ -328,25 +344,25 @@ class Products:
         return gradient, gradient + mixed + 2 * (m * i * i + n * j * j)
 
     def unflatten(self, coefficients):
-        """Coefficients (num_parameters,), NumPy -> the matrix C (m, n), the parameters of S."""
+        """Make the matrix C (m, n), the parameters of S, of coefficients (num_parameters,)."""
         return self.basis.placed(np.asarray(coefficients))
 
     def __call__(self, params, w, args=None):
         return self.value(params, w, args)
 
     def value(self, params, w, args=None):
-        """S(C, w), shape (...): params the matrix C, w (..., 2d)."""
+        """Value S(C, w), shape (...): params the matrix C, w (..., 2d)."""
         (u,), (v,) = self.basis.tables(self.inputs(w, args), 0)
         return namespace(w).sum(matmul(u, params) * v, axis=-1)
 
     def gradient(self, params, w, args=None):
-        """∇S(C, w), shape (..., 2d)."""
+        """Gradient ∇S(C, w), shape (..., 2d)."""
         x, slope, _ = self.inputs.tables(w, 1, args)
         tables = self.basis.tables(x, 1)
         return self.inputs.pull_back_gradient(_gradient(tables, params)[0], slope)
 
     def gradient_and_hessian(self, params, w, args=None):
-        """∇S (..., 2d) and S'' (..., 2d, 2d)."""
+        """Gradient ∇S (..., 2d) and Hessian S'' (..., 2d, 2d)."""
         xp = namespace(w)
         x, slope, curvature = self.inputs.tables(w, 2, args)
         tables = self.basis.tables(x, 2)
@@ -364,7 +380,7 @@ class Products:
         )
 
     def term_gradients(self, w, args=None):
-        """∇ of every term at w (..., 2d): (..., 2d, num_parameters)."""
+        """Gradients of all terms at w (..., 2d): (..., 2d, num_parameters)."""
         xp = namespace(w)
         x, slope, _ = self.inputs.tables(w, 1, args)
         (u, du), (v, dv) = self.basis.tables(x, 1)
@@ -376,7 +392,7 @@ class Products:
 
 
 def _gradient(tables, params):
-    """∇S with respect to the variables (..., k), and the halves C v (..., m) and uᵀC (..., n)."""
+    """Gradient of S in the variables (..., k), and the products C v (..., m) and uᵀC (..., n)."""
     (u, du, *_), (v, dv, *_) = tables
     xp = namespace(u)
     to_a, to_b = matmul(v, params.T), matmul(u, params)

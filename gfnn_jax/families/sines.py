@@ -1,4 +1,4 @@
-"""Random sine features: linear in the parameters where polynomials have too many terms.
+"""Random sine features, linear in the parameters, for states where polynomials need many terms.
 
     S(c, w) = Σ c_j sin(k_j·x + b_j),   k_j normal of deviation ``bandwidth``, b_j uniform
 
@@ -25,7 +25,7 @@ from gfnn_jax.families.inputs import Inputs
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sines:
-    """``num_parameters`` random sines of the variables; whole wave numbers for angles."""
+    """Family of ``num_parameters`` random sines of the variables; whole wave numbers for angles."""
 
     inputs: Inputs
     num_parameters: int
@@ -47,7 +47,7 @@ class Sines:
 
     @cached_property
     def _frequencies(self) -> tuple[np.ndarray, np.ndarray]:
-        """k (num_parameters, variables) and b (num_parameters,); integer k for angles."""
+        """Frequencies k (num_parameters, variables), integer for angles; b (num_parameters,)."""
         rng = np.random.default_rng(self.seed)
         k = self.bandwidth * rng.standard_normal((self.num_parameters, self.inputs.num_variables))
         angles = list(self.inputs.angles)
@@ -55,33 +55,33 @@ class Sines:
         return k, rng.uniform(0, 2 * np.pi, self.num_parameters)
 
     def _phase(self, x):
-        """(k (m, n), the phases k·x + b (..., m))."""
+        """Frequencies k (m, n), and phases k·x + b (..., m)."""
         xp = namespace(x)
         k, b = (xp.asarray(a, dtype=x.dtype) for a in self._frequencies)
         phase = matmul(x, k.T)
         return k, phase + as_row(b, phase)
 
     def unflatten(self, coefficients):
-        """The parameters of S are the coefficients (num_parameters,) themselves."""
+        """Return the coefficients (num_parameters,), which are the parameters of S."""
         return coefficients
 
     def __call__(self, params, w, args=None):
         return self.value(params, w, args)
 
     def value(self, params, w, args=None):
-        """S(params, w), shape (...): params (num_parameters,), w (..., 2d)."""
+        """Value S(params, w), shape (...): params (num_parameters,), w (..., 2d)."""
         _, phase = self._phase(self.inputs(w))
         return matmul(namespace(w).sin(phase), params[:, None])[..., 0]
 
     def gradient(self, params, w, args=None):
-        """∇S(params, w), shape (..., 2d)."""
+        """Gradient ∇S(params, w), shape (..., 2d)."""
         x, slope, _ = self.inputs.tables(w, order=1)
         k, phase = self._phase(x)
         weighted = namespace(w).cos(phase) * as_row(params, phase)
         return self.inputs.pull_back_gradient(matmul(weighted, k), slope)
 
     def gradient_and_hessian(self, params, w, args=None):
-        """∇S (..., 2d) and S'' (..., 2d, 2d)."""
+        """Gradient ∇S (..., 2d) and Hessian S'' (..., 2d, 2d)."""
         x, slope, curvature = self.inputs.tables(w, order=2)
         (k, phase), xp = self._phase(x), namespace(w)
         gradient = matmul(xp.cos(phase) * as_row(params, phase), k)
@@ -94,7 +94,7 @@ class Sines:
         )
 
     def term_gradients(self, w, args=None):
-        """∇ of every sine at w (..., 2d): (..., 2d, num_parameters)."""
+        """Gradients of all sines at w (..., 2d): (..., 2d, num_parameters)."""
         x, slope, _ = self.inputs.tables(w, order=1)
         k, phase = self._phase(x)
         cos = namespace(w).cos(phase)[..., None, :]

@@ -1,10 +1,10 @@
-"""One function summed over neighbourhoods: of the sites of a ring or a chain, of bodies and pairs.
+"""Sums of one function over neighbourhoods: sites of a ring or a chain, bodies, pairs of bodies.
 
     f(c, w) = Σ_parts Σ_neighbourhoods Σ_j c_j φ_j(w in the neighbourhood)
 
-All neighbourhoods of a part share its coefficients, so that one state of a ring of 1,000 sites is
-1,000 rows of data for a function of a few variables. A gradient, and a product with the Hessian,
-cost as many operations as there are neighbourhoods: nothing is a dense matrix.
+All neighbourhoods of a part share its coefficients, so that one state of a ring of 1,000 sites
+gives 1,000 rows of data for a function of a few variables. The cost of a gradient, and of a product
+with the Hessian, grows linearly with the number of neighbourhoods; no matrix is dense.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ _DENSE = 32  # 2d up to which matrices (2d, 2d) are cheaper than products with t
 
 @dataclasses.dataclass(frozen=True)
 class Windows:
-    """``reach`` + 1 sites in a row, wherever such a row fits.
+    """Windows of ``reach`` + 1 successive sites, one for each place where they fit.
 
     ends: "ring", where the last site's neighbour is the first; "free"; or "fixed", between two
-    sites that stay at q = p = 0. fields: q of a site, which stand together; as many p.
+    sites that stay at q = p = 0. fields: number of q of a site, which stand together; as many p.
     """
 
     ends: str
@@ -44,13 +44,13 @@ class Windows:
     prefix = "Σ_i "  # of a formula
 
     def gather(self, w):
-        """w (..., 2d) as states (..., windows, 2·(reach + 1)·fields) of the windows."""
+        """Gather w (..., 2d) into states (..., windows, 2·(reach + 1)·fields) of the windows."""
         xp = namespace(w)
         columns = [c for x in split(w) for c in self._shifted(x)]
         return xp.moveaxis(xp.stack(columns), 0, -1)
 
     def scatter(self, g):
-        """The transpose of ``gather``: (..., windows, 2·(reach + 1)·fields) -> (..., 2d)."""
+        """Transpose of ``gather``: (..., windows, 2·(reach + 1)·fields) -> (..., 2d)."""
         xp, half = namespace(g), g.shape[-1] // 2
         sides = (g[..., :half], g[..., half:])
         return xp.concatenate([self._summed(side) for side in sides], axis=-1)
@@ -88,13 +88,15 @@ class Windows:
         return self.ends == "fixed" and self.reach > 0
 
     def count(self, dim: int) -> int:
-        """The number of windows among the sites of ``dim`` degrees of freedom."""
+        """Number of windows among the sites of ``dim`` degrees of freedom."""
         sites = dim // self.fields
         return sites if self.ends == "ring" else sites - self.reach + 2 * self._held
 
     def named(self, text: str) -> str:
-        """A term of the window's own q1, q2, … as one of a general site: q_i, q_{i+1}, …; of
-        several fields q1_i, q2_i, q1_{i+1}, …"""
+        """Rewrite a term of the window's q1, q2, … for a general site: q_i, q_{i+1}, …
+
+        With several fields the coordinates are q1_i, q2_i, q1_{i+1}, …
+        """
 
         def of_site(found) -> str:
             ahead, field = divmod(int(found[2]) - 1, self.fields)
@@ -107,8 +109,8 @@ class Windows:
 class Groups:
     """Groups of one or two bodies in a space of ``space`` dimensions, q body by body.
 
-    members: the bodies of each group. size: of all bodies. species: whose bodies they are, a letter
-    for each of a group's, where not those of all.
+    members: indices of the bodies of each group. size: number of all bodies. species: a letter for
+    each body of a group, where the groups are those of some species only.
     """
 
     members: tuple[tuple[int, ...], ...]
@@ -119,7 +121,7 @@ class Groups:
     prefix = ""
 
     def gather(self, w):
-        """w (..., 2d) as states (..., groups, 2k) of the groups, their bodies one after another."""
+        """Gather w (..., 2d) into states (..., groups, 2k) of the groups, body by body."""
         places = np.array(self.members)
         sides = []
         for x in split(w):
@@ -128,7 +130,7 @@ class Groups:
         return namespace(w).concatenate(sides, axis=-1)
 
     def scatter(self, g):
-        """The transpose of ``gather``: (..., groups, 2k) -> (..., 2d)."""
+        """Transpose of ``gather``: (..., groups, 2k) -> (..., 2d)."""
         count, lanes = len(self.members[0]), g.shape[:-2]
         sides = g.reshape(*lanes, len(self.members), 2, count, self.space)
         total: Any = 0.0
@@ -139,11 +141,11 @@ class Groups:
         return total.reshape(*lanes, -1)
 
     def count(self, dim: int) -> int:
-        """The number of groups."""
+        """Number of groups."""
         return len(self.members)
 
     def named(self, text: str) -> str:
-        """A term of a group's own q1, q2, … in the positions and momenta of bodies."""
+        """Rewrite a term of a group's q1, q2, … in positions and momenta of bodies."""
         one = len(self.members) == 1
         bodies = [str(b + 1) for b in self.members[0]] if one else ["i", "j"]
         pair = f"|q_{bodies[0]} - q_{bodies[-1]}|"
@@ -158,7 +160,7 @@ class Groups:
 
     @property
     def _every(self) -> str:
-        """The sum over all groups, as it stands in a formula."""
+        """Symbol of the sum over all groups in a formula."""
         pairs = len(self.members[0]) == 2
         if not self.species:
             return "Σ_{i<j}" if pairs else "Σ_i"
@@ -169,12 +171,12 @@ class Groups:
 
 
 def momentum_squared(space: int) -> str:
-    """|p|² of a body as text."""
+    """Write |p|² of a body as text."""
     return " + ".join(f"p{k}**2" for k in range(1, space + 1))
 
 
 def distance(space: int) -> str:
-    """|q − q'| of two bodies as text."""
+    """Write |q − q'| of two bodies as text."""
     squares = (f"(q{k} - q{k + space})**2" for k in range(1, space + 1))
     return f"sqrt({' + '.join(squares)})"
 
@@ -185,7 +187,7 @@ def _site(ahead: int) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """``terms`` of a neighbourhood's own state, summed over all of its kind."""
+    """Sum of ``terms`` of a neighbourhood's own state over all neighbourhoods of one kind."""
 
     terms: Terms
     over: Any
@@ -194,7 +196,7 @@ class Part:
 @partial(jax.tree_util.register_dataclass, data_fields=(), meta_fields=("dim", "parts"))
 @dataclasses.dataclass(frozen=True)
 class Sums:
-    """The sum of its parts. params: the coefficients (N,) of all parts, one after another."""
+    """Family that is the sum of its parts. params: coefficients (N,) of all parts in order."""
 
     dim: int
     parts: tuple[Part, ...]
@@ -212,17 +214,17 @@ class Sums:
 
     @property
     def prefix(self) -> str:
-        """What stands before the formula."""
+        """Text before the formula, a sum sign where one is needed."""
         return self.parts[0].over.prefix
 
     @property
     def matrix_free(self) -> bool:
-        """Whether solvers are to use products with the Hessian instead of the Hessian."""
+        """True where solvers shall use products with the Hessian instead of the Hessian."""
         return 2 * self.dim > _DENSE
 
     @property
     def term_names(self) -> tuple[str, ...]:
-        """Each term as it stands in the formula of a general neighbourhood."""
+        """Text of each term in the formula of a general neighbourhood."""
         return tuple(part.over.named(n) for part in self.parts for n in part.terms.term_names)
 
     @property
@@ -233,7 +235,7 @@ class Sums:
         return gradient, with_hessian
 
     def take(self, rows: Sequence[int]) -> Sums:
-        """The family of these terms alone."""
+        """Make the family of these terms alone."""
         parts, first = [], 0
         for part in self.parts:
             last = first + part.terms.num_parameters
@@ -244,36 +246,38 @@ class Sums:
         return Sums(self.dim, tuple(parts))
 
     def unflatten(self, coefficients):
-        """The parameters are the coefficients (N,) themselves."""
+        """Return the coefficients (N,), which are the parameters."""
         return coefficients
 
     def __call__(self, params, w, args=None):
         return self.value(params, w, args)
 
     def value(self, params, w, args=None):
-        """f, shape (...): params (N,), w (..., 2d)."""
+        """Value of f, shape (...): params (N,), w (..., 2d)."""
         return sum(
             namespace(w).sum(part.terms.value(own, part.over.gather(w), args), axis=-1)
             for part, own in self._with_params(params)
         )
 
     def gradient(self, params, w, args=None):
-        """∂f/∂w (..., 2d)."""
+        """Gradient ∂f/∂w (..., 2d)."""
         return sum(
             part.over.scatter(part.terms.gradient(own, part.over.gather(w), args))
             for part, own in self._with_params(params)
         )
 
     def curvatures(self, params, w, args=None) -> list:
-        """Of each part the Hessians (..., neighbourhoods, k, k) of its terms, which
-        ``hessian_product`` takes."""
+        """Hessians (..., neighbourhoods, k, k) of the terms of each part, for `hessian_product`."""
         return [
             part.terms.gradient_and_hessian(own, part.over.gather(w), args)[1]
             for part, own in self._with_params(params)
         ]
 
     def hessian_product(self, curvatures, v):
-        """∂²f/∂w² v (..., 2d) of the curvatures at w (..., 2d); v may have further axes before."""
+        """Product ∂²f/∂w² v (..., 2d), from the curvatures at w (..., 2d).
+
+        v may have further leading axes.
+        """
         xp = namespace(v)
         return sum(
             part.over.scatter(xp.sum(bend * part.over.gather(v)[..., None, :], axis=-1))
@@ -281,7 +285,7 @@ class Sums:
         )
 
     def gradient_and_hessian(self, params, w, args=None):
-        """∂f/∂w (..., 2d) and ∂²f/∂w² (..., 2d, 2d), a product for every column: for small d."""
+        """Gradient ∂f/∂w (..., 2d) and Hessian ∂²f/∂w² (..., 2d, 2d), a product per column."""
         xp, width = namespace(w), w.shape[-1]
         units = np.eye(width, dtype=w.dtype).reshape(width, *(1,) * (w.ndim - 1), width)
         columns = self.hessian_product(
@@ -290,7 +294,7 @@ class Sums:
         return self.gradient(params, w, args), xp.moveaxis(columns, 0, -1)
 
     def term_gradients(self, w, args=None):
-        """∇ of every term at w (..., 2d): (..., 2d, N). NumPy."""
+        """Gradients of all terms at w (..., 2d): (..., 2d, N). NumPy."""
         found = []
         for part in self.parts:
             local = part.terms.term_gradients(part.over.gather(w), args)
@@ -306,20 +310,20 @@ class Sums:
 
 
 def matrix_free(family) -> bool:
-    """Whether the family's solvers are to do without (2d, 2d) matrices."""
+    """Return whether solvers shall use no (2d, 2d) matrices of this family."""
     return bool(getattr(family, "matrix_free", False))
 
 
 def site_terms(
     dim: int, ends: str, reach: int, degree: int, functions: Sequence[str] = (), fields: int = 1
 ) -> Sums:
-    """Products of total degree 1 to ``degree`` of a site's q and p and the differences of its q to
-    those of the next sites up to ``reach``, and ``functions`` as text in a site's own q1, p1 and
-    the next sites' q2, p2, … to q4, p4; of two fields q1, q2 are the site's, q3, q4 the next one's.
+    """Make terms of equal sites: products of total degree 1 to ``degree``, and ``functions``.
 
-    Powers of one variable come first: of combinations that are equal when summed, they are kept.
-    Each term goes to the shortest window that holds it. Raises InputError for a function that is
-    not understood.
+    The products are of a site's q and p and the differences of its q to those of the next sites up
+    to ``reach``. functions: text in a site's q1, p1 and the next sites' q2, p2, … to q4, p4; with
+    two fields q1, q2 are the site's, q3, q4 the next one's. Powers of one variable come first, so
+    that a fit keeps them among combinations that are equal when summed. Each term goes to the
+    shortest window that holds it. Raises InputError for a function that is not understood.
     """
     own = range(1, fields + 1)
     ahead = (f"q{j * fields + k} - q{k}" for j in range(1, reach + 1) for k in own)
@@ -341,8 +345,10 @@ def site_terms(
 
 
 def periodic_site_terms(dim: int, ends: str, degree: int, *, products: bool) -> Sums:
-    """Powers of p_i, harmonics of the angle q_i and of q_{i+1} − q_i, up to ``degree``; and their
-    products of this total degree, where ``products``."""
+    """Make terms of sites with angles: powers of p_i, harmonics of q_i and of q_{i+1} − q_i.
+
+    Each goes up to ``degree``. With ``products`` their products up to this total degree are added.
+    """
     own, bond = _harmonics("q1", degree), _harmonics("q2 - q1", degree)
     rows: tuple[list, list] = ([], [])  # of one site, of two
     for a, (i, k), (j, m) in product(range(degree + 1), _numbered(degree), _numbered(degree)):
@@ -359,7 +365,7 @@ def periodic_site_terms(dim: int, ends: str, degree: int, *, products: bool) -> 
 
 
 def _harmonics(angle: str, degree: int) -> tuple[str, ...]:
-    """cos and sin of the angle, of twice the angle, …"""
+    """Write cos and sin of the angle, of twice the angle, … up to ``degree``, as text."""
     multiples = [angle, *(f"{k}*({angle})" for k in range(2, degree + 1))]
     return tuple(f"{function}({a})" for a in multiples for function in ("cos", "sin"))
 
@@ -372,11 +378,11 @@ def _numbered(degree: int) -> list[tuple[int, int]]:
 def body_terms(
     bodies: int, space: int, powers: Sequence[int], *, alike: bool = True, species: str = ""
 ) -> Sums:
-    """|p_i|² of every body, and ``powers`` of the distances of every pair.
+    """Make terms |p_i|² of all bodies, and ``powers`` of the distances of all pairs.
 
-    alike: whether all bodies share their coefficients; else each body and each pair has its own.
-    species: a letter for each body, as "abbb": bodies of one letter share theirs, and so do pairs
-    of the same two letters.
+    alike: True where all bodies share their coefficients; else each body and each pair has its own.
+    species: a letter for each body, for example "abbb". Bodies of one letter share coefficients,
+    and so do pairs of the same two letters.
     """
     r = distance(space)
     rows = tuple((max(n, 0), max(-n, 0)) for n in powers)
@@ -397,13 +403,13 @@ def body_terms(
 
 
 def _furthest(row: tuple[int, ...], fields: int) -> int:
-    """How far the last variable is that enters a product of a site's q and p and differences."""
+    """Distance in sites of the furthest variable in a product of a site's terms."""
     last = max((k for k, a in enumerate(row) if a), default=0)
     return max(last // fields - 1, 0)
 
 
 def _reach_of(text: str, fields: int) -> int:
-    """How far a function of a site and those after it reaches."""
+    """Distance in sites of the furthest coordinate in a function of a site and the next ones."""
     longest = _LONGEST * fields
     used = depends_on(parse(text, longest))
     return max((i % longest // fields for i in used), default=0)

@@ -1,10 +1,10 @@
-"""Linear in the parameters: products of powers of named variables, as a formula is written.
+"""Products of powers of named variables, linear in the parameters, as a formula is written.
 
     f(c, w) = Σ_j c_j Π_k x_k(w)^a_jk
 
 A variable x_k is an expression: a coordinate, cos q1, 1/r of a scene, a term that a user gives. The
-coefficients are those of the formula, in the user's units; a fit scales the columns itself. A
-family of this kind is data alone, text and whole numbers, and is saved as such.
+coefficients are those of the formula, in the user's units; a fit scales the columns itself. The
+family consists of text and whole numbers, and is saved as such.
 """
 
 from __future__ import annotations
@@ -32,14 +32,17 @@ from gfnn_jax.families.expressions import (
 from gfnn_jax.families.jets import jets
 from gfnn_jax.families.traced import traced
 
-# So many products with coefficients are written one by one, where XLA fuses them; beyond, a matrix.
+# Up to this number, products with coefficients are written one by one, and XLA fuses them; beyond
+# it they are a matrix product.
 _MOST_WRITTEN_OUT = 400
 
 
 class _Plan:
-    """How the products of powers (N, k) and their derivatives are computed: from a set of products
-    that is closed under division, each one earlier product times a variable. still: the variables
-    that no coordinate changes, of which nothing is a derivative."""
+    """Order of computation of the products of powers (N, k) and of their derivatives.
+
+    The set of products is closed under division by a variable, and each one is an earlier product
+    times a variable. still: variables that depend on no coordinate and have no derivatives.
+    """
 
     def __init__(self, powers: np.ndarray, still: tuple[int, ...] = ()):
         self.powers = powers
@@ -55,14 +58,14 @@ class _Plan:
         rows = sorted(closed, key=lambda r: (sum(r), r))
         place = {row: i for i, row in enumerate(rows)}
         self.size = len(rows)
-        # Of every product but 1: the earlier one, and the variable it is multiplied by.
+        # Each product but 1 is (an earlier product, the variable that multiplies it).
         self.parents = [
             (place[_less(row, k)], k)
             for row in rows[1:]
             for k in [next(k for k in range(variables) if row[k])]
         ]
         self.places = np.array([place[row] for row in terms], dtype=int)
-        # Of ∂/∂x_k: (term, product, factor) with ∂_k term = factor · product; ∂²/∂x_k∂x_l likewise.
+        # ∂/∂x_k as (term, product, factor): ∂_k term = factor · product; ∂²/∂x_k∂x_l likewise.
         slopes: list[list] = [[] for _ in range(variables)]
         curvatures: dict[tuple[int, int], list] = {}
         for j, row in enumerate(terms):
@@ -78,14 +81,14 @@ class _Plan:
         self.curvatures = {pair: _columns(curvatures[pair]) for pair in sorted(curvatures)}
 
     def products(self, variables: list, xp) -> list:
-        """Every product, from the variables' values."""
+        """Compute all products from the values of the variables."""
         found: list[Any] = [xp.ones_like(variables[0])]
         for parent, k in self.parents:
             found.append(variables[k] if parent == 0 else found[parent] * variables[k])
         return found
 
     def combined(self, params, products: list, columns: list) -> list:
-        """Σ_j c_j · factor_j · product_j for each of the columns (term, product, factor)."""
+        """Compute Σ_j c_j · factor_j · product_j for each column (term, product, factor)."""
         xp = namespace(params, products[-1])
         sizes = [len(c[0]) for c in columns]
         if xp is not np and sum(sizes) <= _MOST_WRITTEN_OUT:
@@ -128,9 +131,10 @@ def _plan_of(powers: tuple[tuple[int, ...], ...], still: tuple[int, ...]) -> _Pl
 )
 @dataclasses.dataclass(frozen=True)
 class Terms:
-    """Products of powers of ``variables``, expressions as text, one row of ``powers`` (N, k) each.
+    """Family of products of powers of ``variables``, one for each row of ``powers`` (N, k).
 
-    params: the coefficients (N,). parameters: the names of the args, which variables may hold.
+    variables: expressions as text. params: the coefficients (N,). parameters: names of the args,
+    which variables may contain.
     """
 
     dim: int
@@ -150,12 +154,12 @@ class Terms:
 
     @cached_property
     def trees(self) -> list[Expression]:
-        """The variables as expressions."""
+        """Expressions of the variables."""
         return [parse(text, self.dim, self.parameters) for text in self.variables]
 
     @property
     def quadratic(self) -> bool:
-        """Whether every term is a coordinate or a product of two: the gradient is affine."""
+        """True where every term is a coordinate or a product of two: the gradient is affine."""
         plain = set(self.variables) <= set(coordinate_names(self.dim))
         return plain and all(sum(row) <= 2 for row in self.powers)
 
@@ -169,7 +173,7 @@ class Terms:
 
     @property
     def term_names(self) -> tuple[str, ...]:
-        """Each term as it stands in a formula: "q1² q2"."""
+        """Text of each term in a formula: "q1² q2"."""
         named = [
             text if tree.operation not in ("+", "*", "/", "power", "number") else f"({text})"
             for text, tree in zip(self.variables, self.trees, strict=True)
@@ -195,7 +199,7 @@ class Terms:
         return gradient, gradient + more + 4 * self.dim * self.dim
 
     def take(self, rows: Sequence[int]) -> Terms:
-        """The family of these terms alone, without the variables that are no longer used."""
+        """Make the family of these terms alone, without the variables that are no longer used."""
         kept = np.array(self.powers, dtype=int).reshape(-1, len(self.variables))[list(rows)]
         used = np.flatnonzero(kept.any(axis=0)) if len(kept) else np.arange(0)
         return Terms(
@@ -206,14 +210,14 @@ class Terms:
         )
 
     def unflatten(self, coefficients):
-        """The parameters are the coefficients (N,) themselves."""
+        """Return the coefficients (N,), which are the parameters."""
         return coefficients
 
     def __call__(self, params, w, args=None):
         return self.value(params, w, args)
 
     def value(self, params, w, args=None):
-        """f, shape (...): params (N,), w (..., 2d)."""
+        """Value of f, shape (...): params (N,), w (..., 2d)."""
         variables = self._variables(w, 0, args)
         products = self._products(variables, w)
         places = self._plan.places
@@ -221,14 +225,14 @@ class Terms:
         return self._plan.combined(params, products, columns)[0]
 
     def gradient(self, params, w, args=None):
-        """∂f/∂w (..., 2d)."""
+        """Gradient ∂f/∂w (..., 2d)."""
         variables = self._variables(w, 1, args)
         products = self._products(variables, w)
         slopes = self._plan.combined(params, products, self._plan.slopes)
         return self._stacked(_pulled_back(variables, slopes), w)
 
     def gradient_and_hessian(self, params, w, args=None):
-        """∂f/∂w (..., 2d) and ∂²f/∂w² (..., 2d, 2d)."""
+        """Gradient ∂f/∂w (..., 2d) and Hessian ∂²f/∂w² (..., 2d, 2d)."""
         xp, width = namespace(w), w.shape[-1]
         variables, plan = self._variables(w, 2, args), self._plan
         products = self._products(variables, w)
@@ -262,7 +266,7 @@ class Terms:
         return self._stacked(_pulled_back(variables, slopes), w), hessian
 
     def term_gradients(self, w, args=None):
-        """∇ of every term at w (..., 2d): (..., 2d, N). NumPy."""
+        """Gradients of all terms at w (..., 2d): (..., 2d, N). NumPy."""
         variables, plan = self._variables(w, 1, args), self._plan
         products = np.stack(self._products(variables, w), axis=-1)
         out = np.zeros((*w.shape, self.num_parameters))
@@ -288,12 +292,12 @@ class Terms:
 
 
 def _like(value, zero, xp):
-    """The value as an array of the lanes' shape."""
+    """Broadcast the value to an array of the lanes' shape."""
     return value if getattr(value, "shape", None) == zero.shape else zero + value
 
 
 def _pulled_back(variables, slopes) -> dict[int, Any]:
-    """{i: ∂f/∂w_i} from ∂f/∂x_k."""
+    """Apply the chain rule: {i: ∂f/∂w_i} from ∂f/∂x_k."""
     gradient: dict[int, Any] = {}
     for variable, slope in zip(variables, slopes, strict=True):
         for i, s in variable.slope.items():
@@ -309,14 +313,16 @@ def _superscript(exponent: int) -> str:
     return str(exponent).translate(_DIGITS)
 
 
-# Which terms a family has.
+# Constructors of families of terms.
 
 
 def given_terms(
     dim: int, given: Sequence[str | Callable], parameters: tuple[str, ...] = ()
 ) -> Terms:
-    """A user's own terms as they are: text, or functions of z (2d,), each of which may be several.
-    parameters: names that a text may use beside those of the coordinates.
+    """Make the family of a user's own terms: text, or functions of z (2d,).
+
+    A function may return several terms. parameters: names that a text may use beside those of the
+    coordinates.
 
     Raises InputError for a term that is not understood, or that does not depend on the state.
     """
@@ -326,7 +332,10 @@ def given_terms(
         for tree in trees:
             text = to_text(tree, dim, parameters)
             if not depends_on(tree):
-                raise InputError(f"the term '{text}' is the same at every state: leave it out")
+                raise InputError(
+                    f"the term '{text}' is the same at every state and changes no motion: leave it "
+                    "out"
+                )
             texts.append(text)
     unique = tuple(dict.fromkeys(texts))
     count = range(len(unique))
@@ -342,10 +351,10 @@ def polynomial_terms(
     features: Callable | None = None,
     reversor: Sequence[int] | None = None,
 ) -> Terms:
-    """Every product of total degree 1 to ``degree`` of the coordinates, or of a scene's features.
+    """Make all products of total degree 1 to ``degree`` of the coordinates or a scene's features.
 
     cyclic: indices of z that do not enter. features: ``features(z)`` -> (k,). reversor: signs (2d,)
-    under which H is even; terms that are odd are left out.
+    under which H is even; odd terms are left out.
     """
     if features is not None:
         trees = traced(features, dim)
@@ -359,13 +368,13 @@ def polynomial_terms(
 
 
 def joined(first: Terms, second: Terms) -> Terms:
-    """The terms of both, those that are written alike once."""
+    """Make the union of the terms of both, without duplicates."""
     variables, *rows = _over_both(first, second)
     return Terms(first.dim, variables, tuple(dict.fromkeys(rows[0] + rows[1])), first.parameters)
 
 
 def multiplied(first: Terms, second: Terms) -> Terms:
-    """Every term of the first times every term of the second."""
+    """Multiply each term of the first family by each term of the second."""
     variables, left, right = _over_both(first, second)
     rows = dict.fromkeys(
         tuple(a + b for a, b in zip(one, other, strict=True)) for one in left for other in right
@@ -374,7 +383,7 @@ def multiplied(first: Terms, second: Terms) -> Terms:
 
 
 def _over_both(first: Terms, second: Terms):
-    """The variables of both families, and their powers over these."""
+    """Variables of both families together, and the powers of each over these."""
     variables = tuple(dict.fromkeys((*first.variables, *second.variables)))
     rows = (
         [
@@ -396,8 +405,10 @@ def exponents(variables: int, degree: int) -> list[tuple[int, ...]]:
 
 
 def _odd(trees: list[Expression], dim: int, reversor) -> list[int]:
-    """The variables that change sign under the reversor; one that is neither even nor odd counts as
-    even, as if there were none."""
+    """Indices of the variables that change sign under the reversor.
+
+    A variable that is neither even nor odd counts as even.
+    """
     if reversor is None:
         return []
     z = np.random.default_rng(0).uniform(0.2, 1.0, (8, 2 * dim))

@@ -12,10 +12,10 @@ from gfnn_jax.families.functions import FUNCTIONS
 
 
 def traced(function: Callable, dim: int) -> list[Expression]:
-    """The trees of ``function(z)``, z (2d,), a scalar or a vector made by JAX or by plain
-    arithmetic.
+    """Trace ``function(z)``, z (2d,), a scalar or a vector, into expressions, one per entry.
 
-    Raises InputError where the function branches on its values or uses what has no tree here.
+    Raises InputError where the function uses an operation that has no expression here, or branches
+    on its values.
     """
     import jax
 
@@ -41,13 +41,13 @@ _REARRANGE = {
 
 
 def _trees(values):
-    """An object array of expressions of an array of numbers or expressions."""
+    """Convert an array of numbers or expressions into an object array of expressions."""
     values = np.asarray(values, dtype=object)
     return _elementwise(as_expression, values) if values.size else values
 
 
 def _run(jaxpr, constants, arguments) -> list:
-    """The results of a jaxpr on object arrays of expressions; integers stay numbers."""
+    """Evaluate a jaxpr on object arrays of expressions; integers stay numbers."""
     known: dict = dict(zip(jaxpr.constvars, map(np.asarray, constants), strict=True))
     known.update(zip(jaxpr.invars, arguments, strict=True))
 

@@ -4,8 +4,9 @@
 data nor small steps. Gauss–Newton steps with a trust region (Levenberg–Marquardt) from the better
 of two linear starts; pairs that the present H already explains come first, the others follow.
 
-The rows of a Gauss–Newton problem are folded, block by block, into one triangular factor: of its
-singular values come every damping at once, the condition number and the standard errors.
+The rows [∂r/∂c, r] of a Gauss–Newton problem are folded, block by block, into one triangle
+(`fitting.triangle`): of its singular values come every damping at once, the condition number and
+the standard errors.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.fitting.base_map import field_for
+from gfnn_jax.fitting.triangle import Spectrum, Triangle
 from gfnn_jax.fitting.turns import backwards, forward_logarithm, tangent, turns
 from gfnn_jax.flows.collocation import Steps, images, of_lanes, operations, truncation
 from gfnn_jax.phase_space import apply_j, symplectic_form
@@ -85,28 +87,19 @@ class FlowFit(NamedTuple):
     """Coefficients (terms,) and how well the pairs determine them.
 
     rms: per component of (Φ(z₀) − z₁) ÷ scale on the pairs that were used. standard_errors:
-    (terms,), from the Gauss–Newton factor. factor: R of [∂r/∂c, r] (m + 1, m + 1), and ``rows``,
-    for which it stands. condition: of the scaled columns. used: (N,) the pairs in the loss.
+    (terms,), and the condition of the scaled columns, from ``triangle``, that of [∂r/∂c, r] at the
+    coefficients. used: (N,) the pairs in the loss.
     iterations: Gauss–Newton steps taken. steps: how the flow was computed in the end.
     """
 
     coefficients: np.ndarray
     rms: float
     standard_errors: np.ndarray
-    factor: np.ndarray
-    rows: int
+    triangle: Triangle
     condition: float
     used: np.ndarray
     iterations: int
     steps: Steps
-
-
-class Factor(NamedTuple):
-    """R (m + 1, m + 1) of [∂r/∂c, r], the rows for which it stands, and the cost ‖r‖."""
-
-    matrix: np.ndarray
-    rows: int
-    cost: float
 
 
 # Where a fit starts.
@@ -278,10 +271,10 @@ class Problem:
             parts = [of(self, block) for block in blocks]
         return np.concatenate(parts) if parts else np.zeros((0, self.z0.shape[1]))
 
-    def factor(self, family, coefficients, steps: Steps, rows) -> Factor:
-        """The Gauss–Newton problem of these rows; its cost is infinite where a flow fails."""
+    def linearised(self, family, coefficients, steps: Steps, rows) -> Triangle:
+        """The triangle of [∂r/∂c, r] of these rows; its norm is infinite where a flow fails."""
         if not np.isfinite(coefficients).all():
-            return self._folded(family, coefficients, steps, (), failed=True)
+            return Triangle.empty(family.num_parameters).spoilt()
         columns = family.num_parameters * steps.stages
         blocks = self._blocks(rows, columns, matrix_free(family))
         if not row_blocks.devices():
@@ -289,28 +282,22 @@ class Problem:
         own = self._unpaid()
         found = row_blocks.tree(
             lambda part, device: own._folded(family, coefficients, steps, part),
-            self._parts(blocks, family, steps), lambda one, other, device: merged(one, other),
+            self._parts(blocks, family, steps), lambda one, other, device: one.merge(other),
         )  # fmt: skip
-        return self._folded(family, coefficients, steps, ()) if found is None else found
+        return Triangle.empty(family.num_parameters) if found is None else found
 
-    def _folded(self, family, coefficients, steps: Steps, blocks, failed: bool = False) -> Factor:
-        """The problem of the rows of these blocks, of none where it has failed before."""
-        count = family.num_parameters
-        matrix, seen = np.zeros((0, count + 1)), 0
+    def _folded(self, family, coefficients, steps: Steps, blocks) -> Triangle:
+        """The triangle of the rows of these blocks."""
+        triangle = Triangle.empty(family.num_parameters)
         for block in blocks:
             found = self.images(family, coefficients, block, steps, derivatives=True)
             residual = (found.states - self.z1[block]) / self.scale
             slope = found.by_coefficient / self.scale[:, None]
-            part = np.concatenate([slope, residual[..., None]], axis=-1).reshape(-1, count + 1)
-            failed = not np.isfinite(part).all()
-            if failed:
-                break
-            matrix = np.linalg.qr(np.concatenate([matrix, part]), mode="r")
-            seen += len(part)
-        short = max(count + 1 - len(matrix), 0)
-        matrix = np.concatenate([matrix, np.zeros((short, count + 1))])
-        cost = np.inf if failed else float(np.linalg.norm(matrix[:, -1]))
-        return Factor(matrix, seen, cost)
+            rows = np.concatenate([slope, residual[..., None]], axis=-1)
+            if not np.isfinite(rows).all():
+                return triangle.spoilt()
+            triangle = triangle.stacked(rows.reshape(-1, rows.shape[-1]))
+        return triangle
 
     # Operations are spent where devices are told what to do, in one order, whoever is the first
     # to be done.
@@ -383,14 +370,14 @@ class Problem:
             iterations += made
         if steps is not None:
             used = self._quietest(family, c, steps, rows, len(rows))
-            c, factor, made = self._descend(family, c, steps, used, options.most)
-            return summarised(c, factor, used, iterations + made, steps)
+            c, triangle, made = self._descend(family, c, steps, used, options.most)
+            return summarised(c, triangle, used, iterations + made, steps)
         steps = self.fine_steps(family, c, rows)[0]
         used = self._resolved(family, c, steps, rows)
         for _ in range(options.selections):
-            c, factor, made = self._descend(family, c, steps, used, options.most)
+            c, triangle, made = self._descend(family, c, steps, used, options.most)
             iterations += made
-            summary = summarised(c, factor, used, iterations, steps)
+            summary = summarised(c, triangle, used, iterations, steps)
             still = self._resolved(family, c, steps, used)
             if len(still) == len(used):
                 break
@@ -402,15 +389,14 @@ class Problem:
         foretells the residual that is left: then the start is close. Else None."""
         coarse = self._coarse(family, c, rows)
         rows = self._resolved(family, c, coarse, rows)
-        here = self.factor(family, c, coarse, rows)
-        if not np.isfinite(here.cost) or here.rows < family.num_parameters:
+        here = self.linearised(family, c, coarse, rows)
+        if not np.isfinite(here.norm) or here.rows < family.num_parameters:
             return None
-        step = _Steps(here.matrix)
-        tried = c - step.damped(0.0)
+        spectrum = here.spectrum()
+        tried = c - _step(spectrum, 0.0)
         size = self.residuals(family, tried, coarse, rows)
-        cost = float(np.linalg.norm(size))
-        off = abs(cost - step.cost)
-        return tried if off <= self.options.foretold * here.cost else None
+        off = abs(float(np.linalg.norm(size)) - spectrum.residual_norm)
+        return tried if off <= self.options.foretold * here.norm else None
 
     def _quietest(self, family, c, steps: Steps, rows, count: int):
         """The ``count`` of these rows that c explains best, without those whose flow fails."""
@@ -489,33 +475,33 @@ class Problem:
         )
 
     def _descend(self, family, c, steps: Steps, rows, most: int):
-        """Gauss–Newton steps until nothing is gained: (coefficients, their factor, steps taken)."""
-        return descended(lambda c: self.factor(family, c, steps, rows), c, most, self.options)
+        """As the function `descended`, over these rows."""
+        return descended(lambda c: self.linearised(family, c, steps, rows), c, most, self.options)
 
 
 def descended(
-    factor: Callable[[np.ndarray], Factor], c, most: int, options: Options = OPTIONS
-) -> tuple[np.ndarray, Factor, int]:
+    linearised: Callable[[np.ndarray], Triangle], c, most: int, options: Options = OPTIONS
+) -> tuple[np.ndarray, Triangle, int]:
     """Gauss–Newton steps from c until nothing is gained, at most so many: (coefficients, their
-    factor, steps taken). ``factor(c)`` is the problem at c, of rows wherever they are."""
-    here = factor(c)
+    triangle, steps taken). ``linearised(c)``: the problem at c, of rows wherever they are."""
+    here = linearised(c)
     floor = _ROUNDOFF * np.sqrt(here.rows)
     first_damping, made = 0, 0
-    while made < most and floor < here.cost < np.inf:
-        found, step = None, _Steps(here.matrix)
-        promised = 1 - step.cost / here.cost
+    while made < most and floor < here.norm < np.inf:
+        found, spectrum = None, here.spectrum()
+        promised = 1 - spectrum.residual_norm / here.norm
         for n in range(first_damping, len(options.dampings)):
-            tried = c - step.damped(options.dampings[n])
-            there = factor(tried)
-            if there.cost < here.cost:
+            tried = c - _step(spectrum, options.dampings[n])
+            there = linearised(tried)
+            if there.norm < here.norm:
                 found = n
                 break
-            if promised < options.promised and there.cost < 2 * here.cost:
+            if promised < options.promised and there.norm < 2 * here.norm:
                 break
         if found is None:
             break
         made += 1
-        gained = 1 - there.cost / here.cost
+        gained = 1 - there.norm / here.norm
         c, here = tried, there
         first_damping = max(0, found - 2)
         if gained < options.gained:
@@ -523,10 +509,11 @@ def descended(
     return c, here, made
 
 
-def merged(one: Factor, other: Factor) -> Factor:
-    """The problem of the rows of both."""
-    matrix: Any = np.linalg.qr(np.concatenate([one.matrix, other.matrix]), mode="r")
-    return Factor(matrix, one.rows + other.rows, float(np.hypot(one.cost, other.cost)))
+def _step(spectrum: Spectrum, damping: float) -> np.ndarray:
+    """δ that minimises ‖R δ − r‖² + (damping s₀)² ‖D δ‖² among the directions that are known."""
+    s = np.where(spectrum.known, spectrum.s, 0.0)
+    square = np.where(spectrum.known, s**2 + (damping * spectrum.s[0]) ** 2, 1.0)
+    return spectrum.solution(s / square)
 
 
 def _cheapest(error: Callable[[Steps], float], substeps: int, tolerance: float) -> Steps:
@@ -553,43 +540,13 @@ def _cheapest(error: Callable[[Steps], float], substeps: int, tolerance: float) 
     return next(s for s, e in errors.items() if e <= 3 * best)
 
 
-def _scaled(factor):
-    count = factor.shape[1] - 1
-    a, b = factor[:, :count], factor[:, count]
-    size = np.linalg.norm(a, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    u, s, vt = np.linalg.svd(a / size, full_matrices=False)
-    return size, s, vt, u.T @ b
-
-
-class _Steps:
-    """The steps δ of every damping from one factor: c − δ is the next iterate. cost: what the
-    linearised problem leaves of the residual after the undamped one."""
-
-    def __init__(self, factor):
-        self._size, self._s, self._vt, self._along = _scaled(factor)
-        cutoff = np.finfo(float).eps * max(factor.shape) * self._s[0]
-        self._known = self._s > cutoff
-        told = np.sum(self._along[self._known] ** 2)
-        self.cost = float(np.sqrt(max(np.sum(factor[:, -1] ** 2) - told, 0.0)))
-
-    def damped(self, damping: float) -> np.ndarray:
-        """δ that minimises ‖R δ − r‖² + (damping s₀)² ‖size δ‖²."""
-        s = np.where(self._known, self._s, 0.0)
-        filters = s / np.where(self._known, s**2 + (damping * self._s[0]) ** 2, 1.0)
-        return self._vt.T @ (filters * self._along) / self._size
-
-
-def summarised(c, found: Factor, used, iterations: int, steps: Steps) -> FlowFit:
-    """The fit that ends at c, with the factor that was found there."""
-    count, factor, seen = len(c), found.matrix, found.rows
-    size, s, vt, _ = _scaled(factor)
-    rms = float(np.linalg.norm(factor[:, count])) / np.sqrt(max(seen, 1))
-    left = float(np.linalg.norm(factor[:, count])) / np.sqrt(max(seen - count, 1))
-    inverse = np.where(s > 0, 1.0 / np.where(s > 0, s, 1.0), 0.0)
-    errors = max(left, _ROUNDOFF) * np.linalg.norm(vt.T * inverse, axis=1) / size
-    condition = float(s[0] / s[-1]) if s[-1] > 0 else float("inf")
-    return FlowFit(c, rms, errors, factor, seen, condition, used, iterations, steps)
+def summarised(c, triangle: Triangle, used, iterations: int, steps: Steps) -> FlowFit:
+    """The fit that ends at c, with the triangle that was found there."""
+    spectrum, rows = triangle.spectrum(), triangle.rows
+    rms = triangle.norm / np.sqrt(max(rows, 1))
+    noise = max(triangle.norm / np.sqrt(max(rows - len(c), 1)), _ROUNDOFF)
+    errors = noise * spectrum.deviations()
+    return FlowFit(c, rms, errors, triangle, spectrum.condition, used, iterations, steps)
 
 
 # Fewer terms.
@@ -598,32 +555,25 @@ def summarised(c, found: Factor, used, iterations: int, steps: Steps) -> FlowFit
 def significant_terms(fit: FlowFit, threshold: float) -> np.ndarray:
     """The terms that are left when those below ``threshold`` standard errors go, the others solved
     for again (in the linearised problem), until none is below."""
-    return significant(fit.factor, fit.coefficients, fit.rows, threshold, fit.rms)[0]
+    return significant(fit.triangle, fit.coefficients, threshold, fit.rms)[0]
 
 
 def significant(
-    factor, coefficients, rows: int, threshold: float, rms: float | None = None
+    triangle: Triangle, coefficients, threshold: float, rms: float | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(kept, their coefficients) of the linearised problem that ``factor``, R of [∂r/∂c, r],
-    stands for: as `significant_terms`.
+    """(kept, their coefficients) of the linearised problem of [∂r/∂c, r], as `significant_terms`.
 
     rms: of what the terms do not explain; None: of what all of them leave over.
     """
-    count = len(coefficients)
+    count, rows = len(coefficients), triangle.rows
     kept = np.arange(count)
-    a, r = factor[:, :count], factor[:, count]
-    target = a @ coefficients - r  # min ‖a c − target‖
-    if rms is None:
-        rms = float(np.linalg.norm(factor[count:, count]) / np.sqrt(rows))
-    noise = max(rms, _ROUNDOFF) * np.sqrt(rows / max(rows - count, 1))
-    c = coefficients
+    unexplained = triangle.residual_norm(count) / np.sqrt(rows) if rms is None else rms
+    noise = max(unexplained, _ROUNDOFF) * np.sqrt(rows / max(rows - count, 1))
+    problem, c = triangle.rebased(coefficients), coefficients
     while kept.size:
-        part = np.concatenate([a[:, kept], target[:, None]], axis=1)
-        size, s, vt, along = _scaled(part)
-        inverse = np.where(s > np.finfo(float).eps * s[0], 1 / np.where(s > 0, s, 1.0), 0.0)
-        c = vt.T @ (inverse * along) / size
-        errors = noise * np.linalg.norm(vt.T * inverse, axis=1) / size
-        ratio = np.abs(c) / errors
+        spectrum = problem.pruned(kept).spectrum()
+        c = spectrum.solution(spectrum.inverse)
+        ratio = np.abs(c) / (noise * spectrum.deviations())
         weak = ratio < threshold
         if not weak.any():
             break

@@ -17,6 +17,7 @@ import numpy as np
 from gfnn_jax.families.modes import Mode, Modes
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import Problem, midpoint_start, null_terms, significant
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps
 
 
@@ -191,8 +192,7 @@ class _Look:
         residual (n,) that the linearised problem then leaves, and an orthonormal basis (n, modes)
         of what these modes explain."""
         rows = np.concatenate([self.matrix, self.residual[:, None]], axis=1)
-        factor = np.linalg.qr(rows, mode="r")
-        kept, c = significant(factor, self.coefficients, len(rows), threshold)
+        kept, c = significant(Triangle.of(rows), self.coefficients, threshold)
         rest = self.residual + self.matrix[:, kept] @ c - self.matrix @ self.coefficients
         span = np.linalg.qr(self.matrix[:, kept])[0]
         return {self.modes[j]: float(v) for j, v in zip(kept, c, strict=True)}, rest, span

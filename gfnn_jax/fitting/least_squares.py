@@ -1,15 +1,15 @@
 """Fits of families that are linear in their parameters: one least-squares solve, on the host.
 
 The loss (paper, eq. (3)) is quadratic in S, so with S = Σ c_j φ_j it is ‖A c − b‖², A the stacked
-gradients of the terms and b the target gradients. Rows of [A b] are folded block by block into the
-triangular factor R of [A b], which holds all that the data say; the normal equations would square
-the condition number. Leading columns of R answer for every smaller family whose terms come first.
+gradients of the terms and b the target gradients. Rows of [A b] are folded block by block into
+their triangle (`fitting.triangle`), whose leading columns answer for every smaller family whose
+terms come first.
 
 A size is judged by a triangular solve (`residuals`). The coefficients of a finalist come from the
-SVD of its leading block of R with scaled columns, which gives the rank, the condition number and
-every ridge parameter at once (`solve`).
+singular values of its leading columns, which give the rank, the condition number and every ridge
+parameter at once (`solve`).
 
-Memory for m parameters: one block of rows and R, whatever the number of pairs.
+Memory for m parameters: one block of rows and the triangle, whatever the number of pairs.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ import scipy.linalg
 
 from gfnn_jax.errors import FitError
 from gfnn_jax.fitting import accelerated, row_blocks
-from gfnn_jax.fitting.triangular import folded
-from gfnn_jax.threads import one_thread
+from gfnn_jax.fitting.triangle import Triangle
 
 # Rows that are folded at once stay in the cache: 16 MiB take a quarter longer per row. A block of
 # 1,500 terms takes 50 ms on two cores.
@@ -60,22 +59,14 @@ class LeastSquaresFit(NamedTuple):
     ridge: float
 
 
-class Reduced(NamedTuple):
-    """All that some rows say about a family: the triangular factor (m + 1, m + 1) of [A b], and how
-    many rows it stands for."""
-
-    factor: np.ndarray
-    rows: int
-
-
 def reduce(
     family: Any,
     rows: Iterable[Sequence[np.ndarray]],
     weight: np.ndarray,
     on_block: Callable[[], Any] | None = None,
-) -> Reduced:
-    """The factor of [A b] of a linear family, from (w, target_gradient), each (N, 2d), in parts;
-    with args (N, k) as the third where the family depends on them.
+) -> Triangle:
+    """The triangle of a linear family, from (w, target_gradient), each (N, 2d), in parts; with args
+    (N, k) as the third where the family depends on them.
 
     rows:     any number of such pairs of arrays, which need never be in memory together.
     weight:   (2d,), what a row of ∇S is multiplied by: h divided by the scale of the conjugate
@@ -84,72 +75,57 @@ def reduce(
 
     Raises FitError where a term's gradient or a target is not finite.
     """
-    if row_blocks.devices():
-        return _finite(_reduced_on_devices(family, rows, weight, on_block))
-    m = family.num_parameters
-    factor, seen = np.zeros((m + 1, m + 1), order="F"), 0
-    for part in _blocks(rows, m):
-        if on_block is not None:
-            on_block()
-        block = _block_of(family, part, weight)
-        with one_thread():
-            factor = folded(factor, block)
-        seen += len(block)
-    return _finite(Reduced(factor, seen))
 
-
-def _block_of(family: Any, part: Sequence[Any], weight) -> np.ndarray:
-    """[A b] of these rows: LAPACK works in place on columns that are contiguous."""
-    (w, target, *args), m = part, family.num_parameters
-    block = np.empty((w.size, m + 1), order="F")
-    gradients = family.term_gradients(w, *args) * weight[:, None]
-    block[:, :m] = gradients.reshape(-1, m)
-    block[:, m] = (target * weight).ravel()
-    return block
-
-
-def _finite(reduced: Reduced) -> Reduced:
-    if not np.isfinite(reduced.factor).all():
-        raise FitError("expected finite gradients of all terms and finite targets on the pairs")
-    return reduced
-
-
-def _reduced_on_devices(family: Any, rows, weight, on_block) -> Reduced:
-    """The factor of rows that are shared out among devices."""
-    m = family.num_parameters
-    on_host = row_blocks.devices()[0].platform == "cpu" or not accelerated.takes(family)
-    least = (_PART_ON_CPU if on_host else _PART_ON_ACCELERATORS) * (m + 1)
-
-    def parts() -> Iterator[tuple[np.ndarray, ...]]:
-        for part in _blocks(rows, m, least):
+    def told(parts: Iterator[Any]) -> Iterator[Any]:
+        for part in parts:
             if on_block is not None:
                 on_block()
             yield part
 
-    def of_part(part, device) -> Reduced:
-        if not on_host:
-            pairs = _pairs_of(m, part[0].shape[1], least)
-            return Reduced(accelerated.factor(family, part, weight, pairs, device), part[0].size)
-        factor = np.zeros((m + 1, m + 1), order="F")
-        for block in _blocks([part], m):
-            factor = folded(factor, _block_of(family, block, weight))
-        return Reduced(factor, part[0].size)
-
-    def of_both(one: Reduced, other: Reduced, device) -> Reduced:
-        seen = one.rows + other.rows
-        if not on_host:
-            return Reduced(accelerated.merged(one.factor, other.factor, device), seen)
-        return Reduced(folded(one.factor, other.factor, triangular=True), seen)
-
-    found = row_blocks.tree(of_part, parts(), of_both)
-    return Reduced(np.zeros((m + 1, m + 1), order="F"), 0) if found is None else found
+    if row_blocks.devices():
+        found = _on_devices(family, rows, weight, told)
+    else:
+        found = _of_parts(family, told(_blocks(rows, family.num_parameters)), weight)
+    if not found.finite:
+        raise FitError("expected finite gradients of all terms and finite targets on the pairs")
+    return found
 
 
-def merged(one: Reduced, other: Reduced) -> Reduced:
-    """The factor of the rows of both."""
-    with one_thread():
-        factor = folded(np.array(one.factor, order="F"), np.array(other.factor, order="F"))
-    return Reduced(factor, one.rows + other.rows)
+def _of_parts(family: Any, parts: Iterable[Sequence[Any]], weight) -> Triangle:
+    """The triangle of these blocks of (w, target_gradient), and args."""
+    m = family.num_parameters
+
+    def rows() -> Iterator[np.ndarray]:
+        for w, target, *args in parts:
+            block = np.empty((w.size, m + 1), order="F")
+            gradients = family.term_gradients(w, *args) * weight[:, None]
+            block[:, :m] = gradients.reshape(-1, m)
+            block[:, m] = (target * weight).ravel()
+            yield block
+
+    return Triangle.of_blocks(rows(), m)
+
+
+def _on_devices(family: Any, rows, weight, told: Callable[[Iterator], Iterator]) -> Triangle:
+    """The triangle of rows that are shared out among devices."""
+    m = family.num_parameters
+    on_host = row_blocks.devices()[0].platform == "cpu" or not accelerated.takes(family)
+    least = (_PART_ON_CPU if on_host else _PART_ON_ACCELERATORS) * (m + 1)
+
+    def of_part(part, device) -> Triangle:
+        if on_host:
+            return _of_parts(family, _blocks([part], m), weight)
+        pairs = _pairs_of(m, part[0].shape[1], least)
+        return Triangle(accelerated.factor(family, part, weight, pairs, device), part[0].size)
+
+    def of_both(one: Triangle, other: Triangle, device) -> Triangle:
+        if on_host:
+            return one.merge(other)
+        factor = accelerated.merged(one.factor, other.factor, device)
+        return Triangle(factor, one.rows + other.rows)
+
+    found = row_blocks.tree(of_part, told(_blocks(rows, m, least)), of_both)
+    return Triangle.empty(m) if found is None else found
 
 
 def _blocks(rows, num_parameters: int, least: int = 0) -> Iterator[tuple[np.ndarray, ...]]:
@@ -166,7 +142,9 @@ def _pairs_of(num_parameters: int, width: int, least: int) -> int:
     return max(1, max(_FEWEST_ROWS, _BLOCK_BYTES // (8 * (num_parameters + 1)), least) // width)
 
 
-def residuals(train: Reduced, held: Reduced, sizes: Sequence[int]) -> list[tuple[float, float]]:
+def residuals(
+    train: Triangle, held: Triangle, sizes: Sequence[int]
+) -> list[tuple[float, float]]:  # fmt: skip
     """(train_rms, validation_rms) of the leading ``size`` terms, for each of these sizes.
 
     Of the plain solution, by one triangular solve, where the training rows determine it well; else
@@ -175,78 +153,53 @@ def residuals(train: Reduced, held: Reduced, sizes: Sequence[int]) -> list[tuple
     return [_residual(train, held, size) for size in sizes]
 
 
-def _residual(train: Reduced, held: Reduced, size: int) -> tuple[float, float]:
-    a, b = train.factor[:size, :size], train.factor[:, -1]
-    column = np.linalg.norm(a, axis=0)
+def _residual(train: Triangle, held: Triangle, size: int) -> tuple[float, float]:
+    a, b = train.leading(size)
     diagonal = np.abs(np.diagonal(a))
-    well_conditioned = (diagonal > _WELL_CONDITIONED * column).all()
+    well_conditioned = (diagonal > _WELL_CONDITIONED * np.linalg.norm(a, axis=0)).all()
     if not well_conditioned or train.rows < _WELL_DETERMINED * size:
         fit = solve(train, held, size)
         return fit.train_rms, fit.validation_rms
-    c = scipy.linalg.solve_triangular(a, b[:size], check_finite=False)
-    return _rms(np.linalg.norm(b[size:]), train.rows), _rms(_missed(held, c), held.rows)
+    c = scipy.linalg.solve_triangular(a, b, check_finite=False)
+    return _rms(train.residual_norm(size), train), _rms(held.missed(c), held)
 
 
-def _missed(reduced: Reduced, coefficients) -> float:
-    """‖A c − b‖ of the leading terms."""
-    size = len(coefficients)
-    top = reduced.factor[:size, :size] @ coefficients - reduced.factor[:size, -1]
-    return float(np.hypot(np.linalg.norm(top), np.linalg.norm(reduced.factor[size:, -1])))
+def _rms(norm: Any, of: Triangle) -> float:
+    return float(norm) / math.sqrt(of.rows)
 
 
-def _rms(norm: Any, rows: int) -> float:
-    return float(norm) / math.sqrt(rows)
-
-
-def solve(train: Reduced, held: Reduced, num_terms: int) -> LeastSquaresFit:
+def solve(train: Triangle, held: Triangle, num_terms: int) -> LeastSquaresFit:
     """Coefficients of the leading ``num_terms`` terms.
 
     Scaled columns; the ridge parameter with the smallest error on the held-out rows where that is
     smaller than the plain one's by more than their noise makes it by chance, so that too few data
     give a regularised fit and others the plain one: what a ridge shrinks, no posterior knows of.
     """
-    # Below its leading block R has zeros in these columns.
-    a, b = train.factor[:num_terms, :num_terms], train.factor[:num_terms, -1]
-    held_a, held_b = held.factor[:num_terms, :num_terms], held.factor[:num_terms, -1]
-    held_rest = np.linalg.norm(held.factor[num_terms:, -1])
-    column = np.linalg.norm(a, axis=0)
-    column = np.where(column > 0, column, 1.0)
-    u, s, vt = np.linalg.svd(a / column, full_matrices=False)
-    along = u.T @ b
-    cutoff = np.finfo(np.float64).eps * len(train.factor) * s[0]
-    known = s > cutoff
-    plain = np.where(known, 1.0 / np.where(known, s, 1.0), 0.0)
-    filters = np.stack([plain, *(_ridge_filter(s, ridge) for ridge in _RIDGES[1:])])
-    tried = (vt.T @ (filters * along).T) / column[:, None]
-    errors = np.hypot(np.linalg.norm(held_a @ tried - held_b[:, None], axis=0), held_rest)
+    found = train.spectrum(num_terms)
+    filters = np.stack([found.inverse, *(found.ridged(ridge) for ridge in _RIDGES[1:])])
+    tried = found.solution(filters)
+    errors = held.missed(tried)
     best = int(np.argmin(errors))
-    apart = np.linalg.norm(held_a @ (tried[:, best] - tried[:, 0]))
+    apart = held.image_norm(tried[:, best] - tried[:, 0])
     by_chance = _CERTAIN * 2 * apart * errors[best] / math.sqrt(max(held.rows, 1))
     if not errors[0] ** 2 - errors[best] ** 2 > by_chance:
         best = 0
     c, error = tried[:, best], errors[best]
     # A coefficient no larger than rounding of b would make it is zero, if held-out pairs agree.
     # A symmetry of S that is broken by 1e-17 biases the rounding of every step in one direction.
-    rounding = 4 * np.finfo(np.float64).eps * np.linalg.norm(train.factor[:, -1])
-    noise = rounding * np.linalg.norm(vt.T * filters[best], axis=1) / column
+    noise = 4 * np.finfo(np.float64).eps * train.norm * found.deviations(filters[best])
     rounded = np.where(np.abs(c) > noise, c, 0.0)
-    rounded_error = _missed(held, rounded)
+    rounded_error = held.missed(rounded)
     if rounded_error <= 1.01 * error:
         c, error = rounded, rounded_error
     return LeastSquaresFit(
         coefficients=c,
-        train_rms=_rms(_missed(train, c), train.rows),
-        validation_rms=_rms(error, held.rows),
-        rank=int(known.sum()),
-        condition=float(s[0] / s[-1]) if s[-1] > 0 else float("inf"),
+        train_rms=_rms(train.missed(c), train),
+        validation_rms=_rms(error, held),
+        rank=found.rank,
+        condition=found.condition,
         ridge=_RIDGES[best],
     )
-
-
-def _ridge_filter(s, ridge: float):
-    """What the singular values' reciprocals become: s / (s² + (ridge s₀)²); zero where s₀ is."""
-    damped = s**2 + (ridge * s[0]) ** 2
-    return np.divide(s, damped, out=np.zeros_like(s), where=damped > 0)
 
 
 def fit(
@@ -256,5 +209,5 @@ def fit(
     weight: np.ndarray,
 ) -> LeastSquaresFit:
     """Fit one linear family to (w, target_gradient): ``reduce`` and ``solve`` in one go."""
-    factors = [reduce(family, [rows], weight) for rows in (train, held)]
-    return solve(factors[0], factors[1], family.num_parameters)
+    triangles = [reduce(family, [rows], weight) for rows in (train, held)]
+    return solve(triangles[0], triangles[1], family.num_parameters)

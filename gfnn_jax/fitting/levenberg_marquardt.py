@@ -25,6 +25,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -34,6 +35,7 @@ import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
+from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families import Family
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.phase_space import require_x64
@@ -42,6 +44,7 @@ from gfnn_jax.phase_space import require_x64
 LARGEST_ACCELERATION = 0.75
 # Damping grown by 2^(1 + 2 + ... + 10) without descent: F is flat to roundoff.
 MAX_TRIALS = 11
+BLOCK = 10  # iterations that are made together: a unit of a fit's budget
 # Of members that are trained together: damping after a step that has not lowered F.
 TOGETHER_GROWTH = 4.0
 
@@ -78,7 +81,7 @@ class LMResult(NamedTuple):
 
     train_rms is of the last iteration, validation_rms of ``params``; both are per component of ∇S,
     so that dt times them is the one-step state error to first order in dt. iterations and seconds
-    include what was resumed from. stopped_because: target, iterations, seconds or no progress.
+    include what was resumed from. stopped_because: target, iterations, budget or no progress.
     """
 
     params: Any
@@ -99,7 +102,7 @@ def levenberg_marquardt(
     validation: tuple[Rows, Rows],
     weight: Any = 1.0,
     max_iterations: int = 200,
-    max_seconds: float | None = None,
+    block: Callable[[int], AbstractContextManager] = lambda iterations: nullcontext(),
     target_rms: float = 0.0,
     patience: int = 20,
     chunk: int = 500,
@@ -115,9 +118,10 @@ def levenberg_marquardt(
     validation:  (w, target_gradient) of pairs kept apart; the parameters that fit them best are
                  returned.
     weight:      (2d,), or one for all: what makes a row of ∇S unit-free.
-    max_iterations, max_seconds: when to stop; seconds exclude compilation. Runs that stop by
-                 iterations repeat to the last bit on one machine with the same number of threads;
-                 the clock does not.
+    max_iterations: when to stop. A run repeats to the last bit on one machine with the same number
+                 of threads.
+    block:       gives the context in which the next so many iterations are made; it raises
+                 OutOfTime to stop before them.
     target_rms:  stop once the validation RMS is as small.
     patience:    stop when train_rms fell by less than 1 % in so many iterations.
     chunk:       at most so many pairs have their Jacobian in memory at once.
@@ -147,7 +151,7 @@ def levenberg_marquardt(
     _compile(family, chunks, held, theta, layout)
     compile_seconds = time.perf_counter() - started
     options = _Options(
-        max_iterations, max_seconds, target_rms, patience, (on_progress, checkpoint)
+        max_iterations, block, target_rms, patience, (on_progress, checkpoint)
     )  # fmt: skip
     first = _first_state(theta, math.nan, validation_rms(theta)) if resume is None else resume
     state, why = _trained(first, descend, validation_rms, w.size, options)
@@ -165,7 +169,7 @@ def levenberg_marquardt_together(
     weight: Any = 1.0,
     shares: Float[np.ndarray, "_ _"],
     max_iterations: int = 200,
-    max_seconds: float | None = None,
+    block: Callable[[int], AbstractContextManager] = lambda iterations: nullcontext(),
     target_rms: float = 0.0,
     patience: int = 20,
     chunk: int = 500,
@@ -213,7 +217,7 @@ def levenberg_marquardt_together(
     _loss_of_mean.lower(family, held, theta, layout=layout).compile()
     compile_seconds = time.perf_counter() - started
     options = _Options(
-        max_iterations, max_seconds, target_rms, patience, (on_progress, checkpoint)
+        max_iterations, block, target_rms, patience, (on_progress, checkpoint)
     )  # fmt: skip
     first = _first_state(theta, unknown, validation_rms(theta)) if resume is None else resume
     state, why = _trained(first, descend, validation_rms, w.size, options)
@@ -258,7 +262,7 @@ class _Options(NamedTuple):
     """When a training stops, and who is told of its states."""
 
     max_iterations: int
-    max_seconds: float | None
+    block: Callable[[int], AbstractContextManager]
     target_rms: float
     patience: int
     told: tuple[Callable[[LMState], Any] | None, ...]
@@ -273,17 +277,15 @@ def _trained(state: LMState, descend, validation_rms, size: int, options: _Optio
             return "target"
         if state.iteration >= options.max_iterations:
             return "iterations"
-        if options.max_seconds is not None and state.seconds >= options.max_seconds:
-            return "seconds"
         if state.iteration - state.landmark_iteration >= options.patience:
             return "no progress"
         return None
 
-    while (stopped_because := reason_to_stop(state)) is None:
+    def iterate(state):
+        """The next state, or None where no step lowers F."""
         step = descend(state.theta, state.damping)
         if step is None:
-            stopped_because = "no progress"
-            break
+            return None
         theta, loss, damping = step
         train_rms = math.sqrt(loss / size)
         seconds = seconds_before + time.perf_counter() - started
@@ -291,6 +293,20 @@ def _trained(state: LMState, descend, validation_rms, size: int, options: _Optio
         for report in options.told:
             if report is not None:
                 report(state)
+        return state
+
+    while (stopped_because := reason_to_stop(state)) is None:
+        try:
+            with options.block(BLOCK):
+                for _ in range(BLOCK):
+                    further = iterate(state)
+                    if further is None:
+                        return state, "no progress"
+                    state = further
+                    if reason_to_stop(state) is not None:
+                        break
+        except OutOfTime:
+            return state, "budget"
     return state, stopped_because
 
 

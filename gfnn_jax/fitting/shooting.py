@@ -10,9 +10,9 @@ the maximum of the likelihood where noise is normal (Bock, Springer Ser. Chem. P
 without his matching conditions: an arc ends where noise would have grown beyond the linear). ρ is
 Tukey's biweight, quadratic for most residuals and constant for gross errors of measurement.
 
-The Gauss–Newton equations are an arrow: x of an arc meets c and no other x. A QR factorisation of
-each arc's own rows leaves rows of c alone, which are folded into one triangle: the cost is linear
-in the number of arcs.
+The Gauss–Newton equations are an arrow: x of an arc meets c and no other x. It is eliminated from
+the arc's own rows; those that are left, of c alone, are folded into one triangle
+(`fitting.triangle`): the cost is linear in the number of arcs.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import nearest_image
+from gfnn_jax.dataset.noise import of_residuals
+from gfnn_jax.fitting.triangle import Spectrum, Triangle, eliminated
 from gfnn_jax.flows.collocation import Steps, images
 
 
@@ -52,7 +54,6 @@ class Options:
 
 
 OPTIONS = Options()
-_NORMAL = 1.4826  # a normal deviation over the median of its size
 
 
 class Arcs(NamedTuple):
@@ -65,15 +66,14 @@ class Arcs(NamedTuple):
 
 class Shot(NamedTuple):
     """coefficients (m,). root: (m, m), rootᵀ root is their covariance. noise: (2d,) standard
-    deviation of each coordinate's noise. factor: R of [∂r/∂c, r] (m + 1, m + 1) without the latent
-    states, r in units of the noise, and ``rows``, for which it stands. outlying: measured states
-    that are gross errors. cost: the mean of ρ at the end."""
+    deviation of each coordinate's noise. triangle: of [∂r/∂c, r] without the latent states, r in
+    units of the noise, for the rows that have weight. outlying: measured states that are gross
+    errors. cost: the mean of ρ at the end."""
 
     coefficients: np.ndarray
     root: np.ndarray
     noise: np.ndarray
-    factor: np.ndarray
-    rows: int
+    triangle: Triangle
     outlying: int
     cost: float
 
@@ -135,7 +135,7 @@ class Shooting:
         for _ in range(self.options.rounds):
             problem = self._linearised(family, c, x, noise)
             cost = self._cost(residual, noise)
-            move = np.zeros_like(c) if only_states else -_solved(problem.factor)
+            move = np.zeros_like(c) if only_states else -_solved(problem.triangle.spectrum())
             shift = problem.shift(move)
             found = None
             for n in range(self.options.halvings):
@@ -154,12 +154,13 @@ class Shooting:
                 break
             noise = sharper
         problem = self._linearised(family, c, x, noise)
-        weight = self._weights(residual, noise)
+        weighty = int((self._weights(residual, noise) > 0).sum())
+        triangle = dataclasses.replace(problem.triangle, rows=weighty)
         far = np.abs(residual) > self.options.outlying * noise
         outlying = np.any(far & self.arcs.measured[..., None], axis=2)
         return Shot(
-            c, _root(problem.factor, problem.scores), noise, problem.factor,
-            int((weight > 0).sum()), int(outlying.sum()), self._cost(residual, noise),
+            c, _root(triangle.spectrum(), problem.scores), noise, triangle, int(outlying.sum()),
+            self._cost(residual, noise),
         )  # fmt: skip
 
     def residuals(self, family, c, x) -> np.ndarray:
@@ -198,14 +199,8 @@ class Shooting:
     def _deviations(self, residual) -> np.ndarray:
         """(2d,) of the noise, from the residuals that are no gross errors."""
         known = residual[self.arcs.measured]
-        middle = _NORMAL * np.median(np.abs(known), axis=0)
-        inside = np.abs(known) <= self.options.outlying * middle
-        width = known.shape[1]
-        free = 1.0 - len(residual) * width / known.size
-        square = np.sum(np.where(inside, known, 0.0) ** 2, axis=0) / np.maximum(
-            inside.sum(axis=0), 1
-        )
-        return np.hypot(np.sqrt(square / max(free, 0.5 / width)), self.least)
+        free = max(1.0 - residual[:, 0].size / known.size, 0.5 / known.shape[1])
+        return np.hypot(of_residuals(known, free, self.options.outlying), self.least)
 
     def _weights(self, residual, noise, block=slice(None)) -> np.ndarray:
         size = np.minimum(np.abs(residual) / (self.options.biweight * noise), 1.0)
@@ -222,23 +217,18 @@ class Shooting:
     def _linearised(self, family, c, x, noise) -> _Arrow:
         count, width, length = len(c), x.shape[1], self.arcs.states.shape[1]
         size = max(1, self.options.block_bytes // (8 * length * width * (count + width)))
-        factor, parts = np.zeros((count + 1, count + 1)), []
+        triangle, parts = Triangle.empty(count), []
         for first in range(0, len(x), size):
             block = slice(first, first + size)
             by_state, by_c, residual = self._along(family, c, x[block], block)
             weight = np.sqrt(self._weights(residual, noise, block)) / noise
-            rest = np.concatenate([by_c, residual[..., None]], axis=-1)
-            own, rest = weight[..., None] * by_state, weight[..., None] * rest
-            rows = residual.shape[1] * width
-            rest = rest.reshape(-1, rows, count + 1)
-            q, r = np.linalg.qr(own.reshape(-1, rows, width))
-            inside = q.swapaxes(1, 2) @ rest
-            rest = rest - q @ inside
-            stacked = np.concatenate([factor, rest.reshape(-1, count + 1)])
-            factor = np.asarray(np.linalg.qr(stacked, mode="r"))
-            parts.append((r, inside, rest[..., :-1].swapaxes(1, 2) @ rest[..., -1:]))
-        r, inside, scores = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return _Arrow(factor, r, inside, scores[..., 0])
+            rows = np.concatenate([by_state, by_c, residual[..., None]], axis=-1)
+            rows = (weight[..., None] * rows).reshape(len(residual), length * width, -1)
+            own, inside, rest = eliminated(rows, width)
+            triangle = triangle.append(rest.reshape(-1, count + 1))
+            parts.append((own, inside, rest[..., :-1].swapaxes(1, 2) @ rest[..., -1:]))
+        own, inside, scores = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return _Arrow(triangle, own, inside, scores[..., 0])
 
     def _along(self, family, c, x, block) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """∂z_k/∂x, ∂z_k/∂c and the residuals along the arcs from x (b, 2d)."""
@@ -257,11 +247,11 @@ class Shooting:
 
 
 class _Arrow(NamedTuple):
-    """factor: R of the rows of c that the arcs' own states do not explain. own: (B, 2d, 2d) each
+    """triangle: of the rows of c that the arcs' own states do not explain. own: (B, 2d, 2d) each
     arc's triangle, inside: (B, 2d, m + 1) what it has of [∂r/∂c, r]. scores: (B, m) each arc's part
     of the gradient in c."""
 
-    factor: np.ndarray
+    triangle: Triangle
     own: np.ndarray
     inside: np.ndarray
     scores: np.ndarray
@@ -275,29 +265,14 @@ class _Arrow(NamedTuple):
             return -(np.linalg.pinv(self.own) @ left[..., None])[..., 0]
 
 
-def _parts(factor):
-    """Singular values and right vectors of R with columns scaled to one, those that are told, and
-    what they are multiplied by."""
-    count = factor.shape[1] - 1
-    a = factor[:, :count]
-    size = np.linalg.norm(a, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    u, s, vt = np.linalg.svd(a / size, full_matrices=False)
-    inverse = np.where(s > np.finfo(float).eps * count * s[0], 1 / np.where(s > 0, s, 1.0), 0.0)
-    return size, inverse, vt, u.T @ factor[:, count]
+def _solved(spectrum: Spectrum) -> np.ndarray:
+    return spectrum.solution(spectrum.inverse)
 
 
-def _solved(factor) -> np.ndarray:
-    size, inverse, vt, along = _parts(factor)
-    return vt.T @ (inverse * along) / size
-
-
-def _root(factor, scores) -> np.ndarray:
+def _root(spectrum: Spectrum, scores) -> np.ndarray:
     """(m, m), rootᵀ root the covariance: that of independent noise, widened where the arcs' own
     gradients vary by more than noise makes them: misfit is alike along an arc."""
-    size, inverse, vt, _ = _parts(factor)
-    root = (vt * inverse[:, None]) / size
-    count, arcs = factor.shape[1] - 1, len(scores)
+    root, (arcs, count) = spectrum.root().T, scores.shape
     vary = np.sum((scores @ root.T) ** 2) / count / max(1 - count / arcs, 1 / arcs)
     return root * np.sqrt(max(vary, 1.0))
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import gammainc
 
-from gfnn_jax.fitting.least_squares import Reduced
+from gfnn_jax.fitting.triangle import Triangle
 
 # A row is never taken for one that the coefficients reproduce whatever it says.
 _MOST_LEVERAGE = 0.9
@@ -30,14 +30,14 @@ ALIKE = 2.0
 _FEWEST_TERMS, _TINY = 3, 1e-280
 
 
-def variance(reduced: Reduced, size: int, freedom: float | None = None) -> float:
+def variance(triangle: Triangle, size: int, freedom: float | None = None) -> float:
     """Mean square per degree of freedom that the leading ``size`` terms leave of these rows.
 
     freedom: degrees that noise takes of them, `shared_noise.freedom`; None: it is independent from
     row to row, and takes ``size``.
     """
-    left = float(np.sum(reduced.factor[size:, -1] ** 2))
-    return left / max(reduced.rows - (size if freedom is None else freedom), 1.0)
+    left = triangle.residual_norm(size) ** 2
+    return left / max(triangle.rows - (size if freedom is None else freedom), 1.0)
 
 
 def misfit(explained: float, terms: int, variance: float) -> float:
@@ -61,7 +61,7 @@ def misfit(explained: float, terms: int, variance: float) -> float:
 
 
 def root(
-    train: Reduced, size: int, sample: np.ndarray, residual: np.ndarray, *,
+    train: Triangle, size: int, sample: np.ndarray, residual: np.ndarray, *,
     noise: float | None, ridge: float = 0.0, scores: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
     """(size, size): rootᵀ root is the covariance of the coefficients of the leading terms.
@@ -72,14 +72,8 @@ def root(
     `shared_noise.scores`; None: it is independent from row to row. Directions that are not told, of
     columns scaled to one, are 0, as in the solution.
     """
-    a = train.factor[:size, :size]
-    column = np.linalg.norm(a, axis=0)
-    column = np.where(column > 0, column, 1.0)
-    _, s, vt = np.linalg.svd(a / column, full_matrices=False)
-    known = s > np.finfo(np.float64).eps * len(train.factor) * s[0]
-    filters = np.where(known, 1.0 / (np.where(known, s, 1.0) ** 2 + (ridge * s[0]) ** 2), 0.0)
-    told = max(float(np.sum(filters * s**2)), 1.0)
-    along = vt.T / column[:, None] * np.sqrt(filters)
+    spectrum = train.spectrum(size)
+    along, told = spectrum.root(ridge), max(spectrum.freedom(ridge), 1.0)
     leverage = np.minimum(np.sum((sample @ along) ** 2, axis=1), _MOST_LEVERAGE)
     rows = np.linalg.qr((residual / (1 - leverage))[:, None] * sample, mode="r")
     share = 0.0 if noise is None else min(noise, 1.0)

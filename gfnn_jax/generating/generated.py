@@ -1,8 +1,8 @@
-"""The piece that a generating function makes: Z − z = h J ∇S(w) (paper, eq. (4)).
+"""Piece of a map that a generating function makes: Z − z = h J ∇S(w) (paper, eq. (4)).
 
-The implicit equation for w is solved to roundoff by Newton's method; where S has too many degrees
-of freedom for matrices, by fixed point or Newton–Krylov. Derivatives in the state, the parameters
-and dt come from the implicit function theorem.
+The implicit equation for w is solved to roundoff by Newton's method, or by a fixed point and
+Newton–Krylov where S has too many degrees of freedom for matrices. Derivatives in the state, the
+parameters and dt come from the implicit function theorem.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ MOST_UPDATES = 40
 
 @dataclasses.dataclass(frozen=True)
 class ImplicitStep:
-    """The implicit equation of a chart as the solver wants it: x is the free part of w.
+    """Implicit equation of a chart for the solver; its unknown x is the free part of w.
 
-    shared = (family, params, dt, scale); lanes = (z, w where it is known, args), and (B, 1) a dt of
-    each lane where shared has none. A residual is in units of the coordinates' sizes, so that its
-    floor is one number.
+    shared = (family, params, dt, scale). lanes = (z, w where it is known, args), followed by a dt
+    of each lane (B, 1) where shared has None. The residual is in units of the coordinates' sizes,
+    so that its roundoff floor is one number.
     """
 
     chart: AnyChart
 
     def evaluate(self, shared, lanes, x) -> Evaluation:
-        """The residual; aux is ∇S(w), (B, 2d)."""
+        """Residual; aux is ∇S(w), (B, 2d)."""
         (family, params, dt, scale), (z, known, args, *own_dt) = shared, lanes
         w = self.chart.complete(known, x)
         gradient = symmetric_gradient(family, params, w, args)
         return self._evaluation(z, w, gradient, own_dt[0] if own_dt else dt, scale)[0]
 
     def linearise(self, shared, lanes, x) -> tuple[Evaluation, Any]:
-        """The residual and its Jacobian ∂r/∂x (B, n, n)."""
+        """Residual, and its Jacobian ∂r/∂x (B, n, n)."""
         (family, params, dt, scale), (z, known, args, *own_dt) = shared, lanes
         w = self.chart.complete(known, x)
         gradient, hessian = symmetric_gradient_and_hessian(family, params, w, args)
@@ -61,14 +61,16 @@ class ImplicitStep:
         return evaluation, matrix / unit[..., None]
 
     def unit(self, shared, lanes):
-        """The residual's units (B, n), by which it is the change of a fixed-point iteration."""
+        """Units (B, n) of the residual; residual times unit is the update of a fixed point."""
         (_, _, dt, scale), (z, *_) = shared, lanes
         unit, _ = self.chart.sizes(scale, z, namespace(z).zeros_like(z), dt)
         return jax.lax.stop_gradient(unit) if namespace(z) is jnp else unit
 
     def product(self, shared, lanes, x):
-        """v (B, n) -> (∂r/∂x) v in the residual's units, by products with S'': for families that
-        do without matrices."""
+        """Linear map v (B, n) -> (∂r/∂x) v in the residual's units, by products with S''.
+
+        It serves matrix-free families.
+        """
         (family, params, dt, _), (z, known, args) = shared, lanes
         bends = family.curvatures(params, self.chart.complete(known, x), args)
         unit, nothing = self.unit(shared, lanes), namespace(z).zeros_like(z)
@@ -95,13 +97,14 @@ class ImplicitStep:
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Generated:
-    """The map that S(params, ·) generates in a chart. A piece: see `maps.symplectic_map`. Where S
-    depends on the time, it does on that of the middle of the step, whichever way the step is made.
+    """Map that S(params, ·) generates in a chart. A piece: see `maps.symplectic_map`.
 
-    family: S, a family or a plain ``S(params, w)``; what it holds of the data are leaves.
-    dt:     the time step h, a number or a leaf of the map; of an S of dt also (B,), each lane's.
+    An S that depends on time is taken at the time of the middle of the step, forward and backward.
+
+    family: S, a family or a plain ``S(params, w)``; its numbers from the data are leaves.
+    dt:     the time step h, a number or a leaf of the map; one per lane (B,) for an S of dt.
     scale:  (2d,) sizes of the coordinates, for the roundoff floor.
-    predictor: where the solves start; None: at the chart's own first guess.
+    predictor: first guesses of the solves; with None the chart's own first guess.
     """
 
     family: Any
@@ -117,10 +120,10 @@ class Generated:
             object.__setattr__(self, "dt", np.asarray(self.dt, self.scale.dtype))
 
     def solve(self, z, args=None, *, unrolled: bool | int = False):
-        """(w, ∇S(w), Info) for the states z (B, 2d).
+        """Solve for w: (w, ∇S(w), Info) at the states z (B, 2d).
 
-        unrolled: whether derivatives are those of the iterations that ran, not of the implicit
-        function; a number says that at most so many updates ran.
+        unrolled: True makes derivatives those of the iterations that ran instead of those of the
+        implicit function; a number also bounds the number of updates.
         """
         known = self.chart.first_guess(z)
         guess = known[:, self.chart.free(z.shape[1] // 2)]
@@ -151,22 +154,26 @@ class Generated:
         return fixed_point.root(equation, shared, lanes, jax.lax.stop_gradient(guess))
 
     def step(self, z, args=None, *, unrolled: bool | int = False):
-        """(Z, Info) of the states z (B, 2d), by JAX."""
+        """Step the states z (B, 2d): (Z, Info), by JAX."""
         w, gradient, info = self.solve(z, args, unrolled=unrolled)
         return self.chart.image(z, w, gradient, self._by_lane), info
 
     def compensated_step(self, z, compensation, args=None):
-        """(Z, compensation, Info) of z + compensation, which is what rounding has lost so far
-        (compensated summation: Hairer, Lubich & Wanner, "Geometric Numerical Integration",
-        section VIII.5)."""
+        """Step z + compensation (B, 2d): (Z, compensation, Info).
+
+        The compensation is what rounding has lost so far (compensated summation: Hairer, Lubich &
+        Wanner, "Geometric Numerical Integration", section VIII.5).
+        """
         w, gradient, info = self.solve(z, args)
         if not isinstance(self.chart, Chart):  # Z is no sum
             return self.chart.image(z, w, gradient, self.dt), jnp.zeros_like(z), info
         return *two_sum(z, self._by_lane * apply_j(gradient) + compensation), info
 
     def refined_step(self, z, guess, args=None):
-        """(Z, error (B,)) of the states z (B, 2d) in NumPy, from evaluation points w (B, 2d) that
-        are known to be close: see `solve.newton.refine`. Nothing is compiled."""
+        """Step z (B, 2d) in NumPy from evaluation points w (B, 2d) that are close: (Z, error (B,)).
+
+        See `solve.newton.refine`. Nothing is compiled.
+        """
         refine = fixed_point.refine if matrix_free(self.family) else newton.refine
         dim = z.shape[1] // 2
         x = guess[:, self.chart.free(dim)]
@@ -176,14 +183,16 @@ class Generated:
         return self.chart.image(z, self.chart.complete(known, x), gradient, self._by_lane), error
 
     def action(self, z, image, origin, args=None):
-        """The action (B,) of the step from z (B, 2d) to its image: S itself, at their w. NumPy or
-        JAX."""
+        """Action (B,) of the step from z (B, 2d) to its image about the origin, by S at their w.
+
+        NumPy or JAX.
+        """
         w = self.chart.evaluation_point(z, image)
         generated = self.dt * self.family.value(self.params, w, self._midway(args))
         return self.chart.action(z, image, origin, generated)
 
     def inverse(self) -> Generated:
-        """The inverse map: the same S, the chart read from its other side."""
+        """Make the inverse map: the same S, with the chart read from its other side."""
         chart, dt = self.chart.reverse(self.dt)
         predictor = self.predictor.reverse() if self.predictor is not None else None
         return dataclasses.replace(self, chart=chart, dt=dt, predictor=predictor)
@@ -193,8 +202,10 @@ class Generated:
         return 1.0
 
     def determinant(self, z0, z1, args=None):
-        """det ∂w/∂z (B,) at states z0 (B, 2d) with images z1, NumPy or JAX: it vanishes where the
-        chart is singular. NaN where S does without matrices."""
+        """Determinant det ∂w/∂z (B,) at states z0 (B, 2d) with images z1, NumPy or JAX.
+
+        It vanishes where the chart is singular. It is NaN for a matrix-free S.
+        """
         if matrix_free(self.family):
             return namespace(z0).full(z0.shape[0], np.nan, z0.dtype)
         w = self.chart.evaluation_point(z0, z1)
@@ -204,34 +215,33 @@ class Generated:
 
     @property
     def serves_any_dt(self) -> bool:
-        """Whether S was learned as a function of dt."""
+        """True where S was learned as a function of dt."""
         return isinstance(self.family, OfTimeStep)
 
     def over(self, dt) -> Generated:
-        """The map over another dt, a number or (B,), of an S of dt."""
+        """Make the map over another dt, a number or (B,), from an S of dt."""
         return dataclasses.replace(self, dt=dt)
 
     @property
     def _by_lane(self):
-        """dt as it multiplies states: a number, or (B, 1)."""
+        """Time step in the shape that multiplies states: a number, or (B, 1)."""
         return self.dt[:, None] if np.ndim(self.dt) else self.dt
 
     def _shared_and_lanes(self, z, known, args) -> tuple[tuple, tuple]:
-        """Those of `ImplicitStep`."""
+        """Arguments ``shared`` and ``lanes`` of `ImplicitStep`."""
         if np.ndim(self.dt):
             return (self.family, self.params, None, self.scale), (z, known, args, self._by_lane)
         return (self.family, self.params, self.dt, self.scale), (z, known, args)
 
     def _midway(self, args):
-        """What S depends on beside w: args in the middle of the step that begins with them, or the
-        step itself."""
+        """Args of S: those in the middle of the step that begins with ``args``, or dt itself."""
         if self.serves_any_dt:
             return self._by_lane if np.ndim(self.dt) else self.dt[None]
         return at_time(self.family, args, 0.5 * self.dt)
 
 
 def two_sum(a, b):
-    """a + b as rounded, and what the rounding lost, exactly (Knuth, TAOCP 2, section 4.2.2)."""
+    """Return a + b as rounded, and the exact rounding error (Knuth, TAOCP 2, section 4.2.2)."""
     total = a + b
     part = total - a
     return total, (a - (total - part)) + (b - part)

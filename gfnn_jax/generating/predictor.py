@@ -1,10 +1,9 @@
-"""The predictor: an explicit polynomial model of a chart's unknowns, where the solve starts.
+"""Predictor: an explicit polynomial model of a chart's unknowns, at which the solve starts.
 
-The model is fitted to pairs, where the unknowns are explicit: those that S is fitted to, or states
-and their images by the map itself, to which it can be closer where S is coarse. It need not be
-symplectic: the solve corrects it and forgets it, but for two things. A guess that is as close as
-the root of roundoff leaves one Newton update to do, and beside a fold of S it decides which of the
-branches is found: that of the data.
+The model is fitted to pairs, where the unknowns are explicit: the pairs that S is fitted to, or
+states and their images by the map itself, to which it can be closer where S is coarse. It need not
+be symplectic, because the solve corrects it. A guess as close as the root of roundoff leaves a
+single Newton update. Next to a fold of S the guess decides which branch is found, that of the data.
 """
 
 from __future__ import annotations
@@ -28,24 +27,24 @@ from gfnn_jax.threads import one_thread
 
 # A guess this close, in units of the data's spread, is the root of roundoff: one update is left.
 CLOSE = 5e-8
-# What that update leaves is the square of it, the same at every step: below the floor, but more
-# than roundoff makes of a million steps. Guesses so close leave less (Hénon–Heiles, S of degree 8:
-# the energy error grows with the 0.55th power of the steps instead of the 0.86th).
+# That update leaves the square of the guess's error, the same at every step: below the floor, but
+# more than the roundoff of a million steps. Guesses closer than this leave less (Hénon–Heiles, S of
+# degree 8: the energy error grows with the 0.55th power of the steps instead of the 0.86th).
 _STEADY = 1e-8
-# The model goes on a little outside the box, where rollouts of states at its edge do, but not
-# where T_n of its own degree is larger than 250.
+# The model extends a little outside the box, as rollouts of states at its edge do, but not to where
+# T_n of its own degree is larger than 250.
 _REACH, _LARGEST = 1.2, 250.0
 _MOST_DEGREE, _MOST_TERMS, _ROWS = 20, 250, 4_000
-_RIDGE = 1e-13  # of a column's size: data on a surface leave some products undetermined
+_RIDGE = 1e-13  # relative to a column's size: data on a surface leave some products undetermined
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("family", "matrices"), meta_fields=())
 @dataclasses.dataclass(frozen=True, eq=False)
 class PolynomialModel:
-    """What the unknowns differ from the chart's own first guess by, as polynomials of the state.
+    """Polynomials of the state for the unknowns minus the chart's own first guess.
 
-    family: the products and their box; far outside the model is that of the nearest point of a
-    slightly larger box, so that it stays as small as it is near the data. matrices: (k, m, n) the
+    family: the products and their box. Far outside, the model is evaluated at the nearest point of
+    a slightly larger box, so that it stays as small as near the data. matrices: (k, m, n) the
     coefficients of the k unknowns, the constant included.
     """
 
@@ -66,19 +65,19 @@ class PolynomialModel:
         return 2 * count * (row * n + (m - row) * column + m) + tables
 
     def __call__(self, z, args=None):
-        """The difference (..., k) at the states z (..., 2d), NumPy or JAX."""
+        """Evaluate the difference (..., k) at the states z (..., 2d), NumPy or JAX."""
         xp, x = namespace(z), self.family.inputs(z, args)
         bound = xp.broadcast_to(xp.asarray(self.reach, dtype=x.dtype), x.shape)
         return self.of_variables(xp.clip(x, -bound, bound))
 
     @property
     def reach(self) -> np.ndarray:
-        """The largest magnitude of each variable that the polynomials are taken at."""
+        """Largest magnitude of each variable at which the polynomials are evaluated."""
         reach = min(_REACH, math.cosh(math.acosh(_LARGEST) / self.family.degree))
         return np.where(self.family.inputs.is_angle, np.inf, reach)
 
     def of_variables(self, x):
-        """The difference (..., k) at the variables x (..., n) of the family, within reach."""
+        """Evaluate the difference (..., k) at the family's variables x (..., n), within reach."""
         (u,), (v,) = self.basis.tables(x, 0)
         row, column = self.basis.corner
         low = self._product(self.matrices[:, :row], u[..., :row], v)
@@ -86,7 +85,7 @@ class PolynomialModel:
 
     @staticmethod
     def _product(matrices, u, v):
-        """Σ C_ab u_a v_b of each matrix (k, m, n): one product of the batch with all of them."""
+        """Compute Σ C_ab u_a v_b for each matrix (k, m, n), by one product with all of them."""
         count, m, n = matrices.shape
         by_row = matmul(v, matrices.reshape(count * m, n).T).reshape(*u.shape[:-1], count, m)
         return namespace(u).sum(by_row * u[..., None, :], axis=-1)
@@ -97,18 +96,18 @@ class PolynomialModel:
 )  # fmt: skip
 @dataclasses.dataclass(frozen=True, eq=False)
 class Predictor:
-    """Where the solves of a map (forward) and of its inverse (backward) start."""
+    """First guesses for the solves of a map (forward) and of its inverse (backward)."""
 
     forward: PolynomialModel
     backward: PolynomialModel
 
     def reverse(self) -> Predictor:
-        """The predictor of the inverse map."""
+        """Make the predictor of the inverse map."""
         return Predictor(self.backward, self.forward)
 
 
 class Fitted(NamedTuple):
-    """A predictor and its RMS error, in units of the data's spread, of the worse direction."""
+    """Predictor with its RMS error in the worse direction, in units of the data's spread."""
 
     predictor: Predictor
     error: float
@@ -118,12 +117,12 @@ def fit_predictors(
     chart: AnyChart, y0, y1, dt: Any, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
     features=None, args=None,
 ) -> list[Fitted]:  # fmt: skip
-    """Predictors of a chart's map and of its inverse, by rising degree.
+    """Fit predictors of a chart's map and of its inverse, by rising degree.
 
-    y0, y1: (N, 2d) states and images, NumPy, angles lifted. dt: a number, or one of each pair (N,),
-    which is then what the models depend on beside the state, of either sign. angles, cyclic,
-    features, args: as those of ``box_inputs``. The degree rises until the model is as close as it
-    need be, or no longer gains: then noise, or the number of pairs, is the limit.
+    y0, y1: (N, 2d) states and images, NumPy, angles lifted. dt: a number, or one per pair (N,), of
+    either sign, on which the models then depend beside the state. angles, cyclic, features, args:
+    arguments of ``box_inputs``. The degree rises until the model is close enough or no longer
+    improves, because of noise or of the number of pairs.
     """
     rows = np.linspace(0, len(y0) - 1, min(_ROWS, len(y0))).astype(int)
     y0, y1, args = y0[rows], y1[rows], None if args is None else args[rows]
@@ -151,11 +150,11 @@ def fit_predictors(
 
 
 def affordable(fitted: list[Fitted], family) -> Fitted:
-    """The closest predictor that costs at most half of what the family's own gradient does, or, if
-    none such leaves a single update to do, one that does.
+    """Choose the closest predictor that costs at most half as much as the family's own gradient.
 
-    That one may cost what it spares: two or three evaluations with a Hessian, whose operations take
-    about twice as long as those of a polynomial model.
+    Where no such predictor leaves a single update, one that does may cost as much as the updates
+    that it saves: two or three evaluations with a Hessian, whose operations take about twice as
+    long as those of a polynomial model.
     """
     gradient, with_hessian = family.operations
     cheap = [f for f in fitted if f.predictor.forward.operations <= 0.5 * gradient] or fitted[:1]
@@ -167,13 +166,15 @@ def affordable(fitted: list[Fitted], family) -> Fitted:
 
 
 def _basis(family: Products) -> Basis:
-    """The products of a model: unlike S it also has those of args alone."""
+    """Basis of a model: unlike S it also has products of args alone."""
     return basis_of(family.inputs.is_angle, family.degree, None)
 
 
 def _by_degree(inputs: Inputs, x, target, unit) -> list[tuple[PolynomialModel, float]]:
-    """Least-squares models of the target (N, k) at the variables x (N, ...), one factorisation for
-    all degrees."""
+    """Fit the target (N, k) at the variables x (N, ...) by least squares, by rising degree.
+
+    One factorisation serves all degrees. Returns the models with their held-out errors.
+    """
     held = np.arange(len(x)) % 5 == 0
     most = min(_MOST_TERMS, len(x) // 3)
     top = 1
@@ -183,7 +184,7 @@ def _by_degree(inputs: Inputs, x, target, unit) -> list[tuple[PolynomialModel, f
     design = _design(largest, x)
     width = design.shape[1]
     ridge = _RIDGE * np.linalg.norm(design[~held], axis=0)
-    ridge = np.where(ridge > 0, ridge, 1.0)  # a product that vanishes on all states: no part of it
+    ridge = np.where(ridge > 0, ridge, 1.0)  # a product that vanishes on all states gets 0
     rows = np.vstack([design[~held], np.diag(ridge)])
     with one_thread():
         q, r = np.linalg.qr(rows)
@@ -208,7 +209,7 @@ def _by_degree(inputs: Inputs, x, target, unit) -> list[tuple[PolynomialModel, f
 
 
 def _design(basis, x) -> np.ndarray:
-    """The constant and the products at x (N, k): (N, 1 + terms)."""
+    """Evaluate the constant and the products at x (N, k): (N, 1 + terms)."""
     (u,), (v,) = basis.tables(x, 0)
     row, column = basis.terms.T
     return np.concatenate([np.ones((len(x), 1)), u[:, row] * v[:, column]], axis=1)

@@ -8,14 +8,14 @@ from gfnn_jax.coordinates import TWO_PI
 from gfnn_jax.evaluate import metrics
 from gfnn_jax.scenes import Scene
 
-BINS = 50  # of the histograms that KL divergences compare
+BINS = 50  # bins of the histograms that KL divergences compare
 
 
 def marginal_samples(scene: Scene, states) -> dict[str, tuple[np.ndarray, tuple[float, float]]]:
-    """What the marginals are of: label -> samples, and the range where there is a natural one.
+    """Samples of the marginals: label -> samples, and their natural range or NaN.
 
-    Of the standard map θ and p modulo 2π; else the section q₁ = 0, q̇₁ > 0, interpolated from the
-    saved states alike for every method, in (q₂, p₂).
+    For the standard map they are θ and p modulo 2π. For other scenes they are q₂ and p₂ on the
+    section q₁ = 0, q̇₁ > 0, interpolated from the saved states in the same way for all methods.
     """
     if scene.dim == 1:
         both = states.reshape(-1, 2) % TWO_PI
@@ -31,7 +31,7 @@ def section_points(states) -> np.ndarray:
 
 
 def histogram_range(samples, natural) -> tuple[float, float]:
-    """The natural one, else that of the reference's samples, a twentieth wider on either side."""
+    """Range of a histogram: the natural one, else that of the samples, 5 % wider on each side."""
     if np.isfinite(natural[0]):
         return natural
     low, high = float(samples.min()), float(samples.max())
@@ -39,7 +39,7 @@ def histogram_range(samples, natural) -> tuple[float, float]:
 
 
 def divergences(scene: Scene, predicted, reference) -> dict[str, float] | None:
-    """KL divergences of the marginals from the reference's; None where the orbits are regular."""
+    """KL divergences of the marginals from those of the reference; None for regular orbits."""
     if scene.regular:
         return None
     ours, theirs = (marginal_samples(scene, states) for states in (predicted, reference))

@@ -1,7 +1,7 @@
-"""What ``gfnn compare`` does: the same data through every method, judged by the same measures.
+"""Job of ``gfnn compare``: the same data through all methods, with the same measures.
 
 A finished method is kept in ``OUT.partial`` until all are done, so that an interrupted comparison
-goes on with the next one.
+resumes with the next one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ __all__ = ["CAP", "OURS", "PAPER_GFNN", "QUICK_CAP", "TITLES", "Compared", "comp
 
 
 class Compared(NamedTuple):
-    """Where a comparison was written, and its report."""
+    """Folder of a comparison, and its report."""
 
     out: Path
     report: dict[str, Any]
@@ -54,17 +54,18 @@ def compare(
     resume: bool = False,
     progress: Progress = SILENT,
 ) -> Compared | None:
-    """Learn a scene by these methods (all that apply where none is named), into the folder out.
+    """Learn a scene by these methods (with none named, all that apply), into the folder out.
 
-    cap: most seconds of training for each, compilation apart; 60 unless given, 2 where quick.
-    quick: fewer pairs and test states. resume: keeps the methods that are done; None where ``out``
-    has them all.
+    cap: most seconds of training for each, compilation apart; 60 by default, 2 with quick. quick:
+    fewer pairs and test states. resume: keep the methods that are done; returns None where ``out``
+    has them all. Raises InputError for a scene or a method that cannot be compared, WorkError where
+    a method fails.
     """
     scene = scene_named(name)
     if scene.parameters:
         raise InputError(f"the scene {name} has parameters, which the other methods do not take")
     if scene.any_phase:
-        raise InputError(f"the scene {name} is driven, and the other methods know no time")
+        raise InputError(f"the scene {name} is driven, and the other methods do not take the time")
     cap = (QUICK_CAP if quick else CAP) if cap is None else cap
     chosen = chosen_methods(methods, scene)
     job = {
@@ -81,9 +82,9 @@ def compare(
             progress.say(f"{TITLES[method]}: data")
             try:
                 part, rollouts = learn_and_roll(method, data, cap, progress)
-            except ValueError as error:  # no finite start, no fit: the others need not suffer
+            except ValueError as error:  # the results of the other methods are kept
                 raise WorkError(
-                    f"{TITLES[method]}: {error} (--methods leaves it out, --resume keeps the "
+                    f"{TITLES[method]}: {error} (leave it out with --methods; --resume keeps the "
                     "others)"
                 ) from error
             _keep(kept_in, method, part, rollouts)
@@ -122,7 +123,7 @@ def compare(
 
 
 def chosen_methods(methods: Sequence[str], scene: Scene) -> tuple[str, ...]:
-    """The methods to compare. Raises InputError for one that is not known."""
+    """Return the methods to compare. Raises InputError for one that is not known."""
     unknown = [m for m in methods if m not in TITLES]
     if unknown:
         raise InputError(f"unknown method '{unknown[0]}'; methods: {', '.join(TITLES)}")
@@ -133,7 +134,7 @@ def chosen_methods(methods: Sequence[str], scene: Scene) -> tuple[str, ...]:
 
 
 def _elements(scene: Scene, predicted, reference) -> dict[str, Any] | None:
-    """Curves of the errors of semi-major axis and eccentricity, of two bodies."""
+    """Curves of the errors of semi-major axis and eccentricity; None but for two bodies."""
     if scene.name != "two-body":
         return None
     return {
@@ -153,11 +154,11 @@ def _curve(error) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# What is finished: a .json and a .npz for each method, written whole or not at all.
+# Finished methods: a .json and a .npz for each, written whole or not at all.
 
 
 def _already_done(out: Path, job: dict[str, Any], chosen: Sequence[str]) -> bool:
-    """Whether this is a resumed comparison that had come to its end."""
+    """Return whether a resumed comparison had already finished."""
     try:
         found = json.loads((out / REPORT).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -170,14 +171,14 @@ def _is_finished(folder: Path, method: str) -> bool:
 
 
 def _keep(folder: Path, method: str, part: dict[str, Any], rollouts: Rollouts) -> None:
-    """The .json comes last: where it is, the .npz is whole."""
+    """Keep a finished method. The .json is written last: where it exists, the .npz is whole."""
     with failures_as_work_errors(folder):
         np.savez(folder / f"{method}.npz", **rollouts._asdict())
     atomic_write(folder / f"{method}.json", report.to_json(part))
 
 
 def _kept(folder: Path, method: str) -> tuple[dict[str, Any], Rollouts]:
-    """What `_keep` was given."""
+    """Load what `_keep` has written."""
     part = json.loads((folder / f"{method}.json").read_text(encoding="utf-8"))
     with np.load(folder / f"{method}.npz", allow_pickle=False) as arrays:
         return part, Rollouts(arrays["states"], arrays["status"], float(arrays["seconds"]))

@@ -1,4 +1,4 @@
-"""The figures of a comparison: all methods over the reference."""
+"""Figures of a comparison: all methods with the reference."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gfnn_jax.scenes import Scene
 
 
 def draw(scene: Scene, measured: dict[str, Measured], reference) -> dict[str, Any]:
-    """The scene's figures by file name; measured by the methods' titles."""
+    """Draw the scene's figures, by file name. measured: by the methods' titles."""
     steps = next(iter(measured.values())).steps
     drawn: dict[str, Any] = {}
     if scene.regular:
@@ -52,7 +52,7 @@ def draw(scene: Scene, measured: dict[str, Measured], reference) -> dict[str, An
 
 
 def _coordinates(scene: Scene, predicted, reference):
-    """Both coordinates of one orbit against time, at its end (paper, Figs. 2 and 6)."""
+    """Draw both coordinates of one orbit against time, at its end (paper, Figs. 2 and 6)."""
     lane = int(np.argmax(np.isfinite(reference).all(axis=(1, 2))))
     times = scene.dt * np.arange(reference.shape[1])
     window = (times[-31], times[-1]) if scene.dim == 1 else (0.9 * times[-1], times[-1])
@@ -71,7 +71,7 @@ def _coordinates(scene: Scene, predicted, reference):
 
 
 def _marginals(scene: Scene, predicted, reference):
-    """The histograms that the KL divergences compare, a panel for each coordinate."""
+    """Draw the histograms that the KL divergences compare, a panel for each coordinate."""
     theirs = marginal_samples(scene, reference)
     ours = {n: marginal_samples(scene, z) for n, z in predicted.items()}
     panels = {

@@ -1,4 +1,4 @@
-"""The table of a comparison: a row per method."""
+"""Table of a comparison: a row per method."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 
 def table(compared: dict[str, Any]):
-    """A rich table of a comparison's report: a row per method."""
+    """Make a rich table of a comparison's report, a row per method."""
     from rich.table import Table  # loaded when first used
 
     def number(value, form=".1e"):

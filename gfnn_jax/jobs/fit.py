@@ -1,4 +1,4 @@
-"""What ``gfnn fit`` does: trajectory files in, a model folder with its report out."""
+"""Job of ``gfnn fit``: trajectory files in, a model folder with its report out."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gfnn_jax.data.files import iterate_pairs, read_sample, read_trajectories
+from gfnn_jax.data.files import iterate_pairs, read_trajectories
+from gfnn_jax.data.sample import read_sample
 from gfnn_jax.data.summary import summary
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import report
@@ -23,10 +24,9 @@ from gfnn_jax.processes import Group, Share
 from gfnn_jax.storage.outputs import atomic_folder
 from gfnn_jax.storage.partial import unfinished
 
-# A larger file is never in memory whole, nor are several: candidates are chosen on a sample of the
-# pairs, and the chosen one is fitted to all of them chunk by chunk.
+# A larger file, or several files, are never in memory as a whole: candidates are chosen on a sample
+# of the pairs, and the chosen one is fitted to all of them chunk by chunk.
 _LARGE_BYTES, _FIT_CHUNK = 2**29, 50_000
-_HELD, _HELD_PART = 2_000, 5  # pairs of the sample that judge, at most; at most a fifth
 
 
 def fit(
@@ -36,7 +36,8 @@ def fit(
     dt: float | None = None,
     tolerance: float = 1e-6,
     absolute_tolerance: float | None = None,
-    max_seconds: float = 120.0,
+    max_seconds: float | None = 120.0,
+    max_operations: int | None = None,
     chart: str = "auto",
     learn: str = "auto",
     terms: tuple[str, ...] = (),
@@ -55,10 +56,10 @@ def fit(
 ) -> Ran | None:
     """Learn the map of trajectory files, and write it with its report into the model folder out.
 
-    scene_name: lends its coordinates and features. resume: None where ``out`` is this very job,
-    done. devices: of each process, as ``gfnn.fit`` takes them; a job may be resumed on others.
-    group: the processes that do this job, each with its own rows or files; all but the first
-    answer None. The other options are those of ``gfnn.fit``.
+    scene_name: the scene whose coordinates and features are used. resume: returns None where
+    ``out`` holds the result of this same job. devices: those of each process, as ``gfnn.fit`` takes
+    them; a job may be resumed on others. group: the processes that do this job, each with its own
+    rows or files; all but the first return None. The other options are those of ``gfnn.fit``.
     """
     try:
         own = () if devices is None else local_devices(devices)
@@ -103,18 +104,21 @@ def fit(
         try:
             fitted = search(
                 trajectories.pairs(), scene, angles=angles, max_seconds=max_seconds,
-                progress=progress, kept_in=kept_in, job=job, devices=devices, **options,
+                max_operations=max_operations, progress=progress, kept_in=kept_in, job=job,
+                devices=devices, **options,
             )  # fmt: skip
             if large and can_be_refitted(fitted.map):
                 progress.say("all pairs, for the chosen candidate")
-                sampled = trajectories.pairs()
-                held = sampled.take(slice(min(_HELD, len(sampled) // _HELD_PART)))
                 with failures_of_arithmetic(), row_blocks.on_devices(own):
-                    fitted = refit(fitted, pairs, held, scene=scene, group=group)
+                    fitted = refit(
+                        fitted, pairs, fitted.validation_pairs, test=fitted.test_pairs,
+                        scene=scene, group=group,
+                    )  # fmt: skip
             else:
                 group.told({})
                 fitted = not_refitted(fitted) if large else fitted
-            progress.say("the report: compiling the derivative of a step")
+            progress.say("the report: the posterior, and the derivative of a step")
+            fitted = fitted.settled()
             result = report.assemble(
                 fitted, scene=scene_name, dt=float(np.asarray(fitted.map.dt)), seed=seed,
                 rollout=None,
@@ -137,7 +141,7 @@ def fit(
 
 
 class _Pairs:
-    """The pairs of a process, read anew each time that they are gone through."""
+    """Pairs of a process, read from the files at each iteration."""
 
     def __init__(self, paths: Sequence[Path], dt: float | None, share: Share):
         self.paths, self.dt, self.share = paths, dt, share
@@ -147,5 +151,5 @@ class _Pairs:
 
 
 def _range(values) -> list[float]:
-    """The smallest and the largest."""
+    """Smallest and largest value."""
     return [float(np.min(values)), float(np.max(values))]

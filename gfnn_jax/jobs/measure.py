@@ -14,12 +14,12 @@ from gfnn_jax.jobs.rollouts import Rollouts
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.scenes import Scene
 
-# A first step this many roundings from the reference is roundoff.
+# A first step that differs from the reference by this many roundings is roundoff.
 _ROUNDINGS = 64
 
 
 class Measured(NamedTuple):
-    """Rollouts of the test states (B, L, 2d), their errors (B, L), and the report's part."""
+    """Rollouts (B, L, 2d) of the test states with their errors (B, L), and the report's part."""
 
     steps: np.ndarray
     predicted: np.ndarray
@@ -29,8 +29,10 @@ class Measured(NamedTuple):
 
 
 def measure(rollouts: Rollouts, scene: Scene, reference: np.ndarray, params=None) -> Measured:
-    """Errors against the reference (B, L, 2d), energy and growth. params: (B, k), of a scene that
-    has parameters."""
+    """Measure rollouts against the reference (B, L, 2d): errors, energy, growth.
+
+    params: (B, k), for a scene that has parameters.
+    """
     predicted, steps = rollouts.states, np.arange(reference.shape[1])
     error = metrics.position_error(predicted, reference, angles_of_z(scene))
     energy, drift = None, None
@@ -67,5 +69,5 @@ def angles_of_z(scene: Scene) -> tuple[int, ...]:
 
 
 def plane_of(scene: Scene) -> tuple[tuple[str, str], bool]:
-    """How one degree of freedom is drawn: names of its coordinates, whether modulo 2π."""
+    """Names of the coordinates of one degree of freedom in figures, and True where modulo 2π."""
     return ((r"$\theta$", "$p$"), True) if angles_of_z(scene) else (("$q$", "$p$"), False)

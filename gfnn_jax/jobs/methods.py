@@ -1,4 +1,4 @@
-"""A method of a comparison: learned from the shared data, rolled out, and what is reported."""
+"""Methods of a comparison: learned from the shared data, rolled out and reported."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _NUM_DEFECTS = 200
 def learn_and_roll(
     method: str, data: SharedData, cap: float, progress: Progress
 ) -> tuple[dict[str, Any], Rollouts]:
-    """The report's model, data, fit and map of a method, and its rollouts.
+    """Learn and roll out a method: the report's model, data, fit and map, and the rollouts.
 
     cap: most seconds of training, compilation apart.
     """
@@ -80,7 +80,7 @@ def _baseline(method: str, data: SharedData, budget: Budget) -> tuple[dict[str, 
 
 @partial(jax.jit, static_argnums=0)
 def _jacobians(step, z):
-    """(B, 2d, 2d) of a plain step at z (B, 2d)."""
+    """Jacobians (B, 2d, 2d) of a plain step at z (B, 2d)."""
     return jax.vmap(jax.jacfwd(step))(z)
 
 
@@ -91,7 +91,7 @@ def _steps(step, z):
 
 
 def _training(training: Any, cap: float | None) -> dict[str, Any]:
-    """The report's part on an Adam training. Its errors are those of the method's own loss."""
+    """Report's part on an Adam training. Its errors are those of the method's own loss."""
     return {
         "seconds": training.seconds,
         "compile_seconds": training.compile_seconds,
@@ -122,7 +122,7 @@ def _papers(data: SharedData, budget: Budget) -> tuple[dict[str, Any], Rollouts]
 
 
 def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollouts]:
-    """The map that `gfnn.fit` chooses, from the first few of the same pairs."""
+    """Fit the first few of the same pairs by `gfnn.fit`."""
     scene = data.scene
     num_pairs, tolerance = scene.num_pairs, scene.tolerance
     if data.quick:
@@ -154,7 +154,7 @@ def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollout
 
 
 def _map_part(map_: SymplecticMap, data: SharedData) -> dict[str, Any]:
-    """Where a step is not solved there is none whose defect could be told: those are counted."""
+    """Report's part on a map. Steps that were not solved have no defect, and are counted."""
     z = data.fresh.z0[:_NUM_DEFECTS]
     info = map_.step(z)[1]
     solved = np.asarray(info.status) < NOT_CONVERGED
@@ -168,5 +168,5 @@ def _map_part(map_: SymplecticMap, data: SharedData) -> dict[str, Any]:
 
 
 def _rms(data: SharedData, images) -> float:
-    """Per-component RMS of the one-step state error on fresh pairs, angles modulo 2π."""
+    """RMS per component of the one-step state error on fresh pairs, angles modulo 2π."""
     return one_step_rms(np.asarray(images), data.fresh.z1, angles_of_z(data.scene))

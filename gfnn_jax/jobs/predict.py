@@ -1,4 +1,4 @@
-"""What ``gfnn predict`` does: a saved map, initial states, and a prediction written as it grows."""
+"""Job of ``gfnn predict``: a saved map, initial states, and a prediction written in chunks."""
 
 from __future__ import annotations
 
@@ -24,13 +24,16 @@ from gfnn_jax.phase_space import TIME
 from gfnn_jax.processes import Share, wait_for_all
 from gfnn_jax.storage.outputs import ensure_new
 
-# A chunk of a prediction: what is held in memory at once, and how much work a kill may lose.
+# A chunk of a prediction: bytes in memory at once, and steps that a kill may lose.
 _CHUNK_BYTES, _CHUNK_LANE_STEPS = 32 * 2**20, 400_000
 
 
 class Predicted(NamedTuple):
-    """How a prediction ended: status and left_at (B,), the map's dt, seconds of computing; horizon
-    (B,) where one was asked for. Of several processes the first has all lanes, others their own."""
+    """Result of a prediction: status and left_at (B,), the map's dt, seconds of computing.
+
+    horizon: (B,) where one was asked for. Among several processes the first has all lanes, the
+    others have their own.
+    """
 
     status: np.ndarray
     left_at: np.ndarray
@@ -40,8 +43,11 @@ class Predicted(NamedTuple):
 
 
 class _Drawn(NamedTuple):
-    """Samples and their initial states (n, B, 2d), the angles of a state, the size of the horizon,
-    and what the band is of."""
+    """Samples of a prediction, and their initial states z0 (n, B, 2d).
+
+    angles: indices of the angles of a state. size: that of the horizon, or None. of: uncertainties
+    that the band contains, as text.
+    """
 
     samples: Samples | Sharded
     z0: np.ndarray
@@ -51,7 +57,7 @@ class _Drawn(NamedTuple):
 
 
 class _Request(NamedTuple):
-    """The map, what steps it (itself, or the same over several devices), and how far."""
+    """Request of a prediction: the map, and ``stepped``, itself or the same over devices."""
 
     map: SymplecticMap
     stepped: SymplecticMap | Sharded
@@ -81,26 +87,26 @@ def predict(
 ) -> Predicted:
     """Predict from the initial states in a file, in chunks along the steps, into ``out``.
 
-    dt: of a step, where it is not that of the data: of a map that is the flow of a Hamiltonian.
-    samples: maps drawn from the model's posterior, whose spread becomes ``std`` and ``quantiles``;
-    the noise of the initial states, ``z0_std``, is in it where their file has that, and ``band``
-    says so. horizon_size: of the position, in the user's units; ``horizon`` (B,) is the first saved
-    step at which the band of two standard deviations passes it, −1 where it never does.
-    devices: among which the lanes are shared out, "all" of this process or the first so many; the
-    same bits on any number, and after a resume on another number. share: of the lanes, that this
-    process predicts; it writes a part of its own, and the first process puts the parts together
-    when all are there. A resumed job has the parts that it began with, shared out anew.
+    dt: time step, where it is not that of the data; for a map that can step any dt. samples: number
+    of maps drawn from the model's posterior, whose spread becomes ``std`` and ``quantiles``. Where
+    the file of initial states has their noise ``z0_std``, the spread includes it, and ``band`` says
+    so. horizon_size: a length in position space, in the user's units; ``horizon`` (B,) is the first
+    saved step at which two standard deviations of the position exceed it, −1 where none does.
+    devices: number of devices of this process that share the lanes, or "all"; the bits are the same
+    on any number, and after a resume on another number. share: share of the lanes that this process
+    predicts. It writes a part of its own, and the first process joins the parts when all are there.
+    A resumed job keeps the parts that it began with, shared out anew.
 
-    Memory: one chunk of saved states, 32 MiB at most where a saved state of all lanes is no more
-    than that, whatever ``num_steps``. A job that was killed goes on with ``resume`` where its last
-    chunk ended, to the very bits that an uninterrupted one gives.
+    Memory is one chunk of saved states, at most 32 MiB where a saved state of all lanes is no more
+    than that, for any ``num_steps``. With ``resume`` a killed job continues where its last chunk
+    ended, to the same bits as an uninterrupted one. Raises InputError for bad input.
     """
     if save_every > num_steps:
         raise InputError(
-            f"expected --save-every of at most --num-steps, {num_steps}; got {save_every}"
+            f"expected --save-every of at most --num-steps = {num_steps}, got {save_every}"
         )
     if horizon_size is not None and samples is None:
-        raise InputError("expected --samples beside --horizon: the band is of samples")
+        raise InputError("--horizon needs --samples: the band is the spread of samples")
     map_ = saved.load(model)
     if dt is not None:
         try:
@@ -172,7 +178,7 @@ def predict(
 def _written(
     request: _Request, out: Path, z0, params, identity, drawn: _Drawn | None, progress
 ) -> Predicted:
-    """The prediction of these lanes, in one file."""
+    """Predict these lanes into one file."""
     map_ = request.map
     dt, parameters = float(map_.dt), map_.parameters
     own, drive = None, None
@@ -213,13 +219,13 @@ def _written(
 
 
 def _finished(out: Path, dt: float) -> Predicted:
-    """What a prediction that is there already says."""
+    """Read the result of a prediction that is already there."""
     with np.load(out, allow_pickle=False) as done:
         return Predicted(done["status"], done["left_at"], dt, 0.0, done.get("horizon"))
 
 
 def _drawn(map_: SymplecticMap, count: int, z0, std, size: float | None) -> _Drawn:
-    """The samples of a prediction, the same for the same model and initial states."""
+    """Draw the samples of a prediction, the same for the same model and initial states."""
     try:
         samples = map_.sample(jax.random.key(0), count)
     except ValueError as error:
@@ -235,7 +241,7 @@ def _drawn(map_: SymplecticMap, count: int, z0, std, size: float | None) -> _Dra
 def _go_on(
     request: _Request, z0, params, writer: PredictionWriter, drawn: _Drawn | None, progress
 ) -> Lanes:
-    """All chunks that are not yet written; returns the lanes after the last step."""
+    """Compute all chunks that are not yet written; return the lanes after the last step."""
     map_, save_every, stop_outside = request.stepped, request.save_every, request.stop_outside
     of_samples = None
     passed = np.full(len(z0), -1)
@@ -272,17 +278,17 @@ def _go_on(
 
 
 def _time_left(seconds: float, done: int, writer: PredictionWriter) -> str:
-    """The time that is left at the rate of these seconds for ``done`` saved states, if any."""
+    """Message about the time left, at the rate of ``done`` saved states in these seconds."""
     if not done:
         return ""
     return f", about {seconds * (writer.total - writer.saved) / done:.0f} s left"
 
 
-_OF_SAMPLES = "samples_"  # before the names of their lanes in a carry
+_OF_SAMPLES = "samples_"  # prefix of the samples' lanes in a carry
 
 
 def _carry(lanes: Lanes, of_samples: Lanes | None, passed) -> dict[str, Any]:
-    """What a prediction goes on from."""
+    """Arrays from which a prediction can be continued."""
     if of_samples is None:
         return lanes._asdict()
     others = {_OF_SAMPLES + name: value for name, value in of_samples._asdict().items()}
@@ -290,7 +296,7 @@ def _carry(lanes: Lanes, of_samples: Lanes | None, passed) -> dict[str, Any]:
 
 
 def _with_bands(drawn: _Drawn, states, others, steps, passed) -> tuple[np.ndarray, np.ndarray]:
-    """States with their std and quantiles (B, c, 5 · 2d), and the horizons so far (B,)."""
+    """Join states with their std and quantiles (B, c, 5 · 2d); update the horizons (B,)."""
     found = bands(others, states, drawn.angles)
     if drawn.size is not None:
         passed = np.where(passed < 0, horizon(found.std, steps, drawn.size), passed)
@@ -298,7 +304,7 @@ def _with_bands(drawn: _Drawn, states, others, steps, passed) -> tuple[np.ndarra
 
 
 def _chunk_length(num_lanes: int, width: int, save_every: int) -> int:
-    """Saved states per chunk: a function of the job alone, so that a resumed one cuts alike."""
+    """Number of saved states per chunk, a function of the job alone: a resumed job has the same."""
     by_memory = _CHUNK_BYTES // (8 * num_lanes * width)
     by_operations = _CHUNK_LANE_STEPS // (num_lanes * save_every)
     return max(1, min(by_memory, by_operations))

@@ -1,4 +1,4 @@
-"""What a job says while it works, and how it is shown on standard error."""
+"""Progress messages of a job, and their display on standard error."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-# Seconds between lines where standard error is no terminal: at least, and at most.
+# Least and most seconds between lines where standard error is no terminal.
 BETWEEN, LONGEST_SILENCE = 2.0, 5.0
 
 
@@ -18,7 +18,7 @@ def _nothing(message: str) -> None:
 
 
 class Progress(NamedTuple):
-    """say: what is being done now, shown now and then. tell: a line that is always shown."""
+    """Functions that show messages: ``say`` the current work, now and then; ``tell`` always."""
 
     say: Callable[[str], Any] = _nothing
     tell: Callable[[str], Any] = _nothing
@@ -29,7 +29,7 @@ SILENT = Progress()
 
 @contextlib.contextmanager
 def on_stderr() -> Iterator[Progress]:
-    """A status line on a terminal; elsewhere a line now and then, at least every five seconds."""
+    """Show a status line on a terminal; elsewhere a line now and then, every 5 s at least."""
     if not sys.stderr.isatty():
         lines = _Lines()
         try:
@@ -49,7 +49,7 @@ def on_stderr() -> Iterator[Progress]:
 
 
 class _Lines:
-    """Lines with the seconds since the start; a thread repeats the last where nothing comes."""
+    """Writer of lines with the seconds since the start; a thread repeats the last one."""
 
     def __init__(self):
         self._started = time.perf_counter()

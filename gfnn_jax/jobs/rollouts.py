@@ -15,11 +15,11 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.solve.status import NON_FINITE, OK
 
 NUM_STEPS, NUM_TRAJECTORIES = 1_000, 100
-RUNAWAY = 100.0  # a prediction so many times larger than any reference is lost
+RUNAWAY = 100.0  # a prediction this many times larger than any reference is lost
 
 
 class Rollouts(NamedTuple):
-    """States (B, L, 2d), status (B,), and how long they took, without compilation."""
+    """Rollouts: states (B, L, 2d), status (B,), and seconds without compilation."""
 
     states: np.ndarray
     status: np.ndarray
@@ -29,8 +29,10 @@ class Rollouts(NamedTuple):
 def map_rollouts(
     map_: SymplecticMap, z0, num_steps: int = NUM_STEPS, params=None, t0=None
 ) -> Rollouts:
-    """Rollouts of a symplectic map from z0 (B, 2d) with its params (B, k), from the drive's time t0
-    (B,); predicted twice, as the first time compiles."""
+    """Roll out a symplectic map from z0 (B, 2d), with params (B, k) and the drive's time t0 (B,).
+
+    The rollout runs twice, because the first run compiles.
+    """
     predict = partial(map_.rollout, params=params, t0=t0)
     jax.block_until_ready(predict(z0, num_steps))
     (states, info), seconds = _timed(predict, z0, num_steps)
@@ -38,7 +40,7 @@ def map_rollouts(
 
 
 def step_rollouts(step: Callable, z0, num_steps: int = NUM_STEPS) -> Rollouts:
-    """Rollouts of a plain ``step(z)`` -> Z of one state (2d,) from z0 (B, 2d)."""
+    """Roll out a plain ``step(z)`` -> Z of one state (2d,) from z0 (B, 2d)."""
     z0 = np.asarray(z0)
     program = _rolled_out.lower(step, z0, num_steps).compile()
     states, seconds = _timed(program, z0)
@@ -59,9 +61,10 @@ def _timed(call: Callable, *arguments: Any) -> tuple[Any, float]:
 
 
 def without_runaways(rollouts: Rollouts, reference) -> Rollouts:
-    """What has left the reference's size by far is lost, as what is not finite: NaN from there on.
+    """Set predictions that exceed the reference's size by `RUNAWAY` to NaN, from there on.
 
-    Some learned maps go on for long with numbers of no meaning, which would fill every mean.
+    They count as lost. Some learned maps continue for long with meaningless numbers, which would
+    dominate every mean.
     """
     with np.errstate(invalid="ignore"):
         away = ~(np.abs(rollouts.states) < RUNAWAY * np.nanmax(np.abs(reference))).all(axis=-1)

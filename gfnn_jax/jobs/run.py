@@ -1,4 +1,4 @@
-"""What ``gfnn run`` does: reference data of a scene, fit, rollouts, metrics, figures, report."""
+"""Job of ``gfnn run``: reference data of a scene, fit, rollouts, metrics, figures, report."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from gfnn_jax.scenes.trajectories import (
 from gfnn_jax.storage.outputs import atomic_folder
 from gfnn_jax.storage.partial import unfinished
 
-# Of a network: pairs, tolerance, iterations; and of a quick look.
+# (pairs, tolerance, iterations) of a network, and those with --quick.
 _NETWORK, _NETWORK_QUICK = (6_000, 1e-6, 250), (3_000, 1e-5, 60)
-# Trajectories and maps of the band in the figure of errors: twice the work of all rollouts.
+# Trajectories and samples of the band in the figure of errors: twice the work of all rollouts.
 _BAND_TRAJECTORIES, _BAND_SAMPLES = 10, 20
 QUICK_PAIRS, QUICK_TRAJECTORIES, QUICK_TOLERANCE = 4_000, 25, 1e-7
 
@@ -48,7 +48,8 @@ def run(
     seed: int = 0,
     dt: float | None = None,
     tolerance: float | None = None,
-    max_seconds: float = MAX_SECONDS,
+    max_seconds: float | None = MAX_SECONDS,
+    max_operations: int | None = None,
     chart: str = "auto",
     learn: str = "auto",
     terms: tuple[str, ...] = (),
@@ -60,15 +61,18 @@ def run(
     resume: bool = False,
     progress: Progress = SILENT,
 ) -> Ran | None:
-    """Reference data of a scene, fit, rollouts, metrics, figures and report, into the folder out.
+    """Run a scene: reference data, fit, rollouts, metrics, figures, report, into the folder out.
 
-    tolerance: relative; None: the scene's own, close to the best that can be had. quick: fewer
-    pairs and rollouts, a tolerance of 1e-7 at best, no band in the figure of errors. resume: None
-    where ``out`` is this very job, done.
+    tolerance: relative; with None the scene's own, close to the best attainable. quick: fewer pairs
+    and rollouts, a tolerance of 1e-7 or larger, no band in the figure of errors. resume: returns
+    None where ``out`` holds the result of this same job.
     """
     scene = scene_named(name, dt)
     if family == "features" and scene.features is None:
-        raise InputError(f"family 'features': the scene {name} declares none")
+        raise InputError(
+            f"family 'features' needs features, and the scene {name} declares none: choose another "
+            "family"
+        )
     num_pairs, default = scene.num_pairs, scene.tolerance
     more = {}
     if family == "mlp":
@@ -98,9 +102,9 @@ def run(
             "t0": sample_t0(scene, num_trajectories, key_test),
         }
         fitted = search(
-            pairs, scene, max_seconds=max_seconds, progress=progress, kept_in=kept_in, job=job,
-            **options, **more,
-        )  # fmt: skip
+            pairs, scene, max_seconds=max_seconds, max_operations=max_operations,
+            progress=progress, kept_in=kept_in, job=job, **options, **more,
+        ).settled()  # fmt: skip
         progress.say(f"reference trajectories of {NUM_STEPS} steps")
         reference = np.asarray(reference_trajectories(scene, z0, NUM_STEPS, **given))
         progress.say(f"rollouts of {NUM_STEPS} steps")
@@ -122,21 +126,23 @@ def run(
 
 @jax.jit
 def _keys(seed):
-    """Of the pairs and of the test states."""
+    """Keys of the pairs and of the test states."""
     of_pairs, of_test = jax.random.split(jax.random.key(seed))
     return of_pairs, of_test
 
 
 def _finite(pairs: Pairs) -> Pairs:
-    """In NumPy, without those whose state collides: it has no image."""
+    """Convert pairs to NumPy, without states that collide and have no image."""
     z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
     known = np.isfinite(z1).all(axis=1)
     return dataclasses.replace(pairs, z0=z0, z1=z1).take(known)
 
 
 def _band(map_: SymplecticMap, z0, predicted, given: dict[str, Any]) -> np.ndarray | None:
-    """(B, L): two standard deviations of the position of the first trajectories; None where the map
-    has no posterior."""
+    """Two standard deviations (B, L) of the position of the first trajectories.
+
+    None where the map has no posterior.
+    """
     if map_.posterior is None:
         return None
     few = slice(_BAND_TRAJECTORIES)
@@ -150,7 +156,7 @@ def _band(map_: SymplecticMap, z0, predicted, given: dict[str, Any]) -> np.ndarr
 
 
 def _figures(fit: Fit, scene: Scene, measured: Measured, reference, band=None) -> dict[str, Any]:
-    """The scene's figures by file name. band: of the error (B, L)."""
+    """Draw the scene's figures, by file name. band: that of the error (B, L)."""
     steps, predicted = measured.steps, measured.predicted
     band = None if band is None else (steps, band)
     drawn = {"error": figures.error_growth({"GFNN": (steps, measured.error)}, band=band)}
@@ -193,7 +199,7 @@ def _figures(fit: Fit, scene: Scene, measured: Measured, reference, band=None) -
 
 
 def _figures_of_many(scene: Scene, steps, reference, predicted) -> dict[str, Any]:
-    """Those of the scene's structure, of the first trajectory that both follow to its end."""
+    """Draw the figures of the scene's structure, of the first trajectory finite in both."""
     structure = structure_of(scene.structure, scene.dim, scene.coordinates)
     if structure is None:
         return {}
@@ -209,7 +215,7 @@ def _figures_of_many(scene: Scene, steps, reference, predicted) -> dict[str, Any
 
 
 def _labelled(candidate: Candidate) -> str:
-    """Chart, family and size, with the time of a step where it was measured."""
+    """Label of a candidate: chart, family and size, and the time of a step where measured."""
     microseconds = candidate.microseconds_per_step
     timed = f", {microseconds:.1f} µs" if microseconds is not None else ""
     return f"{candidate.chart} {candidate.label}{timed}"

@@ -1,4 +1,4 @@
-"""``gfnn.fit`` as the jobs call it: its candidates are told, its failures are one line each."""
+"""Call of ``gfnn.fit`` by the jobs: candidates are shown, and a failure is one line."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def search(
     job: dict[str, Any] | None = None,
     **options: Any,
 ) -> Fit:
-    """The fit of these pairs, with the options of ``gfnn.fit``.
+    """Fit these pairs, with the options of ``gfnn.fit``.
 
-    kept_in, job: the folder where a training's checkpoints, factors and the best map so far are
-    kept, and whose they are. Raises InputError for data or a request that cannot give a map,
-    WorkError where the arithmetic fails.
+    kept_in: folder for checkpoints of a training, factors, and the best map so far. job: the job
+    that they belong to. Raises InputError for data or a request that cannot give a map, WorkError
+    where the arithmetic fails.
     """
     checkpoints = factors = on_better = None
     if kept_in is not None:
@@ -59,8 +59,10 @@ def search(
 def _keep(
     folder: Path, scene: Scene | None, job: Any, map_: SymplecticMap, candidate: Candidate
 ) -> None:
-    """The best map so far, on disk. A resumed fit meets its small sizes again: what it had kept is
-    better."""
+    """Save the best map so far, unless a better one is there.
+
+    A resumed fit goes through its small sizes again, which are worse than what it had kept.
+    """
     if _error_of(folder) <= candidate.validation_relative:
         return
     record = {"unfinished": job, "validation_relative": candidate.validation_relative}
@@ -68,7 +70,7 @@ def _keep(
 
 
 def _error_of(folder: Path) -> float:
-    """The error of the map that was kept there, infinite where none can be read."""
+    """Error of the map that was kept in the folder; infinite where none can be read."""
     try:
         return float(saved.record(folder)["validation_relative"])
     except (InputError, KeyError):
@@ -76,8 +78,10 @@ def _error_of(folder: Path) -> float:
 
 
 def line(candidate: Candidate) -> str:
-    """A finished candidate in one line: what it is, and its one-step error ÷ spread; until steps
-    have validated it, what the gradient's residual lets expect."""
+    """Describe a finished candidate in one line: chart, family, one-step error ÷ spread.
+
+    The error is estimated from the gradient's residual until steps have validated it.
+    """
     first = "" if candidate.validated else "first estimated at "
     return (
         f"{candidate.chart} {candidate.label}: one-step error {first}"
@@ -88,7 +92,7 @@ def line(candidate: Candidate) -> str:
 
 @contextlib.contextmanager
 def failures_of_arithmetic() -> Iterator[None]:
-    """A factorisation that does not converge, or JAX out of memory, as a WorkError of one line."""
+    """Turn a factorisation that fails, or JAX out of memory, into a WorkError of one line."""
     try:
         yield
     except (np.linalg.LinAlgError, jax.errors.JaxRuntimeError) as error:
@@ -97,7 +101,7 @@ def failures_of_arithmetic() -> Iterator[None]:
 
 
 def scene_named(name: str, dt: float | None = None) -> Scene:
-    """The scene of this name, with its own time step or another. Raises InputError."""
+    """Make the scene of this name, with its own time step or another. Raises InputError."""
     try:
         return scenes.make(name, dt)
     except ValueError as error:

@@ -1,7 +1,7 @@
-"""The data of a comparison: what all methods learn from and are judged by.
+"""Data of a comparison, from which all methods learn and by which all are measured.
 
-They are the paper's ("Experimental Details"): pairs D₂, and sequences of five states D₅, a fourth
-as many (on two bodies as many).
+They are those of the paper ("Experimental Details"): pairs D₂, and sequences of five states D₅, a
+quarter as many (for two bodies as many).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def _largest_mixed(hamiltonian, z):
 
 
 def separable(scene: Scene) -> bool:
-    """Whether H = T(p) + V(q): its mixed second derivatives vanish. A map has no H to tell."""
+    """Return whether H = T(p) + V(q), by its mixed second derivatives; True for a map without H."""
     if scene.hamiltonian is None:
         return True
     z = sample_test_states(scene, 5, jax.random.key(0))
@@ -52,7 +52,7 @@ def _key(seed, use):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SharedData:
-    """Each part is drawn when first asked for; NumPy. num_steps: of the rollouts."""
+    """Data of a comparison, NumPy; each part is drawn when it is first used."""
 
     scene: Scene
     seed: int
@@ -64,18 +64,18 @@ class SharedData:
 
     @property
     def num_pairs(self) -> int:
-        """Of D₂: a hundred thousand, of the standard map a million."""
+        """Number of pairs of D₂: a hundred thousand, for the standard map a million."""
         if self.quick:
             return _QUICK_PAIRS
         return 100_000 if self.scene.step is None else 1_000_000
 
     def key(self, use: int):
-        """A key for one use of randomness; 0 to 5 are taken by the data."""
+        """Make a key for one use of randomness; the data use 0 to 5."""
         return _key(self.seed, use)
 
     @functools.cache  # noqa: B019, lives as long as a comparison
     def sequences(self, length: int) -> Sequences:
-        """D₂ or D₅."""
+        """Draw D₂ (length 2) or D₅ (length 5)."""
         few = length > 2 and self.scene.name != "two-body"
         num = self.num_pairs // 4 if few else self.num_pairs
         z = np.asarray(sample_sequences(self.scene, num, length, self.key(length)))
@@ -92,7 +92,7 @@ class SharedData:
 
     @functools.cached_property
     def z0(self) -> np.ndarray:
-        """The states that rollouts start from, (B, 2d)."""
+        """Initial states of the rollouts, (B, 2d)."""
         many = NUM_TRAJECTORIES if self.scene.flow is None else _EXACT_TRAJECTORIES
         num = _QUICK_TRAJECTORIES if self.quick else many
         return np.asarray(sample_test_states(self.scene, num, self.key(1)))

@@ -1,4 +1,4 @@
-"""What ``gfnn run`` and ``gfnn fit`` write: a model with its record, and report.json."""
+"""Output of ``gfnn run`` and ``gfnn fit``: a model with its record, and report.json."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ REPORT, MODEL = "report.json", "model"
 
 
 class Ran(NamedTuple):
-    """A fit, where it was written, and its report."""
+    """Result of a job: the fit, the folder where it was written, and its report."""
 
     fit: Fit
     out: Path
@@ -28,9 +28,9 @@ class Ran(NamedTuple):
 
 
 def write(folder: Path, model: Path, fit: Fit, result: dict[str, Any], job: dict[str, Any]) -> None:
-    """The chosen map into the folder ``model``, its report into ``folder``.
+    """Write the chosen map into the folder ``model``, and its report into ``folder``.
 
-    Of the report, the record in the model keeps where the map came from and how good it is.
+    The record in the model keeps the parts of the report on the map's origin and accuracy.
     """
     origin = {key: result[key] for key in ("scene", "seed", "device", "data", "fit", "map")}
     saved.save(fit.map, model, record={"job": job, **report.finite(origin)})
@@ -38,8 +38,10 @@ def write(folder: Path, model: Path, fit: Fit, result: dict[str, Any], job: dict
 
 
 def publish(best: Path, model: Path) -> str:
-    """The best map of an interrupted fit into the folder ``model``; what is to be said of it, or
-    nothing. What stands there stays as it is, unless the same fit, interrupted before, left it."""
+    """Copy the best map of an interrupted fit into the folder ``model``; return a message or "".
+
+    An existing folder is left as it is, unless the same fit, interrupted before, wrote it.
+    """
     if not best.is_dir():
         return ""
     if model.exists() and _unfinished(model) != _unfinished(best):
@@ -50,7 +52,7 @@ def publish(best: Path, model: Path) -> str:
 
 
 def _unfinished(model: Path) -> dict[str, Any] | None:
-    """The job of an interrupted fit whose best map a folder holds; None for any other folder."""
+    """Job of the interrupted fit whose best map a folder holds; None for any other folder."""
     try:
         return saved.record(model).get("unfinished")
     except InputError:
@@ -58,7 +60,7 @@ def _unfinished(model: Path) -> dict[str, Any] | None:
 
 
 def already_done(model: Path, job: dict[str, Any], resume: bool) -> bool:
-    """Whether this is a resumed job that had come to its end."""
+    """Return whether a resumed job had already finished."""
     if not (resume and model.is_dir()):
         return False
     try:

@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.dataset.noise import of_differences
+from gfnn_jax.dataset.runs import steps_between
 from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.phase_space import Pairs
@@ -53,13 +55,14 @@ def arcs_of(prepared: Prepared, judges: Judges, options: Options = OPTIONS) -> A
     or of a structure."""
     if prepared.varied or prepared.structure is not None:
         return None
-    starts, lengths = _runs(np.asarray(judges.pairs.z0), np.asarray(judges.pairs.z1))
+    starts, lengths = _runs(judges.pairs)
     usual = int(np.median(np.repeat(lengths, lengths)))  # that a pair stands in
     if usual <= options.order:
         return None
     moved = (prepared.y1 - prepared.y0) / prepared.scale
     displacement = float(np.sqrt(np.mean(moved**2)))
-    noise = _noise(moved, starts, lengths, options)
+    runs = [moved[first : first + count] for first, count in zip(starts, lengths, strict=True)]
+    noise = of_differences(runs, options.order, options.alike)
     if noise is None or displacement > options.short:
         return None
     wanted = int(np.ceil(options.quiet * np.sqrt(2) * noise / displacement))
@@ -69,32 +72,10 @@ def arcs_of(prepared: Prepared, judges: Judges, options: Options = OPTIONS) -> A
     return _strided(prepared, judges, starts, lengths, length, options)
 
 
-def _runs(z0, z1) -> tuple[np.ndarray, np.ndarray]:
-    """First row and number of rows of each sequence."""
-    begins = np.concatenate([[True], np.any(z1[:-1] != z0[1:], axis=1)])
-    starts = np.flatnonzero(begins)
-    return starts, np.diff(np.append(starts, len(z0)))
-
-
-def _noise(moved, starts, lengths, options: Options) -> float | None:
-    """Standard deviation of the noise, in units of the sizes, by differences of the states along
-    sequences: a high one leaves nothing of a smooth orbit, and √C(2n, n) times the noise. None
-    where two orders disagree."""
-    found = []
-    for order in (options.order - 1, options.order):
-        differences = [
-            np.diff(moved[first : first + count], order - 1, axis=0)
-            for first, count in zip(starts, lengths, strict=True) if count > order
-        ]  # fmt: skip
-        size = np.sqrt(np.mean(np.concatenate(differences) ** 2))
-        found.append(float(size / np.sqrt(_central(order))))
-    low, high = min(found), max(found)
-    return found[-1] if 0 < high <= options.alike * low else None
-
-
-def _central(n: int) -> float:
-    """C(2n, n)."""
-    return float(np.prod([(n + i) / i for i in range(1, n + 1)]))
+def _runs(pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
+    """First row and number of rows of each stretch of a run without a gap."""
+    starts = np.flatnonzero(np.append(True, steps_between(pairs) != 1))
+    return starts, np.diff(np.append(starts, len(pairs)))
 
 
 def _strided(
@@ -108,7 +89,12 @@ def _strided(
     along = first[:, None] + np.arange(length)
     pairs, moved = judges.pairs, prepared.y1 - prepared.y0
     last = first + length - 1
-    strided = Pairs(np.asarray(pairs.z0)[first], np.asarray(pairs.z1)[last], length * prepared.dt)
+    # In chains of arcs that follow one another, one for each offset in a run.
+    begin = np.repeat(starts, lengths)[first]
+    strided = Pairs(
+        np.asarray(pairs.z0)[first], np.asarray(pairs.z1)[last], length * prepared.dt,
+        run=begin + (first - begin) % length, place=(first - begin) // length,
+    )  # fmt: skip
     angles = np.isin(np.arange(moved.shape[1]), prepared.coordinates.angles)
     # Angles go on over turns; what is no angle is as measured, without a sum's rounding.
     y0 = prepared.y0[first]
@@ -121,6 +107,6 @@ def _strided(
     if min(map(len, rows)) < options.fewest:
         return None
     return Arcs(
-        dataclasses.replace(prepared, y0=y0, y1=y1, dt=length * prepared.dt, place=None),
+        dataclasses.replace(prepared, y0=y0, y1=y1, dt=length * prepared.dt),
         Judges(strided, rows[0], rows[1], judges.tolerance), length,
     )  # fmt: skip

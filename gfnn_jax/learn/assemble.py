@@ -9,18 +9,20 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gfnn_jax.errors import OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.flows.collocation import of_lanes
-from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
 from gfnn_jax.learn.candidates import Candidate, Judges, refined_images, with_error
+from gfnn_jax.learn.clock import COMPILE, Budget
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.maps.parameters import Parameters, sampled
 from gfnn_jax.maps.symplectic_map import Piece, SymplecticMap
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.solve.status import LEFT_DOMAIN
 
+_TIMING = "the time of a step, and the error of compiled ones"
 _PREDICTOR_PAIRS = 2_000
 # States are stepped in blocks of one shape, whatever their number: compiled once for a kind of map.
 # A block of wide states is of so many numbers.
@@ -29,24 +31,25 @@ _REPEATS = 5  # of a timed block; the best counts
 
 
 class Assembled(NamedTuple):
-    """The candidate as its own steps show it, with its map, and the seconds that compiling took."""
+    """The candidate as its own steps show it, with its map, and the seconds that compiling took;
+    compiled: whether there was room for that in the budget, else the error is the search's."""
 
     candidate: Candidate
     compile_seconds: float
+    compiled: bool = True
 
 
-def assemble(
-    candidate: Candidate, prepared: Prepared, chart: AnyChart, family, params, features,
-    judges: Judges,
-) -> Assembled:  # fmt: skip
-    """The candidate's map, its error and its time per step measured by the steps that users run."""
-    generated = with_predictor(
-        Generated(family, params, chart, prepared.dt, prepared.scale), prepared, judges.training,
-        features,
-    )  # fmt: skip
-    map_ = composed(generated, prepared, judges)
-    held = judges.pairs.take(judges.held_out)
-    steps = stepped(map_, np.asarray(held.z0), held.dt, held.args)
+def measured(
+    candidate: Candidate, map_: SymplecticMap, prepared: Prepared, judges: Judges, budget: Budget
+) -> Assembled:
+    """The candidate with this map, its error and its time per step measured by the steps that users
+    run, as long as compiling them fits into the budget."""
+    held, compiling = judges.pairs.take(judges.held_out), budget.compiling
+    try:
+        with budget.last(_TIMING, COMPILE, compiling, decides=True):
+            steps = stepped(map_, np.asarray(held.z0), held.dt, held.args)
+    except OutOfTime:
+        return Assembled(dataclasses.replace(candidate, map=map_), 0.0, compiled=False)
     error = judges.error_of(
         np.where(steps.failed[:, None], np.nan, steps.images), prepared.coordinates
     )
@@ -58,7 +61,7 @@ def assemble(
     return Assembled(candidate, steps.compile_seconds)
 
 
-def with_predictor(generated: Generated, prepared: Prepared, rows, features=None) -> Generated:
+def with_predictor(generated: Generated, prepared: Prepared, rows) -> Generated:
     """The piece with predictors fitted to its own images of the data's states: where S is coarse,
     the data are no closer to its roots than S is to the data."""
     rows = rows[:_PREDICTOR_PAIRS]
@@ -68,6 +71,7 @@ def with_predictor(generated: Generated, prepared: Prepared, rows, features=None
     if solved.sum() < 2:  # nothing to learn from: the data's own images
         images, solved = prepared.y1[rows], np.ones(len(rows), bool)
     coordinates, args = prepared.coordinates, prepared.given(rows[solved])[1]
+    features = getattr(getattr(generated.family, "inputs", None), "features", None)
     fitted = fit_predictors(
         generated.chart, prepared.y0[rows][solved], images[solved],
         of_lanes(prepared.given(rows)[0], solved),

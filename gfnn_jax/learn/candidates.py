@@ -12,13 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_user
+from gfnn_jax.dataset.bounds import bound_of_mean
+from gfnn_jax.dataset.split import split_rows
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.phase_space import Pairs, sizes
 
-_NORMAL_95 = 1.645
 # A step in NumPy whose residual is larger, relative to its terms, has not been solved.
 _SOLVED = 1e-10
 _BLOCK = 500  # states that one of several devices steps at a time
@@ -78,7 +79,7 @@ class OneStepError(NamedTuple):
     """Z_predicted − Z on held-out pairs, in the user's coordinates, angles to the nearest image.
 
     rms, relative, deviations: as in Candidate. bound: the upper 95 % bound in the tolerance's
-    measure, that of the mean square by the central limit theorem. All infinite where a step fails.
+    measure (`dataset.bounds`). All infinite where a step fails.
     """
 
     rms: float
@@ -87,15 +88,16 @@ class OneStepError(NamedTuple):
     deviations: np.ndarray
 
 
-def one_step_error(error, spread, tolerance: Tolerance) -> OneStepError:
-    """The statistics of errors (N, 2d) of states whose coordinates have this spread (2d,)."""
+def one_step_error(error, spread, tolerance: Tolerance, block=None) -> OneStepError:
+    """The statistics of errors (N, 2d) of states whose coordinates have this spread (2d,). block:
+    (N,) which of them depend on each other; None: none do."""
     if not np.isfinite(error).all():
         width = error.shape[1]
         return OneStepError(np.inf, np.inf, np.inf, np.full(width, np.inf))
     squares = error**2
     deviations = np.sqrt(squares.mean(axis=0))
     measured = np.mean(squares / spread**2 if tolerance.relative else squares, axis=1)
-    bound = measured.mean() + _NORMAL_95 * measured.std() / np.sqrt(len(measured))
+    bound = bound_of_mean(measured, np.arange(len(measured)) if block is None else block)
     return OneStepError(
         float(np.sqrt(squares.mean())),
         float(np.sqrt(np.mean(squares / spread**2))),
@@ -106,12 +108,22 @@ def one_step_error(error, spread, tolerance: Tolerance) -> OneStepError:
 
 @dataclasses.dataclass(frozen=True)
 class Judges:
-    """The pairs, which of them train and which judge, and the error that is asked for."""
+    """The pairs, which of them train, which choose (``held_out``) and which state the error
+    (``test``, looked at once, at the end), and the error that is asked for. stretch: (N,) as that
+    of `dataset.split.Split`."""
 
     pairs: Pairs
     training: np.ndarray
     held_out: np.ndarray
     tolerance: Tolerance
+    test: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    stretch: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, pairs: Pairs, seed: int, tolerance: Tolerance) -> Judges:
+        """Of pairs with their runs and places, split by the seed."""
+        split = split_rows(pairs, seed)
+        return cls(pairs, split.training, split.validation, tolerance, split.test, split.stretch)
 
     @property
     def spread(self) -> np.ndarray:
@@ -122,11 +134,21 @@ class Judges:
         """Whether the candidate's error is within the tolerance, at 95 %."""
         return candidate.validation_bound <= self.tolerance.bound
 
-    def error_of(self, images: np.ndarray, coordinates) -> OneStepError:
-        """Of the held-out pairs' images (N, 2d) in the user's coordinates."""
+    def error_of(self, images: np.ndarray, coordinates, rows=None) -> OneStepError:
+        """Of the held-out pairs' images (N, 2d) in the user's coordinates, or of these rows'.
+
+        The bound by the held-out pairs is the one that the test pairs are likely to state: as far
+        above their error again as that is above the held-out pairs'.
+        """
         angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
-        error = nearest_image(images - np.asarray(self.pairs.z1)[self.held_out], angles)
-        return one_step_error(error, self.spread, self.tolerance)
+        own = self.held_out if rows is None else rows
+        error = nearest_image(images - np.asarray(self.pairs.z1)[own], angles)
+        block = None if self.stretch is None else self.stretch[own]
+        found = one_step_error(error, self.spread, self.tolerance, block)
+        size = found.relative if self.tolerance.relative else found.rms
+        if rows is not None or not len(self.test) or not 0 < size < np.inf:
+            return found
+        return found._replace(bound=found.bound**2 / size)
 
     def estimate(self, relative: float) -> OneStepError:
         """What a relative residual of the gradient lets expect of the step."""

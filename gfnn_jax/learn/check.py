@@ -9,6 +9,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.own import is_own
 from gfnn_jax.families.sums import site_terms
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.generating.charts import CHARTS
@@ -38,19 +39,23 @@ def check_request(
     learn,
     family,
     angles,
+    model=None,
     terms=(),
     base=None,
     structure=None,
     ensemble=1,
     seed=0,
     max_seconds: float | None = None,
+    max_operations: int | None = None,
 ) -> None:
     """Raises FitError where the request or the pairs cannot give a map."""
     for name, value, known in (
         ("chart", chart, CHART_NAMES), ("family", family, FAMILIES), ("learn", learn, LEARNS)
     ):  # fmt: skip
-        if value not in known:
-            raise FitError(f"expected a {name} among {', '.join(known)}; got '{value}'")
+        if name == "family" and is_own(value):
+            continue
+        if not isinstance(value, str) or value not in known:
+            raise FitError(f"expected {name} to be one of {', '.join(known)}; got {value!r}")
     if not isinstance(pairs, Pairs):
         raise FitError(f"expected gfnn.Pairs(z0, z1, dt), got {type(pairs).__name__}")
     if scene is not None and not isinstance(scene, Scene):
@@ -58,10 +63,18 @@ def check_request(
     budget = isinstance(max_seconds, numbers.Real) and max_seconds > 0
     if max_seconds is not None and not budget:
         raise FitError(f"expected max_seconds above 0, or None for no limit; got {max_seconds!r}")
+    counted = isinstance(max_operations, numbers.Integral) and max_operations >= 0
+    if max_operations is not None and not counted:
+        raise FitError(
+            "expected a whole number of operations as max_operations, or None for no limit; got "
+            f"{max_operations!r}"
+        )
     if not (isinstance(seed, numbers.Integral) and 0 <= seed < 2**32):
         raise FitError(f"expected a whole number from 0 to 2**32 - 1 as seed, got {seed!r}")
     if not (isinstance(ensemble, numbers.Integral) and ensemble >= 1):
         raise FitError(f"expected a whole number of 1 or more as ensemble, got {ensemble!r}")
+    if model is not None:
+        _check_model(model, learn, terms, base, structure, family, chart)
     if ensemble > 1 and (family != "mlp" or learn == "hamiltonian"):
         raise FitError("an ensemble is of networks S: expected family='mlp', and S to be learned")
     own_dt = bool(np.ndim(pairs.dt))
@@ -134,6 +147,21 @@ def check_request(
         check_number(pairs)
     elif len(pairs) < FEWEST:
         raise FitError(f"expected at least {FEWEST} pairs, got {len(pairs)}")
+
+
+def _check_model(model, learn, terms, base, structure, family, chart) -> None:
+    """Raises FitError for what is no model, or does not go with one."""
+    missing = [name for name in ("name", "sizes", "fit") if not hasattr(model, name)]
+    if missing:
+        raise FitError(
+            f"expected a model with a name, sizes(data) and fit(data, size); {model!r} has no "
+            f"{', '.join(missing)}"
+        )
+    if (learn, family, chart, base) != ("auto", "auto", "auto", None) or terms or structure:
+        raise FitError(
+            "a model of one's own is all that is learned: expected no learn, terms, base, "
+            "structure, family or chart beside it"
+        )
 
 
 def check_number(pairs: Pairs) -> None:

@@ -6,10 +6,11 @@ import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from gfnn_jax.learn.assemble import assemble
+from gfnn_jax.errors import OutOfTime
+from gfnn_jax.learn.assemble import composed, measured
 from gfnn_jax.learn.candidates import Candidate, Judges
 from gfnn_jax.learn.choose_law import preferred
-from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.clock import ROWS, Budget
 from gfnn_jax.learn.learned_law import assembled as flow_assembled
 from gfnn_jax.learn.map_of_terms import assembled as map_assembled
 from gfnn_jax.learn.prepare import Prepared
@@ -34,16 +35,18 @@ class Chosen(NamedTuple):
 
 def choose(searched: Searched, request: Request) -> Chosen:
     """The candidate that is taken, its error and its time measured by the steps that users run."""
-    law, judges = searched.law, searched.judges
+    law, judges, budget = searched.law, searched.judges, request.budget
+    if searched.linear is not None:
+        return Chosen(searched.linear, searched.plain, judges, 0.0)
     if searched.of_terms is not None:
-        candidate, seconds = map_assembled(searched.of_terms, searched.plain, judges)
+        candidate, seconds, _ = map_assembled(searched.of_terms, searched.plain, judges, budget)
         return Chosen(candidate, searched.plain, judges, seconds)
     ranking, bound = searched.found.ranking, judges.tolerance.bound
     best = ranking[0].candidate if ranking else None
     if law is None or not (best is None or preferred(law.candidate, best, bound)):
         return _of_ranking(ranking, request)
     request.say(f"compiling the flow of {law.candidate.label}")
-    candidate, seconds = flow_assembled(law, searched.plain, judges)
+    candidate, seconds, _ = flow_assembled(law, searched.plain, judges, budget)
     expected = max(bound, _BORNE_OUT * law.candidate.validation_bound)
     if best is not None and not candidate.validation_bound <= expected:
         return _of_ranking(ranking, request)
@@ -56,25 +59,19 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     Where the steps of a map that was to meet the tolerance do not, larger ones of its sweep are
     looked at before others.
     """
-    clock, say, bound = request.clock, request.say, request.tolerance.bound
+    budget, say, bound = request.budget, request.say, request.tolerance.bound
     compile_seconds, tried = 0.0, []
     first = ranking[0]
-    larger = _larger(first, clock, say) if first.candidate.validation_bound <= bound else ()
+    larger = _larger(first, budget, say) if first.candidate.validation_bound <= bound else ()
     for entry in itertools.chain([first], larger, ranking[1:]):
         say(f"compiling the step of {entry.candidate.chart} {entry.candidate.label}")
-        sweep, size = entry.sweep, entry.size
-        _, params = sweep.solve(size, Clock(), say)
-        inputs = getattr(size.family, "inputs", None)
-        assembled = assemble(
-            entry.candidate, sweep.prepared, sweep.chart, size.family, params,
-            getattr(inputs, "features", None), sweep.judges,
-        )  # fmt: skip
+        sweep = entry.sweep
+        map_ = composed(sweep.piece(entry.size), sweep.prepared, sweep.judges)
+        assembled = measured(entry.candidate, map_, sweep.prepared, sweep.judges, budget)
         compile_seconds += assembled.compile_seconds
         tried.append((assembled.candidate, entry))
         expected = max(bound, _BORNE_OUT * entry.candidate.validation_bound)
-        if assembled.candidate.validation_bound <= expected:
-            break
-        if clock.left_in_all < assembled.compile_seconds:
+        if assembled.candidate.validation_bound <= expected or not assembled.compiled:
             break
     candidate, entry = min(
         tried, key=lambda t: (t[0].validation_bound > bound, t[0].validation_bound)
@@ -82,11 +79,15 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     return Chosen(candidate, entry.sweep.prepared, entry.sweep.judges, compile_seconds, entry)
 
 
-def _larger(entry: Entry, clock: Clock, say) -> Iterator[Entry]:
-    """The larger sizes of an entry's sweep, validated by steps, as long as there is time."""
-    sizes = entry.sweep.sizes
-    for size in sizes[sizes.index(entry.size) + 1 :]:
-        if clock.left <= 0:
+def _larger(entry: Entry, budget: Budget, say) -> Iterator[Entry]:
+    """The larger sizes of an entry's sweep, validated by steps, as far as the budget goes."""
+    sweep = entry.sweep
+    for size in sweep.sizes[sweep.sizes.index(entry.size) + 1 :]:
+        work = sweep.work(size) + sweep.work_of_steps(size)
+        try:
+            with budget.unit(sweep.named(size), ROWS, work):
+                judged = sweep.judge(size, budget, say)
+                judged = sweep.validate(size, judged, budget, say)
+        except OutOfTime:
             return
-        judged = entry.sweep.judge(size, Clock(), say)
-        yield Entry(entry.sweep.validate(size, judged, Clock(), say), entry.sweep, size)
+        yield Entry(judged, sweep, size)

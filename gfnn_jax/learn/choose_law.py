@@ -11,7 +11,7 @@ import numpy as np
 from gfnn_jax.errors import FitError
 from gfnn_jax.fitting.turns import backwards, tangent, turns
 from gfnn_jax.learn.candidates import Candidate, Judges
-from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.clock import Budget, OutOfTime
 from gfnn_jax.learn.flows import learn_hamiltonian
 from gfnn_jax.learn.law_options import OPTIONS
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
@@ -22,9 +22,8 @@ from gfnn_jax.scenes.scene import Scene
 # budget is counted, so that a busy machine chooses no other candidate: 20 and 30 seconds of a quiet
 # core, which makes 5e8 of these operations a second, of modes 7e8 (two bodies, PCR3BP, pendulums).
 _BESIDE = dataclasses.replace(
-    OPTIONS, most_terms=60, most_modes=150, max_seconds=np.inf, mode_seconds=np.inf,
-    max_operations=1e10, mode_operations=2e10,
-)  # fmt: skip
+    OPTIONS, most_terms=60, most_modes=150, max_operations=1e10, mode_operations=2e10
+)
 # A law holds outside the data and at any time step: so much dearer a step it may be.
 DEARER = 4.0
 # Where none meets the tolerance, errors that the noise of held-out pairs does not tell apart.
@@ -32,8 +31,6 @@ _AS_GOOD = 1.01
 # Of the error that a library must leave to have helped, where noise hides what it brings.
 _GAINED_ALONE = 0.8
 _TURNED = 0.2  # radians backwards that are worth a word
-_PART = 0.5  # of the time that is left, at most, for H beside a map
-_PART_STRUCTURED = 0.6  # the same where S is a sum over sites
 
 
 def law_of(
@@ -42,10 +39,11 @@ def law_of(
     scene: Scene | None,
     learn: str,
     terms: Sequence[str | Callable],
-    clock: Clock,
+    budget: Budget,
     say: Callable[[str], Any],
 ) -> LearnedHamiltonian | None:
-    """The Hamiltonian of these pairs, or None where "auto" finds none.
+    """The Hamiltonian of these pairs, or None where "auto" finds none, or the budget ends before
+    the first.
 
     prepared: without a base map. Raises FitError where a Hamiltonian is asked for and there is none
     to learn.
@@ -63,28 +61,19 @@ def law_of(
     if learn == "hamiltonian":  # no map stands in for a law that misses the tolerance
         options = dataclasses.replace(options, only_within=False, gained=_GAINED_ALONE)
     if structured:  # nothing else is learned of bodies, and of sites S in a few seconds
-        beside = learn == "auto" and prepared.of_terms
-        most = _PART_STRUCTURED * clock.left if beside else np.inf
-        options = dataclasses.replace(options, max_seconds=most)
-    elif learn == "auto":  # the map, which every system has, is to have the better part of the time
-        part = _PART * clock.left
-        options = dataclasses.replace(
-            options, max_seconds=min(options.max_seconds, part),
-            mode_seconds=min(options.mode_seconds, part),
-        )  # fmt: skip
-    started = clock.seconds
+        options = dataclasses.replace(options, max_operations=np.inf)
     try:
         with np.errstate(all="ignore"):  # starts that run away are part of the search
             return learn_hamiltonian(
-                prepared, judges, scene, terms=terms, clock=clock, say=say, options=options
+                prepared, judges, scene, terms=terms, budget=budget, say=say, options=options
             )
-    except OutOfTime as spent:
-        if learn == "hamiltonian":
-            seconds = clock.seconds - started
-            raise FitError(f"expected an H that is fitted in {seconds:.2g} s: none was") from spent
+    except OutOfTime:
+        budget.leave_out("H", "no library of terms was fitted within the budget")
     except (FitError, np.linalg.LinAlgError) as error:
         if learn == "hamiltonian" or terms:
             raise FitError(str(error)) from error
+        if isinstance(error, np.linalg.LinAlgError):
+            budget.leave_out("H", f"the arithmetic failed ({error})")
     return None
 
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 
 from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.dataset.runs import first_occurrences, steps_between
 from gfnn_jax.learn.check import check_number
 from gfnn_jax.learn.diagnose import outliers
-from gfnn_jax.learn.held_out import first_occurrences, places, steps_between
 from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.screening import gross_errors
 from gfnn_jax.learn.structures import Structure
@@ -21,16 +20,22 @@ _MOST_OUTLIERS = 0.05  # of the pairs may be left out
 
 
 class Taken(NamedTuple):
-    """The pairs that are taken, the same in the inner coordinates, and warnings about the rest."""
+    """The pairs that are taken, the same in the inner coordinates, the user's row of each, and
+    warnings about the rest."""
 
     pairs: Pairs
     prepared: Prepared
+    row: np.ndarray
     messages: list[str]
 
 
-def clean(pairs: Pairs, coordinates: Coordinates, structure: Structure | None = None) -> Taken:
+def clean(
+    pairs: Pairs, row: np.ndarray, coordinates: Coordinates, structure: Structure | None = None
+) -> Taken:
     """The pairs without copies, without gross errors that are certain, and, where they are few,
     without outliers.
+
+    pairs: with their runs and places. row: (N,) the user's row of each.
 
     Raises FitError where too few are left, or states have no inner coordinates.
     """
@@ -38,21 +43,20 @@ def clean(pairs: Pairs, coordinates: Coordinates, structure: Structure | None = 
     copies = len(pairs) - len(first)
     if copies:
         messages.append(f"{copies} of {len(pairs)} pairs are copies of others: each counts once")
-        pairs = pairs.take(first)
+        pairs, row = pairs.take(first), row[first]
         if structure is None:
             check_number(pairs)
     prepared = prepare(pairs, coordinates, structure)
     if structure is not None:  # too few pairs for so many dimensions to have neighbours
-        return Taken(pairs, prepared, messages)
+        return Taken(pairs, prepared, row, messages)
     count = len(pairs)
     found = outliers(prepared.y0, prepared.y1, prepared.scale, given_by(prepared))
     few = len(found) <= _MOST_OUTLIERS * count
     wrong = np.zeros(count, bool)
     wrong[found[: len(found) if few else 0]] = True
-    gross = gross_errors(prepared, steps_between(pairs, None) > 0, wrong)
+    gross = gross_errors(prepared, steps_between(pairs) == 1, wrong)
     wrong[gross] = True
     kept = np.flatnonzero(~wrong)
-    place = places(pairs) if len(kept) < count else None
     if len(gross):
         # Sizes, and the interval of an angle, are those of what is left.
         prepared = prepare(pairs.take(kept), coordinates)
@@ -66,17 +70,17 @@ def clean(pairs: Pairs, coordinates: Coordinates, structure: Structure | None = 
     if len(found):
         messages.append(
             f"{len(found)} of {count} pairs contradict the pairs around them "
-            f"(rows {_named(first[found])}): "
+            f"(rows {_named(row[found])}): "
             + ("outliers, they are left out" if few else "too many to be left out")
         )
     if len(gross):
         messages.append(
-            f"{len(gross)} of {count} pairs (rows {_named(first[gross])}) are gross errors beside "
+            f"{len(gross)} of {count} pairs (rows {_named(row[gross])}) are gross errors beside "
             "a polynomial through the others: they are left out"
         )
-    if place is not None:
-        prepared = dataclasses.replace(prepared, place=place[kept])
-    return Taken(pairs.take(kept) if len(kept) < count else pairs, prepared, messages)
+    if len(kept) < count:
+        pairs, row = pairs.take(kept), row[kept]
+    return Taken(pairs, prepared, row, messages)
 
 
 def _named(rows: np.ndarray) -> str:

@@ -7,25 +7,28 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
+from gfnn_jax.errors import OutOfTime
 from gfnn_jax.learn.assemble import stepped
-from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance, refined_images
+from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance
 from gfnn_jax.learn.check import not_radians
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.choose_law import long_step
-from gfnn_jax.learn.clock import Clock
-from gfnn_jax.learn.diagnose import differs_between_sequences, sequences_of, volume_change
+from gfnn_jax.learn.clock import SOLVE
+from gfnn_jax.learn.diagnose import differs_between_sequences, volume_change
 from gfnn_jax.learn.noise import noise_of_sites, state_noise
 from gfnn_jax.learn.propose import proposed
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import AS_FAR, MET, Entry
 from gfnn_jax.learn.searches import Searched
+from gfnn_jax.learn.sweeps import OF_SOLVE, OF_STEPS
 
 _NO_MORE = {
     False: "no larger library of terms promised to meet it",
-    True: "the training of the network gained no more, or its budget is spent",
+    True: "the training of the network gained no more",
 }
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _SHARE = 0.1  # of the residual, that a change of volume must explain
+_KNOWN = 1.5  # times the noise that was given: up to it, what is left over is that noise
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 _RESIDUAL_PAIRS = 2_000  # whose residuals are looked at
 _NOISE_PAIRS = 1_024  # from which the noise of the states is measured
@@ -46,22 +49,32 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     met = searched.judges.met_by(candidate)
     ended, noise, messages, unmet, reason = found.ended, None, [], "", ""
     if not searched.swept:
-        ended = MET if met else _NO_MORE[request.of_network]
+        cut = request.budget.ended or (law.ended if law is not None else "")
+        ended = MET if met else cut or _NO_MORE[request.of_network]
     if ended.startswith(MET) and not met:
-        ended = "the steps of a map that was to meet it do not converge from some of the states"
-    if law is not None and searched.of_terms is None:
+        ended = (
+            "the pairs that chose the map meet it, those that state its error do not"
+            if np.isfinite(candidate.validation_relative)
+            else "the steps of a map that was to meet it do not converge from some of the states"
+        )
+    if law is not None and searched.of_terms is None and searched.linear is None:
         on_law = chosen.entry is None or searched.met_by_law
         said = on_law or (law.fast and not met)
         messages += law.messages if said else ()
         unmet = law.unmet if said else ""
     if met:
-        return Conclusion(ended, None, messages)
+        return Conclusion(ended, searched.judges.pairs.std, [*messages, *request.budget.left_out])
     diagnosis: list[str] = []
     structured = request.structure is not None  # too few pairs to look at their neighbours
-    if candidate.validation_relative > _ROUNDOFF:
+    if candidate.validation_relative > _ROUNDOFF and searched.linear is None:
         stalled = _stalled(candidate, chosen.entry, searched)
         left = _left_of_sites if structured else _what_is_left
-        noise, diagnosis, reason = left(chosen, searched, stalled)
+        work = _work(chosen.entry or next(iter(found.ranking), None))
+        try:
+            with request.budget.last("a look at what the map leaves over", SOLVE, work):
+                noise, diagnosis, reason = left(chosen, searched, stalled)
+        except OutOfTime:
+            pass  # told with what else was left out
         if reason and stalled:
             ended = f"larger models are no more accurate: {reason}"
         elif reason:
@@ -74,6 +87,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     if unmet and noise is None and not reason:  # else it is known why
         messages = [unmet, *messages]
     messages += [not_met(candidate, request.tolerance, ended), *diagnosis]
+    messages += request.budget.left_out
     return Conclusion(ended, noise, messages)
 
 
@@ -82,6 +96,17 @@ def only_noise(entry: Entry, searched: Searched) -> bool:
     if not _stalled(entry.candidate, entry, searched):
         return False
     return _no_noise(_residuals_of_sample(entry.candidate, entry, searched), True) is None
+
+
+def _work(entry: Entry | None) -> float:
+    """Operations of a look at what an entry's map leaves over, of H few: the solutions of either
+    half of the rows, steps in NumPy, and compiled ones for the derivative of a step."""
+    if entry is None:
+        return 0.0
+    width, count = 2 * entry.sweep.prepared.dim, entry.candidate.num_parameters
+    rows = len(entry.sweep.judges.training) * width
+    steps = OF_STEPS * (_RESIDUAL_PAIRS + _NOISE_PAIRS * width / 10)
+    return 2 * OF_SOLVE * count**3 + 2 * rows * count**2 + steps * entry.size.operations
 
 
 def _stalled(candidate: Candidate, entry: Entry | None, searched: Searched) -> bool:
@@ -128,7 +153,7 @@ def _residuals_of_sample(
     rows = np.sort(judges.training)[:_RESIDUAL_PAIRS]
     y0, residual, solved = _residuals(candidate, entry, judges, rows)
     rows, y0, residual = rows[solved], y0[solved], residual[solved]
-    sequence = sequences_of(judges.pairs.z0, judges.pairs.z1)[rows]
+    sequence = np.asarray(judges.pairs.run)[rows]
     scale = judges.spread if entry is None else entry.sweep.prepared.scale
     return _Sample(rows, y0, residual, scale, sequence)
 
@@ -185,8 +210,10 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     if law is not None and law.noise is not None and candidate.learns == "hamiltonian":
         # Along an arc what the law misses adds up, and looks like noise.
         noise = np.minimum(law.noise, noise)
+    if judges.pairs.std is not None:
+        return _beside_known(noise, judges.pairs.std)
     own = ""
-    if candidate.learns == "map" and entry is not None:
+    if candidate.learns == "map" and entry is not None and isinstance(entry.sweep, LinearSweep):
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))
         own = f" (the map's own error is then about {part:.1g} of it)"
     hidden = ""
@@ -201,6 +228,20 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         f"{hidden}or to have a structure that these functions cannot represent"
     )
     return _LeftOver(noise, [message])
+
+
+def _beside_known(found: np.ndarray, known: np.ndarray) -> _LeftOver:
+    """Noise (2d,) that was given, beside what the residuals suggest (2d,)."""
+    ratio = float(np.max(found / known))
+    if ratio <= _KNOWN:
+        reason = "what is left over is the noise that was given"
+        return _LeftOver(known, [f"larger models are no more accurate: {reason}"], reason)
+    message = (
+        f"larger models are no more accurate, and leave up to {ratio:.2g} times the noise that was "
+        "given: std is too small, or the pairs have a structure that these functions cannot "
+        "represent"
+    )
+    return _LeftOver(known, [message])
 
 
 def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOver:
@@ -226,10 +267,7 @@ def _residuals(
     prepared where S was learned, in the user's coordinates where only a law was."""
     if entry is not None:
         prepared = entry.sweep.prepared
-        _, params = entry.sweep.solve(entry.size, Clock(), lambda message: None)
-        images, solved = refined_images(
-            prepared, entry.sweep.chart, entry.size.family, params, rows
-        )
+        images, solved = entry.sweep.images(entry.size, rows)
         return prepared.y0[rows], prepared.y1[rows] - images, solved
     pairs, coordinates = judges.pairs.take(rows), chosen.map.coordinates
     angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()

@@ -23,13 +23,13 @@ from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import AnyChart
+from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.choose_charts import choose_charts
-from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.rows import rows_of
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping
-from gfnn_jax.phase_space import Pairs, split, symplectic_form
+from gfnn_jax.phase_space import split, symplectic_form
 from gfnn_jax.threads import one_thread
 
 _CERTAIN = 5.0  # standard errors that make a factor other than 1 certain
@@ -83,11 +83,12 @@ def area_factors(jacobians, scale) -> np.ndarray:
 
 
 def learn_damping(
-    prepared: Prepared, pairs: Pairs, jacobians, error: float, chart: str, reversor, seed: int
+    prepared: Prepared, judges: Judges, jacobians, error: float, chart: str, reversor
 ) -> LearnedDamping | None:
     """The D_b behind these pairs; None where areas are kept, or no D_b explains what is lost.
 
-    prepared: without a base map. jacobians: (n, 2d, 2d) local ones, known to the error.
+    prepared: the judges' pairs, without a base map. jacobians: (n, 2d, 2d) local ones, known to
+    the error.
     """
     factors, dim = area_factors(jacobians, prepared.scale), prepared.dim
     b = float(np.median(factors))
@@ -100,7 +101,7 @@ def learn_damping(
         charts = choose_charts(chart, undamped, reversor, start.undone(jacobians))
     except FitError:  # no chart covers the rest
         return None
-    rows = split_rows(pairs, seed, prepared.place)
+    rows = judges.training, judges.held_out
     problems = [_Problem(prepared, each, charts.half, *rows) for each in charts.charts]
 
     def best(spread: np.ndarray) -> tuple[_Fitted, _Problem]:

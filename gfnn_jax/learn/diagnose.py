@@ -36,6 +36,12 @@ _SLOPE_ERROR = 0.05
 _KNOWN, _ERRORS, _MISSED = 0.06, 3.0, 0.1
 # A pair is an outlier that its neighbours' fit misses by so many standard deviations.
 _OUTLYING, _OUTLIER_ROUNDS = 30.0, 5
+# Pairs that are looked at for gross errors, in blocks of a sequence: 50,000 take two seconds.
+_MOST_LOOKED_AT, _BLOCK = 50_000, 1_000
+# Of more terms than a few (above) only pairs are looked at that an affine map of all misses by so
+# many times the median, and so many that tell what is usual: 2,000 pairs of 32 degrees of freedom
+# take a second instead of eight.
+_SUSPECT, _USUAL = 3.0, 100
 # Neighbours that spread less than this part of their largest spread do not fill a direction.
 _THIN = 0.05
 # What an affine fit within sequences may leave of a residual that agrees within them; neighbours
@@ -135,7 +141,7 @@ def outliers(y0, y1, scale, given=None) -> np.ndarray:
     """
     x, move = np.asarray(y0) / scale, (np.asarray(y1) - np.asarray(y0)) / scale
     x = x if given is None else np.concatenate([x, given], axis=1)
-    rows, found = np.arange(len(x)), []
+    rows, found = looked_for_errors(len(x)), []
     for _ in range(_OUTLIER_ROUNDS):
         outlying = _studentised(x[rows], move[rows]) > _OUTLYING
         if not outlying.any():
@@ -153,8 +159,9 @@ def _studentised(x, move):
     if n <= count:
         return np.zeros(n)
     tree, floor = cKDTree(x), 1e-13 * (1 + np.abs(move).max())
-    error, deviation = np.empty(n), np.empty(n)
-    for block in np.array_split(np.arange(n), 1 + n // 10_000):  # in bounded memory
+    error, deviation = np.zeros(n), np.zeros(n)
+    rows = _suspect(x, move) if terms > _MANY_TERMS else np.arange(n)
+    for block in np.array_split(rows, 1 + len(rows) // 10_000):  # in bounded memory
         near = tree.query(x[block], k=count + 1)[1][:, 1:]
         offset = x[near] - x[block][:, None, :]
         design = np.concatenate([np.ones((*offset.shape[:2], 1)), offset], axis=-1)
@@ -168,7 +175,25 @@ def _studentised(x, move):
         growth = np.sqrt(1 + np.sum(inverse[:, 0] ** 2, axis=-1))
         error[block] = np.linalg.norm(move[block] - solution[:, 0], axis=1) / growth
     # With so few neighbours a fit is now and then exact by chance.
-    return error / (np.maximum(deviation, np.median(deviation)) + floor)
+    return error / (np.maximum(deviation, np.median(deviation[rows])) + floor)
+
+
+def looked_for_errors(count: int) -> np.ndarray:
+    """Rows of so many pairs that are looked at for gross errors: all, or blocks of every part."""
+    blocks = -(-count // _BLOCK)
+    apart = -(-blocks // (_MOST_LOOKED_AT // _BLOCK))
+    return np.flatnonzero(np.arange(count) // _BLOCK % apart == 0)
+
+
+def _suspect(x, move) -> np.ndarray:
+    """Rows whose move one affine map of all pairs misses by more than usual, and a few others: in
+    many dimensions neighbours are far apart, and tell little more than all pairs do."""
+    design = np.column_stack([np.ones(len(x)), x])
+    rest = move - design @ np.linalg.lstsq(design, move, rcond=None)[0]
+    size = np.linalg.norm(rest, axis=1)
+    far = size > _SUSPECT * np.median(size)
+    far[:_USUAL] = True
+    return np.flatnonzero(far)
 
 
 def _pseudo_inverse(design):
@@ -259,24 +284,32 @@ def _divergence(z, residual) -> tuple[float, float]:
     few = len(z) < _PAIRS_PER_TERM * math.comb(width + 3, 3)
     degrees = range(2 if few else 4)
     terms = [t for k in degrees for t in combinations_with_replacement(range(width), k)]
-    powers = np.array([[term.count(i) for i in range(width)] for term in terms])
 
-    def monomials(exponents):
-        return np.prod(x[:, None, :] ** exponents[None, :, :], axis=2)
+    def monomials(terms):
+        return np.stack([np.prod(x[:, list(term)], axis=1) for term in terms], axis=1)
 
-    design = monomials(powers)
+    design = monomials(terms)
     coefficients = np.linalg.lstsq(design, residual, rcond=None)[0]
     rest = residual - design @ coefficients
     if np.mean(rest**2) > 0.5 * np.mean(residual**2):
         return 0.0, np.inf
     covariance = np.linalg.pinv(design.T @ design)
     change, variance = 0.0, 0.0
-    for i, unit in enumerate(np.eye(width, dtype=int)):
-        lowered = monomials(np.maximum(powers - unit, 0))
-        slope = powers[:, i] * lowered.mean(axis=0) / size[i]  # of each term, in direction i
+    for i in range(width):
+        own = [j for j, term in enumerate(terms) if i in term]
+        powers = np.array([terms[j].count(i) for j in own])
+        lowered = monomials([_without(terms[j], i) for j in own])
+        slope = np.zeros(len(terms))  # of each term, in direction i
+        slope[own] = powers * lowered.mean(axis=0) / size[i]
         change += slope @ coefficients[:, i]
         variance += slope @ covariance @ slope * rest[:, i].var()
     return float(change), float(np.sqrt(variance))
+
+
+def _without(term: tuple[int, ...], i: int) -> tuple[int, ...]:
+    """The term with one factor of the i-th coordinate less."""
+    place = term.index(i)
+    return term[:place] + term[place + 1 :]
 
 
 def sampled_dimension(y, scale) -> int:
@@ -293,13 +326,6 @@ def sampled_dimension(y, scale) -> int:
     offset = x[near] - x[near].mean(axis=1, keepdims=True)
     spread = np.linalg.svd(offset, compute_uv=False)
     return int(np.median(np.sum(spread > _THIN * spread[:, :1], axis=1)))
-
-
-def sequences_of(z0, z1) -> np.ndarray:
-    """The number (N,) of the sequence that each pair is of: a pair goes on with the next one where
-    its image is the next one's state."""
-    goes_on = np.all(np.asarray(z1)[:-1] == np.asarray(z0)[1:], axis=1)
-    return np.concatenate([[0], np.cumsum(~goes_on)])
 
 
 def differs_between_sequences(z, residual, sequence) -> bool:

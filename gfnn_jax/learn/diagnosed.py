@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.families.terms import given_terms
+from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.choose_charts import Charts, choose_charts
 from gfnn_jax.learn.damping import LearnedDamping, learn_damping, where_areas_differ
 from gfnn_jax.learn.diagnose import (
@@ -20,7 +21,6 @@ from gfnn_jax.learn.factor_out import factored_out, flow_of
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.varied import given_by
-from gfnn_jax.phase_space import Pairs
 
 
 class Diagnosis(NamedTuple):
@@ -35,10 +35,10 @@ class Diagnosis(NamedTuple):
     damping: LearnedDamping | None = None
 
 
-def diagnose_request(request: Request, plain: Prepared, pairs: Pairs) -> Diagnosis:
+def diagnose_request(request: Request, plain: Prepared, judges: Judges) -> Diagnosis:
     """The diagnosis of the pairs that a fit takes; a law that the user knows is factored out.
 
-    plain: these pairs as prepared. Raises FitError where no chart covers the data.
+    plain: the judges' pairs as prepared. Raises FitError where no chart covers the data.
     """
     if plain.varied or plain.structure is not None:  # H or a sum of terms is looked for first
         return Diagnosis(plain, plain, Charts([], None, {}, []), float("nan"), [])
@@ -50,23 +50,23 @@ def diagnose_request(request: Request, plain: Prepared, pairs: Pairs) -> Diagnos
     # A law of the user's keeps areas, and so does what H of an autonomous system generates.
     may_lose = request.base is None and request.learn != "hamiltonian" and not plain.after
     return diagnosed(
-        prepared, request.chart, request.reversor, request.seed, pairs if may_lose else None
+        prepared, request.chart, request.reversor, request.seed, judges if may_lose else None
     )
 
 
 def diagnosed(
-    prepared: Prepared, chart: str, reversor, seed: int, damped: Pairs | None = None
+    prepared: Prepared, chart: str, reversor, seed: int, damped: Judges | None = None
 ) -> Diagnosis:
     """What the local Jacobians say: whether the pairs look symplectic, and which charts cover
     them; the base map is factored out where one is needed.
 
-    damped: the pairs, where a map that loses area is looked for: its D_b is factored out too.
+    damped: of these pairs, where a map that loses area is looked for: its D_b is factored out too.
     """
     plain = prepared
     jacobians, error = local_jacobians(plain.y0, plain.y1, plain.scale, given_by(plain), seed=seed)
     defect, messages, damping = data_defect(jacobians, plain.scale), _thin(plain), None
     if damped is not None:
-        damping = learn_damping(plain, damped, jacobians, error, chart, reversor, seed)
+        damping = learn_damping(plain, damped, jacobians, error, chart, reversor)
     if damping is not None:
         jacobians = damping.undone(jacobians)
         prepared = plain = plain.without(None, damping.piece)

@@ -43,6 +43,11 @@ class EnsembleSweep(NetworkSweep):
         self._take(jax.tree.map(lambda *a: np.stack(a), *self._starts))
         self._params = np.full(count, 1.0 / count)
 
+    @property
+    def _work_of_iteration(self) -> float:
+        w, parameters = self._train[0], self._network.num_parameters
+        return 2.0 * len(self._starts) * w.size * parameters**2
+
     def _take(self, members) -> None:
         family = Ensemble(self._network, jax.tree.map(np.asarray, members))
         self.sizes = [Size(family, family, 0.0)]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -18,35 +19,38 @@ import jax
 import numpy as np
 
 from gfnn_jax.data.recording import Recording
-from gfnn_jax.errors import FitError, FitWarning
+from gfnn_jax.dataset.runs import identified
+from gfnn_jax.errors import FitError, FitWarning, OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.assemble import block_of
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance
 from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.clean import clean
-from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.clock import COMPILE, ROWS, Budget
 from gfnn_jax.learn.conclude import conclude
 from gfnn_jax.learn.damping import LearnedDamping
-from gfnn_jax.learn.diagnose import ChartJudgement
+from gfnn_jax.learn.diagnose import ChartJudgement, looked_for_errors
 from gfnn_jax.learn.diagnosed import diagnose_request
 from gfnn_jax.learn.draw import NUM_PAIRS, drawn
 from gfnn_jax.learn.gross_errors import without_gross_errors
-from gfnn_jax.learn.held_out import split_rows
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.positions import OfPositions, learn_positions
-from gfnn_jax.learn.posterior import with_posterior
+from gfnn_jax.learn.posterior import with_posterior, work_of_posterior
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
+from gfnn_jax.learn.stated import stated
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.model import Model
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
 
 MAX_SECONDS = 120.0
 
+_OF_DERIVATIVE = 3.0  # times a step's: the time that compiling its derivative takes
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken
 
 
@@ -66,12 +70,18 @@ class Fit:
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
     scene: as given. damping: of a map that loses area, by how much of it in a step. positions: of a
     map that was learned from positions alone, what its S is like; num_pairs are then triples.
+    stated_by: the pairs by which the chosen candidate's error was measured.
+    validation_pairs, test_pairs: that chose, and that stated the error; None where the pairs were
+    too few for these. operations: of the search, as counted; as ``max_operations`` they give this
+    map again, whatever the clock. budget: what is left of it. tells_defect: whether there is
+    time in it to compile the derivative of a step.
     """
 
     map: SymplecticMap
     candidates: tuple[Candidate, ...]
     asked: Tolerance
     num_pairs: int
+    validation_pairs: Pairs
     judgements: dict[str, ChartJudgement]
     data_defect: float
     base_map: bool
@@ -88,6 +98,11 @@ class Fit:
     scene: Scene | None = None
     damping: LearnedDamping | None = None
     positions: OfPositions | None = None
+    stated_by: str = ""
+    test_pairs: Pairs | None = None
+    operations: int = 0
+    budget: Budget = dataclasses.field(default_factory=Budget, repr=False)
+    tells_defect: bool = True
 
     def __repr__(self) -> str:
         """One line: the chosen map, its error and the tolerance."""
@@ -135,6 +150,38 @@ class Fit:
             tolerance=self.relative_tolerance if tolerance is None else tolerance,
         )  # fmt: skip
 
+    def settled(self) -> Fit:
+        """With what a report and a saved model hold beside the map, as far as the budget goes: the
+        posterior, which is left out of the map where it does not fit, and the defect of a step.
+        Warns (FitWarning) of what is left out."""
+        told, map_, tells = len(self.budget.left_out), self.map, True
+        if map_.posterior is not None and not map_.posterior.known:
+            work = work_of_posterior(self.chosen.num_parameters)
+            try:
+                with self.budget.last("the posterior, which bands are drawn from", ROWS, work):
+                    _ = map_.posterior.root
+            except OutOfTime:
+                map_ = dataclasses.replace(map_, posterior=None)
+        try:
+            seconds = _OF_DERIVATIVE * self.budget.compiling
+            with self.budget.last("the symplecticity defect of a step", COMPILE, seconds):
+                defect = self.symplecticity_defect
+        except OutOfTime:
+            tells, defect = False, float("nan")
+        messages = self.budget.left_out[told:]
+        for message in messages:
+            warnings.warn(message, FitWarning, stacklevel=2)
+        candidates = tuple(
+            dataclasses.replace(c, map=map_) if c.chosen else c for c in self.candidates
+        )
+        found = dataclasses.replace(
+            self, map=map_, candidates=candidates, messages=(*self.messages, *messages),
+            tells_defect=tells, seconds=self.budget.seconds,
+        )  # fmt: skip
+        if tells:
+            found.__dict__["symplecticity_defect"] = defect
+        return found
+
     def sample(self, key, num: int):
         """``num`` maps drawn from the posterior of the chosen map's coefficients, as one pytree,
         each exactly symplectic: `maps.samples.Samples`. key: of ``jax.random``.
@@ -143,6 +190,13 @@ class Fit:
         drawn from a law.
         """
         return self.map.sample(key, num)
+
+    @property
+    def max_operations(self) -> int:
+        """A bound on operations that gives this map again: the one that was asked for, or those
+        that were done."""
+        asked = self.budget.max_operations
+        return self.operations if asked is None else asked
 
     @property
     def relative_tolerance(self) -> float:
@@ -205,12 +259,15 @@ def fit(
     terms: Sequence[str | Callable] = (),
     base: str | Callable | None = None,
     structure: str | None = None,
-    family: str = "auto",
+    family: Any = "auto",
+    model: Model | None = None,
     chart: str = "auto",
     ensemble: int = 1,
     angles: tuple[int, ...] = (),
     seed: int = 0,
     max_seconds: float | None = MAX_SECONDS,
+    max_operations: int | None = None,
+    clock: Callable[[], float] = time.perf_counter,
     max_iterations: int = 250,
     devices: int | str | None = None,
     checkpoints: Any = None,
@@ -242,13 +299,20 @@ def fit(
                species; of sites, S where learn is "map" or no H meets the tolerance.
                None: the scene's own.
     family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp";
-               with learn="hamiltonian" H is a sum of terms, or a network with "mlp".
+               with learn="hamiltonian" H is a sum of terms, or a network with "mlp". Or a family
+               of one's own that is linear in its parameters, or a function of `Inputs` that gives
+               such families by rising number of terms (`families.own`).
+    model:     a model of one's own (`models.model.Model`), which is then all that is learned.
     chart:     "auto" or one of type1, type2, type3, midpoint.
     ensemble:  so many networks trained together, of which the map is the mean and their spread the
                posterior; with family="mlp".
     angles:    without a scene, the indices of z that have period 2π.
     max_seconds: for all of it; the search ends with the best map so far while there is time to
-               compile its step. None: no budget.
+               compile its step. None: no budget, and the same map on a busy machine and an idle
+               one.
+    max_operations: of the search, as counted: what a fit reports as ``operations`` gives its map
+               again, whatever the clock has ended. None: no bound.
+    clock:     gives the seconds that max_seconds is held against.
     max_iterations: of the training of "mlp".
     devices:   of this process, among which the rows of the least-squares and Gauss–Newton problems,
                the steps of held-out pairs and the networks of an ensemble are shared out: "all" or
@@ -264,16 +328,18 @@ def fit(
     meets the tolerance, where a chart is close to singular, where pairs contradict their neighbours
     (a few are left out), and where the pairs do not look symplectic.
     """
-    require_x64("a fit")
     if isinstance(pairs, Recording):
         if learn != "map":
             raise FitError("expected learn='map' with a recording of positions")
         return fit_positions(
             pairs, tolerance=tolerance, absolute_tolerance=absolute_tolerance,
-            structure=structure, seed=seed, max_seconds=max_seconds, on_progress=on_progress,
+            structure=structure, seed=seed, max_seconds=max_seconds,
+            max_operations=max_operations, clock=clock, on_progress=on_progress,
             on_candidate=on_candidate,
         )  # fmt: skip
-    clock = Clock(max_seconds, pairs.dim if isinstance(pairs, Pairs) else None)
+    dim = pairs.dim if isinstance(pairs, Pairs) else None
+    budget = Budget(max_seconds, max_operations, clock, dim)
+    require_x64("a fit")
     messages: list[str] = []
 
     def warn(new: Sequence[str]) -> None:
@@ -283,28 +349,39 @@ def fit(
 
     request = checked(
         pairs, scene, tolerance=tolerance, absolute_tolerance=absolute_tolerance, learn=learn,
-        terms=terms, base=base, structure=structure, family=family, chart=chart,
-        ensemble=ensemble, angles=angles, seed=seed, clock=clock, max_iterations=max_iterations,
+        terms=terms, base=base, structure=structure, family=family, model=model, chart=chart,
+        ensemble=ensemble, angles=angles, seed=seed, budget=budget, max_iterations=max_iterations,
         checkpoints=checkpoints, factors=factors, say=on_progress, tell=on_candidate,
     )  # fmt: skip
     warn(request.messages)
     on_progress("looking at the map's local Jacobians")
     with row_blocks.on_devices(_devices(devices)):
-        pairs, plain, about_pairs = clean(request.pairs, request.coordinates, request.structure)
+        pairs, plain, row, about_pairs = clean(
+            *identified(request.pairs), request.coordinates, request.structure
+        )
         warn(about_pairs)
-        seen = diagnose_request(request, plain, pairs)
+        looked_at = len(looked_for_errors(len(request.pairs)))
+        if looked_at < len(request.pairs):
+            budget.leave_out(
+                f"a look for gross errors at all but {looked_at:,} of {len(request.pairs):,} pairs",
+                "those that the map misses by far are found in the end",
+            )
+        judges = Judges.of(pairs, seed, request.tolerance)
+        seen = diagnose_request(request, plain, judges)
         warn(seen.messages)
         damping, plain = seen.damping, seen.plain
         if damping is not None:  # H of an autonomous system keeps areas
             on_progress(str(damping))
             request = dataclasses.replace(request, learn="map")
-        judges = Judges(pairs, *split_rows(pairs, seed, plain.place), request.tolerance)
         found = searched(request, plain, seen, judges, on_better)
-        seen, found, about_pairs = without_gross_errors(request, seen, found)
+        seen, found, about_pairs = without_gross_errors(request, seen, found, row)
         warn(about_pairs)
         found = without_bias(found, request)
         pairs = found.judges.pairs
         chosen = with_posterior(choose(found, request), found)
+        on_progress("the test pairs: the error that is stated")
+        error = stated(chosen, found)
+        chosen = chosen._replace(candidate=error.candidate)
         conclusion = conclude(chosen, found, request)
         warn(conclusion.messages)
     judged = min(_JUDGED, block_of(2 * pairs.dim))
@@ -314,6 +391,7 @@ def fit(
         candidates=_all_candidates(chosen, found),
         asked=request.tolerance,
         num_pairs=len(pairs),
+        validation_pairs=pairs.take(found.judges.held_out),
         judgements=found.charts.judgements,
         data_defect=seen.data_defect,
         base_map=bool(chosen.prepared.before or chosen.prepared.after),
@@ -321,7 +399,7 @@ def fit(
         noise=conclusion.noise,
         messages=tuple(messages),
         ended=conclusion.ended,
-        seconds=clock.seconds,
+        seconds=budget.seconds,
         compile_seconds=chosen.compile_seconds,
         test_states=np.asarray(test.z0),
         test_args=test.args,
@@ -329,45 +407,54 @@ def fit(
         pairs=pairs,
         scene=scene,
         damping=damping,
+        stated_by=error.words,
+        test_pairs=pairs.take(found.judges.test) if len(found.judges.test) else None,
+        operations=budget.operations,
+        budget=budget,
     )
 
 
 def fit_positions(
     recording: Recording, *, tolerance: float = 1e-6, absolute_tolerance: float | None = None,
     structure: str | None = None, seed: int = 0, max_seconds: float | None = MAX_SECONDS,
+    max_operations: int | None = None, clock: Callable[[], float] = time.perf_counter,
     on_progress: Callable[[str], Any] = lambda message: None,
     on_candidate: Callable[[Candidate], Any] = lambda candidate: None,
 ) -> Fit:  # fmt: skip
     """Learn the map behind positions alone, at even times or by turns: S(q, Q) of chart type 1.
 
-    recording: its positions, of one run or many; an angle's values outside one turn are a lift and
-    trusted, others known modulo 2π. structure: "ring" or "chain" of equal sites. The rest as of
-    `fit`; errors are those of the next position.
+    recording: its positions, of one run or many; an angle's values that range over more than one
+    turn are a lift and trusted, others known modulo 2π. structure: "ring" or "chain" of equal
+    sites. The rest as of `fit`; errors are those of the next position.
 
     The map acts on z = (q, p), p = −h ∂S/∂q: ``map.from_positions`` and
     ``map.rollout(positions=(q, Q), …)`` start it. Positions of one place tell p but for a factor
     and a gauge, which `models.discrete_lagrangian` fixes: frequencies, positions and stability do
     not depend on them, the size of p, energies and areas do.
-    Raises FitError where the recording is none of positions at even times, or too short.
+    Raises FitError where the recording has no positions at even times, or too few.
     """
+    require_x64("a fit")
     relative = absolute_tolerance is None
     asked = Tolerance(tolerance if absolute_tolerance is None else absolute_tolerance, relative)
+    budget = Budget(max_seconds, max_operations, clock, len(recording.positions) or None)
     found = learn_positions(
-        recording, tolerance=asked, structure=structure, seed=seed, max_seconds=max_seconds,
+        recording, tolerance=asked, structure=structure, seed=seed, budget=budget,
         say=on_progress, tell=on_candidate,
     )  # fmt: skip
     for message in found.messages:
         warnings.warn(message, FitWarning, stacklevel=3)
-    test = found.states.take(found.held_out[: min(_JUDGED, block_of(2 * found.map.dim))])
+    test = found.states.take(found.test[: min(_JUDGED, block_of(2 * found.map.dim))])
     determinant = np.asarray(found.map.determinant(test.z0))
     return Fit(
-        map=found.map, candidates=found.candidates, asked=found.asked,
+        map=found.map, candidates=found.candidates, asked=asked,
         num_pairs=found.positions.num_triples, judgements={}, data_defect=float("nan"),
         base_map=False, noise=None, messages=tuple(found.messages), ended=found.ended,
-        seconds=found.seconds, compile_seconds=found.compile_seconds,
+        seconds=budget.seconds, compile_seconds=found.compile_seconds,
         test_states=np.asarray(test.z0),
         model_determinant_min=float(determinant[np.argmin(np.abs(determinant))]),
-        pairs=found.states, positions=found.positions,
+        pairs=found.states, positions=found.positions, stated_by=found.stated_by,
+        validation_pairs=found.states.take(found.validation),
+        operations=budget.operations, budget=budget,
     )  # fmt: skip
 
 

@@ -7,16 +7,17 @@ go while the held-out error does not rise.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
-from gfnn_jax.errors import FitError
+from gfnn_jax.dataset.split import outermost
+from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import (
@@ -30,8 +31,7 @@ from gfnn_jax.fitting.growth import grow
 from gfnn_jax.learn.arcs import arcs_of
 from gfnn_jax.learn.candidates import Judges, OneStepError
 from gfnn_jax.learn.centrifugal import centrifugal_terms
-from gfnn_jax.learn.clock import Clock, Counted, OutOfTime
-from gfnn_jax.learn.held_out import outermost
+from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.law_libraries import (
     angles_and_others,
     check_finite,
@@ -41,7 +41,9 @@ from gfnn_jax.learn.law_libraries import (
 )
 from gfnn_jax.learn.law_options import OPTIONS, Options
 from gfnn_jax.learn.law_starts import starts
+from gfnn_jax.learn.law_work import LawWork
 from gfnn_jax.learn.learned_law import (
+    Dropped,
     FittedLaw,
     LearnedHamiltonian,
     bound_of,
@@ -59,6 +61,7 @@ _HOPELESS = 10.0  # times the tolerance, of an error that is known before a libr
 # libraries differ in kind.
 _POOR, _POOR_GIVEN, _POOR_STRUCTURED = 2, 3, 5
 _TURNING = 2_000  # pairs that tell how far a step turns the states
+_FIRST_ROUND = 5e8  # operations that the first round of growth is expected to take
 _EXPLAINED = 0.05  # of the spread: an error below it is that of the right branch of the turns
 
 
@@ -68,7 +71,7 @@ def learn_hamiltonian(
     scene: Any = None,
     *,
     terms: Sequence[str | Callable] = (),
-    clock: Clock | None = None,
+    budget: Budget | None = None,
     say: Callable[[str], Any] = lambda message: None,
     options: Options = OPTIONS,
 ) -> LearnedHamiltonian:
@@ -82,9 +85,7 @@ def learn_hamiltonian(
     if basis is not None and not terms:
         own = centrifugal_terms(prepared, judges.training, basis.terms(basis.box()))
         basis = modes_of(prepared, scene, own)
-    most = options.max_seconds if basis is None else options.mode_seconds
-    clock = clock or Clock()
-    searching = Clock(min(most, clock.left))
+    budget = budget or Budget()
     if prepared.before or prepared.after:
         raise FitError("expected pairs without a base map: it is no part of a flow")
     started = time.perf_counter()
@@ -96,10 +97,10 @@ def learn_hamiltonian(
         say(f"H: arcs of {arcs.length} steps, in which the states move far against their noise")
         prepared, judges = arcs.prepared, arcs.judges
     problem = Problem(
-        prepared.y0, prepared.y1, prepared.each_dt, prepared.scale, args=prepared.args,
-        check=searching.check,
-        spend=Counted(options.max_operations if basis is None else options.mode_operations).spend,
-    )  # fmt: skip
+        prepared.y0, prepared.y1, prepared.each_dt, prepared.scale, args=prepared.args
+    )
+    most = options.max_operations if basis is None else options.mode_operations
+    work = LawWork(problem, budget, most)
     everywhere, free = judges, (*prepared.coordinates.cyclic, *prepared.whole)
     if prepared.structure is None:
         outer = outermost(prepared.y0[judges.training], free)
@@ -107,51 +108,64 @@ def learn_hamiltonian(
         outer = np.zeros(len(judges.training), bool)
     judges = dataclasses.replace(everywhere, training=everywhere.training[~outer])
     if prepared.args is not None:
-        best = _walked(problem, prepared, judges, scene, terms, options, say)
+        best = _walked(problem, work, prepared, judges, scene, terms, options, say)
     elif basis is not None:
-        best = _grown(problem, basis, prepared, judges, searching, options, say)
+        best = _grown(problem, work, basis, prepared, judges, options, say)
     else:
-        found = _searched(problem, prepared, judges, scene, terms, options, say)
+        found = _searched(problem, work, prepared, judges, scene, terms, options, say)
         if not terms and prepared.structure is None:
-            found = _beside_centrifugal(problem, found, prepared, judges, options, say)
+            found = _beside_centrifugal(problem, work, found, prepared, judges, options, say)
         best, options = found
     everyone = np.arange(len(prepared.y0))
     if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
         raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
-    outside = None
+    outside, what = None, ""
     try:
         if best.noisy:
-            # What is pruned is soon fitted: the search is over.
-            problem.check, problem.spend = clock.check, Counted(np.inf).spend
-            best = _told_from_noise(problem, best, judges.training, prepared, judges, options)
-        best = _sparse(problem, best, prepared, judges, options, say)
+            what = "dropping the terms of H that are noise"
+            work.uncapped()  # what is pruned is soon fitted
+            with work.again(what, (best.larger or best).family, len(judges.training)):
+                best = _told_from_noise(problem, best, judges.training, prepared, judges, options)
+        what = "dropping the terms of H that the pairs do not ask for"
+        with work.again(what, best.family, len(best.fit.used)):
+            best = _sparse(problem, best, prepared, judges, options, say)
         there = dataclasses.replace(everywhere, held_out=everywhere.training[outer])
         if outer.any():
             outside = held_out_error(best.family, best.fit, prepared, there).relative
         if best.error.relative > _ROUNDOFF and len(best.fit.used) < len(everywhere.training):
-            best = _refitted(problem, best, everywhere.training, prepared, judges)
-    except OutOfTime:
-        pass  # what was found stands
-    problem.check, problem.spend = lambda: None, Counted(np.inf).spend
-    root = None
+            what = "the fit of H to all pairs"
+            with work.again(what, best.family, len(everywhere.training)):
+                best = _refitted(problem, best, everywhere.training, prepared, judges)
+    except OutOfTime:  # what was found stands
+        budget.leave_out(what, work.ended)
+    problem.check, problem.spend = lambda: None, lambda operations: None
+    of_arcs = None
     if arcs is not None:
-        root = covariance_root(best, problem, prepared, best.fit.steps, everywhere.pairs)
+        of_arcs = partial(
+            covariance_root, best, problem, prepared, best.fit.steps, everywhere.pairs
+        )
         prepared, everywhere = steps_of, judges_of_steps
         problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale)
         best = best._replace(error=held_out_error(best.family, best.fit, prepared, everywhere))
     noisy = best.noisy or arcs is not None
     if noisy and best.error.bound > everywhere.tolerance.bound:
+        what = "the fit of H to whole sequences"
         say("H: whole sequences")
-        with contextlib.suppress(OutOfTime, np.linalg.LinAlgError):
-            best = _of_sequences(problem, best, prepared, everywhere, clock)
+        try:
+            with work.again(what, best.family, len(everywhere.training)):
+                best = _of_sequences(problem, best, prepared, everywhere, budget)
+        except OutOfTime:
+            budget.leave_out(what, budget.ended)
+        except np.linalg.LinAlgError as error:
+            budget.leave_out(what, f"the arithmetic failed ({error})")
     seconds = time.perf_counter() - started
-    learned = learned_from(best, problem, prepared, everywhere, seconds, options, root)
+    learned = learned_from(best, problem, prepared, everywhere, seconds, options, of_arcs)
     candidate = dataclasses.replace(learned.candidate, outside=outside)
-    return dataclasses.replace(learned, candidate=candidate)
+    return dataclasses.replace(learned, candidate=candidate, ended=work.ended)
 
 
 def _searched(
-    problem, prepared, judges: Judges, scene, terms, options: Options, say
+    problem, work: LawWork, prepared, judges: Judges, scene, terms, options: Options, say
 ) -> tuple[FittedLaw, Options]:
     """The smallest library that meets the tolerance, else the best; and the options, which try no
     fewer terms where the tolerance is out of reach."""
@@ -171,7 +185,7 @@ def _searched(
         for family in libraries:
             say(f"H: {family.num_parameters} terms")
             found = _fitted(
-                problem, family, prepared, judges, tried[-1] if tried else None, options, say
+                problem, work, family, prepared, judges, tried[-1] if tried else None, options, say
             )
             better = best is None or found.error.relative < options.gained * best.error.relative
             poor = 0 if better else poor + 1
@@ -201,8 +215,9 @@ def _searched(
 
 
 def _beside_centrifugal(
-    problem, before: tuple[FittedLaw, Options], prepared, judges: Judges, options: Options, say
-) -> tuple[FittedLaw, Options]:
+    problem, work: LawWork, before: tuple[FittedLaw, Options], prepared, judges: Judges,
+    options: Options, say,
+) -> tuple[FittedLaw, Options]:  # fmt: skip
     """The best of libraries with centrifugal terms and their options, where ``before`` misses the
     tolerance, the pairs ask for such terms and these libraries are better; else ``before``."""
     best, _ = before
@@ -213,14 +228,17 @@ def _beside_centrifugal(
         return before
     options = dataclasses.replace(options, given_degrees=options.given_degrees[1:])
     try:
-        found = _searched(problem, prepared, judges, None, own, options, say)
-    except (OutOfTime, FitError):
+        found = _searched(problem, work, prepared, judges, None, own, options, say)
+    except OutOfTime:
+        work.budget.leave_out("libraries of H with centrifugal terms", work.ended)
+        return before
+    except FitError:
         return before
     return found if found[0].error.relative < best.error.relative else before
 
 
 def _walked(
-    problem, prepared: Prepared, judges: Judges, scene, terms, options: Options, say
+    problem, work: LawWork, prepared: Prepared, judges: Judges, scene, terms, options: Options, say
 ) -> FittedLaw:
     """The best of the libraries of states and parameters, which grow together."""
     own = own_terms(prepared, terms) if terms else None
@@ -239,7 +257,7 @@ def _walked(
 
     def attempt(family: Terms) -> FittedLaw:
         say(f"H: {family.num_parameters} terms")
-        return _fitted(problem, family, prepared, judges, best, options, say)
+        return _fitted(problem, work, family, prepared, judges, best, options, say)
 
     try:
         for found in walked(
@@ -261,29 +279,33 @@ def _walked(
 
 
 def _grown(
-    problem, basis: Modes, prepared, judges: Judges, clock: Clock, options: Options, say
+    problem, work: LawWork, basis: Modes, prepared, judges: Judges, options: Options, say
 ) -> FittedLaw:
-    """The library that has grown to the tolerance, or as far as the time and the pairs allow."""
+    """The library that has grown to the tolerance, or as far as the cap and the pairs allow."""
     goal = options.goal * bound_of(judges, problem.scale)
     most = int(len(judges.training) * 2 * prepared.dim / options.rows_per_term)
-    problem.check = Clock(options.growth_part * clock.left).check
-    problem.spend = Counted(options.growth_part * options.mode_operations).spend
-    grown, ended = None, "the time is over"
+    work.capped(options.growth_part * options.mode_operations)
+    grown, ended, expected = None, "", _FIRST_ROUND
+    rounds = grow(problem, basis, judges.training, goal, min(most, options.most_modes))
     try:
-        for grown in grow(problem, basis, judges.training, goal, min(most, options.most_modes)):
-            ended = grown.ended
+        while True:
+            before = work.made
+            with work.round("growth of H", expected):
+                further = next(rounds, None)
+            if further is None:
+                break
+            grown, ended, expected = further, further.ended, work.made - before
             why = f": {ended}" if ended else ""
             say(f"H grows: {len(grown.coefficients)} modes, error {grown.rms:.1e}{why}")
     except OutOfTime:
         if grown is None:
             raise
-        ended = ended or "the time is over"
+        ended = ended or work.ended
     if grown is None or not np.isfinite(grown.rms):
         raise FitError(
             f"expected more pairs, or pairs of a flow: {len(prepared.y0)} tell no library of modes"
         )
-    problem.check = clock.check
-    problem.spend = Counted((1 - options.growth_part) * options.mode_operations).spend
+    work.capped((1 - options.growth_part) * options.mode_operations)
     count = int(np.ceil(options.judged_rows * len(grown.coefficients) / (2 * prepared.dim)))
     rows = judges.training[: max(count, 500)]
     fit = problem.fit(grown.family, grown.coefficients, rows, rounds=False, say=say)
@@ -314,7 +336,9 @@ def _out_of_reach(errors: list[float], left: int, bound: float) -> bool:
     return errors[-1] * gain**left > bound
 
 
-def _fitted(problem, family, prepared, judges, last: FittedLaw | None, options, say) -> FittedLaw:
+def _fitted(
+    problem, work: LawWork, family, prepared, judges, last: FittedLaw | None, options, say
+) -> FittedLaw:
     """The library fitted to as many training pairs as tell its terms, from the best start."""
     names = family.term_names
     z = prepared.y0[judges.training]
@@ -330,13 +354,16 @@ def _fitted(problem, family, prepared, judges, last: FittedLaw | None, options, 
     count = int(np.ceil(options.judged_rows * family.num_parameters / z.shape[1]))
     rows = judges.training[: max(count, fewest)]
     null_names, best = tuple(names[j] for j in null), None
-    for start in starts(problem, family, rows, judges.training[:_TURNING], last):
-        fit = problem.fit(family, start, rows, say=say)
-        error = held_out_error(family, fit, prepared, judges)
-        if best is None or error.relative < best.error.relative:
-            best = FittedLaw(family, fit, rows, error, null_names, undetermined)
-        if error.relative <= _EXPLAINED:
-            break
+    # Nothing but H is learned of such pairs.
+    first = last is None and (prepared.varied or prepared.structure is not None)
+    with work.library(f"H of {family.num_parameters} terms", family, len(rows), first=first):
+        for start in starts(problem, family, rows, judges.training[:_TURNING], last):
+            fit = problem.fit(family, start, rows, say=say)
+            error = held_out_error(family, fit, prepared, judges)
+            if best is None or error.relative < best.error.relative:
+                best = FittedLaw(family, fit, rows, error, null_names, undetermined)
+            if error.relative <= _EXPLAINED:
+                break
     assert best is not None
     return best
 
@@ -357,16 +384,15 @@ def _told_from_noise(
     found = _pruned(problem, smallest, rows, prepared, judges, options)
     if smallest.larger is None:
         return found
-    with contextlib.suppress(OutOfTime):
-        few = _significant(problem, smallest.larger, rows, options)
-        more = 0 if few is None else few.family.num_parameters - found.family.num_parameters
-        if few is None or more <= 0:
-            return found
-        few = _refitted(problem, few, rows, prepared, judges)
-        # Twice the logarithm of the likelihood's ratio.
-        gained = 2 * few.fit.rows * np.log(found.fit.rms / few.fit.rms)
-        if gained > options.certain**2 * more and few.error.relative <= found.error.relative:
-            return few._replace(noisy=True)
+    few = _significant(problem, smallest.larger, rows, options)
+    more = 0 if few is None else few.family.num_parameters - found.family.num_parameters
+    if few is None or more <= 0:
+        return found
+    few = _refitted(problem, few, rows, prepared, judges)
+    # Twice the logarithm of the likelihood's ratio.
+    gained = 2 * few.fit.triangle.rows * np.log(found.fit.rms / few.fit.rms)
+    if gained > options.certain**2 * more and few.error.relative <= found.error.relative:
+        return few._replace(noisy=True)
     return found
 
 
@@ -384,10 +410,10 @@ def _significant(problem, full: FittedLaw, rows, options: Options) -> FittedLaw 
     """The terms that these pairs tell from noise, which one Gauss–Newton problem of all terms says,
     so that only a few are fitted to many pairs; None where it tells none."""
     resolved = np.setdiff1d(rows, np.setdiff1d(full.rows, full.fit.used))
-    found = problem.factor(full.family, full.fit.coefficients, full.fit.steps, resolved)
-    if not np.isfinite(found.cost):
+    found = problem.linearised(full.family, full.fit.coefficients, full.fit.steps, resolved)
+    if not np.isfinite(found.norm):
         return None
-    kept, start = significant(found.matrix, full.fit.coefficients, found.rows, options.certain)
+    kept, start = significant(found, full.fit.coefficients, options.certain)
     if not len(kept):
         return None
     return full._replace(
@@ -410,8 +436,12 @@ def _sparse(problem, full: FittedLaw, prepared, judges, options: Options, say) -
         start = full.fit.coefficients[list(kept)]
         fit = problem.fit(family, start, full.fit.used, rounds=False, steps=full.fit.steps)
         error = held_out_error(family, fit, prepared, judges)
-        if error.relative <= max(options.rise * full.error.relative, options.rounding):
-            return full._replace(family=family, fit=fit, error=error)
+        before = full.error.relative
+        if error.relative <= max(options.rise * before, options.rounding):
+            dropped = Dropped(full.family.num_parameters - len(kept), before, error.relative)
+            told = f"error {error.relative:.2e}, before {before:.2e}"
+            say(f"H without {dropped.terms} terms: {told}")
+            return full._replace(family=family, fit=fit, error=error, dropped=dropped)
     return full
 
 
@@ -422,11 +452,11 @@ def _refitted(problem, found: FittedLaw, rows, prepared, judges) -> FittedLaw:
     return found._replace(fit=fit, rows=rows, error=error)
 
 
-def _of_sequences(problem, found: FittedLaw, prepared, judges, clock: Clock) -> FittedLaw:
+def _of_sequences(problem, found: FittedLaw, prepared, judges, budget: Budget) -> FittedLaw:
     """Fitted to whole sequences, where there are such and held-out steps bear it out."""
     if found.error.relative <= _ROUNDOFF:
         return found
-    whole = fitted_to_sequences(problem, found.family, found.fit, prepared, judges, clock.check)
+    whole = fitted_to_sequences(problem, found.family, found.fit, prepared, judges, budget.check)
     if whole is None:
         return found
     family = found.family.take(whole.kept)

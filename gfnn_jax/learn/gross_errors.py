@@ -15,12 +15,10 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.diagnosed import Diagnosis, diagnose_request
-from gfnn_jax.learn.held_out import places, split_rows
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.learn.sweeps import LinearSweep
-from gfnn_jax.phase_space import Pairs
 
 # A residual beyond so many times what all but two of its neighbours stay below, and the median of
 # all. Of normal noise and d = 1 it is four times the median in one of 60,000 pairs.
@@ -47,11 +45,13 @@ class Cleaned(NamedTuple):
     messages: list[str]
 
 
-def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> Cleaned:
+def without_gross_errors(
+    request: Request, seen: Diagnosis, found: Searched, row: np.ndarray
+) -> Cleaned:
     """Searched again without gross errors, as long as that lowers what is left over of the others;
-    as it is, where the tolerance is met, there are none, or too many."""
-    taken, gone = found.judges.pairs, 0
-    count = len(taken)
+    as it is, where the tolerance is met, there are none, or too many. row: (N,) the user's row of
+    each pair."""
+    count, gone = len(found.judges.pairs), 0
     kept = np.arange(count)
     request = dataclasses.replace(request, factors=None, checkpoints=None)
     for _ in range(_ROUNDS):
@@ -59,18 +59,16 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
         if size is None:
             break
         rows = _standing_alone(found.plain, size)
-        if not len(rows) or gone + len(rows) > _MOST * count or request.clock.left <= 0:
+        if not len(rows) or gone + len(rows) > _MOST * count or request.budget.over:
             break
         others = np.setdiff1d(np.arange(len(size)), rows)
         if not _rms(size) > _SPOILT * _rms(size[others]):
             break
         pairs, plain = found.judges.pairs, found.plain
-        if plain.place is None:
-            plain = dataclasses.replace(plain, place=places(pairs))
         pairs, plain = pairs.take(others), plain.take(others)
         request.say(f"without {gone + len(rows)} of {count} pairs that are gross errors")
-        diagnosis = diagnose_request(request, plain, pairs)
-        judges = Judges(pairs, *split_rows(pairs, request.seed, plain.place), request.tolerance)
+        judges = Judges.of(pairs, request.seed, request.tolerance)
+        diagnosis = diagnose_request(request, plain, judges)
         again = searched(request, plain, diagnosis, judges, None)
         left = _residuals(again)
         if left is not None and not _rms(left) <= _RISE * _rms(size[others]):
@@ -78,19 +76,12 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
         seen, found, gone, kept = diagnosis, again, gone + len(rows), kept[others]
     if not gone:
         return Cleaned(seen, found, [])
-    first = np.setdiff1d(np.arange(count), kept)[:5]
-    z0, z1 = (np.asarray(z)[first] for z in (taken.z0, taken.z1))
-    rows = ", ".join(map(str, (_row(request.pairs, *pair) for pair in zip(z0, z1, strict=True))))
+    rows = ", ".join(map(str, row[np.setdiff1d(np.arange(count), kept)[:5]]))
     rows += ", …" if gone > 5 else ""
     return Cleaned(seen, found, [
         f"{gone} of {count} pairs (rows {rows}) are gross errors beside the map of the others: "
         "they were given no weight"
     ])  # fmt: skip
-
-
-def _row(pairs: Pairs, z0, z1) -> int:
-    """Of the user's pairs, the first that is this one."""
-    return int(np.argmax(np.all((pairs.z0 == z0) & (pairs.z1 == z1), axis=1)))
 
 
 def _rms(size) -> float:

@@ -8,16 +8,16 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import Coordinates
-from gfnn_jax.errors import FitError
+from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.choose_charts import Charts
-from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.clock import FLOW, Budget
 from gfnn_jax.learn.cost_of_flow import flow_operations
 from gfnn_jax.learn.diagnosed import diagnosed
-from gfnn_jax.learn.draw import drawn
+from gfnn_jax.learn.draw import NUM_PAIRS, drawn
 from gfnn_jax.learn.factor_out import TRIAL_PAIRS, factored_out, flow_of
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.prepare import Prepared, prepare
@@ -27,6 +27,7 @@ from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
 
 _FITTED, _MOST_STRONG = 200, 4  # pairs and terms of the simplest laws
+_THERE_AND_BACK = 8.0  # steps of a law's flow, at each of the states
 _EXPLAINED = 0.3  # of the spread: a law that errs by more explains too little to be factored out
 
 
@@ -47,11 +48,15 @@ def more_pairs_would_help(sweeps, found: Found, bound: Tolerance, dearest: float
 
 def search_of_law(
     law: LearnedHamiltonian, pairs: Pairs, judges: Judges, scene: Scene | None,
-    coordinates: Coordinates, dearest: float, clock: Clock, say, tell, seed: int,
+    coordinates: Coordinates, dearest: float, budget: Budget, say, tell, seed: int,
 ) -> LawMaps | None:  # fmt: skip
     """Maps fitted to pairs that are drawn from the law's flow, and judged by the user's held-out
     pairs; None where none of them meets the tolerance, or no chart covers the drawn pairs."""
-    more = drawn(law.flow, coordinates, pairs.z0, float(pairs.dt), seed=seed)
+    try:
+        with budget.unit("pairs drawn from the flow of H", FLOW, _work(law, NUM_PAIRS)):
+            more = drawn(law.flow, coordinates, pairs.z0, float(pairs.dt), seed=seed)
+    except OutOfTime:
+        return None
     held = pairs.take(judges.held_out)
     both = Pairs(
         np.concatenate([more.z0, held.z0]), np.concatenate([more.z1, held.z1]), float(pairs.dt)
@@ -64,7 +69,7 @@ def search_of_law(
     except FitError:  # drawn ones go further than the user's; the law itself is left
         return None
     sweeps = list(sweeps_for("auto", seen.charts.charts, seen.prepared, scene, judges))
-    found = search(sweeps, judges.tolerance.bound, clock, say, tell, None, dearest)
+    found = search(sweeps, judges.tolerance.bound, budget, say, tell, None, dearest)
     if not found.ranking:
         return None
     if found.ranking[0].candidate.validation_bound > judges.tolerance.bound:
@@ -73,10 +78,12 @@ def search_of_law(
     return LawMaps(found, seen.charts)
 
 
-def law_explains_most(law: LearnedHamiltonian, found: Found, bound: Tolerance, clock) -> bool:
+def law_explains_most(
+    law: LearnedHamiltonian, found: Found, bound: Tolerance, budget: Budget
+) -> bool:
     """Whether nothing meets the tolerance, but S might with most of the motion factored out. What
     stalls in noise would stall without it too."""
-    if clock.left <= 0 or not found.ranking or found.stalled:
+    if budget.over or not found.ranking or found.stalled:
         return False
     best = found.ranking[0].candidate
     error = law.candidate.validation_relative
@@ -84,7 +91,7 @@ def law_explains_most(law: LearnedHamiltonian, found: Found, bound: Tolerance, c
 
 
 def search_around(
-    law: LearnedHamiltonian, plain: Prepared, judges: Judges, scene: Scene | None, clock: Clock,
+    law: LearnedHamiltonian, plain: Prepared, judges: Judges, scene: Scene | None, budget: Budget,
     say, tell, better, seed: int,
 ) -> LawMaps | None:  # fmt: skip
     """Maps of a law's flow Φ and of S, which learns what Φ leaves over: of the whole law, then of
@@ -92,15 +99,18 @@ def search_around(
     the states, or no chart covers what is left."""
     best: LawMaps | None = None
     for laws in ([(law.flow.family, np.asarray(law.flow.params))], strongest(law, plain, judges)):
+        if not laws:
+            break
         try:
-            flows = [flow_of(family, c, plain) for family, c in laws]
-            if not flows or clock.left <= 0:
-                break
-            flow, prepared = factored_out(flows, plain, seed)
-            seen = diagnosed(prepared, "auto", scene.reversor if scene else None, seed)
+            with budget.unit("what the flow of H leaves over", FLOW, _work(law, len(plain.y0))):
+                flows = [flow_of(family, c, plain) for family, c in laws]
+                flow, prepared = factored_out(flows, plain, seed)
+                seen = diagnosed(prepared, "auto", scene.reversor if scene else None, seed)
+        except OutOfTime:
+            break
         except FitError:
             continue
-        found = _around(flow, seen, plain, judges, scene, clock, say, tell, better)
+        found = _around(flow, seen, plain, judges, scene, budget, say, tell, better)
         if found.found.ranking and (
             best is None
             or found.found.ranking[0].candidate.validation_bound
@@ -112,14 +122,19 @@ def search_around(
     return best
 
 
+def _work(law: LearnedHamiltonian, states: int) -> float:
+    """Operations of the law's flow, there and back, at so many states."""
+    return _THERE_AND_BACK * states * law.candidate.operations
+
+
 def _around(
-    flow: Flow, seen, plain: Prepared, judges: Judges, scene: Scene | None, clock: Clock, say, tell,
-    better,
+    flow: Flow, seen, plain: Prepared, judges: Judges, scene: Scene | None, budget: Budget, say,
+    tell, better,
 ) -> LawMaps:  # fmt: skip
     """The search for S around one flow, whose operations are added to every candidate's."""
     more = flow_operations(flow, plain)
     sweeps = list(sweeps_for("auto", seen.charts.charts, seen.prepared, scene, judges))
-    found = search(sweeps, judges.tolerance.bound, clock, say, tell, better)
+    found = search(sweeps, judges.tolerance.bound, budget, say, tell, better)
 
     def dearer(entry: Entry) -> Entry:
         candidate = dataclasses.replace(

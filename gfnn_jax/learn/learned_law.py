@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sums import Sums, matrix_free
@@ -20,11 +22,11 @@ from gfnn_jax.fitting.gauss_newton import (
     Problem,
     rates,
 )
-from gfnn_jax.fitting.least_squares import Reduced
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.flows.flow import Flow
-from gfnn_jax.learn.assemble import Assembled, composed, stepped
+from gfnn_jax.learn.assemble import Assembled, composed, measured
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
+from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.cost_of_flow import (
     CONTRACTING,
     FREQUENCY_STATES,
@@ -33,7 +35,6 @@ from gfnn_jax.learn.cost_of_flow import (
     operations_of,
 )
 from gfnn_jax.learn.formula import Term, formula
-from gfnn_jax.learn.held_out import looked_at
 from gfnn_jax.learn.law_options import OPTIONS, Options
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.whole_sequences import Whole
@@ -56,9 +57,10 @@ class LearnedHamiltonian:
     flow, times dt, in the median over the data; beyond π pairs of one dt may not tell H.
     contraction: the fixed point's factor where it is largest. condition: of the terms' columns.
     null_terms: that the data do not tell from the others. left_out: pairs that the flow does not
-    resolve. stalled: whether larger libraries were no more accurate. root: (m, m), rootᵀ root is
-    the coefficients' covariance; None of a network. unmet: that the tolerance is missed, and what
-    that may be from; "" where it is met.
+    resolve. stalled: whether larger libraries were no more accurate. covariance: makes ``root``;
+    None of a network. unmet: that the tolerance is missed, and what that may be from; "" where it
+    is met. ended: what cut the search for it short, "" where nothing did. dropped: terms that went
+    in the end.
     """
 
     candidate: Candidate
@@ -73,10 +75,18 @@ class LearnedHamiltonian:
     left_out: int
     messages: tuple[str, ...]
     stalled: bool
-    root: np.ndarray | None
+    covariance: Callable[[], np.ndarray] | None
     noise: np.ndarray | None = None
     arcs: int = 0
     unmet: str = ""
+    ended: str = ""
+    dropped: Dropped | None = None
+
+    @cached_property
+    def root(self) -> np.ndarray | None:
+        """(m, m): rootᵀ root is the coefficients' covariance; None of a network. Computed when it
+        is first asked for."""
+        return None if self.covariance is None else self.covariance()
 
     @property
     def fast(self) -> bool:
@@ -84,12 +94,21 @@ class LearnedHamiltonian:
         return self.omega_h > FAST
 
 
+class Dropped(NamedTuple):
+    """Terms that went because the pairs do not ask for them, and what that cost: the held-out error
+    ÷ spread with them and without."""
+
+    terms: int
+    error_with: float
+    error_without: float
+
+
 class FittedLaw(NamedTuple):
     """rows: that the fit was given; it has left out those that the flow does not resolve.
     undetermined: of the null terms, those that other states would tell from the rest. ended: why a
     library that grew did so no longer. stalled: whether larger libraries were no better. noisy:
     whether their errors were the same, which is that of the pairs; larger: the largest
-    of those. whole:
+    of those. dropped: terms that went in the end. whole:
     what whole sequences tell, where they were fitted."""
 
     family: Terms | Sums
@@ -102,14 +121,15 @@ class FittedLaw(NamedTuple):
     stalled: bool = False
     noisy: bool = False
     larger: FittedLaw | None = None
+    dropped: Dropped | None = None
     whole: Whole | None = None
 
 
 def learned_from(
     found: FittedLaw, problem, prepared: Prepared, judges: Judges, seconds: float, options: Options,
-    root: np.ndarray | None,
+    of_arcs: Callable[[], np.ndarray] | None,
 ) -> LearnedHamiltonian:  # fmt: skip
-    """root: of the covariance, where the fit was not to these pairs but to arcs of them."""
+    """of_arcs: makes the root, where the fit was not to these pairs but to arcs of them."""
     family, fit, whole = found.family, found.fit, found.whole
     rows = judges.held_out
     z, args = prepared.y0[rows], prepared.given(rows)[1]
@@ -147,19 +167,18 @@ def learned_from(
     omega_h = omega_h_of(family, fit.coefficients, prepared, fastest)
     left_out = len(np.setdiff1d(found.rows, fit.used))
     resolved = np.abs(off).max(axis=1) <= bound_of(judges, prepared.scale)
+    covariance = of_arcs or partial(covariance_root, found, problem, prepared, steps, judges.pairs)
     if whole is not None:
-        root = whole.root
-    elif root is None:
-        root = covariance_root(found, problem, prepared, steps, judges.pairs)
+        covariance = partial(np.asarray, whole.root)
     return LearnedHamiltonian(
         with_error(candidate, error), flow, terms, getattr(family, "prefix", "") + formula(terms),
         float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(error, omega_h, prepared, judges, found, left_out, int((~resolved).sum()))),
         stalled=found.stalled,
-        root=root, noise=None if whole is None else whole.noise,
+        covariance=covariance, noise=None if whole is None else whole.noise,
         arcs=0 if whole is None else whole.arcs,
-        unmet=_unmet(error, omega_h, prepared, judges, found),
+        dropped=found.dropped, unmet=_unmet(error, omega_h, prepared, judges, found),
     )  # fmt: skip
 
 
@@ -240,9 +259,8 @@ def covariance_root(
             states = first, second, goes_on
         degree = int(np.max(np.sum(found.family.powers, axis=1)))
         noise = unexplained(prepared, rows, residual, count, degree, states)
-    train = Reduced(np.asfortranarray(fit.factor), fit.rows)
     return uncertainty.root(
-        train, count, slopes.reshape(-1, count), np.hypot(left, _NEAR_ROUNDOFF).ravel(),
+        fit.triangle, count, slopes.reshape(-1, count), np.hypot(left, _NEAR_ROUNDOFF).ravel(),
         noise=noise, scores=scores,
     )  # fmt: skip
 
@@ -280,7 +298,7 @@ def unexplained(
             slopes, weight * target, to_target @ first, to_target @ second, goes_on
         )
         freedom = shared_noise.freedom(slopes, weight * target, scores)
-    left = np.sum(reduced.factor[:, -1] ** 2) / max(reduced.rows - taken, 1)
+    left = reduced.norm**2 / max(reduced.rows - taken, 1)
     if left == 0:
         return 1.0
     part = float(uncertainty.variance(reduced, count, freedom) / left)
@@ -335,20 +353,13 @@ def _messages(
         )
 
 
-def assembled(learned: LearnedHamiltonian, prepared: Prepared, judges: Judges) -> Assembled:
-    """The candidate's map, its error and its time per step measured by the steps that users run."""
+def assembled(
+    learned: LearnedHamiltonian, prepared: Prepared, judges: Judges, budget: Budget
+) -> Assembled:
+    """The candidate's map, measured."""
     prepared = _in_relative_domain(learned.flow, prepared)
     map_ = composed(learned.flow, prepared, judges)
-    held = judges.pairs.take(judges.held_out)
-    steps = stepped(map_, np.asarray(held.z0), held.dt, held.args)
-    states = np.where(steps.failed[:, None], np.nan, steps.images)
-    error = judges.error_of(states, prepared.coordinates)
-    candidate = dataclasses.replace(
-        with_error(learned.candidate, error), map=map_,
-        newton_iterations_max=int(steps.iterations.max()),
-        microseconds_per_step=steps.microseconds_per_step,
-    )  # fmt: skip
-    return Assembled(candidate, steps.compile_seconds)
+    return measured(learned.candidate, map_, prepared, judges, budget)
 
 
 def _in_relative_domain(flow: Flow, prepared: Prepared) -> Prepared:

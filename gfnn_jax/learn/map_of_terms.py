@@ -10,24 +10,25 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
-from gfnn_jax.errors import FitError
+from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.gauss_newton import fitted_gradients, null_terms, significant
-from gfnn_jax.fitting.least_squares import Reduced
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import CHARTS, AnyChart
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.assemble import Assembled, composed, stepped
+from gfnn_jax.learn.assemble import Assembled, composed, measured
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
-from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.clock import ROWS, Budget
 from gfnn_jax.learn.diagnose import SINGULAR
 from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
 from gfnn_jax.learn.prepare import Prepared
@@ -38,19 +39,20 @@ _THRESHOLDS = (1e4, 1e3, 100.0, 30.0, 10.0)  # standard errors below which terms
 _RISE, _ROUNDING = 1.1, 1e-15  # of the held-out error that this may cost
 _STRUCTURED_ROWS = 50_000  # numbers of training pairs that sites are fitted to: no more are needed
 _NULL_ROWS = 4_000  # of them, which tell whose gradients are combinations of others
+_FEWER_TERMS = "dropping the terms of S that the pairs do not ask for"
 _BETTER = 0.5  # of the error of an H, that S of a structure must have to be taken in its stead
 _FLAT = 1.2  # libraries whose errors differ by less have met the pairs' noise
 _SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved
 
 
 class LearnedMap(NamedTuple):
-    """The candidate, its error measured by steps in NumPy, and the piece that S generates. root:
-    (m, m), rootᵀ root is the coefficients' covariance. stalled: whether another library of the
-    chart was no less accurate, and the tolerance is missed."""
+    """The candidate, its error measured by steps in NumPy, and the piece that S generates.
+    covariance: gives (m, m), rootᵀ root is that of the coefficients. stalled: whether another
+    library of the chart was no less accurate, and the tolerance is missed."""
 
     candidate: Candidate
     piece: Generated
-    root: np.ndarray
+    covariance: Callable[[], np.ndarray]
     stalled: bool
 
 
@@ -62,20 +64,24 @@ class _Tried(NamedTuple):
 
 def learn_map(
     prepared: Prepared, judges: Judges, scene: Any = None, *, chart: str = "auto",
-    clock: Clock | None = None, say: Callable[[str], Any] = lambda message: None,
+    budget: Budget | None = None, say: Callable[[str], Any] = lambda message: None,
+    needed: bool = True,
 ) -> LearnedMap:  # fmt: skip
     """The map of these pairs of one dt and several systems, or of many sites: of the first chart
-    that meets the tolerance, else of the best.
+    that meets the tolerance, else of the best. needed: whether the first library is fitted whatever
+    the budget, because nothing else would be left.
 
     Raises FitError where no chart covers the data, or the pairs are too few.
     """
-    clock, started = clock or Clock(), time.perf_counter()
+    budget, started = budget or Budget(), time.perf_counter()
     best: _Tried | None = None
     tried: list[_Tried] = []
     try:
         for name in _CHARTS if chart == "auto" else (chart,):
-            for found in _of_chart(CHARTS[name], prepared, judges, scene, clock, say):
+            attempts = _Attempts(CHARTS[name], prepared, judges, budget, say, needed)
+            for found in _of_chart(attempts, scene):
                 tried.append(found)
+                needed = False
                 if best is None or found.error.bound < best.error.bound:
                     best = found
             if best is not None and best.error.bound <= judges.tolerance.bound:
@@ -95,7 +101,11 @@ def learn_map(
     stalled = len(rivals) > 1 and best.error.bound > judges.tolerance.bound
     if prepared.structure is not None:
         judges = _fewer(prepared, judges)
-    best = _sparse(best, prepared, judges)
+    try:
+        with budget.unit(_FEWER_TERMS, ROWS, len(_THRESHOLDS) * _work(best.piece.family, judges)):
+            best = _sparse(best, prepared, judges)
+    except OutOfTime:
+        budget.leave_out(_FEWER_TERMS, budget.ended)
     piece = best.piece
     gradient, with_hessian = piece.family.operations
     candidate = Candidate(
@@ -106,18 +116,22 @@ def learn_map(
         deviations=best.error.deviations, train_rms=best.train_rms,
         fit_seconds=time.perf_counter() - started,
     )  # fmt: skip
-    root = _root(piece, prepared, _fewer(prepared, judges) if prepared.structure else judges)
-    return LearnedMap(with_error(candidate, best.error), piece, root, stalled)
+    covariance = partial(
+        _root, piece, prepared, _fewer(prepared, judges) if prepared.structure else judges
+    )
+    return LearnedMap(with_error(candidate, best.error), piece, covariance, stalled)
 
 
 def map_of(
-    prepared: Prepared, judges: Judges, scene: Any, chart: str, law: Any, clock: Clock,
+    prepared: Prepared, judges: Judges, scene: Any, chart: str, law: Any, budget: Budget,
     say: Callable[[str], Any],
 ) -> LearnedMap | None:  # fmt: skip
     """As `learn_map`; None where it finds none, or none that is better than the law that was."""
     try:
         with np.errstate(all="ignore"):
-            found = learn_map(prepared, judges, scene, chart=chart, clock=clock, say=say)
+            found = learn_map(
+                prepared, judges, scene, chart=chart, budget=budget, say=say, needed=law is None
+            )
     except (FitError, OutOfTime):
         if law is None:
             raise
@@ -129,30 +143,50 @@ def map_of(
     return found
 
 
-def assembled(learned: LearnedMap, prepared: Prepared, judges: Judges) -> Assembled:
-    """The candidate's map, its error and its time per step measured by the steps that users run."""
+def assembled(
+    learned: LearnedMap, prepared: Prepared, judges: Judges, budget: Budget
+) -> Assembled:  # fmt: skip
+    """The candidate's map, measured."""
     map_ = composed(learned.piece, prepared, judges)
-    held = judges.pairs.take(judges.held_out)
-    steps = stepped(map_, np.asarray(held.z0), args=held.args)
-    states = np.where(steps.failed[:, None], np.nan, steps.images)
-    candidate = dataclasses.replace(
-        with_error(learned.candidate, judges.error_of(states, prepared.coordinates)), map=map_,
-        newton_iterations_max=int(steps.iterations.max()),
-        microseconds_per_step=steps.microseconds_per_step,
-    )  # fmt: skip
-    return Assembled(candidate, steps.compile_seconds)
+    return measured(learned.candidate, map_, prepared, judges, budget)
 
 
-def _of_chart(chart: AnyChart, prepared: Prepared, judges: Judges, scene, clock: Clock, say):
-    """What is tried in this chart, in turn."""
+@dataclasses.dataclass
+class _Attempts:
+    """Libraries fitted in a chart, each a unit of the budget; the first of them in any case where
+    it is ``needed``."""
 
-    def attempt(family: Any) -> _Tried:
-        clock.check()
-        say(f"S in {chart.name}: {family.num_parameters} terms")
-        return _fitted(chart, family, prepared, judges)
+    chart: AnyChart
+    prepared: Prepared
+    judges: Judges
+    budget: Budget
+    say: Callable[[str], Any]
+    needed: bool
 
+    def __post_init__(self) -> None:
+        if self.prepared.structure is not None:
+            self.judges = _fewer(self.prepared, self.judges)
+
+    def __call__(self, family: Any) -> _Tried:
+        name = f"S in {self.chart.name}: {family.num_parameters} terms"
+        work = _work(family, self.judges)
+        self.say(name)
+        first, self.needed = self.needed, False
+        unit = self.budget.free(ROWS, work) if first else self.budget.unit(name, ROWS, work)
+        with unit:
+            return _fitted(self.chart, family, self.prepared, self.judges)
+
+
+def _work(family: Any, judges: Judges) -> float:
+    """Operations of a least-squares fit of the family's terms."""
+    rows = len(judges.training) * judges.spread.size
+    return 2.0 * rows * family.num_parameters**2
+
+
+def _of_chart(attempt: _Attempts, scene) -> Iterator[_Tried]:
+    """What is tried in a chart, in turn."""
+    prepared, judges = attempt.prepared, attempt.judges
     if prepared.structure is not None:
-        judges = _fewer(prepared, judges)
         yield from _of_sites(prepared, judges, attempt)
         return
     coordinates, dim = prepared.coordinates, prepared.dim
@@ -254,8 +288,7 @@ def _root(piece: Generated, prepared: Prepared, judges: Judges) -> np.ndarray:
             part = uncertainty.variance(both, known.num_parameters)
             left = float(np.sum(residual**2)) / max(target.size - count, 1)
             noise = min(part / left, 1.0) if left > 0 else 1.0
-    factor = np.linalg.qr(np.column_stack([slopes, aim]), mode="r")
-    train = Reduced(np.asfortranarray(factor), target.size)
+    train = Triangle.of(np.column_stack([slopes, aim]))
     return uncertainty.root(train, count, slopes, residual, noise=noise)
 
 
@@ -266,10 +299,10 @@ def _sparse(full: _Tried, prepared: Prepared, judges: Judges) -> _Tried:
     weight = _weight(prepared)
     terms = (piece.family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
     residual = terms @ piece.params - (target * weight).ravel()
-    factor = np.linalg.qr(np.column_stack([terms, residual]), mode="r")
+    triangle = Triangle.of(np.column_stack([terms, residual]))
     tried: set[int] = set()
     for threshold in _THRESHOLDS:
-        kept, _ = significant(factor, piece.params, len(residual), threshold)
+        kept, _ = significant(triangle, piece.params, threshold)
         if not 0 < len(kept) < piece.family.num_parameters or len(kept) in tried:
             continue
         tried.add(len(kept))

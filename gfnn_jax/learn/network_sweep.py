@@ -13,16 +13,16 @@ from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.fitting.levenberg_marquardt import LMResult, LMState, levenberg_marquardt
 from gfnn_jax.learn.candidates import Candidate, Judges, validated
-from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.clock import NETWORK, Budget
 from gfnn_jax.learn.rows import rows_of
-from gfnn_jax.learn.sweeps import Size
+from gfnn_jax.learn.sweeps import OF_STEPS, Generates, Size
 
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
 _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
 _CHECKPOINT_SECONDS = 10.0
 
 
-class NetworkSweep:
+class NetworkSweep(Generates):
     """The one size of a network, trained by Levenberg–Marquardt."""
 
     kind = "mlp"
@@ -41,7 +41,25 @@ class NetworkSweep:
         self._train, self.sizes = (w, target), [Size(family, family, 0.0)]
         self._params: Any = None
 
-    def judge(self, size: Size, clock: Clock, say: Callable[[str], Any]) -> Candidate:
+    def named(self, size: Size) -> str:
+        """What is done to judge the size."""
+        return f"{self.chart.name} {size.family.label}"
+
+    def work(self, size: Size) -> float:
+        """The training's own units are counted block by block."""
+        return 1.0
+
+    def work_of_steps(self, size: Size) -> float:
+        """Operations that validating the judged size takes."""
+        return OF_STEPS * len(self.judges.held_out) * size.operations
+
+    @property
+    def _work_of_iteration(self) -> float:
+        """Operations of an iteration of the training."""
+        w, parameters = self._train[0], self.sizes[0].family.num_parameters
+        return 2.0 * w.size * parameters**2
+
+    def judge(self, size: Size, budget: Budget, say: Callable[[str], Any]) -> Candidate:
         """Train the network."""
         family = size.family
         held, _ = rows_of(self.prepared, self.chart, self.judges.held_out)
@@ -55,7 +73,9 @@ class NetworkSweep:
         resume = self._checkpoints.latest(self._like()) if self._checkpoints else None
         result = self._trained(
             validation=held, weight=self._weight, max_iterations=self._max_iterations,
-            max_seconds=clock.left if np.isfinite(clock.left) else None,
+            block=lambda count: budget.unit(
+                f"{count} iterations of {family.label}", NETWORK, count * self._work_of_iteration
+            ),
             target_rms=0.5 * self.judges.tolerance.bound,
             on_progress=report, checkpoint=_every_few_seconds(self._checkpoints),
             resume=resume[1] if resume else None,
@@ -82,11 +102,11 @@ class NetworkSweep:
         self._params = jax.tree.map(np.asarray, result.params)
         return result
 
-    def validate(self, size: Size, judged: Candidate, clock: Clock, say) -> Candidate:
+    def validate(self, size: Size, judged: Candidate, budget: Budget, say) -> Candidate:
         """The trained network with its error measured by steps."""
         return validated(judged, self.prepared, self.chart, size.family, self._params, self.judges)
 
-    def solve(self, size: Size, clock: Clock, say) -> tuple[Any, Any]:
+    def solve(self, size: Size, budget: Budget, say) -> tuple[Any, Any]:
         """The params of the trained network."""
         return None, self._params
 

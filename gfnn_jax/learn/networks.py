@@ -28,7 +28,7 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
 from gfnn_jax.learn.choose_law import unfit_for_law
-from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.clock import NETWORK, Budget
 from gfnn_jax.learn.cost_of_flow import contraction_of, omega_h_of, operations_of
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.prepare import Prepared
@@ -64,7 +64,7 @@ _RESOLVED = 0.1  # of the tolerance: what rounds may leave over of the gradient
 
 def learn_network(
     prepared: Prepared, judges: Judges, scene: Scene | None, *, seed: int, max_iterations: int,
-    clock: Clock, say: Callable[[str], Any] = lambda message: None, options: Options = OPTIONS,
+    budget: Budget, say: Callable[[str], Any] = lambda message: None, options: Options = OPTIONS,
 ) -> LearnedHamiltonian:  # fmt: skip
     """The network H whose flow is nearest to these pairs. It has no formula and no posterior.
 
@@ -89,13 +89,14 @@ def learn_network(
     family = Mlp(inputs, options.hidden, options.activation, amplitude_of(w, wanted))
     params, label = family.init(jax.random.key(seed), np.float64), f"H, {family.label}"
     weight, target = residual_weight(MIDPOINT, scale, dt), wanted
+    work = 2.0 * w[:count].size * family.num_parameters**2  # of an iteration
     best: _Round | None = None
     idle = done = 0
-    while idle < options.idle and done < max_iterations and clock.left > 0:
+    while idle < options.idle and done < max_iterations and not budget.over:
         result = levenberg_marquardt(
             family, params, w[:count], target[:count], validation=(w[count:], target[count:]),
             weight=weight, max_iterations=options.iterations[done > 0],
-            max_seconds=clock.left if np.isfinite(clock.left) else None,
+            block=lambda n: budget.unit(f"{n} iterations of {label}", NETWORK, n * work),
             target_rms=_RESOLVED * judges.tolerance.bound,
         )  # fmt: skip
         params, done = jax.tree.map(np.asarray, result.params), done + max(result.iterations, 1)
@@ -151,7 +152,8 @@ def _learned(
         )
     return LearnedHamiltonian(
         with_error(candidate, error), flow, (), None, truncation, omega_h,
-        contraction_of(fastest, dt, steps), float("nan"), (), 0, messages, stalled=False, root=None,
+        contraction_of(fastest, dt, steps), float("nan"), (), 0, messages, stalled=False,
+        covariance=None,
     )  # fmt: skip
 
 

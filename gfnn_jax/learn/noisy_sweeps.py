@@ -14,12 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import uncertainty
 from gfnn_jax.fitting.nearest_states import Whitened, nearest
 from gfnn_jax.learn.candidates import Candidate, validated
 from gfnn_jax.learn.choose_law import preferred
-from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.clock import ROWS, Budget
 from gfnn_jax.learn.conclude import only_noise
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.rows import rows_of
@@ -28,6 +29,7 @@ from gfnn_jax.learn.searches import Searched
 from gfnn_jax.learn.sweeps import LinearSweep, Size
 
 _MOST_SWEEPS = 3
+_WHAT = "the fit of S to the states that noisy pairs most likely had"
 _NO_WORSE = 1.2  # of the expected squared error: a map that is cheaper is as good
 
 
@@ -46,12 +48,20 @@ def without_bias(found: Searched, request: Request) -> Searched:
     if met or (law is not None and preferred(law.candidate, best.candidate, np.inf)):
         return found
     rivals = _as_far(found)
-    if not rivals or request.clock.left <= 0 or not only_noise(best, found):
+    if not rivals or request.budget.over:
         return found
-    request.say("fitting S to the states that noisy pairs most likely had")
+    work = sum(3 * e.sweep.work_of_factor(e.sweep.largest_known) for e in rivals)
     try:
-        entry = _corrected(rivals, request)
-    except (np.linalg.LinAlgError, OutOfTime):  # a chart that is singular at some pair
+        with request.budget.unit(_WHAT, ROWS, work):
+            if not only_noise(best, found):
+                return found
+            request.say("fitting S to the states that noisy pairs most likely had")
+            entry = _corrected(rivals, request)
+    except OutOfTime:
+        request.budget.leave_out(_WHAT, request.budget.ended)
+        return found
+    except np.linalg.LinAlgError:  # a chart that is singular at some pair
+        request.budget.leave_out(_WHAT, "the chart is singular at some of the pairs")
         return found
     if not entry.candidate.validation_relative <= AS_FAR * best.candidate.validation_relative:
         return found
@@ -92,7 +102,7 @@ class Expected(NamedTuple):
     noise: float
 
 
-def best_size(sweep: LinearSweep, near: Size, most: Size, clock: Clock, say) -> Expected:
+def best_size(sweep: LinearSweep, near: Size, most: Size, budget: Budget, say) -> Expected:
     """The size of the smallest expected error, among those up to ``most``, and those beyond as long
     as the last one is the best.
 
@@ -101,11 +111,11 @@ def best_size(sweep: LinearSweep, near: Size, most: Size, clock: Clock, say) -> 
     near: whose residuals tell how noise is shared.
     """
     while True:
-        train = sweep.factors(most.group, clock, say).train
+        train = sweep.factors(most.group, budget, say).train
         place = sweep.sizes.index(most)
         sizes = sweep.sizes[: place + 1]
         counts = [size.family.num_parameters for size in sizes]
-        left = [float(np.sum(train.factor[count:, -1] ** 2)) for count in counts]
+        left = [train.residual_norm(count) ** 2 for count in counts]
         taken = np.array(sweep.freedoms(near, most, counts))
         noise = left[-1] / (train.rows - taken[-1])
         # What each size leaves out of the next, beyond what that one makes of noise.
@@ -126,7 +136,7 @@ def _last_of_group(sweep: LinearSweep, size: Size) -> Size:
 
 def _corrected(rivals: list[Entry], request: Request) -> Entry:
     """The entry of smallest expected error, or the cheapest that is as good."""
-    given = request.clock, request.say
+    given = request.budget, request.say
     most = [entry.sweep.largest_known for entry in rivals]
     starts = [
         best_size(e.sweep, e.size, m, *given).size for e, m in zip(rivals, most, strict=True)
@@ -148,7 +158,7 @@ def _corrected(rivals: list[Entry], request: Request) -> Entry:
     size, m = expected.size, most[judged.index((sweep, expected))]
     sweep = NoisySweep(sweep.plain, sweep, size, deviations)
     size = best_size(sweep, size, m, *given).size
-    free = Clock()
+    free = Budget()
     candidate = sweep.validate(size, sweep.judge(size, free, request.say), free, request.say)
     return Entry(candidate, sweep, size)
 
@@ -165,8 +175,8 @@ class NoisySweep(LinearSweep):
     ):  # fmt: skip
         self.__dict__.update(plain.__dict__)
         self.__dict__.pop("of_states", None)
-        self.plain, self._kept, self._factors = plain, None, {}
-        family, params = size.family, near.solve(size, Clock(), lambda message: None)[1]
+        self.plain, self._kept, self._factors, self._solved = plain, None, {}, {}
+        family, params = size.family, near.solve(size, Budget(), lambda message: None)[1]
         of_noise = np.tile(deviations, 2)
         of_point, of_target = (of * of_noise for of in plain.of_states)
 
@@ -184,14 +194,14 @@ class NoisySweep(LinearSweep):
         """The family whose terms make the rows of this sweep."""
         return Whitened(family)
 
-    def judge(self, size: Size, clock: Clock, say) -> Candidate:
+    def judge(self, size: Size, budget: Budget, say) -> Candidate:
         """As the sweep that was corrected judges it, by the measured points."""
-        return self.plain.judge(size, clock, say)
+        return self.plain.judge(size, budget, say)
 
-    def validate(self, size: Size, judged: Candidate, clock: Clock, say) -> Candidate:
+    def validate(self, size: Size, judged: Candidate, budget: Budget, say) -> Candidate:
         """The judged size solved in these rows, and its error measured by steps."""
-        plain = self.plain.validate(size, judged, clock, say)
-        solved, params = self.solve(size, clock, say)
+        plain = self.plain.validate(size, judged, budget, say)
+        solved, params = self.solve(size, budget, say)
         candidate = dataclasses.replace(plain, condition=solved.condition, rank=solved.rank)
         return validated(candidate, self.prepared, self.chart, size.family, params, self.judges)
 

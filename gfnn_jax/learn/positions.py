@@ -16,7 +16,9 @@ import numpy as np
 
 from gfnn_jax.coordinates import Coordinates, circle_centre, nearest_image, whole_turns
 from gfnn_jax.data.recording import Recording
-from gfnn_jax.errors import FitError
+from gfnn_jax.dataset.runs import identified
+from gfnn_jax.dataset.split import Split, split_rows
+from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
@@ -26,7 +28,7 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
 from gfnn_jax.learn.assemble import stepped
 from gfnn_jax.learn.candidates import Candidate, OneStepError, Tolerance, one_step_error
-from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.clock import ROWS, Budget
 from gfnn_jax.learn.search import MET
 from gfnn_jax.learn.structures import Sites, structure_of
 from gfnn_jax.maps.domain import covering
@@ -37,8 +39,7 @@ from gfnn_jax.phase_space import Pairs, sizes
 
 _DEGREES = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)
 _ROWS_PER_TERM, _MOST_OPERATIONS = 3, 2e10  # of one solve: a few seconds on one core
-_HELD_OUT, _MOST_HELD_OUT, _FEWEST = 0.1, 1_000, 8  # of the triples
-_FEWEST_RUNS = 10  # to hold out whole runs; of fewer, blocks in time
+_FEWEST = 20  # triples
 _BETTER, _WORSE = 0.9, 3  # of the residual: sizes in a row that leave more end a sweep
 _GAIN = 0.5  # of the residual: what an S without symmetry must lower it to
 _ROUNDOFF = 1e-15  # of the spread
@@ -72,23 +73,24 @@ class OfPositions:
 
 
 class LearnedPositions(NamedTuple):
-    """The map, every size that was tried, and what is to be said of them."""
+    """The map, every size that was tried, what its S is like, all states as pairs, the rows that
+    chose and those that state the error, and what is to be said."""
 
     map: SymplecticMap
     candidates: tuple[Candidate, ...]
-    asked: Tolerance
     positions: OfPositions
     states: Pairs
-    held_out: np.ndarray
+    validation: np.ndarray
+    test: np.ndarray
+    stated_by: str
     messages: list[str]
     ended: str
-    seconds: float
     compile_seconds: float
 
 
 def learn_positions(
-    recording: Recording, *, tolerance: Tolerance, structure: str | None = None, seed: int = 0,
-    max_seconds: float | None = None, say: Callable[[str], Any] = lambda message: None,
+    recording: Recording, *, tolerance: Tolerance, budget: Budget, structure: str | None = None,
+    seed: int = 0, say: Callable[[str], Any] = lambda message: None,
     tell: Callable[[Candidate], Any] = lambda candidate: None,
 ) -> LearnedPositions:  # fmt: skip
     """The map behind the positions of a recording, at even times or by turns.
@@ -96,15 +98,13 @@ def learn_positions(
     structure: "ring" or "chain" of equal sites. Raises FitError where the triples are too few for
     the smallest S, or no S explains them.
     """
-    clock = Clock(max_seconds, len(recording.positions) or None)
     triples = triples_of(recording, sites=structure is not None)
-    whole = Coordinates("positions", triples.angles)
-    sites = structure_of(structure, triples.dim, whole)
+    sites = structure_of(structure, triples.dim, Coordinates("positions", triples.angles))
     if sites is not None and not isinstance(sites, Sites):
         raise FitError(f"expected a ring or a chain of positions, got {structure!r}")
     if len(triples) < _FEWEST:
         raise FitError(f"expected at least {_FEWEST} triples of positions, got {len(triples)}")
-    sweep = _Sweep(triples, sites, *_split(triples, seed), tolerance, clock, say, tell)
+    sweep = _Sweep(triples, sites, _split(triples, seed), tolerance, budget, say, tell)
     best = sweep.best(symmetric=True)
     if best is None or best.candidate.validation_bound > tolerance.bound:
         other = sweep.best(symmetric=False)
@@ -112,8 +112,8 @@ def learn_positions(
             best = other
     if best is None:
         raise FitError(
-            f"expected more triples of positions: {len(triples)} are too few for the smallest S, "
-            "or no S of theirs has a step"
+            f"expected more triples of positions, or more time: {len(triples)} are too few for the "
+            "smallest S, or no S of theirs has a step"
         )
     return sweep.learned(best, say)
 
@@ -130,14 +130,13 @@ def _clearly_better(one: _Found, other: _Found) -> bool:
 
 @dataclasses.dataclass
 class _Sweep:
-    """The triples, which of them train and which judge, and every size that was tried."""
+    """The triples, which of them train, choose and test, and every size that was tried."""
 
     triples: Triples
     sites: Sites | None
-    training: np.ndarray
-    held_out: np.ndarray
+    split: Split
     tolerance: Tolerance
-    clock: Clock
+    budget: Budget
     say: Callable[[str], Any]
     tell: Callable[[Candidate], Any]
     tried: list[Candidate] = dataclasses.field(default_factory=list)
@@ -156,9 +155,14 @@ class _Sweep:
         found: _Found | None = None
         worse = 0
         for family in self._families(symmetric):
-            if self.clock.left <= 0:
+            rows = len(self.split.training) * self.triples.dim
+            try:
+                with self.budget.unit(
+                    f"S of {family.label}", ROWS, rows * family.num_parameters**2
+                ):
+                    new = self._fitted(family, symmetric)
+            except OutOfTime:
                 break
-            new = self._fitted(family, symmetric)
             if found is None or not new.candidate.validation_bound >= (
                 _BETTER * found.candidate.validation_bound
             ):
@@ -174,7 +178,7 @@ class _Sweep:
 
     def _families(self, symmetric: bool) -> Iterator[OfDisplacement]:
         """By rising size, as many as the training triples determine."""
-        triples, rows = self.triples, len(self.training) * self.triples.dim
+        triples, rows = self.triples, len(self.split.training) * self.triples.dim
         # An angle stays as it is: the middle of two would be known by half a turn only.
         part, moves = 0.0 if triples.angles else 0.5, _centres_of_moves(triples)
         for k, inner in enumerate(self._inner(symmetric, part)):
@@ -206,15 +210,15 @@ class _Sweep:
 
     def _fitted(self, family: OfDisplacement, symmetric: bool) -> _Found:
         """S of this family, and the error of its steps from positions that were held out."""
-        self.say(f"S of positions: {family.label}, {family.num_parameters} terms")
+        self.say(f"S of {family.label}, {family.num_parameters} terms")
         started, triples = time.perf_counter(), self.triples
-        training, held = triples.take(self.training), triples.take(self.held_out)
+        training, held = (triples.take(r) for r in (self.split.training, self.split.validation))
         solved = solve(family, training)
         params = family.unflatten(solved.coefficients)
         states = _states(family, params, triples)
         piece = Generated(family, params, TYPE1, triples.dt, sizes(states[0]))
         left = left_over(family, params, training) / self.spread
-        error = self.error_of(_images(piece, held))
+        error = self.error_of(_images(piece, held), self.split.validation)
         gradient, with_hessian = family.operations
         candidate = Candidate(
             label=family.label, family=family.name, chart=TYPE1.name,
@@ -232,20 +236,20 @@ class _Sweep:
         )
         return _Found(piece, candidate, about)
 
-    def error_of(self, positions: np.ndarray) -> OneStepError:
-        """Of the held-out triples' last positions (n, d), as predicted."""
-        error = positions - self.triples.after[self.held_out]
-        return one_step_error(
-            nearest_image(error, self.triples.angles), self.spread, self.tolerance
-        )
+    def error_of(self, positions: np.ndarray, rows: np.ndarray) -> OneStepError:
+        """Of the last positions (n, d) of these rows, as predicted."""
+        error = nearest_image(positions - self.triples.after[rows], self.triples.angles)
+        return one_step_error(error, self.spread, self.tolerance, self.split.stretch[rows])
 
     def learned(self, best: _Found, say: Callable[[str], Any]) -> LearnedPositions:
-        """The map of the best S, judged by the steps that users run."""
+        """The map of the best S, its error that of the steps that users run, on triples that chose
+        nothing where there are enough."""
         say(f"compiling the step of {best.candidate.label}")
         map_, states = _map_of(best.piece, self.triples, self.sites)
-        steps = stepped(map_, states.z1[self.held_out])
+        test = self.split.test if len(self.split.test) else self.split.validation
+        steps = stepped(map_, states.z1[test])
         images = np.where(steps.failed[:, None], np.nan, steps.images)[:, : self.triples.dim]
-        error = self.error_of(images)
+        error = self.error_of(images, test)
         chosen = dataclasses.replace(
             best.candidate, validation_rms=error.rms, validation_relative=error.relative,
             validation_bound=error.bound, deviations=error.deviations, map=map_, chosen=True,
@@ -253,44 +257,30 @@ class _Sweep:
             microseconds_per_step=steps.microseconds_per_step,
         )  # fmt: skip
         others = [c for c in self.tried if c is not best.candidate]
-        candidates = tuple(sorted([*others, chosen], key=lambda c: c.operations))
-        met = chosen.validation_bound <= self.tolerance.bound
-        ended = MET if met else "larger S are no more accurate, or take more triples"
-        messages = []
+        met, messages = chosen.validation_bound <= self.tolerance.bound, []
+        ended = MET if met else self.budget.ended or "larger S are no more accurate"
         if not met:
             messages.append(
                 f"no S of positions meets the tolerance {self.tolerance.bound:g}: the most "
                 f"accurate has a one-step error of {chosen.validation_relative:.2e} of the spread "
-                f"(95 % bound {chosen.validation_bound:.2e})"
+                f"(95 % bound {chosen.validation_bound:.2e}); the search ended because {ended}"
             )
         say(str(best.about))
+        part = "took no part in the fit or its choices" if test is self.split.test else "also chose"
         return LearnedPositions(
-            map_, candidates, self.tolerance, best.about, states, self.held_out, messages, ended,
-            self.clock.seconds, steps.compile_seconds,
+            map_, tuple(sorted([*others, chosen], key=lambda c: c.operations)), best.about, states,
+            self.split.validation, test, f"{len(test):,} triples that {part}", messages, ended,
+            steps.compile_seconds,
         )  # fmt: skip
 
 
-def _split(triples: Triples, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows that train and rows held out: whole runs, or of few runs blocks in time, whose
-    neighbours, which share positions with them, do not train."""
-    rng, count = np.random.default_rng(seed), len(triples)
-    wanted = int(np.clip(_HELD_OUT * count, min(4, count // 2), _MOST_HELD_OUT))
-    blocks = triples.run
-    by_run = len(np.unique(blocks)) >= _FEWEST_RUNS
-    if not by_run:
-        length = max(1, wanted // 5)
-        blocks = triples.run * (1 + count // length) + np.arange(count) // length
-    names = rng.permutation(np.unique(blocks))
-    held = np.zeros(count, bool)
-    for name in names:
-        if held.sum() >= wanted:
-            break
-        held |= blocks == name
-    apart = ~held
-    for off in (1, 2) if not by_run else ():
-        apart[off:] &= ~held[:-off]
-        apart[:-off] &= ~held[off:]
-    return np.flatnonzero(apart), np.flatnonzero(held)[:_MOST_HELD_OUT]
+def _split(triples: Triples, seed: int) -> Split:
+    """By runs, or of few runs by blocks of time, as pairs of states (q, Q − q) are split."""
+    coming, going = np.split(triples.moves, 2)
+    z0 = np.concatenate([triples.middle, coming], axis=1)
+    z1 = np.concatenate([triples.after, going], axis=1)
+    pairs = Pairs(z0, z1, triples.dt, run=triples.run, place=triples.place)
+    return split_rows(identified(pairs).pairs, seed)
 
 
 def _centres_of_moves(triples: Triples) -> np.ndarray | None:

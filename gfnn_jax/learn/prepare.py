@@ -32,8 +32,6 @@ class Prepared:
     which are ``own_dt`` (N,). args: (N, k) values of the ``parameters``, or None. period: of a
     drive, whose time is their last.
     structure: of many degrees of freedom, whose sizes and domain are then those of its parts.
-    place: (N,) of pairs some of which were left out, else None: consecutive numbers along a
-    sequence, of all pairs that there were, and sequences far apart.
     """
 
     y0: np.ndarray
@@ -51,7 +49,6 @@ class Prepared:
     parameters: tuple[str, ...] = ()
     structure: Structure | None = None
     period: float | None = None
-    place: np.ndarray | None = None
 
     @property
     def each_dt(self) -> Any:
@@ -86,13 +83,9 @@ class Prepared:
 
     def take(self, rows: np.ndarray) -> Prepared:
         """Of these rows alone; sizes and domain are theirs."""
-        own_dt, args, place = (
-            of_lanes(values, rows) for values in (self.own_dt, self.args, self.place)
-        )
+        own_dt, args = (of_lanes(values, rows) for values in (self.own_dt, self.args))
         return _sized(
-            dataclasses.replace(
-                self, y0=self.y0[rows], y1=self.y1[rows], own_dt=own_dt, args=args, place=place
-            )
+            dataclasses.replace(self, y0=self.y0[rows], y1=self.y1[rows], own_dt=own_dt, args=args)
         )
 
     def without(self, before: Factored | None, after: Factored | None) -> Prepared:

@@ -1,6 +1,6 @@
 """The chosen map of a fit, fitted anew to more pairs than fit into memory, of many processes.
 
-Each process folds its own rows into one triangular factor (local QR); factors are merged in pairs
+Each process folds its own rows into one triangle (local QR); triangles are merged in pairs
 up a tree, a TSQR (Demmel, Grigori, Hoemmen & Langou, SIAM J. Sci. Comput. 34, 2012), one tree for
 S and one for each Gauss–Newton problem of H. The first process solves, and decides alone.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +22,7 @@ from gfnn_jax.families.family import at_time
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import gauss_newton, least_squares
 from gfnn_jax.fitting.gauss_newton import FlowFit
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated
@@ -66,17 +67,18 @@ def not_refitted(fitted: Fit) -> Fit:
 
 
 def refit(
-    fitted: Fit, chunks: Iterable[Pairs], held: Pairs, *, scene: Scene | None = None,
-    group: Group | None = None,
+    fitted: Fit, chunks: Iterable[Pairs], held: Pairs, *, test: Pairs | None = None,
+    scene: Scene | None = None, group: Group | None = None,
 ) -> Fit:  # fmt: skip
     """The chosen map of a fit, of a linear family, with its coefficients from all of these pairs.
 
     fitted: of a sample of them. chunks: all of the pairs, which need never be in memory together;
     of a law they are gone through once for each Gauss–Newton step. held: pairs that choose the
-    ridge and judge the result; they are left out of the fit, as are outliers, which the sample's
-    map misses by far, and what the steps of a law do not resolve. Charts, domain and noise remain
-    those that the sample gave, and so does the map where all pairs give a worse one. Warns
-    (FitWarning) of both, and where the tolerance is missed.
+    ridge, and between the new map and the sample's. test: pairs that state the error; None: those
+    held state it too. Both are left out of the fit, as are outliers, which the sample's map misses
+    by far, and what the steps of a law do not resolve. Charts, domain and noise remain those that
+    the sample gave, and so does the map where all pairs give a worse one. Warns (FitWarning) of
+    both, and where the tolerance is missed.
 
     group: the processes that have the pairs. This one is the first, with chunks of its own; the
     others call `help_refit`. scene: as `maps.saved.save` takes it.
@@ -92,12 +94,14 @@ def refit(
 
     old, law = fitted.chosen, fitted.hamiltonian
     most = _OUTLYING * np.maximum(old.deviations, _ROUNDOFF * np.asarray(old.map.scale))
-    worker = _Refit(old.map, {"most": most, "held": np.asarray(held.z0)})
-    held = held.take(np.flatnonzero(worker.close(held)))
-    chosen, num_pairs, before = None, fitted.num_pairs, old.validation_rms
-    if len(held):
+    apart = [held] if test is None else [held, test]
+    worker = _Refit(old.map, {"most": most, "held": _states_of(apart)})
+    apart = [pairs.take(np.flatnonzero(worker.close(pairs))) for pairs in apart]
+    held, test = apart[0], apart[-1]
+    chosen, num_pairs, before, after = None, fitted.num_pairs, old.validation_rms, np.inf
+    if len(held) and len(test):
         before = worker.error(old.map, held, tolerance).rms
-        worker.task["held"] = np.asarray(held.z0)
+        worker.task["held"] = _states_of(apart)
         worker.task |= worker.resolving(held)
         bare = dataclasses.replace(old.map, posterior=None)
         group.told({**packed(bare, scene), **{_OF_TASK + n: v for n, v in worker.task.items()}})
@@ -118,13 +122,14 @@ def refit(
                 "resolved by the steps of the law: they are left out"
             )
         if found.map is not None:
-            candidate = with_error(old, worker.error(found.map, held, tolerance))
+            after = worker.error(found.map, held, tolerance).rms
+            candidate = with_error(old, worker.error(found.map, test, tolerance))
             chosen = dataclasses.replace(candidate, map=found.map, train_rms=found.train_rms)
             num_pairs = found.count
     else:
         group.told({})
-    if chosen is None or not chosen.validation_rms <= _NO_WORSE * before:
-        found_map = "no map" if chosen is None else f"a worse map ({chosen.validation_rms:.2e})"
+    if chosen is None or not after <= _NO_WORSE * before:
+        found_map = "no map" if chosen is None else f"a worse map ({after:.2e})"
         warn(f"all pairs give {found_map}: that of the sample ({before:.2e}) is kept")
         chosen, num_pairs = old, fitted.num_pairs
     elif law is not None and found.law is not None and old.learns == "hamiltonian":
@@ -137,6 +142,11 @@ def refit(
         fitted, map=chosen.map, candidates=candidates, num_pairs=num_pairs, seconds=seconds,
         hamiltonian=law, messages=tuple(messages),
     )  # fmt: skip
+
+
+def _states_of(parts: Sequence[Pairs]) -> np.ndarray:
+    """The states z0 of all parts, one after the other."""
+    return np.concatenate([np.asarray(pairs.z0) for pairs in parts])
 
 
 def help_refit(
@@ -280,24 +290,21 @@ class _Refit:
     # What a process answers, and how two answers become one.
 
     def answer(self, chunks: Iterable[Pairs], wanted: dict[str, Any]) -> dict[str, Any]:
-        """The factor of the rows of these pairs but outliers and those held out, and how many there
-        are; of a law at the coefficients that are wanted."""
+        """The triangle of the rows of these pairs but outliers and those held out, and how many
+        there are; of a law at the coefficients that are wanted."""
         counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
         kept = self._kept(chunks, counts)
         if isinstance(self.piece, Generated):
-            reduced = self._reduced(kept)
-            found = {"factor": reduced.factor, "rows": reduced.rows}
+            found = self._of_map(kept)
         else:
-            found = self._of_law(kept, wanted["c"], counts)._asdict()
-        return {**found, **counts}
+            found = self._of_law(kept, wanted["c"], counts)
+        return {"factor": found.factor, "rows": found.rows, **counts}
 
     def merged(self, one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
         """One answer of two."""
         counts = {n: one[n] + other[n] for n in _COUNTED}
-        if isinstance(self.piece, Generated):
-            both = least_squares.merged(*(_as_reduced(answer) for answer in (one, other)))
-            return {"factor": both.factor, "rows": both.rows, **counts}
-        return {**gauss_newton.merged(_as_factor(one), _as_factor(other))._asdict(), **counts}
+        both = _triangle(one).merge(_triangle(other))
+        return {"factor": both.factor, "rows": both.rows, **counts}
 
     def solved(self, chunks: Iterable[Pairs], held: Pairs, group: Group) -> _Solved:
         """The map of the pairs of all processes."""
@@ -311,19 +318,18 @@ class _Refit:
 
         law = None
         if isinstance(self.piece, Generated):
-            train = _as_reduced(asked())
-            held_factor = self._reduced([self._inner(held)])
+            train, judge = _triangle(asked()), self._of_map([self._inner(held)])
             size, rows = self.piece.family.num_parameters, train.rows
             if rows:
-                solved = least_squares.solve(train, held_factor, size)
+                solved = least_squares.solve(train, judge, size)
                 coefficients, train_rms = solved.coefficients, solved.train_rms
         else:
-            c, factor, made = gauss_newton.descended(
-                lambda c: _as_factor(asked(c)), self.piece.params, gauss_newton.OPTIONS.most
+            c, found, made = gauss_newton.descended(
+                lambda c: _triangle(asked(c)), self.piece.params, gauss_newton.OPTIONS.most
             )
-            rows = factor.rows
+            rows = found.rows
             if rows:
-                law = gauss_newton.summarised(c, factor, None, made, self._steps)
+                law = gauss_newton.summarised(c, found, None, made, self._steps)
                 coefficients, train_rms = law.coefficients, law.rms
         group.told({})
         if not rows:
@@ -334,8 +340,8 @@ class _Refit:
         map_ = dataclasses.replace(self.map, pieces=tuple(pieces))
         return _Solved(map_, train_rms, law, **counts)
 
-    def _reduced(self, kept: Iterable[_Rows]) -> least_squares.Reduced:
-        """The factor of S from pairs as its piece sees them."""
+    def _of_map(self, kept: Iterable[_Rows]) -> Triangle:
+        """The triangle of S from pairs as its piece sees them."""
         chart, family = self.piece.chart, self.piece.family
         # The rows of an S of dt are multiplied by each pair's own.
         dt = 1.0 if isinstance(family, OfTimeStep) else self.dt
@@ -349,18 +355,16 @@ class _Refit:
 
         return least_squares.reduce(of_rows(family), (row_of(*rows) for rows in kept), weight)
 
-    def _of_law(self, kept, c, counts: dict[str, int]) -> gauss_newton.Factor:
+    def _of_law(self, kept, c, counts: dict[str, int]) -> Triangle:
         """The Gauss–Newton problem of H at c, from pairs that its steps resolve."""
         family = self.piece.family
-        size = family.num_parameters + 1
-        whole = gauss_newton.Factor(np.zeros((size, size)), 0, 0.0)
+        whole = Triangle.empty(family.num_parameters)
         for own in kept:
             problem, rows = self._problem(own), np.arange(len(own.y0))
             known, off, _ = problem.resolution(family, self.piece.params, self._steps, rows)
             resolved = rows[known & (off <= self.task["limit"])]
             counts["unresolved"] += len(rows) - len(resolved)
-            part = problem.factor(family, c, self._steps, resolved)
-            whole = gauss_newton.merged(whole, part)
+            whole = whole.merge(problem.linearised(family, c, self._steps, resolved))
         return whole
 
     @property
@@ -426,12 +430,8 @@ class _Refit:
         return _Rows(y0, y1, self._own_dt(pairs), columns)
 
 
-def _as_reduced(answer: dict[str, Any]) -> least_squares.Reduced:
-    return least_squares.Reduced(np.asfortranarray(answer["factor"]), int(answer["rows"]))
-
-
-def _as_factor(answer: dict[str, Any]) -> gauss_newton.Factor:
-    return gauss_newton.Factor(answer["matrix"], int(answer["rows"]), float(answer["cost"]))
+def _triangle(answer: dict[str, Any]) -> Triangle:
+    return Triangle(answer["factor"], int(answer["rows"]))
 
 
 def _keys(z) -> np.ndarray:

@@ -11,9 +11,10 @@ import numpy as np
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.learn.candidates import Candidate, Tolerance
 from gfnn_jax.learn.check import check_request, coarse_tolerance, unlike_the_scene
-from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.structures import Structure, structure_of
 from gfnn_jax.learn.varied import as_varied
+from gfnn_jax.models.model import Model
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
 
@@ -33,11 +34,12 @@ class Request:
     terms: Sequence[str | Callable]
     base: str | Callable | None
     structure: Structure | None
-    family: str
+    family: Any
+    model: Model | None
     chart: str
     ensemble: int
     seed: int
-    clock: Clock
+    budget: Budget
     max_iterations: int
     checkpoints: Any
     factors: Any
@@ -53,7 +55,7 @@ class Request:
     @property
     def seeks_law(self) -> bool:
         """Whether H is looked for."""
-        free = (self.family, self.chart, self.base) == ("auto", "auto", None)
+        free = (self.family, self.chart, self.base, self.model) == ("auto", "auto", None, None)
         angles = self.structure is not None and bool(self.structure.angles)
         return (free or self.of_network) and self.learn != "map" and not angles
 
@@ -71,7 +73,7 @@ def lent(scene: Scene, learn: str, chart: str) -> str | None:
 
 def checked(
     pairs: Pairs, scene: Scene | None, *, tolerance, absolute_tolerance, learn, terms, base,
-    structure, family, chart, ensemble, angles, seed, clock: Clock, **others: Any,
+    structure, family, model, chart, ensemble, angles, seed, budget: Budget, **others: Any,
 ) -> Request:  # fmt: skip
     """The request, with what is constant in the pairs as a constant.
 
@@ -83,9 +85,10 @@ def checked(
     if absolute_tolerance is not None:
         bound = Tolerance(absolute_tolerance, relative=False)
     check_request(
-        pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, angles=angles,
+        pairs, scene, tolerance=bound.bound, chart=chart, learn=learn, family=family, model=model,
+        angles=angles,
         terms=terms, base=base, structure=structure, ensemble=ensemble, seed=seed,
-        max_seconds=clock.max_seconds,
+        max_seconds=budget.max_seconds, max_operations=budget.max_operations,
     )  # fmt: skip
     coordinates = scene.coordinates if scene else Coordinates("cartesian", angles=tuple(angles))
     found = structure_of(structure, pairs.dim, coordinates)
@@ -98,7 +101,8 @@ def checked(
         messages += unlike_the_scene(pairs, scene)
     messages += coarse_tolerance(pairs, bound)
     return Request(
-        pairs, scene, coordinates, bound, learn, terms, base, found, family, chart, ensemble, seed,
-        clock,
+        pairs, scene, coordinates, bound, learn, terms, base, found, family, model, chart, ensemble,
+        seed,
+        budget,
         messages=messages, **others,
     )  # fmt: skip

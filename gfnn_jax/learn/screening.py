@@ -23,6 +23,8 @@ import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.coordinates import nearest_image
+from gfnn_jax.dataset.noise import robust
+from gfnn_jax.learn.diagnose import looked_for_errors
 from gfnn_jax.learn.prepare import Prepared
 
 # Times the median residual: beyond the second, a pair is a gross error. Those between the two are
@@ -37,7 +39,7 @@ _NEIGHBOURS, _BUT, _ALONE = 10, 4, 0.8
 _BRIDGED, _LONGEST = 0.8, 10
 # A state is a regressor within so many robust deviations of the median: others have too much
 # weight in a fit.
-_WITHIN, _NORMAL = 8.0, 1.4826
+_WITHIN = 8.0
 _PAIRS_PER_TERM, _MOST_TERMS, _MOST_ROWS = 8, 130, 3_000
 _GAINED = 0.9  # of the residual, that a higher degree must leave
 _USABLE = 0.25  # of the moves' size: a polynomial that leaves more says nothing
@@ -54,6 +56,10 @@ def gross_errors(prepared: Prepared, goes_on: np.ndarray, left_out: np.ndarray) 
     none = np.zeros(0, int)
     if prepared.varied or prepared.structure is not None:
         return none
+    rows = looked_for_errors(len(prepared.y0))
+    if len(rows) < len(prepared.y0):
+        within = goes_on[rows[:-1]] & (np.diff(rows) == 1)
+        return rows[gross_errors(prepared.take(rows), within, left_out[rows])]
     best = None
     for model in _models(prepared, ~left_out):
         if best is not None and not model.left < _GAINED * best.left:
@@ -87,7 +93,7 @@ class _Model:
         self.y0, self.y1 = prepared.y0, prepared.y1
         both = np.concatenate([self.y0, self.y1])
         self._centre = np.median(both, axis=0)
-        unit = _NORMAL * np.median(np.abs(both - self._centre), axis=0)
+        unit = robust(both - self._centre, axis=0)
         self.unit = np.where(unit > 0, unit, prepared.scale)
         move = nearest_image(self.y1 - self.y0, self._angles) / self.unit
         self._ahead, ahead, left = self._fitted(self.y0, move, known)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.learn.candidates import Candidate
-from gfnn_jax.learn.clock import Clock, OutOfTime
+from gfnn_jax.learn.clock import ROWS, SOLVE, Budget, OutOfTime
 from gfnn_jax.learn.extrapolate import Course, course
 
 # A size that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
@@ -59,74 +59,144 @@ class Found(NamedTuple):
 def search(
     sweeps: Sequence[Any],
     bound: float,
-    clock: Clock,
+    budget: Budget,
     say: Callable[[str], Any],
     tell: Callable[[Candidate], Any],
     on_validated: Callable[[Entry], Any] | None = None,
     dearest: float = np.inf,
 ) -> Found:
-    """Climb the sweeps. A sweep has ``sizes`` with ``operations`` by rising order and an
-    ``extent`` with which the logarithm of the error falls in proportion, ``judge(size, clock,
-    say)`` and ``validate(size, judged, clock, say)``, which give candidates, ``short_of_pairs``:
-    whether more pairs would allow larger sizes, and ``at(extent)``, which says what a size of this
-    extent is and takes.
+    """Climb the sweeps to their end: a `Search` in one go, its arguments those of ``climb``."""
+    started = Search(sweeps, bound, budget, say, tell, on_validated)
+    started.climb(dearest)
+    return started.found()
+
+
+class Search:
+    """A climb of sweeps, which may be made in parts.
+
+    A sweep has ``sizes`` with ``operations`` by rising order and an ``extent`` with which the
+    logarithm of the error falls in proportion, ``judge(size, budget, say)`` and ``validate(size,
+    judged, budget, say)``, which give candidates, ``work(size)`` and ``work_of_steps(size)``: the
+    operations that these take, ``short_of_pairs``: whether more pairs would allow larger sizes, and
+    ``at(extent)``, which says what a size of this extent is and takes.
 
     bound: the tolerance on a candidate's ``validation_bound``. tell: called with every candidate.
-    on_validated: called with every entry whose steps have been looked at. dearest: operations from
-    which a size is of no use, because something else meets the tolerance with so many.
+    on_validated: called with every entry whose steps have been looked at.
     """
-    queue = sorted(
-        ((size.operations, i, n) for i, s in enumerate(sweeps) for n, size in enumerate(s.sizes))
-    )
-    entries: list[Entry] = []
-    best = [np.inf] * len(sweeps)
-    ratio = [1.0 / _CALIBRATED] * len(sweeps)  # of a step's error to its estimate
-    beaten, stalled = [0] * len(sweeps), [0] * len(sweeps)
-    left: set[int] = set()
-    seen: list[list[tuple[float, float]]] = [[] for _ in sweeps]  # (extent, bound) of the estimates
-    cheapest, kept, ended = dearest, np.inf, ""
-    try:
-        for operations, i, n in queue:
-            if i in left or operations >= cheapest:
-                continue
-            clock.check()
-            sweep, size = sweeps[i], sweeps[i].sizes[n]
-            judged = sweep.judge(size, clock, say)
-            size = sweep.sizes[n]  # with what was trained
-            candidate = judged
-            # Something to keep should the search be interrupted is worth a few more looks.
-            keep = on_validated is not None and judged.validation_relative < _KEPT * kept
-            kept = min(kept, judged.validation_relative) if keep else kept
-            if keep or ratio[i] * judged.validation_bound <= _HOPEFUL * bound:
-                candidate = sweep.validate(size, judged, clock, say)
-                if np.isfinite(candidate.validation_relative) and judged.validation_relative > 0:
-                    ratio[i] = candidate.validation_relative / judged.validation_relative
-            entries.append(Entry(candidate, sweep, size))
-            tell(candidate)
-            if candidate.validated and on_validated is not None:
-                on_validated(entries[-1])
-            if candidate.validated and candidate.validation_bound <= bound:
-                cheapest = min(cheapest, operations)
-                left.add(i)
-            relative = judged.validation_relative
-            stalled[i] = stalled[i] + 1 if relative > _WORTHWHILE * best[i] else 0
-            best[i] = min(best[i], relative)
-            beaten[i] += any(_beats(e.candidate, judged) for e in entries)
-            if stalled[i] == _STALLED or beaten[i] == _BEATEN:
-                left.add(i)
-            seen[i].append((size.extent, judged.validation_bound))
-            left |= _hopeless(sweeps, seen, [_known(r) for r in ratio], left, bound)
-    except OutOfTime:
-        ended = f"the budget of {clock.max_seconds:g} s is spent"
-    if not np.isfinite(cheapest):
-        entries = _finalists(entries, clock, say)
-    entries = [_calibrated(e, ratio[sweeps.index(e.sweep)]) for e in entries]
-    if np.isfinite(cheapest):
+
+    def __init__(
+        self, sweeps: Sequence[Any], bound: float, budget: Budget, say: Callable[[str], Any],
+        tell: Callable[[Candidate], Any], on_validated: Callable[[Entry], Any] | None = None,
+    ):  # fmt: skip
+        self.sweeps, self._bound, self._budget = sweeps, bound, budget
+        self._say, self._tell, self._on_validated = say, tell, on_validated
+        self._queue = sorted(
+            (size.operations, i, n) for i, s in enumerate(sweeps) for n, size in enumerate(s.sizes)
+        )
+        self._entries: list[Entry] = []
+        self._best = [np.inf] * len(sweeps)
+        self._ratio = [1.0 / _CALIBRATED] * len(sweeps)  # of a step's error to its estimate
+        self._beaten, self._stalled = [0] * len(sweeps), [0] * len(sweeps)
+        self._left: set[int] = set()
+        # (extent, bound) of the estimates
+        self._seen: list[list[tuple[float, float]]] = [[] for _ in sweeps]
+        self._cheapest, self._kept, self._unfinished = np.inf, np.inf, False
+
+    def climb(self, dearest: float = np.inf, most: float = np.inf) -> None:
+        """Judge size after size, one at least, up to the first that takes more than ``most``
+        operations to judge, or as far as the budget goes. dearest: operations of a step from which
+        a size is of no use, because something else meets the tolerance with so many."""
+        self._cheapest = min(self._cheapest, dearest)
+        try:
+            while self._queue:
+                operations, i, n = self._queue[0]
+                if i not in self._left and operations < self._cheapest:
+                    work = self.sweeps[i].work(self.sweeps[i].sizes[n])
+                    if work > most and self._entries:
+                        return
+                    self._look_at(i, n)
+                self._queue.pop(0)
+        except OutOfTime:
+            self._unfinished = True
+
+    def _look_at(self, i: int, n: int) -> None:
+        """One size: estimated, and validated by steps where it may be accurate enough."""
+        sweep, size = self.sweeps[i], self.sweeps[i].sizes[n]
+        follows = SOLVE, sweep.work_of_steps(size)
+        with self._budget.unit(sweep.named(size), ROWS, sweep.work(size), then=follows):
+            judged = sweep.judge(size, self._budget, self._say)
+        size = sweep.sizes[n]  # with what was trained
+        entry = Entry(judged, sweep, size)
+        self._entries.append(entry)
+        relative = judged.validation_relative
+        # Something to keep should the search be interrupted is worth a few more looks.
+        keep = self._on_validated is not None and relative < _KEPT * self._kept
+        self._kept = min(self._kept, relative) if keep else self._kept
+        if keep or self._ratio[i] * judged.validation_bound <= _HOPEFUL * self._bound:
+            entry = self._validated(entry)
+            error = entry.candidate.validation_relative
+            if np.isfinite(error) and relative > 0:
+                self._ratio[i] = error / relative
+        candidate = entry.candidate
+        self._tell(candidate)
+        if candidate.validated and self._on_validated is not None:
+            self._on_validated(entry)
+        if candidate.validated and candidate.validation_bound <= self._bound:
+            self._cheapest = min(self._cheapest, size.operations)
+            self._left.add(i)
+        self._stalled[i] = self._stalled[i] + 1 if relative > _WORTHWHILE * self._best[i] else 0
+        self._best[i] = min(self._best[i], relative)
+        self._beaten[i] += any(_beats(e.candidate, judged) for e in self._entries)
+        if self._stalled[i] == _STALLED or self._beaten[i] == _BEATEN:
+            self._left.add(i)
+        self._seen[i].append((size.extent, judged.validation_bound))
+        self._left |= _hopeless(self.sweeps, self._seen, self._ratios, self._left, self._bound)
+
+    def _validated(self, entry: Entry) -> Entry:
+        """The entry with its error measured by steps, in its place among the others."""
+        sweep, size = entry.sweep, entry.size
+        name = f"steps of {sweep.named(size)}"
+        with self._budget.unit(name, SOLVE, sweep.work_of_steps(size)):
+            candidate = sweep.validate(size, entry.candidate, self._budget, self._say)
+        return self._replaced(entry, candidate)
+
+    def _replaced(self, entry: Entry, candidate: Candidate) -> Entry:
+        place = next(k for k, e in enumerate(self._entries) if e is entry)
+        self._entries[place] = entry._replace(candidate=candidate)
+        return self._entries[place]
+
+    @property
+    def _ratios(self) -> list[float]:
+        return [_known(r) for r in self._ratio]
+
+    def found(self) -> Found:
+        """What there is; where nothing meets the tolerance, with the few best validated."""
+        met = bool(np.isfinite(self._cheapest))
+        if not met:
+            self._validate_the_best()
+        sweeps, stalled = self.sweeps, self._stalled
+        entries = [_calibrated(e, self._ratio[sweeps.index(e.sweep)]) for e in self._entries]
         ended = MET
-    else:
-        ended = ended or _why(sweeps, stalled, best)
-        ended += _promised(sweeps, seen, [_known(r) for r in ratio], stalled, bound)
-    return Found(entries, _ranking(entries, bound), _stalled_sweeps(entries), ended)
+        if not met:
+            ended = self._budget.ended if self._unfinished else _why(sweeps, stalled, self._best)
+            ended += _promised(sweeps, self._seen, self._ratios, stalled, self._bound)
+        return Found(entries, _ranking(entries, self._bound), _stalled_sweeps(entries), ended)
+
+    def _validate_the_best(self) -> None:
+        """The few best of the entries, validated: one at least, whatever the budget."""
+        best = _finalists([e for e in self._entries if not e.candidate.validated])
+        for first, entry in zip((True, *[False] * len(best)), best, strict=False):
+            if first:
+                work = entry.sweep.work_of_steps(entry.size)
+                with self._budget.free(SOLVE, work):
+                    free = Budget()
+                    judged = entry.sweep.validate(entry.size, entry.candidate, free, self._say)
+                self._replaced(entry, judged)
+                continue
+            try:
+                self._validated(entry)
+            except OutOfTime:
+                return
 
 
 def _known(ratio: float) -> float:
@@ -195,24 +265,16 @@ def _calibrated(entry: Entry, ratio: float) -> Entry:
     )
 
 
-def _finalists(entries: list[Entry], clock: Clock, say) -> list[Entry]:
-    """The entries with the few best of them validated: one at least, whatever the time."""
+def _finalists(entries: list[Entry]) -> list[Entry]:
+    """The few best of these entries."""
     best = sorted(
-        (e for e in entries if not e.candidate.validated),
-        key=lambda e: (e.candidate.validation_relative, e.candidate.train_rms),
-    )
+        entries, key=lambda e: (e.candidate.validation_relative, e.candidate.train_rms)
+    )  # fmt: skip
     # Of those that are as good as the best, the cheapest comes second.
     as_good = [e for e in best[1:] if _as_good(e, best[0])]
     second = sorted(as_good, key=lambda e: e.candidate.operations)[:1]
     best = [*best[:1], *second, *(e for e in best[1:] if e not in second)]
-    done: dict[int, Entry] = {}
-    for entry in best[:_FINALISTS]:
-        if done and clock.left <= 0:
-            break
-        free = Clock()  # a step of the held-out pairs is short
-        candidate = entry.sweep.validate(entry.size, entry.candidate, free, say)
-        done[id(entry)] = entry._replace(candidate=candidate)
-    return [done.get(id(e), e) for e in entries]
+    return best[:_FINALISTS]
 
 
 def _ranking(entries: list[Entry], bound: float) -> list[Entry]:

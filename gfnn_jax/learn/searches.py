@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.errors import FitError
-from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.assemble import composed, with_predictor
+from gfnn_jax.learn.assemble import composed
 from gfnn_jax.learn.candidates import Candidate, Judges
 from gfnn_jax.learn.choose_charts import Charts
 from gfnn_jax.learn.choose_law import DEARER, law_of
-from gfnn_jax.learn.clock import Clock
+from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.diagnosed import Diagnosis, diagnosed
 from gfnn_jax.learn.ensembles import EnsembleSweep
 from gfnn_jax.learn.law_maps import (
@@ -24,22 +23,27 @@ from gfnn_jax.learn.law_maps import (
     search_of_law,
 )
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
+from gfnn_jax.learn.linear_map import linear_map
 from gfnn_jax.learn.map_of_terms import LearnedMap, map_of
+from gfnn_jax.learn.model_sweep import ModelSweep
 from gfnn_jax.learn.network_sweep import NetworkSweep
 from gfnn_jax.learn.networks import learn_network
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
-from gfnn_jax.learn.search import Entry, Found, search
+from gfnn_jax.learn.search import Entry, Found, Search
 from gfnn_jax.learn.sweeps import sweep_of_dt, sweeps_for
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
+# Operations of a size of S that is judged before H is looked for: a fifth of a second.
+_SMALL = 2e9
 OnBetter = Callable[[SymplecticMap, Candidate], Any]
 
 
 class Searched(NamedTuple):
-    """law: H, or None. of_terms: S with parameters or of a structure, or None. found: the generated
-    maps. swept: whether any were looked for. charts: theirs. plain: the pairs as prepared, without
-    a base map or law factored out. judges: of the user's pairs."""
+    """law: H, or None. of_terms: S with parameters or of a structure, or None. linear: the linear
+    map, where the budget has left nothing that is as accurate. found: the generated maps. swept:
+    whether any were looked for. charts: theirs. plain: the pairs as prepared, without a base map or
+    law factored out. judges: of the user's pairs."""
 
     law: LearnedHamiltonian | None
     of_terms: LearnedMap | None
@@ -48,6 +52,7 @@ class Searched(NamedTuple):
     charts: Charts
     plain: Prepared
     judges: Judges
+    linear: Candidate | None = None
 
     @property
     def met_by_law(self) -> bool:
@@ -59,16 +64,21 @@ def searched(
     on_better: OnBetter | None,
 ) -> Searched:  # fmt: skip
     """Every candidate. Raises FitError where there is none."""
-    bound, clock, say, tell = request.tolerance, request.clock, request.say, request.tell
+    bound, budget, say, tell = request.tolerance, request.budget, request.say, request.tell
     scene, prepared, charts = request.scene, seen.prepared, seen.charts
     better = _Better(on_better) if on_better is not None else None
+    given = bound.bound, budget, say, tell, better
+    # Small sizes first: a map is then there, however long the search for H.
+    early = not prepared.of_terms or request.model is not None
+    climb = Search(_sweeps(request, plain, seen, judges) if early else [], *given)
+    climb.climb(most=_SMALL)
     law = _law(request, plain, judges, better)
     of_terms, failed = None, None
     met_by_law = law is not None and judges.met_by(law.candidate)
-    wanted = prepared.of_terms and request.learn != "hamiltonian" and not met_by_law
+    wanted = not early and request.learn != "hamiltonian" and not met_by_law
     if wanted and request.family == "auto":
         try:
-            of_terms = map_of(prepared, judges, scene, request.chart, law, clock, say)
+            of_terms = map_of(prepared, judges, scene, request.chart, law, budget, say)
         except FitError as error:
             failed = error
     if wanted and plain.args is not None and not _met(of_terms, judges):
@@ -77,35 +87,50 @@ def searched(
         except FitError as error:
             failed = failed or error
         prepared, charts = seen.prepared, seen.charts
-    sweeps = _sweeps(request, seen, judges)
+    if not early:
+        climb = Search(_sweeps(request, plain, seen, judges), *given)
     dearest = law.candidate.operations if law is not None and met_by_law else np.inf
-    found = search(sweeps, bound.bound, clock, say, tell, better, dearest)
+    climb.climb(dearest)
+    found = climb.found()
     dearest /= DEARER  # of maps that would be chosen
     if plain.varied:  # pairs of a law's flow are drawn, and factored out, at one dt
         pass
-    elif law is not None and met_by_law and more_pairs_would_help(sweeps, found, bound, dearest):
+    elif (
+        law is not None
+        and met_by_law
+        and more_pairs_would_help(climb.sweeps, found, bound, dearest)
+    ):
         say("drawing pairs from the flow of H")
         drawn = search_of_law(
-            law, judges.pairs, judges, scene, request.coordinates, dearest, clock, say, tell,
+            law, judges.pairs, judges, scene, request.coordinates, dearest, budget, say, tell,
             request.seed,
         )  # fmt: skip
         if drawn is not None:
             found, charts = drawn
     elif (
         law is not None and not met_by_law and plain.args is None
-        and law_explains_most(law, found, bound, clock)
+        and law_explains_most(law, found, bound, budget)
     ):  # fmt: skip
         say(f"learning what the flow of {law.candidate.label} leaves over")
-        around = search_around(law, plain, judges, scene, clock, say, tell, better, request.seed)
+        around = search_around(law, plain, judges, scene, budget, say, tell, better, request.seed)
         if around is not None and better_than(around.found, found, law):
             found, charts = around
-    if not found.ranking and law is None and of_terms is None:
-        raise failed or FitError(_nothing_found(len(judges.pairs), clock))
+    known = [f.candidate for f in (law, of_terms, *found.ranking[:1]) if f is not None]
+    best = min((c.validation_bound for c in known), default=np.inf)
+    linear = None
+    if budget.over and best > bound.bound:
+        linear = linear_map(plain, judges)
+        if linear is not None and linear.validation_bound < best:
+            tell(linear)
+        elif known:
+            linear = None
+    if not known and linear is None:
+        raise failed or FitError(_nothing_found(len(judges.pairs), budget))
     if of_terms is not None and found.ranking and not _met(of_terms, judges):
         best = found.ranking[0].candidate
         if best.validation_bound < of_terms.candidate.validation_bound:
             of_terms = None
-    return Searched(law, of_terms, found, bool(sweeps), charts, plain, judges)
+    return Searched(law, of_terms, found, bool(climb.sweeps), charts, plain, judges, linear)
 
 
 def _met(found: LearnedMap | None, judges: Judges) -> bool:
@@ -120,12 +145,12 @@ def _law(
         return None
     if request.of_network:
         law = learn_network(
-            plain, judges, request.scene, seed=request.seed, clock=request.clock, say=request.say,
+            plain, judges, request.scene, seed=request.seed, budget=request.budget, say=request.say,
             max_iterations=request.max_iterations,
         )  # fmt: skip
     else:
         law = law_of(
-            plain, judges, request.scene, request.learn, request.terms, request.clock, request.say
+            plain, judges, request.scene, request.learn, request.terms, request.budget, request.say
         )
     if law is not None:
         if better is not None:
@@ -134,15 +159,17 @@ def _law(
     return law
 
 
-def _sweeps(request: Request, seen: Diagnosis, judges: Judges) -> list[Any]:
+def _sweeps(request: Request, plain: Prepared, seen: Diagnosis, judges: Judges) -> list[Any]:
     """The sweeps of S over the charts that cover the data; none where H alone is learned, or the
     pairs are driven, or differ in dt and in parameters too."""
+    if request.model is not None:
+        return [ModelSweep(request.model, plain, judges)]
     charts, prepared = seen.charts.charts, seen.prepared
     if request.learn == "hamiltonian" or prepared.period is not None:
         return []
     if prepared.own_dt is not None:
-        plain = prepared.structure is None and prepared.args is None
-        return [sweep_of_dt(prepared, request.scene, judges, request.factors)] if plain else []
+        alone = prepared.structure is None and prepared.args is None
+        return [sweep_of_dt(prepared, request.scene, judges, request.factors)] if alone else []
     if request.family == "mlp":
         given = (prepared, charts[0], judges, request.max_iterations, request.seed,
                  request.checkpoints)  # fmt: skip
@@ -153,9 +180,9 @@ def _sweeps(request: Request, seen: Diagnosis, judges: Judges) -> list[Any]:
     )
 
 
-def _nothing_found(num_pairs: int, clock: Clock) -> str:
-    if clock.left <= 0:
-        return f"expected a budget of more than {clock.max_seconds:g} s: no candidate was finished"
+def _nothing_found(num_pairs: int, budget: Budget) -> str:
+    if budget.over:
+        return f"expected a larger budget: no candidate was finished; {budget.ended}"
     return f"expected more pairs: {num_pairs} are too few for the smallest model of this kind"
 
 
@@ -177,10 +204,5 @@ class _Better:
 
 
 def _map_of(entry: Entry) -> SymplecticMap:
-    sweep, family = entry.sweep, entry.size.family
-    prepared, judges = sweep.prepared, sweep.judges
-    _, params = sweep.solve(entry.size, Clock(), lambda message: None)
-    generated = Generated(family, params, sweep.chart, prepared.dt, prepared.scale)
-    features = getattr(getattr(family, "inputs", None), "features", None)
-    generated = with_predictor(generated, prepared, judges.training, features)
-    return composed(generated, prepared, judges)
+    sweep = entry.sweep
+    return composed(sweep.piece(entry.size), sweep.prepared, sweep.judges)

@@ -11,15 +11,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.inputs import box_inputs, variable_signs
+from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.noise import of_pairs
+from gfnn_jax.dataset.runs import looked_at
+from gfnn_jax.dataset.split import outermost
+from gfnn_jax.families.inputs import Inputs, box_inputs, variable_signs
+from gfnn_jax.families.own import own_families
 from gfnn_jax.families.products import Products, number_of_terms
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
-from gfnn_jax.learn.candidates import Candidate, Judges, validated
-from gfnn_jax.learn.clock import Clock
-from gfnn_jax.learn.held_out import looked_at, outermost
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.learn.assemble import with_predictor
+from gfnn_jax.learn.candidates import Candidate, Judges, refined_images, validated
+from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.rows import of_rows, rows_of
 from gfnn_jax.maps.affine import Affine
@@ -43,7 +50,8 @@ _MOST_OPERATIONS = 3.2e11
 # what it was (FPUT chains, a Penning trap, a satellite); to leave them out costs no more than that.
 _SCARCE_FROM_DIM, _PARITY_ROWS, _ODD_DEGREE, _NO_GAIN = 3, 6, 3, 0.98
 _WORTH_KEEPING = 1.0  # seconds
-_OPERATIONS_PER_SECOND = 1e10  # of a factorisation on one thread, for the estimate that is told
+# Operations of singular values, ÷ terms³; and of a step in NumPy, in units that take as long.
+OF_SOLVE, OF_STEPS = 22.0, 20.0
 # Pairs of a block that goes to one of two halves: long beside the noise that neighbours share.
 _HALVES_BLOCK = 50
 # Rows per term of a larger size, by which noise is told from misfit.
@@ -68,13 +76,20 @@ class Size:
 
 
 def sweeps_for(
-    request: str, charts: Sequence[AnyChart], prepared, scene, judges, factors=None
+    request: Any, charts: Sequence[AnyChart], prepared, scene, judges, factors=None
 ) -> Iterator:
     """The sweeps of the families that apply, chart by chart.
 
-    request: "auto", "polynomial", "features" (the scene's) or "sines"; with "auto" random sines
-    are tried where polynomials have too many terms. factors: as ``LinearSweep`` takes them.
+    request: "auto", "polynomial", "features" (the scene's), "sines", or a user's own; with "auto"
+    random sines are tried where polynomials have too many terms. factors: as ``LinearSweep`` takes
+    them.
     """
+    if not isinstance(request, str):
+        for chart in charts:
+            yield LinearSweep(
+                prepared, chart, judges, "own", None, None, own=lambda i: own_families(request, i)
+            )  # fmt: skip
+        return
     features = scene.features if scene is not None else None
     polynomials = request in ("auto", "polynomial")
     even = polynomials and (scene is None or scene.reversor is None) and is_even(prepared, judges)
@@ -101,22 +116,54 @@ class _Factors(NamedTuple):
     """Of the training rows, of those held out, and of the training rows without the outermost
     twentieth and of that twentieth alone."""
 
-    train: least_squares.Reduced
-    held: least_squares.Reduced
-    inner: least_squares.Reduced
-    outer: least_squares.Reduced
+    train: Triangle
+    held: Triangle
+    inner: Triangle
+    outer: Triangle
+
+    @classmethod
+    def of(cls, inner: Triangle, outer: Triangle, held: Triangle) -> _Factors:
+        """The rows of the outermost twentieth are appended to the others by their own triangle."""
+        return cls(inner.append(outer.factor, outer.rows), held, inner, outer)
 
 
-class LinearSweep:
+class Generates:
+    """What sweeps of S have in common: a solved size makes a piece."""
+
+    prepared: Prepared
+    chart: AnyChart
+    judges: Judges
+
+    def solve(self, size: Size, budget: Budget, say) -> tuple[Any, Any]:
+        """What is known of the solution, and the params of the size's family."""
+        raise NotImplementedError
+
+    def piece(self, size: Size) -> Generated:
+        """The piece that the size's S generates, with its predictor."""
+        prepared, params = self.prepared, self._params_of(size)
+        piece = Generated(size.family, params, self.chart, prepared.dt, prepared.scale)
+        return with_predictor(piece, prepared, self.judges.training)
+
+    def images(self, size: Size, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Images of these rows (n, 2d), as prepared, and which steps were solved (n,)."""
+        params = self._params_of(size)
+        return refined_images(self.prepared, self.chart, size.family, params, rows)
+
+    def _params_of(self, size: Size) -> Any:
+        return self.solve(size, Budget(), lambda message: None)[1]
+
+
+class LinearSweep(Generates):
     """The sizes of one linear family in one chart.
 
     factors: a ``KeptFactors``, where factors that took long are kept for a fit that goes on. even:
-    whether S(−w) = S(w), and has even terms only.
+    whether S(−w) = S(w), and has even terms only. own: a user's families, of the inputs, by rising
+    number of terms.
     """
 
     def __init__(
         self, prepared: Prepared, chart: AnyChart, judges: Judges, kind: str, features, reversor,
-        factors=None, even=False,
+        factors=None, even=False, own: Callable[[Inputs], Iterable[Any]] | None = None,
     ):  # fmt: skip
         reversor = (-1,) * 2 * prepared.dim if even else reversor
         self._kept, self._prefix = factors, "even " if even else ""
@@ -136,15 +183,17 @@ class LinearSweep:
         )  # fmt: skip
         degrees = _EVEN_DEGREES if even else _DEGREES
         signs = None
-        if kind != "sines" and reversor is not None:
+        if kind != "sines" and own is None and reversor is not None:
             signs = variable_signs(inputs, reversor, w)
 
         def groups() -> Iterator[Iterable[Any]]:
+            if own is not None:
+                return ([family] for family in own(inputs))
             if kind == "sines":
                 return ([Sines(inputs, count)] for count in _SINES)
             return ((of(inputs, degree, signs) for degree in g) for g in degrees)
 
-        known = len(_SINES) if kind == "sines" else sum(map(len, degrees))
+        known = len(_SINES) if kind == "sines" or own is not None else sum(map(len, degrees))
         self._groups, rows = groups, self._train[1].size
         self.sizes = [
             Size(family, group[-1], _extent(family))
@@ -153,22 +202,43 @@ class LinearSweep:
         # Else the last size is the largest there is, or the most terms are reached.
         self.short_of_pairs = len(self.sizes) < known and rows < _ROWS_PER_TERM * _MOST_TERMS
         self._factors: dict[Any, _Factors] = {}
+        self._solved: dict[int, least_squares.LeastSquaresFit] = {}  # by the number of terms
 
-    def judge(self, size: Size, clock: Clock, say: Callable[[str], Any]) -> Candidate:
+    def named(self, size: Size) -> str:
+        """What is done to judge the size."""
+        return f"{self.chart.name} {self._prefix}{size.group.label}"
+
+    def work(self, size: Size) -> float:
+        """Operations that judging the size takes: its group's factor, if that is not there yet."""
+        solved = size.family.num_parameters**2
+        return solved if size.group in self._factors else solved + self.work_of_factor(size)
+
+    def work_of_factor(self, size: Size) -> float:
+        """Operations of the factor that the size is judged from."""
+        count, width = self._rows_of(size.group)
+        return 2 * (count + len(self._held[1])) * width * (size.group.num_parameters + 1) ** 2
+
+    def work_of_steps(self, size: Size) -> float:
+        """Operations that validating the judged size takes, those of the steps as those that the
+        solution makes in their time."""
+        steps = len(self.judges.held_out) * size.operations
+        return OF_SOLVE * size.family.num_parameters**3 + OF_STEPS * steps
+
+    def judge(self, size: Size, budget: Budget, say: Callable[[str], Any]) -> Candidate:
         """The size with its error estimated from the held-out residual of the gradient."""
         started = time.perf_counter()
-        train, held = self.factors(size.group, clock, say)[:2]
+        train, held = self.factors(size.group, budget, say)[:2]
         count = size.family.num_parameters
         ((train_rms, held_rms),) = least_squares.residuals(train, held, [count])
         return self._candidate(size, train_rms, held_rms, time.perf_counter() - started)
 
-    def validate(self, size: Size, judged: Candidate, clock: Clock, say) -> Candidate:
+    def validate(self, size: Size, judged: Candidate, budget: Budget, say) -> Candidate:
         """The judged size solved, and its error measured by steps."""
-        clock.check()
+        budget.check()
         say(f"{judged.chart} {judged.label}: steps of the held-out pairs")
         started = time.perf_counter()
-        solved, params = self.solve(size, clock, say)
-        factors = self.factors(size.group, clock, say)
+        solved, params = self.solve(size, budget, say)
+        factors = self.factors(size.group, budget, say)
         outside = None
         if factors.outer.rows:  # none where every coordinate covers its circle
             ((_, outside),) = least_squares.residuals(
@@ -187,7 +257,7 @@ class LinearSweep:
     def at(self, extent: float) -> str:
         """What the size of this extent is, how many terms it has, and how many pairs they take."""
         family = self.sizes[0].family
-        if isinstance(family, Sines):
+        if not hasattr(family, "degree"):
             label = f"{family.name} {(terms := round(2**extent))}"
         else:
             degree = round(extent)
@@ -199,15 +269,32 @@ class LinearSweep:
         most = f", more than the {_MOST_TERMS:,} that are tried" if terms > _MOST_TERMS else ""
         return f"{label} ({terms:,} terms{most}; about {pairs:,} pairs)"
 
-    def solve(self, size: Size, clock: Clock, say) -> tuple[least_squares.LeastSquaresFit, Any]:
-        """The coefficients of this size, and the params of its family."""
-        train, held = self.factors(size.group, clock, say)[:2]
-        solved = least_squares.solve(train, held, size.family.num_parameters)
+    def solve(self, size: Size, budget: Budget, say) -> tuple[least_squares.LeastSquaresFit, Any]:
+        """The coefficients of this size, and the params of its family: solved for once."""
+        count = size.family.num_parameters
+        if count not in self._solved:
+            train, held = self.factors(size.group, budget, say)[:2]
+            self._solved[count] = least_squares.solve(train, held, count)
+        solved = self._solved[count]
         return solved, size.family.unflatten(solved.coefficients)
+
+    def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Images (n, 2d) of these rows, in the user's coordinates, by a fit to other rows; NaN
+        where a step is not solved."""
+        prepared, family = self.prepared, self.in_rows(size.family)
+        train = least_squares.reduce(
+            family, [rows_of(prepared, self.chart, others)[0]], self._weight
+        )
+        held = least_squares.reduce(family, [self._held], self._weight)
+        solved = least_squares.solve(train, held, size.family.num_parameters)
+        params = size.family.unflatten(solved.coefficients)
+        images, known = refined_images(prepared, self.chart, size.family, params, rows)
+        images = prepared.whole_image(np.where(known[:, None], images, np.nan))
+        return to_user(prepared.coordinates, images)
 
     def left_over(self, size: Size) -> np.ndarray:
         """(N, 2d): what the size leaves of ∇S of every pair, unit-free as train_rms."""
-        _, params = self.solve(size, Clock(), lambda message: None)
+        _, params = self.solve(size, Budget(), lambda message: None)
         (w, target, *args), weight = rows_of(self.prepared, self.chart, slice(None))
         gradient = np.asarray(size.family.gradient(params, w, *args))
         if self.prepared.own_dt is not None:
@@ -218,7 +305,7 @@ class LinearSweep:
         """What noise leaves wrong in the size's ∇S, in the measure of train_rms: half of the
         difference between the fits to either half of the training pairs, blocks in time."""
         half = self.judges.training // _HALVES_BLOCK % 2
-        train, held = self.factors(size.group, Clock(), lambda message: None)[:2]
+        train, held = self.factors(size.group, Budget(), lambda message: None)[:2]
         count = size.family.num_parameters
         one, other = (
             least_squares.solve(
@@ -230,16 +317,15 @@ class LinearSweep:
             ).coefficients
             for i in (0, 1)
         )  # fmt: skip
-        missed = np.linalg.norm(train.factor[:count, :count] @ (one - other))
-        return float(missed) / (2 * np.sqrt(train.rows))
+        return train.image_norm(one - other) / (2 * np.sqrt(train.rows))
 
     def root(self, size: Size) -> np.ndarray:
         """(m, m): rootᵀ root is the covariance of the size's coefficients.
 
         What of the residual is noise, a larger size tells: it leaves that too.
         """
-        train = self.factors(size.group, Clock(), lambda message: None).train
-        family, solved = size.family, self.solve(size, Clock(), lambda message: None)[0]
+        train = self.factors(size.group, Budget(), lambda message: None).train
+        family, solved = size.family, self.solve(size, Budget(), lambda message: None)[0]
         larger = self._larger(size)
         most = family if larger is None else larger.family
         data, goes_on = self._sample(-(-_SAMPLE_ROWS * most.num_parameters // self._width))
@@ -306,13 +392,12 @@ class LinearSweep:
         """(2d,) standard deviation of each coordinate's noise, ÷ its scale, from what this size
         leaves of a sample of the training pairs."""
         (w, target, *args), goes_on = self._sample(_NOISE_PAIRS)
-        solved, params = self.solve(size, Clock(), lambda message: None)
+        solved, params = self.solve(size, Budget(), lambda message: None)
         slopes = self._slopes(size.family, w, *args)
         residual = slopes @ solved.coefficients - target * self._weight
         first, second = self.by_states(size.family, params, w, *args)
         step = np.linalg.solve(second, np.concatenate([residual[..., None], -first], axis=-1))
-        found = shared_noise.variances(step[..., 0], step[..., 1:], np.flatnonzero(goes_on))
-        return np.sqrt(found)
+        return of_pairs(step[..., 0], step[..., 1:], np.flatnonzero(goes_on))
 
     def freedoms(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
         """Degrees of freedom that noise takes of a fit of so many of the leading terms of a size:
@@ -321,7 +406,7 @@ class LinearSweep:
         (w, target, *args), goes_on = self._sample(-(-_SAMPLE_ROWS * max(counts) // self._width))
         if not goes_on.any() or not self.moved_by_states:
             return [float(count) for count in counts]
-        solved, params = self.solve(near, Clock(), lambda message: None)
+        solved, params = self.solve(near, Budget(), lambda message: None)
         larger = max(near, most, key=lambda size: size.family.num_parameters)
         slopes = self._slopes(larger.family, w, *args)
         residual = slopes[..., : len(solved.coefficients)] @ solved.coefficients
@@ -336,6 +421,12 @@ class LinearSweep:
     @property
     def _width(self) -> int:
         return self._train[0].shape[1]
+
+    def _rows_of(self, group) -> tuple[int, int]:
+        """Pairs that a group's factor is made of, and rows of each. They are shuffled: the first of
+        them are a sample, where all would take too long."""
+        count, width = self._train[1].shape
+        return min(count, max(1, int(_MOST_OPERATIONS / (group.num_parameters**2 * width)))), width
 
     def _sample(self, pairs: int) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
         """Rows of about so many training pairs, and which of them go on with the next."""
@@ -359,7 +450,7 @@ class LinearSweep:
                 slopes = self._slopes(of.family, data[0], *data[2:])
                 scores = shared_noise.scores(slopes, *states)
                 freedom = shared_noise.freedom(slopes, states[0], scores)
-            square = float(np.sum(reduced.factor[count:, -1] ** 2)) / max(reduced.rows, 1)
+            square = reduced.residual_norm(count) ** 2 / max(reduced.rows, 1)
             return square, freedom, reduced.rows
 
         (of_all, taken, _), (of_rest, more, rows) = left(size), left(larger)
@@ -383,10 +474,10 @@ class LinearSweep:
             further += [Size(f, f, _extent(f)) for f in itertools.islice(beyond, 2 - len(further))]
         return further[-1] if further else None
 
-    def factors(self, group, clock: Clock, say) -> _Factors:
+    def factors(self, group, budget: Budget, say) -> _Factors:
         """Those of a group's largest family, which answer for all of its sizes."""
         if group not in self._factors:
-            self._factors[group] = self._known(group) or self._computed(group, clock, say)
+            self._factors[group] = self._known(group) or self._computed(group, budget, say)
         return self._factors[group]
 
     def _known(self, group) -> _Factors | None:
@@ -395,24 +486,18 @@ class LinearSweep:
         if stored is None:
             return None
         inner, outer, held = (
-            least_squares.Reduced(np.asfortranarray(stored[part]), int(stored[f"{part}_rows"]))
+            Triangle(stored[part], int(stored[f"{part}_rows"]))
             for part in ("inner", "outer", "held")
         )
-        return _Factors(least_squares.merged(inner, outer), held, inner, outer)
+        return _Factors.of(inner, outer, held)
 
-    def _computed(self, group, clock: Clock, say) -> _Factors:
-        # Shuffled rows: the first of them are a sample, where all would take too long.
-        count, width = self._train[1].shape
-        taken = min(count, max(1, int(_MOST_OPERATIONS / (group.num_parameters**2 * width))))
-        seconds = 2 * taken * width * group.num_parameters**2 / _OPERATIONS_PER_SECOND
-        say(
-            f"{self.chart.name}: {group.num_parameters} terms of {group.label}, {taken} pairs, "
-            f"about {max(1, round(seconds))} s"
-        )
+    def _computed(self, group, budget: Budget, say) -> _Factors:
+        taken, _ = self._rows_of(group)
+        say(f"{self.chart.name}: {group.num_parameters} terms of {group.label}, {taken} pairs")
         started = time.perf_counter()
         train, outermost = tuple(a[:taken] for a in self._train), self._outermost[:taken]
         inner, outer, held = (
-            least_squares.reduce(self.in_rows(group), [rows], self._weight, on_block=clock.check)
+            least_squares.reduce(self.in_rows(group), [rows], self._weight, on_block=budget.check)
             for rows in (
                 tuple(a[~outermost] for a in train), tuple(a[outermost] for a in train), self._held
             )
@@ -422,7 +507,7 @@ class LinearSweep:
                 self._named(group), inner=inner.factor, inner_rows=inner.rows, outer=outer.factor,
                 outer_rows=outer.rows, held=held.factor, held_rows=held.rows,
             )  # fmt: skip
-        return _Factors(least_squares.merged(inner, outer), held, inner, outer)
+        return _Factors.of(inner, outer, held)
 
     def _named(self, group) -> str:
         return f"{self.chart.name} {self.kind} {group.num_parameters}"
@@ -439,8 +524,9 @@ class LinearSweep:
 
 
 def _extent(family) -> float:
-    """The degree of products, or log₂ of the number of sines."""
-    return float(np.log2(family.num_parameters) if isinstance(family, Sines) else family.degree)
+    """The degree of products, or log₂ of the number of terms."""
+    degree = getattr(family, "degree", None)
+    return float(np.log2(family.num_parameters) if degree is None else degree)
 
 
 class _WithOdd:
@@ -479,9 +565,12 @@ def is_even(prepared: Prepared, judges: Judges) -> bool:
     if not degrees:
         return False
     even = Products(inputs, degrees[-1], signs)
+    odd = number_of_terms(inputs.is_angle, _ODD_DEGREE) - even.terms_of(_ODD_DEGREE)
+    if even.num_parameters + odd > _MOST_TERMS:
+        return False
     family = _WithOdd(even)
     pairs = -(-_PARITY_ROWS * family.num_parameters // w.shape[1])
-    if family.num_parameters > _MOST_TERMS or pairs > len(w):
+    if pairs > len(w):
         return False
     train, held = (
         least_squares.reduce(family, [tuple(a[:pairs] for a in rows)], weight)

@@ -117,7 +117,11 @@ def _without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
         "is not known"
         for name in still
     ]
-    return Pairs(pairs.z0, pairs.z1, one, kept or None, period=period), own_time + messages
+    varied = Pairs(
+        pairs.z0, pairs.z1, one, kept or None, period=period, run=pairs.run, place=pairs.place,
+        std=pairs.std,
+    )  # fmt: skip
+    return varied, own_time + messages
 
 
 def _same_phase(t0: np.ndarray, period: float) -> bool:

@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.noise import robust
+from gfnn_jax.dataset.runs import steps_between
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem, significant
 from gfnn_jax.fitting.shooting import OPTIONS, Shooting, Shot, arcs_of, longest_arc
 from gfnn_jax.learn.candidates import Judges
-from gfnn_jax.learn.held_out import steps_between
 from gfnn_jax.learn.prepare import Prepared
 
 _SHORTEST = 3  # steps of an arc that says more than its pairs do
@@ -21,7 +22,6 @@ _RISE = 1.01  # of the held-out arcs' noise, by chance
 # fitted to these too: what judges it then is off by less than 1 / 200 of the noise's variance.
 _ROWS_PER_TERM = 200
 _STATES = 100  # from which the noise and its growth along an arc are measured
-_NORMAL = 1.4826  # a normal deviation over the median of its size
 _STEP_ERROR = 0.01  # of a step's own error ÷ the noise
 
 
@@ -51,12 +51,12 @@ def fitted_to_sequences(
         return None
     c = fit.coefficients
     some = judges.training[:_STATES]
-    rms = _NORMAL * float(np.median(np.abs(problem.residuals(family, c, fit.steps, some))))
+    rms = float(robust(problem.residuals(family, c, fit.steps, some)))
     if not 0 < rms < np.inf:
         return None
     resolved = _STEP_ERROR * rms
     steps = problem.fine_steps(family, c, judges.training, (resolved,))[0]
-    between = steps_between(judges.pairs, prepared.place)
+    between = steps_between(judges.pairs)
     longest = longest_arc(family, c, prepared.y0[some], prepared.dt, steps, rms)
 
     def along(rows) -> Shooting | None:
@@ -84,13 +84,13 @@ def fitted_to_sequences(
     if found is None or not left(family, found.coefficients) <= _RISE * before:
         return None
     kept = tuple(range(len(c)))
-    few = significant(found.factor, found.coefficients, found.rows, _CERTAIN)[0]
+    few = significant(found.triangle, found.coefficients, _CERTAIN)[0]
     if 0 < len(few) < len(c):
         fewer = family.take(tuple(few.tolist()))
         again = train.fit(fewer, found.coefficients[few])
         if again is not None and left(fewer, again.coefficients) <= _RISE * before:
             kept, found, family = tuple(few.tolist()), again, fewer
-    if _ROWS_PER_TERM * len(kept) <= found.rows:
+    if _ROWS_PER_TERM * len(kept) <= found.triangle.rows:
         everyone = along(np.arange(len(prepared.y0)))
         again = everyone.fit(family, found.coefficients) if everyone is not None else None
         if everyone is not None and again is not None:

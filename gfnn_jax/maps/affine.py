@@ -1,4 +1,4 @@
-"""Affine symplectic maps, as base maps are made of."""
+"""Affine symplectic maps, of which base maps are made."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gfnn_jax.solve.status import OK, Info
 )  # fmt: skip
 @dataclasses.dataclass(frozen=True, eq=False)
 class Affine:
-    """z -> centre + shift + E (z − centre), E a symplectic matrix: half a base map (R^½). A piece.
+    """Map z -> centre + shift + E (z − centre), E a symplectic matrix: half a base map. A piece.
 
     matrix: (2d, 2d). centre, shift: (2d,).
     """
@@ -29,28 +29,30 @@ class Affine:
     shift: Any
 
     def image(self, z):
-        """The images of states z (..., 2d), NumPy or JAX."""
+        """Compute the images of states z (..., 2d), NumPy or JAX."""
         moved = matmul(z - as_row(self.centre, z), self.matrix.T)
         return as_row(self.centre + self.shift, z) + moved
 
     def step(self, z, args=None, *, unrolled: bool | int = False):
-        """(Z, Info) of the states z (B, 2d), by JAX."""
+        """Step the states z (B, 2d): (Z, Info), by JAX."""
         lanes = jnp.zeros(z.shape[0], jnp.int32)
         return self.image(z), Info(lanes + OK, lanes, jnp.zeros(z.shape[0], z.dtype))
 
     def compensated_step(self, z, compensation, args=None):
-        """(Z, compensation, Info) of z + compensation; a product's rounding is lost."""
+        """Step z + compensation: (Z, compensation, Info). The product's rounding is not kept."""
         image, info = self.step(z)
         return image + matmul(compensation, self.matrix.T), jnp.zeros_like(z), info
 
     def action(self, z, image, origin, args=None):
-        """The action (B,) of the step from z (B, 2d) to its image; about the centre it vanishes
-        there."""
+        """Action (B,) of the step from z (B, 2d) to its image about the origin.
+
+        The constant is such that the action about the centre vanishes at the centre.
+        """
         centre = as_row(self.centre, z) - origin
         return area(centre + as_row(self.shift, z), image) - area(centre, z)
 
     def inverse(self) -> Affine:
-        """E⁻¹, which of a symplectic E is −J Eᵀ J."""
+        """Make the inverse map, by E⁻¹ = −J Eᵀ J of a symplectic E."""
         inverse = apply_j(apply_j(self.matrix).T)
         return Affine(inverse, self.centre + self.shift, -self.shift)
 

@@ -13,35 +13,44 @@ QUANTILES = (0.05, 0.5, 0.95)
 
 
 class Bands(NamedTuple):
-    """std (B, S, 2d): root mean square about the map's own prediction. quantiles (3, B, S, 2d): 5,
-    50 and 95 % of the samples. Both of the samples that go on; NaN where none does."""
+    """Bands of a prediction: std (B, S, 2d) and quantiles (3, B, S, 2d) at 5, 50 and 95 %.
+
+    std is the root mean square about the map's own prediction. Both are over the samples that have
+    not failed, and NaN where all have.
+    """
 
     std: np.ndarray
     quantiles: np.ndarray
 
     @property
     def median(self) -> np.ndarray:
-        """(B, S, 2d)."""
+        """Median (B, S, 2d) of the samples."""
         return self.quantiles[1]
 
 
 def bands(drawn, states, angles: tuple[int, ...] = ()) -> Bands:
-    """Bands of the samples' states (n, B, S, 2d) about the prediction (B, S, 2d). angles: indices
-    of coordinates that are compared modulo 2π."""
+    """Compute the bands of the samples' states (n, B, S, 2d) about the prediction (B, S, 2d).
+
+    angles: indices of coordinates that are compared modulo 2π.
+    """
     states = np.asarray(states)
     off = np.asarray(drawn) - states
     if angles:
         off = nearest_image(off.reshape(-1, off.shape[-1]), angles).reshape(off.shape)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of lanes without a sample that goes on
+        warnings.simplefilter("ignore", RuntimeWarning)  # for lanes in which all samples failed
         std = np.sqrt(np.nanmean(off**2, axis=0))
         quantiles = states + np.nanquantile(off, QUANTILES, axis=0)
     return Bands(std, quantiles)
 
 
 def horizon(std, steps, size: float) -> np.ndarray:
-    """(B,) the first of these steps (S,) at which two standard deviations of the position, the
-    Euclidean norm of std (B, S, 2d) over q, pass ``size`` or are not known; −1 where none does."""
+    """First step (B,) of ``steps`` (S,) at which two standard deviations of the position exceed
+    ``size``.
+
+    The standard deviation is the Euclidean norm of std (B, S, 2d) over q; one that is not known
+    counts as too large. −1 where no step exceeds it.
+    """
     dim = std.shape[-1] // 2
     beyond = ~(2 * np.linalg.norm(std[..., :dim], axis=-1) <= size)
     first = np.asarray(steps)[np.argmax(beyond, axis=1)]

@@ -1,6 +1,6 @@
-"""The region of phase space that the data covered.
+"""Region of phase space that the data covered.
 
-A box would call its empty corners known ground. The empirical Christoffel function does not: with
+A box would include its empty corners. The empirical Christoffel function does not: with
 v(y) the monomials of degree at most 2 and G = mean of v vᵀ over the data, κ(y) = vᵀ G⁻¹ v is small
 where the data are and grows fast outside them, for shells and annuli too (Lasserre & Pauwels, Adv.
 Comput. Math. 45 (2019), 1439). It is a sum of squares of a few dozen terms, cheap enough for every
@@ -23,7 +23,7 @@ from gfnn_jax.phase_space import sizes
 
 # κ is of degree 4 in y: a factor 2 is a margin of about a fifth of the region's size.
 _MARGIN = 2.0
-_RANGE_MARGIN = 0.25  # of a range's width, on either side
+_RANGE_MARGIN = 0.25  # on either side, relative to a range's width
 
 
 @partial(
@@ -33,7 +33,7 @@ _RANGE_MARGIN = 0.25  # of a range's width, on either side
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Domain:
-    """{y : κ(y) <= limit}, in the coordinates ``keep`` of y; everything where ``keep`` is empty.
+    """Domain {y : κ(y) <= limit} in the coordinates ``keep`` of y; all states where it is empty.
 
     centre, scale: (k,), factor: (m, m) the inverse Cholesky factor of G, limit: scalar.
     """
@@ -45,27 +45,29 @@ class Domain:
     limit: Any
 
     def contains(self, y):
-        """Whether the states y (..., 2d) lie where data were; False for non-finite ones. NumPy or
-        JAX."""
+        """Return whether the states y (..., 2d) lie in the domain. NumPy or JAX.
+
+        Non-finite states do not.
+        """
         xp = namespace(y)
         finite = xp.all(xp.isfinite(y), axis=-1)
         return finite & (self.christoffel(y) <= self.limit) if self.keep else finite
 
     def christoffel(self, y):
-        """κ (...) at the states y (..., 2d), NumPy or JAX."""
+        """Christoffel function κ (...) at the states y (..., 2d), NumPy or JAX."""
         x = y[..., np.array(self.keep)]
         x = (x - as_row(self.centre, x)) / as_row(self.scale, x)
         return namespace(y).sum(matmul(_monomials(x), self.factor.T) ** 2, axis=-1)
 
 
 def _monomials(x):
-    """1, x_i, x_i x_j of x (..., k): (..., 1 + k + k(k+1)/2)."""
+    """Monomials 1, x_i, x_i x_j of x (..., k): (..., 1 + k + k(k+1)/2)."""
     xp, (i, j) = namespace(x), np.triu_indices(x.shape[-1])
     return xp.concatenate([xp.ones_like(x[..., :1]), x, x[..., i] * x[..., j]], axis=-1)
 
 
 def covering(y, *, ignore: tuple[int, ...] = ()) -> Domain:
-    """The domain of the states y (N, 2d), without the coordinates ``ignore``.
+    """Make the domain of the states y (N, 2d), without the coordinates ``ignore``.
 
     ``ignore`` names cyclic coordinates and angles whose whole circle is covered.
     """
@@ -85,40 +87,44 @@ def covering(y, *, ignore: tuple[int, ...] = ()) -> Domain:
     return Domain(keep, centre, scale, factor, np.asarray(limit))
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("low", "high"), meta_fields=("seen",))
+@partial(jax.tree_util.register_dataclass, data_fields=("low", "high"), meta_fields=("sums",))
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ranges:
-    """Where every neighbourhood's variables are within the range that the data's had, of all
-    neighbourhoods together: what a sum over neighbourhoods knows, however many there are.
+    """Domain of a sum over neighbourhoods, by the ranges of each variable of a neighbourhood.
 
-    seen: whose variables they are. low, high: (variables of all parts,).
+    A range is that of the data, over all neighbourhoods together. A state is inside where the
+    variables of all its neighbourhoods are within their ranges.
+
+    sums: the family whose variables they are. low, high: (variables of all parts,).
     """
 
-    seen: Sums
+    sums: Sums
     low: Any
     high: Any
 
     def contains(self, y):
-        """Whether the states y (..., 2d) lie where data were; False for non-finite ones. NumPy or
-        JAX."""
+        """Return whether the states y (..., 2d) lie in the domain. NumPy or JAX.
+
+        Non-finite states do not.
+        """
         xp = namespace(y)
         inside, n = xp.all(xp.isfinite(y), axis=-1), 0
-        for values in variables_of(self.seen, y):
+        for values in variables_of(self.sums, y):
             good = (values >= self.low[n]) & (values <= self.high[n])
             inside, n = inside & xp.all(good, axis=-1), n + 1
         return inside
 
 
-def variables_of(seen: Sums, y) -> list:
-    """The variables (..., neighbourhoods) of all parts at the states y (..., 2d)."""
+def variables_of(sums: Sums, y) -> list:
+    """Variables (..., neighbourhoods) of all parts at the states y (..., 2d)."""
     return [
-        jet.value for part in seen.parts for jet in jets(part.terms.trees, part.over.gather(y), 0)
+        jet.value for part in sums.parts for jet in jets(part.terms.trees, part.over.gather(y), 0)
     ]
 
 
-def ranges_of(seen: Sums, y) -> Ranges:
-    """The ranges over the states y (N, 2d), with a margin."""
-    values = variables_of(seen, np.asarray(y, np.float64))
+def ranges_of(sums: Sums, y) -> Ranges:
+    """Make the ranges over the states y (N, 2d), with a margin."""
+    values = variables_of(sums, np.asarray(y, np.float64))
     low, high = (np.array([f(v) for v in values]) for f in (np.min, np.max))
     margin = _RANGE_MARGIN * (high - low)
-    return Ranges(seen, low - margin, high + margin)
+    return Ranges(sums, low - margin, high + margin)

@@ -1,4 +1,4 @@
-"""The modified Hamiltonian of a symplectic map: the H̃ whose flow over h the map is.
+"""Modified Hamiltonian of a symplectic map: the H̃ whose flow over h is the map.
 
 Backward error analysis gives H̃ as a series in h, whose terms need ever higher derivatives of S:
 S − h²/24 S''(J∇S, J∇S) + … in the midpoint chart (Hairer, Lubich & Wanner, "Geometric Numerical
@@ -36,16 +36,22 @@ NUM_STEPS = _CELLS + _MEAN  # to either side
 
 
 class ModifiedHamiltonian(NamedTuple):
-    """H̃, and its error: the last term of the differences, and how far H̃ drifts along the iterates
-    that it was made of. Each () or (B,)."""
+    """Modified Hamiltonian H̃ with its error, each () or (B,).
+
+    The error is the last term of the differences, plus the drift of H̃ along the iterates that it
+    was computed from, plus rounding.
+    """
 
     value: Any
     error: Any
 
 
 class Cells(NamedTuple):
-    """Steps of one direction, in a row from a state: their actions about it (N, B), how far each
-    moved (N, B, 2d), and where it came to, seen from that state (N, B, 2d)."""
+    """N successive steps of one direction from a state.
+
+    action: (N, B) of each step, about that state. moved: (N, B, 2d) the change of each step. place:
+    (N, B, 2d) the position after each step, relative to that state.
+    """
 
     action: Any
     moved: Any
@@ -53,14 +59,14 @@ class Cells(NamedTuple):
 
 
 def of_cells(forward: Cells, backward: Cells, dt) -> ModifiedHamiltonian:
-    """H̃ of the state in the middle, from ``NUM_STEPS`` steps of the map and of its inverse. JAX."""
+    """Compute H̃ of the middle state from ``NUM_STEPS`` steps of the map and of its inverse. JAX."""
     action = jnp.concatenate([-backward.action[::-1], forward.action])
     moved = jnp.concatenate([-backward.moved[::-1], forward.moved])
     start = jnp.zeros_like(forward.place[:1])
     place = jnp.concatenate([backward.place[_MEAN - 1 :: -1], start, forward.place[:_MEAN]])
 
     def means(order: int):
-        """Of the H̃ of each iterate in the middle: over all, the earlier, the later ones."""
+        """Mean H̃ over the middle iterates: all, the earlier ones, the later ones, (3, B)."""
         differences = jnp.asarray(_differences(order), action.dtype)
         velocity = matmul(differences, moved.reshape(len(moved), -1)).reshape(place.shape)
         along = area(place, velocity) - matmul(differences, action)
@@ -74,9 +80,11 @@ def of_cells(forward: Cells, backward: Cells, dt) -> ModifiedHamiltonian:
 
 @cache
 def _differences(m: int) -> np.ndarray:
-    """(2 _MEAN + 1, 2 NUM_STEPS): the derivative at each iterate in the middle, to order 2m, of a
-    function by its changes over the cells."""
-    # Of the central difference Σ_k c_k (a_k − a_−k); a cell counts in all k beyond it.
+    """Matrix (2 _MEAN + 1, 2 NUM_STEPS) of central differences of order 2m.
+
+    It maps the changes of a function over the cells to its derivative at each middle iterate.
+    """
+    # The central difference is Σ_k c_k (a_k − a_−k); a cell counts in all k beyond it.
     c = [
         (-1) ** (k + 1) * factorial(m) ** 2 / (k * factorial(m - k) * factorial(m + k))
         for k in range(1, m + 1)
@@ -92,8 +100,10 @@ def _differences(m: int) -> np.ndarray:
 
 @cache
 def _means() -> np.ndarray:
-    """(3, 2 _MEAN + 1): a mean over the iterates in the middle, and two of half that width, over
-    the earlier and the later ones."""
+    """Weights (3, 2 _MEAN + 1) of three means over the middle iterates.
+
+    The first is over all of them, the others over the earlier and the later half.
+    """
     means = np.zeros((3, 2 * _MEAN + 1))
     means[0] = _binomial(_MEAN)
     means[1, : _MEAN + 1] = means[2, _MEAN:] = _binomial(_MEAN // 2)
@@ -101,5 +111,5 @@ def _means() -> np.ndarray:
 
 
 def _binomial(half: int) -> np.ndarray:
-    """Weights of 2 half + 1 places, of sum 1."""
+    """Binomial weights of 2 half + 1 places, of sum 1."""
     return np.array([comb(2 * half, k) for k in range(2 * half + 1)]) / 4.0**half

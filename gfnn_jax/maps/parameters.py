@@ -1,8 +1,8 @@
-"""What a map depends on beside the state, by name: parameters of the system and the time of a
-periodic drive, and where they were sampled.
+"""Arguments of a map beside the state: parameters of the system, the time of a periodic drive.
 
-The time moves on with the steps. It is counted from the step's number, t₀ + n dt reduced by whole
-periods without rounding, so that a rollout of any length does not lose the drive's phase.
+They have names, and ranges in which they were sampled. The time advances with the steps. It is
+counted from the step's number: t₀ + n dt, reduced by whole periods without rounding, so that a
+rollout of any length keeps the drive's phase.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import numpy as np
 from gfnn_jax.arrays import as_row, namespace
 from gfnn_jax.phase_space import TIME
 
-_EDGE = 1e-9  # of the range: what a printed number may miss its end by
-# Of a period: a part of it that no pair has seen and that is longer is not known. Harmonics of up
-# to the fourth are learned, which vary over an eighth.
+_EDGE = 1e-9  # tolerance at the ends of a range, relative to it, for printed numbers
+# A part of a period that no pair covers and that is longer than this, relative to the period, lies
+# outside the data. Harmonics of up to the fourth are learned, which vary over an eighth.
 _UNSEEN = 1 / 8
 _HALF_DIGITS = 2.0**27 + 1  # splits a float64 in two halves, whose products are exact (Veltkamp)
 
@@ -32,9 +32,12 @@ _HALF_DIGITS = 2.0**27 + 1  # splits a float64 in two halves, whose products are
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Parameters:
-    """names (k,) in their order; low, high (k,): the smallest and largest values of the data.
-    period: of a drive, whose time t is then the last name; the data saw it from low to high, at
-    most a period later."""
+    """Names, ranges and period of the arguments of a map.
+
+    names: (k,) in their order. low, high: (k,) the smallest and largest values in the data. period:
+    that of a drive, whose time t is then the last name; the data cover it from low to high, at most
+    a period later.
+    """
 
     names: tuple[str, ...]
     low: Any
@@ -43,12 +46,15 @@ class Parameters:
 
     @property
     def bounds(self) -> tuple[Any, Any]:
-        """(k,) each: low and high, and what a printed number may miss them by."""
+        """Lower and upper bounds (k,), with a tolerance for numbers that were printed."""
         edge = _EDGE * (self.high - self.low)
         return self.low - edge, self.high + edge
 
     def contains(self, args):
-        """Whether the values args (..., k) lie where data were: (...). NumPy or JAX."""
+        """Return whether the values args (..., k) lie in the ranges of the data: (...).
+
+        NumPy or JAX.
+        """
         xp = namespace(args)
         low, high = (as_row(a, args) for a in self.bounds)
         if self.period is not None:
@@ -57,8 +63,10 @@ class Parameters:
         return xp.all((args >= low) & (args <= high), axis=-1)
 
     def after(self, args, steps, dt):
-        """args (..., k) that many steps (...) of dt later: the time goes on, reduced by whole
-        periods. NumPy or JAX."""
+        """Advance args (..., k) by a number of steps (...) of dt. NumPy or JAX.
+
+        The time advances and is reduced by whole periods; the other values stay.
+        """
         if self.period is None:
             return args
         xp = namespace(args, steps)
@@ -75,21 +83,26 @@ class Parameters:
 def sampled(
     names: tuple[str, ...], args: np.ndarray, dt: Any = 0.0, period: float | None = None
 ) -> Parameters:
-    """Those of the data's values args (N, k); of a drive its time is that from a pair's state to
-    its image, dt later, a number or (N,)."""
+    """Make the parameters of the data's values args (N, k).
+
+    With ``period``, the last of the args is the time of a drive at each pair's state. A pair covers
+    the time to its image, dt later, a number or (N,).
+    """
     low, high = args.min(axis=0), args.max(axis=0)
     if period is not None:
-        low[-1], high[-1] = _seen(args[:, -1], np.broadcast_to(dt, len(args)), period)
+        low[-1], high[-1] = _covered(args[:, -1], np.broadcast_to(dt, len(args)), period)
     return Parameters(names, low, high, period)
 
 
-def _seen(t0: np.ndarray, dt: np.ndarray, period: float) -> tuple[float, float]:
-    """From when to when the intervals (t0, t0 + dt) (N,) see a drive: all but the longest part of
-    its period that none does."""
+def _covered(t0: np.ndarray, dt: np.ndarray, period: float) -> tuple[float, float]:
+    """Begin and end of the part of a period that the intervals (t0, t0 + dt) (N,) cover.
+
+    It is the period without the longest gap between the intervals.
+    """
     begin = np.mod(t0, period)
     order = np.argsort(begin)
     begin, end = begin[order], np.maximum.accumulate((begin + dt)[order])
-    # What reaches into the next period has seen its first part.
+    # An interval that reaches into the next period covers the first part of this one.
     gaps = np.append(begin[1:], begin[0] + period) - np.maximum(end, end[-1] - period)
     longest = int(np.argmax(gaps))
     if gaps[longest] <= _UNSEEN * period:
@@ -99,17 +112,17 @@ def _seen(t0: np.ndarray, dt: np.ndarray, period: float) -> tuple[float, float]:
 
 
 def as_args(parameters: Parameters | None, given: Any, shape: tuple, dtype, t0: Any = None) -> Any:
-    """What steps of states of this shape, (2d,) or (B, 2d), take: (k,) or (B, k), or None.
+    """Convert a user's parameters to args (k,) or (B, k) for states (2d,) or (B, 2d), or None.
 
-    given: name -> a number or (B,), or an array of the names' order; of one parameter also a
-    number or (B,). t0: the time of a drive, a number or (B,), where it is not among them. Raises
-    ValueError, in one line, where it is not what the map was learned with.
+    given: name -> a number or (B,), or an array in the order of the names; for a single parameter
+    also a number or (B,). t0: the time of a drive, a number or (B,), where it is not in ``given``.
+    Raises ValueError, in one line, where they are not the parameters that the map was learned with.
     """
     if t0 is not None:
         given = _with_time(parameters, given, t0)
     if parameters is None:
         if given is not None:
-            raise ValueError("expected no params: the map was learned without")
+            raise ValueError("expected no params: the map was learned without parameters")
         return None
     names = parameters.names
     wanted = ", ".join(names)
@@ -135,7 +148,7 @@ def as_args(parameters: Parameters | None, given: Any, shape: tuple, dtype, t0: 
 
 
 def _with_time(parameters: Parameters | None, given: Any, t0: Any) -> dict[str, Any]:
-    """The params by name, the time of the drive among them."""
+    """Return the params by name, including the time of the drive."""
     if parameters is None or parameters.period is None:
         raise ValueError("expected no t0: the map was learned without a drive")
     others = parameters.names[:-1]
@@ -146,7 +159,8 @@ def _with_time(parameters: Parameters | None, given: Any, t0: Any) -> dict[str, 
         given = given[..., None] if len(others) == 1 and given.shape[-1:] != (1,) else given
         if given.ndim not in (1, 2) or given.shape[-1] != len(others):
             raise ValueError(
-                f"expected params {', '.join(others) or 'none'} beside t0, got {given.shape}"
+                f"expected params {', '.join(others) or 'none'} beside t0, got an array of shape "
+                f"{given.shape}"
             )
         given = {name: given[..., i] for i, name in enumerate(others)}
     return {**given, TIME: t0}

@@ -1,7 +1,7 @@
-"""Apply a step many times: scan over steps, save every K-th.
+"""Rollouts of a step function: scan over steps, save every K-th state.
 
-Knows nothing of generating functions: any ``step(carry) -> carry`` will do, so every method that
-ends in a step function is rolled out, timed and judged by the same code.
+This module knows nothing of generating functions. Any ``step(carry) -> carry`` will do, so that
+every method that ends in a step function is rolled out, timed and judged by the same code.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 def scan_steps(
     step: Callable, carry: Any, num_saved: int, *, save_every: int = 1, observe: Callable
 ) -> tuple[Any, Any]:
-    """``num_saved`` blocks of ``save_every`` steps, ``observe(carry)`` after each block.
+    """Scan ``num_saved`` blocks of ``save_every`` steps, with ``observe(carry)`` after each block.
 
-    Returns the last carry and the stacked observations (num_saved, ...). Memory is that of what is
-    saved, whatever the number of steps.
+    Returns the last carry and the stacked observations (num_saved, ...). Memory grows with the
+    observations only, not with the number of steps.
     """
 
     def block(carry, _):

@@ -1,7 +1,7 @@
 """Maps drawn from the posterior of a map's coefficients.
 
-Every draw is a map of the same kind, exactly symplectic as that one is; n of them are one pytree,
-and one compiled program steps them all.
+Each sample is a map of the same kind and exactly symplectic. n samples are one pytree, and one
+compiled program steps them all.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from gfnn_jax.maps.symplectic_map import (
     predicted,
 )
 
-# Lanes that are stepped together at least. More samples at once gain nothing on a CPU: a batched
+# Fewest lanes that are stepped together. More samples at once gain nothing on a CPU: a batched
 # program takes both sides of every branch (100 samples, Hénon–Heiles, µs per step: 1,000 states
-# 1.7 one by one and 2.8 by tens; one state 21 and 6.4).
+# take 1.7 one by one and 2.8 by tens; one state 21 and 6.4).
 _TOGETHER = 256
 
 
@@ -34,7 +34,7 @@ _TOGETHER = 256
 )  # fmt: skip
 @dataclasses.dataclass(frozen=True, eq=False)
 class Samples:
-    """n maps that differ in the params (n, ...) of one piece; otherwise all are ``map``."""
+    """Set of n maps that equal ``map`` but for the params (n, ...) of one piece."""
 
     map: SymplecticMap
     params: Any
@@ -43,21 +43,23 @@ class Samples:
     def __len__(self) -> int:
         return self.params.shape[0]
 
-    def __iter__(self):  # an index of JAX's that is too large is no error, and would not end it
+    def __iter__(self):  # an index of JAX that is too large raises nothing and would not end it
         return (self[i] for i in range(len(self)))
 
     def __getitem__(self, index) -> SymplecticMap:
         return self.one(self.params[index])
 
     def one(self, params) -> SymplecticMap:
-        """The map with these params of its piece."""
+        """Make the map with these params of its piece."""
         pieces = list(self.map.pieces)
         pieces[self.piece] = dataclasses.replace(pieces[self.piece], params=params)
         return dataclasses.replace(self.map, pieces=tuple(pieces), posterior=None)
 
     def start(self, z0, *, params=None, t0=None, stop_outside: bool = False) -> Lanes:
-        """As `SymplecticMap.start`, leaves (n, B, ...). z0: (B, 2d), or (n, B, 2d) where every
-        sample has its own."""
+        """Start lanes as `SymplecticMap.start` does, with leaves (n, B, ...).
+
+        z0: (B, 2d), or (n, B, 2d) where each sample has its own.
+        """
         z0, args = self._given(z0, params, t0)
         return _start(self, z0, args, stop_outside, self._together(z0))
 
@@ -65,7 +67,7 @@ class Samples:
         self, lanes: Lanes, num_saved: int, *, params=None, t0=None, save_every: int = 1,
         stop_outside: bool = False,
     ) -> tuple[Lanes, Any]:  # fmt: skip
-        """As `SymplecticMap.advance`: the lanes, and the saved states (n, B, num_saved, 2d)."""
+        """Advance lanes as `SymplecticMap.advance` does; the states are (n, B, num_saved, 2d)."""
         args = self.map._args(params, lanes.y[0], t0)
         together = self._together(lanes.y)
         return _advance(self, lanes, args, num_saved, save_every, stop_outside, together)
@@ -80,10 +82,11 @@ class Samples:
         save_every: int = 1,
         stop_outside: bool = False,
     ) -> tuple[Any, RolloutInfo]:
-        """Predict with every map: states (n, B, 1 + num_steps // save_every, 2d), and a RolloutInfo
-        of (n, B). z0: (B, 2d), or (n, B, 2d) where every sample has its own.
+        """Predict with every map.
 
-        Compiled once, whatever the samples. Raises ValueError where a shape is wrong.
+        z0: (B, 2d), or (n, B, 2d) where each sample has its own. Returns the states
+        (n, B, 1 + num_steps // save_every, 2d), and a RolloutInfo of leaves (n, B). Other samples
+        of the same kind use the same compiled program. Raises ValueError where a shape is wrong.
         """
         z0, args = self._given(z0, params, t0)
         return _rollout(
@@ -91,7 +94,7 @@ class Samples:
         )
 
     def _given(self, z0, params, t0) -> tuple[Any, Any]:
-        """The states (n, B, 2d) and their args."""
+        """Return the states (n, B, 2d) and their args."""
         z0 = np.asarray(z0)
         if z0.ndim not in (2, 3) or (z0.ndim == 3 and len(z0) != len(self)):
             raise ValueError(
@@ -103,22 +106,21 @@ class Samples:
         return np.broadcast_to(z0.astype(one.dtype), (len(self), *one.shape)), args
 
     def _together(self, z0) -> int:
-        """Samples at a time: they divide their number."""
+        """Number of samples at a time, a divisor of their number."""
         most = int(np.clip(_TOGETHER // max(z0.shape[1], 1), 1, len(self)))
         return next(k for k in range(most, 0, -1) if len(self) % k == 0)
 
 
 def sampled(map_: SymplecticMap, key, num: int) -> Samples:
-    """``num`` maps drawn from the posterior of the coefficients of ``map_``.
+    """Draw ``num`` maps from the posterior of the coefficients of ``map_``.
 
-    key: of ``jax.random``; a key stands for the same maps always. Raises ValueError where the map
-    has no posterior, or ``num`` is no number above 0.
+    key: of ``jax.random``; the same key always gives the same maps. Raises ValueError where the map
+    has no posterior, or ``num`` is not above 0.
     """
     if map_.posterior is None:
         raise ValueError(
-            "expected a map with a posterior: one that gfnn.fit fitted to the pairs themselves, "
-            "linear in its coefficients or an ensemble of networks; a single network and a map of "
-            "drawn pairs have none"
+            "the map has no posterior to draw from: gfnn.fit gives one to a map fitted to the "
+            "pairs themselves that is linear in its coefficients or an ensemble of networks"
         )
     if num < 1:
         raise ValueError(f"expected a number of samples above 0, got {num}")
@@ -130,12 +132,12 @@ def sampled(map_: SymplecticMap, key, num: int) -> Samples:
 
 
 def _generator(key) -> np.random.Generator:
-    """NumPy's generator of a key of ``jax.random``: draws without compiling."""
+    """Make NumPy's generator of a key of ``jax.random``, which draws without compiling."""
     return np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel())
 
 
 def _mapped(samples: Samples, function, each: tuple, together: int):
-    """function(map, *own) of every map with its own part of ``each``: ``together`` at a time."""
+    """Apply function(map, *own) to every map and its part of ``each``, ``together`` at a time."""
 
     def one(own):
         return function(samples.one(own[0]), *own[1:])

@@ -1,9 +1,9 @@
 """Symplectic maps on disk: a model folder with a description that a human can read.
 
-A map is a tree of frozen dataclasses. Its arrays go to the folder's arrays, bit for bit; all the
-rest, the type of every node and its constants, is text. Loading builds nothing but the types of a
-fixed table, and no code runs from a loaded file: the two kinds of function that a map may hold, a
-scene's change of coordinates and its features, are taken from a scene, by its name.
+A map is a tree of frozen dataclasses. Its arrays go to the folder's arrays, bit for bit. The rest,
+the type of every node and its constants, is text. Loading builds only the types of a fixed table,
+and no code runs from a loaded file. The two kinds of function that a map may hold, a scene's change
+of coordinates and its features, are taken from a scene, by its name.
 """
 
 from __future__ import annotations
@@ -54,15 +54,33 @@ _TYPES: dict[str, type] = {
         OfDisplacement,
     )
 }  # fmt: skip
-# Names that were used before, in models that may still be about.
+
+
+def register(kind: type) -> type:
+    """Register a dataclass of one's own, a family or a piece, for `save` and `load`, by its name.
+
+    It is a decorator of the class, in a module that is imported before such a map is loaded. Fields
+    of the class are arrays, numbers, text, tuples of these, or of other registered types. Raises
+    InputError where it is no dataclass, or another type has its name.
+    """
+    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+        raise InputError(f"expected a dataclass to register, got {kind!r}")
+    if _TYPES.get(kind.__name__, kind).__module__ != kind.__module__:
+        raise InputError(f"another type is registered as {kind.__name__}: choose another name")
+    _TYPES[kind.__name__] = kind
+    return kind
+
+
+# Names in models that earlier releases saved.
 _FORMER_TYPES = {"Start": "PolynomialModel"}
 _FORMER_FIELDS = {
     ("Generated", "scalar"): "family",
     ("SymplecticMap", "cut"): "angle_centre",
+    ("Ranges", "seen"): "sums",
 }
 # Stands in the description where a function of the scene belongs.
 _OF_SCENE = "of the scene"
-_DESCRIBED = "described"  # all that is no array
+_DESCRIBED = "described"  # name of the text among the arrays of `packed`
 _PACKAGES = ("gfnn_jax", "jax", "jaxlib", "flax", "optax", "diffrax", "numpy", "scipy")
 
 
@@ -76,9 +94,9 @@ def save(
 ) -> None:
     """Save a map as a model folder.
 
-    scene:  whose coordinates or features the map uses, where it is not one of the package's own;
-            `load` must be given it again.
-    record: JSON-able, anything worth keeping: where the data came from, how the fit went.
+    scene:  the scene whose coordinates or features the map uses, where it is not one of the
+            package's own; `load` needs it too.
+    record: JSON-able, anything worth keeping, such as the origin of the data and the fit's report.
 
     Raises InputError where ``folder`` exists (unless ``overwrite``) or the map holds a function
     that cannot be found again by a name, WorkError where writing fails.
@@ -96,7 +114,7 @@ def save(
 
 
 def load(folder, scene: Scene | None = None) -> SymplecticMap:
-    """The map of a model folder; it predicts the very bits that the saved one did.
+    """Load the map of a model folder; it predicts the same bits as the saved one.
 
     scene: the scene that the map was learned in, where it is not one of the package's own.
 
@@ -107,7 +125,7 @@ def load(folder, scene: Scene | None = None) -> SymplecticMap:
     name = description.get("scene")
     if scene is None and name is not None:
         if name not in SCENES:
-            raise InputError(f"{folder}: was learned in the scene '{name}': pass that scene")
+            raise InputError(f"{folder}: was learned in the scene '{name}': pass it (scene=...)")
         scene = SCENES[name]()
     if scene is not None and name is not None and scene.name != name:
         raise InputError(f"{folder}: was learned in the scene '{name}', not in '{scene.name}'")
@@ -120,7 +138,7 @@ def load(folder, scene: Scene | None = None) -> SymplecticMap:
 
 
 def packed(map_: SymplecticMap, scene: Scene | None = None) -> dict[str, np.ndarray]:
-    """A map as arrays by name, to be sent to another process: `unpacked` makes it anew."""
+    """Pack a map into arrays by name, to send it to another process; `unpacked` is the inverse."""
     text, arrays = _encode(map_)
     named, _ = jax.tree_util.tree_flatten_with_path(arrays)
     described = json.dumps({"scene": _lender(map_, scene), "map": text})
@@ -129,7 +147,7 @@ def packed(map_: SymplecticMap, scene: Scene | None = None) -> dict[str, np.ndar
 
 
 def unpacked(arrays: dict[str, np.ndarray], scene: Scene | None = None) -> SymplecticMap:
-    """The map that `packed` took apart; ``scene`` as in `load`."""
+    """Rebuild the map of `packed`; ``scene`` has the meaning of that of `load`."""
     described = json.loads(str(arrays[_DESCRIBED]))
     if scene is None and described["scene"] is not None:
         scene = SCENES[described["scene"]]()
@@ -145,17 +163,17 @@ def unpacked(arrays: dict[str, np.ndarray], scene: Scene | None = None) -> Sympl
 
 
 def record(folder) -> dict[str, Any]:
-    """What was saved beside a map as its record. Raises InputError as `load` does."""
+    """Load the record that was saved beside a map. Raises InputError as `load` does."""
     return load_model(folder)[1]["record"]
 
 
 def digest(folder) -> str:
-    """SHA-256 that identifies a saved model: of its description, which has every array's own."""
+    """SHA-256 of a saved model's description, which contains that of every array."""
     return hashlib.sha256((Path(folder) / "model.json").read_bytes()).hexdigest()
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of what a result depends on; None for a package that is not installed."""
+    """Versions of the packages that a result depends on; None for one that is not installed."""
     found: dict[str, str | None] = {}
     for package in _PACKAGES:
         try:
@@ -166,7 +184,7 @@ def versions() -> dict[str, str | None]:
 
 
 def _features(map_: SymplecticMap) -> list:
-    """The functions that stand in for w in the map's families."""
+    """Feature functions of the map's families."""
     inputs = jax.tree.leaves(map_, is_leaf=lambda node: isinstance(node, Inputs))
     return [i.features for i in inputs if isinstance(i, Inputs) and i.features is not None]
 
@@ -183,7 +201,8 @@ def _lender(map_: SymplecticMap, scene: Scene | None) -> str | None:
             return lender.name
     what = "coordinates" if changed else "features"
     raise InputError(
-        f"the map uses {what} of a scene that is not known: pass it (scene=...), and again to load"
+        f"the map uses {what} of a scene that is not known: pass the scene (scene=...) to save and "
+        "to load"
     )
 
 
@@ -191,7 +210,7 @@ def _lender(map_: SymplecticMap, scene: Scene | None) -> str | None:
 
 
 def _encode(value: Any) -> tuple[Any, Any]:
-    """(text, arrays) of a node; None for arrays where there are none, and for text likewise."""
+    """Encode a node as (text, arrays); either is None where there is none."""
     if isinstance(value, dict) or (isinstance(value, (jax.Array, np.ndarray)) and value.ndim > 0):
         return None, value
     if isinstance(value, (np.generic, np.ndarray, jax.Array)):
@@ -212,7 +231,10 @@ def _encode(value: Any) -> tuple[Any, Any]:
     if value is None or isinstance(value, (bool, int, float, str)):
         return value, None
     kind = "function" if callable(value) else type(value).__name__
-    raise InputError(f"a map that holds a {kind} of your own cannot be saved")
+    raise InputError(
+        f"a map that holds a {kind} of your own cannot be saved: gfnn_jax.register makes a "
+        "dataclass known"
+    )
 
 
 def _encode_all(items: dict[str, Any], text: dict[str, Any]) -> tuple[Any, Any]:
@@ -249,11 +271,16 @@ def _decode(text: Any, arrays: Any, scene: Scene | None) -> Any:
             items[name] = numbers
     if kind == "tuple":
         return tuple(items[str(i)] for i in range(len(items)))
+    if kind not in _TYPES:
+        raise InputError(
+            f"holds a {kind}, which is not known: import the module that registers it "
+            "(gfnn_jax.register)"
+        )
     return _TYPES[kind](**items)
 
 
 def _renamed(text: Any, arrays: Any) -> tuple[Any, Any]:
-    """The same tree with today's names for types and fields."""
+    """Rename types and fields of earlier releases in the tree."""
     if not isinstance(text, dict) or "type" not in text:
         return text, arrays
     kind: str = _FORMER_TYPES.get(str(text["type"])) or text["type"]

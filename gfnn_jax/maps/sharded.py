@@ -1,9 +1,9 @@
 """Rollouts over several devices: lanes in blocks of one size, the blocks shared out.
 
-Each device runs the program that one device runs, on blocks of one shape, so that a lane's bits
-depend neither on how many devices there are nor on how many lanes. No loop waits for another
-device, and nothing is sent from one to another. (``jax.shard_map`` is compiled in another way for
-several devices than for one: the last digits then differ.)
+Each device runs the program that a single device would run, on blocks of one shape. A lane's bits
+therefore depend neither on the number of devices nor on that of lanes. No loop waits for another
+device, and nothing is sent from one to another. (``jax.shard_map`` compiles differently for several
+devices than for one, and the last digits would differ.)
 """
 
 from __future__ import annotations
@@ -20,31 +20,32 @@ from gfnn_jax.maps.samples import Samples
 from gfnn_jax.maps.symplectic_map import Lanes, RolloutInfo, SymplecticMap
 
 # Lanes of a block. On a CPU 64 and 1,024 are no faster for a generated map, 64 perhaps for a law
-# (benchmarks/scaling.py, on a busy machine); an accelerator wants many, and was not at hand to tell
-# how many.
+# (benchmarks/scaling.py, on a busy machine). An accelerator needs many; the best number was not
+# measured.
 _ON_CPU, _ON_ACCELERATORS = 256, 16_384
 
 
 def local_devices(devices: int | str = "all") -> tuple[Any, ...]:
-    """Devices of this process: "all", or the first so many. Raises ValueError where there are not
-    so many."""
+    """Devices of this process: "all", or the first ``devices`` of them.
+
+    Raises ValueError where there are fewer.
+    """
     own = jax.local_devices()
     count = len(own) if devices == "all" else devices
     if isinstance(count, bool) or not isinstance(count, int):
         raise ValueError(f"expected a number of devices or 'all', got {devices!r}")
     if not 1 <= count <= len(own):
-        raise ValueError(f"expected 1 to {len(own)} devices, which there are; got {count}")
+        raise ValueError(f"expected 1 to {len(own)} devices, all that exist here; got {count}")
     return tuple(own[:count])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sharded:
-    """A map whose rollouts are shared out among devices of this process, or samples of it, each
-    device stepping all of them.
+    """Map, or samples of it, with rollouts shared out among devices of this process.
 
-    ``start``, ``advance`` and ``rollout`` take and mean what those of the map or the samples do,
-    for batches of states. They answer with NumPy arrays, put together from what each device has
-    found. The last block is filled up with copies of the last lane.
+    ``start``, ``advance`` and ``rollout`` have the arguments and results of those of the map or the
+    samples, for batches of states. Their results are NumPy arrays, joined from all devices. Each
+    device steps all samples of its lanes. The last block is filled up with copies of the last lane.
     """
 
     map: SymplecticMap | Samples
@@ -52,11 +53,11 @@ class Sharded:
 
     @property
     def block(self) -> int:
-        """Lanes that are stepped together."""
+        """Number of lanes that are stepped together."""
         return _ON_CPU if self.devices[0].platform == "cpu" else _ON_ACCELERATORS
 
     def start(self, z0, *, params=None, t0=None, stop_outside: bool = False) -> Lanes:
-        """Lanes at step 0 from z0 (B, 2d)."""
+        """Start lanes at step 0 from z0 (B, 2d)."""
 
         def start(map_, z, args):
             return map_.start(z, params=args, stop_outside=stop_outside)
@@ -67,8 +68,8 @@ class Sharded:
         self, lanes: Lanes, num_saved: int, *, params=None, t0=None, save_every: int = 1,
         stop_outside: bool = False,
     ) -> tuple[Lanes, Any]:  # fmt: skip
-        """``num_saved`` blocks of ``save_every`` steps: the lanes after them, and the saved states
-        (B, num_saved, 2d)."""
+        """Advance by ``num_saved`` blocks of ``save_every`` steps: the lanes after them, and the
+        saved states (B, num_saved, 2d)."""
         options = {"save_every": save_every, "stop_outside": stop_outside}
 
         def advance(map_, lanes, args):
@@ -80,8 +81,11 @@ class Sharded:
         self, z0, num_steps: int, *, params=None, t0=None, save_every: int = 1,
         stop_outside: bool = False,
     ) -> tuple[Any, RolloutInfo]:  # fmt: skip
-        """Predict ``num_steps`` steps from z0 (B, 2d): the states
-        (B, 1 + num_steps // save_every, 2d), and a RolloutInfo. Raises what the map's does."""
+        """Predict ``num_steps`` steps from z0 (B, 2d).
+
+        Returns the states (B, 1 + num_steps // save_every, 2d) and a RolloutInfo. Raises ValueError
+        as the map's rollout does.
+        """
         options = {"save_every": save_every, "stop_outside": stop_outside}
 
         def rollout(map_, z, args):
@@ -95,11 +99,13 @@ class Sharded:
             return z0, self._args(args, z0, None)
         z0 = np.asarray(self.map._states(z0))
         if z0.ndim != 2 or not len(z0):
-            raise ValueError(f"expected states (B, {2 * self.map.dim}), B > 0; got {z0.shape}")
+            raise ValueError(
+                f"expected states of shape (B, {2 * self.map.dim}), B > 0; got {z0.shape}"
+            )
         return z0, self._args(params, z0, t0)
 
     def _args(self, params, z, t0) -> Any:
-        """Those of each lane, (B, k), or None."""
+        """Args of each lane, (B, k), or None."""
         if isinstance(self.map, Samples):
             map_, z = self.map.map, z[0]
         else:
@@ -108,15 +114,17 @@ class Sharded:
         return args if args is None else np.broadcast_to(args, (len(z), np.shape(args)[-1]))
 
     def _shared_out(self, function: Callable, lanes: Any, args: Any) -> Any:
-        """``function(map, lanes, args)`` of all lanes, whose leaves are (B, ...), those of samples
-        (n, B, ...); the args are (B, k)."""
+        """Compute ``function(map, lanes, args)`` on all devices, and join the results.
+
+        The leaves of the lanes are (B, ...), for samples (n, B, ...); the args are (B, k).
+        """
         axis = 1 if isinstance(self.map, Samples) else 0
         own = jax.tree.map(np.asarray, (lanes, args))
         count, size = jax.tree.leaves(own)[0].shape[axis], self.block
         firsts, num = range(0, count, size), len(self.devices)
 
         def on(index: int) -> list[Any]:
-            """What the device of this index finds of its blocks."""
+            """Compute the blocks of the device of this index."""
             map_ = jax.device_put(self.map, self.devices[index])
             found = []
             for first in firsts[index::num]:

@@ -1,7 +1,7 @@
-"""The stroboscopic map of a driven system: its steps at the phases of one period, composed.
+"""Stroboscopic map of a driven system: its steps at the phases of one period, composed.
 
-Each step is symplectic, and so is their product; seen once a period, the system is one map and the
-time is gone from it.
+Each step is symplectic, and so is their product. Observed once a period, the system is one map
+that does not depend on time.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
-_WHOLE = 1e-9  # of a step: what a whole number of them may miss
+_WHOLE = 1e-9  # relative tolerance on the whole number of steps in a period
 
 
 @partial(
@@ -27,9 +27,9 @@ _WHOLE = 1e-9  # of a step: what a whole number of them may miss
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class OverPhases:
-    """A driven piece at the times t0 + n dt, n from 0 to ``steps`` − 1. A piece without args.
+    """Row of a driven piece at the times t0 + n dt, n from 0 to ``steps`` − 1, itself without args.
 
-    parameters: of the map, whose only one is the time. backward: whether it is the inverse of the
+    parameters: those of the map; the time is the only one. backward: True for the inverse of the
     row, which is applied from its end.
     """
 
@@ -41,11 +41,11 @@ class OverPhases:
     backward: bool = False
 
     def step(self, z, args=None, *, unrolled: bool | int = False):
-        """(Z, Info) of the states z (B, 2d), by JAX."""
+        """Step the states z (B, 2d): (Z, Info), by JAX."""
         return self._row(lambda z, at: self.piece.step(z, at, unrolled=unrolled), z)
 
     def compensated_step(self, z, compensation, args=None):
-        """(Z, compensation, Info) of z + compensation."""
+        """Step z + compensation (B, 2d): (Z, compensation, Info)."""
 
         def step(both, at):
             *both, info = self.piece.compensated_step(*both, at)
@@ -55,7 +55,7 @@ class OverPhases:
         return z, compensation, info
 
     def action(self, z, image, origin, args=None):
-        """The action (B,) of the row from z (B, 2d): the sum of its steps'."""
+        """Action (B,) of the row from z (B, 2d), the sum of the actions of its steps."""
 
         def step(both, at):
             z, total = both
@@ -65,7 +65,7 @@ class OverPhases:
         return self._row(step, (z, jnp.zeros(z.shape[:1], z.dtype)))[0][1]
 
     def inverse(self) -> OverPhases:
-        """The inverse steps from the last to the first."""
+        """Make the inverse row: the inverse steps from the last to the first."""
         return dataclasses.replace(self, piece=self.piece.inverse(), backward=not self.backward)
 
     def multiplier(self, args=None):
@@ -84,14 +84,14 @@ class OverPhases:
 
 
 def stroboscopic(map_: SymplecticMap, t0: float = 0.0) -> SymplecticMap:
-    """The map over one period of the drive, from its time ``t0``: of a map that is one driven
-    piece, the time its only parameter, and dt a whole part of the period.
+    """Make the map over one period of the drive, from its time ``t0``.
 
-    Raises ValueError for any other map.
+    ``map_`` is one driven piece whose only parameter is the time, and the period is a whole number
+    of its dt. Raises ValueError for any other map.
     """
     known = map_.parameters
     if known is None or known.period is None or len(known.names) > 1 or len(map_.pieces) != 1:
-        raise ValueError("expected a driven map of one piece and no parameter but the time")
+        raise ValueError("expected a driven map of a single piece, with no parameter but the time")
     dt, period = float(np.asarray(map_.dt)), float(np.asarray(known.period))
     steps = round(period / dt)
     if steps < 1 or abs(period / dt - steps) > _WHOLE * steps:

@@ -1,13 +1,13 @@
-"""The symplectic map: pieces in a row, each symplectic, each with its inverse.
+"""Symplectic map: pieces in a row, each symplectic, each with its inverse.
 
     coordinates⁻¹ ∘ R^½ ∘ generated(S, chart) ∘ R^½ ∘ coordinates
 
 Of a system with friction a piece multiplies the symplectic form by a factor μ, its multiplier, or
 keeps no multiple of it; so does the map.
 
-Maps are pytrees: their numbers can be passed through ``jit`` and differentiated; what is static
-(the kind of family, chart, coordinates) is a hashable constant, and what is compiled for one map
-serves all of its kind.
+Maps are pytrees: their numbers can be passed through ``jit`` and differentiated. The kind of
+family, the chart and the coordinates are static, hashable constants. A program compiled for one map
+serves all maps of the same kind.
 """
 
 from __future__ import annotations
@@ -37,35 +37,37 @@ from gfnn_jax.maps.rollout import scan_steps
 from gfnn_jax.phase_space import defect_of_pairs, require_x64, symplecticity_defect
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, Info
 
-# 2d up to which a defect is that of all tangent vectors; random pairs of them beyond.
+# Up to this 2d a defect uses all tangent vectors; beyond it this many random pairs of them.
 _WIDEST, _TANGENT_PAIRS = 64, 4
-_DT_EDGE = 1e-6  # of a dt: what a printed number may miss the end of its range by
-_TWO_PI_REST = 2.4492935982947064e-16  # what float64 leaves out of 2π
+_DT_EDGE = 1e-6  # relative tolerance at the ends of a range of dt, for printed numbers
+_TWO_PI_REST = 2.4492935982947064e-16  # 2π minus its float64 value
 
 
 @runtime_checkable
 class Piece(Protocol):
-    """One map of a row, batch first: z (B, 2d), by JAX.
+    """Map in a row of such, batch first: z (B, 2d), by JAX.
 
     A piece is a pytree. ``unrolled`` makes derivatives those of the iterations that ran; a number
-    says that at most so many updates ran.
+    also bounds the number of updates.
     """
 
     def step(self, z: Any, args: Any = None, *, unrolled: bool | int = False) -> tuple[Any, Info]:
-        """(Z, Info)."""
+        """Step z: (Z, Info)."""
         ...
 
     def compensated_step(self, z: Any, compensation: Any, args: Any = None) -> tuple:
-        """(Z, compensation, Info) of z + compensation, compensation what rounding has lost."""
+        """Step z + compensation: (Z, compensation, Info). Rounding has lost the compensation."""
         ...
 
     def action(self, z: Any, image: Any, origin: Any, args: Any = None) -> Any:
-        """(B,) of the step from z to its image, about the origin (B, 2d): see
-        `maps.modified_hamiltonian`."""
+        """Action (B,) of the step from z to its image, about the origin (B, 2d).
+
+        See `maps.modified_hamiltonian`.
+        """
         ...
 
     def inverse(self) -> Any:
-        """The inverse piece."""
+        """Make the inverse piece."""
         ...
 
     def multiplier(self, args: Any = None) -> Any:
@@ -76,12 +78,12 @@ class Piece(Protocol):
 
 
 class Lanes(NamedTuple):
-    """Where a batch of rollouts stands; the whole state from which it can go on.
+    """Complete state of a batch of rollouts, from which it can be continued.
 
-    y: inner coordinates with angles reduced (B, 2d). compensation: what rounding has lost of them,
-    less than their last digit (B, 2d). winding: whole turns of the angles (B, a). status, left_at
-    (step at which the lane left the domain, −1 if never), iterations (most Newton updates of a
-    step), steps done: each (B,).
+    y: inner coordinates with angles reduced (B, 2d). compensation: their rounding error, less than
+    their last digit (B, 2d). winding: whole turns of the angles (B, a). status, left_at (step at
+    which the lane left the domain, −1 if never), iterations (most Newton updates of a step), steps
+    (number of steps done): each (B,).
     """
 
     y: Any
@@ -94,8 +96,11 @@ class Lanes(NamedTuple):
 
 
 class RolloutInfo(NamedTuple):
-    """How each lane of a rollout ended: status, step at which it left the domain (−1 if it never
-    did), most Newton updates in a step; each (B,). bands: of the samples that were asked for."""
+    """Result of each lane of a rollout, (B,): status, left_at, iterations; and bands.
+
+    left_at: step at which the lane left the domain, −1 if it never did. iterations: most Newton
+    updates in a step. bands: those of the samples, where samples were asked for.
+    """
 
     status: Any
     left_at: Any
@@ -111,26 +116,26 @@ class RolloutInfo(NamedTuple):
 )
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class SymplecticMap:
-    """A learned map and what it knows of its data.
+    """Learned map, with the domain and the ranges of its data.
 
     pieces:       applied in order, in the inner coordinates.
-    coordinates:  the inner coordinates; the user's are outside.
-    domain:       where the data were, in the inner coordinates.
+    coordinates:  the inner coordinates; methods take and return the user's.
+    domain:       region that the data covered, in the inner coordinates.
     scale:        (2d,) sizes of the user's coordinates.
     angle_centre: (a,) centre of the interval of length 2π in which each angle is kept.
-    dt:           the time one step takes; of a reversed map below 0.
-    parameters:   what the system depends on beside its state, where it was learned with that.
-    dt_range:     (2,) the lowest and highest dt of the data, of a map that was learned with dt as a
-                  variable of S.
-    posterior:    how well the coefficients are known, where that is; no leaf: what makes another
-                  map of the leaves (``jit``, ``jax.tree.map``) leaves it out.
+    dt:           time of one step; negative for a reversed map.
+    parameters:   names and ranges of the parameters that the map was learned with, or None.
+    dt_range:     (2,) the lowest and highest dt of the data, for a map that was learned with dt as
+                  a variable of S.
+    posterior:    posterior of the coefficients, or None. It is no leaf: a map that is made of the
+                  leaves (``jit``, ``jax.tree.map``) has none.
 
-    Methods take states z (2d,) or (B, 2d), NumPy or JAX, and answer with JAX arrays. A map that was
+    Methods take states z (2d,) or (B, 2d), NumPy or JAX, and return JAX arrays. A map that was
     learned with parameters takes their values too: name -> a number or (B,), or an array (k,) or
-    (B, k); that of a driven system takes t0, the time of the drive at z, a number or (B,), which
-    goes on with the steps. They can be differentiated, in forward and reverse mode, in z, in the
-    parameters' values and in the map's own leaves, by the implicit-function theorem; ``jax.vmap``
-    and ``jax.jit`` work over them.
+    (B, k). A map of a driven system takes t0, the time of the drive at z, a number or (B,), which
+    advances with the steps. Methods can be differentiated, in forward and reverse mode, in z, in
+    the parameters' values and in the map's own leaves, by the implicit-function theorem.
+    ``jax.vmap`` and ``jax.jit`` work over them.
     """
 
     pieces: tuple
@@ -148,60 +153,62 @@ class SymplecticMap:
             object.__setattr__(self, "dt", np.asarray(self.dt, self.scale.dtype))
 
     def __repr__(self) -> str:
-        """One line, without the arrays."""
+        """Text of one line, without the arrays."""
         pieces = ", ".join(type(piece).__name__ for piece in self.pieces)
         return f"SymplecticMap({pieces}; {self.coordinates.name}, d = {self.dim}, dt = {self.dt})"
 
     @property
     def dim(self) -> int:
-        """Degrees of freedom."""
+        """Number d of degrees of freedom."""
         return self.scale.shape[-1] // 2
 
     def save(self, folder, **options) -> None:
-        """Write a model folder, which ``gfnn.load`` reads; `maps.saved.save` has the options."""
+        """Write a model folder, which ``gfnn.load`` reads; options: those of `maps.saved.save`."""
         from gfnn_jax.maps import saved  # stands after this module: a shorthand for its function
 
         saved.save(self, folder, **options)
 
     def sample(self, key, num: int):
-        """``num`` maps drawn from the posterior, each symplectic: `maps.samples.Samples`."""
+        """Draw ``num`` maps from the posterior, each symplectic: `maps.samples.Samples`."""
         from gfnn_jax.maps import samples  # stands after this module: a shorthand for its function
 
         return samples.sampled(self, key, num)
 
     def sharded(self, devices: int | str = "all"):
-        """This map with its rollouts shared out among devices of this process, "all" or the first
-        so many: `maps.sharded.Sharded`."""
+        """Share rollouts of this map out among devices of this process: `maps.sharded.Sharded`.
+
+        devices: "all", or the number of devices, the first ones.
+        """
         from gfnn_jax.maps import sharded  # stands after this module: a shorthand for its class
 
         return sharded.Sharded(self, sharded.local_devices(devices))
 
     def step(self, z, args=None, *, dt=None, t0=None):
-        """One step: (Z, Info); Info's leaves are () or (B,). dt: of `over`."""
+        """Make one step: (Z, Info); Info's leaves are () or (B,). dt: argument of `over`."""
         z = self._states(z)
         map_ = self if dt is None else self.over(dt, z.shape[:-1])
         return _step(map_, z, self._args(args, z, t0))
 
     def inverse(self, z, args=None, *, t0=None):
-        """One step back: (z, Info) of Z. t0: the time of z, as that of the step to Z."""
+        """Make one step back, from Z to (z, Info). t0: the time at z, not at Z."""
         args = self._args(args, z := self._states(z), t0)
         if self.parameters is not None:
             args = self.parameters.after(args, 1, self.dt)
         return _step(self.reversed(), z, args)
 
     def over(self, dt, lanes: tuple[int, ...] = ()) -> SymplecticMap:
-        """The map over another time than that of the data: of the flow of one Hamiltonian, or of an
-        S that was learned from pairs of several dt. Beyond those the lanes' status is 1.
+        """Make the map over another dt: of the flow of one Hamiltonian, or of an S of dt.
 
-        dt: a number, or one of each lane where that many ``lanes`` are to be stepped; above 0.
-        Raises ValueError for any other map, unless dt is its own: it is known at one dt only.
+        Outside the range of dt that an S of dt was learned with, the lanes' status is 1. dt: above
+        0, a number, or one per lane, of the shape ``lanes``. Raises ValueError for any other map,
+        which is known at one dt only, unless dt is its own.
         """
         known = not any(isinstance(value, Tracer) for value in (dt, self.dt))
         if known and np.ndim(dt) == 0 and np.array_equal(dt, self.dt):  # inside jit too
             return self
         if len(self.pieces) != 1 or not serves_any_dt(self.pieces[0]):
             raise ValueError(
-                f"expected the flow of a Hamiltonian to step another dt, got a map of dt = "
+                "only the flow of a Hamiltonian can step another dt, got a map of dt = "
                 f"{float(np.asarray(self.dt)):g} only: fit with learn='hamiltonian'"
             )
         if not isinstance(dt, jax.Array):
@@ -209,7 +216,9 @@ class SymplecticMap:
             if dt.dtype.kind not in "fiu" or not (np.isfinite(dt) & (dt > 0)).all():
                 raise ValueError(f"expected a time step that is finite and above 0, got {dt}")
         if dt.shape not in ((), lanes):
-            raise ValueError(f"expected one time step, or one of each state; got {dt.shape}")
+            raise ValueError(
+                f"expected one time step, or one per state {lanes}; got shape {dt.shape}"
+            )
         dt = dt.astype(self.scale.dtype)
         return dataclasses.replace(self, pieces=(self.pieces[0].over(dt),), dt=dt)
 
@@ -225,18 +234,18 @@ class SymplecticMap:
         return positions.state_at(self, q, other)
 
     def then(self, other: SymplecticMap) -> SymplecticMap:
-        """This map and the other one after it, as one map: sectors of a ring, phases of a period.
+        """Compose this map and the other one after it: sectors of a ring, phases of a period.
 
-        Its domain and its sizes are those of this map, its dt, and the range of one that S was
-        learned with, the sum of both; the values of parameters are those that both have seen.
-        Raises ValueError where the maps have different coordinates or parameters, or are driven.
+        The domain and the sizes are those of this map. dt, and its range for an S of dt, is the sum
+        of both. Ranges of parameters are the intersections of both. Raises ValueError where the
+        maps have different coordinates or parameters, or are driven.
         """
         ours, theirs = self.parameters, other.parameters
         names = [() if p is None else p.names for p in (ours, theirs)]
         driven = any(p is not None and p.period is not None for p in (ours, theirs))
         if self.coordinates != other.coordinates or names[0] != names[1] or driven:
             raise ValueError(
-                "expected two maps of the same coordinates and parameters, and without a drive"
+                "only maps of the same coordinates and parameters, without a drive, can be composed"
             )
         if ours is not None and theirs is not None:
             low, high = np.maximum(ours.low, theirs.low), np.minimum(ours.high, theirs.high)
@@ -250,12 +259,11 @@ class SymplecticMap:
         )  # fmt: skip
 
     def reversed(self) -> SymplecticMap:
-        """The inverse map, as a map of its own."""
+        """Make the inverse map."""
         pieces = tuple(piece.inverse() for piece in reversed(self.pieces))
         posterior = self.posterior
         if posterior is not None:
-            last = len(pieces) - 1
-            posterior = dataclasses.replace(posterior, piece=last - posterior.piece)
+            posterior = posterior.of_piece(len(pieces) - 1 - posterior.piece)
         return dataclasses.replace(self, pieces=pieces, dt=-self.dt, posterior=posterior)
 
     def multiplier(self, args=None):
@@ -266,12 +274,12 @@ class SymplecticMap:
         return None if any(factor is None for factor in factors) else math.prod(factors, start=1.0)
 
     def defect(self, z, args=None, *, t0=None):
-        """Symplecticity defect ‖AᵀJA − μJ‖ () or (B,) of the step's unrolled derivative A at z, in
-        units of ``scale``, μ the multiplier; NaN where there is none. Of many degrees of freedom by
-        random pairs of tangent vectors.
+        """Symplecticity defect ‖AᵀJA − μJ‖ () or (B,) of the step's derivative A at z, in units of
+        ``scale``; μ the multiplier. NaN where there is none.
 
-        By forward differentiation through the iterations that ran, never by the implicit rule,
-        which would look symplectic however badly the solve had converged.
+        The derivative is the unrolled one, by forward differentiation through the iterations that
+        ran. That of the implicit rule would look symplectic however badly the solve had converged.
+        For many degrees of freedom the defect is estimated by random pairs of tangent vectors.
         """
         z = self._states(z)
         args = self._args(args, z, t0)
@@ -281,35 +289,37 @@ class SymplecticMap:
         return _defect(self, z, args, 1 if once else True)
 
     def determinant(self, z, args=None, *, t0=None):
-        """Chart determinant () or (B,) at z, of the piece where it is smallest; NaN where no piece
-        has a chart."""
+        """Chart determinant () or (B,) at z, the smallest of all pieces; NaN without a chart."""
         z = self._states(z)
         return _determinant(self, z, self._args(args, z, t0))
 
     def hamiltonian(self, z, args=None, *, t0=None):
-        """H () or (B,) at z: what was learned where the map is the flow of one Hamiltonian; of any
-        other map the modified Hamiltonian, of which ``modified_hamiltonian`` gives the error."""
+        """Hamiltonian H () or (B,) at z.
+
+        It is the learned one where the map is the flow of a Hamiltonian. For any other map it is
+        the modified Hamiltonian, whose error ``modified_hamiltonian`` gives.
+        """
         if len(self.pieces) != 1 or not isinstance(self.pieces[0], Flow):
             return self.modified_hamiltonian(z, args).value
         z = self._states(z)
         return _hamiltonian(self, z, self._args(args, z, t0))
 
     def modified_hamiltonian(self, z, args=None) -> ModifiedHamiltonian:
-        """The Hamiltonian H̃ whose flow over dt is this map, at z: its value and the error of that,
-        each () or (B,), in units of H. Its constant is that of S.
+        """Value and error, each () or (B,), of the Hamiltonian H̃ whose flow over dt is this map.
 
-        From 32 steps to either side of z (`maps.modified_hamiltonian`). The error is small where
-        the orbit turns slowly against a step (Hénon–Heiles: 1e-12 at dt 0.4, 1e-8 at 0.8), and of
-        the size of H̃ for a map that is near no flow. NaN where one of these steps fails. Raises
-        ValueError for a driven map, which keeps no energy.
+        Both are in units of H; the constant is that of S. They come from 32 steps to either side of
+        z (`maps.modified_hamiltonian`). The error is small where the orbit turns slowly against a
+        step (Hénon–Heiles: 1e-12 at dt 0.4, 1e-8 at 0.8), and as large as H̃ for a map that is near
+        no flow. Both are NaN where one of these steps fails. Raises ValueError for a driven map,
+        which conserves no energy.
         """
         if self.parameters is not None and self.parameters.period is not None:
-            raise ValueError("expected a map without a drive: a driven one keeps no energy")
+            raise ValueError("expected a map without a drive: a driven one conserves no energy")
         z = self._states(z)
         return _modified(self, z, self._args(args, z))
 
     def start(self, z0, *, params=None, t0=None, stop_outside: bool = False) -> Lanes:
-        """Lanes at step 0 from z0 (B, 2d). Initial states outside the domain have that status."""
+        """Start lanes at step 0 from z0 (B, 2d). States outside the domain have that status."""
         z0 = self._states(z0)
         return _start(self, z0, self._args(params, z0, t0), stop_outside)
 
@@ -317,8 +327,11 @@ class SymplecticMap:
         self, lanes: Lanes, num_saved: int, *, params=None, t0=None, save_every: int = 1,
         stop_outside: bool = False,
     ) -> tuple[Lanes, Any]:  # fmt: skip
-        """``num_saved`` blocks of ``save_every`` steps: the lanes after them, and the saved states
-        (B, num_saved, 2d). params, t0: those that the lanes were started with."""
+        """Advance by ``num_saved`` blocks of ``save_every`` steps.
+
+        Returns the lanes after them, and the saved states (B, num_saved, 2d). params, t0: those
+        that the lanes were started with.
+        """
         args = self._args(params, lanes.y, t0)
         return _advance(self, lanes, args, num_saved, save_every, stop_outside)
 
@@ -329,14 +342,14 @@ class SymplecticMap:
         """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d).
 
         positions: (q, Q) in place of z0, of `from_positions`: the first two positions.
-        params: the values of a map's parameters. t0: the time of a drive at z0; it goes on with the
-        steps. dt: of `over`, for each step. samples, key: how many maps are drawn from the
-        posterior by which key of ``jax.random``; the states of all of them are held at once.
-        Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first, and a
-        RolloutInfo; with samples its ``bands`` have their std about the states, median and
-        quantiles. A lane whose step fails, or that leaves the domain with ``stop_outside``,
-        repeats NaN from there on. Raises ValueError where a number of steps or a shape is wrong,
-        and where samples are asked for without a key or of a map without posterior.
+        params: the values of a map's parameters. t0: the time of a drive at z0; it advances with
+        the steps. dt: argument of `over`. samples: number of maps drawn from the posterior with
+        key, of ``jax.random``; the states of all of them are in memory at once. Returns the states
+        (B, 1 + num_steps // save_every, 2d), the initial ones first, and a RolloutInfo. With
+        samples its ``bands`` have their std about the states, and quantiles. A lane is NaN from
+        where its step fails, or from where it leaves the domain with ``stop_outside``. Raises
+        ValueError where a number of steps or a shape is wrong, and where samples are asked for
+        without a key or from a map without a posterior.
         """
         for name, number in (("num_steps", num_steps), ("save_every", save_every)):
             if not isinstance(number, Integral):
@@ -361,7 +374,7 @@ class SymplecticMap:
         if samples is None:
             return states, info
         if key is None:
-            raise ValueError("expected a key of jax.random beside samples")
+            raise ValueError("expected a key as well as samples, e.g. key=jax.random.key(0)")
         options = {"params": params, "t0": t0, "save_every": save_every}
         drawn, _ = map_.sample(key, samples).rollout(
             np.atleast_2d(z0), num_steps, stop_outside=stop_outside, **options
@@ -380,7 +393,7 @@ class SymplecticMap:
         return as_args(self.parameters, given, z.shape, np.dtype(self.scale.dtype), t0)
 
     def _after(self, args, steps):
-        """args that many steps (B,) later."""
+        """Advance args by a number of steps (B,)."""
         return args if self.parameters is None else self.parameters.after(args, steps, self.dt)
 
     def _states(self, z):
@@ -403,11 +416,10 @@ class SymplecticMap:
         return np.array(self.coordinates.angles, dtype=int)
 
     def _reduce(self, y, compensation):
-        """y with its angles in their interval, the compensation, and the turns taken out.
+        """Reduce the angles of y to their interval: (y, compensation, turns taken out).
 
-        2π is more than its own digits: what they leave out goes to the compensation, so that
-        millions of turns add no drift. An angle so large that its last digit is more than a radian
-        has no meaning, and becomes NaN.
+        The rounding error of 2π goes to the compensation, so that millions of turns add no drift.
+        An angle so large that its last digit exceeds a radian becomes NaN.
         """
         angles = self._angles()
         if not angles.size:
@@ -422,12 +434,12 @@ class SymplecticMap:
         return y, compensation.at[:, angles].set(lost), turns
 
     def _inner(self, z):
-        """The reduced y of the user's states, the compensation and the turns taken out."""
+        """Convert the user's states to the reduced y, the compensation and the turns taken out."""
         y = jax.vmap(self.coordinates.forward)(z)
         return self._reduce(y, jnp.zeros_like(y))
 
     def _outer(self, y, turns):
-        """The user's states of the reduced y and its turns."""
+        """Convert the reduced y and its turns to the user's states."""
         angles = self._angles()
         if angles.size:
             two_pi, beyond = parts_of_two_pi(y.dtype)
@@ -435,7 +447,7 @@ class SymplecticMap:
         return jax.vmap(self.coordinates.inverse)(y)
 
     def _contains(self, y, args):
-        """Whether states and parameters lie where data were (B,)."""
+        """Return whether states, parameters and dt lie in the ranges of the data (B,)."""
         inside = self.domain.contains(y)
         if self.dt_range is not None:
             low, high = self.dt_range[0] * (1 - _DT_EDGE), self.dt_range[1] * (1 + _DT_EDGE)
@@ -443,7 +455,7 @@ class SymplecticMap:
         return inside if self.parameters is None else inside & self.parameters.contains(args)
 
     def _apply(self, z, args, *, unrolled: bool | int = False):
-        """(Z, Info) of the states z (B, 2d) in the user's coordinates."""
+        """Step the states z (B, 2d) in the user's coordinates: (Z, Info)."""
         y, _, turns = self._inner(z)
         inside = self._contains(y, args)
         infos = []
@@ -457,23 +469,23 @@ class SymplecticMap:
 
 
 def serves_any_dt(piece: Any) -> bool:
-    """Whether a piece can be stepped over any time."""
+    """Return whether a piece can be stepped over any dt."""
     return isinstance(piece, Flow) or (isinstance(piece, Generated) and piece.serves_any_dt)
 
 
 def parts_of_two_pi(dtype):
-    """2π as the sum of a number of this dtype and a small rest."""
+    """Split 2π into a number of this dtype and a small rest."""
     near = np.asarray(TWO_PI, dtype)
     return near, TWO_PI - float(near) + _TWO_PI_REST
 
 
 def _worst(infos: list[Info]) -> Info:
-    """Of each lane, the largest status, iterations and residual of its pieces."""
+    """Combine the Info of all pieces: the largest status, iterations and residual per lane."""
     return jax.tree.map(lambda *column: jnp.max(jnp.stack(column), axis=0), *infos)
 
 
 def _or_one_state(function):
-    """The function (map, z (B, 2d), args, ...) of a batch, for one state z (2d,) too."""
+    """Extend a function (map, z (B, 2d), args, ...) of a batch to one state z (2d,)."""
 
     @wraps(function)
     def either(map_, z, args, *static):
@@ -525,7 +537,7 @@ def _modified(map_, z, args):
 
 
 def _cells(map_, y, args) -> Cells:
-    """What the steps from y (B, 2d) on contribute to the modified Hamiltonian."""
+    """Compute the cells of the modified Hamiltonian along the steps from y (B, 2d)."""
 
     def advance(carry, _):
         y, origin = carry
@@ -560,13 +572,13 @@ def _determinant(map_, z, args):
 
 
 def _judge(status, inside, stop_outside: bool):
-    """Status after looking at the domain; only lanes that go on are looked at."""
+    """Update the status by the domain; only lanes that have not ended can change."""
     outside = STOPPED_AT_EDGE if stop_outside else LEFT_DOMAIN
     return jnp.where((status <= LEFT_DOMAIN) & ~inside, outside, status)
 
 
 def begun(map_, z, args, stop_outside) -> Lanes:
-    """`SymplecticMap.start` of states z (B, 2d), inside ``jit``."""
+    """Implement `SymplecticMap.start` for states z (B, 2d), inside ``jit``."""
     y, compensation, turns = map_._inner(z)
     inside, finite = map_._contains(y, args), jnp.all(jnp.isfinite(y), axis=-1)
     status = _judge(jnp.where(finite, OK, NON_FINITE), inside, stop_outside)
@@ -582,7 +594,7 @@ _start = compiled_sooner(begun, (3,))
 
 
 def advanced(map_, lanes, args, num_saved, save_every, stop_outside) -> tuple[Lanes, Any]:
-    """`SymplecticMap.advance` inside ``jit``."""
+    """Implement `SymplecticMap.advance` inside ``jit``."""
 
     def step(lanes: Lanes) -> Lanes:
         going = lanes.status <= LEFT_DOMAIN
@@ -621,7 +633,7 @@ _advance = compiled_sooner(advanced, (3, 4, 5))
 
 
 def predicted(map_, z, args, num_saved, save_every, stop_outside) -> tuple[Any, RolloutInfo]:
-    """`SymplecticMap.rollout` of states z (B, 2d), inside ``jit``."""
+    """Implement `SymplecticMap.rollout` for states z (B, 2d), inside ``jit``."""
     lanes = begun(map_, z, args, stop_outside)
     lanes, saved = advanced(map_, lanes, args, num_saved, save_every, stop_outside)
     info = RolloutInfo(lanes.status, lanes.left_at, lanes.iterations)

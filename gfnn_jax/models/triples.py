@@ -18,15 +18,17 @@ _ONE_TURN = 2 * np.pi * (1 + 1e-3)  # a column that ranges over more is a lift
 class Triples:
     """Positions q₋, q, q₊ (N, d) each, one step apart, so that their differences are the moves.
 
-    run: (N,) the number of the run of each, in rising order. dt: the time of a step; 1 where the
-    recording has none. angles: indices of positions of period 2π. wrapped: whether their readings
-    are known modulo 2π, and moves were lifted so as to be continuous over the data.
+    run, place: (N,) the number of the run of each, in rising order, and its place there. dt: the
+    time of a step; 1 where the recording has none. angles: indices of positions of period 2π.
+    wrapped: whether their readings are known modulo 2π, and moves were lifted so as to be
+    continuous over the data.
     """
 
     before: np.ndarray
     middle: np.ndarray
     after: np.ndarray
     run: np.ndarray
+    place: np.ndarray
     dt: float
     angles: tuple[int, ...] = ()
     wrapped: bool = False
@@ -41,9 +43,8 @@ class Triples:
 
     def take(self, rows) -> Triples:
         """Those of these rows."""
-        parts = (self.before, self.middle, self.after, self.run)
-        before, middle, after, run = (part[rows] for part in parts)
-        return dataclasses.replace(self, before=before, middle=middle, after=after, run=run)
+        names = ("before", "middle", "after", "run", "place")
+        return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     @property
     def moves(self) -> np.ndarray:
@@ -67,7 +68,7 @@ def triples_of(recording: Recording, *, sites: bool = False) -> Triples:
     if not names:
         raise FitError(f"{recording.source}: expected positions, got none")
     angles = tuple(names.index(name) for name in recording.angles)
-    rows, runs, steps = [], [], []
+    rows, runs, places, steps = [], [], [], []
     for number, run in enumerate(recording.runs):
         q, times = recording.array("positions", run), recording.times(run)
         if len(q) < 3:
@@ -76,6 +77,7 @@ def triples_of(recording: Recording, *, sites: bool = False) -> Triples:
         known = np.isfinite(own).all(axis=(1, 2))
         rows.append(own[known])
         runs.append(np.full(known.sum(), number))
+        places.append(np.flatnonzero(known))
         steps.append(np.stack([times[1:-1] - times[:-2], times[2:] - times[1:-1]], axis=1)[known])
     q = np.concatenate(rows) if rows else np.empty((0, 3, len(names)))
     if not len(q):
@@ -91,7 +93,8 @@ def triples_of(recording: Recording, *, sites: bool = False) -> Triples:
         )
     whole = np.concatenate([recording.array("positions", run) for run in recording.runs])
     wrapped = bool(angles) and bool(np.nanmax(np.ptp(whole[:, angles], axis=0)) <= _ONE_TURN)
-    found = Triples(q[:, 0], q[:, 1], q[:, 2], np.concatenate(runs), dt, angles, wrapped)
+    run, place = np.concatenate(runs), np.concatenate(places)
+    found = Triples(q[:, 0], q[:, 1], q[:, 2], run, place, dt, angles, wrapped)
     return _lifted(found, sites) if wrapped else found
 
 

@@ -1,7 +1,7 @@
-"""The scenes that come with the package, each a `Scene`, by function and by name.
+"""Scenes that come with the package, each a `Scene`, by function and by name.
 
-A scene is one module here. Its ``SCENES`` are the names on the command line with the functions that
-make them; its function of the module's own name becomes one of this package.
+Each scene is one module here. Its ``SCENES`` maps names on the command line to the functions that
+make the scenes. Its function of the module's own name becomes a function of this package.
 """
 
 from __future__ import annotations
@@ -52,16 +52,16 @@ _collect()
 
 
 def names() -> tuple[str, ...]:
-    """The names that `make` knows."""
+    """Names that `make` knows."""
     return tuple(SCENES)
 
 
 def make(name: str, dt: float | None = None) -> Scene:
-    """The scene of this name, with its own time step or with another.
+    """Make the scene of this name, with its own time step or with another.
 
     Raises ValueError, in one line, on an unknown name (naming the nearest one and all there are),
-    on a ``dt`` that is not finite and > 0, on any but its own for a scene that is a map without
-    time, and on one that is not a whole number of periods where the scene has a period.
+    on a ``dt`` that is not finite and > 0, on another ``dt`` than its own for a scene that is a map
+    without time, and on one that is not a whole number of periods where the scene has a period.
     """
     if name not in SCENES:
         close = difflib.get_close_matches(name, SCENES, n=1)
@@ -71,7 +71,7 @@ def make(name: str, dt: float | None = None) -> Scene:
     if dt is None or dt == scene.dt:
         return scene
     if scene.timeless:
-        raise ValueError(f"{name} is a map without time: it has dt = {scene.dt:g} only, not {dt:g}")
+        raise ValueError(f"{name} is a map without time: its dt is {scene.dt:g}, got {dt:g}")
     return dataclasses.replace(scene, dt=dt)
 
 

@@ -30,9 +30,12 @@ def momentum(z: State) -> Scalar:
 
 
 def fput(dim: int = 32, alpha: float = 0.0, beta: float = 1.0, dt: float = 0.1) -> Scene:
-    """The β ring of ``dim`` sites (Fermi, Pasta, Ulam & Tsingou 1955), or with ``alpha`` the α + β
-    ring. q of standard deviation 0.2 at every site and p of 0.28, which is about equipartition:
-    chaotic, slowly."""
+    """Scene of the β ring of ``dim`` sites (Fermi, Pasta, Ulam & Tsingou 1955); with ``alpha`` of
+    the α + β ring.
+
+    q and p have standard deviations 0.2 and 0.28 at every site, which is about equipartition. The
+    orbits are weakly chaotic.
+    """
     energy = Springs(alpha, beta)
     return Scene(
         name="fput",

@@ -42,7 +42,7 @@ class Torus:
 
 
 def froeschle(dim: int = 64, k: float = 0.5, b: float = 0.1) -> Scene:
-    """q and p of every site are angles, uniform. Chaotic."""
+    """Scene of ``dim`` coupled standard maps. q and p of every site are uniform angles. Chaotic."""
     return Scene(
         name="froeschle",
         purpose="a ring of coupled standard maps, a map without a flow: structure ring",

@@ -18,7 +18,7 @@ def hamiltonian(z: State, t=0.0) -> Scalar:
 
 
 def printed_hamiltonian(z: State, t=0.0) -> Scalar:
-    """The same with + q₂³/3, as the paper prints it: separable in q₁ ± q₂, hence integrable."""
+    """‖p‖²/2 + ‖q‖²/2 + q₁²q₂ + q₂³/3, as the paper prints it: separable in q₁ ± q₂, integrable."""
     q, p = split(z)
     return p @ p / 2 + q @ q / 2 + q[0] ** 2 * q[1] + q[1] ** 3 / 3
 
@@ -53,7 +53,9 @@ def henon_heiles(energy: float = 1 / 12, dt: float = 0.5, *, printed: bool = Fal
     """
     highest = 1 / 12 if printed else ESCAPE_ENERGY
     if not 0 < energy <= highest:
-        raise ValueError(f"energy must be > 0 and at most {highest:.6g} (bound), not {energy}")
+        raise ValueError(
+            f"energy must be > 0 and at most {highest:.6g}, where orbits are bound, got {energy}"
+        )
     kind = "printed" if printed else "regular" if energy < 0.1 else "chaotic"
     chaotic = kind == "chaotic"
 

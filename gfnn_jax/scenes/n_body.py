@@ -15,8 +15,8 @@ from gfnn_jax.scenes.scene import DrawnFrom, Scene
 _MASSES = (1.0, 0.01, 0.02, 0.005)
 _RADII = (1.0, 1.9, 3.2)  # of the companions' orbits
 _TILT = 0.1  # standard deviation of a direction out of the plane
-# (part of a radius within which it is drawn, standard deviation of a speed, of that on a circle):
-# of the states that rollouts start from, and of those of pairs, among which such orbits then stay.
+# (relative spread of a radius, relative standard deviation of a speed) of initial states of
+# rollouts, and of the states of pairs, which are spread wider so that such orbits stay among them.
 _TEST, _TRAINING = (0.05, 0.02), (0.25, 0.15)
 
 
@@ -36,11 +36,11 @@ class Gravity:
 
 @dataclasses.dataclass(frozen=True)
 class Companions:
-    """``draw(key, num)``: near-circular orbits of any phase about the star, slightly tilted, in the
-    frame of the centre of mass.
+    """Law ``draw(key, num)`` of near-circular orbits of any phase about the star, slightly tilted.
 
-    spread: part of a radius within which it is drawn. faster: standard deviation of a speed, of
-    that on a circle."""
+    The frame is that of the centre of mass. spread: largest deviation of a radius, relative to it.
+    faster: standard deviation of a speed, relative to that on a circle.
+    """
 
     masses: tuple[float, ...]
     radii: tuple[float, ...]

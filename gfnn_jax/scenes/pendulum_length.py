@@ -23,8 +23,10 @@ def hamiltonian(z: State, t=0.0, args=(1.0,)) -> Scalar:
 
 @dataclasses.dataclass(frozen=True)
 class Swinging:
-    """``draw(key, num)``: (q, p, l), l uniform between two lengths; below the separatrix, where
-    p = 0 the angle is at most ``most``."""
+    """Law ``draw(key, num)`` of (q, p, l): l uniform between two lengths, states that librate.
+
+    most: the largest amplitude of the angle, in radians.
+    """
 
     shortest: float
     longest: float

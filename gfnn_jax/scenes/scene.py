@@ -1,4 +1,4 @@
-"""What a scene is: dynamics + coordinates + sampling law + dt, as data and small pure functions."""
+"""Scenes: dynamics + coordinates + sampling law + dt, as data and small pure functions."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ from gfnn_jax.phase_space import State
 
 @dataclasses.dataclass(frozen=True)
 class DrawnFrom:
-    """States drawn directly: ``draw(key, num)`` -> (num, 2d) float64, traced by ``jax.jit``; of a
-    scene with k parameters (num, 2d + k), their values last."""
+    """Law of states drawn directly: ``draw(key, num)`` -> (num, 2d) float64, run by ``jax.jit``.
+
+    For a scene with k parameters ``draw`` returns (num, 2d + k), the parameters' values last.
+    """
 
     draw: Callable
 
@@ -52,9 +54,9 @@ class NormalSites:
 
 @dataclasses.dataclass(frozen=True)
 class AroundOrbit:
-    """States of one orbit, perturbed by a centred Gaussian (paper, "Experimental Details").
+    """Law of states of one orbit, perturbed by a centred Gaussian (paper, "Experimental Details").
 
-    start: the orbit's first state (2d,). num_steps: how many time steps of it are used.
+    start: the orbit's first state (2d,). num_steps: number of its time steps that are used.
     sigma: standard deviation of the perturbation of every coordinate.
     """
 
@@ -65,13 +67,13 @@ class AroundOrbit:
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """A surface of section x_index = 0 of an autonomous system, crossed upwards, at one energy.
+    """Surface of section x_index = 0 of an autonomous system, crossed upwards, at one energy.
 
-    The state z of the return map holds the other coordinates, in their order: dq∧dp of the whole
-    system is dq∧dp of these on the section, so that the map is symplectic (Poincaré).
+    The state z of the return map holds the other coordinates, in their order. On the section dq∧dp
+    of the whole system is dq∧dp of these, so that the map is symplectic (Poincaré).
 
     hamiltonian: ``hamiltonian(x, t)`` -> scalar, of the whole system's state x (2d + 2,).
-    index:       which position of x is zero on the section.
+    index:       index of the position in x that is zero on the section.
     lift:        ``lift(z)`` -> (2d + 2,): the state on the section, at the energy.
     """
 
@@ -80,21 +82,21 @@ class Section:
     lift: Callable
 
     def coordinates(self, x: Float[Array, "whole"]) -> State:
-        """z (2d,) of a state x (2d + 2,) on the section."""
+        """Coordinates z (2d,) of a state x (2d + 2,) on the section."""
         return jnp.delete(x, np.array([self.index, self.index + x.shape[0] // 2]))
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """A system as a user meets it; one of ``flow``, ``step``, ``section`` and ``hamiltonian`` is
-    its reference.
+    """System with coordinates, sampling law, time step and a reference.
 
-    They are taken in that order: an exact flow before an exact map before a numerical integration
-    (a Hamiltonian may be given beside an exact flow; it is then an invariant, not the reference).
-    What is compiled for one scene serves another with the same functions: functions with
-    parameters of their own are best frozen dataclasses with ``__call__``, which compare by value.
+    The reference is the first of ``flow``, ``step``, ``section`` and ``hamiltonian`` that is given:
+    an exact flow before an exact map before a numerical integration. A Hamiltonian beside an exact
+    flow is an invariant, not the reference. Programs compiled for one scene serve another with the
+    same functions. Functions with parameters of their own are therefore best frozen dataclasses
+    with ``__call__``, which compare by value.
 
-    name, purpose: as `gfnn scenes` prints them, one line.
+    name, purpose: one line, which `gfnn scenes` prints.
     dim:           degrees of freedom d.
     dt:            time step of the pairs; 1 for a map without time.
     sampling:      the law of the training states.
@@ -103,21 +105,22 @@ class Scene:
     step:          ``step(z)`` -> (2d,): the exact map.
     section:       the reference is the return map to it, and the scene a map without time.
     hamiltonian:   ``hamiltonian(z, t)`` -> scalar; autonomous ones ignore t (write ``t=0.0``).
-    parameters:    names (k,) of what differs between systems: ``hamiltonian(z, t, args)`` takes
-                   their values (k,), and ``sampling`` draws them beside the states.
-    period:        of a hamiltonian that depends on t. ``dt`` is a whole number of periods, so that
-                   every step is the same map, unless ``any_phase``.
-    any_phase:     whether pairs and trajectories begin at any time of the period, drawn uniformly.
+    parameters:    names (k,) of the parameters that differ between systems. ``sampling`` draws
+                   their values (k,) beside the states; ``hamiltonian(z, t, args)`` takes them.
+    period:        period of a hamiltonian that depends on t. Unless ``any_phase``, ``dt`` is a
+                   whole number of periods, so that every step is the same map.
+    any_phase:     True where pairs and trajectories begin at any time of the period, drawn
+                   uniformly.
     invariants:    name -> ``f(z)`` -> scalar, conserved exactly by the reference.
     coordinates:   the inner coordinates a fit uses (angles, cyclic coordinates, canonical change).
-    features:      ``features(y)`` -> (k,): what S is a function of, in the inner coordinates,
-                   where it is not y itself: invariants of a symmetry, inverse distances.
+    features:      ``features(y)`` -> (k,): variables of S, functions of the inner coordinates,
+                   where they are not y itself: invariants of a symmetry, inverse distances.
     reversor:      signs (2d,) of a linear reversor ρ in the inner coordinates (ρᵀJρ = −J and
                    φ∘ρ∘φ = ρ, φ the map), where there is one; it halves a midpoint basis.
-    structure:     of many degrees of freedom, as `gfnn.fit` takes it: what a fit learns by unless
-                   it is told otherwise.
+    structure:     structure of many degrees of freedom that a fit uses by default, in the form that
+                   `gfnn.fit` takes.
     regular:       True where the orbits are regular, so that error growth has an exponent.
-    num_pairs:     pairs that `gfnn run` draws.
+    num_pairs:     number of pairs that `gfnn run` draws.
     tolerance:     relative one-step error that `gfnn run` asks for: RMS over coordinates of the
                    error divided by the coordinate's spread.
     """
@@ -148,7 +151,7 @@ class Scene:
         for name in ("dt", "tolerance"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} must be finite and > 0, not {value}")
+                raise ValueError(f"{name} must be finite and > 0, got {value}")
         if self.parameters and self.hamiltonian is None:
             raise ValueError(f"{self.name}: parameters need a hamiltonian that takes them")
         if self.any_phase and (self.period is None or self.hamiltonian is None):
@@ -157,10 +160,10 @@ class Scene:
             periods = self.dt / self.period
             if round(periods) < 1 or abs(periods - round(periods)) > 1e-9 * periods:
                 raise ValueError(
-                    f"dt must be a whole number of periods of {self.period}, not {self.dt}"
+                    f"dt must be a whole number of periods of {self.period}, got {self.dt}"
                 )
 
     @property
     def timeless(self) -> bool:
-        """Whether it is a map without time, exact or to a section."""
+        """True for a map without time: an exact map or the return map to a section."""
         return self.step is not None or self.section is not None

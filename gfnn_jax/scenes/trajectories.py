@@ -26,15 +26,15 @@ Drawn = Float[np.ndarray, "num phase"]
 
 TOLERANCE = 1e-15  # 1e-14 costs 15 % less and drifts ten times more in energy
 MAX_SOLVER_STEPS = 1024  # for one dt; a state that needs more is about to collide
-KEPT_ORBITS = 8  # orbits that states are drawn around, so that the next draw has them
-LONGEST_RETURN = 1e6  # to a section: what does not come back uses up its steps before
+KEPT_ORBITS = 8  # cached orbits that states are drawn around
+LONGEST_RETURN = 1e6  # time allowed for a return to a section; lost orbits run out of steps before
 
 
 def _solve(field, start, end, z, until=None):
-    """z (2d,) carried by Dopri8 along dz/dt = field(z, t), from time ``start`` to ``end``, or with
-    ``until`` to the end of the first step after which ``until(z)`` holds. NaN where that fails.
+    """Integrate dz/dt = field(z, t) by Dopri8 from z (2d,) at time ``start`` to time ``end``.
 
-    The solver stops exactly there and never interpolates.
+    With ``until`` the solver stops at the end of the first step after which ``until(z)`` holds. It
+    never interpolates. The result is NaN where the solver fails.
     """
     event = None if until is None else diffrax.Event(lambda t, y, args, **_: until(y))
     # A dead lane gets an interval of length zero, so that the others do not wait for it.
@@ -59,9 +59,11 @@ def _solve(field, start, end, z, until=None):
 
 @dataclasses.dataclass(frozen=True)
 class _WithArgs:
-    """The vector field of a Hamiltonian with parameters: ``field(x, t)`` for x = (z, args), z of
-    ``width``, along which args stay as they are. begins: whether the last of them is the time at
-    which t = 0."""
+    """Vector field of a Hamiltonian with parameters: ``field(x, t)`` for x = (z, args).
+
+    z has ``width`` entries; args are constant in time. begins: True where the last of the args is
+    the time of the drive at t = 0.
+    """
 
     hamiltonian: Callable
     width: int
@@ -81,27 +83,29 @@ def _field(hamiltonian):
 
 
 def _integrator(hamiltonian, dt):
-    """``advance(t, z)`` by one ``dt``, for z (B, 2d); what fails becomes NaN for good.
+    """Make ``advance(t, z)`` by one ``dt``, for z (B, 2d). A state that fails becomes NaN for good.
 
-    One solve for every dt: a trajectory does not depend on which of its states are saved.
+    Each dt is one solve, so that a trajectory does not depend on which of its states are saved.
     """
     field = _field(hamiltonian)
     return jax.vmap(lambda t, z: _solve(field, t, t + dt, z), in_axes=(None, 0))
 
 
 def _stroboscopic(hamiltonian, period, dt):
-    """The same for a Hamiltonian of this period in t, dt a whole number of them: one solve for
-    every period, from time 0, which therefore never grows so large that its digits are missed."""
+    """Make ``advance(t, z)`` by ``dt``, a whole number of periods of the Hamiltonian in t.
+
+    Each period is one solve from time 0, so that the time never grows and loses digits.
+    """
     one = _integrator(hamiltonian, period)
     periods = jnp.round(dt / period).astype(int)
     return lambda t, z: jax.lax.fori_loop(0, periods, lambda _, z: one(0.0, z), z)
 
 
 def _return_map(section):
-    """``step(z)``: the next crossing of the section, to roundoff, from z (2d,).
+    """Make ``step(z)``, the next crossing of the section, to roundoff, from z (2d,).
 
-    The orbit is followed to below the section and to beyond it; then back onto it with the
-    section's own coordinate as the independent variable (Hénon, Physica D 5, 1982).
+    The orbit is followed to below the section and then to beyond it. It is brought back onto it
+    with the section's own coordinate as the independent variable (Hénon, Physica D 5, 1982).
     """
     field, i = hamiltonian_vector_field(section.hamiltonian), section.index
 
@@ -145,7 +149,7 @@ def _trajectories(z0, save_every, num_saved, dt, flow, step, section, hamiltonia
 
 
 def _reference(scene: Scene) -> tuple:
-    """What a trajectory of the scene depends on."""
+    """Everything that a trajectory of the scene depends on, as arguments of `_trajectories`."""
     hamiltonian = scene.hamiltonian
     if scene.parameters or scene.any_phase:
         assert hamiltonian is not None
@@ -159,10 +163,11 @@ def reference_trajectories(
 ) -> Float[np.ndarray, "batch saved phase"]:
     """Reference trajectories from ``z0`` (B, 2d): (B, 1 + num_steps // save_every, 2d), z0 first.
 
-    The scene's exact flow or exact map where it has one, else Dopri8, to its section where it has
-    one. Time starts at 0, or at t0 (B,) where the scene has any phase. params: (k,) or (B, k),
-    where the scene has parameters. Angles are not reduced. From where a state escapes or collides
-    its own row is NaN, and no other lane's.
+    The reference is the scene's exact flow or exact map where it has one, else Dopri8; to its
+    section where it has one. Time starts at 0, or at t0 (B,) where the scene has any phase. params:
+    (k,) or (B, k), where the scene has parameters. Angles are not reduced. A lane is NaN from where
+    its state escapes or collides; other lanes are unaffected. Raises RuntimeError where x64 is off,
+    ValueError where params or t0 do not fit the scene.
     """
     require_x64("a reference trajectory")
     z0 = np.asarray(z0, np.float64)
@@ -173,7 +178,7 @@ def reference_trajectories(
 
 
 def _with_params(scene: Scene, z0, params, t0=None):
-    """States, parameters and the time at which they begin, beside each other (B, 2d + k)."""
+    """Concatenate states, parameters and initial times of the drive (B, 2d + k)."""
     if (t0 is not None) != scene.any_phase:
         wanted = "t0, the time of the drive" if scene.any_phase else "no t0"
         raise ValueError(f"expected {wanted} for the scene {scene.name}")
@@ -189,12 +194,11 @@ def _with_params(scene: Scene, z0, params, t0=None):
 
 
 def flow_step(field: Callable, dt: float, tolerance: float) -> Callable:
-    """``step(z)``: the state (2d,) one ``dt`` later along ż = field(z), by an adaptive Runge–Kutta
-    method of orders 5 and 4 (Dopri5, also known as RK45).
+    """Make ``step(z)``, the state (2d,) one ``dt`` later along ż = field(z), by Dopri5 (RK45).
 
-    What a learned vector field predicts; no reference. Not symplectic beyond ``tolerance``, the
-    local error allowed, absolute and relative. Where it fails the state becomes NaN. Can be
-    differentiated forwards, through the steps that ran.
+    It predicts with a learned vector field and is no reference. The step is symplectic only to
+    ``tolerance``, the allowed local error, absolute and relative. Where the solver fails the state
+    becomes NaN. The step can be differentiated forwards, through the solver's steps that ran.
     """
     term = diffrax.ODETerm(lambda t, z, _: field(z))
     controller = diffrax.PIDController(rtol=tolerance, atol=tolerance)
@@ -219,13 +223,13 @@ def flow_step(field: Callable, dt: float, tolerance: float) -> Callable:
 
 
 def reference_error(scene: Scene, z0: States, num_steps: int) -> float:
-    """Measured error of the reference: the largest distance, over ``num_steps`` steps from z0,
-    to a second reference that differs from it by errors only. z0 has shape (B, 2d).
+    """Measured error of the reference: its largest distance to a second one over ``num_steps``.
 
-    For an integrated scene that second one takes every solve as two, so that both its steps and
-    its roundoff differ. An exact flow or map errs by roundoff only, as does a return to a section:
-    there the initial state is moved by one unit of it. Lanes that do not stay finite are left out;
-    NaN where none does. A scene of any phase begins at the drive's time 0.
+    Both start from z0 (B, 2d) and differ by numerical errors only. For an integrated scene the
+    second reference does each solve as two, so that both its steps and its roundoff differ. An
+    exact flow or map, and a return to a section, err by roundoff only; there the initial state is
+    moved by one unit of roundoff. Lanes that do not stay finite are left out; the result is NaN
+    where none does. A scene of any phase begins at the drive's time 0.
     """
     t0 = 0.0 if scene.any_phase else None
     first = reference_trajectories(scene, z0, num_steps, t0=t0)
@@ -249,7 +253,7 @@ def _drawn(key, *, draw, num):
 
 @partial(jax.jit, static_argnames=("length", "shape"))
 def _perturbations(key, *, length, shape):
-    """Which states of an orbit of this length (num,), and standard normal noise (num, 2d)."""
+    """Random indices (num,) of states of an orbit, and standard normal noise (num, 2d)."""
     key_time, key_noise = jax.random.split(key)
     time = jax.random.randint(key_time, shape[:1], 0, length)
     return time, jax.random.normal(key_noise, shape, jnp.float64)
@@ -257,14 +261,14 @@ def _perturbations(key, *, length, shape):
 
 @lru_cache(maxsize=KEPT_ORBITS)
 def _orbit(law: AroundOrbit, *reference):
-    """The states (num_steps + 1, 2d) of the law's orbit."""
+    """States (num_steps + 1, 2d) of the law's orbit."""
     start = np.array([law.start])
     states = np.asarray(_trajectories(start, 1, law.num_steps, *reference))
     return np.concatenate([start, states[:, 0]])
 
 
 def _reduce_angles(coordinates, z):
-    """Angles of z (num, 2d) brought to [0, 2π)."""
+    """Bring the angles of z (num, 2d) to [0, 2π)."""
     if not coordinates.angles:
         return z
     y, angles = to_inner(coordinates, z), list(coordinates.angles)
@@ -274,11 +278,11 @@ def _reduce_angles(coordinates, z):
 
 def _check_drawn(scene, num, key) -> None:
     if not isinstance(scene, Scene):
-        raise ValueError(f"expected a scene, as gfnn.scenes.make('two-body'), got {scene!r}")
+        raise ValueError(f"expected a scene, e.g. gfnn.scenes.make('two-body'), got {scene!r}")
     if not isinstance(num, numbers.Integral) or num < 1:
-        raise ValueError(f"expected a whole number of states from 1 on, got {num!r}")
+        raise ValueError(f"expected a whole number of states ≥ 1, got {num!r}")
     if not isinstance(key, (jax.Array, np.ndarray)):
-        raise ValueError(f"expected a key, as jax.random.key(0), got {key!r}")
+        raise ValueError(f"expected a key, e.g. jax.random.key(0), got {key!r}")
 
 
 def _draw(scene, law, num, key):
@@ -294,15 +298,17 @@ def _draw(scene, law, num, key):
 
 
 def sample_states(scene: Scene, num: int, key) -> Drawn:
-    """``num`` states of the scene's training law, (num, 2d)."""
+    """Draw ``num`` states of the scene's training law, (num, 2d)."""
     return _draw(scene, scene.sampling, num, key)[:, : 2 * scene.dim]
 
 
 def sample_params(
     scene: Scene, num: int, key, *, test: bool = False
 ) -> Float[np.ndarray, "num params"] | None:
-    """The parameters (num, k) of the states that `sample_states`, or with ``test``
-    `sample_test_states`, draws with the same key; None where the scene has none."""
+    """Draw the parameters (num, k) that belong to `sample_states` with the same key.
+
+    With ``test`` they belong to `sample_test_states`. None where the scene has no parameters.
+    """
     if not scene.parameters:
         return None
     law = (scene.test_states if test else None) or scene.sampling
@@ -310,8 +316,10 @@ def sample_params(
 
 
 def sample_t0(scene: Scene, num: int, key) -> Float[np.ndarray, "num"] | None:
-    """Times of the drive (num,), uniform over its period, at which the states drawn with the same
-    key begin; None where the scene has not any phase."""
+    """Draw the times of the drive (num,), uniform over its period, of states drawn with this key.
+
+    None where the scene does not begin at any phase.
+    """
     if not scene.any_phase:
         return None
     assert scene.period is not None
@@ -319,14 +327,14 @@ def sample_t0(scene: Scene, num: int, key) -> Float[np.ndarray, "num"] | None:
 
 
 def sample_test_states(scene: Scene, num: int, key) -> Drawn:
-    """``num`` states for rollouts to start from, (num, 2d): the training law unless declared."""
+    """Draw ``num`` states (num, 2d) for rollouts, of the scene's test law or else training law."""
     return _draw(scene, scene.test_states or scene.sampling, num, key)[:, : 2 * scene.dim]
 
 
 def sample_sequences(
     scene: Scene, num: int, length: int, key
 ) -> Float[np.ndarray, "num length phase"]:
-    """``num`` reference sequences of ``length`` states each, from states of the training law."""
+    """Draw ``num`` reference sequences of ``length`` states, which start with the training law."""
     return reference_trajectories(
         scene, sample_states(scene, num, key), length - 1, params=sample_params(scene, num, key),
         t0=sample_t0(scene, num, key),
@@ -336,10 +344,10 @@ def sample_sequences(
 def sample_pairs(
     scene: Scene, num_pairs: int, key, *, dt_range: tuple[float, float] | None = None
 ) -> Pairs:
-    """``num_pairs`` states of the training law and their images one ``dt`` later.
+    """Draw ``num_pairs`` states of the training law, and their images one ``dt`` later.
 
-    dt_range: the shortest and the longest time between the states of a pair, which is then drawn
-    uniformly for each: irregular sampling. Raises ValueError where the scene has no flow.
+    dt_range: the shortest and the longest time step, between which one is drawn uniformly for each
+    pair: irregular sampling. Raises ValueError where the scene has no autonomous flow.
     """
     _check_drawn(scene, num_pairs, key)
     params = sample_params(scene, num_pairs, key)
@@ -353,8 +361,8 @@ def sample_pairs(
     stroboscopic = scene.period is not None and not scene.any_phase
     if scene.timeless or stroboscopic or not 0 < low < high < np.inf:
         raise ValueError(
-            f"expected 0 < shortest < longest dt, of an autonomous flow; got {low:g} and {high:g} "
-            f"for the scene {scene.name}"
+            f"expected 0 < shortest < longest dt, and a scene with a flow; got dt from {low:g} to "
+            f"{high:g} for the scene {scene.name}"
         )
     z0 = sample_states(scene, num_pairs, key)
     dt = low + (high - low) * np.asarray(_uniform(jax.random.fold_in(key, 1), num=num_pairs))
@@ -371,7 +379,7 @@ def _uniform(key, *, num):
 
 @partial(jax.jit, static_argnames=("flow", "hamiltonian"))
 def _after(x, dt, *, flow, hamiltonian):
-    """States x (B, ...) each a time dt (B,) later."""
+    """Advance states x (B, ...), each by its own time dt (B,)."""
     if flow is not None:
         return jax.vmap(flow)(x, dt)
     field = _field(hamiltonian)

@@ -1,10 +1,10 @@
 """Fixed-point iteration for a batch of systems that are too large for matrices, and Newton–Krylov.
 
 The solve finds x (B, n) with r(shared, lanes, x) = 0 by x ← x − unit · r, which contracts where a
-map is near the identity, or is kicked. A lane in which it does not, or hardly does, begins again by
-Newton's method, each step from products with the Jacobian alone and halved until the residual is
-smaller. Iterates are judged as those of `solve.newton` are, each by the residual at it; status is
-data; a lane that is done is frozen.
+map is near the identity, or is kicked. A lane that does not contract, or too slowly, starts again
+by Newton's method: each step comes from products with the Jacobian alone, and is halved until the
+residual is smaller. Each iterate is judged by the residual at it, as in `solve.newton`. Status is
+data. A lane that has converged is frozen.
 """
 
 from __future__ import annotations
@@ -22,35 +22,35 @@ from gfnn_jax.solve.krylov import norm_of
 from gfnn_jax.solve.newton import Evaluation, floors, largest, relative, settled_floors, where
 from gfnn_jax.solve.status import NON_FINITE, NOT_CONVERGED, OK, Info
 
-MOST = 100  # updates, of a derivative too: roundoff at a factor of 0.7
-# Near roundoff a lane goes on while two updates, as q moves p and p moves q, leave no more of its
-# residual than this.
+MOST = 100  # updates, and those of a derivative: a contraction of 0.7 reaches roundoff
+# Near roundoff a lane continues while two updates (q moves p and p moves q) leave no more than this
+# part of its residual.
 _SHRINKS = 0.7
-# A lane whose error after the first few updates is not below this power of their number has a
-# Newton update instead, which costs as much as some fifty.
+# A lane whose error after _FIRST or more updates n is not below _SLOW^n has Newton updates instead,
+# each of which costs as much as some fifty.
 _SLOW, _FIRST = 0.8, 10
 _MOST_NEWTON = 40  # updates of Newton's method
-_LINEAR = 1e-4  # residual of their linear systems: a derivative of so many updates is at roundoff
-_SHORTEST = 2.0**-20  # part of a Newton step
-_CLOSE = 1e-15  # in NumPy, of the residual's terms: roundoff
-_SOLVED = 1e-14  # of them: lanes above it have Newton updates in NumPy
-_STALE = 4  # updates in NumPy that make no lane better: the end
+_LINEAR = 1e-4  # relative residual of their linear systems
+_SHORTEST = 2.0**-20  # smallest part of a Newton step
+_CLOSE = 1e-15  # residual relative to its terms, in NumPy: roundoff
+_SOLVED = 1e-14  # relative residual above which a lane has Newton updates in NumPy
+_STALE = 4  # updates in NumPy without a better lane, after which the iteration ends
 
 
 @runtime_checkable
 class Contraction(Protocol):
-    """r(shared, lanes, x) = 0 as x = x − unit · r: a hashable constant."""
+    """Equation r(shared, lanes, x) = 0 as x = x − unit · r: a hashable constant."""
 
     def evaluate(self, shared: Any, lanes: Any, x: Any) -> Evaluation:
-        """The residual at x, in these units."""
+        """Residual at x, in units of ``unit``."""
         ...
 
     def unit(self, shared: Any, lanes: Any) -> Any:
-        """(B, n): the units of the residual."""
+        """Units (B, n) of the residual."""
         ...
 
     def product(self, shared: Any, lanes: Any, x: Any) -> Callable[[Any], Any]:
-        """v (B, n) -> (∂r/∂x) v at x, v in these units too. NumPy or JAX."""
+        """Linear map v (B, n) -> (∂r/∂x) v at x, with v in units of ``unit``. NumPy or JAX."""
         ...
 
 
@@ -59,7 +59,7 @@ class _Iterate(NamedTuple):
     residual: Any
     aux: Any
     error: Any  # largest residual relative to its roundoff floor
-    earlier: Any  # the same an update ago
+    earlier: Any  # error one update ago
     iterations: Any
     open: Any
 
@@ -69,7 +69,7 @@ class _Damped(NamedTuple):
     residual: Any
     aux: Any
     error: Any
-    step: Any  # of Newton's method from x, and the part of it (B, 1) to be tried next
+    step: Any  # Newton step from x, and the part of it (B, 1) to be tried next
     part: Any
     iterations: Any
     open: Any
@@ -78,7 +78,7 @@ class _Damped(NamedTuple):
 def iterate(
     equation: Contraction, shared: Any, lanes: Any, guess: Any, *, most: int
 ) -> tuple[Any, Any, Info]:
-    """The iterations from guess (B, n): (x, aux at x, Info). most: of the fixed point."""
+    """Iterate from guess (B, n); return (x, aux at x, Info). most: fixed-point updates."""
     unit, settled = equation.unit(shared, lanes), settled_floors(guess.dtype)
     evaluation = equation.evaluate(shared, lanes, guess)
     start = floors(evaluation)
@@ -111,12 +111,15 @@ def iterate(
 def newton_krylov(
     equation: Contraction, shared: Any, lanes: Any, done: tuple[Any, Any, Info], guess: Any
 ) -> tuple[Any, Any, Info]:
-    """``done``, (x, aux at x, Info), where it is ok; the other lanes by Newton's method from guess
-    (B, n), a step halved until the residual is smaller."""
+    """Solve the lanes of ``done`` = (x, aux at x, Info) that are not ok by Newton's method.
+
+    It starts from guess (B, n); each step is halved until the residual is smaller. The other lanes
+    are returned as they are.
+    """
     unit, settled = equation.unit(shared, lanes), settled_floors(guess.dtype)
     _, aux, info = done
     most, infinite = info.iterations + _MOST_NEWTON, jnp.full_like(guess, jnp.inf)
-    begun = _Damped(  # the first step is none: it leads to the guess
+    begun = _Damped(  # the first step is zero and leads to the guess
         guess, infinite, aux, infinite[:, 0], jnp.zeros_like(guess), jnp.ones_like(guess[:, :1]),
         info.iterations, info.status != OK,
     )  # fmt: skip
@@ -152,8 +155,11 @@ def _info(error, iterations, settled: float) -> Info:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def root(equation: Contraction, shared: Any, lanes: Any, guess: Any):
-    """As ``iterate``, with derivatives in shared and lanes by the implicit function theorem, whose
-    linear equation is solved by products too; the guess has no influence."""
+    """Solve as ``iterate``, with derivatives by the implicit function theorem.
+
+    Derivatives exist in shared and lanes; the guess has no influence. Their linear equation is
+    solved by products with the Jacobian.
+    """
     return iterate(equation, shared, lanes, guess, most=MOST)
 
 
@@ -174,10 +180,10 @@ def _root_jvp(equation, primals, tangents):
 
 
 def refine(equation: Contraction, shared: Any, lanes: Any, guess: Any):
-    """The same in NumPy: (x, aux, error (B,)), the error relative to the residual's terms.
+    """Solve in NumPy from a close guess (B, n): (x, aux, error (B,)).
 
-    Each lane's best iterate is what it ends with; where a fixed point does not get there, of
-    Newton's method from the guess, which is to be close.
+    error: the largest residual relative to its terms. Each lane ends with its best iterate. Lanes
+    that the fixed point does not solve have Newton updates from the guess.
     """
 
     def judged(x):

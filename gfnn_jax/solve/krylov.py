@@ -1,11 +1,11 @@
-"""Linear systems of a batch that are known by their products alone: GMRES, lane by lane.
+"""GMRES, lane by lane, for a batch of linear systems that are known by their products alone.
 
     min ‖b − A x‖ over the Krylov space of A and b
 
-As the adaptive simpler GMRES of Jiránek & Rozložník (SIAM J. Matrix Anal. Appl. 31 (2010), 1483):
-directions d_k with A d_k orthonormal, each begun from the residual where that has shrunk, else from
-A d_{k−1}. There is no Hessenberg matrix, and the method never breaks down. Memory: 2 `SPACE`
-vectors for each lane.
+The method is the adaptive simpler GMRES of Jiránek & Rozložník (SIAM J. Matrix Anal. Appl. 31
+(2010), 1483). Its directions d_k have orthonormal A d_k. Each starts from the residual where that
+has shrunk, else from A d_{k−1}. There is no Hessenberg matrix, and the method never breaks down.
+Memory: 2 `SPACE` vectors for each lane.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import numpy as np
 from gfnn_jax.arrays import namespace
 
 SPACE = 20  # directions before a restart
-_NOTHING = 1e-12  # of an image: what is left of it is roundoff, and the space exhausted
-_SHRUNK = 0.8  # of a residual: below it the next direction begins from it
-_RESTART = 1e-8  # of a residual: where one of the solves to roundoff begins again
+_NOTHING = 1e-12  # an image that shrinks to this part is roundoff: the space is exhausted
+_SHRUNK = 0.8  # a residual that shrinks to this part begins the next direction
+_RESTART = 1e-8  # relative residual at which a solve to roundoff restarts
 _MOST = 12  # restarts of a system that is solved to roundoff
-_STALLED = 0.5  # of the residual: a restart that leaves more has met roundoff
+_STALLED = 0.5  # a restart that leaves more than this part of the residual has met roundoff
 
 
 class _Search(NamedTuple):
@@ -36,9 +36,9 @@ class _Search(NamedTuple):
 
 
 def solve(product: Callable, rhs: Any, tolerance: float):
-    """x (B, n) with ‖rhs − A x‖ ≤ tolerance ‖rhs‖, or the best of `SPACE` directions; NumPy or JAX.
+    """Solve for x (B, n) with ‖rhs − A x‖ ≤ tolerance ‖rhs‖ in at most `SPACE` directions.
 
-    product: v (B, n) -> A v, lane by lane. A lane that is there stays as it is.
+    product: v (B, n) -> A v, lane by lane. A lane that has converged stays as it is. NumPy or JAX.
     """
     xp = namespace(rhs)
     start = norm_of(rhs)
@@ -72,7 +72,7 @@ def solve(product: Callable, rhs: Any, tolerance: float):
 
 
 def differentiable(product: Callable, rhs: Any, tolerance: float):
-    """As `solve`, by JAX: with the derivatives of A⁻¹ rhs, which are solved for in the same way."""
+    """Solve as `solve`, in JAX, with the derivatives of A⁻¹ rhs by solves of the same kind."""
 
     def solved(product, rhs):
         return solve(product, rhs, tolerance)
@@ -81,9 +81,9 @@ def differentiable(product: Callable, rhs: Any, tolerance: float):
 
 
 def solve_to_roundoff(product: Callable, rhs: Any):
-    """x (B, n) with A x = rhs, as `solve` with restarts until a residual no longer shrinks. JAX.
+    """Solve A x = rhs for x (B, n) by `solve`, restarted until the residual no longer shrinks. JAX.
 
-    Linear in rhs: it has derivatives of either mode.
+    The solution is linear in rhs and has derivatives in forward and reverse mode.
     """
 
     def solved(product, rhs):
@@ -111,19 +111,19 @@ def solve_to_roundoff(product: Callable, rhs: Any):
 
 
 def norm_of(rows):
-    """Euclid's norm (...) of each row."""
+    """Euclidean norm (...) of each row."""
     xp = namespace(rows)
     return xp.sqrt(xp.sum(rows * rows, axis=-1))
 
 
 def _unit(rows, size):
-    """The rows by their size; 0 where that is 0."""
+    """Divide the rows by their size; 0 where the size is 0."""
     xp, some = namespace(rows), (size > 0)[..., None]
     return xp.where(some, rows / xp.where(some, size[..., None], 1.0), 0.0)
 
 
 def _while(xp, goes_on, further, state):
-    """``state = further(state)`` while it goes on."""
+    """Repeat ``state = further(state)`` while ``goes_on(state)``, in NumPy or JAX."""
     if xp is not np:
         return jax.lax.while_loop(goes_on, further, state)
     while goes_on(state):

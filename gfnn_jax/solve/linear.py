@@ -17,16 +17,17 @@ COFACTORS_UP_TO, _UNROLL_UP_TO = 4, 8
 def small_solve(matrix, rhs):
     """Solve matrix @ x = rhs for matrix (..., n, n) and rhs (..., n), NumPy or JAX.
 
-    By cofactors, or by elimination with partial pivoting, unrolled: a few fused loops over the
-    batch, many times faster than a batched LAPACK call at these sizes. Cofactors lose a factor of
-    the condition number in the residual, which an iteration that judges its own residual makes
-    good. Linear in ``rhs``, so it can be transposed. A singular system gives non-finite numbers.
+    Small systems are solved by cofactors, or by unrolled elimination with partial pivoting: a few
+    fused loops over the batch, many times faster than a batched LAPACK call at these sizes.
+    Cofactors lose a factor of the condition number in the residual; an iteration that judges its
+    own residual makes up for that. The solution is linear in ``rhs`` and can be transposed. A
+    singular system gives non-finite numbers.
     """
     return solve_and_sign(matrix, rhs)[0]
 
 
 def solve_and_sign(matrix, rhs):
-    """The solution (..., n), and the sign (...) of the matrix' determinant."""
+    """Solve as `small_solve`; return the solution (..., n) and sign (...) of the determinant."""
     n = rhs.shape[-1]
     if n <= COFACTORS_UP_TO:
         x, determinant = by_cofactors(matrix, rhs)
@@ -37,12 +38,12 @@ def solve_and_sign(matrix, rhs):
 
 
 def by_cofactors(matrix, rhs):
-    """The solution (..., n) for matrix (..., n, n), and the determinant (...)."""
+    """Solve by cofactors; return the solution (..., n) and the determinant (...)."""
     xp, n = namespace(matrix, rhs), rhs.shape[-1]
 
     @cache
     def minor(rows, columns):
-        """The determinant of these rows and columns, expanded along the first row."""
+        """Determinant of these rows and columns, expanded along the first row."""
         if not rows:
             return 1.0
         total = 0.0

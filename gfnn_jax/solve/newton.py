@@ -2,14 +2,14 @@
 
 The solve finds x (B, n) with r(shared, lanes, x) = 0, a system for each lane. Three rules:
 
-- Every iterate is judged by the residual that was evaluated *at it*, so "ok" is never a guess, and
-  what belongs to the returned x (the gradient of S) is at hand without another evaluation.
-- Finished lanes are frozen, and those that need more updates than most are gathered from the batch
-  for them: a slow or bad lane costs the others neither a bit nor its own time.
+- Every iterate is judged by the residual that was evaluated *at it*. "ok" is never a guess, and the
+  gradient of S at the returned x needs no further evaluation.
+- Finished lanes are frozen. Lanes that need more updates than most are gathered from the batch. A
+  slow or failed lane changes no bit of the others and takes none of their time.
 - Status is data. Non-finite values are tested for, since ``while err > tol`` ends silently on NaN.
 
-Derivatives of ``root`` come from the implicit function theorem, in forward and reverse mode; those
-of ``iterate`` from the iterations that ran, which is what an honest symplecticity defect needs.
+Derivatives of ``root`` come from the implicit function theorem, in forward and reverse mode. Those
+of ``iterate`` are those of the iterations that ran, which an honest symplecticity defect needs.
 """
 
 from __future__ import annotations
@@ -27,25 +27,28 @@ from gfnn_jax.solve.linear import small_solve, solve_and_sign
 from gfnn_jax.solve.status import NON_FINITE, NOT_CONVERGED, OK, Info
 
 _HALVINGS = 30
-# How much the residual's slope along a step may change, as a part of the steeper slope; how far the
-# residual's change may be from what these slopes tell (the trapezoidal rule), as a part of it.
+# Largest change of the residual's slope along a step, relative to the steeper slope; largest
+# difference between the residual's change and its estimate from the two slopes (trapezoidal rule),
+# relative to that change.
 _BENT, _OFF_PATH = 0.35, 0.05
-# The first step is tried whole where the update with the same step has left this of the residual,
-# else by this part: it may lead past any number of folds, and seldom does so by small steps.
+# The first step is tried whole where the update with the same step has left at most _STRAIGHT of
+# the residual, else the part _BEGIN of it: a whole step may lead past folds, small steps seldom do.
 _STRAIGHT, _BEGIN = 0.01, 0.125
 # A residual of this many eps of the size of its terms is the floor: a few roundings of that size.
 _FLOOR_EPS = 4.0
-# Where one update is not enough, this many lanes of a batch, or this part of it, are gathered at a
-# time for so many updates: the fewer, the less waits for the hardest, the more often all are seen.
-# Tuned on CPUs (benchmarks/speed.py); where all lanes of a batch are hard, it costs up to a fifth
-# more than to wait.
+# Where one update is not enough, max(_FEWEST, B // _PART) lanes of a batch are gathered at a time
+# for _VISIT updates. With fewer lanes fewer wait for the slowest, but all are scanned more often.
+# Tuned on CPUs (benchmarks/speed.py); where all lanes of a batch are hard, gathering costs up to a
+# fifth more than waiting.
 _FEWEST, _PART, _VISIT = 32, 32, 2
-_QUADRATIC = 1e-9  # a residual so small is at roundoff after another update
+_QUADRATIC = 1e-9  # a residual this small is at roundoff after another update
 
 
 class Evaluation(NamedTuple):
-    """residual (B, n); size (B, n) of the terms whose difference it is: a few eps of it is
-    roundoff; aux: a pytree of (B, ...) that belongs to x."""
+    """Evaluation of an equation at x: residual (B, n), size (B, n) of its terms, and aux.
+
+    A few eps of the size is roundoff. aux: a pytree of (B, ...) that belongs to x.
+    """
 
     residual: Any
     size: Any
@@ -54,20 +57,23 @@ class Evaluation(NamedTuple):
 
 @runtime_checkable
 class Equation(Protocol):
-    """r(shared, lanes, x) = 0 for each lane: a hashable constant, everything else is in its
-    arguments. shared: a pytree common to all lanes. lanes: a pytree of (B, ...). x: (B, n)."""
+    """Equation r(shared, lanes, x) = 0 for each lane: a hashable constant.
+
+    Everything that may change is in the arguments. shared: a pytree common to all lanes. lanes: a
+    pytree of (B, ...). x: (B, n).
+    """
 
     def evaluate(self, shared: Any, lanes: Any, x: Any) -> Evaluation:
-        """The residual at x."""
+        """Residual at x."""
         ...
 
     def linearise(self, shared: Any, lanes: Any, x: Any) -> tuple[Evaluation, Any]:
-        """The residual at x and its Jacobian ∂r/∂x (B, n, n)."""
+        """Residual at x, and its Jacobian ∂r/∂x (B, n, n)."""
         ...
 
 
 class _Iterate(NamedTuple):
-    """Where each lane stands; every leaf is (B, ...)."""
+    """State of the iteration of each lane; every leaf is (B, ...)."""
 
     x: Any
     residual: Any
@@ -77,31 +83,31 @@ class _Iterate(NamedTuple):
     step: Any  # the Newton step from x, and the part of it to be tried next
     factor: Any
     iterations: Any
-    open: Any  # still to be improved
+    open: Any  # True for lanes that need further updates
 
     @property
     def merit(self):
-        """The largest residual."""
+        """Largest residual of each lane (B,)."""
         return largest(self.residual)
 
 
 def iterate(
     equation: Equation, shared: Any, lanes: Any, guess: Any, *, most: int, gather: bool = True
 ) -> tuple[Any, Any, Info]:
-    """The iterations themselves, from guess (B, n): (x, aux at x, Info).
+    """Iterate from guess (B, n); return (x, aux at x, Info).
 
-    One update with the Jacobian at the guess, where it is evaluated together with the residual,
-    with which it shares most of its work: from a guess as close as the root of roundoff that is
-    all. For the lanes that are left, Newton's method with a fresh Jacobian, a step halved until it
-    stays by the Newton path r(x) = (1 − t) r(guess) (Deuflhard, "Newton Methods for Nonlinear
-    Problems", 2004, chapter 3), which ends at the solution of the guess's own branch or at a fold:
-    there the sign of det ∂r/∂x would change, and the lane is given up, not led to another branch.
-    A step over a pair of folds keeps the sign and may shrink the residual; it shows in the slopes.
-    A lane closes when its residual is at the roundoff floor, or is close to it and no longer
-    halves, or cannot be made smaller.
+    The first update uses the Jacobian at the guess, which shares most of its work with the
+    residual. From a guess as close as the root of roundoff it is the only one. The lanes that are
+    left have Newton updates with a fresh Jacobian. Each step is halved until it stays near the
+    Newton path r(x) = (1 − t) r(guess) (Deuflhard, "Newton Methods for Nonlinear Problems", 2004,
+    chapter 3). The path ends at the solution of the guess's own branch, or at a fold, where the
+    sign of det ∂r/∂x would change; the lane is then given up instead of led to another branch. A
+    step over a pair of folds keeps the sign and may shrink the residual, but shows in the slopes. A
+    lane closes when its residual is at the roundoff floor, or is close to it and no longer halves,
+    or cannot be made smaller.
 
-    most: updates, 1 or more. gather: whether open lanes are taken out of the batch; else all wait
-    for the slowest.
+    most: number of updates, 1 or more. gather: True takes open lanes out of the batch; else all
+    lanes wait for the slowest.
     """
     settled = settled_floors(guess.dtype)
     size = guess.shape[0]
@@ -144,29 +150,31 @@ def iterate(
 
 
 def settled_floors(dtype) -> float:
-    """The error in floors up to which a lane is solved: 3e-12 of the size in float64, 1e-5 in
-    float32."""
+    """Error in roundoff floors up to which a lane counts as solved.
+
+    It is 3e-12 of the size of the terms in float64, 1e-5 in float32.
+    """
     return float(jnp.finfo(dtype).eps) ** -0.25
 
 
 def floors(evaluation: Evaluation):
-    """The largest residual of each lane, in units of its roundoff floor."""
+    """Largest residual of each lane, in units of its roundoff floor."""
     eps = float(jnp.finfo(evaluation.residual.dtype).eps)
     return largest(evaluation.residual / evaluation.size) / (_FLOOR_EPS * eps)
 
 
 def relative(error):
-    """An error in floors as a part of the residual's terms."""
+    """Convert an error in roundoff floors to one relative to the residual's terms."""
     return error * (_FLOOR_EPS * float(jnp.finfo(error.dtype).eps))
 
 
 def _goes_on(error, merit, merit_before, settled: float):
-    """Whether a lane that came to this error is still to be improved."""
+    """Return whether a lane with this error needs a further update."""
     return (error > settled) | ((error > 1.0) & (merit < 0.5 * merit_before))
 
 
 def _newton(equation, shared, lanes, state: _Iterate, *, most, settled) -> _Iterate:
-    """Try a part of each open lane's step: take it where it stays by the path, else halve it."""
+    """Try a part of each open lane's step: take it where it stays near the path, else halve it."""
     part, merit = state.factor[:, None], state.merit
     x = state.x - part * state.step
     evaluation, matrix = equation.linearise(shared, lanes, x)
@@ -200,15 +208,16 @@ def _newton(equation, shared, lanes, state: _Iterate, *, most, settled) -> _Iter
 
 
 def largest(rows):
-    """The largest entry of each row in magnitude; infinite where one is NaN, which XLA's maximum of
-    a long row passes over on a CPU. NumPy or JAX."""
+    """Largest entry of each row in magnitude; infinite where one is NaN. NumPy or JAX.
+
+    XLA's maximum of a long row ignores NaN on a CPU.
+    """
     size = abs(rows)
     return namespace(rows).where(size == size, size, np.inf).max(axis=-1)
 
 
 def where(chosen, one, other):
-    """Of each lane, the leaves of one where ``chosen`` (B,), else of the other."""
-
+    """Select lanes: the leaves of ``one`` where ``chosen`` (B,), else those of ``other``."""
     xp = namespace(chosen)
     return jax.tree.map(
         lambda a, b: xp.where(chosen.reshape(chosen.shape + (1,) * (a.ndim - 1)), a, b), one, other
@@ -216,7 +225,7 @@ def where(chosen, one, other):
 
 
 def _gathered(newton, shared, lanes, state: _Iterate, few: int) -> _Iterate:
-    """Newton's method on the open lanes alone, ``few`` at a time: the others need not wait."""
+    """Apply Newton's method to the open lanes alone, ``few`` at a time; the others do not wait."""
     count = state.open.shape[0]
     lane = jnp.arange(count)
     given, lanes_of = _packed(lanes, state.x.dtype)
@@ -248,8 +257,10 @@ def _gathered(newton, shared, lanes, state: _Iterate, few: int) -> _Iterate:
 
 
 def _packed(tree: Any, dtype) -> tuple[Any, Callable]:
-    """The leaves (B, ...) of a tree as columns of one array (B, k), and what takes such an array
-    apart again: one gather and one scatter serve all of them."""
+    """Pack the leaves (B, ...) of a tree into one array (B, k); with the function that unpacks it.
+
+    One gather and one scatter then serve all leaves.
+    """
     leaves, structure = jax.tree.flatten(tree)
     columns = [leaf.reshape(leaf.shape[0], -1).astype(dtype) for leaf in leaves]
     ends = np.cumsum([column.shape[1] for column in columns])[:-1]
@@ -266,7 +277,7 @@ def _packed(tree: Any, dtype) -> tuple[Any, Callable]:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 4))
 def root(equation: Equation, shared: Any, lanes: Any, guess: Any, most: int):
-    """As ``iterate``, with derivatives in shared and lanes by the implicit function theorem.
+    """Solve as ``iterate``, with derivatives by the implicit function theorem.
 
     dx = −(∂r/∂x)⁻¹ (∂r/∂θ) dθ, θ = (shared, lanes); the guess has no influence.
     """
@@ -290,11 +301,11 @@ def _root_jvp(equation, most, primals, tangents):
 
 
 def refine(equation: Equation, shared: Any, lanes: Any, guess: Any, updates: int = 6):
-    """Newton updates in NumPy from a guess (B, n) known to be close: (x, aux, error (B,)).
+    """Solve by Newton updates in NumPy from a guess (B, n) known to be close: (x, aux, error (B,)).
 
-    For fits, where the data give the evaluation points: no predictor and no branches, and nothing
-    is compiled. A lane keeps what it has where an update does not make its residual smaller. error:
-    the largest residual relative to the size of its terms.
+    It serves fits, where the data give the evaluation points: there is no predictor and no choice
+    of branches, and nothing is compiled. A lane keeps its iterate where an update does not make the
+    residual smaller. error: the largest residual relative to the size of its terms.
     """
     with np.errstate(all="ignore"):
         state = (guess, *equation.linearise(shared, lanes, guess))
@@ -307,6 +318,6 @@ def refine(equation: Equation, shared: Any, lanes: Any, guess: Any, updates: int
             if better.any():
                 state = where(better, new, state)
             if not (better & (before > _QUADRATIC)).any():
-                break  # what was so small is roundoff now
+                break  # quadratic convergence: small residuals are roundoff now
         x, evaluation, _ = state
         return x, evaluation.aux, np.abs(evaluation.residual / evaluation.size).max(axis=-1)

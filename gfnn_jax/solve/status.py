@@ -1,4 +1,4 @@
-"""How a solve, or a lane of a rollout, ended. Status is data: a bad lane raises nothing."""
+"""Status of a solve or of a lane of a rollout. Status is data: a failed lane raises nothing."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ STATUS_NAMES = (
 
 
 class Info(NamedTuple):
-    """How a solve ended, per lane: status, Newton updates made, and the residual relative to
-    the size of the terms that it is made of; each (B,)."""
+    """Result of a solve, per lane (B,): status, number of updates, relative residual.
+
+    The residual is relative to the size of its terms.
+    """
 
     status: Any
     iterations: Any

@@ -39,14 +39,14 @@ _JSON = "model.json"
 def save_model(folder, arrays: dict[str, Any], description: dict[str, Any]) -> None:
     """Save nested dicts of arrays and a JSON-able description as a model folder.
 
-    What was in ``folder`` is replaced; `outputs.ensure_new` asks first. Raises WorkError if writing
-    fails, and what was there before is then as it was.
+    An existing ``folder`` is replaced; `outputs.ensure_new` checks first. Raises WorkError if
+    writing fails; an existing folder is then unchanged.
     """
     _write(Path(folder), arrays, {"description": description})
 
 
 def load_model(folder) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The arrays (NumPy, the very bits and dtypes that were saved) and the description.
+    """Load the arrays (NumPy, with the bits and dtypes that were saved) and the description.
 
     Raises InputError, in one line, where anything is missing, changed, or of another format, and
     where the arrays are float64 while JAX's x64 mode is off, which would round them.
@@ -62,7 +62,7 @@ def load_model(folder) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 class TrainingCheckpoints:
-    """The last two checkpoints of a training, in ``folder/step_...``.
+    """Store of the last two checkpoints of a training, in ``folder/step_...``.
 
     identity: a JSON-able dict that says which training this is (digests of data and settings);
     `latest` refuses the checkpoints of another one.
@@ -77,10 +77,10 @@ class TrainingCheckpoints:
         self.identity = json.loads(json.dumps(identity))
 
     def save(self, step: int, tree: Any) -> None:
-        """Save the tree as that of ``step``; it and the one before it remain. Raises WorkError."""
+        """Save the tree of ``step``; it and the checkpoint before it remain. Raises WorkError."""
         _write(self._path(step), tree, {"step": int(step), "identity": self.identity})
         before = [old for old in self._steps() if old < step]
-        # Later steps are damaged ones that were passed over, hidden folders what a kill left.
+        # Later steps are damaged ones that were passed over; a kill leaves hidden folders.
         unused = [
             self._path(old) for old in self._steps() if old != step and old not in before[-1:]
         ]
@@ -88,7 +88,7 @@ class TrainingCheckpoints:
             shutil.rmtree(path, ignore_errors=True)
 
     def latest(self, like: Any = None) -> tuple[int, Any] | None:
-        """The newest whole checkpoint as (step, tree), or None.
+        """Load the newest undamaged checkpoint as (step, tree), or None.
 
         Leaves come back bit for bit as they were saved: NumPy as NumPy, JAX as JAX, numbers as
         numbers. ``like`` is a tree of the same structure, shapes and dtypes, needed where the tree
@@ -133,7 +133,7 @@ class TrainingCheckpoints:
 
 
 class Damaged(InputError):
-    """A folder that is incomplete or changed since it was saved."""
+    """Error of a folder that is incomplete or has changed since it was saved."""
 
 
 # ---------------------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
 
 
 def _read(folder: Path, like: Any = None) -> tuple[Any, dict[str, Any]]:
-    """The tree, with NumPy leaves, and what stands in ``model.json``; both verified."""
+    """Read the tree, with NumPy leaves, and the content of ``model.json``; verify both."""
     with failures_as_work_errors(folder):
         restore_interrupted(folder)
     if not folder.is_dir():
@@ -224,7 +224,10 @@ def _orbax():
 
 
 def _verify_files(folder: Path) -> None:
-    """Every file listed in SHA256SUMS is there and unchanged. Files beside them are not ours."""
+    """Verify that every file listed in SHA256SUMS is there and unchanged. Raises Damaged.
+
+    Files that are not listed are ignored.
+    """
     try:
         listed = (folder / _SUMS).read_text(encoding="utf-8").splitlines()
         sums = {name: digest for digest, name in (line.split("  ", 1) for line in listed)}
@@ -242,7 +245,7 @@ def _verify_files(folder: Path) -> None:
 
 
 def _describe(name: str, leaf: Any) -> tuple[dict[str, Any], np.ndarray | None]:
-    """What ``model.json`` says of a leaf, and the array to store."""
+    """Make the entry of a leaf in ``model.json``, and the array to store or None."""
     if isinstance(leaf, (bool, int, float)) and not isinstance(leaf, np.generic):
         return {"name": name, "kind": "number", "value": leaf}, None
     if isinstance(leaf, jax.Array) and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key):
@@ -278,12 +281,12 @@ def _restored(folder: Path, entry: dict[str, Any], stored: dict[str, Any]) -> An
 
 
 def _would_be_rounded(leaf: Any) -> bool:
-    """Whether JAX, as configured, would make another dtype of this array."""
+    """Return whether JAX, as configured, would change the dtype of this array."""
     return isinstance(leaf, np.ndarray) and jax.dtypes.canonicalize_dtype(leaf.dtype) != leaf.dtype
 
 
 def _structure(tree: Any, numbers) -> Any:
-    """The tree in JSON, a leaf by its number; a node that JSON cannot name as {"node": type}."""
+    """Write the tree as JSON, each leaf as its number, a registered node as {"node": type}."""
     if tree is None:
         return None
     if type(tree) is dict and all(type(key) is str for key in tree):
@@ -304,7 +307,9 @@ def _rebuild(folder: Path, structure: Any, leaves: list[Any]) -> Any:
         return leaves[structure]
     ((kind, content),) = structure.items()
     if kind == "node":
-        raise InputError(f"{folder}: holds a {content}: pass a tree like it")
+        raise InputError(
+            f"{folder}: holds a {content}, which JSON cannot describe: pass a tree like it"
+        )
     if kind == "dict":
         return {key: _rebuild(folder, item, leaves) for key, item in content.items()}
     items = [_rebuild(folder, item, leaves) for item in content]
@@ -312,7 +317,8 @@ def _rebuild(folder: Path, structure: Any, leaves: list[Any]) -> Any:
 
 
 def _as_like(folder: Path, like: Any, entries: list[dict[str, Any]], leaves: list[Any]) -> Any:
-    """The leaves in the structure of ``like``, if names, shapes and dtypes are the same."""
+    """Put the leaves into the structure of ``like``. Raises InputError where they differ in name,
+    shape or dtype."""
     named, structure = jax.tree_util.tree_flatten_with_path(like)
     expected = [
         _describe(jax.tree_util.keystr(path, simple=True, separator="/"), leaf)[0]

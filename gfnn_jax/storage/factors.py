@@ -1,4 +1,4 @@
-"""Triangular factors of an unfinished fit, kept so that it need not be computed twice."""
+"""Triangular factors of an unfinished fit, kept so that they need not be computed twice."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ FACTORS = "factors"
 
 
 class KeptFactors:
-    """Pairs of factors by name, in ``folder/factors``. A damaged one counts as none."""
+    """Store of pairs of factors by name, in ``folder/factors``. A damaged one counts as missing."""
 
     def __init__(self, folder):
         self.folder = Path(folder) / FACTORS
 
     def load(self, name: str) -> dict[str, np.ndarray] | None:
-        """The arrays that were saved under this name, or None."""
+        """Load the arrays that were saved under this name; None where there are none."""
         try:
             with np.load(self._path(name), allow_pickle=False) as stored:
                 return dict(stored)
@@ -27,7 +27,7 @@ class KeptFactors:
             return None
 
     def save(self, name: str, **arrays) -> None:
-        """Keep these arrays under this name. Raises WorkError."""
+        """Save these arrays under this name. Raises WorkError."""
         with atomic_file(self._path(name)) as stream:
             np.savez(stream, **arrays)
 

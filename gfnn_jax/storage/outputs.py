@@ -15,8 +15,8 @@ from typing import Any
 
 from gfnn_jax.errors import InputError, WorkError
 
-# What marks a folder as written by this package, and what else is in such a folder: --overwrite
-# deletes no other folder, and none that holds something else, such as data.
+# Files that mark a folder as written by this package, and the other contents of such a folder.
+# --overwrite deletes no other folder, and none that holds something else, such as data.
 FOLDER_MARKS = ("model.json", "report.json")
 _OURS = (*FOLDER_MARKS, "SHA256SUMS", "arrays", "model", "*.png")
 
@@ -24,9 +24,10 @@ _OURS = (*FOLDER_MARKS, "SHA256SUMS", "arrays", "model", "*.png")
 def ensure_new(path, overwrite: bool = False, *, folder: bool = False) -> Path:
     """Check, before any work, that the file or folder ``path`` can be written. Writes nothing.
 
-    Raises InputError where it exists and ``overwrite`` is off, where it is of the other kind, where
-    it is a folder that this package did not write or that holds anything else, where it is the
-    current folder or one above it, or where its parent cannot be written.
+    Raises InputError where ``path`` exists and ``overwrite`` is off, where it is a folder instead
+    of a file or the reverse, where it is a folder that this package did not write or that holds
+    anything else, where it is the current folder or one above it, or where its parent cannot be
+    written.
     """
     path = Path(path)
     try:
@@ -36,7 +37,7 @@ def ensure_new(path, overwrite: bool = False, *, folder: bool = False) -> Path:
             raise InputError(f"{path}: is a file, expected a folder to write")
         if folder and path.resolve() in (here := Path.cwd(), *here.parents):
             raise InputError(
-                f"{path}: is the folder you are in, or one above it: expected another to write"
+                f"{path}: is the current folder or one above it; name another folder to write"
             )
         if path.exists() and not (folder and not any(path.iterdir())):
             if not overwrite:
@@ -68,7 +69,7 @@ def ensure_new(path, overwrite: bool = False, *, folder: bool = False) -> Path:
 
 @contextlib.contextmanager
 def failures_as_work_errors(path) -> Iterator[None]:
-    """An OSError while writing ``path`` (a full disk), as a WorkError of one line."""
+    """Turn an OSError while writing ``path``, such as a full disk, into a WorkError of one line."""
     try:
         yield
     except OSError as error:
@@ -77,8 +78,10 @@ def failures_as_work_errors(path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """SIGINT and SIGTERM wait until the block ends. Elsewhere than in the main thread, where no
-    signal comes, nothing is done."""
+    """Delay SIGINT and SIGTERM until the block ends.
+
+    Nothing is done outside the main thread, where no signal arrives.
+    """
     waiting: list[int] = []
     try:
         before = {
@@ -99,7 +102,7 @@ def uninterrupted() -> Iterator[None]:
 
 @contextlib.contextmanager
 def atomic_file(path) -> Iterator[Any]:
-    """A binary stream; ``path`` appears whole when the block ends, and not at all if it fails."""
+    """Open a binary stream. ``path`` appears whole when the block ends, not at all if it fails."""
     path = Path(path)
     beside = path.with_name(f".{path.name}.part")
     with failures_as_work_errors(path):
@@ -123,10 +126,10 @@ def atomic_write(path, content: str | bytes) -> None:
 
 @contextlib.contextmanager
 def atomic_folder(path) -> Iterator[Path]:
-    """A new folder to fill; it takes the place of ``path`` when the block ends without failing.
+    """Open a new folder to fill; it replaces ``path`` when the block ends without failing.
 
-    A folder cannot be exchanged for another in one step: the old one stands as ``.NAME.old`` for
-    an instant, and `restore_interrupted` brings it back if that instant was the last.
+    A folder cannot be exchanged for another in one step. The old one is ``.NAME.old`` for an
+    instant; `restore_interrupted` brings it back if the process was killed in that instant.
     """
     path = Path(path)
     beside = path.absolute().with_name(f".{path.name}.part")
@@ -141,7 +144,7 @@ def atomic_folder(path) -> Iterator[Path]:
                 if file.is_file():
                     with open(file, "rb") as stream:
                         os.fsync(stream.fileno())
-            with uninterrupted():  # or the old folder would be away, and the new one not there
+            with uninterrupted():  # between the two renames there is neither folder
                 if path.exists():
                     os.rename(path, old)
                 os.rename(beside, path)

@@ -1,7 +1,7 @@
-"""``OUT.partial``: what an unfinished job has kept, until its output is there.
+"""Folder ``OUT.partial``, in which an unfinished job keeps its work until its output is there.
 
-The folder holds ``job.json``, what was asked for, and beside it whatever the job writes. Only the
-same job goes on with it.
+The folder holds ``job.json``, the request, and whatever the job writes. Only the same job can
+resume from it.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ JOB = "job.json"
 def unfinished(
     out: Path, job: dict[str, Any], *, what: str, overwrite: bool, resume: bool
 ) -> Iterator[Path]:
-    """The folder ``OUT.partial`` of a job that writes the folder ``out``.
+    """Open the folder ``OUT.partial`` of a job that writes the folder ``out``.
 
-    job: JSON-able, says which job it is. what: its name in messages, "fit" say. When the block ends
-    the folder is removed; when the block fails it is left if the job has kept anything in it, and
-    an interrupt (KeyboardInterrupt) is given a note that says what was kept.
+    job: JSON-able, identifies the job. what: its name in messages, "fit" for example. The folder is
+    removed when the block ends. When the block fails, the folder stays if the job has kept anything
+    in it, and a KeyboardInterrupt gets a note that names what was kept.
 
-    Raises InputError where ``out`` is in the way, where an unfinished job is there and neither
-    ``resume`` nor ``overwrite`` is set, and where ``resume`` meets another job.
+    Raises InputError where ``out`` exists and may not be replaced, where an unfinished job is there
+    and neither ``resume`` nor ``overwrite`` is set, and where ``resume`` meets another job.
     """
     folder = _beside(out)
     # What an interrupted job has left in ``out`` may be replaced by the same job.
@@ -45,7 +45,7 @@ def unfinished(
         try:
             yield folder
         except BaseException as error:
-            told = told_of(out)
+            told = unfinished_note(out)
             if told is None:
                 _discard(folder)
             if isinstance(error, KeyboardInterrupt):
@@ -56,8 +56,10 @@ def unfinished(
 
 @contextlib.contextmanager
 def _claimed(out: Path, what: str) -> Iterator[None]:
-    """``OUT.lock`` held by this process, where the system has such locks; a killed process lets go
-    of it. Raises InputError where another process holds it."""
+    """Hold ``OUT.lock`` by this process, where the system has file locks.
+
+    A killed process releases it. Raises InputError where another process holds it.
+    """
     try:
         import fcntl
     except ImportError:
@@ -82,15 +84,15 @@ def _claimed(out: Path, what: str) -> Iterator[None]:
 
 
 def kept(folder: Path) -> list[str]:
-    """Names, without suffix, of what a job has kept in its folder beside ``job.json``."""
+    """Names, without suffix, of the files that a job has kept in its folder beside ``job.json``."""
     if not folder.exists():
         return []
     names = (path.name for path in folder.iterdir())
     return sorted({Path(n).stem for n in names if n != JOB and not n.startswith(".")})
 
 
-def told_of(out: Path) -> str | None:
-    """What is to be said of an unfinished job of ``out``; None where it has kept nothing."""
+def unfinished_note(out: Path) -> str | None:
+    """Message about the unfinished job of ``out``; None where it has kept nothing."""
     folder = _beside(out)
     if not ((folder / JOB).is_file() and (found := kept(folder))):
         return None
@@ -105,14 +107,14 @@ def _make_way(folder: Path, job, what: str, *, overwrite: bool, resume: bool) ->
     if not folder.exists():
         return
     if not (folder / JOB).is_file():
-        raise InputError(f"{folder}: is in the way, and is no unfinished {what}")
+        raise InputError(f"{folder}: exists and is no unfinished {what}; move or delete it")
     if not kept(folder):  # killed before it had kept anything
         return
     if not resume:
         if not overwrite:
             raise InputError(
-                f"{folder}: an unfinished {what} (--resume goes on with it, --overwrite discards "
-                "it)"
+                f"{folder}: holds an unfinished {what} (--resume continues it, --overwrite "
+                "discards it)"
             )
         return _discard(folder)
     try:
@@ -122,7 +124,8 @@ def _make_way(folder: Path, job, what: str, *, overwrite: bool, resume: bool) ->
     other = [key for key in {**found, **job} if found.get(key) != job.get(key)]
     if other:
         raise InputError(
-            f"{folder}: of another {what}: {', '.join(other)} differ (--overwrite discards it)"
+            f"{folder}: belongs to another {what}: {', '.join(other)} differ (--overwrite discards "
+            "it)"
         )
 
 

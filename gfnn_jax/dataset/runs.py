@@ -1,0 +1,133 @@
+"""Runs: which pairs follow one another, known once and kept to the end of a fit.
+
+A run is a trajectory that was measured; the place of a pair is the number of its state along the
+run. Two pairs of a run whose places differ by one share a state, and its noise.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.phase_space import Pairs
+
+_BRIDGED = 10  # pairs of a run, left out one after another, beyond which it does not go on
+_TOGETHER = 50  # pairs of a run that are looked at or left out as one
+
+
+class Identified(NamedTuple):
+    """Pairs in the order of their runs, with ``run`` as numbers from 0 on and ``place``; and the
+    user's row (N,) of each."""
+
+    pairs: Pairs
+    row: np.ndarray
+
+
+def identified(pairs: Pairs) -> Identified:
+    """The pairs with their runs and places.
+
+    Pairs with a run are sorted by run and place, so that the order of a user's rows does not
+    matter. Without places, the pairs of a run follow one another where the image of one is the
+    state of the other. Pairs without a run stay in their order, and a run lasts as long as the
+    image of a pair is the state of the next.
+    """
+    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
+    row = np.arange(len(pairs))
+    if pairs.run is None:
+        begins = np.ones(len(pairs), bool)
+        begins[1:] = np.any(z1[:-1] != z0[1:], axis=1)
+        run = np.cumsum(begins) - 1
+        return Identified(_numbered(pairs, run, row - np.flatnonzero(begins)[run]), row)
+    run = np.unique(np.asarray(pairs.run), return_inverse=True)[1].reshape(-1)
+    if pairs.place is not None:
+        place = np.asarray(pairs.place)
+        row = np.lexsort((place, run))
+        return Identified(_numbered(pairs.take(row), run[row], place[row]), row)
+    chain, along = _chains(run, z0, z1)
+    row = np.lexsort((along, chain))
+    # Chains of one run are farther apart than what is bridged.
+    place = along[row] + chain[row] * (len(pairs) + _BRIDGED)
+    return Identified(_numbered(pairs.take(row), run[row], place), row)
+
+
+def _numbered(pairs: Pairs, run: np.ndarray, place: np.ndarray) -> Pairs:
+    """The pairs with these runs and places."""
+    return Pairs(
+        pairs.z0, pairs.z1, pairs.dt, pairs.args, period=pairs.period, run=run, place=place,
+        std=pairs.std,
+    )  # fmt: skip
+
+
+def _chains(run: np.ndarray, z0: np.ndarray, z1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The number of the chain that each pair is of (N,), by rising run and first state, and its
+    place in the chain (N,).
+
+    The next of a pair is the one pair of its run whose state is its image; where several are, none.
+    """
+    count = len(run)
+    states = np.column_stack([np.tile(run, 2), np.concatenate([z0, z1])])
+    name = np.unique(states, axis=0, return_inverse=True)[1].reshape(-1)
+    of_state, of_image = name[:count], name[count:]
+    pair_of = np.full(name.max() + 1, -1)
+    pair_of[of_state] = np.arange(count)
+    pair_of[np.bincount(of_state, minlength=len(pair_of)) != 1] = -1
+    after = pair_of[of_image]
+    entered = np.bincount(after[after >= 0], minlength=count)
+    after = np.where((after >= 0) & (entered[after] == 1), after, -1)
+    first = np.ones(count, bool)
+    first[after[after >= 0]] = False
+    chain, along, number = np.full(count, -1), np.zeros(count, int), 0
+    # Closed chains, a periodic orbit's, have no first pair: they begin at their smallest state.
+    for start in np.argsort(of_state + name.max() * ~first, kind="stable"):
+        place, pair = 0, int(start)
+        while pair >= 0 and chain[pair] < 0:
+            chain[pair], along[pair] = number, place
+            place, pair = place + 1, int(after[pair])
+        number += place > 0
+    starts = of_state[along == 0][np.argsort(chain[along == 0])]
+    return np.argsort(np.argsort(starts, kind="stable"))[chain], along
+
+
+def steps_between(pairs: Pairs) -> np.ndarray:
+    """(N − 1,) steps from the state of each pair to that of the next row: 1 where its image is the
+    next one's state, more where pairs between them were left out, 0 where the next row is of
+    another run, or far along it; none where pairs have no run."""
+    if pairs.run is None:
+        return np.zeros(max(0, len(pairs) - 1), int)
+    steps = np.diff(pairs.place)
+    same = (np.diff(pairs.run) == 0) & (steps > 0) & (steps <= 1 + _BRIDGED)
+    return np.where(same, steps, 0)
+
+
+def next_of(pairs: Pairs, rows: np.ndarray) -> np.ndarray:
+    """(n − 1,) whether the image of each of these rows (n,) is the state of the one after it; none
+    where pairs have no run."""
+    if pairs.run is None:
+        return np.zeros(max(0, len(rows) - 1), bool)
+    run, place = np.asarray(pairs.run)[rows], np.asarray(pairs.place)[rows]
+    return (np.diff(run) == 0) & (np.diff(place) == 1)
+
+
+def looked_at(pairs: Pairs, rows: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """About ``most`` of these rows, as places among them (n,), the rows there in rising order; and
+    (n − 1,) whether the image of one is the state of the next.
+
+    Drawn at random, of runs by blocks of consecutive pairs.
+    """
+    places = np.argsort(rows)
+    if len(rows) > most:
+        together = _TOGETHER if next_of(pairs, rows[places]).any() else 1
+        block = np.arange(len(rows)) // together
+        drawn = np.random.default_rng(0).permutation(block[-1] + 1)[: -(-most // together)]
+        places = places[np.isin(block, drawn)]
+    return places, next_of(pairs, rows[places])
+
+
+def first_occurrences(pairs: Pairs) -> np.ndarray:
+    """The rows where a pair stands for the first time: held-out copies of training pairs would
+    judge nothing."""
+    given = [] if not np.ndim(pairs.dt) else [pairs.dt]
+    given += [np.asarray(values) for values in (pairs.args or {}).values()]
+    rows = np.column_stack([np.asarray(pairs.z0), np.asarray(pairs.z1), *given])
+    return np.sort(np.unique(rows, axis=0, return_index=True)[1])

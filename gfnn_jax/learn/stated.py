@@ -1,0 +1,119 @@
+"""The error that a fit states: that of the chosen map, on pairs that chose nothing.
+
+The test pairs are looked at here for the first time, after everything is chosen, and once. Where
+the pairs were too few to keep some apart, the chosen model is fitted anew without each fifth
+of the blocks in turn, and errs on that fifth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.coordinates import to_user
+from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.flows.collocation import Steps
+from gfnn_jax.learn.assemble import stepped
+from gfnn_jax.learn.candidates import Candidate, with_error
+from gfnn_jax.learn.choose import Chosen
+from gfnn_jax.learn.network_sweep import NetworkSweep
+from gfnn_jax.learn.search import Entry
+from gfnn_jax.learn.searches import Searched
+
+_FOLDS = 5
+
+# rows that are left out -> images (n, 2d) of them in the user's coordinates, NaN where a step fails
+Predicts = Callable[[np.ndarray], np.ndarray]
+
+
+class Stated(NamedTuple):
+    """The candidate with the error that is stated. by: "test", pairs that chose nothing;
+    "cross-validation"; or "validation", pairs that chose too, where the model is neither a linear
+    S nor an H. pairs, blocks: how many it is measured by."""
+
+    candidate: Candidate
+    by: str
+    pairs: int
+    blocks: int
+
+    @property
+    def words(self) -> str:
+        """What the error was measured by, as text."""
+        count = f"{self.pairs:,} pairs"
+        if self.blocks < self.pairs:
+            count += f" of {self.blocks:,} independent stretches"
+        if self.by == "test":
+            return f"{count} that took no part in the fit or its choices"
+        if self.by == "cross-validation":
+            return f"{count}, each predicted by a fit without its fifth (cross-validation)"
+        return f"{count} that also chose the model"
+
+
+def stated(chosen: Chosen, found: Searched) -> Stated:
+    """The chosen candidate with its error on the test pairs, or by cross-validation."""
+    judges, candidate = found.judges, chosen.candidate
+    block = np.arange(len(judges.pairs)) if judges.stretch is None else judges.stretch
+    if len(judges.test):
+        rows, by = judges.test, "test"
+        images = _images_of(candidate, judges.pairs.take(rows))
+    else:
+        by, predicts = "cross-validation", _predictor(chosen, found)
+        rows = np.concatenate([judges.training, judges.held_out])
+        if predicts is None:
+            return Stated(
+                candidate, "validation", len(judges.held_out), _count(block, judges.held_out)
+            )
+        folds = np.array_split(np.unique(block[rows]), min(_FOLDS, _count(block, rows)))
+        out = [rows[np.isin(block[rows], fold)] for fold in folds]
+        rows, images = np.concatenate(out), np.concatenate([predicts(part) for part in out])
+    error = judges.error_of(images, candidate.map.coordinates, rows)
+    return Stated(with_error(candidate, error), by, len(rows), _count(block, rows))
+
+
+def _count(block: np.ndarray, rows: np.ndarray) -> int:
+    return len(np.unique(block[rows]))
+
+
+def _images_of(candidate: Candidate, pairs) -> np.ndarray:
+    """By the steps that users run."""
+    steps = stepped(candidate.map, np.asarray(pairs.z0), pairs.dt, pairs.args, timed=False)
+    return np.where(steps.failed[:, None], np.nan, steps.images)
+
+
+def _predictor(chosen: Chosen, found: Searched) -> Predicts | None:
+    """Fits the chosen model to all pairs but some, and predicts these; None where that is not
+    known how."""
+    entry, law = chosen.entry, found.law
+    if entry is not None:
+        return _of_entry(entry) if entry.sweep.judges.pairs is found.judges.pairs else None
+    flow = law is not None and chosen.candidate.learns == "hamiltonian" and law.terms
+    return _of_law(found) if flow else None
+
+
+def _of_entry(entry: Entry) -> Predicts | None:
+    sweep = entry.sweep
+    if isinstance(sweep, NetworkSweep):  # each would be trained as long as the first
+        return None
+    everyone = np.concatenate([sweep.judges.training, sweep.judges.held_out])
+    return lambda rows: sweep.predicted(entry.size, np.setdiff1d(everyone, rows), rows)
+
+
+def _of_law(found: Searched) -> Predicts:
+    prepared, law = found.plain, found.law
+    assert law is not None
+    flow = law.flow
+    problem = Problem(
+        prepared.y0, prepared.y1, prepared.each_dt, prepared.scale, args=prepared.args
+    )
+    steps = Steps(flow.stages, flow.over(np.max(prepared.each_dt)).substeps)
+    coefficients = np.asarray(flow.params)
+
+    def predicts(rows: np.ndarray) -> np.ndarray:
+        others = np.setdiff1d(np.arange(len(prepared.y0)), rows)
+        fit = problem.fit(flow.family, coefficients, others, rounds=False, steps=steps)
+        images = problem.images(flow.family, fit.coefficients, rows, steps)
+        return to_user(prepared.coordinates, images.states)
+
+    return predicts

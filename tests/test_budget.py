@@ -1,0 +1,251 @@
+"""Budgets: decisions that count operations, and a clock that only says how many fit."""
+
+import itertools
+
+import jax
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax.errors import OutOfTime
+from gfnn_jax.learn.clock import COMPILE, ROWS, Budget
+
+QUIETLY = pytest.mark.filterwarnings("ignore::gfnn_jax.FitWarning")
+LARGE = 10**10  # operations whose time tells the rate of their kind: a second, by default
+
+
+class Hand:
+    """A clock that stands still until it is moved."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def moved(budget, hand, operations, seconds, name="a size"):
+    """A unit of so many operations that takes so many seconds."""
+    with budget.unit(name, ROWS, operations):
+        hand.now += seconds
+
+
+# The budget by itself.
+
+
+def test_without_a_budget_every_unit_fits_whatever_the_clock():
+    hand = Hand()
+    budget = Budget(clock=hand)
+    for _ in range(3):
+        moved(budget, hand, LARGE, 1e9)
+    assert not budget.over
+    assert budget.operations == 3 * LARGE
+
+
+def test_a_unit_that_does_not_fit_is_not_begun_nor_anything_smaller_in_its_stead():
+    hand = Hand()
+    budget = Budget(max_seconds=10.0, clock=hand)
+    moved(budget, hand, LARGE, 2.0, "degree 3")
+    with pytest.raises(OutOfTime):
+        moved(budget, hand, 5 * LARGE, 0.0, "degree 4")  # of 10 s, at 2 s each
+    assert budget.ended == (
+        "the clock ended it: the budget of 10 s is spent after unit 1, degree 3: degree 4 and what "
+        "follows would take about 10 s, and 8 s are left"
+    )
+    with pytest.raises(OutOfTime):
+        moved(budget, hand, 1, 0.0)
+    assert budget.operations == LARGE
+
+
+def test_time_is_foretold_by_units_of_the_same_kind():
+    """By default a unit of 1e10 operations takes a second; this process takes 100 times as long."""
+    fast, slow = Hand(), Hand()
+    for hand, seconds, fits in ((fast, 1.0, True), (slow, 100.0, False)):
+        budget = Budget(max_seconds=150.0, clock=hand)
+        moved(budget, hand, LARGE, seconds)
+        if fits:
+            moved(budget, hand, LARGE, seconds)
+        else:
+            with pytest.raises(OutOfTime):
+                moved(budget, hand, LARGE, seconds)
+        assert budget.operations == LARGE * (2 if fits else 1)
+
+
+def test_what_must_follow_the_last_unit_is_reserved():
+    hand = Hand()
+    budget = Budget(max_seconds=10.0, clock=hand)
+    with pytest.raises(OutOfTime), budget.unit("a size", ROWS, LARGE, then=(ROWS, 9.5 * LARGE)):
+        pass
+    compiling = Budget(max_seconds=20.0, clock=hand, dim=3)
+    with pytest.raises(OutOfTime), compiling.unit("a size", ROWS, 17 * LARGE):
+        pass  # of 20 s a fifth is for compiling, which would take 9 s
+
+
+def test_the_number_of_operations_gives_the_same_units_again():
+    """A clock ends the search somewhere; its count of operations ends it there without a clock."""
+    work = [3 * LARGE, LARGE, 7 * LARGE, 2 * LARGE, LARGE]
+
+    def done(**options):
+        hand = Hand()
+        budget = Budget(clock=hand, **options)
+        try:
+            for number, operations in enumerate(work):
+                moved(budget, hand, operations, operations / 1e9, f"size {number}")
+        except OutOfTime:
+            pass
+        return budget
+
+    for seconds in (35.0, 45.0, 115.0, 135.0, 1e4):
+        first = done(max_seconds=seconds)
+        again = done(max_operations=first.operations)
+        assert again.operations == first.operations
+        assert again._last == first._last
+
+
+def test_what_follows_the_search_takes_the_place_of_no_unit():
+    hand = Hand()
+    first = Budget(max_seconds=10.0, clock=hand)
+    moved(first, hand, LARGE, 1.0)
+    with pytest.raises(OutOfTime):
+        moved(first, hand, 20 * LARGE, 0.0)
+    with first.last("the compiled step", COMPILE, 5.0, decides=True):
+        hand.now += 5.0
+    with pytest.raises(OutOfTime), first.last("its derivative", COMPILE, 7.0):
+        pass
+    with pytest.raises(OutOfTime), first.last("a figure", COMPILE, 1.0):
+        pass
+    assert first.left_out == [
+        f"left out: {what}: it does not fit into what is left of the budget"
+        for what in ("its derivative", "a figure")
+    ]
+    again = Budget(max_operations=first.operations)
+    with again.unit("the same", ROWS, LARGE):
+        pass
+    with pytest.raises(OutOfTime), again.unit("the next", ROWS, 2):
+        pass
+    with again.last("the compiled step", COMPILE, 5.0, decides=True):
+        pass
+    with pytest.raises(OutOfTime), again.last("that of the next", COMPILE, 5.0, decides=True):
+        pass
+    with again.last("its derivative", COMPILE, 7.0):  # changes nothing that is chosen
+        pass
+
+
+def test_a_unit_that_takes_longer_than_foretold_leaves_nothing_behind():
+    hand = Hand()
+    budget = Budget(max_seconds=10.0, clock=hand)
+
+    def slow_unit():
+        with budget.unit("a size", ROWS, LARGE):
+            budget.check()
+            hand.now += 11.0
+            budget.check()
+
+    with pytest.raises(OutOfTime):
+        slow_unit()
+    assert budget.operations == 0
+    assert budget.over
+
+
+# Fits.
+
+
+def kepler(num_pairs=300):
+    """Cartesian pairs of two bodies: no H of few terms, and an S of many."""
+    scene = gfnn.scenes.two_body()
+    pairs = gfnn.sample_pairs(scene, num_pairs, jax.random.key(0))
+    return gfnn.Pairs(np.asarray(pairs.z0), np.asarray(pairs.z1), pairs.dt)
+
+
+def leaves(fit):
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(fit.map)]
+
+
+def same_bits(one, other):
+    assert one.chosen.label == other.chosen.label
+    for a, b in zip(leaves(one), leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+class Jumping:
+    """A clock that jumps by up to a thousand seconds whenever it is looked at."""
+
+    def __init__(self, seed):
+        self._random, self._now = np.random.default_rng(seed), 0.0
+
+    def __call__(self):
+        self._now += self._random.uniform(0, 1_000)
+        return self._now
+
+
+@QUIETLY
+@pytest.mark.parametrize("options", [{}, {"learn": "map"}, {"learn": "hamiltonian"}])
+def test_without_a_budget_no_decision_looks_at_the_clock(options):
+    pairs = kepler()
+    options = {"tolerance": 1e-4, "max_seconds": None, **options}
+    if options.get("learn") == "hamiltonian":
+        options["terms"] = ["p1**2 + p2**2", "1/sqrt(q1**2 + q2**2)"]
+    one, other = (gfnn.fit(pairs, clock=Jumping(seed), **options) for seed in (1, 2))
+    same_bits(one, other)
+    assert (one.ended, one.operations) == (other.ended, other.operations)
+
+
+@QUIETLY
+@pytest.mark.parametrize("learn", ["map", "auto"])
+def test_a_faster_clock_ends_at_an_earlier_unit_which_operations_reproduce(learn):
+    """A clock that ticks at every look at it: so many looks fit, whatever the machine does."""
+    pairs, found = kepler(), []
+    for tick in (1e-3, 4.0, 12.0, 1e4):
+        looks = itertools.count()
+        fit = gfnn.fit(
+            pairs, tolerance=1e-9, learn=learn, max_seconds=100.0,
+            clock=lambda looks=looks, tick=tick: tick * next(looks),
+        )  # fmt: skip
+        found.append(fit)
+        again = gfnn.fit(
+            pairs, tolerance=1e-9, learn=learn, max_seconds=None, max_operations=fit.operations
+        )
+        same_bits(fit, again)
+        assert again.operations == fit.operations
+        assert ("the clock ended it" in fit.ended) == (tick > 1)
+    operations = [fit.operations for fit in found]
+    assert operations == sorted(operations, reverse=True)
+    assert len(set(operations)) == len(operations)
+
+
+@QUIETLY
+def test_a_fit_leaves_some_map_whatever_its_budget():
+    pairs = kepler()
+    for options in ({}, {"learn": "hamiltonian"}, {"learn": "map"}):
+        fit = gfnn.fit(pairs, max_seconds=1e-6, **options)
+        assert fit.chosen.family == "linear"
+        states, _ = fit.map.rollout(np.asarray(pairs.z0[:5]), 3)
+        assert np.isfinite(np.asarray(states)).all()
+        assert fit.symplecticity_defect < 1e-12
+        assert "the clock ended it" in fit.ended
+        moved = np.asarray(pairs.z1) - np.asarray(pairs.z0)
+        assert fit.chosen.validation_rms < 0.5 * np.sqrt(np.mean(moved**2))
+
+
+@QUIETLY
+def test_the_words_of_a_search_that_was_cut_off():
+    fit = gfnn.fit(kepler(), learn="hamiltonian", tolerance=1e-9, max_seconds=None,
+                   max_operations=4 * 10**8)  # fmt: skip
+    said = " ".join([*fit.messages, fit.ended])
+    assert "promised" not in said
+    assert "operations is spent after unit" in said
+
+
+@QUIETLY
+def test_the_posterior_is_computed_when_it_is_asked_for():
+    fit = gfnn.fit(kepler(), learn="map", tolerance=1e-4, max_seconds=None)
+    assert not fit.map.posterior.known
+    assert not fit.map.reversed().posterior.known
+    fit.sample(jax.random.key(0), 2)
+    assert fit.map.posterior.known
+
+
+def test_a_bound_that_is_no_number_of_operations_is_refused():
+    for wrong in (-1, 1.5, "1e9"):
+        with pytest.raises(gfnn.FitError, match="whole number of operations"):
+            gfnn.fit(kepler(30), max_operations=wrong)

@@ -1,0 +1,254 @@
+"""Runs keep their identity from the file to the report; who trains, who chooses, who states."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax.data.files import read_trajectories
+from gfnn_jax.data.sample import read_sample
+from gfnn_jax.dataset.bounds import bound_of_mean
+from gfnn_jax.dataset.runs import identified, next_of, steps_between
+from gfnn_jax.dataset.split import correlation_time, split_rows
+from gfnn_jax.processes import Group
+
+# Runs
+
+
+def walks(*lengths):
+    rng = np.random.default_rng(0)
+    return [rng.normal(size=(length + 1, 2)) for length in lengths]
+
+
+def in_rows(sequences, **more):
+    """Pairs of consecutive states of each sequence (L, 2d), one sequence after the other."""
+    z0, z1 = (np.concatenate([s[part] for s in sequences]) for part in (slice(-1), slice(1, None)))
+    return gfnn.Pairs(z0, z1, 0.4, **more)
+
+
+LENGTHS = (7, 1, 12, 3)
+LABELS = np.repeat(["d", "b", "a", "c"], LENGTHS)
+PLACES = np.concatenate([np.arange(length) for length in LENGTHS])
+
+
+@pytest.mark.parametrize("given", [{"run": LABELS}, {"run": LABELS, "place": PLACES}])
+def test_the_order_of_rows_that_have_a_run_does_not_matter(given):
+    pairs = in_rows(walks(*LENGTHS), **given)
+    order = np.random.default_rng(1).permutation(len(pairs))
+    found, row = identified(pairs)
+    again, moved = identified(pairs.take(order))
+    for name in ("z0", "z1", "run", "place"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
+    np.testing.assert_array_equal(order[moved], row)
+    np.testing.assert_array_equal(found.z0, pairs.z0[row])
+    # Runs in the order of their labels, each a row after the other.
+    assert np.array(["a", "b", "c", "d"])[found.run].tolist() == sorted(LABELS)
+    assert steps_between(found).sum() == len(pairs) - len(LENGTHS)
+
+
+def test_runs_without_a_label_are_those_of_rows_that_go_on():
+    found = identified(in_rows(walks(3, 1, 2))).pairs
+    assert found.run.tolist() == [0, 0, 0, 1, 2, 2]
+    assert found.place.tolist() == [0, 1, 2, 0, 0, 1]
+    few = found.take(np.array([0, 2, 3, 5]))
+    assert steps_between(few).tolist() == [2, 0, 0]
+    assert next_of(found, np.array([0, 1, 3, 5])).tolist() == [True, False, False]
+
+
+def test_a_periodic_orbit_is_a_chain_too():
+    corners = np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]])
+    pairs = gfnn.Pairs(corners, np.roll(corners, -1, axis=0), 1.0, run=np.zeros(4, int))
+    found, row = identified(pairs)
+    assert found.place.tolist() == [0, 1, 2, 3]
+    assert row.tolist() == [2, 3, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"run": np.zeros(3)}, r"expected run as numbers or text of shape \(23,\), got float64"),
+        ({"place": PLACES}, "expected run as well as place"),
+        ({"run": LABELS, "place": PLACES + 0.5}, "expected place as integers"),
+        ({"std": [1e-3]}, r"expected std of shape \(2,\), one of each coordinate, got \(1,\)"),
+        ({"std": [1e-3, 0.0]}, "expected every std finite and above 0"),
+    ],
+)
+def test_identities_and_noise_that_are_none(given, message):
+    with pytest.raises(gfnn.FitError, match=message):
+        in_rows(walks(*LENGTHS), **given)
+
+
+def test_a_permuted_fit_is_the_same_fit():
+    rng = np.random.default_rng(0)
+    states = np.zeros((20, 12, 2))
+    states[:, 0] = rng.uniform(-1, 1, (20, 2))
+    for k in range(11):  # a kicked rotor, and noise
+        p = states[:, k, 1] - 0.4 * np.sin(states[:, k, 0])
+        states[:, k + 1] = np.stack([states[:, k, 0] + 0.4 * p, p], axis=1)
+    states += 1e-4 * rng.normal(size=states.shape)
+    pairs = in_rows(states, run=np.repeat(np.arange(20), 11))
+    order = rng.permutation(len(pairs))
+    maps = [gfnn.fit(p, tolerance=1e-2, learn="map").map for p in (pairs, pairs.take(order))]
+    z = rng.uniform(-1, 1, (20, 2))
+    images = [np.asarray(m.step(z)[0]) for m in maps]
+    np.testing.assert_array_equal(*images)
+
+
+# Samples of large files
+
+
+def continued(sample):
+    """Number of rows of the sample whose image is the next row's state."""
+    return int(np.sum(steps_between(identified(sample.pairs()).pairs) == 1))
+
+
+@pytest.mark.parametrize("kind", ["trajectories", "pairs", "table"])
+@pytest.mark.parametrize("group", [None, Group()])
+def test_a_sample_keeps_whole_arcs(tmp_path, kind, group):
+    states = np.random.default_rng(0).normal(size=(1_000, 2))
+    path = tmp_path / ("z.csv" if kind == "table" else "z.npz")
+    if kind == "trajectories":
+        np.savez(path, trajectories=states[None], dt=0.1)
+    elif kind == "pairs":
+        np.savez(path, z0=states[:-1], z1=states[1:], dt=0.1)
+    else:
+        rows = np.column_stack([0.1 * np.arange(1_000), states])
+        np.savetxt(path, rows, delimiter=",", header="t,q1,p1", comments="")
+    whole = read_sample(path, group=group)
+    assert whole.num_pairs == 999
+    assert continued(whole) == 998
+    some = read_sample(path, num_pairs=500, group=group)
+    assert 450 <= some.num_pairs <= 500
+    assert continued(some) >= some.num_pairs - 10  # arcs of 50
+    known = {tuple(z) for z in read_trajectories(path).pairs().z0}
+    assert {tuple(z) for z in some.pairs().z0} <= known
+
+
+def test_runs_of_several_files_are_different_runs(tmp_path):
+    states = np.random.default_rng(0).normal(size=(2, 4, 9, 2))
+    for i in range(2):
+        np.savez(tmp_path / f"{i}.npz", trajectories=states[i], dt=0.1)
+    found = identified(read_sample([tmp_path / "0.npz", tmp_path / "1.npz"]).pairs()).pairs
+    assert np.bincount(found.run).tolist() == [8] * 8
+    assert steps_between(found).sum() == 8 * 7
+
+
+def test_a_table_keeps_the_labels_of_its_sequences(tmp_path):
+    text = "sequence,t,q1,p1\n" + "".join(
+        f"{label},{k},{label + k},{k}\n" for label in (7, 3) for k in range(4)
+    )
+    (tmp_path / "z.csv").write_text(text)
+    pairs = read_trajectories(tmp_path / "z.csv").pairs()
+    assert pairs.run.tolist() == [7] * 3 + [3] * 3
+    assert pairs.place.tolist() == [0, 1, 2] * 2
+
+
+# The split
+
+
+def test_single_pairs_are_split_at_random():
+    states = np.random.default_rng(0).normal(size=(2, 400, 2))
+    pairs = identified(gfnn.Pairs(*states, 0.4)).pairs
+    split = split_rows(pairs, seed=3)
+    assert [len(rows) for rows in split[:3]] == [320, 40, 40]
+    assert np.array_equal(np.sort(np.concatenate(split[:3])), np.arange(400))
+    assert np.ptp(split.test) > 300
+    assert all(map(np.array_equal, split, split_rows(pairs, seed=3)))
+    assert not np.array_equal(split.test, split_rows(pairs, seed=4).test)
+
+
+def test_few_pairs_have_no_test_rows():
+    states = np.random.default_rng(0).normal(size=(2, 59, 2))
+    split = split_rows(identified(gfnn.Pairs(*states, 0.4)).pairs, seed=0)
+    assert [len(rows) for rows in split[:3]] == [54, 5, 0]
+
+
+@pytest.mark.parametrize("lengths", [(20,) * 30, (7, 1, 40, 3, 12) * 10])
+def test_whole_runs_are_held_out(lengths):
+    pairs = identified(in_rows(walks(*lengths))).pairs
+    split = split_rows(pairs, seed=1)
+    assert np.array_equal(np.sort(np.concatenate(split[:3])), np.arange(len(pairs)))
+    runs = [set(pairs.run[rows]) for rows in split[:3]]
+    assert not any(one & other for one, other in itertools.combinations(runs, 2))
+    for rows in (split.validation, split.test):
+        assert 0.05 * len(pairs) <= len(rows) < 0.2 * len(pairs)
+
+
+@pytest.mark.parametrize("lengths", [(1_000,), (16,), (700, 5, 5), (300, 300)])
+def test_of_long_runs_blocks_of_time_are_held_out(lengths):
+    pairs = identified(in_rows(walks(*lengths))).pairs
+    split = split_rows(pairs, seed=1)
+    assert len(split.training) > 0.55 * len(pairs)
+    states = [{tuple(z) for of in (pairs.z0, pairs.z1) for z in of[r]} for r in split[:3]]
+    assert not any(one & other for one, other in itertools.combinations(states, 2))
+
+
+def test_a_correlation_time_lies_between_blocks():
+    t = np.arange(2_001) / 40.0  # a quarter of a period of 2π is 63 samples
+    states = np.stack([np.cos(t), -np.sin(t)], axis=1)
+    pairs = identified(in_rows([states])).pairs
+    gap = correlation_time(pairs, np.ones(len(pairs) - 1, bool))
+    assert gap == 12  # a sixteenth of what is held out: its blocks would be gone else
+    split = split_rows(pairs, seed=0)
+    for rows in (split.validation, split.test):
+        assert np.abs(rows[:, None] - split.training).min() == gap + 1
+    fast = identified(in_rows([np.stack([np.cos(30 * t), -np.sin(30 * t)], axis=1)])).pairs
+    # cos(0.75 k) < 1/e from k = 2 on.
+    assert correlation_time(fast, np.ones(len(fast) - 1, bool)) == 2
+
+
+# The bound
+
+
+@pytest.mark.parametrize(("pairs", "blocks"), [(6, 6), (40, 40), (400, 400), (200, 20)])
+def test_the_bound_holds_nineteen_times_in_twenty(pairs, blocks):
+    """Of normal errors in four coordinates; in blocks, a fifth of the variance is the block's."""
+    rng, block, held = np.random.default_rng(0), np.arange(pairs) * blocks // pairs, 0
+    for _ in range(1_000):
+        error = rng.normal(size=(pairs, 4))
+        if blocks < pairs:
+            error = np.sqrt(0.8) * error + np.sqrt(0.2) * rng.normal(size=(blocks, 4))[block]
+        held += bound_of_mean(np.mean(error**2, axis=1), block) >= 1
+    assert 910 <= held <= 980  # 950 ± 4 × 7, and what Γ is not
+
+
+def test_a_bound_of_exact_and_of_too_few():
+    assert bound_of_mean(np.full(5, 2.0), np.arange(5)) == 2.0
+    assert np.isnan(bound_of_mean(np.ones(5), np.zeros(5, int)))
+
+
+# What is stated
+
+
+def test_the_stated_error_is_of_pairs_that_chose_nothing():
+    rng = np.random.default_rng(0)
+    z = rng.uniform(-1, 1, (200, 2))
+    c, s = np.cos(0.3), np.sin(0.3)
+    pairs = gfnn.Pairs(z, z @ np.array([[c, -s], [s, c]]) + 1e-3 * rng.normal(size=z.shape), 0.3)
+    fit = gfnn.fit(pairs, tolerance=1e-2, learn="map")
+    assert fit.stated_by == "20 pairs that took no part in the fit or its choices"
+    few = gfnn.fit(pairs.take(slice(50)), tolerance=1e-2, learn="map")
+    assert "cross-validation" in few.stated_by
+    fresh = rng.uniform(-1, 1, (1_000, 2))
+    image = fresh @ np.array([[c, -s], [s, c]]) + 1e-3 * rng.normal(size=fresh.shape)
+    for one in (fit, few):
+        error = (np.asarray(one.map.step(fresh)[0]) - image) / np.std(z, axis=0)
+        assert 0.5 < one.chosen.validation_relative / np.sqrt(np.mean(error**2)) < 2
+        assert one.chosen.validation_bound > one.chosen.validation_relative
+
+
+def test_noise_that_was_given_is_told_from_what_a_map_cannot_represent():
+    rng = np.random.default_rng(0)
+    z = rng.uniform(-1, 1, (400, 2))
+    c, s = np.cos(0.3), np.sin(0.3)
+    image = z @ np.array([[c, -s], [s, c]]) + 1e-3 * rng.normal(size=z.shape)
+    said = {}
+    for std in (1e-3, 1e-4):
+        pairs = gfnn.Pairs(z, image, 0.3, std=[std, std])
+        with pytest.warns(gfnn.FitWarning):
+            fit = gfnn.fit(pairs, tolerance=1e-6, learn="map", chart="midpoint")
+        np.testing.assert_array_equal(fit.noise, std)
+        said[std] = " ".join(fit.messages)
+    assert "what is left over is the noise that was given" in said[1e-3]
+    assert "std is too small" in said[1e-4]
