@@ -1,4 +1,4 @@
-"""Command line: ``gfnn scenes | run | fit | predict | export | compare``.
+"""Command line: ``gfnn scenes | run | look | fit | predict | export | compare``.
 
 Each exit status but 0 comes with one line that gives the reason (`EXIT_STATUS`). JAX is imported
 only after the usage has been checked.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import math
 import os
 import re
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gfnn_jax import processes
+from gfnn_jax.cli_columns import add_column_options, column_options, masses
 from gfnn_jax.compiling import enable_compile_cache
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
@@ -141,6 +143,24 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--quick", action="store_true", help="fewer pairs and rollouts")
     command.add_argument("--dt", type=_positive, metavar="H", help="another time step")
     _add_fit_options(command, "the scene's own, close to the best there is")
+
+    command = commands.add_parser(
+        "look", help="what a recording holds, before anything is learned",
+        description="Runs, rates, gaps, noise, friction and mistakes of a recording, told by the "
+        "file itself: .csv and other text, .npz, .npy.", **others,
+    )  # fmt: skip
+    command.set_defaults(command=_look)
+    command.add_argument("data", type=Path, metavar="FILE", nargs="+", help="one file or several")
+    add_column_options(command)
+    command.add_argument("--dt", type=_positive, metavar="H", help="seconds between rows")
+    command.add_argument("--json", action="store_true", help="print plain data, and draw nothing")
+    command.add_argument(
+        "--figure", type=Path, metavar="FILE", help="default runs/look-NAME.png, written anew"
+    )
+    command.add_argument("--overwrite", action="store_true", help="replace an existing --figure")
+    command.add_argument(
+        "--strict", action="store_true", help="exit status 1 where something is wrong"
+    )
 
     command = commands.add_parser(
         "fit", help="learn the map of your own trajectories",
@@ -422,6 +442,30 @@ def _run(arguments: argparse.Namespace) -> None:
         )  # fmt: skip
     _summarise(ran, out)
     _hold_to(arguments.strict, out / "model")
+
+
+def _look(arguments: argparse.Namespace) -> None:
+    if arguments.figure is not None:
+        ensure_new(arguments.figure, arguments.overwrite)
+    for path in arguments.data:
+        _check_exists(path)
+    figure = arguments.figure
+    if figure is None and not arguments.json:
+        figure = Path("runs") / f"look-{arguments.data[0].stem}.png"
+    options = column_options(arguments)
+    given = {"dt": arguments.dt, "mass": masses(arguments)}
+    options |= {name: value for name, value in given.items() if value}
+    from gfnn_jax.jobs.look import look
+
+    summary = look(arguments.data, options, figure)
+    if arguments.json:
+        print(json.dumps(summary.as_json(), indent=2, ensure_ascii=False))
+    else:
+        _print_table(summary)
+        print(f"figure: {figure}")
+    wrong = sum(fault.wrong for fault in summary.faults)
+    if arguments.strict and wrong:
+        raise WorkError(f"{arguments.data[0]}: wrong in {wrong} ways (--strict)")
 
 
 def _fit(arguments: argparse.Namespace) -> None:

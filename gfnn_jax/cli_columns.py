@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
-import shlex
 from typing import Any
 
 from gfnn_jax.data.recording import SECONDS
-
-ROLES = ("positions", "velocities", "momenta", "inputs", "parameters")
+from gfnn_jax.data.roles import ROLES
 
 
 def add_column_options(command: argparse.ArgumentParser) -> None:
@@ -64,21 +62,7 @@ def masses(arguments: argparse.Namespace) -> dict[str, float]:
 
 def names_roles(options: dict[str, Any]) -> bool:
     """Whether keywords of `column_options` say what columns are, which makes a file a recording."""
-    said = {*ROLES, "columns"} & set(options)
-    return bool(said)
-
-
-def as_text(options: dict[str, Any]) -> str:
-    """Keywords of `column_options` as they are typed, with a blank before each."""
-    words = {"start": "from", "stop": "to", "time_unit": "time-unit"}
-    typed = []
-    for name, value in options.items():
-        if isinstance(value, dict):
-            value = ",".join(f"{k}={v:g}" for k, v in value.items())
-        elif not isinstance(value, (str, float, int)):
-            value = ",".join(str(v) for v in value)
-        typed.append(f" --{words.get(name, name)} {shlex.quote(str(value))}")
-    return "".join(typed)
+    return bool({*ROLES, "columns"} & set(options))
 
 
 def _names(text: str) -> tuple[str, ...]:

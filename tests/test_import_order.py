@@ -15,13 +15,17 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 # A module imports only from rooms before its own; the modules of a room share its place.
 ORDER = (
     "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes",
-    "storage", "data", "scenes", "families", "solve", "generating", "flows", "maps", "exports",
-    "dataset", "fitting", "models", "learn", "baselines", "evaluate", "jobs", "cli_columns", "cli",
-    "__main__",
+    "storage", "signals", "data", "dataset", "scenes", "families", "solve", "generating", "flows",
+    "maps", "exports", "fitting", "models", "learn", "baselines", "evaluate", "jobs", "cli_columns",
+    "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {
     ("maps.symplectic_map", f"maps.{name}") for name in ("positions", "saved", "samples", "sharded")
+}
+SHORTHANDS |= {
+    ("data.recording", "data.recording_summary"),
+    ("data.recording_summary", "data.summary_screen"),
 }
 HOMES = {  # the module, and those whose names begin as its own does
     "argparse": "cli",

@@ -7,8 +7,9 @@ import pandas as pd
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax.cli_columns import add_column_options, as_text, column_options, masses, names_roles
+from gfnn_jax.cli_columns import add_column_options, column_options, masses, names_roles
 from gfnn_jax.data.kinds import are_recordings
+from gfnn_jax.data.recording_summary import as_typed
 from gfnn_jax.errors import InputError
 
 T = np.array([0.0, 0.1, 0.25, 0.3, 1.0])
@@ -238,7 +239,7 @@ def test_options_of_the_command_line_are_keywords_of_read():
         "positions": ("theta1", "theta2"), "angles": ("theta1",), "degrees": ("theta1",),
         "time_unit": "ms", "std": {"theta1": 0.01}, "start": 2.0, "every": 3,
     }  # fmt: skip
-    assert column_options(parser.parse_args(as_text(options).split())) == options
+    assert column_options(parser.parse_args(as_typed(options).split())) == options
     assert names_roles(options)
     assert not names_roles(column_options(parser.parse_args(["--angles", "0,2"])))
     assert column_options(parser.parse_args(["--angles", "0,2"]))["angles"] == (0, 2)

@@ -14,13 +14,16 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gfnn_jax.data.roles import ROLES, by_name, is_angle, is_run, is_time, plain
 from gfnn_jax.data.tables import Table, from_arrays, from_memory, from_text
 from gfnn_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from gfnn_jax.data.recording_summary import RecordingSummary
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 _TURN = 2 * np.pi
@@ -42,6 +45,8 @@ class Recording:
     time_unit:  of the file; `times` are in seconds.
     offsets, scales: columns that a sensor shows with an unknown offset, or scale, to be fitted.
     ignored:    columns without a role.
+    angles_given: whether the angles were told, not read off names and units.
+    notes:      what reading had to decide, a line each.
     source:     the files.
     """
 
@@ -59,6 +64,8 @@ class Recording:
     offsets: tuple[str, ...]
     scales: tuple[str, ...]
     ignored: tuple[str, ...]
+    angles_given: bool
+    notes: tuple[str, ...]
     source: str
     _times: dict[str, np.ndarray]
     _values: dict[str, dict[str, np.ndarray]]  # run -> name -> (n,)
@@ -107,6 +114,9 @@ class Recording:
         }  # fmt: skip
         unit = _time_unit(source, names, units, time_unit)
         runs = _runs(tables, numbers, factors, SECONDS[unit], dt)
+        empty = [n for n in with_role if not any(np.isfinite(v[n]).any() for _, v in runs.values())]
+        if empty:
+            raise InputError(f"{source}: no value in column {', '.join(empty)}")
         std = dict(std or {})
         for what, wanted in (("std", std), ("offset", _names(offset)), ("scale", _names(scale))):
             _check_known(source, what, wanted, with_role)
@@ -125,6 +135,8 @@ class Recording:
             "scales": _names(scale),
             "ignored": tuple(n for n in numbers if n not in with_role)
             + tuple(dict.fromkeys(n for t in tables for n in t.text)),
+            "angles_given": angles is not None or degrees is not None,
+            "notes": (*(n for t in tables for n in t.notes), *_restarts(tables, runs)),
             "source": source,
             "_times": {run: times for run, (times, _) in runs.items()},
             "_values": {run: values for run, (_, values) in runs.items()},
@@ -206,6 +218,18 @@ class Recording:
         values = {r: {n: v[k] for n, v in self._values[r].items()} for r, k in kept.items()}
         object.__setattr__(part, "_values", values)
         return part
+
+    def summary(self) -> RecordingSummary:
+        """What the samples tell before anything is fitted: noise, frequencies, friction, mistakes.
+
+        Prints as one screen; `RecordingSummary.as_json` gives plain data.
+        """
+        from gfnn_jax.data.recording_summary import summarise
+
+        return summarise(self)
+
+    def _repr_html_(self) -> str:
+        return self.summary()._repr_html_()
 
     def _named(self, run: str | float) -> str:
         """The name of a run, given as text or as a number."""
@@ -331,7 +355,8 @@ def _check_known(source: str, what: str, wanted: Any, known: Sequence[str]) -> N
     missing = [name for name in wanted if name not in known]
     if missing:
         raise InputError(
-            f"{source}: {what}: no column {', '.join(missing)} among {', '.join(known) or 'none'}"
+            f"{source}: {what}: no column {', '.join(map(str, missing))} among "
+            f"{', '.join(known) or 'none'}"
         )
 
 
@@ -419,6 +444,13 @@ def _parts(
         _check_times(table, time, rows, times)
         parts[run] = (rows, times * second)
     return parts
+
+
+def _restarts(tables: list[Table], runs: Mapping[str, Any]) -> list[str]:
+    """A note where times that fall have made runs."""
+    if len(runs) == len(tables) or any(_run_column(table) for table in tables):
+        return []
+    return [f"the times run back {len(runs) - len(tables)} times, and a run begins there"]
 
 
 def _check_times(table: Table, name: str, rows: np.ndarray, times: np.ndarray) -> None:

@@ -30,13 +30,14 @@ class Table:
     """Columns of equal length by name: (T,) float64, of runs (T,) text.
 
     units: by column name, as a header or a row of units gave them. text: names of columns that hold
-    no numbers. locate: says where a row stands, for a message.
+    no numbers. notes: what reading had to decide. locate: says where a row stands, for a message.
     """
 
     columns: dict[str, np.ndarray]
     units: dict[str, str] = dataclasses.field(default_factory=dict)
     source: str = "the table"
     text: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     locate: Callable[[int], str] = lambda row: f"row {row + 1}"
 
 
@@ -126,6 +127,7 @@ class _Format:
     names: tuple[str, ...]
     units: dict[str, str]
     text: tuple[str, ...]  # columns that hold words
+    notes: tuple[str, ...]
 
 
 def from_text(
@@ -160,7 +162,7 @@ def from_text(
         stands = itertools.islice(_rows(path, form), int(row_numbers[row]), None)
         return f"line {next(stands)[0]}"
 
-    return Table(found, form.units, str(path), form.text, locate)
+    return Table(found, form.units, str(path), form.text, form.notes, locate)
 
 
 def _blocks(path: Path, form: _Format, wanted: list[str]) -> Iterator[dict[str, np.ndarray]]:
@@ -295,11 +297,13 @@ def _sniffed(path: Path, columns: Sequence[str]) -> _Format:
     ):
         width -= 1  # a separator ends every line
         above = [cells[:width] for cells in above]
+    notes: tuple[str, ...] = ()
     named = [cells for cells in above if len(cells) == width]
     if named:
         names, units = _named(named[0])
         for cells in named[1:2]:
             units |= {n: _bare(c) for n, c in zip(names, cells, strict=True) if _bare(c)}
+            notes = (f"the line below the names holds units: {', '.join(cells)}",)
     elif above and plain[:first]:
         raise InputError(
             f"{path}: line {plain[first][0]}: {len(above[-1])} columns expected "
@@ -323,7 +327,7 @@ def _sniffed(path: Path, columns: Sequence[str]) -> _Format:
         if not is_run(name) and not any(_is_number(r[i], decimal) for r in rows if i < len(r))
     )  # fmt: skip
     before = plain[first][0] - 1
-    return _Format(separator, decimal, comment, before, tuple(names), units, words)
+    return _Format(separator, decimal, comment, before, tuple(names), units, words, notes)
 
 
 def _separator(path: Path, lines: list[str]) -> tuple[str, str]:
