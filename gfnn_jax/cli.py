@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gfnn_jax import processes
-from gfnn_jax.cli_columns import add_column_options, column_options, masses
+from gfnn_jax.cli_columns import add_column_options, column_options, masses, names_roles
 from gfnn_jax.compiling import enable_compile_cache
+from gfnn_jax.data.kinds import are_recordings
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new
@@ -177,9 +178,7 @@ def _parser() -> argparse.ArgumentParser:
         "--scene", metavar="NAME",
         help="lends its coordinates and features; the features assume the scene's units",
     )  # fmt: skip
-    command.add_argument(
-        "--angles", type=_indices, default=(), metavar="0,2", help="indices in z with period 2π"
-    )
+    add_column_options(command)
     _add_fit_options(command, "1e-6")
     command.add_argument(
         "--devices", type=_devices, metavar="all|N",
@@ -205,7 +204,8 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
     command.add_argument(
         "--initial", type=Path, metavar="FILE", required=True,
-        help="initial states, or a trajectory file, whose sequences go on from their last states",
+        help="initial states, or a trajectory file, whose sequences go on from their last states; "
+        "of a map of positions a recording, whose runs go on from their last two",
     )  # fmt: skip
     command.add_argument("--num-steps", type=_count, metavar="N", required=True)
     command.add_argument(
@@ -396,16 +396,6 @@ def _texts(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(";") if part.strip())
 
 
-def _indices(text: str) -> tuple[int, ...]:
-    parts = text.split(",")
-    found = tuple(int(part) for part in parts if part.strip().isdecimal())
-    if len(set(found)) < len(parts):
-        raise argparse.ArgumentTypeError(
-            f"expected different whole numbers separated by commas, e.g. 0,2; got '{text}'"
-        )
-    return found
-
-
 def _max_seconds(arguments: argparse.Namespace) -> float | None:
     """The budget of a fit: where operations are bounded nothing else is, unless told."""
     given = arguments.max_seconds
@@ -475,6 +465,12 @@ def _fit(arguments: argparse.Namespace) -> None:
         ensure_new(arguments.out, arguments.overwrite, folder=True)
     for path in arguments.data:
         _check_exists(path)
+    columns = column_options(arguments)
+    if are_recordings(arguments.data, with_roles=names_roles(columns)):
+        if arguments.dt is not None:
+            columns["dt"] = arguments.dt
+        return _fit_positions(arguments, columns)
+    arguments.angles = _as_indices(columns)
     with contextlib.ExitStack() as stack:
         group = None
         if arguments.distributed:
@@ -483,6 +479,35 @@ def _fit(arguments: argparse.Namespace) -> None:
         if arguments.distributed:
             group = processes.Group(processes.join())
         _fit_and_tell(arguments, group)
+
+
+def _fit_positions(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
+    """Learn the map of a recording of positions."""
+    if arguments.learn != "map":
+        raise InputError("expected --learn map for a recording of positions")
+    _set_up_jax()
+    from gfnn_jax.jobs.fit_positions import fit_positions
+
+    with progress.on_stderr() as shown:
+        ran = fit_positions(
+            arguments.data, out=arguments.out, columns=columns, seed=arguments.seed,
+            tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
+            absolute_tolerance=arguments.absolute_tolerance, structure=arguments.structure,
+            max_seconds=_max_seconds(arguments), max_operations=arguments.max_operations,
+            progress=shown,
+        )  # fmt: skip
+    _summarise(ran, arguments.out)
+    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
+          "--out prediction.npz")  # fmt: skip
+    _hold_to(arguments.strict, arguments.out)
+
+
+def _as_indices(columns: dict[str, Any]) -> tuple[int, ...]:
+    """``--angles`` of canonical states. Raises InputError for names of columns."""
+    angles = columns.get("angles", ())
+    if not all(isinstance(i, int) for i in angles):
+        raise InputError(f"--angles: expected indices in z as 0,2, got {','.join(angles)}")
+    return tuple(angles)
 
 
 def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) -> None:

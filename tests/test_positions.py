@@ -1,10 +1,14 @@
 """Maps that are learned from positions alone: discrete Lagrangians and the maps they generate."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
+from gfnn_jax import cli
 from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.families.displacements import OfDisplacement
@@ -210,6 +214,36 @@ def test_the_family_of_displacements_is_differentiated_right():
         turned = np.roll(w, 2, axis=1)
         if both:
             assert np.array_equal(family.value(params, w), family.value(params, turned))
+
+
+# The command line
+
+
+def test_positions_in_a_file_are_fitted_and_continued(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    def written(name, read):
+        runs, steps = read.shape[:2]
+        rows = np.column_stack([
+            np.repeat(np.arange(runs), steps), np.tile(np.arange(steps), runs), read.ravel()
+        ])  # fmt: skip
+        np.savetxt(name, rows, delimiter=",", header="run,t,theta", comments="", fmt="%.17g")
+
+    read = np.mod(turns(300, 7, 5), 2 * np.pi)[..., 0]
+    written("turns.csv", turns(500, 2, 0)[..., 0] % (2 * np.pi))
+    written("begun.csv", read[:20, :4])
+    said = ["fit", "turns.csv", "--positions", "theta", "--angles", "theta", "--out", "model"]
+    assert cli.main([*said, "--learn", "hamiltonian"]) == 2
+    assert "expected --learn map" in capsys.readouterr().err
+    assert cli.main([*said, "--learn", "map", "--tolerance", "1e-12"]) == 0
+    report = json.loads(Path("model/report.json").read_text())
+    assert report["model"]["chart"] == "type1"
+    assert report["fit"]["tolerance_met"]
+    assert report["map"]["positions"]["symmetric"]
+    go_on = ["predict", "model", "--initial", "begun.csv", "--num-steps", "4", "--out", "on.npz"]
+    assert cli.main(go_on) == 0
+    ahead = np.load("on.npz")["trajectories"][..., 0]
+    assert np.abs(nearest_image(ahead - read[:20, 3:], tuple(range(5)))).max() < 1e-11
 
 
 # What is refused, in a line

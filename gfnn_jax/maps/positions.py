@@ -7,14 +7,20 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.generating.charts import TYPE1
-from gfnn_jax.generating.generated import Generated
+
+
+def starts_from_positions(map_: Any) -> bool:
+    """Whether a map was learned from positions alone: its S is one of q and Q."""
+    piece = map_.pieces[0]
+    ours = isinstance(getattr(piece, "family", None), OfDisplacement)
+    return ours and len(map_.pieces) == 1 and piece.chart == TYPE1
 
 
 def state_at(map_: Any, q, other):
     """See `SymplecticMap.from_positions`."""
-    piece = map_.pieces[0]
-    if len(map_.pieces) != 1 or not isinstance(piece, Generated) or piece.chart != TYPE1:
+    if not starts_from_positions(map_):
         raise ValueError(
             "expected a map that was learned from positions alone, whose S is one of (q, Q)"
         )
@@ -25,7 +31,7 @@ def state_at(map_: Any, q, other):
             f"expected two positions of shape ({map_.dim},) or (B, {map_.dim}), got {q.shape} and "
             f"{other.shape}"
         )
-    own = jax.tree.map(np.asarray, piece)
+    own = jax.tree.map(np.asarray, map_.pieces[0])
     w = np.concatenate([q, own.family.lifted(q, other)], axis=-1)
     p = -own.dt * own.family.gradient(own.params, w)[..., : map_.dim]
     return jax.device_put(np.concatenate([q, p], axis=-1))
