@@ -1,4 +1,4 @@
-"""Command line: ``gfnn scenes | run | look | fit | predict | export | compare``.
+"""The command line: ``gfnn scenes | run | look | fit | predict | export | compare``.
 
 Each exit status but 0 comes with one line that gives the reason (`EXIT_STATUS`). JAX is imported
 only after the usage has been checked.
@@ -143,7 +143,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/SCENE)")
     command.add_argument("--quick", action="store_true", help="fewer pairs and rollouts")
     command.add_argument("--dt", type=_positive, metavar="H", help="another time step")
-    _add_fit_options(command, "the scene's own, close to the best there is")
+    _add_fit_options(command, "the scene's own, close to the best attainable")
 
     command = commands.add_parser(
         "look", help="what a recording holds, before anything is learned",
@@ -176,13 +176,13 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--dt", type=_positive, metavar="H", help="time step, if DATA has none")
     command.add_argument(
         "--scene", metavar="NAME",
-        help="lends its coordinates and features; the features assume the scene's units",
+        help="scene whose coordinates and features are used; features assume the scene's units",
     )  # fmt: skip
     add_column_options(command)
     _add_fit_options(command, "1e-6")
     command.add_argument(
         "--devices", type=_devices, metavar="all|N",
-        help="share the rows, and the networks of an ensemble, out among so many devices; on a CPU "
+        help="number of devices that share the rows, and the networks of an ensemble; on a CPU "
         "these are its cores",
     )  # fmt: skip
     command.add_argument(
@@ -204,8 +204,8 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
     command.add_argument(
         "--initial", type=Path, metavar="FILE", required=True,
-        help="initial states, or a trajectory file, whose sequences go on from their last states; "
-        "of a map of positions a recording, whose runs go on from their last two",
+        help="initial states, or a trajectory file: its sequences continue from their last states; "
+        "of a map of positions a recording, whose runs continue from their last two",
     )  # fmt: skip
     command.add_argument("--num-steps", type=_count, metavar="N", required=True)
     command.add_argument(
@@ -214,8 +214,8 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument(
         "--dt", type=_positive, metavar="H",
-        help="another time step than the data's, of a model that learned a Hamiltonian, or pairs "
-        "of several time steps",
+        help="another time step than that of the data, for a model of a Hamiltonian or of pairs "
+        "with several time steps",
     )  # fmt: skip
     command.add_argument("--out", type=Path, metavar="FILE", required=True, help=".npz to write")
     command.add_argument(
@@ -224,7 +224,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument(
         "--horizon", type=_positive, metavar="SIZE",
-        help="with --samples: adds the step at which the band of the position passes SIZE",
+        help="with --samples: adds the step at which the band of the position exceeds SIZE",
     )  # fmt: skip
     command.add_argument(
         "--outside", choices=("continue", "stop"), default="continue",
@@ -232,7 +232,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument(
         "--devices", type=_devices, metavar="all|N",
-        help="share the trajectories out among so many devices; on a CPU these are its cores",
+        help="number of devices that share the trajectories; on a CPU these are its cores",
     )  # fmt: skip
     command.add_argument(
         "--distributed", action="store_true",
@@ -289,19 +289,18 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
     )
     command.add_argument(
         "--terms", type=_texts, default=(), metavar="TEXT",
-        help='of H, that you know: "p1**2; 1/sqrt(q1**2 + q2**2)"',
+        help='known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"',
     )  # fmt: skip
     command.add_argument(
         "--base", metavar="TEXT",
-        help='an H that you know a part of the map by: "p1**2/2 - cos(q1)"; its flow is factored '
-        "out, and S learns what it leaves over",
+        help='known part of H: "p1**2/2 - cos(q1)"; its flow is factored out, and S learns the '
+        "remainder",
     )  # fmt: skip
     command.add_argument(
         "--structure", type=_structure, metavar="|".join(STRUCTURES),
-        help="of many degrees of freedom: H is a sum over equal sites, whose --terms are text in "
-        "q1, p1 of a site and q2, p2, … of the next ones (ring:2: two q at every site, side by "
-        "side); or over bodies and pairs, of which bodies:4:abbb says that the last three are "
-        "alike",
+        help="structure of many degrees of freedom: H is a sum over equal sites, with --terms in "
+        "q1, p1 of a site and q2, p2, … of the next ones (ring:2 has two q at every site, side by "
+        "side); or over bodies and pairs of bodies (bodies:4:abbb: the last three are alike)",
     )  # fmt: skip
     command.add_argument("--chart", choices=CHARTS, default="auto", help="default %(default)s")
     command.add_argument(
@@ -314,19 +313,19 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
     )  # fmt: skip
     command.add_argument(
         "--ensemble", type=_count, default=1, metavar="N",
-        help="with --family mlp: so many networks trained together; their mean is the map, and "
-        "their spread its bands",
+        help="with --family mlp: number of networks trained together; their mean is the map, their "
+        "spread its bands",
     )  # fmt: skip
     command.add_argument("--seed", type=_seed, default=0, metavar="N")
     command.add_argument(
         "--max-seconds", type=_positive, default=None, metavar="S",
-        help="for the fit: the best map by then is kept (default 120, or none where operations are "
-        "bounded)",
+        help="time for the fit, after which the best map so far is kept (default 120, or none with "
+        "--max-operations)",
     )  # fmt: skip
     command.add_argument(
         "--max-operations", type=_count, default=None, metavar="N",
-        help="for the fit, counted: a report's fit.max_operations gives its model again, whatever "
-        "the clock has ended",
+        help="counted operations for the fit: the value of fit.max_operations in a report gives "
+        "the same model again, also where time had ended that fit",
     )  # fmt: skip
     command.add_argument(
         "--strict", action="store_true", help="exit status 1 where the tolerance is not met"
@@ -336,7 +335,7 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
 
 def _add_output_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--overwrite", action="store_true", help="replace an existing output")
-    command.add_argument("--resume", action="store_true", help="go on with an unfinished one")
+    command.add_argument("--resume", action="store_true", help="continue an unfinished output")
 
 
 def _positive(text: str) -> float:

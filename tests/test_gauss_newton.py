@@ -10,6 +10,7 @@ from gfnn_jax.families.terms import Terms, given_terms, polynomial_terms
 from gfnn_jax.fitting.gauss_newton import Problem, log_start, midpoint_start, null_terms
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.learn.candidates import Judges, Tolerance
+from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.flows import learn_hamiltonian
 from gfnn_jax.learn.formula import Term, formula
 from gfnn_jax.learn.learned_law import assembled
@@ -147,7 +148,7 @@ def test_a_pendulum_of_any_angle():
     )
     assert found.formula == "-cos(q1) + 0.5 p1²"
     assert found.candidate.validation_relative < 1e-14
-    final = assembled(found, prepared, judges).candidate
+    final = assembled(found, prepared, judges, Budget()).candidate
     assert final.validation_relative < 1e-14
     # The learned law holds outside the data and at any dt.
     states, _ = final.map.rollout(jnp.array([[0.1, 2.5]]), 200)

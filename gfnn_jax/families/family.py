@@ -50,10 +50,8 @@ class Family(Protocol):
 
 
 def at_time(family: Any, args: Any, after: Any) -> Any:
-    """Advance args (..., k) by a time ``after`` (...). NumPy or JAX.
-
-    Where the family depends on time, it is the last of the args and grows; the others stay.
-    """
+    """args (..., k) as they are a time ``after`` (...) later: the last of them is the time where
+    the family depends on it, the others stay. NumPy or JAX."""
     if getattr(family, "parameters", ())[-1:] != (TIME,):
         return args
     xp = namespace(args, after)

@@ -20,7 +20,7 @@ from gfnn_jax.learn.propose import proposed
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import AS_FAR, MET, Entry
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.learn.sweeps import OF_SOLVE, OF_STEPS
+from gfnn_jax.learn.sweeps import OF_SOLVE, OF_STEPS, LinearSweep
 
 _NO_MORE = {
     False: "no larger library of terms promised to meet it",
@@ -57,6 +57,8 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
             if np.isfinite(candidate.validation_relative)
             else "the steps of a map that was to meet it do not converge from some of the states"
         )
+    if met and not ended.startswith(MET):  # by the pairs that state the error
+        ended = f"{MET}; {request.budget.ended}" if request.budget.over else MET
     if law is not None and searched.of_terms is None and searched.linear is None:
         on_law = chosen.entry is None or searched.met_by_law
         said = on_law or (law.fast and not met)

@@ -82,11 +82,10 @@ class Samples:
         save_every: int = 1,
         stop_outside: bool = False,
     ) -> tuple[Any, RolloutInfo]:
-        """Predict with every map.
+        """Predict with every map: states (n, B, 1 + num_steps // save_every, 2d), and a RolloutInfo
+        of (n, B). z0: (B, 2d), or (n, B, 2d) where every sample has its own.
 
-        z0: (B, 2d), or (n, B, 2d) where each sample has its own. Returns the states
-        (n, B, 1 + num_steps // save_every, 2d), and a RolloutInfo of leaves (n, B). Other samples
-        of the same kind use the same compiled program. Raises ValueError where a shape is wrong.
+        Compiled once, whatever the samples. Raises ValueError where a shape is wrong.
         """
         z0, args = self._given(z0, params, t0)
         return _rollout(

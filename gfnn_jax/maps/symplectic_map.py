@@ -5,9 +5,9 @@
 Of a system with friction a piece multiplies the symplectic form by a factor μ, its multiplier, or
 keeps no multiple of it; so does the map.
 
-Maps are pytrees: their numbers can be passed through ``jit`` and differentiated. The kind of
-family, the chart and the coordinates are static, hashable constants. A program compiled for one map
-serves all maps of the same kind.
+Maps are pytrees: their numbers can be passed through ``jit`` and differentiated; what is static
+(the kind of family, chart, coordinates) is a hashable constant, and what is compiled for one map
+serves all of its kind.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _TWO_PI_REST = 2.4492935982947064e-16  # 2π minus its float64 value
 
 @runtime_checkable
 class Piece(Protocol):
-    """Map in a row of such, batch first: z (B, 2d), by JAX.
+    """One map of a row, batch first: z (B, 2d), by JAX.
 
     A piece is a pytree. ``unrolled`` makes derivatives those of the iterations that ran; a number
     also bounds the number of updates.
@@ -123,19 +123,19 @@ class SymplecticMap:
     domain:       region that the data covered, in the inner coordinates.
     scale:        (2d,) sizes of the user's coordinates.
     angle_centre: (a,) centre of the interval of length 2π in which each angle is kept.
-    dt:           time of one step; negative for a reversed map.
-    parameters:   names and ranges of the parameters that the map was learned with, or None.
-    dt_range:     (2,) the lowest and highest dt of the data, for a map that was learned with dt as
-                  a variable of S.
-    posterior:    posterior of the coefficients, or None. It is no leaf: a map that is made of the
-                  leaves (``jit``, ``jax.tree.map``) has none.
+    dt:           the time one step takes; of a reversed map below 0.
+    parameters:   what the system depends on beside its state, where it was learned with that.
+    dt_range:     (2,) the lowest and highest dt of the data, of a map that was learned with dt as a
+                  variable of S.
+    posterior:    how well the coefficients are known, where that is; no leaf: what makes another
+                  map of the leaves (``jit``, ``jax.tree.map``) leaves it out.
 
-    Methods take states z (2d,) or (B, 2d), NumPy or JAX, and return JAX arrays. A map that was
+    Methods take states z (2d,) or (B, 2d), NumPy or JAX, and answer with JAX arrays. A map that was
     learned with parameters takes their values too: name -> a number or (B,), or an array (k,) or
-    (B, k). A map of a driven system takes t0, the time of the drive at z, a number or (B,), which
-    advances with the steps. Methods can be differentiated, in forward and reverse mode, in z, in
-    the parameters' values and in the map's own leaves, by the implicit-function theorem.
-    ``jax.vmap`` and ``jax.jit`` work over them.
+    (B, k); that of a driven system takes t0, the time of the drive at z, a number or (B,), which
+    goes on with the steps. They can be differentiated, in forward and reverse mode, in z, in the
+    parameters' values and in the map's own leaves, by the implicit-function theorem; ``jax.vmap``
+    and ``jax.jit`` work over them.
     """
 
     pieces: tuple
@@ -184,7 +184,7 @@ class SymplecticMap:
         return sharded.Sharded(self, sharded.local_devices(devices))
 
     def step(self, z, args=None, *, dt=None, t0=None):
-        """Make one step: (Z, Info); Info's leaves are () or (B,). dt: argument of `over`."""
+        """One step: (Z, Info); Info's leaves are () or (B,). dt: of `over`."""
         z = self._states(z)
         map_ = self if dt is None else self.over(dt, z.shape[:-1])
         return _step(map_, z, self._args(args, z, t0))
@@ -274,12 +274,12 @@ class SymplecticMap:
         return None if any(factor is None for factor in factors) else math.prod(factors, start=1.0)
 
     def defect(self, z, args=None, *, t0=None):
-        """Symplecticity defect ‖AᵀJA − μJ‖ () or (B,) of the step's derivative A at z, in units of
-        ``scale``; μ the multiplier. NaN where there is none.
+        """Symplecticity defect ‖AᵀJA − μJ‖ () or (B,) of the step's unrolled derivative A at z, in
+        units of ``scale``, μ the multiplier; NaN where there is none. Of many degrees of freedom by
+        random pairs of tangent vectors.
 
-        The derivative is the unrolled one, by forward differentiation through the iterations that
-        ran. That of the implicit rule would look symplectic however badly the solve had converged.
-        For many degrees of freedom the defect is estimated by random pairs of tangent vectors.
+        By forward differentiation through the iterations that ran, never by the implicit rule,
+        which would look symplectic however badly the solve had converged.
         """
         z = self._states(z)
         args = self._args(args, z, t0)
@@ -305,16 +305,16 @@ class SymplecticMap:
         return _hamiltonian(self, z, self._args(args, z, t0))
 
     def modified_hamiltonian(self, z, args=None) -> ModifiedHamiltonian:
-        """Value and error, each () or (B,), of the Hamiltonian H̃ whose flow over dt is this map.
+        """The Hamiltonian H̃ whose flow over dt is this map, at z: its value and the error of that,
+        each () or (B,), in units of H. Its constant is that of S.
 
-        Both are in units of H; the constant is that of S. They come from 32 steps to either side of
-        z (`maps.modified_hamiltonian`). The error is small where the orbit turns slowly against a
-        step (Hénon–Heiles: 1e-12 at dt 0.4, 1e-8 at 0.8), and as large as H̃ for a map that is near
-        no flow. Both are NaN where one of these steps fails. Raises ValueError for a driven map,
-        which conserves no energy.
+        From 32 steps to either side of z (`maps.modified_hamiltonian`). The error is small where
+        the orbit turns slowly against a step (Hénon–Heiles: 1e-12 at dt 0.4, 1e-8 at 0.8), and of
+        the size of H̃ for a map that is near no flow. NaN where one of these steps fails. Raises
+        ValueError for a driven map, which keeps no energy.
         """
         if self.parameters is not None and self.parameters.period is not None:
-            raise ValueError("expected a map without a drive: a driven one conserves no energy")
+            raise ValueError("expected a map without a drive: a driven one keeps no energy")
         z = self._states(z)
         return _modified(self, z, self._args(args, z))
 
@@ -327,11 +327,8 @@ class SymplecticMap:
         self, lanes: Lanes, num_saved: int, *, params=None, t0=None, save_every: int = 1,
         stop_outside: bool = False,
     ) -> tuple[Lanes, Any]:  # fmt: skip
-        """Advance by ``num_saved`` blocks of ``save_every`` steps.
-
-        Returns the lanes after them, and the saved states (B, num_saved, 2d). params, t0: those
-        that the lanes were started with.
-        """
+        """``num_saved`` blocks of ``save_every`` steps: the lanes after them, and the saved states
+        (B, num_saved, 2d). params, t0: those that the lanes were started with."""
         args = self._args(params, lanes.y, t0)
         return _advance(self, lanes, args, num_saved, save_every, stop_outside)
 
@@ -342,14 +339,14 @@ class SymplecticMap:
         """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d).
 
         positions: (q, Q) in place of z0, of `from_positions`: the first two positions.
-        params: the values of a map's parameters. t0: the time of a drive at z0; it advances with
-        the steps. dt: argument of `over`. samples: number of maps drawn from the posterior with
-        key, of ``jax.random``; the states of all of them are in memory at once. Returns the states
-        (B, 1 + num_steps // save_every, 2d), the initial ones first, and a RolloutInfo. With
-        samples its ``bands`` have their std about the states, and quantiles. A lane is NaN from
-        where its step fails, or from where it leaves the domain with ``stop_outside``. Raises
-        ValueError where a number of steps or a shape is wrong, and where samples are asked for
-        without a key or from a map without a posterior.
+        params: the values of a map's parameters. t0: the time of a drive at z0; it goes on with the
+        steps. dt: of `over`, for each step. samples, key: how many maps are drawn from the
+        posterior by which key of ``jax.random``; the states of all of them are held at once.
+        Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first, and a
+        RolloutInfo; with samples its ``bands`` have their std about the states, median and
+        quantiles. A lane whose step fails, or that leaves the domain with ``stop_outside``,
+        repeats NaN from there on. Raises ValueError where a number of steps or a shape is wrong,
+        and where samples are asked for without a key or of a map without posterior.
         """
         for name, number in (("num_steps", num_steps), ("save_every", save_every)):
             if not isinstance(number, Integral):
@@ -374,7 +371,7 @@ class SymplecticMap:
         if samples is None:
             return states, info
         if key is None:
-            raise ValueError("expected a key as well as samples, e.g. key=jax.random.key(0)")
+            raise ValueError("expected a key of jax.random beside samples")
         options = {"params": params, "t0": t0, "save_every": save_every}
         drawn, _ = map_.sample(key, samples).rollout(
             np.atleast_2d(z0), num_steps, stop_outside=stop_outside, **options
@@ -393,7 +390,7 @@ class SymplecticMap:
         return as_args(self.parameters, given, z.shape, np.dtype(self.scale.dtype), t0)
 
     def _after(self, args, steps):
-        """Advance args by a number of steps (B,)."""
+        """args that many steps (B,) later."""
         return args if self.parameters is None else self.parameters.after(args, steps, self.dt)
 
     def _states(self, z):

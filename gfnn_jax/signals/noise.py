@@ -192,6 +192,9 @@ def resolution(values: np.ndarray) -> float | None:
     if len(levels) < len(known) / 2:  # many values occur again: these are the sensor's levels
         return float(np.median(steps))
     step = float(steps.min())
+    for reach in 10.0 ** np.arange(1, 9):  # over more and more steps, each is known better
+        way = levels[np.searchsorted(levels, levels[0] + reach * step) - 1] - levels[0]
+        step = way / round(way / step) if way > step else step
     multiples = (known[:1000] - known[0]) / step
     even = np.abs(multiples - np.round(multiples)) < 0.02
-    return step if np.mean(even) > 0.99 and np.ptp(levels) < 1e9 * step else None
+    return float(step) if np.mean(even) > 0.99 and np.ptp(levels) < 1e9 * step else None

@@ -48,4 +48,4 @@ def systems(traits: Traits) -> Iterator[Fault]:
 
 def reading(traits: Traits) -> Iterator[Fault]:
     for note in traits.recording.notes:
-        yield Fault("reading", note, "say so if it is not meant", wrong=False)
+        yield Fault("reading", note, "nothing, if that is meant", wrong=False)
