@@ -213,7 +213,8 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
     command.add_argument(
         "--initial", type=Path, metavar="FILE", required=True,
-        help="initial states, or a trajectory file: its sequences continue from their last states",
+        help="initial states, or a trajectory file: its sequences continue from their last states; "
+        "of a map of positions a recording, whose runs continue from their last two",
     )  # fmt: skip
     command.add_argument("--num-steps", type=_count, metavar="N")
     command.add_argument(
@@ -414,16 +415,6 @@ def _texts(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(";") if part.strip())
 
 
-def _indices(text: str) -> tuple[int, ...]:
-    parts = text.split(",")
-    found = tuple(int(part) for part in parts if part.strip().isdecimal())
-    if len(set(found)) < len(parts):
-        raise argparse.ArgumentTypeError(
-            f"expected different whole numbers separated by commas, e.g. 0,2; got '{text}'"
-        )
-    return found
-
-
 def _max_seconds(arguments: argparse.Namespace) -> float | None:
     """The budget of a fit: where operations are bounded nothing else is, unless told."""
     given = arguments.max_seconds
@@ -497,6 +488,8 @@ def _fit(arguments: argparse.Namespace) -> None:
     if are_recordings(arguments.data, with_roles=names_roles(columns)):
         if arguments.dt is not None:
             columns["dt"] = arguments.dt
+        if arguments.learn == "map":
+            return _fit_positions(arguments, columns)
         return _fit_law(arguments, columns)
     if arguments.learn == "lagrangian":
         raise InputError("--learn lagrangian: expected a recording, got states q, p")
@@ -526,6 +519,25 @@ def _fit_law(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
     print(f"written to {arguments.out}")
     print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
           "--out forecast.csv")  # fmt: skip
+
+
+def _fit_positions(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
+    """Learn the map of a recording of positions."""
+    _set_up_jax()
+    from gfnn_jax.jobs.fit_positions import fit_positions
+
+    with progress.on_stderr() as shown:
+        ran = fit_positions(
+            arguments.data, out=arguments.out, columns=columns, seed=arguments.seed,
+            tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
+            absolute_tolerance=arguments.absolute_tolerance, structure=arguments.structure,
+            max_seconds=_max_seconds(arguments), max_operations=arguments.max_operations,
+            progress=shown,
+        )  # fmt: skip
+    _summarise(ran, arguments.out)
+    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
+          "--out prediction.npz")  # fmt: skip
+    _hold_to(arguments.strict, arguments.out)
 
 
 def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) -> None:
@@ -577,7 +589,7 @@ def _predict(arguments: argparse.Namespace) -> None:
     for path in (arguments.model, arguments.initial, arguments.inputs, arguments.compare):
         if path is not None:
             _check_exists(path)
-    if are_recordings(arguments.initial):
+    if are_recordings(arguments.initial) and _is_law(arguments.model):
         return _forecast(arguments)
     if arguments.num_steps is None:
         raise InputError("expected --num-steps: how many steps to predict")
@@ -589,6 +601,14 @@ def _predict(arguments: argparse.Namespace) -> None:
         if arguments.distributed:
             share = processes.join()
         _predict_and_tell(arguments, share)
+
+
+def _is_law(model: Path) -> bool:
+    """Whether the model is the law of a recording, and no map of its positions."""
+    _set_up_jax()
+    from gfnn_jax.maps.saved import record
+
+    return "lagrangian" in record(model)
 
 
 def _forecast(arguments: argparse.Namespace) -> None:

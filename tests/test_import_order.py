@@ -22,7 +22,7 @@ ORDER = (
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {
     ("maps.symplectic_map", f"maps.{name}")
-    for name in ("saved", "samples", "sharded", "energy", "estimates")
+    for name in ("positions", "saved", "samples", "sharded", "energy", "estimates")
 }
 SHORTHANDS |= {
     ("data.recording", "data.recording_summary"),

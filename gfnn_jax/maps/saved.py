@@ -21,6 +21,7 @@ import numpy as np
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.errors import InputError
 from gfnn_jax.families import lagrangian
+from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.ensemble import Ensemble
 from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.lagrangian import Friction
@@ -38,6 +39,7 @@ from gfnn_jax.generating.charts import Chart, TypeOne
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import PolynomialModel, Predictor
 from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.damping import Damping
 from gfnn_jax.maps.domain import Domain, Ranges
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.parameters import Parameters
@@ -56,7 +58,7 @@ _TYPES: dict[str, type] = {
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
         Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
         Windows, Groups, Ranges, OfTimeStep, Ensemble, Uniform, Forced, Legendre, Friction, Signals,
-        Sensors,
+        Sensors, Damping, OfDisplacement,
     )
 } | {"LagrangianTerms": lagrangian.Terms}  # fmt: skip
 _NAMES = {kind: name for name, kind in _TYPES.items()}

@@ -232,6 +232,17 @@ class SymplecticMap:
         dt = dt.astype(self.scale.dtype)
         return dataclasses.replace(self, pieces=(self.pieces[0].over(dt),), dt=dt)
 
+    def from_positions(self, q, other):
+        """The state z = (q, p) at q, (2d,) or (B, 2d), of a map that was learned from positions
+        alone, from q and the position ``other`` a step later, (d,) or (B, d) each: p = −h ∂S/∂q.
+
+        Where angles were learned from readings modulo their period, the move is taken modulo it;
+        else a lift is trusted. Raises ValueError for another map, or another shape.
+        """
+        from gfnn_jax.maps import positions  # stands after this module: a shorthand
+
+        return positions.state_at(self, q, other)
+
     def then(self, other: SymplecticMap) -> SymplecticMap:
         """Compose this map and the other one after it: sectors of a ring, phases of a period.
 
@@ -372,11 +383,13 @@ class SymplecticMap:
         return _advance(self, lanes, args, num_saved, save_every, stop_outside)
 
     def rollout(
-        self, z0, num_steps: int, *, params=None, t0=None, inputs=None, dt=None,
+        self, z0=None, num_steps: int = 0, *, positions=None, params=None, t0=None, inputs=None,
+        dt=None,
         save_every: int = 1, stop_outside: bool = False, samples: int | None = None, key=None,
     ) -> tuple[Any, RolloutInfo]:  # fmt: skip
         """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d).
 
+        positions: (q, Q) in place of z0, of `from_positions`: the first two positions.
         params: the values of a map's parameters. t0: the time of a drive at z0; it advances with
         the steps. inputs: of each step's begin, (num_steps, k) or (B, num_steps, k), and, as one
         row more, at the last one's end. dt: argument of `over`. samples: number of maps drawn from
@@ -399,6 +412,10 @@ class SymplecticMap:
                 f"expected save_every <= num_steps, got {save_every} and {num_steps}: only the "
                 "initial states would be saved"
             )
+        if (z0 is None) == (positions is None):
+            raise ValueError("expected either states z0 or two positions (q, Q) to start from")
+        if positions is not None:
+            z0 = self.from_positions(*positions)
         z0 = self._states(z0)
         map_ = self if dt is None else self.over(dt, z0.shape[:-1])
         args = map_._schedule(params, z0, t0, inputs, num_steps)
