@@ -131,6 +131,26 @@ def test_roles_that_are_given_leave_the_other_columns_out():
     assert recording.angles == ()
 
 
+def test_data_tell_roles_that_names_do_not():
+    t = 0.01 * np.arange(600)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal((4, len(t)))
+    motion = np.stack([np.sin(3 * t), 3 * np.cos(3 * t), np.cos(5 * t), -5 * np.sin(5 * t)])
+    motion += noise
+    table = {"t": t, "b": motion[1], "a": motion[0], "d": motion[2], "e": motion[3]}
+    recording = gfnn.Recording(table)
+    assert (recording.positions, recording.velocities) == (("a", "d"), ("b", "e"))
+    assert "derivatives" in recording.notes[0]
+    with pytest.raises(InputError, match="d may be motion or what drives it"):
+        gfnn.Recording({name: table[name] for name in "tabd"})
+
+
+def test_columns_that_differ_from_run_to_run_are_parameters():
+    table = {"run": [0, 0, 1, 1], "t": [0, 1, 0, 1], "x": [0.0, 1, 2, 3], "mass": [1.0, 1, 2, 2]}
+    recording = gfnn.Recording({**table, "day": [7, 7, 7, 7]})
+    assert recording.parameters == ("mass",)
+    assert recording.ignored == ("day",)
+
+
 def test_an_angle_is_lifted_and_a_lift_is_trusted():
     lift = np.linspace(0, 20, 60)
     wrapped = np.angle(np.exp(1j * lift))
