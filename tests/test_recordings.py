@@ -61,6 +61,8 @@ TEXTS = {
     "a byte-order mark": "\ufefft,theta,omega\r\n" + rows(T, THETA, OMEGA).replace("\n", "\r\n"),
     "a separator at the end": "t;theta;omega;\n"
     + rows(T, THETA, OMEGA, separator=";").replace("\n", ";\n"),
+    "decimal commas in quotes": '"t","theta","omega"\n'
+    + '"' + rows(T, THETA, OMEGA, separator='","', decimal=",")[:-1].replace("\n", '"\n"') + '"\n',
     "another order": "omega,t,theta\n" + rows(OMEGA, T, THETA),
 }  # fmt: skip
 
@@ -68,6 +70,15 @@ TEXTS = {
 @pytest.mark.parametrize("name", TEXTS)
 def test_text_files_of_every_dialect(tmp_path, name):
     check(gfnn.read(write(tmp_path / "r.csv", TEXTS[name])))
+
+
+def test_times_of_day(tmp_path):
+    text = "time,x\n2024-05-01 23:59:59.5,1\n2024-05-02 00:00:00.25,2\n2024-05-02 00:00:01,3\n"
+    recording = gfnn.read(write(tmp_path / "r.csv", text))
+    np.testing.assert_allclose(recording.times("0"), [0, 0.75, 1.5], atol=1e-12)
+    bad = write(tmp_path / "bad.csv", text + "2024-05-02 00:00:99,4\n")
+    with pytest.raises(InputError, match="00:00:99"):
+        gfnn.read(bad)
 
 
 def test_tables_in_memory_and_arrays(tmp_path):

@@ -31,6 +31,8 @@ def roles_of(
     Raises InputError where a name is unknown or has two roles, or where nothing tells.
     """
     wanted = [name for of_role in given.values() for name in of_role]
+    if not names:
+        raise InputError(f"{source}: expected columns of numbers beside the times, found none")
     if wanted:
         for role, of_role in given.items():
             check_known(source, role, of_role, names)

@@ -30,7 +30,8 @@ from gfnn_jax.data.columns import (
 )
 from gfnn_jax.data.roles import ROLES, is_run, is_time
 from gfnn_jax.data.runs import restarts, runs_of
-from gfnn_jax.data.tables import Table, from_arrays, from_memory, from_text
+from gfnn_jax.data.tables import Table, from_arrays, from_memory
+from gfnn_jax.data.text_files import from_text
 from gfnn_jax.errors import InputError
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ class Recording:
         degrees: columns in degrees, or degrees per second; a position among them is an angle.
         time_unit: s (the default), ms, us, ns, min or h; a header's own unit serves too.
         std:     σ of columns, in their own unit.
-        columns: those to take; all others are as if they were not there.
+        columns: those to take beside times and runs; all others are as if they were not there.
         dt:      seconds between rows, in place of a column of times.
         offset, scale: columns that a sensor shows shifted, or scaled, by an unknown amount.
         Raises InputError where names, times or values do not fit.
@@ -262,7 +263,8 @@ def read(
     paths:    ``.csv`` and other text (separated by commas, semicolons, tabs or blanks; decimal
               points or commas; lines of comments; a line of units below the names), ``.npz`` of
               named arrays, ``.npy``.
-    columns:  names of those to read; of all, in order, where a file names none.
+    columns:  names of those to read beside times and runs; of all, in order, where a file names
+              none.
     start, stop, every: rows to keep: between these times (in the file's unit), every so many.
     options:  positions, velocities, momenta, inputs, parameters, angles, degrees, time_unit, std,
               dt, offset, scale: as of `Recording`.
@@ -305,7 +307,8 @@ def _selected(table: Table, columns: tuple[str, ...]) -> Table:
         raise InputError(
             f"{table.source}: no column {', '.join(missing)}, found {', '.join(table.columns)}"
         )
-    return dataclasses.replace(table, columns={n: table.columns[n] for n in columns})
+    kept = {n: x for n, x in table.columns.items() if n in columns or is_time(n) or is_run(n)}
+    return dataclasses.replace(table, columns=kept)
 
 
 def _std(
