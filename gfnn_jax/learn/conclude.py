@@ -57,6 +57,8 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
             if np.isfinite(candidate.validation_relative)
             else "the steps of a map that was to meet it do not converge from some of the states"
         )
+    if met and not ended.startswith(MET):  # by the pairs that state the error
+        ended = f"{MET}; {request.budget.ended}" if request.budget.over else MET
     if law is not None and searched.of_terms is None and searched.linear is None:
         on_law = chosen.entry is None or searched.met_by_law
         said = on_law or (law.fast and not met)

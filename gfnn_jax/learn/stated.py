@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
@@ -57,7 +58,7 @@ def stated(chosen: Chosen, found: Searched) -> Stated:
     block = np.arange(len(judges.pairs)) if judges.stretch is None else judges.stretch
     if len(judges.test):
         rows, by = judges.test, "test"
-        images = _images_of(candidate, judges.pairs.take(rows))
+        images = _images_of(chosen, found, rows)
     else:
         by, predicts = "cross-validation", _predictor(chosen, found)
         rows = np.concatenate([judges.training, judges.held_out])
@@ -76,8 +77,19 @@ def _count(block: np.ndarray, rows: np.ndarray) -> int:
     return len(np.unique(block[rows]))
 
 
-def _images_of(candidate: Candidate, pairs) -> np.ndarray:
-    """By the steps that users run."""
+def _images_of(chosen: Chosen, found: Searched, rows: np.ndarray) -> np.ndarray:
+    """By the steps that users run; in NumPy where the budget had no room for compiling them."""
+    candidate, prepared, entry = chosen.candidate, chosen.prepared, chosen.entry
+    pairs = found.judges.pairs.take(rows)
+    if candidate.microseconds_per_step is None and found.linear is not None:
+        linear = jax.tree.map(np.asarray, candidate.map.pieces[0])
+        return to_user(prepared.coordinates, linear.image(prepared.y0[rows]))
+    sweep = None if entry is None else entry.sweep
+    own = sweep is not None and sweep.judges.pairs is found.judges.pairs
+    if candidate.microseconds_per_step is None and entry is not None and own:
+        images, solved = entry.sweep.images(entry.size, rows)
+        images = prepared.whole_image(np.where(solved[:, None], images, np.nan))
+        return to_user(prepared.coordinates, images)
     steps = stepped(candidate.map, np.asarray(pairs.z0), pairs.dt, pairs.args, timed=False)
     return np.where(steps.failed[:, None], np.nan, steps.images)
 

@@ -205,7 +205,7 @@ class LinearSweep(Generates):
 
     def named(self, size: Size) -> str:
         """What is done to judge the size."""
-        return f"{self.chart.name} {self._prefix}{size.group.label}"
+        return f"{self.chart.name} {self._prefix}{size.family.label}"
 
     def work(self, size: Size) -> float:
         """Operations that judging the size takes: its group's factor, if that is not there yet."""
