@@ -35,7 +35,7 @@ HOMES = {  # the module, and those whose names begin as its own does
     "matplotlib": "evaluate.figures",
     "optax": "fitting.adam",
     "orbax": "storage.checkpoints",
-    "pandas": "data.tables",
+    "pandas": "data.text_files",
 }
 
 
