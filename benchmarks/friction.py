@@ -250,12 +250,16 @@ def tables() -> None:
     apart = found.pop("twins", None)
     heads = ("system", "law", "coefficients", "friction", "one-step RMS", "μ", "defect",
              "energy, 1,000 steps", "fit, CPU s")  # fmt: skip
-    keys = ("coefficient_error", "friction_error", "one_step_rms", "multiplier",
-            "symplecticity_defect", "energy_error", "processor_seconds")  # fmt: skip
-    rows = [
-        [name, r["measured"]["label"], *(number(r["measured"].get(key)) for key in keys)]
-        for name, r in found.items()
-    ]
+    before, after = (
+        ("coefficient_error", "friction_error", "one_step_rms"),
+        ("symplecticity_defect", "energy_error", "processor_seconds"),
+    )
+    rows = []
+    for name, result in found.items():
+        m = result["measured"]
+        multiplier = "–" if m["multiplier"] is None else f"{m['multiplier']:.6f}"
+        figures = [[number(m.get(key)) for key in keys] for keys in (before, after)]
+        rows.append([name, m["label"], *figures[0], multiplier, *figures[1]])
     text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
     if apart is not None:
         m = apart["measured"]
