@@ -414,16 +414,6 @@ def _texts(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(";") if part.strip())
 
 
-def _indices(text: str) -> tuple[int, ...]:
-    parts = text.split(",")
-    found = tuple(int(part) for part in parts if part.strip().isdecimal())
-    if len(set(found)) < len(parts):
-        raise argparse.ArgumentTypeError(
-            f"expected different whole numbers separated by commas, e.g. 0,2; got '{text}'"
-        )
-    return found
-
-
 def _max_seconds(arguments: argparse.Namespace) -> float | None:
     """The budget of a fit: where operations are bounded nothing else is, unless told."""
     given = arguments.max_seconds
@@ -558,8 +548,10 @@ def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) 
 def _as_indices(columns: dict[str, Any]) -> tuple[int, ...]:
     """``--angles`` of canonical states. Raises InputError for names of columns."""
     angles = columns.get("angles", ())
-    if not all(isinstance(i, int) for i in angles):
-        raise InputError(f"--angles: expected indices in z as 0,2, got {','.join(angles)}")
+    if not all(isinstance(i, int) for i in angles) or len(set(angles)) < len(angles):
+        raise InputError(
+            f"--angles: expected different whole numbers, indices in z, got {', '.join(map(str, angles))}"
+        )
     return tuple(angles)
 
 
