@@ -549,9 +549,8 @@ def _as_indices(columns: dict[str, Any]) -> tuple[int, ...]:
     """``--angles`` of canonical states. Raises InputError for names of columns."""
     angles = columns.get("angles", ())
     if not all(isinstance(i, int) for i in angles) or len(set(angles)) < len(angles):
-        raise InputError(
-            f"--angles: expected different whole numbers, indices in z, got {', '.join(map(str, angles))}"
-        )
+        got = ", ".join(map(str, angles))
+        raise InputError(f"--angles: expected different whole numbers, indices in z, got {got}")
     return tuple(angles)
 
 
