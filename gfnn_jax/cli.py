@@ -572,8 +572,9 @@ def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) 
 def _as_indices(columns: dict[str, Any]) -> tuple[int, ...]:
     """``--angles`` of canonical states. Raises InputError for names of columns."""
     angles = columns.get("angles", ())
-    if not all(isinstance(i, int) for i in angles):
-        raise InputError(f"--angles: expected indices in z as 0,2, got {','.join(angles)}")
+    if not all(isinstance(i, int) for i in angles) or len(set(angles)) < len(angles):
+        got = ", ".join(map(str, angles))
+        raise InputError(f"--angles: expected different whole numbers, indices in z, got {got}")
     return tuple(angles)
 
 

@@ -69,12 +69,15 @@ def search(
     plain = [libraries.textbook(d, angles)]
     if d > 1 and len(angles) == d:
         plain.append(libraries.relative(d, angles))
+    plain_terms = []
     for rows in (*plain, libraries.first(d, angles)):
         library = Structure(d, tuple(rows), tuple(linear), (), num_inputs)
         try:
             structure, known = weak_start(library, nodes, scales)
         except FitError:
             continue
+        if rows in plain:
+            plain_terms.append(structure.terms)
         zeros = tuple(i for i in angles if any(row[2][i] for row in structure.terms))
         structure = structure.plus(
             [("loss", row) for row in linear[:d]] + [("zero", i) for i in zeros]
@@ -92,9 +95,14 @@ def search(
     if not starts:
         raise FitError("no library of terms follows this recording: do its positions move freely?")
     (hold, bench), *_ = benches.items()
-    misfit = np.array([float(np.max(start.rms() / scales.sigma)) for start in starts])
-    enough = misfit <= options.plain_is_enough * misfit.min()
-    fit = starts[int(np.flatnonzero(enough)[0])]
+    misfit = [
+        float(np.max(start.rms() / scales.sigma)) if np.isfinite(start.fitted.cost) else np.inf
+        for start in starts
+    ]
+    best = min(range(len(starts)), key=lambda k: misfit[k])
+    simple = [k for k, start in enumerate(starts) if start.structure.terms in plain_terms]
+    simple = [k for k in simple if misfit[k] <= options.plain_is_enough * misfit[best]]
+    fit = starts[min(simple, key=lambda k: misfit[k]) if simple else best]
     every = Structure(
         d, (*libraries.first(d, angles), *libraries.more(d, angles)),
         _with_opposites(libraries.losses(d, libraries.KINDS, width)), angles, num_inputs,

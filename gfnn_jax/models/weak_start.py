@@ -13,6 +13,7 @@ from gfnn_jax.models.weak_form import weak_rows
 
 _LENGTHS = (0.5, 1.0)  # of the windows, in periods
 _OVERLAP = 3.0  # rows that share samples: as many count as one
+_APART = 100.0  # weights of coordinates: a wrong library would make one of them all
 _SIGNIFICANT = 4.0  # standard errors
 
 
@@ -53,7 +54,7 @@ def weak_start(
             size = np.sqrt(np.mean(residual**2, axis=0))
             if not np.min(size) > 1e-9 * np.linalg.norm(X[..., keep] * c):
                 raise FitError("the weak form has a solution without motion: a wrong library")
-            weight = weight / size
+            weight = np.maximum(weight / size, np.max(weight / size) / _APART)
         error = np.sqrt(_OVERLAP * np.mean(residual**2)) * np.linalg.norm(inverse, axis=1)
         z = [
             np.inf if keys[k] in fixed else abs(value) / e
