@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numbers
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -105,9 +106,14 @@ def check_request(
     if pairs.period is not None and chart == "type1":
         raise FitError("expected another chart than type1, which a driven map has not")
     if not own_dt and not 0 < float(pairs.dt) < np.inf:
-        raise FitError(f"expected a time step that is finite and above 0, got {pairs.dt}")
+        raise FitError(
+            f"expected a time step that is finite and above 0, got {pairs.dt}"
+            + (float(pairs.dt) < 0) * ": of steps back, z1 are the states and z0 their images"
+        )
     if isinstance(terms, str):
         raise FitError(f"expected a sequence of terms, got the text '{terms}'")
+    if not isinstance(terms, Sequence):
+        raise FitError(f"expected a sequence of terms, () for none; got {terms!r}")
     if any(not (isinstance(term, str) or callable(term)) for term in terms):
         raise FitError(f"expected terms as texts or functions of z, got {terms!r}")
     if structure is not None:
