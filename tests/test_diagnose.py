@@ -76,6 +76,10 @@ def test_outliers_are_found_and_right_pairs_are_not(sigma):
 def test_few_or_coinciding_pairs_are_no_outliers():
     z = np.random.default_rng(3).uniform(-1, 1, (5, 2))
     assert len(outliers(z, turned(z), z.std(axis=0))) == 0
+    q, p = np.random.default_rng(1642).uniform(-1, 1, (2, 20))  # the worst of 4,000 such draws
+    ahead = q + 0.5 * p
+    pairs = np.c_[q, p], np.c_[ahead, p - np.sin(ahead)]
+    assert len(outliers(*pairs, pairs[0].std(axis=0))) == 0
     many = np.tile(z, (20, 1))
     assert len(outliers(many, turned(many), many.std(axis=0))) == 0
 

@@ -29,6 +29,7 @@ _OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; tho
 _COMPARED = 100
 FEWEST = 8  # pairs of a structure: 4 train, 4 are held out
 _COARSE = 0.01  # of what a step moves
+_STILL = 1e-15  # of the spread: no move
 
 
 def check_request(
@@ -149,6 +150,12 @@ def check_request(
                 f"expected finite states, got {int((~finite).sum())} rows of {name} with NaN or "
                 f"infinity, the first is row {int(np.argmin(finite))}"
             )
+    z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
+    if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= _STILL:
+        raise FitError(
+            "expected states that move, got z1 = z0 in every pair: H = 0, or the same columns "
+            "twice?"
+        )
     if structure is None:
         check_number(pairs)
     elif len(pairs) < FEWEST:
