@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
+from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.learn.check import unnamed_angles
 
 DT = 0.1
 RNG = np.random.default_rng(0)
@@ -154,3 +156,21 @@ def test_a_negative_number_of_steps_goes_back(learned):
     back, info = learned.rollout(np.asarray(ahead[:, -1]), -100, save_every=20)
     assert not info.status.any()
     np.testing.assert_allclose(back, ahead[:, ::-20], rtol=0, atol=1e-13)
+
+
+def test_an_angle_that_is_wrapped_is_named():
+    """Rotors pass ±π or 0; swings within half a turn, and jumps by more than a kick's, are none."""
+    rng = np.random.default_rng(1)
+    q, p, cartesian = rng.uniform(-9, 9, 300), rng.uniform(-3, 3, 300), Coordinates("cartesian")
+    for centre in (0.0, np.pi):
+        ends = [
+            np.c_[p, centre + np.remainder(x - centre + np.pi, 2 * np.pi) - np.pi]
+            for x in (q, q + 0.2 * p)
+        ]
+        (said,) = unnamed_angles(gfnn.Pairs(*ends, 0.2), cartesian)
+        assert "coordinate 1 of z: jumps of 2π in" in said
+        assert "--angles 1, angles=(1,)" in said
+        assert unnamed_angles(gfnn.Pairs(*ends, 0.2), Coordinates("cartesian", angles=(1,))) == []
+    assert unnamed_angles(PAIRS, cartesian) == []
+    kicked = gfnn.Pairs(Z0, rng.uniform(-3, 3, Z0.shape), 1.0)
+    assert unnamed_angles(kicked, cartesian) == []

@@ -29,6 +29,7 @@ _OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; tho
 _COMPARED = 100
 FEWEST = 8  # pairs of a structure: 4 train, 4 are held out
 _COARSE = 0.01  # of what a step moves
+_FEWEST_JUMPS = 3  # by 2π, that make an angle
 _STILL = 1e-15  # of the spread: no move
 
 
@@ -276,4 +277,37 @@ def not_radians(pairs: Pairs, coordinates: Coordinates) -> list[str]:
         f"{move[a]:.3g} in a step: an angle has period 2π (radians); are these degrees?"
         for a in coordinates.angles
         if range_[a] > 2 * TWO_PI and move[a] > np.pi
+    ]
+
+
+def wrapped(pairs: Pairs, coordinates: Coordinates) -> list[int]:
+    """Indices in z of what jumps by 2π, as an angle does that is wrapped and was not named: its
+    values lie within one turn, some moves are beyond half a turn, and those are moves of the size
+    of the others where 2π is taken from them."""
+    if coordinates.forward is not CARTESIAN.forward:
+        return []
+    z0, move = np.asarray(pairs.z0), np.asarray(pairs.z1) - np.asarray(pairs.z0)
+    found = []
+    for i in (i for i in range(2 * pairs.dim) if i not in coordinates.angles):
+        size = np.abs(move[:, i])
+        jumps = size > np.pi
+        if not _FEWEST_JUMPS <= jumps.sum() < len(size) / 2 or np.ptp(z0[:, i]) > TWO_PI:
+            continue
+        most = min(1.5 * size[~jumps].max(), np.pi / 2)
+        if np.abs(size[jumps] - TWO_PI).max() <= most:
+            found.append(i)
+    return found
+
+
+def unnamed_angles(pairs: Pairs, coordinates: Coordinates) -> list[str]:
+    """A warning that names the coordinates which are `wrapped` angles, and the option."""
+    found = wrapped(pairs, coordinates)
+    if not found:
+        return []
+    move = np.abs(np.asarray(pairs.z1) - np.asarray(pairs.z0))
+    count, indices = int((move[:, found] > np.pi).any(axis=1).sum()), ",".join(map(str, found))
+    named = "coordinate " + indices if len(found) == 1 else f"coordinates {indices}"
+    return [
+        f"{named} of z: jumps of 2π in {count} of {len(pairs)} pairs, as of an angle that is "
+        f"wrapped; name it: --angles {indices}, angles=({indices},)"
     ]

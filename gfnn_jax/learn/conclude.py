@@ -10,7 +10,7 @@ from gfnn_jax.coordinates import CARTESIAN, nearest_image
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.learn.assemble import stepped
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance
-from gfnn_jax.learn.check import not_radians
+from gfnn_jax.learn.check import not_radians, wrapped
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.choose_law import long_step
 from gfnn_jax.learn.clock import SOLVE
@@ -67,8 +67,11 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     if met:
         return Conclusion(ended, searched.judges.pairs.std, [*messages, *request.budget.left_out])
     diagnosis: list[str] = []
+    jumps = wrapped(request.pairs, request.coordinates)
     structured = request.structure is not None  # too few pairs to look at their neighbours
-    if candidate.validation_relative > _ROUNDOFF and searched.linear is None:
+    if jumps:
+        ended = reason = "no map follows the jumps of an angle that is wrapped and was not named"
+    elif candidate.validation_relative > _ROUNDOFF and searched.linear is None:
         stalled = _stalled(candidate, chosen.entry, searched)
         left = _left_of_sites if structured else _what_is_left
         work = _work(chosen.entry or next(iter(found.ranking), None))
