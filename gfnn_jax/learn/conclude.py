@@ -21,11 +21,13 @@ from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import AS_FAR, MET, Entry
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.learn.sweeps import OF_SOLVE, OF_STEPS, LinearSweep
+from gfnn_jax.learn.white import leaves_white
 
 _NO_MORE = {
     False: "no larger library of terms promised to meet it",
     True: "the training of the network gained no more",
 }
+_RIGHT = "H is right, as far as these pairs tell, and what it leaves over is noise"
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _SHARE = 0.1  # of the residual, that a change of volume must explain
 _KNOWN = 1.5  # times the noise that was given: up to it, what is left over is that noise
@@ -91,7 +93,10 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         diagnosis += proposed(searched.plain)
     if unmet and noise is None and not reason:  # else it is known why
         messages = [unmet, *messages]
-    messages += [not_met(candidate, request.tolerance, ended), *diagnosis]
+    unmet = not_met(candidate, request.tolerance, ended)
+    messages = (
+        [*diagnosis, *messages, unmet] if reason == _RIGHT else [*messages, unmet, *diagnosis]
+    )
     messages += request.budget.left_out
     return Conclusion(ended, noise, messages)
 
@@ -217,7 +222,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         noise = np.minimum(law.noise, noise)
     if judges.pairs.std is not None:
         return _beside_known(noise, judges.pairs.std)
-    own = ""
+    own, sizes_of_noise = "", ", ".join(f"{sigma:.1e}" for sigma in noise)
     if candidate.learns == "map" and entry is not None and isinstance(entry.sweep, LinearSweep):
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))
         own = f" (the map's own error is then about {part:.1g} of it)"
@@ -227,9 +232,16 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
             "or to depend on something that the states do not hold (a parameter, a drive), which "
             "single pairs do not tell from noise, "
         )
+    of_law = candidate.learns == "hamiltonian" and law is not None
+    if of_law and not hidden and leaves_white(law, searched.plain, judges):
+        message = (
+            "H is right, as far as these pairs tell: what it leaves over is white, noise of about "
+            f"{sizes_of_noise} on the coordinates in their order"
+        )
+        return _LeftOver(noise, [message], _RIGHT)
     message = (
         "larger models are no more accurate: the pairs seem to carry noise of about "
-        f"{', '.join(f'{sigma:.1e}' for sigma in noise)} on the coordinates in their order{own}, "
+        f"{sizes_of_noise} on the coordinates in their order{own}, "
         f"{hidden}or to have a structure that these functions cannot represent"
     )
     return _LeftOver(noise, [message])
