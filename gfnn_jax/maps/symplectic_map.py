@@ -199,8 +199,14 @@ class SymplecticMap:
         map_ = self if dt is None else self.over(dt, z.shape[:-1])
         return _step(map_, z, self._args(args, z, t0, inputs))
 
-    def inverse(self, z, args=None, *, t0=None):
-        """Make one step back, from Z to (z, Info). t0: the time at z, not at Z."""
+    def inverse(self, z=None, args=None, *, t0=None):
+        """Make one step back, from Z to (z, Info). t0: the time at z, not at Z. Raises ValueError
+        without states: the inverse map itself is ``reversed()``."""
+        if z is None:
+            raise ValueError(
+                "expected states to step back from, map.inverse(z); the inverse map itself is "
+                "map.reversed()"
+            )
         args = self._args(args, z := self._states(z), t0)
         if self.parameters is not None:
             args = self.parameters.after(args, 1, self.dt)
@@ -216,15 +222,18 @@ class SymplecticMap:
         known = not any(isinstance(value, Tracer) for value in (dt, self.dt))
         if known and np.ndim(dt) == 0 and np.array_equal(dt, self.dt):  # inside jit too
             return self
+        if not isinstance(dt, jax.Array):
+            dt = np.asarray(dt)
+            if dt.dtype.kind not in "fiu" or not (np.isfinite(dt) & (dt > 0)).all():
+                raise ValueError(
+                    f"expected a time step that is finite and above 0, got {dt}; for steps back "
+                    "give rollout a negative num_steps, or use inverse"
+                )
         if len(self.pieces) != 1 or not serves_any_dt(self.pieces[0]):
             raise ValueError(
                 "only the flow of a Hamiltonian can step another dt, got a map of dt = "
                 f"{float(np.asarray(self.dt)):g} only: fit with learn='hamiltonian'"
             )
-        if not isinstance(dt, jax.Array):
-            dt = np.asarray(dt)
-            if dt.dtype.kind not in "fiu" or not (np.isfinite(dt) & (dt > 0)).all():
-                raise ValueError(f"expected a time step that is finite and above 0, got {dt}")
         if dt.shape not in ((), lanes):
             raise ValueError(
                 f"expected one time step, or one per state {lanes}; got shape {dt.shape}"
@@ -387,14 +396,15 @@ class SymplecticMap:
         dt=None,
         save_every: int = 1, stop_outside: bool = False, samples: int | None = None, key=None,
     ) -> tuple[Any, RolloutInfo]:  # fmt: skip
-        """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d).
+        """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d), back by the inverse map where the
+        number is negative.
 
         positions: (q, Q) in place of z0, of `from_positions`: the first two positions.
         params: the values of a map's parameters. t0: the time of a drive at z0; it advances with
         the steps. inputs: of each step's begin, (num_steps, k) or (B, num_steps, k), and, as one
         row more, at the last one's end. dt: argument of `over`. samples: number of maps drawn from
         the posterior with key, of ``jax.random``; the states of all of them are in memory at once.
-        Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first, and a
+        Returns the states (B, 1 + |num_steps| // save_every, 2d), the initial ones first, and a
         RolloutInfo. With samples its ``bands`` have their std about the states, and quantiles. A
         lane is NaN from where its step fails, or from where it leaves the domain with
         ``stop_outside``. Raises ValueError where a number of steps or a shape is wrong, and where
@@ -403,10 +413,14 @@ class SymplecticMap:
         for name, number in (("num_steps", num_steps), ("save_every", save_every)):
             if not isinstance(number, Integral):
                 raise ValueError(f"expected a whole number as {name}, got {number!r}")
-        if save_every < 1 or num_steps < 0:
-            raise ValueError(
-                f"expected num_steps >= 0 and save_every >= 1, got {num_steps} and {save_every}"
-            )
+        if save_every < 1:
+            raise ValueError(f"expected save_every >= 1, got {save_every}")
+        if num_steps < 0:
+            map_ = self if dt is None else self.over(dt, np.shape(z0)[:-1])
+            return map_.reversed().rollout(
+                z0, -num_steps, params=params, t0=t0, save_every=save_every,
+                stop_outside=stop_outside, samples=samples, key=key,
+            )  # fmt: skip
         if save_every > num_steps > 0:
             raise ValueError(
                 f"expected save_every <= num_steps, got {save_every} and {num_steps}: only the "
