@@ -3,7 +3,7 @@
     python benchmarks/double_pendulum.py            into results/, figures/ and the README
     python benchmarks/double_pendulum.py --quick    the same into runs/, nothing else is touched
 
-The record is Schmidt & Lipson's (benchmarks/data/README.md): two angles, told to be angles; its
+The record is Schmidt & Lipson's (`gfnn_jax/records`): two angles, told to be angles; its
 velocities are not used. States are estimated from the twenty samples before a time of the last
 third, which no fit has seen, and forecast for a second.
 """
@@ -23,7 +23,6 @@ import numpy as np
 
 import gfnn_jax as gfnn
 
-DATA = Path(__file__).resolve().parent / "data" / "double_pendulum.csv"
 ANGLES = ("theta1", "theta2")
 SAMPLES, AHEAD, STARTS = 20, 1.0, 3  # of a start; seconds; starts in the figure
 PART = 2 / 3  # of the record, in time, that is learned from
@@ -31,7 +30,7 @@ PART = 2 / 3  # of the record, in time, that is learned from
 
 def measured() -> dict:
     """The law, its time, and forecasts from several starts beside what was measured."""
-    record = gfnn.read(DATA, angles=ANGLES, positions=ANGLES)
+    record = gfnn.read(gfnn.records.path("double_pendulum"), angles=ANGLES, positions=ANGLES)
     run = record.runs[0]
     t = record.times(run)
     end = t[0] + PART * (t[-1] - t[0])

@@ -51,9 +51,8 @@ def test_the_example_runs(example):
 
 
 @pytest.mark.slow
-def test_a_recording_gives_its_law(monkeypatch):
+def test_a_recording_gives_its_law():
     """The law of a measured double pendulum, and a forecast beside what was measured."""
-    monkeypatch.chdir(ROOT)
     code, names = blocks("python")[0], {}
     exec(compile(code, "README.md", "exec"), names)
     assert len(code.splitlines()) <= 12
