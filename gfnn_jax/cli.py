@@ -132,6 +132,8 @@ def _parser() -> argparse.ArgumentParser:
 
     command = commands.add_parser("scenes", help="list the scenes")
     command.set_defaults(command=_scenes)
+    command = commands.add_parser("records", help="list the measured records of the package")
+    command.set_defaults(command=_records)
 
     command = commands.add_parser(
         "run", help="a scene from reference data to figures",
@@ -422,6 +424,15 @@ def _max_seconds(arguments: argparse.Namespace) -> float | None:
 
 
 # The commands. The heavy imports are here, after the checks that need none of them.
+
+
+def _records(arguments: argparse.Namespace) -> None:
+    from gfnn_jax.records import RECORDS, path
+
+    for name, record in RECORDS.items():
+        options = f"--positions {','.join(record.positions)}"
+        options += f" --angles {','.join(record.angles)}" if record.angles else ""
+        print(f"{name:16} {record.what}\n{'':16} gfnn fit {path(name)} {options} --out {name}")
 
 
 def _scenes(arguments: argparse.Namespace) -> None:

@@ -390,10 +390,8 @@ def fit(
         judges = Judges.of(pairs, seed, request.tolerance)
         seen = diagnose_request(request, plain, judges)
         warn(seen.messages)
-        damping, plain = seen.damping, seen.plain
-        if damping is not None:  # H of an autonomous system keeps areas
-            on_progress(str(damping))
-            request = dataclasses.replace(request, learn="map")
+        if seen.damping is not None:
+            on_progress(str(seen.damping))
         found = searched(request, plain, seen, judges, on_better)
         seen, found, about_pairs = without_gross_errors(request, seen, found, row)
         warn(about_pairs)
@@ -427,7 +425,7 @@ def fit(
         model_determinant_min=_smallest_determinant(chosen),
         pairs=pairs,
         scene=scene,
-        damping=damping,
+        damping=seen.damping if chosen.candidate.learns == "map" else None,
         stated_by=error.words,
         test_pairs=pairs.take(found.judges.test) if len(found.judges.test) else None,
         operations=budget.operations,
