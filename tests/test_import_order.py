@@ -16,8 +16,8 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 ORDER = (
     "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes",
     "storage", "signals", "data", "records", "dataset", "scenes", "families", "solve", "generating",
-    "flows", "maps", "exports", "fitting", "models", "learn", "baselines", "evaluate", "jobs", "cli_columns",
-    "cli", "__main__",
+    "flows", "maps", "exports", "fitting", "models", "learn", "baselines", "evaluate", "jobs",
+    "cli_columns", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {
