@@ -240,10 +240,10 @@ QUICK = {
     "H of several dt": (partial(oscillators, dt=SEVERAL), {"learn": "hamiltonian"}),
     "H of a ring": (ring, {"learn": "hamiltonian", "structure": "ring"}),
     "H of a parameter": (pendulums, {"learn": "hamiltonian", "terms": PENDULUM_TERMS}),
+    "S of noisy sequences": (sequences, {"learn": "map"}),
 }
 SLOW = {
     "S of noisy pairs": (partial(oscillators, noise=1e-3), {"learn": "map"}),
-    "S of noisy sequences": (sequences, {"learn": "map"}),
     "H of noisy sequences": (sequences, {"learn": "hamiltonian"}),
     "S beside a base": (oscillators, {"learn": "map", "base": "p1**2/2"}),
     "S of sines": (partial(oscillators, 400), {"learn": "map", "family": "sines"}),
