@@ -97,9 +97,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
 
 
-_MAX_SECONDS = 120.0  # of a fit
-
-
 def _fail(status: int, why: object) -> int:
     print(f"gfnn: {why}", file=sys.stderr)
     processes.abandon(status)
@@ -417,12 +414,6 @@ def _texts(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(";") if part.strip())
 
 
-def _max_seconds(arguments: argparse.Namespace) -> float | None:
-    """The budget of a fit: where operations are bounded nothing else is, unless told."""
-    given = arguments.max_seconds
-    return _MAX_SECONDS if given is None and arguments.max_operations is None else given
-
-
 # The commands. The heavy imports are here, after the checks that need none of them.
 
 
@@ -453,8 +444,8 @@ def _run(arguments: argparse.Namespace) -> None:
     with progress.on_stderr() as shown:
         ran = run(
             arguments.scene, out=out, quick=arguments.quick, seed=arguments.seed, dt=arguments.dt,
-            tolerance=arguments.tolerance, max_seconds=_max_seconds(arguments),
-            max_operations=arguments.max_operations,
+            tolerance=arguments.tolerance,
+            max_seconds=arguments.max_seconds or "auto", max_operations=arguments.max_operations,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
             base=arguments.base, structure=arguments.structure,
             family=arguments.family, ensemble=arguments.ensemble, overwrite=arguments.overwrite,
@@ -560,8 +551,8 @@ def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) 
         ran = fit(
             arguments.data, out=arguments.out, dt=arguments.dt,
             tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
-            absolute_tolerance=arguments.absolute_tolerance, max_seconds=_max_seconds(arguments),
-            max_operations=arguments.max_operations,
+            absolute_tolerance=arguments.absolute_tolerance,
+            max_seconds=arguments.max_seconds or "auto", max_operations=arguments.max_operations,
             chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
             base=arguments.base, structure=arguments.structure,
             family=arguments.family, ensemble=arguments.ensemble, scene_name=arguments.scene,

@@ -1,13 +1,18 @@
 """Budgets: decisions that count operations, and a clock that only says how many fit."""
 
 import itertools
+import time
+from functools import partial
 
 import jax
 import numpy as np
 import pytest
+import scipy.linalg
 
 import gfnn_jax as gfnn
 from gfnn_jax.errors import OutOfTime
+from gfnn_jax.families.terms import given_terms
+from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.learn.clock import COMPILE, ROWS, Budget
 
 QUIETLY = pytest.mark.filterwarnings("ignore::gfnn_jax.FitWarning")
@@ -178,16 +183,107 @@ class Jumping:
         return self._now
 
 
+def turned(z, dt):
+    """The exact flow of an oscillator whose frequency depends on its energy."""
+    q, p = np.split(z, 2, axis=1)
+    turn = np.reshape(dt, (-1, 1)) * (1 + 0.2 * (q**2 + p**2))
+    cos, sin = np.cos(turn), np.sin(turn)
+    return np.concatenate([cos * q + sin * p, cos * p - sin * q], axis=1)
+
+
+def oscillators(num_pairs=60, dt=0.5, noise=0.0):
+    """Pairs of single steps, of one dt or of each its own."""
+    rng = np.random.default_rng(0)
+    z0 = rng.uniform(-1, 1, (num_pairs, 2))
+    z0, z1 = (z + noise * rng.normal(size=z.shape) for z in (z0, turned(z0, dt)))
+    return gfnn.Pairs(z0, z1, dt)
+
+
+def sequences(num=6, length=20, noise=1e-3):
+    """Pairs of noisy sequences, which continue each other."""
+    rng, states = np.random.default_rng(0), []
+    z = rng.uniform(-1, 1, (num, 2))
+    for _ in range(length + 1):
+        states.append(z + noise * rng.normal(size=z.shape))
+        z = turned(z, 0.5)
+    seen = np.stack(states, axis=1)
+    run = np.repeat(np.arange(num), length)
+    return gfnn.Pairs(seen[:, :-1].reshape(-1, 2), seen[:, 1:].reshape(-1, 2), 0.5, run=run)
+
+
+def ring(dim=6, num_pairs=30):
+    """Sites between springs, by the exponential of their linear equations."""
+    springs = 2 * np.eye(dim) - np.roll(np.eye(dim), 1, axis=0) - np.roll(np.eye(dim), -1, axis=0)
+    rates = np.block([[np.zeros((dim, dim)), np.eye(dim)], [-springs, np.zeros((dim, dim))]])
+    z0 = np.random.default_rng(0).normal(size=(num_pairs, 2 * dim))
+    return gfnn.Pairs(z0, z0 @ scipy.linalg.expm(0.1 * rates).T, 0.1)
+
+
+def pendulums(num_pairs=80):
+    """Pendulums of different lengths: the length is a parameter."""
+    rng = np.random.default_rng(0)
+    z0, length = rng.uniform(-1, 1, (num_pairs, 2)), rng.uniform(0.5, 2, num_pairs)
+    law, args = given_terms(1, PENDULUM_TERMS, ("l",)), length[:, None]
+    z1 = images(law, np.array([0.5, -1.0]), z0, 0.1, Steps(8, 1), args=args).states
+    return gfnn.Pairs(z0, z1, 0.1, {"l": length})
+
+
+SEVERAL = np.tile([0.3, 0.5, 0.7], 20)
+NETWORK = {"family": "mlp", "chart": "midpoint", "max_iterations": 3}
+KEPLER_TERMS = ["p1**2 + p2**2", "1/sqrt(q1**2 + q2**2)"]
+PENDULUM_TERMS = ["p1**2/l**2", "l*cos(q1)"]
+QUICK = {
+    "S or H": (kepler, {"tolerance": 1e-4}),
+    "S": (kepler, {"learn": "map", "tolerance": 1e-4}),
+    "H": (kepler, {"learn": "hamiltonian", "terms": KEPLER_TERMS, "tolerance": 1e-4}),
+    "S of several dt": (partial(oscillators, dt=SEVERAL), {"learn": "map"}),
+    "H of several dt": (partial(oscillators, dt=SEVERAL), {"learn": "hamiltonian"}),
+    "H of a ring": (ring, {"learn": "hamiltonian", "structure": "ring"}),
+    "H of a parameter": (pendulums, {"learn": "hamiltonian", "terms": PENDULUM_TERMS}),
+    "S of noisy sequences": (sequences, {"learn": "map"}),
+}
+SLOW = {
+    "S of noisy pairs": (partial(oscillators, noise=1e-3), {"learn": "map"}),
+    "H of noisy sequences": (sequences, {"learn": "hamiltonian"}),
+    "S beside a base": (oscillators, {"learn": "map", "base": "p1**2/2"}),
+    "S of sines": (partial(oscillators, 400), {"learn": "map", "family": "sines"}),
+    "a network S": (oscillators, NETWORK),
+    "an ensemble": (oscillators, {**NETWORK, "ensemble": 2}),
+    "a network H": (oscillators, {**NETWORK, "chart": "auto", "learn": "hamiltonian"}),
+    "S of a ring": (ring, {"learn": "map", "structure": "ring"}),
+    "S of a parameter": (pendulums, {"learn": "map"}),
+}
+FITS = QUICK | SLOW
+
+
 @QUIETLY
-@pytest.mark.parametrize("options", [{}, {"learn": "map"}, {"learn": "hamiltonian"}])
-def test_without_a_budget_no_decision_looks_at_the_clock(options):
-    pairs = kepler()
-    options = {"tolerance": 1e-4, "max_seconds": None, **options}
-    if options.get("learn") == "hamiltonian":
-        options["terms"] = ["p1**2 + p2**2", "1/sqrt(q1**2 + q2**2)"]
-    one, other = (gfnn.fit(pairs, clock=Jumping(seed), **options) for seed in (1, 2))
+@pytest.mark.parametrize(
+    "what", [*QUICK, *(pytest.param(what, marks=pytest.mark.slow) for what in SLOW)]
+)
+def test_without_a_budget_no_decision_looks_at_a_clock(what, monkeypatch):
+    """Neither at the budget's, nor past it at the machine's."""
+    data, options = FITS[what]
+    pairs, found = data(), []
+    for seed in (1, 2):
+        monkeypatch.setattr(time, "perf_counter", Jumping(10 + seed))
+        found.append(gfnn.fit(pairs, clock=Jumping(seed), max_seconds=None, **options))
+    one, other = found
     same_bits(one, other)
+    assert one.formula == other.formula
     assert (one.ended, one.operations) == (other.ended, other.operations)
+
+
+@QUIETLY
+def test_a_bound_on_operations_puts_none_on_the_clock_unless_told():
+    """Of a clock that jumps by hours, 120 s end a fit that is told nothing before any unit."""
+    pairs, options = kepler(100), {"learn": "map", "tolerance": 1e-4}
+    told_nothing = gfnn.fit(pairs, clock=Jumping(1), **options)
+    assert "the budget of 120 s is spent before the first unit" in told_nothing.ended
+    found = gfnn.fit(pairs, max_operations=10**8, clock=Jumping(1), **options)
+    same_bits(found, gfnn.fit(pairs, max_operations=10**8, max_seconds=None, **options))
+    assert found.operations > 0
+    both = gfnn.fit(pairs, max_operations=10**8, max_seconds=120.0, clock=Jumping(1), **options)
+    same_bits(both, told_nothing)
 
 
 @QUIETLY

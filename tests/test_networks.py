@@ -72,3 +72,10 @@ def test_what_it_cannot_be_learned_from_is_refused():
     several = gfnn.Pairs(z, moved(z), np.linspace(0.1, 0.3, 100))
     with pytest.raises(gfnn.FitError, match="family"):
         gfnn.fit(several, family="mlp", **options)
+
+
+def test_the_flow_in_numpy_is_that_of_the_step(fit):
+    """By it the pairs are looked at for gross errors, where a network misses the tolerance."""
+    z = states(20, 4)
+    images = fit.hamiltonian.flow.image(z)
+    np.testing.assert_allclose(images, np.asarray(fit.hamiltonian.flow.step(z)[0]), atol=1e-13)

@@ -143,8 +143,8 @@ class Flow:
         """Images of the states z (N, 2d), in NumPy: NaN where a stage has no solution. args: (N, k)
         or None."""
         steps = Steps(self.stages, self.substeps)
-        dt = float(np.asarray(self.dt))
-        return images(self.family, np.asarray(self.params), z, dt, steps, args=args).states
+        params, dt = jax.tree.map(np.asarray, self.params), float(np.asarray(self.dt))
+        return images(self.family, params, z, dt, steps, args=args).states
 
     def over(self, dt) -> Flow:
         """The flow over another dt, a number or (B,), in substeps that are no longer than those of

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -36,7 +37,7 @@ def fit(
     dt: float | None = None,
     tolerance: float = 1e-6,
     absolute_tolerance: float | None = None,
-    max_seconds: float | None = 120.0,
+    max_seconds: float | Literal["auto"] | None = "auto",
     max_operations: int | None = None,
     chart: str = "auto",
     learn: str = "auto",

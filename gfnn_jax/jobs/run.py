@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -17,7 +17,7 @@ from gfnn_jax.jobs.rollouts import NUM_STEPS, NUM_TRAJECTORIES, map_rollouts
 from gfnn_jax.jobs.search import scene_named, search
 from gfnn_jax.jobs.written import MODEL, Ran, already_done, pairs_digest, write
 from gfnn_jax.learn.candidates import Candidate
-from gfnn_jax.learn.fit import MAX_SECONDS, Fit
+from gfnn_jax.learn.fit import Fit
 from gfnn_jax.learn.structures import Bodies, structure_of
 from gfnn_jax.maps.bands import bands
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -48,7 +48,7 @@ def run(
     seed: int = 0,
     dt: float | None = None,
     tolerance: float | None = None,
-    max_seconds: float | None = MAX_SECONDS,
+    max_seconds: float | Literal["auto"] | None = "auto",
     max_operations: int | None = None,
     chart: str = "auto",
     learn: str = "auto",

@@ -12,8 +12,11 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator
+from typing import Literal
 
 from gfnn_jax.errors import OutOfTime
+
+MAX_SECONDS = 120.0  # of a fit that is told of no budget
 
 # Operations a second of a quiet core by kind of work, until units of a kind have been measured:
 # rows folded into a factor, singular values, flows and their derivatives in NumPy, iterations of a
@@ -28,6 +31,16 @@ _TELLING = 0.1
 _COMPILING = {2: 3.0, 4: 5.0, 6: 9.0, 8: 10.0}
 _COMPILING_MORE = 9.0
 _MOST_RESERVED = 1 / 5  # of a budget
+
+
+def seconds_allowed(
+    max_seconds: float | Literal["auto"] | None, max_operations: int | None
+) -> float | None:
+    """The seconds that "auto" stands for, or what else was asked for: where operations are bounded
+    the clock decides nothing, so that they give the same map again."""
+    if max_seconds != "auto":
+        return max_seconds
+    return MAX_SECONDS if max_operations is None else None
 
 
 class Counted:

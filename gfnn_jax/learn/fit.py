@@ -13,7 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -27,7 +27,7 @@ from gfnn_jax.learn.assemble import block_of
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance
 from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.clean import clean
-from gfnn_jax.learn.clock import COMPILE, ROWS, Budget
+from gfnn_jax.learn.clock import COMPILE, MAX_SECONDS, ROWS, Budget, seconds_allowed
 from gfnn_jax.learn.conclude import conclude
 from gfnn_jax.learn.damping import LearnedDamping
 from gfnn_jax.learn.diagnose import ChartJudgement, looked_for_errors
@@ -48,8 +48,6 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.model import Model
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
-
-MAX_SECONDS = 120.0
 
 _OF_DERIVATIVE = 3.0  # times a step's: the time that compiling its derivative takes
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken
@@ -268,7 +266,7 @@ def fit(
     ensemble: int = 1,
     angles: tuple[int, ...] = (),
     seed: int = 0,
-    max_seconds: float | None = MAX_SECONDS,
+    max_seconds: float | Literal["auto"] | None = "auto",
     max_operations: int | None = None,
     clock: Callable[[], float] = time.perf_counter,
     max_iterations: int = 250,
@@ -320,7 +318,7 @@ def fit(
     angles:    without a scene, the indices of z that have period 2π.
     max_seconds: for all of it; the search ends with the best map so far while there is time to
                compile its step. None: no budget, and the same map on a busy machine and an idle
-               one.
+               one. "auto": 120, or None where max_operations is given.
     max_operations: of the search, as counted: what a fit reports as ``operations`` gives its map
                again, whatever the clock has ended. None: no bound.
     clock:     gives the seconds that max_seconds is held against.
@@ -359,7 +357,7 @@ def fit(
             pairs, friction=friction, input_hold=input_hold, mass=mass, on_progress=on_progress
         )
     dim = pairs.dim if isinstance(pairs, Pairs) else None
-    budget = Budget(max_seconds, max_operations, clock, dim)
+    budget = Budget(seconds_allowed(max_seconds, max_operations), max_operations, clock, dim)
     require_x64("a fit")
     messages: list[str] = []
 
