@@ -14,8 +14,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gfnn_jax import scenes
+    from gfnn_jax import records, scenes
     from gfnn_jax.compiling import enable_compile_cache
+    from gfnn_jax.data.recording import Recording, read
     from gfnn_jax.errors import FitError, FitWarning, InputError, WorkError
     from gfnn_jax.evaluate import figures, metrics
     from gfnn_jax.exports.export import export
@@ -37,7 +38,12 @@ if TYPE_CHECKING:
 
     __version__: str
 
-_MODULES = {"figures": "evaluate.figures", "metrics": "evaluate.metrics", "scenes": "scenes"}
+_MODULES = {
+    "figures": "evaluate.figures",
+    "metrics": "evaluate.metrics",
+    "records": "records",
+    "scenes": "scenes",
+}
 _HOMES = {
     "CHARTS": "generating.charts",
     "Chart": "generating.charts",
@@ -47,6 +53,7 @@ _HOMES = {
     "Fitted": "models.model",
     "InputError": "errors",
     "Pairs": "phase_space",
+    "Recording": "data.recording",
     "Scene": "scenes",
     "SymplecticMap": "maps.symplectic_map",
     "TrainingData": "models.model",
@@ -56,6 +63,7 @@ _HOMES = {
     "fit": "learn.fit",
     "from_function": "families",
     "load": "maps.saved",
+    "read": "data.recording",
     "reference_trajectories": "scenes.trajectories",
     "register": "maps.saved",
     "sample_pairs": "scenes.trajectories",
@@ -73,6 +81,7 @@ __all__ = [
     "Fitted",
     "InputError",
     "Pairs",
+    "Recording",
     "Scene",
     "SymplecticMap",
     "TrainingData",
@@ -84,6 +93,8 @@ __all__ = [
     "from_function",
     "load",
     "metrics",
+    "read",
+    "records",
     "reference_trajectories",
     "register",
     "sample_pairs",

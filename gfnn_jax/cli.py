@@ -1,4 +1,4 @@
-"""The command line: ``gfnn scenes | run | fit | predict | export | compare``.
+"""The command line: ``gfnn scenes | run | look | fit | predict | export | compare``.
 
 Each exit status but 0 comes with one line that gives the reason (`EXIT_STATUS`). JAX is imported
 only after the usage has been checked.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import math
 import os
 import re
@@ -19,7 +20,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gfnn_jax import processes
+from gfnn_jax.cli_columns import add_column_options, column_options, masses, names_roles
 from gfnn_jax.compiling import enable_compile_cache
+from gfnn_jax.data.kinds import are_recordings
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new
@@ -29,7 +32,7 @@ from gfnn_jax.storage.partial import unfinished_note
 # compares them.
 CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
 FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
-LEARN = ("auto", "map", "hamiltonian")
+LEARN = ("auto", "map", "hamiltonian", "lagrangian")
 STRUCTURES = ("ring", "chain", "bodies:N", "ring:FIELDS", "chain:FIELDS", "bodies:N:SPECIES")
 EXPORTS = ("c", "stablehlo")
 _FEW_TERMS = 15  # of a law with noise that is shown as H
@@ -130,6 +133,8 @@ def _parser() -> argparse.ArgumentParser:
 
     command = commands.add_parser("scenes", help="list the scenes")
     command.set_defaults(command=_scenes)
+    command = commands.add_parser("records", help="list the measured records of the package")
+    command.set_defaults(command=_records)
 
     command = commands.add_parser(
         "run", help="a scene from reference data to figures",
@@ -142,6 +147,24 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--quick", action="store_true", help="fewer pairs and rollouts")
     command.add_argument("--dt", type=_positive, metavar="H", help="another time step")
     _add_fit_options(command, "the scene's own, close to the best attainable")
+
+    command = commands.add_parser(
+        "look", help="what a recording holds, before anything is learned",
+        description="Runs, rates, gaps, noise, friction and mistakes of a recording, told by the "
+        "file itself: .csv and other text, .npz, .npy.", **others,
+    )  # fmt: skip
+    command.set_defaults(command=_look)
+    command.add_argument("data", type=Path, metavar="FILE", nargs="+", help="one file or several")
+    add_column_options(command)
+    command.add_argument("--dt", type=_positive, metavar="H", help="seconds between rows")
+    command.add_argument("--json", action="store_true", help="print plain data, and draw nothing")
+    command.add_argument(
+        "--figure", type=Path, metavar="FILE", help="default runs/look-NAME.png, written anew"
+    )
+    command.add_argument("--overwrite", action="store_true", help="replace an existing --figure")
+    command.add_argument(
+        "--strict", action="store_true", help="exit status 1 where something is wrong"
+    )
 
     command = commands.add_parser(
         "fit", help="learn the map of your own trajectories",
@@ -158,10 +181,17 @@ def _parser() -> argparse.ArgumentParser:
         "--scene", metavar="NAME",
         help="scene whose coordinates and features are used; features assume the scene's units",
     )  # fmt: skip
-    command.add_argument(
-        "--angles", type=_indices, default=(), metavar="0,2", help="indices in z with period 2π"
-    )
     _add_fit_options(command, "1e-6")
+    add_column_options(command)
+    command.add_argument(
+        "--friction", default="auto", metavar="KIND",
+        help="of a recording: auto, none, linear, quadratic, dry, or some joined by + "
+        "(default %(default)s)",
+    )  # fmt: skip
+    command.add_argument(
+        "--input-hold", choices=("auto", "hold", "linear", "band"), default="auto",
+        help="of a recording: how inputs go on between samples (default %(default)s)",
+    )  # fmt: skip
     command.add_argument(
         "--devices", type=_devices, metavar="all|N",
         help="number of devices that share the rows, and the networks of an ensemble; on a CPU "
@@ -186,9 +216,21 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
     command.add_argument(
         "--initial", type=Path, metavar="FILE", required=True,
-        help="initial states, or a trajectory file: its sequences continue from their last states",
+        help="initial states, or a trajectory file: its sequences continue from their last states; "
+        "of a map of positions a recording, whose runs continue from their last two",
     )  # fmt: skip
-    command.add_argument("--num-steps", type=_count, metavar="N", required=True)
+    command.add_argument("--num-steps", type=_count, metavar="N")
+    command.add_argument(
+        "--estimate-from", type=_count, metavar="K",
+        help="of a recording: samples that the state at its end is estimated from",
+    )  # fmt: skip
+    command.add_argument(
+        "--inputs", type=Path, metavar="FILE", help="of a recording: the inputs ahead of its end"
+    )
+    command.add_argument(
+        "--compare", type=Path, metavar="FILE",
+        help="of a recording: what was measured after its end, which the forecast is held to",
+    )  # fmt: skip
     command.add_argument(
         "--save-every", type=_count, metavar="K", default=1,
         help="save the state of every K-th step (default %(default)s)",
@@ -376,16 +418,6 @@ def _texts(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(";") if part.strip())
 
 
-def _indices(text: str) -> tuple[int, ...]:
-    parts = text.split(",")
-    found = tuple(int(part) for part in parts if part.strip().isdecimal())
-    if len(set(found)) < len(parts):
-        raise argparse.ArgumentTypeError(
-            f"expected different whole numbers separated by commas, e.g. 0,2; got '{text}'"
-        )
-    return found
-
-
 def _max_seconds(arguments: argparse.Namespace) -> float | None:
     """The budget of a fit: where operations are bounded nothing else is, unless told."""
     given = arguments.max_seconds
@@ -393,6 +425,15 @@ def _max_seconds(arguments: argparse.Namespace) -> float | None:
 
 
 # The commands. The heavy imports are here, after the checks that need none of them.
+
+
+def _records(arguments: argparse.Namespace) -> None:
+    from gfnn_jax.records import RECORDS, path
+
+    for name, record in RECORDS.items():
+        options = f"--positions {','.join(record.positions)}"
+        options += f" --angles {','.join(record.angles)}" if record.angles else ""
+        print(f"{name:16} {record.what}\n{'':16} gfnn fit {path(name)} {options} --out {name}")
 
 
 def _scenes(arguments: argparse.Namespace) -> None:
@@ -424,6 +465,30 @@ def _run(arguments: argparse.Namespace) -> None:
     _hold_to(arguments.strict, out / "model")
 
 
+def _look(arguments: argparse.Namespace) -> None:
+    if arguments.figure is not None:
+        ensure_new(arguments.figure, arguments.overwrite)
+    for path in arguments.data:
+        _check_exists(path)
+    figure = arguments.figure
+    if figure is None and not arguments.json:
+        figure = Path("runs") / f"look-{arguments.data[0].stem}.png"
+    options = column_options(arguments)
+    given = {"dt": arguments.dt, "mass": masses(arguments)}
+    options |= {name: value for name, value in given.items() if value}
+    from gfnn_jax.jobs.look import look
+
+    summary = look(arguments.data, options, figure)
+    if arguments.json:
+        print(json.dumps(summary.as_json(), indent=2, ensure_ascii=False))
+    else:
+        _print_table(summary)
+        print(f"figure: {figure}")
+    wrong = sum(fault.wrong for fault in summary.faults)
+    if arguments.strict and wrong:
+        raise WorkError(f"{arguments.data[0]}: wrong in {wrong} ways (--strict)")
+
+
 def _fit(arguments: argparse.Namespace) -> None:
     if arguments.tolerance is not None and arguments.absolute_tolerance is not None:
         raise InputError("expected --tolerance or --absolute-tolerance, not both")
@@ -431,6 +496,18 @@ def _fit(arguments: argparse.Namespace) -> None:
         ensure_new(arguments.out, arguments.overwrite, folder=True)
     for path in arguments.data:
         _check_exists(path)
+    columns = column_options(arguments)
+    with_roles = names_roles(columns)
+    asked = with_roles or arguments.learn == "map"
+    if asked and are_recordings(arguments.data, with_roles=with_roles):
+        if arguments.dt is not None:
+            columns["dt"] = arguments.dt
+        if arguments.learn == "map":
+            return _fit_positions(arguments, columns)
+        return _fit_law(arguments, columns)
+    if arguments.learn == "lagrangian":
+        raise InputError("--learn lagrangian: expected a recording, got states q, p")
+    arguments.angles = _as_indices(columns)
     with contextlib.ExitStack() as stack:
         group = None
         if arguments.distributed:
@@ -439,6 +516,42 @@ def _fit(arguments: argparse.Namespace) -> None:
         if arguments.distributed:
             group = processes.Group(processes.join())
         _fit_and_tell(arguments, group)
+
+
+def _fit_law(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
+    """The law of a recording."""
+    _set_up_jax()
+    from gfnn_jax.jobs.fit_recording import fit_recording
+
+    with progress.on_stderr() as shown:
+        learned = fit_recording(
+            arguments.data, out=arguments.out, columns=columns, learn=arguments.learn,
+            friction=arguments.friction, input_hold=arguments.input_hold,
+            mass=masses(arguments), seed=arguments.seed, progress=shown,
+        )  # fmt: skip
+    print(learned.fit.table)
+    print(f"written to {arguments.out}")
+    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
+          "--out forecast.csv")  # fmt: skip
+
+
+def _fit_positions(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
+    """Learn the map of a recording of positions."""
+    _set_up_jax()
+    from gfnn_jax.jobs.fit_positions import fit_positions
+
+    with progress.on_stderr() as shown:
+        ran = fit_positions(
+            arguments.data, out=arguments.out, columns=columns, seed=arguments.seed,
+            tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
+            absolute_tolerance=arguments.absolute_tolerance, structure=arguments.structure,
+            max_seconds=_max_seconds(arguments), max_operations=arguments.max_operations,
+            progress=shown,
+        )  # fmt: skip
+    _summarise(ran, arguments.out)
+    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
+          "--out prediction.npz")  # fmt: skip
+    _hold_to(arguments.strict, arguments.out)
 
 
 def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) -> None:
@@ -468,6 +581,15 @@ def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) 
     _hold_to(arguments.strict, arguments.out)
 
 
+def _as_indices(columns: dict[str, Any]) -> tuple[int, ...]:
+    """``--angles`` of canonical states. Raises InputError for names of columns."""
+    angles = columns.get("angles", ())
+    if not all(isinstance(i, int) for i in angles) or len(set(angles)) < len(angles):
+        got = ", ".join(map(str, angles))
+        raise InputError(f"--angles: expected different whole numbers, indices in z, got {got}")
+    return tuple(angles)
+
+
 def _hold_to(strict: bool, model: Path) -> None:
     """Raise WorkError where ``strict`` is set and the model misses the tolerance."""
     from gfnn_jax.maps.saved import record
@@ -479,8 +601,13 @@ def _hold_to(strict: bool, model: Path) -> None:
 def _predict(arguments: argparse.Namespace) -> None:
     if not arguments.resume:
         ensure_new(arguments.out, arguments.overwrite)
-    for path in (arguments.model, arguments.initial):
-        _check_exists(path)
+    for path in (arguments.model, arguments.initial, arguments.inputs, arguments.compare):
+        if path is not None:
+            _check_exists(path)
+    if are_recordings(arguments.initial) and _is_law(arguments.model):
+        return _forecast(arguments)
+    if arguments.num_steps is None:
+        raise InputError("expected --num-steps: how many steps to predict")
     with contextlib.ExitStack() as stack:
         share = None
         if arguments.distributed:
@@ -489,6 +616,32 @@ def _predict(arguments: argparse.Namespace) -> None:
         if arguments.distributed:
             share = processes.join()
         _predict_and_tell(arguments, share)
+
+
+def _is_law(model: Path) -> bool:
+    """Whether the model is the law of a recording, and no map of its positions."""
+    _set_up_jax()
+    from gfnn_jax.maps.saved import record
+
+    return "lagrangian" in record(model)
+
+
+def _forecast(arguments: argparse.Namespace) -> None:
+    """From the end of a recording."""
+    _set_up_jax()
+    from gfnn_jax.jobs.forecast import forecast_recording
+
+    found, judged = forecast_recording(
+        arguments.model, arguments.initial, out=arguments.out, num_steps=arguments.num_steps,
+        save_every=arguments.save_every, estimate_from=arguments.estimate_from,
+        inputs=arguments.inputs, compare=arguments.compare, overwrite=arguments.overwrite,
+    )  # fmt: skip
+    times = [f.times[-1] for f in found.values()]
+    print(f"{arguments.out}: forecasts of {len(found)} runs, up to {max(times):g} s")
+    if judged is not None:
+        for name, (rms, median, within) in judged.columns.items():
+            print(f"{name}: error {rms:.4g} rms, {median:.4g} median; {within:.0%} of "
+                  f"{judged.num_samples} samples within two standard deviations")  # fmt: skip
 
 
 def _predict_and_tell(arguments: argparse.Namespace, share: processes.Share | None) -> None:
@@ -579,6 +732,8 @@ def _summarise(ran: Any, out: Path) -> None:
     )
     if report["hamiltonian"] is not None:
         print(law_line(report))
+        for loss in report["hamiltonian"]["friction"]:
+            print(f"{loss['term']}: {loss['coefficient']:.6g} ± {loss['std']:.1g}")
     print(fit["ended"])
     rollout = report["rollout"]
     if rollout is not None:

@@ -70,12 +70,13 @@ def symplectic_form(dim: int) -> Float[np.ndarray, "phase phase"]:
     return np.block([[zero, one], [-one, zero]])
 
 
-def symplecticity_defect(jacobian, scale=None):
-    """Largest entry of Mᵀ J M − J in magnitude, (...), for Jacobians M of shape (..., 2d, 2d).
+def symplecticity_defect(jacobian, scale=None, multiplier: Any = 1.0):
+    """Largest entry of Mᵀ J M − μJ in magnitude, (...), for Jacobians M of shape (..., 2d, 2d).
 
     ``scale`` (2d,) makes the coordinates unit-sized first: z = scale * y. The form that M must
     preserve is then J with the entry (q_i, p_i) multiplied by scale_q,i * scale_p,i; the defect is
-    divided by the largest such product, so that it is a pure number. NumPy or JAX.
+    divided by the largest such product, so that it is a pure number. multiplier: μ, a number or one
+    of each Jacobian (...); 1 of a symplectic map. NumPy or JAX.
     """
     xp = namespace(jacobian)
     form = xp.asarray(symplectic_form(jacobian.shape[-1] // 2), dtype=jacobian.dtype)
@@ -85,20 +86,26 @@ def symplecticity_defect(jacobian, scale=None):
         jacobian = jacobian * scale.reshape((1,) * (jacobian.ndim - 1) + scale.shape)  # dZ/dy
         weighted = form * (scale[:, None] * scale[None, :])
     pulled_back = matmul(xp.swapaxes(jacobian, -1, -2), matmul(form, jacobian))
-    defect = pulled_back - weighted.reshape((1,) * (jacobian.ndim - 2) + weighted.shape)
+    kept = weighted.reshape((1,) * (jacobian.ndim - 2) + weighted.shape)
+    defect = (
+        pulled_back - (multiplier[..., None, None] if np.ndim(multiplier) else multiplier) * kept
+    )
     return xp.max(xp.abs(defect), axis=(-2, -1)) / xp.max(xp.abs(weighted))
 
 
-def defect_of_pairs(before, after, scale):
-    """The largest |after_uᵀ J after_v − before_uᵀ J before_v| (...) over pairs of tangent vectors,
-    the first half with the second: (2k, ..., 2d) each, ÷ the largest of scale_q scale_p (2d,).
+def defect_of_pairs(before, after, scale, multiplier: Any = 1.0):
+    """Largest |after_uᵀ J after_v − μ before_uᵀ J before_v| (...) over pairs (u, v) of tangents.
 
-    For random signs of length 1 in units of ``scale`` it is about ‖MᵀJM − J‖ ÷ √(2d), Frobenius'
-    norm: what the entries of a row come to. NumPy or JAX.
+    before, after: tangent vectors (2k, ..., 2d); u runs over the first half, v over the second.
+    The result is divided by the largest product of scale_q and scale_p, scale (2d,). For tangents
+    of random signs, of length 1 in units of ``scale``, it is about ‖MᵀJM − J‖ ÷ √(2d) in
+    Frobenius' norm, the size of a row. NumPy or JAX.
     """
     xp, half, dim = namespace(after), len(before) // 2, len(scale) // 2
     form = [xp.sum(t[:half] * apply_j(t[half:]), axis=-1) for t in (after, before)]
-    return xp.max(xp.abs(form[0] - form[1]), axis=0) / xp.max(scale[:dim] * scale[dim:])
+    return xp.max(xp.abs(form[0] - multiplier * form[1]), axis=0) / xp.max(
+        scale[:dim] * scale[dim:]
+    )
 
 
 def hamiltonian_vector_field(hamiltonian: Callable) -> Callable:

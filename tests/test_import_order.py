@@ -15,11 +15,19 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 # A module imports only from rooms before its own; the modules of a room share its place.
 ORDER = (
     "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes",
-    "storage", "scenes", "families", "solve", "generating", "flows", "maps", "exports", "data",
-    "dataset", "fitting", "models", "learn", "baselines", "evaluate", "jobs", "cli", "__main__",
+    "storage", "signals", "data", "records", "dataset", "scenes", "families", "solve", "generating",
+    "flows", "maps", "exports", "fitting", "models", "learn", "baselines", "evaluate", "jobs",
+    "cli_columns", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
-SHORTHANDS = {("maps.symplectic_map", f"maps.{name}") for name in ("saved", "samples", "sharded")}
+SHORTHANDS = {
+    ("maps.symplectic_map", f"maps.{name}")
+    for name in ("positions", "saved", "samples", "sharded", "energy", "estimates")
+}
+SHORTHANDS |= {
+    ("data.recording", "data.recording_summary"),
+    ("data.recording_summary", "data.summary_screen"),
+}
 HOMES = {  # the module, and those whose names begin as its own does
     "argparse": "cli",
     "diffrax": "scenes.trajectories",
@@ -27,6 +35,7 @@ HOMES = {  # the module, and those whose names begin as its own does
     "matplotlib": "evaluate.figures",
     "optax": "fitting.adam",
     "orbax": "storage.checkpoints",
+    "pandas": "data.text_files",
 }
 
 

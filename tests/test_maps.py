@@ -1,6 +1,7 @@
 """The symplectic map: composition, inverse, defect, angles, lanes apart, users' transforms."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -173,11 +174,44 @@ def test_base_map_around_a_generated_piece():
     inner, expected = base.image(Z), PENDULUM.step(base.image(Z))
     np.testing.assert_allclose(images, base.image(np.asarray(expected[0])), rtol=0, atol=1e-14)
     assert (info.status == OK).all()
+    assert learned.multiplier() == 1.0
     np.testing.assert_array_equal(info.iterations, expected[1].iterations)  # the worst piece's
     assert learned.defect(Z).max() < 1e-12
     np.testing.assert_allclose(learned.inverse(images)[0], Z, rtol=0, atol=1e-13)
     # The chart's determinant is that of the generated piece, where that piece acts.
     np.testing.assert_allclose(learned.determinant(Z), PENDULUM.determinant(inner), rtol=1e-12)
+
+
+@partial(
+    jax.tree_util.register_dataclass, data_fields=("matrix", "centre", "shift"),
+    meta_fields=("known",),
+)  # fmt: skip
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scaling(Affine):
+    """As an affine map whose matrix need not be symplectic, and a multiplier that it claims."""
+
+    known: float | None = 1.0
+
+    def multiplier(self, args=None):
+        return self.known
+
+
+def test_the_defect_is_that_of_the_multiplier():
+    """q and 0.9 p: of the form it keeps 0.9 times; twice, 0.81 times; of no known multiple, NaN."""
+
+    def scaled(known):
+        return Scaling(np.diag([1.0, 0.9]), np.zeros(2), np.zeros(2), known)
+
+    def around(*pieces):
+        return dataclasses.replace(PENDULUM, pieces=(*pieces, *PENDULUM.pieces))
+
+    once, twice = around(scaled(0.9)), around(scaled(0.9), scaled(0.9))
+    assert once.multiplier() == 0.9
+    assert twice.multiplier() == 0.9 * 0.9
+    assert max(map_.defect(Z).max() for map_ in (once, twice)) < 1e-14
+    np.testing.assert_allclose(around(scaled(0.8)).defect(Z), 0.1, rtol=1e-12)
+    assert around(scaled(None)).multiplier() is None
+    assert np.isnan(around(scaled(None)).defect(Z)).all()
 
 
 @from_function

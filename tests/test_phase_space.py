@@ -42,6 +42,9 @@ def test_defect_of_symplectic_matrices_is_roundoff_and_of_others_is_not(dim):
     # (1 + a) I has MᵀJM − J = (2a + a²) J.
     stretched = 1.001 * np.eye(2 * dim)
     assert float(symplecticity_defect(jnp.asarray(stretched))) == pytest.approx(0.002001)
+    assert symplecticity_defect(stretched, multiplier=1.001**2) < 1e-15
+    each = symplecticity_defect(np.stack([stretched, batch[0]]), multiplier=np.array([1.001**2, 1]))
+    assert each.max() < 1e-12
     swapped = np.eye(2 * dim)[::-1]  # q and p exchanged without the sign
     assert float(symplecticity_defect(jnp.asarray(swapped.copy()))) == pytest.approx(2.0)
 

@@ -50,8 +50,14 @@ class Family(Protocol):
 
 
 def at_time(family: Any, args: Any, after: Any) -> Any:
-    """args (..., k) as they are a time ``after`` (...) later: the last of them is the time where
-    the family depends on it, the others stay. NumPy or JAX."""
+    """Advance args (..., k) by a time ``after`` (...). NumPy or JAX.
+
+    Where the family depends on time, it is the last of the args and grows; the others stay. A
+    family may have an ``at_time`` of its own instead.
+    """
+    own = getattr(family, "at_time", None)
+    if own is not None:
+        return own(args, after)
     if getattr(family, "parameters", ())[-1:] != (TIME,):
         return args
     xp = namespace(args, after)
@@ -79,6 +85,16 @@ class LinearFamily(Family, Protocol):
     def unflatten(self, coefficients: Any) -> Any:
         """Make the params of the family from coefficients (num_parameters,)."""
         ...
+
+
+def parameter_gradients(family: Any, params: Any, w: Any, args: Any = None, along: Any = None):
+    """∂/∂params of the gradient (..., 2d, m): the gradients of the terms of a linear family, or
+    what a family says that has a ``parameter_gradients`` of its own. along: a linear family of
+    other terms, in whose coefficients it is instead, these 0. NumPy."""
+    own = getattr(family, "parameter_gradients", None)
+    if own is not None:
+        return own(params, w, args, along)
+    return (along or family).term_gradients(w, args)
 
 
 class DifferentiatedByJax:

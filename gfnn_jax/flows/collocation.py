@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.family import at_time
+from gfnn_jax.families.family import at_time, parameter_gradients
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.flows.gauss import gauss
+from gfnn_jax.flows.uniform import Uniform
 from gfnn_jax.phase_space import apply_j, symplectic_form
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -77,18 +78,23 @@ def images(
         for _ in range(steps.substeps):
             on_substep()
             newton = steps.newton and not free
-            slopes, done = solve_stages(family, params, z, h, rule, args, newton=newton)
+            damped = isinstance(family, Uniform)
+            stepped, own = family.begun(args, z) if damped else (family, args)
+            slopes, done = solve_stages(stepped, params, z, h, rule, own, newton=newton)
             solved = solved & done
             inside = z + h * _summed(rule.matrix, slopes) if derivatives else z
+            moved = h * _summed(rule.weights[None, :], slopes)[0]
+            z = z + (family.moved(params, z, moved, h) if damped else moved)
             if derivatives and free:
                 by_coefficient = _carried(
                     family, params, inside, h, rule, args, along or family, by_coefficient
                 )
             elif derivatives:
-                by_z, by_c = _derivatives(family, params, inside, h, rule, args, along or family)
+                by_z, by_c = _derivatives(stepped, params, inside, h, rule, own, along)
+                if damped:
+                    by_z, by_c = family.moved_derivatives(params, z, by_z, by_c, h)
                 by_state = by_z @ by_state
                 by_coefficient = by_z @ by_coefficient + by_c if np.ndim(by_coefficient) else by_c
-            z = z + h * _summed(rule.weights[None, :], slopes)[0]
             args = at_time(family, args, h[:, 0] if np.ndim(h) else h)
     z = np.where(solved[:, None], z, np.nan)
     return Images(z, solved, *((by_state, by_coefficient) if derivatives else ()))
@@ -266,7 +272,7 @@ def _carried(family, params, inside, h, rule, args, along, before):
 def _derivatives(family, params, inside, h, rule, args, along):
     """∂Z/∂z (B, 2d, 2d) and ∂Z/∂c (B, 2d, terms) of one step, its stage states (s, B, 2d).
 
-    N dK = JH'' dz + J∇φ dc with N the stage matrix and φ the terms of ``along``, and
+    N dK = JH'' dz + J∇φ dc with N the stage matrix and φ the terms, of ``along`` if given, and
     dZ = dz + h Σ b_i dK_i: the rows h bᵀ N⁻¹ are solved for once, whatever the number of terms.
     """
     count, lanes, width = inside.shape
@@ -283,5 +289,5 @@ def _derivatives(family, params, inside, h, rule, args, along):
     rows = rows.reshape(lanes, width, count * width)
     bent = hessian.transpose(1, 0, 2, 3).reshape(lanes, count * width, width)
     by_state = np.eye(width) + rows @ bent
-    terms = along.term_gradients(inside, args).transpose(1, 0, 2, 3)
+    terms = parameter_gradients(family, params, inside, args, along).transpose(1, 0, 2, 3)
     return by_state, rows @ terms.reshape(lanes, count * width, -1)

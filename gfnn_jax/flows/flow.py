@@ -25,6 +25,7 @@ from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.gauss import gauss
+from gfnn_jax.flows.uniform import Uniform, power
 from gfnn_jax.generating.generated import two_sum
 from gfnn_jax.phase_space import apply_j, area, symplectic_form
 from gfnn_jax.solve import fixed_point, krylov, newton
@@ -191,9 +192,34 @@ class Flow:
 
         return self._repeated(substep, (z, jnp.zeros(z.shape[:1], z.dtype)), args)[0][1]
 
+    def work(self, z, args=None):
+        """(Z, Power) of the step from z (B, 2d): the energy that friction has taken and inputs have
+        brought, by the quadrature of the stages, of the order of the step."""
+
+        def substep(both, args):
+            z, done = both
+            slopes, info = self._slopes(z, args, False)
+            h, inside = self._substep, z[None] + _coupled(slopes)
+            at = _at_stages(self.family, args, h, self.stages)
+            if isinstance(self.family, Uniform):
+                since = jnp.asarray(gauss(self.stages).nodes, z.dtype)[:, None, None] * h
+                inside = self.family.from_canonical(self.params, inside, since)
+            rate = power(self.family, self.params, inside, at)
+            more = jax.tree.map(lambda a: jnp.sum(_weighted(h, a) * a, axis=0), rate)
+            moved = self._moved(z, slopes)
+            return (z + moved, jax.tree.map(jnp.add, done, more)), info
+
+        none = jax.tree.map(jnp.zeros_like, power(self.family, self.params, z, args))
+        return self._repeated(substep, (z, none), args)[0]
+
     def inverse(self) -> Flow:
         """The inverse map: the same flow backwards."""
         return dataclasses.replace(self, dt=-self.dt)
+
+    def multiplier(self, args=None):
+        """1.0 without forces, e^(−γ dt) with uniform friction γ, None with others."""
+        own = getattr(self.family, "multiplier", None)
+        return 1.0 if own is None else own(self.params, self.dt)
 
     def _repeated(self, substep, carry, args):
         """All substeps of carry, the time among the args going on with them."""
@@ -211,19 +237,33 @@ class Flow:
     def _increment(self, z, args, unrolled: bool | int):
         """(Z − z, Info) of one substep."""
         slopes, info = self._slopes(z, args, unrolled)
-        return jnp.sum(slopes, axis=0), info
+        return self._moved(z, slopes), info
+
+    def _moved(self, z, slopes):
+        """Z − z of one substep."""
+        moved = jnp.sum(slopes, axis=0)
+        if isinstance(self.family, Uniform):
+            moved = self.family.moved(self.params, z, moved, self._substep)
+        return moved
+
+    @property
+    def _substep(self):
+        """The time of a substep as it multiplies states: a number, or (B, 1)."""
+        h = self.dt / self.substeps
+        return h[:, None] if jnp.ndim(h) else h
 
     def _slopes(self, z, args, unrolled: bool | int):
-        """(L (s, B, 2d), Info) of one substep."""
-        h = self.dt / self.substeps
-        h = h[:, None] if jnp.ndim(h) else h
-        shared = (self.family, self.params, h, self.scale)
+        """(L (s, B, 2d), Info) of one substep; with uniform friction in the variables (q, p̃)."""
+        h, family = self._substep, self.family
+        if isinstance(family, Uniform):
+            family, args = family.begun(args, z)
+        shared = (family, self.params, h, self.scale)
         if self.newton:
             equation = StageEquation(self.stages)
             if args is not None:  # open lanes are taken out of the batch, with their own
                 args = jnp.broadcast_to(args, (z.shape[0], args.shape[-1]))
             lanes = (z, args, h) if jnp.ndim(h) else (z, args)
-            first = h * apply_j(self.family.gradient(self.params, z, args))
+            first = h * apply_j(family.gradient(self.params, z, args))
             weights = np.repeat(gauss(self.stages).weights, first.shape[-1])
             guess = jnp.tile(first, self.stages) * jnp.asarray(weights, first.dtype)[None]
             if unrolled:

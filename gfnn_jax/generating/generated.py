@@ -197,6 +197,10 @@ class Generated:
         predictor = self.predictor.reverse() if self.predictor is not None else None
         return dataclasses.replace(self, chart=chart, dt=dt, predictor=predictor)
 
+    def multiplier(self, args=None) -> float:
+        """1.0: the piece is symplectic."""
+        return 1.0
+
     def determinant(self, z0, z1, args=None):
         """Determinant det ∂w/∂z (B,) at states z0 (B, 2d) with images z1, NumPy or JAX.
 

@@ -101,7 +101,7 @@ def local_jacobians(
     fewest = _NEIGHBOURS_PER_TERM * terms
     count = min(n, max(fewest, min(_MOST_NEIGHBOURS, fewest * n // _LOCAL_ENOUGH)))
     affordable = max(_FEWEST_CENTRES, int(_OPERATIONS / (6 * count * terms**2)))
-    chosen = np.random.default_rng(seed).permutation(n)[: min(_CENTRES, affordable)]
+    chosen = _centres(n, min(_CENTRES, affordable), seed)
     tree = cKDTree(x)
     while True:
         _, near = tree.query(x[chosen], k=count)
@@ -126,6 +126,15 @@ def local_jacobians(
     filled = _full_rank(design) & (reach > _FILLED)
     known = float(error + 0.5 * count * error**2) if np.mean(filled) > 0.5 else np.inf
     return slope * scale[:, None] / scale[None, :], known
+
+
+def centres(y0, jacobians, seed: int) -> np.ndarray:
+    """(n, 2d): the states among y0 (N, 2d) at which `local_jacobians` of this seed are."""
+    return np.asarray(y0)[_centres(len(y0), len(jacobians), seed)]
+
+
+def _centres(count: int, most: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).permutation(count)[:most]
 
 
 def outliers(y0, y1, scale, given=None) -> np.ndarray:

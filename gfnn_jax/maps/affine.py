@@ -55,3 +55,7 @@ class Affine:
         """Make the inverse map, by E⁻¹ = −J Eᵀ J of a symplectic E."""
         inverse = apply_j(apply_j(self.matrix).T)
         return Affine(inverse, self.centre + self.shift, -self.shift)
+
+    def multiplier(self, args=None) -> float:
+        """1.0: the piece is symplectic."""
+        return 1.0

@@ -20,8 +20,11 @@ import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.errors import InputError
+from gfnn_jax.families import lagrangian
+from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.ensemble import Ensemble
 from gfnn_jax.families.inputs import Inputs
+from gfnn_jax.families.lagrangian import Friction
 from gfnn_jax.families.mlp import Mlp
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
@@ -29,13 +32,19 @@ from gfnn_jax.families.sums import Groups, Part, Sums, Windows
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.forces import Forced
+from gfnn_jax.flows.legendre import Legendre
+from gfnn_jax.flows.uniform import Uniform
 from gfnn_jax.generating.charts import Chart, TypeOne
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import PolynomialModel, Predictor
 from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.damping import Damping
 from gfnn_jax.maps.domain import Domain, Ranges
+from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.posterior import Posterior
+from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.maps.stroboscopic import OverPhases
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.scenes import SCENES
@@ -48,9 +57,11 @@ _TYPES: dict[str, type] = {
     for kind in (
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
         Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
-        Windows, Groups, Ranges, OfTimeStep, Ensemble,
+        Windows, Groups, Ranges, OfTimeStep, Ensemble, Uniform, Forced, Legendre, Friction, Signals,
+        Sensors, Damping, OfDisplacement,
     )
-}  # fmt: skip
+} | {"LagrangianTerms": lagrangian.Terms}  # fmt: skip
+_NAMES = {kind: name for name, kind in _TYPES.items()}
 
 
 def register(kind: type) -> type:
@@ -64,7 +75,7 @@ def register(kind: type) -> type:
         raise InputError(f"expected a dataclass to register, got {kind!r}")
     if _TYPES.get(kind.__name__, kind).__module__ != kind.__module__:
         raise InputError(f"another type is registered as {kind.__name__}: choose another name")
-    _TYPES[kind.__name__] = kind
+    _TYPES[kind.__name__], _NAMES[kind] = kind, kind.__name__
     return kind
 
 
@@ -220,7 +231,7 @@ def _encode(value: Any) -> tuple[Any, Any]:
         items = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
         if items.get("features") is not None:
             items["features"] = _OF_SCENE  # _lender has found whose they are
-        return _encode_all(items, {"type": type(value).__name__})
+        return _encode_all(items, {"type": _NAMES[type(value)]})
     if isinstance(value, tuple) and any(dataclasses.is_dataclass(item) for item in value):
         return _encode_all({str(i): item for i, item in enumerate(value)}, {"type": "tuple"})
     if isinstance(value, tuple):

@@ -68,6 +68,11 @@ class OverPhases:
         """Make the inverse row: the inverse steps from the last to the first."""
         return dataclasses.replace(self, piece=self.piece.inverse(), backward=not self.backward)
 
+    def multiplier(self, args=None):
+        """The product of those of the steps, which are alike; None where a step has none."""
+        one = self.piece.multiplier(args)
+        return None if one is None else one**self.steps
+
     def _row(self, step, carry):
         def following(carry, number):
             # Backward, a piece begins where its step forward ends.

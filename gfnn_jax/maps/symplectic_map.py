@@ -2,14 +2,18 @@
 
     coordinates⁻¹ ∘ R^½ ∘ generated(S, chart) ∘ R^½ ∘ coordinates
 
-Maps are pytrees: their numbers can be passed through ``jit`` and differentiated; what is static
-(the kind of family, chart, coordinates) is a hashable constant, and what is compiled for one map
-serves all of its kind.
+Of a system with friction a piece multiplies the symplectic form by a factor μ, its multiplier, or
+keeps no multiple of it; so does the map.
+
+Maps are pytrees: their numbers can be passed through ``jit`` and differentiated. The kind of
+family, the chart and the coordinates are static, hashable constants. A program compiled for one map
+serves all maps of the same kind.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from functools import partial, wraps
 from numbers import Integral
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -26,10 +30,12 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated, two_sum
 from gfnn_jax.maps.bands import Bands, bands
 from gfnn_jax.maps.domain import Domain, Ranges
+from gfnn_jax.maps.inputs import Scheduled, Signals
 from gfnn_jax.maps.modified_hamiltonian import NUM_STEPS, Cells, ModifiedHamiltonian, of_cells
 from gfnn_jax.maps.parameters import Parameters, as_args
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.rollout import scan_steps
+from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.phase_space import defect_of_pairs, require_x64, symplecticity_defect
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, Info
 
@@ -41,7 +47,7 @@ _TWO_PI_REST = 2.4492935982947064e-16  # 2π minus its float64 value
 
 @runtime_checkable
 class Piece(Protocol):
-    """One symplectic map of a row, batch first: z (B, 2d), by JAX.
+    """Map in a row of such, batch first: z (B, 2d), by JAX.
 
     A piece is a pytree. ``unrolled`` makes derivatives those of the iterations that ran; a number
     also bounds the number of updates.
@@ -64,6 +70,12 @@ class Piece(Protocol):
 
     def inverse(self) -> Any:
         """Make the inverse piece."""
+        ...
+
+    def multiplier(self, args: Any = None) -> Any:
+        """μ of AᵀJA = μJ, which holds for the derivative A of every step: 1.0 of a symplectic
+        piece; another number, or one of each lane (B,), of a conformally symplectic one; None where
+        there is no such number."""
         ...
 
 
@@ -101,8 +113,8 @@ class RolloutInfo(NamedTuple):
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=("pieces", "domain", "scale", "angle_centre", "dt", "parameters", "dt_range"),
-    meta_fields=("coordinates",),
-    drop_fields=("posterior",),
+    meta_fields=("coordinates", "signals"),
+    drop_fields=("posterior", "sensors"),
 )
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class SymplecticMap:
@@ -113,19 +125,24 @@ class SymplecticMap:
     domain:       region that the data covered, in the inner coordinates.
     scale:        (2d,) sizes of the user's coordinates.
     angle_centre: (a,) centre of the interval of length 2π in which each angle is kept.
-    dt:           the time one step takes; of a reversed map below 0.
-    parameters:   what the system depends on beside its state, where it was learned with that.
-    dt_range:     (2,) the lowest and highest dt of the data, of a map that was learned with dt as a
-                  variable of S.
-    posterior:    how well the coefficients are known, where that is; no leaf: what makes another
-                  map of the leaves (``jit``, ``jax.tree.map``) leaves it out.
+    dt:           time of one step; negative for a reversed map.
+    parameters:   names and ranges of the parameters that the map was learned with, or None.
+    dt_range:     (2,) the lowest and highest dt of the data, for a map that was learned with dt as
+                  a variable of S.
+    signals:      names of the inputs that act on the system, or None.
+    sensors:      columns of the recording that the map was learned from, with their noise, or None.
+                  They are no leaf.
+    posterior:    posterior of the coefficients, or None. It is no leaf: a map that is made of the
+                  leaves (``jit``, ``jax.tree.map``) has none.
 
-    Methods take states z (2d,) or (B, 2d), NumPy or JAX, and answer with JAX arrays. A map that was
+    Methods take states z (2d,) or (B, 2d), NumPy or JAX, and return JAX arrays. A map that was
     learned with parameters takes their values too: name -> a number or (B,), or an array (k,) or
-    (B, k); that of a driven system takes t0, the time of the drive at z, a number or (B,), which
-    goes on with the steps. They can be differentiated, in forward and reverse mode, in z, in the
-    parameters' values and in the map's own leaves, by the implicit-function theorem; ``jax.vmap``
-    and ``jax.jit`` work over them.
+    (B, k). A map of a driven system takes t0, the time of the drive at z, a number or (B,), which
+    advances with the steps. A map with inputs takes these: (k,) or (B, k) during a step, (N, k) or
+    (B, N, k) of the N steps of a rollout; where they are not given, none acts. Methods can be
+    differentiated, in forward and reverse mode, in z, in the parameters' values, in the inputs and
+    in the map's own leaves, by the implicit-function theorem. ``jax.vmap`` and ``jax.jit`` work
+    over them.
     """
 
     pieces: tuple
@@ -137,6 +154,8 @@ class SymplecticMap:
     parameters: Parameters | None = None
     posterior: Posterior | None = None
     dt_range: Any = None
+    signals: Signals | None = None
+    sensors: Sensors | None = None
 
     def __post_init__(self):
         if isinstance(self.dt, (int, float)):
@@ -173,11 +192,12 @@ class SymplecticMap:
 
         return sharded.Sharded(self, sharded.local_devices(devices))
 
-    def step(self, z, args=None, *, dt=None, t0=None):
-        """One step: (Z, Info); Info's leaves are () or (B,). dt: of `over`."""
+    def step(self, z, args=None, *, dt=None, t0=None, inputs=None):
+        """Make one step: (Z, Info); Info's leaves are () or (B,). dt: argument of `over`. inputs:
+        that act during the step."""
         z = self._states(z)
         map_ = self if dt is None else self.over(dt, z.shape[:-1])
-        return _step(map_, z, self._args(args, z, t0))
+        return _step(map_, z, self._args(args, z, t0, inputs))
 
     def inverse(self, z=None, args=None, *, t0=None):
         """Make one step back, from Z to (z, Info). t0: the time at z, not at Z. Raises ValueError
@@ -221,6 +241,17 @@ class SymplecticMap:
         dt = dt.astype(self.scale.dtype)
         return dataclasses.replace(self, pieces=(self.pieces[0].over(dt),), dt=dt)
 
+    def from_positions(self, q, other):
+        """The state z = (q, p) at q, (2d,) or (B, 2d), of a map that was learned from positions
+        alone, from q and the position ``other`` a step later, (d,) or (B, d) each: p = −h ∂S/∂q.
+
+        Where angles were learned from readings modulo their period, the move is taken modulo it;
+        else a lift is trusted. Raises ValueError for another map, or another shape.
+        """
+        from gfnn_jax.maps import positions  # stands after this module: a shorthand
+
+        return positions.state_at(self, q, other)
+
     def then(self, other: SymplecticMap) -> SymplecticMap:
         """Compose this map and the other one after it: sectors of a ring, phases of a period.
 
@@ -254,12 +285,21 @@ class SymplecticMap:
             posterior = posterior.of_piece(len(pieces) - 1 - posterior.piece)
         return dataclasses.replace(self, pieces=pieces, dt=-self.dt, posterior=posterior)
 
-    def defect(self, z, args=None, *, t0=None):
-        """Symplecticity defect () or (B,) of the step's unrolled derivative at z, in units of
-        ``scale``; of many degrees of freedom by random pairs of tangent vectors.
+    def multiplier(self, args=None):
+        """μ of AᵀJA = μJ, which holds for the derivative A of every step: the product of those of
+        the pieces. 1.0 where the map is symplectic, e^(−γ dt) with uniform friction γ, None where
+        the map keeps no multiple of the form: with other friction, or with inputs."""
+        factors = [piece.multiplier(args) for piece in self.pieces]
+        return None if any(factor is None for factor in factors) else math.prod(factors, start=1.0)
 
-        By forward differentiation through the iterations that ran, never by the implicit rule,
-        which would look symplectic however badly the solve had converged.
+    def defect(self, z, args=None, *, t0=None):
+        """Symplecticity defect ‖AᵀJA − μJ‖ () or (B,) of the step's derivative A at z.
+
+        It is in units of ``scale``, μ the multiplier; NaN where there is none.
+
+        The derivative is the unrolled one, by forward differentiation through the iterations that
+        ran. That of the implicit rule would look symplectic however badly the solve had converged.
+        For many degrees of freedom the defect is estimated by random pairs of tangent vectors.
         """
         z = self._states(z)
         args = self._args(args, z, t0)
@@ -284,17 +324,53 @@ class SymplecticMap:
         z = self._states(z)
         return _hamiltonian(self, z, self._args(args, z, t0))
 
-    def modified_hamiltonian(self, z, args=None) -> ModifiedHamiltonian:
-        """The Hamiltonian H̃ whose flow over dt is this map, at z: its value and the error of that,
-        each () or (B,), in units of H. Its constant is that of S.
+    def power(self, z, args=None, *, inputs=None):
+        """Energy per unit of time at z: ``lost`` (..., F) by each friction and ``supplied``
+        (..., k) by each input: `maps.energy`. Raises ValueError for a map that is no flow."""
+        from gfnn_jax.maps import energy  # stands after this module: a shorthand for its function
 
-        From 32 steps to either side of z (`maps.modified_hamiltonian`). The error is small where
-        the orbit turns slowly against a step (Hénon–Heiles: 1e-12 at dt 0.4, 1e-8 at 0.8), and of
-        the size of H̃ for a map that is near no flow. NaN where one of these steps fails. Raises
-        ValueError for a driven map, which keeps no energy.
+        return energy.power_of(self, z, args, inputs)
+
+    def estimate(self, recording) -> tuple[np.ndarray, np.ndarray]:
+        """States z = (q, p) (runs, 2d) at each run's last time and their covariance (runs, 2d, 2d),
+        from the samples of the recording before it: `maps.estimates`. Raises InputError for a map
+        that was not learned from a recording, or where columns or samples are missing."""
+        from gfnn_jax.maps import (
+            estimates,
+        )  # stands after this module: a shorthand for its function
+
+        return estimates.estimate(self, recording)
+
+    def forecast(self, recording, times, inputs=None):
+        """`maps.estimates.Forecast` of the positions at ``times`` (n,), the recording's clock, from
+        the state at each run's end; ``inputs`` are a recording of those ahead, matched by run where
+        it has several. Raises InputError as `estimate` does, and for times before a run's end."""
+        from gfnn_jax.maps import (
+            estimates,
+        )  # stands after this module: a shorthand for its function
+
+        return estimates.forecast(self, recording, times, inputs)
+
+    def linearise(self, z, inputs=None, args=None, *, t0=None):
+        """(A, B) of a step: ∂Z/∂z (..., 2d, 2d) and ∂Z/∂u (..., 2d, k), inputs u, (k,) or (B, k),
+        that do not change during the step."""
+        z = self._states(z)
+        return _linearised(self, z, self._args(args, z, t0, inputs))
+
+    def modified_hamiltonian(self, z, args=None) -> ModifiedHamiltonian:
+        """Value and error, each () or (B,), of the Hamiltonian H̃ whose flow over dt is this map.
+
+        Both are in units of H; the constant is that of S. They come from 32 steps to either side of
+        z (`maps.modified_hamiltonian`). The error is small where the orbit turns slowly against a
+        step (Hénon–Heiles: 1e-12 at dt 0.4, 1e-8 at 0.8), and as large as H̃ for a map that is near
+        no flow. Both are NaN where one of these steps fails. Raises ValueError for a driven map,
+        and for one with friction, which conserve no energy.
         """
         if self.parameters is not None and self.parameters.period is not None:
-            raise ValueError("expected a map without a drive: a driven one keeps no energy")
+            raise ValueError("expected a map without a drive: a driven one conserves no energy")
+        multiplier = self.multiplier()
+        if not (isinstance(multiplier, float) and multiplier == 1.0):
+            raise ValueError("expected a map without friction: one with it conserves no energy")
         z = self._states(z)
         return _modified(self, z, self._args(args, z))
 
@@ -304,29 +380,35 @@ class SymplecticMap:
         return _start(self, z0, self._args(params, z0, t0), stop_outside)
 
     def advance(
-        self, lanes: Lanes, num_saved: int, *, params=None, t0=None, save_every: int = 1,
-        stop_outside: bool = False,
+        self, lanes: Lanes, num_saved: int, *, params=None, t0=None, inputs=None,
+        save_every: int = 1, stop_outside: bool = False,
     ) -> tuple[Lanes, Any]:  # fmt: skip
-        """``num_saved`` blocks of ``save_every`` steps: the lanes after them, and the saved states
-        (B, num_saved, 2d). params, t0: those that the lanes were started with."""
-        args = self._args(params, lanes.y, t0)
+        """Advance by ``num_saved`` blocks of ``save_every`` steps.
+
+        Returns the lanes after them, and the saved states (B, num_saved, 2d). params, t0: those
+        that the lanes were started with. inputs: of all steps from their start on.
+        """
+        args = self._schedule(params, lanes.y, t0, inputs)
         return _advance(self, lanes, args, num_saved, save_every, stop_outside)
 
     def rollout(
-        self, z0, num_steps: int, *, params=None, t0=None, dt=None, save_every: int = 1,
-        stop_outside: bool = False, samples: int | None = None, key=None,
+        self, z0=None, num_steps: int = 0, *, positions=None, params=None, t0=None, inputs=None,
+        dt=None,
+        save_every: int = 1, stop_outside: bool = False, samples: int | None = None, key=None,
     ) -> tuple[Any, RolloutInfo]:  # fmt: skip
         """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d), back by the inverse map where the
         number is negative.
 
-        params: the values of a map's parameters. t0: the time of a drive at z0; it goes on with the
-        steps. dt: of `over`, for each step. samples, key: how many maps are drawn from the
-        posterior by which key of ``jax.random``; the states of all of them are held at once.
+        positions: (q, Q) in place of z0, of `from_positions`: the first two positions.
+        params: the values of a map's parameters. t0: the time of a drive at z0; it advances with
+        the steps. inputs: of each step's begin, (num_steps, k) or (B, num_steps, k), and, as one
+        row more, at the last one's end. dt: argument of `over`. samples: number of maps drawn from
+        the posterior with key, of ``jax.random``; the states of all of them are in memory at once.
         Returns the states (B, 1 + |num_steps| // save_every, 2d), the initial ones first, and a
-        RolloutInfo; with samples its ``bands`` have their std about the states, median and
-        quantiles. A lane whose step fails, or that leaves the domain with ``stop_outside``,
-        repeats NaN from there on. Raises ValueError where a number of steps or a shape is wrong,
-        and where samples are asked for without a key or of a map without posterior.
+        RolloutInfo. With samples its ``bands`` have their std about the states, and quantiles. A
+        lane is NaN from where its step fails, or from where it leaves the domain with
+        ``stop_outside``. Raises ValueError where a number of steps or a shape is wrong, and where
+        samples are asked for without a key or from a map without a posterior.
         """
         for name, number in (("num_steps", num_steps), ("save_every", save_every)):
             if not isinstance(number, Integral):
@@ -344,15 +426,19 @@ class SymplecticMap:
                 f"expected save_every <= num_steps, got {save_every} and {num_steps}: only the "
                 "initial states would be saved"
             )
+        if (z0 is None) == (positions is None):
+            raise ValueError("expected either states z0 or two positions (q, Q) to start from")
+        if positions is not None:
+            z0 = self.from_positions(*positions)
         z0 = self._states(z0)
         map_ = self if dt is None else self.over(dt, z0.shape[:-1])
-        args = self._args(params, z0, t0)
+        args = map_._schedule(params, z0, t0, inputs, num_steps)
         states, info = _rollout(map_, z0, args, num_steps // save_every, save_every, stop_outside)
         if samples is None:
             return states, info
         if key is None:
-            raise ValueError("expected a key of jax.random beside samples")
-        options = {"params": params, "t0": t0, "save_every": save_every}
+            raise ValueError("expected a key as well as samples, e.g. key=jax.random.key(0)")
+        options = {"params": params, "t0": t0, "inputs": inputs, "save_every": save_every}
         drawn, _ = map_.sample(key, samples).rollout(
             np.atleast_2d(z0), num_steps, stop_outside=stop_outside, **options
         )
@@ -366,11 +452,28 @@ class SymplecticMap:
         """Indices of the user's coordinates that are angles."""
         return self.coordinates.angles if self.coordinates.forward is CARTESIAN.forward else ()
 
-    def _args(self, given, z, t0=None):
-        return as_args(self.parameters, given, z.shape, np.dtype(self.scale.dtype), t0)
+    def _args(self, given, z, t0=None, inputs=None):
+        """What a step of the states z takes."""
+        dtype = np.dtype(self.scale.dtype)
+        args = as_args(self.parameters, given, z.shape, dtype, t0)
+        if self.signals is not None:
+            return self.signals.constant(args, inputs, z.shape, dtype)
+        if inputs is not None:
+            raise ValueError("expected no inputs: the map was learned without")
+        return args
+
+    def _schedule(self, given, z, t0=None, inputs=None, num_steps: int | None = None):
+        """What rollouts from the states z take: as one step, or of each of ``num_steps``."""
+        if self.signals is None:
+            return self._args(given, z, t0, inputs)
+        dtype = np.dtype(self.scale.dtype)
+        args = as_args(self.parameters, given, z.shape, dtype, t0)
+        return self.signals.scheduled(args, inputs, z.shape, dtype, self.dt, num_steps)
 
     def _after(self, args, steps):
-        """args that many steps (B,) later."""
+        """Advance args by a number of steps (B,)."""
+        if isinstance(args, Scheduled):
+            return args.at(self._after(args.params, steps), steps)
         return args if self.parameters is None else self.parameters.after(args, steps, self.dt)
 
     def _states(self, z):
@@ -429,7 +532,10 @@ class SymplecticMap:
         if self.dt_range is not None:
             low, high = self.dt_range[0] * (1 - _DT_EDGE), self.dt_range[1] * (1 + _DT_EDGE)
             inside = inside & (low <= abs(self.dt)) & (abs(self.dt) <= high)
-        return inside if self.parameters is None else inside & self.parameters.contains(args)
+        if self.parameters is None:
+            return inside
+        given = args.params if isinstance(args, Scheduled) else args
+        return inside & self.parameters.contains(given[..., : len(self.parameters.names)])
 
     def _apply(self, z, args, *, unrolled: bool | int = False):
         """Step the states z (B, 2d) in the user's coordinates: (Z, Info)."""
@@ -482,6 +588,10 @@ def _step(map_, z, args):
 @partial(compiled_sooner, static_argnums=(3,), seldom_run=True)
 @_or_one_state
 def _defect(map_, z, args, unrolled):
+    multiplier = map_.multiplier(args)
+    if multiplier is None:
+        return jnp.full(z.shape[0], jnp.nan, z.dtype)
+
     def tangent(unit):
         step = partial(map_._apply, args=args, unrolled=unrolled)
         return jax.jvp(lambda y: step(y)[0], (z,), (jnp.broadcast_to(unit, z.shape),))[1]
@@ -490,9 +600,32 @@ def _defect(map_, z, args, unrolled):
     if width > _WIDEST:
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (2 * _TANGENT_PAIRS, width))
         before = jnp.asarray(signs / np.sqrt(width), z.dtype) * map_.scale[None]
-        return defect_of_pairs(before[:, None], jax.vmap(tangent)(before), map_.scale)
+        after = jax.vmap(tangent)(before)
+        return defect_of_pairs(before[:, None], after, map_.scale, multiplier)
     jacobian = jax.vmap(tangent, out_axes=-1)(jnp.eye(z.shape[1], dtype=z.dtype))
-    return symplecticity_defect(jacobian, map_.scale)
+    return symplecticity_defect(jacobian, map_.scale, multiplier)
+
+
+@compiled_sooner
+@_or_one_state
+def _linearised(map_, z, args):
+    width, signals = z.shape[1], map_.signals
+    count = 0 if signals is None else len(signals.names)
+
+    def step(moved):
+        acting = args
+        if signals is not None:  # the constant coefficients of the inputs come first of theirs
+            first = args.shape[-1] - (signals.degree + 1) * count
+            acting = jnp.broadcast_to(args, (len(z), args.shape[-1]))
+            acting = acting.at[:, first : first + count].add(moved[:, width:])
+        return map_._apply(z + moved[:, :width], acting)[0]
+
+    def along(unit):
+        at = jnp.zeros((len(z), width + count), z.dtype)
+        return jax.jvp(step, (at,), (jnp.broadcast_to(unit, at.shape),))[1]
+
+    both = jax.vmap(along, out_axes=-1)(jnp.eye(width + count, dtype=z.dtype))
+    return both[..., :width], both[..., width:]
 
 
 @compiled_sooner

@@ -1,0 +1,113 @@
+"""Options of the command line about a recording's columns and rows, shared by its commands."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from typing import Any
+
+from gfnn_jax.data.recording import SECONDS
+from gfnn_jax.data.roles import ROLES
+
+
+def add_column_options(command: argparse.ArgumentParser) -> None:
+    """Add the options; `column_options` takes them from what was parsed.
+
+    ``--angles`` are names of columns, or whole numbers, the indices in z of canonical states.
+    """
+    group = command.add_argument_group(
+        "columns of a recording", "names separated by commas; without them names and data decide"
+    )
+    for role in ROLES:
+        group.add_argument(f"--{role}", type=_names, metavar="A,B", help=f"columns of {role}")
+    group.add_argument(
+        "--angles", type=_names_or_indices, metavar="A,B",
+        help="positions with period 2π; of canonical states indices in z, as 0,2",
+    )  # fmt: skip
+    group.add_argument("--degrees", type=_names, metavar="A,B", help="columns in degrees")
+    group.add_argument(
+        "--columns", type=_names, metavar="A,B",
+        help="columns to read; names of all of them where the file has none",
+    )  # fmt: skip
+    group.add_argument("--time-unit", choices=tuple(SECONDS), help="of the times (default s)")
+    group.add_argument(
+        "--std", type=_numbers, action="append", metavar="NAME=σ", help="noise of a column, known"
+    )
+    group.add_argument(
+        "--mass", type=_numbers, action="append", metavar="NAME=m",
+        help="known mass, or moment of inertia, of a position",
+    )  # fmt: skip
+    group.add_argument("--offset", type=_names, metavar="A,B", help="columns with unknown offsets")
+    group.add_argument("--scale", type=_names, metavar="A,B", help="columns of unknown scale")
+    group.add_argument(
+        "--from", dest="start", type=_finite, metavar="T", help="rows from time T on"
+    )
+    group.add_argument("--to", dest="stop", type=_finite, metavar="T", help="rows up to time T")
+    group.add_argument("--every", type=_count, metavar="K", help="every K-th row")
+
+
+def column_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The options that were given, as keywords of `gfnn_jax.read`; ``mass`` is none of them."""
+    names = (*ROLES, "angles", "degrees", "columns", "time_unit", "offset", "scale", "start",
+             "stop", "every")  # fmt: skip
+    given = {name: getattr(arguments, name) for name in names}
+    given["std"] = dict(pair for pairs in arguments.std or () for pair in pairs)
+    return {name: value for name, value in given.items() if value not in (None, {})}
+
+
+def masses(arguments: argparse.Namespace) -> dict[str, float]:
+    """The known masses by name of a position."""
+    return dict(pair for pairs in arguments.mass or () for pair in pairs)
+
+
+def names_roles(options: dict[str, Any]) -> bool:
+    """Whether keywords of `column_options` say what columns are, which makes a file a recording."""
+    return bool({*ROLES, "columns"} & set(options))
+
+
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(part.strip() for part in text.split(",") if part.strip())
+    if not names or len(set(names)) < len(names):
+        raise argparse.ArgumentTypeError(
+            f"expected different names separated by commas, got '{text}'"
+        )
+    return names
+
+
+def _names_or_indices(text: str) -> tuple[str, ...] | tuple[int, ...]:
+    names = _names(text)
+    if len(names) < len(text.split(",")):
+        raise argparse.ArgumentTypeError(
+            f"expected different names or indices separated by commas, got '{text}'"
+        )
+    return tuple(map(int, names)) if all(name.isdecimal() for name in names) else names
+
+
+def _numbers(text: str) -> list[tuple[str, float]]:
+    pairs = []
+    for part in text.split(","):
+        name, equals, number = part.partition("=")
+        value = _float(number)
+        if not (name.strip() and equals and math.isfinite(value) and value > 0):
+            raise argparse.ArgumentTypeError(f"expected NAME=NUMBER above 0, got '{part}'")
+        pairs.append((name.strip(), value))
+    return pairs
+
+
+def _finite(text: str) -> float:
+    if not math.isfinite(_float(text)):
+        raise argparse.ArgumentTypeError(f"expected a finite number, got '{text}'")
+    return float(text)
+
+
+def _count(text: str) -> int:
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"expected a whole number above 0, got '{text}'")
+    return int(text)
+
+
+def _float(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

@@ -1,0 +1,321 @@
+"""Recordings: what sensors gave of a motion, as named columns with roles, run by run.
+
+    recording = gfnn.read("swing.csv", positions=["theta"], velocities=["omega"])
+    recording.values("theta", run="0")      # (n,) radians, NaN where missing
+    recording.slice(2.0, 5.0)               # by time, both ends included
+
+Times may be uneven and have gaps, runs may differ in length, values may be missing. Nothing here
+needs JAX.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gfnn_jax.data.columns import (
+    SECONDS,
+    Names,
+    angles_of,
+    check_known,
+    factors_of,
+    listed,
+    roles_of,
+    time_unit_of,
+)
+from gfnn_jax.data.roles import ROLES, is_run, is_time
+from gfnn_jax.data.runs import restarts, runs_of
+from gfnn_jax.data.tables import Table, from_arrays, from_memory
+from gfnn_jax.data.text_files import from_text
+from gfnn_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from gfnn_jax.data.recording_summary import RecordingSummary
+
+_TURN = 2 * np.pi
+
+
+@dataclasses.dataclass(frozen=True, init=False, eq=False, repr=False)
+class Recording:
+    """Runs of a motion: uneven times, named columns with roles, gaps, missing values.
+
+    runs:       names in order of appearance, as the file has them; "0" where it names none.
+    positions, velocities, momenta, inputs, parameters: names of columns. The i-th velocity and the
+                i-th momentum belong to the i-th position.
+    angles:     positions of period 2π, in radians, wrapped or not.
+    std:        name -> standard deviation σ of the column's noise, or None where it was not given;
+                in radians where the column is.
+    units:      name -> unit, as the file gives it.
+    factors:    name -> value here ÷ number in the file: π/180 of a column in degrees, else 1.
+    time_unit:  of the file; `times` are in seconds.
+    offsets, scales: columns that a sensor shows with an unknown offset, or scale, to be fitted.
+    ignored:    columns without a role.
+    angles_given: whether the angles were told, not read off names and units.
+    notes:      what reading had to decide, a line each.
+    source:     the files.
+    """
+
+    runs: tuple[str, ...]
+    positions: tuple[str, ...]
+    velocities: tuple[str, ...]
+    momenta: tuple[str, ...]
+    inputs: tuple[str, ...]
+    parameters: tuple[str, ...]
+    angles: tuple[str, ...]
+    std: dict[str, float | None]
+    units: dict[str, str]
+    factors: dict[str, float]
+    time_unit: str
+    offsets: tuple[str, ...]
+    scales: tuple[str, ...]
+    ignored: tuple[str, ...]
+    angles_given: bool
+    notes: tuple[str, ...]
+    source: str
+    _times: dict[str, np.ndarray]
+    _values: dict[str, dict[str, np.ndarray]]  # run -> name -> (n,)
+
+    def __init__(
+        self, table: Any, *, positions: Names = None, velocities: Names = None,
+        momenta: Names = None, inputs: Names = None, parameters: Names = None,
+        angles: Names = None, degrees: Names = None, time_unit: str | None = None,
+        std: Mapping[str, float] | None = None, columns: Names = None, dt: float | None = None,
+        offset: Names = None, scale: Names = None,
+    ):  # fmt: skip
+        """The recording of a table in memory; of files: `read`.
+
+        table:   a DataFrame, a dict of arrays (T,), or a list of these, one run each (or several,
+                 told apart by a column run, trial or sequence). A column t or time holds the times,
+                 which rise in a run; without a column of runs a new run begins where they fall.
+        positions … parameters: names of columns. Where any is given, columns without a role are
+                 ignored; where none is, the names of the columns decide.
+        angles:  positions of period 2π; without it those whose name or unit says so.
+        degrees: columns in degrees, or degrees per second; a position among them is an angle.
+        time_unit: s (the default), ms, us, ns, min or h; a header's own unit serves too.
+        std:     σ of columns, in their own unit.
+        columns: those to take beside times and runs; all others are as if they were not there.
+        dt:      seconds between rows, in place of a column of times.
+        offset, scale: columns that a sensor shows shifted, or scaled, by an unknown amount.
+        Raises InputError where names, times or values do not fit.
+        """
+        given = {
+            "positions": listed(positions), "velocities": listed(velocities),
+            "momenta": listed(momenta), "inputs": listed(inputs),
+            "parameters": listed(parameters),
+        }  # fmt: skip
+        tables = [from_memory(t) for t in (table if isinstance(table, (list, tuple)) else [table])]
+        if not tables:
+            raise InputError("expected at least one table, got none")
+        tables = [_selected(t, listed(columns)) for t in tables]
+        source = ", ".join(dict.fromkeys(t.source for t in tables))
+        names = list(dict.fromkeys(name for t in tables for name in t.columns))
+        units = {name: unit for t in reversed(tables) for name, unit in t.units.items()}
+        numbers = [name for name in names if not is_run(name) and not is_time(name)]
+        unit = time_unit_of(source, names, units, time_unit)
+        runs = runs_of(tables, numbers, SECONDS[unit], dt)
+        roles, decided = roles_of(source, numbers, given, runs)
+        with_role = [name for role in ROLES for name in roles[role]]
+        empty = [n for n in with_role if not any(np.isfinite(v[n]).any() for _, v in runs.values())]
+        if empty:
+            raise InputError(f"{source}: no value in column {', '.join(empty)}")
+        angular, in_degrees = angles_of(
+            source, roles, listed(angles), listed(degrees), angles is None, units
+        )
+        factors = factors_of(numbers, in_degrees)
+        values = {
+            run: {name: column * factors[name] for name, column in of_run.items()}
+            for run, (_, of_run) in runs.items()
+        }
+        for what, wanted in (
+            ("std", std or {}),
+            ("offset", listed(offset)),
+            ("scale", listed(scale)),
+        ):
+            check_known(source, what, wanted, with_role)
+        fields = {
+            **roles,
+            "runs": tuple(runs),
+            "angles": angular,
+            "std": _std(std or {}, with_role, factors),
+            "units": {n: u for n, u in units.items() if n in numbers},
+            "factors": factors,
+            "time_unit": unit,
+            "offsets": listed(offset),
+            "scales": listed(scale),
+            "ignored": tuple(n for n in numbers if n not in with_role)
+            + tuple(dict.fromkeys(n for t in tables for n in t.text)),
+            "angles_given": angles is not None or degrees is not None,
+            "notes": (*(n for t in tables for n in t.notes), *restarts(tables, runs), *decided),
+            "source": source,
+            "_times": {run: times for run, (times, _) in runs.items()},
+            "_values": values,
+        }
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+        for run in self.runs:
+            for array in (self._times[run], *self._values[run].values()):
+                array.flags.writeable = False
+
+    def __len__(self) -> int:
+        """The number of samples of all runs."""
+        return sum(len(times) for times in self._times.values())
+
+    def __repr__(self) -> str:
+        roles = ", ".join(f"{r} {', '.join(getattr(self, r))}" for r in ROLES if getattr(self, r))
+        return f"Recording({self.source}: {len(self.runs)} runs, {len(self)} samples; {roles})"
+
+    @property
+    def dim(self) -> int:
+        """Degrees of freedom: the number of positions, or of velocities where there are none."""
+        return len(self.positions) or len(self.velocities) or len(self.momenta)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns that have a role, role by role."""
+        return tuple(name for role in ROLES for name in getattr(self, role))
+
+    def times(self, run: str | float) -> np.ndarray:
+        """Times (n,) of a run in seconds, rising."""
+        return self._times[self._named(run)]
+
+    def values(self, name: str, run: str | float) -> np.ndarray:
+        """A column (n,) in a run, NaN where missing; angles in radians, wrapped as they came."""
+        found = self._values[self._named(run)]
+        if name not in found:
+            raise InputError(f"{self.source}: no column {name}, found {', '.join(found)}")
+        return found[name]
+
+    def unwrapped(self, name: str, run: str | float) -> np.ndarray:
+        """A column (n,) in a run, an angle lifted so that it moves by less than half a turn between
+        neighbours. Values that range over more than one turn are such a lift already."""
+        values = self.values(name, run)
+        if name not in self.angles:
+            return values
+        known = np.isfinite(values)
+        if not known.any() or np.ptp(values[known]) > _TURN * (1 + 1e-3):
+            return values
+        lifted = values.copy()
+        lifted[known] = np.unwrap(values[known])
+        return lifted
+
+    def array(self, role: str, run: str | float) -> np.ndarray:
+        """The columns of a role (n, k) in a run, as `values`. Raises InputError at no such role."""
+        if role not in ROLES:
+            raise InputError(f"expected a role among {', '.join(ROLES)}, got {role!r}")
+        names = getattr(self, role)
+        columns = [self.values(name, run) for name in names]
+        return np.stack(columns, axis=1) if columns else np.empty((len(self.times(run)), 0))
+
+    def slice(
+        self, start: float = -np.inf, stop: float = np.inf, run: str | float | None = None
+    ) -> Recording:
+        """The samples from time ``start`` to ``stop`` (s), both included, of one run or of all.
+
+        run: its name, as text or as a number. Runs without such a sample are left out.
+        Raises InputError where nothing is left.
+        """
+        runs = self.runs if run is None else (self._named(run),)
+        kept = {r: (self._times[r] >= start) & (self._times[r] <= stop) for r in runs}
+        kept = {r: keep for r, keep in kept.items() if keep.any()}
+        if not kept:
+            raise InputError(f"{self.source}: no sample from {start:g} s to {stop:g} s")
+        part = object.__new__(Recording)
+        for field in dataclasses.fields(self):
+            object.__setattr__(part, field.name, getattr(self, field.name))
+        object.__setattr__(part, "runs", tuple(kept))
+        object.__setattr__(part, "_times", {r: self._times[r][k] for r, k in kept.items()})
+        values = {r: {n: v[k] for n, v in self._values[r].items()} for r, k in kept.items()}
+        object.__setattr__(part, "_values", values)
+        return part
+
+    def summary(self) -> RecordingSummary:
+        """What the samples tell before anything is fitted: noise, frequencies, friction, mistakes.
+
+        Prints as one screen; `RecordingSummary.as_json` gives plain data.
+        """
+        from gfnn_jax.data.recording_summary import summarise
+
+        return summarise(self)
+
+    def _repr_html_(self) -> str:
+        return self.summary()._repr_html_()
+
+    def _named(self, run: str | float) -> str:
+        """The name of a run, given as text or as a number."""
+        text = str(run)
+        for name in self.runs:
+            if name == text or _number(name) == _number(text) is not None:
+                return name
+        raise InputError(f"{self.source}: no run {run}, found {', '.join(self.runs[:12])}")
+
+
+def read(
+    paths: str | Path | Sequence[str | Path], *, start: float = -np.inf, stop: float = np.inf,
+    every: int = 1, columns: Names = None, **options: Any,
+) -> Recording:  # fmt: skip
+    """The recording that a file holds, or several files, one run each or more.
+
+    paths:    ``.csv`` and other text (separated by commas, semicolons, tabs or blanks; decimal
+              points or commas; lines of comments; a line of units below the names), ``.npz`` of
+              named arrays, ``.npy``.
+    columns:  names of those to read beside times and runs; of all, in order, where a file names
+              none.
+    start, stop, every: rows to keep: between these times (in the file's unit), every so many.
+    options:  positions, velocities, momenta, inputs, parameters, angles, degrees, time_unit, std,
+              dt, offset, scale: as of `Recording`.
+    Raises InputError, one line with the file and the line, where a file cannot be used.
+    """
+    several = [paths] if isinstance(paths, (str, Path)) else list(paths)
+    chosen = listed(columns)
+    tables = []
+    for path in map(Path, several):
+        if not path.is_file():
+            raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
+        if path.suffix.lower() in (".npz", ".npy"):
+            tables.append(_rows_of(from_arrays(path, chosen), start, stop, every))
+        else:
+            tables.append(from_text(path, chosen, start=start, stop=stop, every=every))
+    return Recording(tables, columns=columns, **options)
+
+
+def _rows_of(table: Table, start: float, stop: float, every: int) -> Table:
+    length = len(next(iter(table.columns.values()), ()))
+    keep = np.arange(length) % every == 0
+    for name, values in table.columns.items():
+        if is_time(name):
+            keep &= (values >= start) & (values <= stop)
+    return dataclasses.replace(table, columns={n: v[keep] for n, v in table.columns.items()})
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def _selected(table: Table, columns: tuple[str, ...]) -> Table:
+    if not columns:
+        return table
+    missing = [name for name in columns if name not in table.columns and name not in table.text]
+    if missing:
+        raise InputError(
+            f"{table.source}: no column {', '.join(missing)}, found {', '.join(table.columns)}"
+        )
+    kept = {n: x for n, x in table.columns.items() if n in columns or is_time(n) or is_run(n)}
+    return dataclasses.replace(table, columns=kept)
+
+
+def _std(
+    given: Mapping[str, float], names: Sequence[str], factors: Mapping[str, float]
+) -> dict[str, float | None]:
+    """σ of each column, inside. Raises InputError where one is no size."""
+    bad = {name: s for name, s in given.items() if not (math.isfinite(s) and s >= 0)}
+    if bad:
+        raise InputError(f"expected a finite σ, 0 or above, got std = {bad}")
+    return {name: given[name] * factors[name] if name in given else None for name in names}

@@ -1,0 +1,252 @@
+"""The summary of a recording: what its samples tell before anything is fitted."""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gfnn_jax.data.faults import Fault, faults
+from gfnn_jax.data.roles import ROLES
+from gfnn_jax.data.traits import Traits, traits
+from gfnn_jax.signals import energy
+from gfnn_jax.signals.spectra import dominant_frequencies
+from gfnn_jax.signals.steps import gaps
+
+if TYPE_CHECKING:
+    from gfnn_jax.data.recording import Recording
+
+_RELATED = 0.8  # of a column's variance that a derivative must explain
+_OF_NOISE_WINDOW = 12  # samples that tell a polynomial of degree 5 about as well as all of them
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """One column, in the file's unit.
+
+    role: positions, velocities, momenta, inputs, parameters, or ignored. sigma: of the noise, with
+    ``white`` whether neighbouring samples have independent noise; None where it is not told.
+    resolution: the smallest step between values. derivative_of: the column whose derivative it is,
+    times ``factor``, ``lag`` seconds late. frequencies: in Hz, the strongest first.
+    """
+
+    name: str
+    role: str
+    unit: str
+    low: float
+    high: float
+    resolution: float | None
+    sigma: float | None
+    white: bool
+    angle: bool
+    derivative_of: str | None
+    factor: float | None
+    lag: float | None
+    frequencies: tuple[float, ...]
+    missing: int
+    outliers: int
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordingSummary:
+    """What a recording holds. Prints as one screen, in a notebook too.
+
+    runs: name -> (number of samples, begin, end in s). steps: (shortest, median, longest without
+    gaps) in s. gaps: (run, begin, end in s). period: of the motion, in s. coarsest: step in s that
+    would tell the motion as well. loss: of energy per period. faults: the wrong ones first.
+    command: to type next.
+    """
+
+    source: str
+    runs: Mapping[str, tuple[int, float, float]]
+    steps: tuple[float, float, float]
+    gaps: tuple[tuple[str, float, float], ...]
+    columns: tuple[Column, ...]
+    period: float | None
+    coarsest: float | None
+    loss: energy.Loss | None
+    driven: bool
+    faults: tuple[Fault, ...]
+    command: str
+
+    @property
+    def dt_median(self) -> float:
+        """The median time between samples, in s."""
+        return self.steps[1]
+
+    def as_json(self) -> dict[str, Any]:
+        """The figures as plain data: runs, dt_median, gaps, columns, loss_per_period, command, and
+        what else the screen shows."""
+        loss = self.loss
+        plain = {
+            "source": self.source,
+            "runs": list(self.runs),
+            "samples": {run: count for run, (count, _, _) in self.runs.items()},
+            "dt_median": self.dt_median,
+            "dt_range": [self.steps[0], self.steps[2]],
+            "gaps": [{"run": run, "begin": a, "end": b} for run, a, b in self.gaps],
+            "columns": {
+                column.name: {
+                    key: list(value) if isinstance(value, tuple) else value
+                    for key, value in dataclasses.asdict(column).items()
+                    if key != "name"
+                }
+                for column in self.columns
+            },
+            "period": self.period,
+            "dt_resolved": self.coarsest,
+            "loss_per_period": None if loss is None else loss.per_period,
+            "loss_std": None if loss is None else loss.error,
+            "friction": None if loss is None or not loss.seen else (loss.kind or "seen"),
+            "faults": [
+                {"kind": f.kind, "message": f.message, "remedy": f.remedy, "wrong": f.wrong}
+                for f in self.faults
+            ],
+            "command": self.command,
+        }
+        return _without_nan(plain)
+
+    def __rich__(self):
+        from gfnn_jax.data.summary_screen import screen
+
+        return screen(self)
+
+    def __str__(self) -> str:
+        from gfnn_jax.data.summary_screen import as_text
+
+        return as_text(self)
+
+    def _repr_html_(self) -> str:
+        from gfnn_jax.data.summary_screen import as_html
+
+        return as_html(self)
+
+
+def _without_nan(value: Any) -> Any:
+    """Plain data, with None for numbers that JSON has not."""
+    if isinstance(value, dict):
+        return {key: _without_nan(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(inner) for inner in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def summarise(recording: Recording, options: Mapping[str, Any] | None = None) -> RecordingSummary:
+    """The summary of a recording, in seconds for a million samples.
+
+    options: those that it was read with, for the command to type.
+    """
+    known = traits(recording)
+    found = faults(known)
+    counts = {
+        run: (len(t), float(t[0]), float(t[-1]))
+        for run, t in zip(recording.runs, known.times, strict=True)
+    }
+    holes = gaps(known.times)
+    steps = np.concatenate([np.diff(t) for t in known.times])
+    longest = min((b - a for _, a, b in holes), default=np.inf)
+    between = steps[steps < longest] if len(steps) else np.array([np.nan])
+    period, loss = _motion(known)
+    return RecordingSummary(
+        recording.source, counts,
+        (float(between.min()), known.step, float(between.max())),
+        tuple((recording.runs[r], a, b) for r, a, b in holes),
+        tuple(_column(known, name) for name in known.columns),
+        period, _coarsest(known), loss, bool(recording.inputs), found,
+        _command(recording, found, options or {}),
+    )  # fmt: skip
+
+
+def _motion(known: Traits) -> tuple[float | None, energy.Loss | None]:
+    """(period in s, loss of energy) of the positions."""
+    recording, local = known.recording, known.local
+    if local is None or not recording.positions:
+        return None, None
+    places = [known.moving.index(name) for name in recording.positions]
+    fits = dataclasses.replace(
+        local.slopes, values=local.slopes.values[places], slopes=local.slopes.slopes[places],
+        curvatures=local.slopes.curvatures[places],
+    )  # fmt: skip
+    if not np.isfinite(fits.slopes).all(axis=0).any() or not np.any(np.nanstd(fits.slopes, axis=1)):
+        return None, None
+    middle = fits.rows[:, fits.rows.shape[1] // 2]
+    inputs = np.array([known.columns[name][middle] for name in recording.inputs])
+    period = energy.mean_period(fits, len(recording.runs))
+    angles = [name in recording.angles for name in recording.positions]
+    inputs = inputs.reshape(len(recording.inputs), len(middle))
+    return period, energy.loss(fits, angles, inputs, period)
+
+
+def _coarsest(known: Traits) -> float | None:
+    """The step, in s, at which a window that the noise allows still has enough samples."""
+    sizes = [known.noise[name].size for name in known.recording.positions]
+    return known.step * max(min(sizes) // _OF_NOISE_WINDOW, 1) if sizes else None
+
+
+def _column(known: Traits, name: str) -> Column:
+    recording, values = known.recording, known.columns[name]
+    factor = recording.factors[name]
+    role = next((r for r in ROLES if name in getattr(recording, r)), "ignored")
+    noise = known.noise.get(name)
+    of, relation = _derivative_of(known, name)
+    resolution = known.resolution[name]
+    have = np.isfinite(values).any()
+    given = recording.std.get(name)
+    sigma = given if given is not None else noise.sigma if noise else None
+    return Column(
+        name, role, recording.units.get(name, ""),
+        float(np.nanmin(values)) / factor if have else np.nan,
+        float(np.nanmax(values)) / factor if have else np.nan,
+        None if resolution is None else resolution / factor,
+        None if sigma is None else sigma / factor,
+        noise is None or noise.white, name in recording.angles, of,
+        None if relation is None else relation.factor, None if relation is None else relation.lag,
+        tuple(dominant_frequencies(known.times, _turning(known, name))) if noise and have else (),
+        int(np.sum(~np.isfinite(values))), len(noise.outliers) if noise else 0,
+    )  # fmt: skip
+
+
+def _turning(known: Traits, name: str) -> np.ndarray:
+    """A column whose spectrum tells frequencies: of an angle that turns round its sine."""
+    values = known.columns[name]
+    turns = name in known.recording.angles and np.nanmax(values) - np.nanmin(values) > 2 * np.pi
+    return np.sin(values) if turns else values
+
+
+def _derivative_of(known: Traits, name: str):
+    """(column, relation) of which this one is the derivative; (None, None) if of none."""
+    recording = known.recording
+    if name in recording.positions:
+        return None, None
+    related = [(of, known.relation(of, name)) for of in recording.positions]
+    good = [(of, r) for of, r in related if r is not None and r.explained > _RELATED]
+    return max(good, key=lambda pair: pair[1].explained, default=(None, None))
+
+
+def _command(recording: Recording, found: tuple[Fault, ...], options: Mapping[str, Any]) -> str:
+    """``gfnn fit`` with the options that were given and those that mend what is wrong."""
+    typed = dict(options)
+    for fault in found:
+        if fault.wrong:
+            for option, value in fault.options.items():
+                before = () if option == "positions" else typed.get(option, ())
+                joined = isinstance(value, tuple) and isinstance(before, tuple)
+                typed[option] = tuple(dict.fromkeys([*before, *value])) if joined else value
+    files = " ".join(shlex.quote(path) for path in recording.source.split(", "))
+    return f"gfnn fit {files}{as_typed(typed)} --out model"
+
+
+def as_typed(options: Mapping[str, Any]) -> str:
+    """Keywords of `gfnn_jax.read` as options of the command line, with a blank before each."""
+    words = {"start": "from", "stop": "to", "time_unit": "time-unit"}
+    said = []
+    for option, value in options.items():
+        if isinstance(value, Mapping):
+            value = ",".join(f"{name}={number:g}" for name, number in value.items())
+        elif isinstance(value, (tuple, list)):
+            value = ",".join(map(str, value))
+        said.append(f" --{words.get(option, option)} {shlex.quote(str(value))}")
+    return "".join(said)

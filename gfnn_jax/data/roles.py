@@ -1,0 +1,126 @@
+"""The roles of a recording's columns, by their names."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterable
+
+ROLES = ("positions", "velocities", "momenta", "inputs", "parameters")
+TIMES = (
+    "t", "time", "times", "timestamp", "timestamps", "date", "datetime", "elapsed", "clock", "sec",
+    "seconds", "zeit", "temps", "tiempo", "tempo",
+)  # fmt: skip
+RUNS = ("run", "trial", "sequence", "seq", "episode", "experiment", "trajectory")
+
+_GREEK = {
+    "α": "alpha", "β": "beta", "γ": "gamma", "θ": "theta", "φ": "phi", "ϕ": "phi", "ψ": "psi",
+    "ϑ": "theta", "ω": "omega", "τ": "tau",
+}  # fmt: skip
+_ANGLES = ("theta", "phi", "psi", "alpha", "beta", "gamma", "angle", "yaw", "pitch", "roll")
+_WORDS = {
+    "positions": (*_ANGLES, "q", "x", "y", "z", "r", "position", "pos", "displacement"),
+    "velocities": ("v", "omega", "velocity", "vel", "speed", "qdot", "qd", "gyro", "dq"),
+    "momenta": ("p", "momentum"),
+    "inputs": (
+        "u", "tau", "torque", "force", "input", "voltage", "current", "motor", "drive", "command",
+    ),
+}  # fmt: skip
+_ROLE_OF = {word: role for role, words in _WORDS.items() for word in words}
+# A word, perhaps an index (a number or the letter of an axis) after it.
+_INDEXED = re.compile(r"([a-z]+?)_?(\d+|[xyz])?")
+# A derivative of another column: theta_dot, thetadot, dtheta, dtheta_dt, dtheta/dt, d_theta, θ̇.
+_DERIVATIVES = (
+    re.compile(r"(?P<of>.+?)_?(dot|prime|')(?P<index>_?\d*)"),
+    re.compile(r"d_?(?P<of>.+?)(?P<index>)[_/]?dt"),
+    re.compile(r"d_?(?P<of>[a-z].*?)(?P<index>)"),
+)
+
+
+def plain(name: str) -> str:
+    """The name in lower case, Greek letters spelled out, a dot above as ``_dot``, no blanks."""
+    text = unicodedata.normalize("NFD", name.strip().lower())
+    text = re.sub("(.)\u0307(\\d*)", r"\1_dot\2", text)  # a combining dot above
+    text = "".join(_GREEK.get(letter, letter) for letter in text)
+    text = "".join(letter for letter in text if not unicodedata.combining(letter))
+    return re.sub(r"[\s.-]+", "_", text.translate(str.maketrans("₀₁₂₃₄₅₆₇₈₉", "0123456789")))
+
+
+def is_time(name: str) -> bool:
+    """Whether this is the name of a column of times."""
+    return re.sub(r"_?(s|ms|us|µs|ns)$", "", plain(name)) in TIMES or plain(name) in TIMES
+
+
+def is_run(name: str) -> bool:
+    """Whether this is the name of a column that tells runs apart."""
+    return re.sub(r"_?(id|no|nr|number|index)$", "", plain(name)) in RUNS
+
+
+def is_angle(name: str) -> bool:
+    """Whether this is the usual name of an angle."""
+    found = _INDEXED.fullmatch(plain(name))
+    return bool(found) and found[1] in _ANGLES
+
+
+def derivative_of(name: str) -> str | None:
+    """The plain name of the column whose derivative this one's name says it is; None if it says
+    nothing of the kind."""
+    for pattern in _DERIVATIVES:
+        found = pattern.fullmatch(plain(name))
+        if found:
+            return f"{found['of']}{found['index'].lstrip('_')}"
+    return None
+
+
+def role_of(name: str) -> str | None:
+    """The role that a column of this name usually has; None where names do not tell."""
+    found = _INDEXED.fullmatch(plain(name))
+    role = _ROLE_OF.get(found[1]) if found else None
+    if role is None and (of := derivative_of(name)) is not None and role_of(of) == "positions":
+        return "velocities"
+    return role
+
+
+def by_name(names: Iterable[str]) -> dict[str, tuple[str, ...]]:
+    """The columns of each role, those whose names do not tell left out.
+
+    The i-th velocity (and momentum) belongs to the i-th position: by the name that it is the
+    derivative of, else by its index, else by the order of the columns.
+    """
+    names = list(names)
+    columns = {role: [n for n in names if role_of(n) == role] for role in ROLES}
+    positions = columns["positions"]
+    for role in ("velocities", "momenta"):
+        columns[role] = _in_order(positions, columns[role])
+    paired = len(columns["velocities"])
+    if 0 < paired < len(positions):  # those that have a velocity come first
+        mates = {_mate(positions, v) for v in columns["velocities"]}
+        columns["positions"] = sorted(positions, key=lambda n: n not in mates)
+    return {role: tuple(of_role) for role, of_role in columns.items()}
+
+
+def _in_order(positions: list[str], others: list[str]) -> list[str]:
+    """The other columns in the order of the positions that they belong to; as they are where some
+    name no position."""
+    mates = [_mate(positions, name) for name in others]
+    if None in mates or len(set(mates)) < len(mates):
+        return others
+    return sorted(others, key=lambda name: positions.index(str(_mate(positions, name))))
+
+
+def _mate(positions: list[str], name: str) -> str | None:
+    """The position whose derivative, or whose index, this name has."""
+    of = derivative_of(name)
+    for position in positions:
+        if plain(position) == of:
+            return position
+    index = _index(name)
+    same = [p for p in positions if index and (_index(p) == index or plain(p) == index)]
+    if len(same) == 1:
+        return same[0]
+    return positions[0] if len(positions) == 1 else None
+
+
+def _index(name: str) -> str:
+    found = _INDEXED.fullmatch(plain(name))
+    return (found[2] or "") if found else ""

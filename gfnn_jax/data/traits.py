@@ -1,0 +1,77 @@
+"""The traits of a recording's columns that both its summary and the search for mistakes need."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gfnn_jax.signals.derivatives import Derivatives, Relation, derivatives
+from gfnn_jax.signals.noise import Noise, noise, resolution
+from gfnn_jax.signals.steps import median_step
+
+if TYPE_CHECKING:
+    from gfnn_jax.data.recording import Recording
+
+_MOST_IGNORED = 8  # columns without a role that are looked at
+_NARROWEST = 7  # samples of a window for derivatives
+
+
+@dataclasses.dataclass(frozen=True)
+class Traits:
+    """What the samples of a recording tell column by column.
+
+    times: (n_r,) of each run. columns: name -> (T,), the runs one after another, angles lifted.
+    noise, resolution: by name. local: local polynomials of the columns named in ``moving``.
+    step: the median one, in s.
+    """
+
+    recording: Recording
+    times: list[np.ndarray]
+    columns: dict[str, np.ndarray]
+    noise: dict[str, Noise]
+    resolution: dict[str, float | None]
+    moving: tuple[str, ...]
+    local: Derivatives | None
+    step: float
+
+    def relation(self, of: str, name: str) -> Relation | None:
+        """Column ``name`` against the derivative of column ``of``; None where nothing tells."""
+        if self.local is None or not {of, name} <= set(self.moving):
+            return None
+        return self.local.relation(self.moving.index(of), self.moving.index(name))
+
+    def by_run(self, name: str) -> list[np.ndarray]:
+        """A column of `columns`, (n_r,) of each run."""
+        return np.split(self.columns[name], np.cumsum([len(t) for t in self.times])[:-1])
+
+
+def traits(recording: Recording) -> Traits:
+    """The traits of a recording, in seconds for a million rows."""
+    ignored = [name for name in recording.ignored if name in recording.factors][:_MOST_IGNORED]
+    names = [*recording.columns, *ignored]
+    times = [recording.times(run) for run in recording.runs]
+    columns = {
+        name: np.concatenate([recording.unwrapped(name, run) for run in recording.runs])
+        for name in names
+    }
+    told = {}
+    inputs = np.stack([columns[n] for n in recording.inputs]) if recording.inputs else None
+    driven = [n for n in names if n not in (*recording.inputs, *recording.parameters)]
+    for group, by in ((driven, inputs), (recording.inputs, None)):
+        if group:
+            found = noise(times, np.stack([columns[n] for n in group]), by)
+            told |= dict(zip(group, found, strict=True))
+    positions = [told[n].size for n in recording.positions]
+    size = max(min(positions, default=0) // 2, _NARROWEST)
+    moving = tuple(driven)
+    local = None
+    if moving:
+        sigmas = [told[n].sigma for n in moving]
+        local = derivatives(times, np.stack([columns[n] for n in moving]), size, sigmas)
+    steps = {
+        n: resolution(np.concatenate([recording.values(n, run) for run in recording.runs]))
+        for n in names
+    }
+    return Traits(recording, times, columns, told, steps, moving, local, median_step(times))

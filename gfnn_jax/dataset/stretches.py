@@ -1,0 +1,184 @@
+"""A recording as a fit of its law sees it: stretches without gaps, thinned to nodes, cut into arcs.
+
+A *stretch* is a part of one run without a gap, angles lifted. Its *nodes* are samples of it, some
+forty to a period of the fastest motion, each with the state (q, v) that local cubics give. An
+*arc* is a row of nodes. All is NumPy, made once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.dataset.local_cubics import choose_half, smooth
+from gfnn_jax.errors import FitError, InputError
+
+GAP = 3.5  # median steps: a longer one ends a stretch
+PER_PERIOD = 40  # nodes
+MOST_STEPS = 6_000  # of a fit: more tell little more
+_BLOCK = 8.0  # periods of a block, where only some blocks of a long recording are taken
+_SHORTEST = (
+    9  # samples of a stretch, nodes of an arc: shorter ones tell less than their state needs
+)
+_SHORTEST_ARC = 5
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Stretch:
+    """Samples without a gap of ``run``: times t (n,), positions y (n, d), inputs u (n, k)."""
+
+    run: str
+    t: np.ndarray
+    y: np.ndarray
+    u: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Nodes:
+    """Samples ``at`` (m,) of a stretch, with their times t (m,), positions y (m, d) and states x
+    (m, 2d)."""
+
+    stretch: Stretch
+    at: np.ndarray
+    t: np.ndarray
+    y: np.ndarray
+    x: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scales:
+    """What the samples say about themselves: noise σ (d,), rms speeds (d,), the fastest frequency
+    ω (1/s), the median step dt, and the window of the local cubics (samples to either side)."""
+
+    sigma: np.ndarray
+    speed: np.ndarray
+    omega: float
+    dt: float
+    half: int
+
+    @property
+    def period(self) -> float:
+        return 2 * np.pi / self.omega
+
+    @property
+    def every(self) -> int:
+        """Samples from one node to the next."""
+        return max(1, round(self.period / self.dt / PER_PERIOD))
+
+    @property
+    def per_period(self) -> float:
+        """Nodes to a period: some forty, fewer of a recording with fewer samples."""
+        return self.period / (self.dt * self.every)
+
+    @property
+    def substeps(self) -> int:
+        """Runge–Kutta steps between two nodes, each at most a quarter of a radian."""
+        return max(1, int(np.ceil(2 * np.pi / self.per_period / 0.25)))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Arcs:
+    """Arcs of one length L: times (A, L), y (A, L, d), states x (A, L, 2d), and where they come
+    from: (stretch, first node, node after the last). A shorter arc repeats its last node, unseen
+    (NaN)."""
+
+    t: np.ndarray
+    y: np.ndarray
+    x: np.ndarray
+    home: tuple[tuple[int, int, int], ...]
+
+    def take(self, keep: np.ndarray) -> Arcs:
+        chosen = np.arange(len(self.home))[keep]
+        home = tuple(self.home[i] for i in chosen)
+        return Arcs(self.t[keep], self.y[keep], self.x[keep], home)
+
+
+def stretches(recording: Recording) -> list[Stretch]:
+    """The stretches of all runs. Raises FitError where none is long enough."""
+    found = []
+    for run in recording.runs:
+        t = recording.times(run)
+        y = np.stack([recording.unwrapped(n, run) for n in recording.positions], axis=1)
+        u = recording.array("inputs", run)
+        seen = np.isfinite(y).all(1) & np.isfinite(u).all(1)
+        found += pieces(run, t[seen], y[seen], u[seen])
+    found = [s for s in found if len(s.t) >= _SHORTEST]
+    if not found:
+        raise FitError(
+            f"{recording.source}: expected stretches of at least {_SHORTEST} samples without a gap"
+        )
+    return found
+
+
+def pieces(
+    run: str, t: np.ndarray, y: np.ndarray, u: np.ndarray, gap: float = GAP
+) -> list[Stretch]:
+    """A run cut at its gaps."""
+    steps = np.diff(t)
+    cuts = np.flatnonzero(steps > gap * np.median(steps)) + 1 if len(steps) else []
+    parts = (np.split(a, cuts) for a in (t, y, u))
+    return [Stretch(run, *part) for part in zip(*parts, strict=True)]
+
+
+def measure(found: Sequence[Stretch]) -> Scales:
+    """Noise, speeds and the fastest frequency, from local cubics at some two thousand samples."""
+    half, sigma = choose_half([(s.t, s.y) for s in found])
+    every = max(1, sum(len(s.t) for s in found) // 2_000)
+    smooths = [smooth(s.t, s.y, half, np.arange(0, len(s.t), every))[0] for s in found]
+    speed = np.sqrt(np.mean(np.concatenate([s.v for s in smooths]) ** 2, axis=0))
+    acceleration = np.sqrt(np.mean(np.concatenate([s.a for s in smooths]) ** 2, axis=0))
+    if not np.all(speed > 0):
+        raise InputError("expected positions that move: a column is constant")
+    dt = float(np.median(np.concatenate([np.diff(s.t) for s in found])))
+    resolution = np.median(np.abs(np.concatenate([np.diff(s.y, axis=0) for s in found])), axis=0)
+    sigma = np.maximum(sigma, 1e-9 * np.maximum(resolution, speed * dt))  # clean data have none
+    return Scales(sigma, speed, float(np.max(acceleration / speed)), dt, half)
+
+
+def nodes_of(found: Sequence[Stretch], scales: Scales) -> list[Nodes]:
+    """The nodes of all stretches; of a long recording those of blocks, spread evenly over it."""
+    rows = [np.arange(0, len(s.t), scales.every) for s in found]
+    total = sum(map(len, rows))
+    length = round(_BLOCK * scales.period / scales.dt / scales.every)
+    keep = -(-total * scales.substeps // MOST_STEPS)  # every so many blocks
+    nodes, count = [], 0
+    for s, at in zip(found, rows, strict=True):
+        blocks = [at] if keep == 1 else [at[k : k + length] for k in range(0, len(at), length)]
+        for block in blocks:
+            count += 1
+            if len(block) < _SHORTEST_ARC or (count - 1) % keep:
+                continue
+            q, v, _ = smooth(s.t, s.y, scales.half, block)[0]
+            x = np.concatenate([q, v], axis=1)
+            nodes.append(Nodes(s, block, s.t[block], s.y[block], x))
+    return nodes
+
+
+def arcs_of(nodes: Sequence[Nodes], length: int) -> Arcs:
+    """All nodes in arcs of about ``length`` nodes, each node in one arc."""
+    home = []
+    for i, node in enumerate(nodes):
+        count = max(1, round(len(node.t) / length))
+        edges = np.linspace(0, len(node.t), count + 1).round().astype(int)
+        home += [(i, int(a), int(b)) for a, b in pairwise(edges) if b - a >= _SHORTEST_ARC]
+    longest = max(b - a for _, a, b in home)
+    t, y, x = [], [], []
+    for i, a, b in home:
+        index = np.minimum(np.arange(a, a + longest), b - 1)
+        t.append(nodes[i].t[index])
+        x.append(nodes[i].x[index])
+        seen = np.arange(a, a + longest) < b
+        y.append(np.where(seen[:, None], nodes[i].y[index], np.nan))
+    return Arcs(np.array(t), np.array(y), np.array(x), tuple(home))
+
+
+def with_states(nodes: Sequence[Nodes], arcs: Arcs, x: np.ndarray) -> list[Nodes]:
+    """The nodes with the states x (A, L, 2d) that a fit of these arcs found."""
+    states = [node.x.copy() for node in nodes]
+    for k, (i, a, b) in enumerate(arcs.home):
+        states[i][a:b] = x[k, : b - a]
+    return [dataclasses.replace(n, x=s) for n, s in zip(nodes, states, strict=True)]

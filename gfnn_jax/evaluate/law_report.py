@@ -1,0 +1,80 @@
+"""report.json of a law that was learned from a recording; the keys are those of `evaluate.report`,
+null where they do not apply, with the law's own beside them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.evaluate.report import device
+from gfnn_jax.maps.saved import versions
+from gfnn_jax.models.learned_law import LearnedLaw
+
+
+def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:
+    """The report of a fit of the recording ``source``."""
+    map_, sensors = fit.map, fit.map.sensors
+    assert sensors is not None
+    num_parameters = sum(t.std > 0 for t in (*fit.lagrangian.terms, *fit.friction.terms))
+    return {
+        "scene": None,
+        "dt": float(np.asarray(map_.dt)),
+        "seed": seed,
+        "dtype": str(map_.scale.dtype),
+        "device": device(),
+        "versions": versions(),
+        "data": {"num_pairs": None, "num_samples": fit.num_samples, "source": source},
+        "model": {
+            "learns": "lagrangian",
+            "family": "Lagrangian",
+            "label": f"L of {len(fit.lagrangian.terms)} terms",
+            "chart": None,
+            "num_parameters": num_parameters,
+        },
+        "fit": {
+            "seconds": fit.seconds,
+            "compile_seconds": 0.0,
+            "total_seconds": fit.seconds,
+            "train_rms": fit.residual,
+            "validation_rms": None,
+            "validation_relative": None,
+            "tolerance": None,
+            "tolerance_met": None,
+            "ended": fit.ended,
+            "messages": list(fit.messages),
+            "steps": list(fit.steps),
+            "alike": list(fit.alike),
+        },
+        "hamiltonian": _law(fit.hamiltonian),
+        "lagrangian": {**_law(fit.lagrangian), "text": str(fit.lagrangian)},
+        "friction": {**_law(fit.friction), "text": str(fit.friction)},
+        "inputs": {
+            "hold": sensors.hold,
+            "delay": sensors.delay,
+            "gains": {
+                name: {q: {"gain": g, "std": s} for q, (g, s) in forces.items()}
+                for name, forces in fit.gains.items()
+            },
+        },
+        "zeros": {name: {"zero": z, "std": s} for name, (z, s) in fit.zeros.items()},
+        "noise": {n: {"sigma": s, "residual": fit.residual[n]} for n, s in fit.noise.items()},
+        "gauge": fit.gauge,
+        "energy": fit.energy,
+        "horizon": [h._asdict() for h in fit.horizon],
+        "map": {
+            "multiplier": map_.multiplier(),
+            "symplecticity_defect": None,
+            "chart_determinant_min": None,
+            "newton_iterations_max": None,
+        },
+        "rollout": None,
+        "candidates": [],
+    }
+
+
+def _law(expression: Any) -> dict[str, Any]:
+    return {
+        "formula": expression.formula,
+        "terms": [term._asdict() for term in expression.terms],
+    }

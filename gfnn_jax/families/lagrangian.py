@@ -1,0 +1,391 @@
+"""A Lagrangian with forces, linear in its coefficients: the law of a mechanical system as arrays.
+
+    d/dt ∂L/∂v − ∂L/∂q + ∂R/∂v = G u,      L = Σ θ_j ℓ_j(q, v),      R = Σ ρ_k r_k(v)
+
+    ℓ_j = ∏ v_i^k_ji · ∏ q_i^n_ji · cos(m_j·q + φ_j)
+
+k, n and m are whole numbers, and a term has at most two factors v: kinetic, gyroscopic and
+potential terms. With s = c·v, the speed of one coordinate or the relative speed of two, friction is
+linear, r = ½s²; quadratic, r = ⅓|s|³; or dry, r = √(s² + ε²) − ε. Everything is batch first, in
+closed form, and runs in NumPy or JAX. A term is a row of arrays, none of which is static, so that
+another library of as many terms (`Terms.padded`) compiles nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from gfnn_jax.arrays import as_row, matmul, namespace
+
+MAX_POWER = 8  # of one coordinate in one term; powers come from a table of this length
+LINEAR, QUADRATIC, DRY = range(3)
+
+
+class Potentials(NamedTuple):
+    """The factors of terms that depend on q, with derivatives, None above the order asked."""
+
+    value: Any  # (..., P)
+    slope: Any  # (..., P, d)
+    curvature: Any  # (..., P, d, d)
+
+
+class Derivatives(NamedTuple):
+    """L and its derivatives; ``by_vq`` [..., i, j] is ∂²L/∂v_i∂q_j, ``by_vv`` the masses M."""
+
+    value: Any  # (...)
+    by_q: Any  # (..., d)
+    by_v: Any  # (..., d)
+    by_qq: Any  # (..., d, d)
+    by_vq: Any  # (..., d, d)
+    by_vv: Any  # (..., d, d)
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("speeds", "powers", "modes", "phases"),
+    meta_fields=(),
+)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Terms:
+    """The terms ℓ_j of a Lagrangian: whole numbers k, n and m, each (P, d), and phases (P,).
+
+    A phase is 0 for a cosine and −π/2 for a sine.
+    """
+
+    speeds: Any
+    powers: Any
+    modes: Any
+    phases: Any
+
+    @staticmethod
+    def of(rows: Sequence[Sequence[Any]], dim: int) -> Terms:
+        """Of rows (k, n, m, φ). Raises ValueError for more than two factors v, or a power > 8."""
+        k, n, m = (np.array([r[i] for r in rows], dtype=int).reshape(-1, dim) for i in range(3))
+        if (k.sum(1) > 2).any() or k.min(initial=0) < 0:
+            raise ValueError("a term of a Lagrangian has at most two factors v")
+        if n.max(initial=0) > MAX_POWER or n.min(initial=0) < 0:
+            raise ValueError(f"powers of coordinates are from 0 to {MAX_POWER}")
+        return Terms(k, n, m, np.array([float(r[3]) for r in rows]))
+
+    @property
+    def count(self) -> int:
+        return self.speeds.shape[0]
+
+    @property
+    def dim(self) -> int:
+        return self.speeds.shape[1]
+
+    def rows(self) -> list[tuple]:
+        """(k, n, m, φ) of each term, hashable."""
+        whole = (self.speeds, self.powers, self.modes)
+        return [
+            (*(tuple(map(int, a[j])) for a in whole), float(self.phases[j]))
+            for j in range(self.count)
+        ]
+
+    def take(self, keep: Any) -> Terms:
+        """The terms with these indices, or where this mask holds."""
+        return Terms(self.speeds[keep], self.powers[keep], self.modes[keep], self.phases[keep])
+
+    def padded(self, count: int) -> Terms:
+        """With constants behind, which move nothing, ``count`` terms in all."""
+        more = count - self.count
+        k, n, m = (np.pad(a, ((0, more), (0, 0))) for a in (self.speeds, self.powers, self.modes))
+        return Terms(k, n, m, np.pad(self.phases, (0, more)))
+
+    def quadratic(self) -> tuple[Any, Any, Any]:
+        """A (P, d, d), b (P, d), c (P,) of ∏ v_i^k_i = ½ vᵀA v + b·v + c."""
+        xp, k = namespace(self.phases), self.speeds
+        k = k.astype(self.phases.dtype)
+        degree = k.sum(1)
+        outer = k[:, :, None] * k[:, None, :]
+        twice, once, never = ((degree == n).astype(k.dtype) for n in (2, 1, 0))
+        own = as_row(xp.eye(self.dim, dtype=k.dtype), outer) * k[:, None, :]
+        return (outer - own) * twice[:, None, None], k * once[:, None], never
+
+    def potentials(self, q: Any, order: int = 2) -> Potentials:
+        """∏ q_i^n_i cos(m·q + φ) at q (..., d), with its derivatives up to ``order`` 0, 1 or 2."""
+        xp = namespace(q)
+        m = self.modes.astype(q.dtype)
+        phase = matmul(q, m.T)
+        phase = phase + as_row(self.phases, phase)
+        cos = xp.cos(phase)
+        plain = xp is np and not np.any(self.powers)  # angles alone: no powers to compute
+        if plain and order == 0:
+            return Potentials(cos, None, None)
+        sin = xp.sin(phase) if order > 0 else None
+        if plain:
+            slope = -_outer(sin, m)
+            curvature = None
+            if order > 1:
+                curvature = -_outer(cos, m[:, :, None] * m[:, None, :])
+            return Potentials(cos, slope, curvature)
+        b, db, ddb = _monomials(q, self.powers, order)
+        slope = curvature = None
+        if order > 0:
+            dcos = -_outer(sin, m)
+            slope = dcos * b[..., None] + cos[..., None] * db
+        if order > 1:
+            both = dcos[..., :, None] * db[..., None, :]
+            ddcos = -_outer(cos, m[:, :, None] * m[:, None, :])
+            curvature = ddcos * b[..., None, None] + cos[..., None, None] * ddb
+            curvature = curvature + both + xp.swapaxes(both, -1, -2)
+        return Potentials(cos * b, slope, curvature)
+
+    def motion(self, v: Any) -> tuple[Any, Any]:
+        """∏ v_i^k_i (..., P) and its gradient (..., P, d) at v (..., d)."""
+        A, b, c = self.quadratic()
+        slope = matmul(v, A.reshape(-1, self.dim).T).reshape(*v.shape[:-1], *b.shape)
+        b = as_row(b, slope)
+        value = (v[..., None, :] * (0.5 * slope + b)).sum(-1)
+        return value + as_row(c, value), slope + b
+
+    def residuals(self, q: Any, v: Any, a: Any) -> Any:
+        """d/dt ∂ℓ_j/∂v − ∂ℓ_j/∂q along motion with acceleration a: (..., P, d)."""
+        f, df, _ = self.potentials(q, order=1)
+        g, dg = self.motion(v)
+        A, _, _ = self.quadratic()
+        push = matmul(a, A.reshape(-1, self.dim).T).reshape(*a.shape[:-1], *A.shape[:2])
+        along = (df * v[..., None, :]).sum(-1)
+        return push * f[..., None] + dg * along[..., None] - g[..., None] * df
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("directions", "kinds", "widths"),
+    meta_fields=(),
+)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Friction:
+    """Terms r_k of Rayleigh's R: directions c (F, d), whole numbers; kinds (F,), LINEAR, QUADRATIC
+    or DRY; widths ε (F,), which dry friction alone uses, in units of v."""
+
+    directions: Any
+    kinds: Any
+    widths: Any
+
+    @staticmethod
+    def of(rows: Sequence[Sequence[Any]], dim: int) -> Friction:
+        """Of rows (c, kind, ε)."""
+        return Friction(
+            np.array([r[0] for r in rows], dtype=int).reshape(-1, dim),
+            np.array([r[1] for r in rows], dtype=int),
+            np.array([float(r[2]) for r in rows]),
+        )
+
+    @property
+    def count(self) -> int:
+        return self.kinds.shape[0]
+
+    def rows(self) -> list[tuple]:
+        """(c, kind, ε) of each term, hashable."""
+        return [
+            (tuple(map(int, self.directions[k])), int(self.kinds[k]), float(self.widths[k]))
+            for k in range(self.count)
+        ]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Each term as it stands in a formula: "½ v1²", "⅓ |v1 - v2|³", "|v2|"."""
+        return tuple(_friction_named(c, kind) for c, kind, _ in self.rows())
+
+    def take(self, keep: Any) -> Friction:
+        return Friction(self.directions[keep], self.kinds[keep], self.widths[keep])
+
+    def padded(self, count: int) -> Friction:
+        """With terms along no direction behind, ``count`` in all."""
+        more = count - self.count
+        return Friction(
+            np.pad(self.directions, ((0, more), (0, 0))),
+            np.pad(self.kinds, (0, more)),
+            np.pad(self.widths, (0, more), constant_values=1.0),
+        )
+
+    def tables(self, v: Any) -> tuple[Any, Any, Any]:
+        """r_k, dr_k/ds and d²r_k/ds² at v (..., d), each (..., F)."""
+        xp = namespace(v)
+        s = matmul(v, self.directions.astype(v.dtype).T)
+        size = xp.abs(s)
+        kinds, widths = as_row(self.kinds, s), as_row(self.widths, s)
+        root = xp.sqrt(s * s + widths**2)
+        root = xp.where(root > 0, root, 1.0)  # at rest with ε = 0 there is no direction to push
+        linear, quadratic = kinds == LINEAR, kinds == QUADRATIC
+        value = xp.where(linear, 0.5 * s * s, xp.where(quadratic, size**3 / 3, root - widths))
+        slope = xp.where(linear, s, xp.where(quadratic, s * size, s / root))
+        dry = widths**2 / root**3
+        curvature = xp.where(linear, xp.ones_like(s), xp.where(quadratic, 2 * size, dry))
+        return value, slope, curvature
+
+    def residuals(self, v: Any) -> Any:
+        """∂r_k/∂v at v (..., d): (..., F, d)."""
+        _, slope, _ = self.tables(v)
+        return _outer(slope, self.directions.astype(v.dtype))
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("terms", "coefficients", "friction", "losses", "uniform", "gains"),
+    meta_fields=(),
+)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lagrangian:
+    """L = Σ θ_j ℓ_j with θ ``coefficients`` (P,), friction R = Σ ρ_k r_k with ρ ``losses`` (F,),
+    uniform friction −γ ∂L/∂v with γ ``uniform`` in 1/time, and gains G (d, inputs) of inputs u."""
+
+    terms: Terms
+    coefficients: Any
+    friction: Friction
+    losses: Any
+    uniform: Any
+    gains: Any
+
+    @property
+    def dim(self) -> int:
+        return self.terms.dim
+
+    @property
+    def num_inputs(self) -> int:
+        return self.gains.shape[1]
+
+    def derivatives(self, q: Any, v: Any) -> Derivatives:
+        """L and its first and second derivatives at q, v (..., d)."""
+        f, df, ddf = self.terms.potentials(q)
+        g, dg = self.terms.motion(v)
+        A, _, _ = self.terms.quadratic()
+        theta = as_row(self.coefficients, f)
+        weight = theta * g
+        return Derivatives(
+            (weight * f).sum(-1),
+            (weight[..., None] * df).sum(-2),
+            ((theta * f)[..., None] * dg).sum(-2),
+            (weight[..., None, None] * ddf).sum(-3),
+            (theta[..., None, None] * dg[..., :, None] * df[..., None, :]).sum(-3),
+            self._masses(f, A),
+        )
+
+    def _masses(self, f: Any, A: Any) -> Any:
+        d = self.dim
+        weighted = as_row(self.coefficients, f) * f
+        return matmul(weighted, A.reshape(-1, d * d)).reshape(*f.shape[:-1], d, d)
+
+    def momentum(self, q: Any, v: Any) -> Any:
+        """p = ∂L/∂v (..., d)."""
+        f, _, _ = self.terms.potentials(q, order=0)
+        _, dg = self.terms.motion(v)
+        return ((as_row(self.coefficients, f) * f)[..., None] * dg).sum(-2)
+
+    def masses(self, q: Any) -> Any:
+        """M = ∂²L/∂v∂v (..., d, d), which depends on q alone."""
+        f, _, _ = self.terms.potentials(q, order=0)
+        return self._masses(f, self.terms.quadratic()[0])
+
+    def energy(self, q: Any, v: Any) -> Any:
+        """v·∂L/∂v − L (...)."""
+        f, _, _ = self.terms.potentials(q, order=0)
+        g, dg = self.terms.motion(v)
+        return (as_row(self.coefficients, f) * f * ((dg * v[..., None, :]).sum(-1) - g)).sum(-1)
+
+    def forces(self, q: Any, v: Any, u: Any = None) -> Any:
+        """−∂R/∂v − γ ∂L/∂v + G u (..., d); u is (..., inputs), or None for none."""
+        _, slope, _ = self.friction.tables(v)
+        push = -matmul(as_row(self.losses, slope) * slope, self.friction.directions.astype(v.dtype))
+        push = push - self.uniform * self.momentum(q, v)
+        return push if u is None else push + matmul(u, self.gains.T)
+
+    def losses_by_v(self, v: Any) -> Any:
+        """∂²R/∂v∂v (..., d, d)."""
+        _, _, curvature = self.friction.tables(v)
+        c = self.friction.directions.astype(v.dtype)
+        outer = (c[:, :, None] * c[:, None, :]).reshape(-1, self.dim**2)
+        flat = matmul(as_row(self.losses, curvature) * curvature, outer)
+        return flat.reshape(*v.shape, self.dim)
+
+    def acceleration(self, q: Any, v: Any, u: Any = None) -> Any:
+        """a of M a = ∂L/∂q − (∂²L/∂v∂q) v − ∂R/∂v − γ ∂L/∂v + G u, at q, v (..., d)."""
+        f, df, _ = self.terms.potentials(q, order=1)
+        g, dg = self.terms.motion(v)
+        theta = as_row(self.coefficients, f)
+        along = (df * v[..., None, :]).sum(-1)
+        force = ((theta * g)[..., None] * df - (theta * along)[..., None] * dg).sum(-2)
+        return _solve(self._masses(f, self.terms.quadratic()[0]), force + self.forces(q, v, u))
+
+    def power(self, q: Any, v: Any, u: Any = None) -> tuple[Any, Any]:
+        """Energy per unit of time: lost to each friction (..., F + 1), the last one uniform
+        friction, and supplied by each input (..., inputs)."""
+        xp = namespace(v)
+        lost = (self.friction.residuals(v) * v[..., None, :]).sum(-1)
+        lost = lost * as_row(self.losses, lost)
+        even = self.uniform * (self.momentum(q, v) * v).sum(-1)
+        lost = xp.concatenate([lost, even[..., None]], axis=-1)
+        supplied = matmul(v, self.gains) * (0.0 if u is None else u)
+        return lost, supplied
+
+
+def _friction_named(direction: tuple[int, ...], kind: int) -> str:
+    parts = [f"{'-' if c < 0 else '+'} {abs(c) if abs(c) > 1 else ''}v{i + 1}"
+             for i, c in enumerate(direction) if c]  # fmt: skip
+    speed = " ".join(parts).removeprefix("+ ")
+    if kind == LINEAR:
+        return f"½ ({speed})²" if len(parts) > 1 else f"½ {speed}²"
+    return f"⅓ |{speed}|³" if kind == QUADRATIC else f"|{speed}|"
+
+
+def _monomials(x: Any, n: Any, order: int) -> tuple[Any, Any, Any]:
+    """∏ x_i^n_i (..., P) of x (..., d) and n (P, d), and its derivatives up to the order."""
+    xp, d = namespace(x), x.shape[-1]
+    rank = n.astype(x.dtype)
+    table = [xp.ones_like(x)]
+    for _ in range(MAX_POWER if xp is not np else int(n.max(initial=0))):
+        table.append(table[-1] * x)
+    powers = xp.stack(table, axis=-1)
+    factors = [[powers[..., i, n[:, i]] for i in range(d)]]
+    if order > 0:
+        slopes = [_rows(rank[:, i], powers[..., i, xp.maximum(n[:, i] - 1, 0)]) for i in range(d)]
+        factors.append(slopes)
+    if order > 1:
+        curvatures = [
+            _rows(rank[:, i] * (rank[:, i] - 1), powers[..., i, xp.maximum(n[:, i] - 2, 0)])
+            for i in range(d)
+        ]
+        factors.append(curvatures)
+
+    def product(*orders: int) -> Any:
+        found = factors[orders[0]][0]
+        for i in range(1, d):
+            found = found * factors[orders[i]][i]
+        return found
+
+    value, slope, curvature = product(*[0] * d), None, None
+    if order > 0:
+        slope = xp.stack([product(*(int(i == k) for i in range(d))) for k in range(d)], axis=-1)
+    if order > 1:
+        entries = [
+            product(*(int(i == k) + int(i == j) for i in range(d)))
+            for k in range(d)
+            for j in range(d)
+        ]
+        curvature = xp.stack(entries, axis=-1).reshape(*value.shape, d, d)
+    return value, slope, curvature
+
+
+def _outer(f: Any, m: Any) -> Any:
+    """f (..., P) times m (P, ...), term by term."""
+    f = f.reshape(*f.shape, *(1,) * (m.ndim - 1))
+    return f * as_row(m, f)
+
+
+def _rows(n: Any, f: Any) -> Any:
+    return as_row(n, f) * f
+
+
+def _solve(matrix: Any, vector: Any) -> Any:
+    """matrix⁻¹ vector of a batch of small systems: (..., d, d), (..., d)."""
+    if matrix.shape[-1] == 1:
+        return vector / matrix[..., 0]
+    return namespace(vector).linalg.solve(matrix, vector[..., None])[..., 0]

@@ -1,0 +1,226 @@
+"""Rayleigh friction and inputs beside a Hamiltonian, in the stages of its flow.
+
+    q̇ = ∂H/∂p = v,      ṗ = −∂H/∂q − ∂R/∂v(v) + G u(t),      R = Σ ρ_k r_k(v)
+
+The d'Alembert principle with forces: Gauss collocation of these equations has order 2s. Such a flow
+keeps no multiple of the symplectic form, except where friction is uniform (`flows.uniform`).
+
+An input is a polynomial in time over each step: its value at the step's begin and the coefficients
+of τ, τ², … stand among the args, and `families.family.at_time` moves them to a stage's time.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from math import comb
+from typing import Any
+
+import jax
+import numpy as np
+
+from gfnn_jax.arrays import as_row, matmul, namespace
+from gfnn_jax.families.family import at_time, parameter_gradients
+from gfnn_jax.families.lagrangian import LINEAR, Friction
+from gfnn_jax.phase_space import split
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("family", "friction"),
+    meta_fields=("num_inputs", "degree"),
+)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Forced:
+    """H of ``family`` with friction and inputs; params are those of H, then ρ (F,), then G (d, k)
+    row by row.
+
+    friction: the terms r_k. num_inputs: k. degree: of the inputs' polynomials; the last
+    (degree + 1) k of the args are the coefficients of τ⁰ of each input, then those of τ¹, ….
+
+    In place of ∇H stands the field (∂H/∂q + ∂R/∂v − G u, ∂H/∂p), which J turns into the velocity,
+    and in place of its Hessian that field's derivative. ``value`` is H.
+    """
+
+    family: Any
+    friction: Friction
+    num_inputs: int = 0
+    degree: int = 0
+
+    name = "terms with friction"
+
+    @property
+    def label(self) -> str:
+        losses, inputs = self.friction.count, self.num_inputs
+        return f"{self.family.label}, {losses} of friction, {inputs} inputs"
+
+    @property
+    def dim(self) -> int:
+        return self.family.dim
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """The names of the args that are no inputs."""
+        return getattr(self.family, "parameters", ())
+
+    @property
+    def num_parameters(self) -> int:
+        return self.family.num_parameters + self.friction.count + self.dim * self.num_inputs
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """Those of H, of R, and of G."""
+        gains = [f"u{j + 1} on q{i + 1}" for i in range(self.dim) for j in range(self.num_inputs)]
+        return (*self.family.term_names, *self.friction.names, *gains)
+
+    @property
+    def quadratic(self) -> bool:
+        """Whether the field is affine."""
+        return self.family.quadratic and not np.any(self.friction.kinds != LINEAR)
+
+    @property
+    def operations(self) -> tuple[int, int]:
+        """Those of H, with the Hessian that friction's derivative takes."""
+        gradient, with_hessian = self.family.operations
+        more = 8 * self.friction.count * self.dim + 2 * self.dim * self.num_inputs
+        return gradient + more, with_hessian + more + 4 * self.dim**3
+
+    def unflatten(self, coefficients):
+        """The parameters are the coefficients themselves."""
+        return coefficients
+
+    def take(self, rows) -> Any:
+        """The family of these terms of H and R alone, all gains with them; the one of H where no
+        forces are left."""
+        of_h, losses = self.family.num_parameters, self.friction.count
+        own = self.family.take([j for j in rows if j < of_h])
+        kept = [j - of_h for j in rows if of_h <= j < of_h + losses]
+        if not kept and not self.num_inputs:
+            return own
+        return dataclasses.replace(self, family=own, friction=self.friction.take(kept))
+
+    def term_gradients(self, w, args=None):
+        """The field of every term of H and R (..., 2d, m), those of R as if v were p: to start
+        from. NumPy."""
+        _, slope, _ = self.friction.tables(split(w)[1])
+        frictions = slope[..., None, :] * self.friction.directions.T.astype(w.dtype)
+        frictions = np.concatenate([frictions, np.zeros_like(frictions)], axis=-2)
+        return np.concatenate(
+            [self.family.term_gradients(w, self._inner(args)), frictions], axis=-1
+        )
+
+    def multiplier(self, params, dt) -> None:
+        """None: no multiple of the symplectic form is kept."""
+        return None
+
+    def at_time(self, args, after):
+        """args a time ``after`` later: the inputs' polynomials about that time."""
+        if not self.num_inputs:
+            return at_time(self.family, args, after)
+        xp = namespace(args, after)
+        count = (self.degree + 1) * self.num_inputs
+        powers, lanes = range(self.degree + 1), args.shape[:-1]
+        axes = max(len(lanes), xp.ndim(after))  # of stages and lanes
+        lanes = (*(1,) * (axes - len(lanes)), *lanes)
+        jets = args[..., -count:].reshape(*lanes, self.degree + 1, self.num_inputs)
+        after_ = xp.reshape(after, (*(1,) * (axes - xp.ndim(after)), *xp.shape(after), 1))
+        shifted = [
+            sum(comb(i, j) * after_ ** (i - j) * jets[..., i, :] for i in powers[j:])
+            for j in powers
+        ]
+        later = xp.concatenate(xp.broadcast_arrays(*shifted), axis=-1)
+        if args.shape[-1] == count:
+            return later
+        others = at_time(self.family, args[..., :-count], after)
+        others = xp.broadcast_to(others, (*later.shape[:-1], others.shape[-1]))
+        return xp.concatenate([others, later], axis=-1)
+
+    def __call__(self, params, w, args=None):
+        return self.value(params, w, args)
+
+    def value(self, params, w, args=None):
+        """H, shape (...)."""
+        own, _, _ = self.parts(params)
+        return self.family.value(own, w, self._inner(args))
+
+    def gradient(self, params, w, args=None):
+        """(∂H/∂q + ∂R/∂v − G u, ∂H/∂p), shape (..., 2d)."""
+        own, losses, gains = self.parts(params)
+        gradient = self.family.gradient(own, w, self._inner(args))
+        _, slope, _ = self.friction.tables(split(gradient)[1])
+        return self._field(gradient, slope, losses, gains, args)
+
+    def gradient_and_hessian(self, params, w, args=None):
+        """That field, and its derivative (..., 2d, 2d), which is not symmetric."""
+        own, losses, gains = self.parts(params)
+        gradient, hessian = self.family.gradient_and_hessian(own, w, self._inner(args))
+        _, slope, curvature = self.friction.tables(split(gradient)[1])
+        field = self._field(gradient, slope, losses, gains, args)
+        return field, self._beside(hessian, losses, curvature)
+
+    def parameter_gradients(self, params, w, args=None, along=None):
+        """∂/∂params of the field (..., 2d, m); of a family ``along`` of other terms of H those of
+        its coefficients alone. NumPy."""
+        own, losses, _ = self.parts(params)
+        inner, dim = self._inner(args), self.dim
+        _, slope, curvature = self.friction.tables(split(self.family.gradient(own, w, inner))[1])
+        columns = parameter_gradients(self.family, own, w, inner, along)
+        columns = self._beside(columns, losses, curvature)
+        if along is not None:
+            return columns
+        frictions = slope[..., None, :] * self.friction.directions.T.astype(w.dtype)
+        u = self._inputs(args)
+        pushes = -(np.eye(dim)[:, :, None] * u[..., None, None, :]).reshape(*u.shape[:-1], dim, -1)
+        pushes = np.broadcast_to(pushes, (*w.shape[:-1], dim, dim * self.num_inputs))
+        more = np.concatenate([frictions, pushes], axis=-1)
+        more = np.concatenate([more, np.zeros_like(more)], axis=-2)
+        return np.concatenate([columns, more], axis=-1)
+
+    def power(self, params, w, args=None):
+        """Energy per unit of time at states w (..., 2d): lost by each friction (..., F), supplied
+        by each input (..., k)."""
+        own, losses, gains = self.parts(params)
+        v = split(self.family.gradient(own, w, self._inner(args)))[1]
+        _, slope, _ = self.friction.tables(v)
+        speeds = matmul(v, self.friction.directions.astype(v.dtype).T)
+        lost = as_row(losses, slope) * slope * speeds
+        return lost, matmul(v, gains) * self._inputs(args)
+
+    def parts(self, params) -> tuple[Any, Any, Any]:
+        """The params of H, ρ (F,) and G (d, k)."""
+        own, count = self.family.num_parameters, self.friction.count
+        gains = params[own + count :].reshape(self.dim, self.num_inputs)
+        return params[:own], params[own : own + count], gains
+
+    def _inner(self, args):
+        """The args of H."""
+        if args is None:
+            return None
+        others = args.shape[-1] - (self.degree + 1) * self.num_inputs
+        return args[..., :others] if others else None
+
+    def _inputs(self, args):
+        """u (..., k) at the time of these args."""
+        if not self.num_inputs:
+            return np.zeros(0)
+        start = args.shape[-1] - (self.degree + 1) * self.num_inputs
+        return args[..., start : start + self.num_inputs]
+
+    def _field(self, gradient, slope, losses, gains, args):
+        along_q, along_p = split(gradient)
+        directions = self.friction.directions.astype(gradient.dtype)
+        along_q = along_q + matmul(as_row(losses, slope) * slope, directions)
+        if self.num_inputs:
+            along_q = along_q - matmul(self._inputs(args), gains.T)
+        return namespace(gradient).concatenate([along_q, along_p], axis=-1)
+
+    def _beside(self, columns, losses, curvature):
+        """Derivatives (..., 2d, n) of ∇H with those of the friction, whose speed ∂H/∂p moves too:
+        ∂²R/∂v² times the rows of p beside the rows of q."""
+        directions = self.friction.directions.astype(columns.dtype)
+        outer = (directions[:, :, None] * directions[:, None, :]).reshape(-1, self.dim**2)
+        by_v = matmul(as_row(losses, curvature) * curvature, outer)
+        by_v = by_v.reshape(*by_v.shape[:-1], self.dim, self.dim)
+        along_q, along_p = columns[..., : self.dim, :], columns[..., self.dim :, :]
+        along_q = along_q + matmul(by_v, along_p)
+        return namespace(columns).concatenate([along_q, along_p], axis=-2)

@@ -1,0 +1,185 @@
+"""The Hamiltonian of a Lagrangian: its Legendre transform, as one more family of H.
+
+    H(q, p) = p·v − L(q, v),      ∂L/∂v(q, v) = M(q) v + a(q) = p
+
+L has at most two factors v in a term, so that v is the solution of a small linear system, and with
+∂H/∂q = −∂L/∂q and ∂H/∂p = v all derivatives are closed formulas (H. Goldstein, "Classical
+Mechanics", section 8.1). A double pendulum's L has five terms where its H is rational.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+from gfnn_jax.arrays import namespace
+from gfnn_jax.families.lagrangian import Derivatives, Friction, Lagrangian, Terms
+from gfnn_jax.flows.forces import Forced
+from gfnn_jax.flows.uniform import Uniform
+from gfnn_jax.phase_space import split
+from gfnn_jax.solve.linear import small_solve
+
+_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=("terms",), meta_fields=())
+@dataclasses.dataclass(frozen=True, eq=False)
+class Legendre:
+    """H of L = Σ θ_j ℓ_j; params are θ (P,), ``terms`` the ℓ_j. H is not linear in θ."""
+
+    terms: Terms
+
+    name = "Lagrangian"
+    prefix = "Legendre transform of L = "  # of a formula
+
+    @property
+    def label(self) -> str:
+        return f"L of {self.num_parameters} terms"
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """Each ℓ_j as it stands in a formula: "v1 v2 cos(q1 - q2)"."""
+        return tuple(_named(*row) for row in self.terms.rows())
+
+    def take(self, rows) -> Legendre:
+        """The family of these terms alone."""
+        return Legendre(self.terms.take(list(rows)))
+
+    @property
+    def dim(self) -> int:
+        return self.terms.dim
+
+    @property
+    def num_parameters(self) -> int:
+        return self.terms.count
+
+    @property
+    def operations(self) -> tuple[int, int]:
+        """Floating-point operations of a gradient, and of a gradient with its Hessian."""
+        d, count = self.dim, self.num_parameters
+        gradient = count * (20 + 6 * d + 2 * d * d) + d**3
+        return gradient, 2 * gradient + 6 * d**3
+
+    def unflatten(self, coefficients):
+        """The parameters are the coefficients (P,) themselves."""
+        return coefficients
+
+    def __call__(self, params, w, args=None):
+        return self.value(params, w, args)
+
+    def velocity(self, params, w):
+        """v (..., d) at states w = (q, p)."""
+        law, (q, p) = self._law(params), split(w)
+        return small_solve(law.masses(q), p - law.momentum(q, namespace(q).zeros_like(q)))
+
+    def state(self, params, q, v):
+        """z = (q, p) (..., 2d) of positions and velocities (..., d)."""
+        return namespace(q, v).concatenate([q, self._law(params).momentum(q, v)], axis=-1)
+
+    def value(self, params, w, args=None):
+        """H, shape (...): the energy v·∂L/∂v − L."""
+        return self._law(params).energy(split(w)[0], self.velocity(params, w))
+
+    def gradient(self, params, w, args=None):
+        """(−∂L/∂q, v), shape (..., 2d)."""
+        v = self.velocity(params, w)
+        by_q = self._law(params).derivatives(split(w)[0], v).by_q
+        return namespace(w).concatenate([-by_q, v], axis=-1)
+
+    def gradient_and_hessian(self, params, w, args=None):
+        """∂H/∂w and ∂²H/∂w² (..., 2d, 2d), of M v(q, p) + a = p by the implicit function:
+
+        H_pp = M⁻¹,  H_pq = ∂v/∂q = −M⁻¹ L_vq,  H_qq = −L_qq + L_qv M⁻¹ L_vq.
+        """
+        v, found = self._derivatives(params, w)
+        xp, turn = namespace(w), partial(namespace(w).swapaxes, axis1=-1, axis2=-2)
+        unit = xp.broadcast_to(np.eye(self.dim, dtype=w.dtype), found.by_vv.shape)
+        inverse = _solved(found.by_vv, unit)
+        inverse = 0.5 * (inverse + turn(inverse))
+        by_q = -_solved(found.by_vv, turn(found.by_vq))  # (..., q, v): rows are solved for
+        bent = -found.by_qq + by_q @ -found.by_vq
+        bent = 0.5 * (bent + turn(bent))
+        above = xp.concatenate([bent, by_q], axis=-1)
+        below = xp.concatenate([turn(by_q), inverse], axis=-1)
+        gradient = xp.concatenate([-found.by_q, v], axis=-1)
+        return gradient, xp.concatenate([above, below], axis=-2)
+
+    def parameter_gradients(self, params, w, args=None, along=None):
+        """∂/∂θ of the gradient (..., 2d, P), or in the coefficients of a family ``along`` of other
+        terms: ∂v/∂θ_j = −M⁻¹ ∂ℓ_j/∂v and −∂ℓ_j/∂q − L_qv ∂v/∂θ_j. NumPy."""
+        if along is not None and not isinstance(along, Legendre):
+            return along.term_gradients(w, args)
+        q = split(w)[0]
+        v, found = self._derivatives(params, w)
+        terms = self.terms if along is None else along.terms
+        value, slope, _ = terms.potentials(q, order=1)
+        motion, by_motion = terms.motion(v)
+        by_v = -_solved(found.by_vv, value[..., None] * by_motion)  # (..., P, d)
+        by_q = -slope * motion[..., None] - by_v @ found.by_vq
+        return np.swapaxes(np.concatenate([by_q, by_v], axis=-1), -1, -2)
+
+    def _derivatives(self, params, w) -> tuple[Any, Derivatives]:
+        """v and the derivatives of L there."""
+        v = self.velocity(params, w)
+        return v, self._law(params).derivatives(split(w)[0], v)
+
+    def _law(self, params) -> Lagrangian:
+        none = np.zeros(0)
+        return Lagrangian(
+            self.terms, params, Friction.of([], self.dim), none, 0.0, none.reshape(self.dim, 0)
+        )
+
+
+def _named(speeds, powers, mode, phase: float) -> str:
+    parts = []
+    for letter, exponents in (("v", speeds), ("q", powers)):
+        for i, n in enumerate(exponents, 1):
+            parts += [f"{letter}{i}" + ("" if n == 1 else str(n).translate(_DIGITS))] if n else []
+    if any(mode):
+        sign = "".join(
+            f" {'-' if m < 0 else '+'} {'' if abs(m) == 1 else f'{abs(m)} '}q{i}"
+            for i, m in enumerate(mode, 1) if m
+        )  # fmt: skip
+        angle = sign[3:] if sign.startswith(" +") else "-" + sign[3:]
+        parts.append(f"{'cos' if phase == 0 else 'sin'}({angle})")
+    return " ".join(parts)
+
+
+def _solved(matrix, rows):
+    """matrix⁻¹ of each row of (..., n, d); matrix (..., d, d) is symmetric."""
+    return small_solve(matrix[..., None, :, :], rows)
+
+
+def family_of(law: Lagrangian, degree: int = 0) -> tuple[Any, np.ndarray]:
+    """The family and the params of a law's flow: H by the Legendre transform, its friction and its
+    inputs as forces, and uniform friction where it has any.
+
+    degree: of the inputs' polynomials in time over a step.
+    """
+    family: Any = Legendre(law.terms)
+    params = [np.asarray(law.coefficients)]
+    if law.friction.count or law.num_inputs:
+        family = Forced(family, law.friction, law.num_inputs, degree)
+        params += [np.asarray(law.losses), np.asarray(law.gains).ravel()]
+    if law.uniform != 0:
+        family = Uniform(family)
+        params.append(np.atleast_1d(law.uniform))
+    return family, np.concatenate(params)
+
+
+def law_of(family: Any, params: Any) -> Lagrangian:
+    """The law behind the family and the params of a flow: the inverse of `family_of`."""
+    uniform: Any = 0.0
+    if isinstance(family, Uniform):
+        family, params, uniform = family.family, params[:-1], params[-1]
+    if isinstance(family, Forced):
+        own, losses, gains = family.parts(params)
+        return Lagrangian(family.family.terms, own, family.friction, losses, uniform, gains)
+    dim, none = family.dim, np.zeros(0)
+    return Lagrangian(
+        family.terms, params, Friction.of([], dim), none, uniform, none.reshape(dim, 0)
+    )

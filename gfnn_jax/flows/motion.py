@@ -1,0 +1,153 @@
+"""Motion of a law between samples, with its derivatives in the state and in the coefficients.
+
+The equation of motion is linear in the coefficients p of a law, r(q, v, a; p) = 0, so that with the
+acceleration known all its derivatives are explicit:
+
+    ∂a/∂x = −M⁻¹ ∂r/∂x,      ∂a/∂p_k = −M⁻¹ r_k,      r_k the residual of term k alone
+
+One step between two samples is a Runge–Kutta step of Dormand and Prince (order 5), with as many
+substeps as the fastest motion asks; all steps of a recording are taken at once, as one batch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
+
+# Dormand & Prince, J. Comput. Appl. Math. 6 (1980) 19: the solution of order 5.
+NODES = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])
+_A = np.array([
+    [0, 0, 0, 0, 0, 0],
+    [1 / 5, 0, 0, 0, 0, 0],
+    [3 / 40, 9 / 40, 0, 0, 0, 0],
+    [44 / 45, -56 / 15, 32 / 9, 0, 0, 0],
+    [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
+    [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
+])  # fmt: skip
+_B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
+
+
+class Step(NamedTuple):
+    """States after a step (N, 2d), and their derivatives in the states before (N, 2d, 2d) and in
+    the coefficients (N, 2d, n)."""
+
+    states: np.ndarray
+    by_state: np.ndarray
+    by_coefficients: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Form:
+    """A law whose coefficients are free: terms with θ = ``fixed`` + ``basis`` c (the gauge),
+    friction, and gains of the inputs. Its coefficients are (c, ρ, G row by row)."""
+
+    terms: Terms
+    fixed: np.ndarray
+    basis: np.ndarray
+    friction: Friction
+    num_inputs: int = 0
+
+    @property
+    def dim(self) -> int:
+        return self.terms.dim
+
+    @property
+    def count(self) -> int:
+        return self.basis.shape[1] + self.friction.count + self.dim * self.num_inputs
+
+    def split(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """c, ρ and G (d, inputs) of p (count,)."""
+        ends = np.cumsum([self.basis.shape[1], self.friction.count])
+        c, losses, gains = np.split(p, ends)
+        return c, losses, gains.reshape(self.dim, self.num_inputs)
+
+    def lagrangian(self, p: np.ndarray) -> Lagrangian:
+        c, losses, gains = self.split(p)
+        theta = self.fixed + self.basis @ c
+        return Lagrangian(self.terms, theta, self.friction, losses, 0.0, gains)
+
+    def accelerate(
+        self, law: Lagrangian, q: np.ndarray, v: np.ndarray, u: np.ndarray, sensitive: bool = True
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """a (N, d), and its derivatives in q, v and, where ``sensitive``, in the coefficients
+        (N, d, 2d + count)."""
+        f, df, ddf = self.terms.potentials(q)
+        g, dg = self.terms.motion(v)
+        A, _, _ = self.terms.quadratic()
+        theta, d = law.coefficients, self.dim
+        A = A.reshape(-1, d * d)
+        _, pull, stiffness = self.friction.tables(v)
+        directions = self.friction.directions
+        along = np.einsum("npi,ni->np", df, v)
+        forced, turned = theta * g, np.einsum("np,npi->ni", theta * along, dg)
+        force = np.einsum("np,npi->ni", forced, df) - turned - (law.losses * pull) @ directions
+        if self.num_inputs:
+            force = force + u @ law.gains.T
+        inverse = np.linalg.inv(((theta * f) @ A).reshape(-1, d, d))
+        a = np.einsum("nij,nj->ni", inverse, force)
+        push = (a @ A.reshape(-1, d).T).reshape(df.shape)
+        weighted = theta[:, None] * df
+        by_q = push.swapaxes(1, 2) @ weighted
+        by_q += dg.swapaxes(1, 2) @ (theta[:, None] * np.einsum("npij,nj->npi", ddf, v))
+        by_q -= np.einsum("np,npij->nij", forced, ddf)
+        turned = dg.swapaxes(1, 2) @ weighted
+        outer = (directions[:, :, None] * directions[:, None, :]).reshape(-1, d * d)
+        by_v = ((theta * along) @ A + (law.losses * stiffness) @ outer).reshape(-1, d, d)
+        by_v = by_v + turned - turned.swapaxes(1, 2)
+        columns = [by_q, by_v]
+        if sensitive:
+            rows = push * f[..., None] + dg * along[..., None] - g[..., None] * df
+            columns.append(rows.swapaxes(1, 2) @ self.basis)
+            columns.append((pull[..., None] * directions).swapaxes(1, 2))
+        if sensitive and self.num_inputs:
+            pushed = -u[:, None, None, :] * np.eye(d)[:, :, None]
+            columns.append(pushed.reshape(len(v), d, -1))
+        return a, -inverse @ np.concatenate(columns, axis=-1)
+
+    def step(
+        self, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray, sensitive: bool = True
+    ) -> Step:
+        """One step h (N,) of states x (N, 2d) with its derivatives, those in the coefficients where
+        ``sensitive``; u (N, substeps, 6, inputs) are the inputs at the nodes of each substep."""
+        law, d, substeps = self.lagrangian(p), self.dim, u.shape[1]
+        n, width = len(x), 2 * d + (self.count if sensitive else 0)
+        h = (h / substeps)[:, None]
+        wide = h[..., None]
+        D = np.zeros((n, 2 * d, width))
+        D[:, range(2 * d), range(2 * d)] = 1.0
+        for k in range(substeps):
+            rates, slopes = [], []
+            for i in range(6):
+                xi, Di = x, D
+                for j in np.flatnonzero(_A[i]):
+                    xi, Di = xi + _A[i, j] * h * rates[j], Di + _A[i, j] * wide * slopes[j]
+                a, by = self.accelerate(law, xi[:, :d], xi[:, d:], u[:, k, i], sensitive)
+                slope = np.empty_like(D)
+                slope[:, :d] = Di[:, d:]
+                slope[:, d:] = by[..., : 2 * d] @ Di
+                slope[:, d:, 2 * d :] += by[..., 2 * d :]
+                rates.append(np.concatenate([xi[:, d:], a], axis=1))
+                slopes.append(slope)
+            for i in np.flatnonzero(_B):
+                x, D = x + _B[i] * h * rates[i], D + _B[i] * wide * slopes[i]
+        return Step(x, D[..., : 2 * d], D[..., 2 * d :])
+
+    def advance(self, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """States (N, 2d) after a step, as `step` has them, without derivatives."""
+        law, d, substeps = self.lagrangian(p), self.dim, u.shape[1]
+        h = (h / substeps)[:, None]
+        for k in range(substeps):
+            rates: list[np.ndarray] = []
+            for i in range(6):
+                xi = x
+                for j in np.flatnonzero(_A[i]):
+                    xi = xi + _A[i, j] * h * rates[j]
+                a = law.acceleration(xi[:, :d], xi[:, d:], u[:, k, i])
+                rates.append(np.concatenate([xi[:, d:], a], axis=1))
+            for i in np.flatnonzero(_B):
+                x = x + _B[i] * h * rates[i]
+        return x

@@ -1,0 +1,209 @@
+"""``gfnn.fit`` of a recording: from positions to the law behind them, with friction and inputs.
+
+stretches → nodes → search (`models.law_search`) → the law in the recording's words → map → bands
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.dataset.stretches import Scales, measure, nodes_of, stretches
+from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.maps.estimates import law_in_use
+from gfnn_jax.maps.inputs import HOLDS, Signals
+from gfnn_jax.maps.laws import map_of_law
+from gfnn_jax.maps.sensors import Sensors
+from gfnn_jax.models.arc_inputs import ArcInputs
+from gfnn_jax.models.calibration import calibrated
+from gfnn_jax.models.law_fit import LawFit
+from gfnn_jax.models.law_search import FRICTIONS, SearchOptions, search
+from gfnn_jax.models.law_text import Expression, friction_of, speed_names, terms_of
+from gfnn_jax.models.learned_law import LearnedLaw, hamiltonian_of, in_columns, scaled
+
+_ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apart
+
+
+def fit_recording(
+    recording: Recording, *, friction: str = "auto", input_hold: str = "auto",
+    mass: Mapping[str, float] | None = None,
+    on_progress: Callable[[str], Any] = lambda message: None,
+) -> LearnedLaw:  # fmt: skip
+    """The law of a recording, from its positions and inputs.
+
+    friction: "auto", "none", "linear", "quadratic", "dry", or several of them, as
+    "linear+dry". input_hold: "auto", or how inputs go on between samples: "hold", "linear" or
+    "band". mass: the known mass (or moment of inertia) of one position, which fixes the scale of L.
+    Raises InputError for bad options or a recording without positions, FitError where no law is
+    found.
+    """
+    started = time.process_time()
+    options = _options(friction)
+    _check(recording, input_hold, mass)
+    steps: list[str] = []
+
+    def told(line: str) -> None:
+        steps.append(line)
+        on_progress(line)
+
+    found = stretches(recording)
+    scales = measure(found)
+    nodes = nodes_of(found, scales)
+    angles = tuple(i for i, n in enumerate(recording.positions) if n in recording.angles)
+    if not recording.inputs:
+        holds: tuple[str, ...] = ("hold",)
+    else:
+        holds = HOLDS if input_hold == "auto" else (input_hold,)
+    inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
+    fit, hold, nodes = search(nodes, scales, angles, len(recording.inputs), inputs, told, options)
+    if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
+        raise FitError("no law of the library follows this recording: its arcs could not be closed")
+    law, covariance = in_columns(fit)
+    gauge = f"the mean of M11 over the data is 1 ({recording.positions[0]})"
+    if mass:
+        (name, value), i = next(iter(mass.items())), recording.positions.index(next(iter(mass)))
+        masses = law.masses(np.concatenate([n.x[:, : fit.form.dim] for n in nodes]))
+        law, covariance = scaled(law, covariance, value / float(np.mean(masses[:, i, i])))
+        gauge = f"the mean mass of {name} over the data is {value:g}"
+    x = np.concatenate([n.x for n in nodes])
+    d = fit.form.dim
+    zeros = np.zeros(d)
+    zeros[list(fit.structure.zeros)] = fit.p[fit.form.count :]
+    q, v = x[:, :d] + zeros, x[:, d:]
+    root = _root(covariance)
+    sensors = Sensors(
+        recording.positions, recording.inputs, recording.angles,
+        np.minimum(scales.sigma, fit.rms()), scales.omega,
+        scales.period, hold, 0.0, np.array([scales.period]), np.zeros((1, d)),
+    )  # fmt: skip
+    told("bands: forecasts from windows of the record")
+    spread = np.std(np.concatenate([s.y for s in found]), axis=0)
+    used, horizons = calibrated(law_in_use(law, root, sensors), found, scales, spread)
+    z = np.concatenate([q, law.momentum(q, v)], axis=1)
+    u = np.concatenate([n.stretch.u[n.at] for n in nodes])
+    signals = Signals(recording.inputs, hold) if recording.inputs else None
+    map_ = map_of_law(
+        law, z, scales.dt, angles=angles, signals=signals, inputs=u if signals else None, root=root
+    )
+    map_ = _with_sensors(map_, used.sensors)
+    return _described(recording, fit, map_, law, covariance, horizons, gauge, tuple(steps), scales,
+                      (q, v, u), [n.t for n in nodes], time.process_time() - started)  # fmt: skip
+
+
+def _options(friction: str) -> SearchOptions:
+    if friction == "auto":
+        return SearchOptions()
+    kinds = () if friction == "none" else tuple(friction.split("+"))
+    if not set(kinds) <= set(FRICTIONS):
+        raise InputError(
+            f"expected friction auto, none or some of {', '.join(FRICTIONS)} joined by +, got "
+            f"{friction!r}"
+        )
+    return SearchOptions(frictions=kinds, choose_friction=False)
+
+
+def _check(recording: Recording, input_hold: str, mass: Mapping[str, float] | None) -> None:
+    if not recording.positions:
+        raise InputError(f"{recording.source}: expected positions, found none (--positions)")
+    if input_hold not in ("auto", *HOLDS):
+        raise InputError(f"expected input_hold auto, {', '.join(HOLDS)}, got {input_hold!r}")
+    for name, value in (mass or {}).items():
+        if name not in recording.positions:
+            raise InputError(f"mass: no position {name} among {', '.join(recording.positions)}")
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"mass: expected {name} above 0, got {value}")
+    if len(mass or {}) > 1:
+        raise InputError("mass: one known mass fixes the scale of L; got several")
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """rootᵀ root = covariance, of its eigenvalues above roundoff."""
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > 1e-14 * max(float(values.max(initial=0.0)), 1e-300)
+    return np.sqrt(values[kept])[:, None] * vectors[:, kept].T
+
+
+def _with_sensors(map_: Any, sensors: Sensors) -> Any:
+    return dataclasses.replace(map_, sensors=sensors)
+
+
+def _described(
+    recording: Recording, fit: LawFit, map_: Any, law: Any, covariance: np.ndarray,
+    horizons: Any, gauge: str, steps: tuple[str, ...], scales: Scales, states: Any,
+    times: list[np.ndarray], seconds: float,
+) -> LearnedLaw:  # fmt: skip
+    """The law in the words of the recording."""
+    names = recording.positions
+    speeds = speed_names(names, recording.velocities)
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    count, lost = law.terms.count, law.friction.count
+    lagrangian = terms_of(law.terms, law.coefficients, std[:count], names, speeds)
+    friction = friction_of(law.friction, law.losses, std[count : count + lost], speeds)
+    of_gains = std[count + lost :].reshape(law.gains.shape)
+    gains = {
+        u: {q: (float(law.gains[i, j]), float(of_gains[i, j])) for i, q in enumerate(names)}
+        for j, u in enumerate(recording.inputs)
+    }
+    zero_std = np.sqrt(np.diag(fit.covariance()))[fit.form.count :]
+    zeros = {
+        names[i]: (float(fit.p[fit.form.count + k]), float(zero_std[k]))
+        for k, i in enumerate(fit.structure.zeros)
+    }
+    messages = [] if fit.fitted.converged else ["the last fit had not converged"]
+    if any(rho < 0 for rho in law.losses):
+        messages.append("friction with a negative coefficient: the record shows energy gained")
+    return LearnedLaw(
+        map=map_, lagrangian=lagrangian, friction=friction, gains=gains,
+        hamiltonian=hamiltonian_of(law.terms, lagrangian, names), zeros=zeros,
+        noise=dict(zip(names, map(float, map_.sensors.sigma), strict=True)),
+        residual=dict(zip(names, map(float, fit.rms()), strict=True)), gauge=gauge,
+        alike=_alike(fit, lagrangian, friction), horizon=tuple(horizons),
+        energy=_energy(law, friction, recording.inputs, states, times),
+        messages=tuple(messages), steps=steps, num_samples=len(recording), seconds=seconds,
+        ended="every length of arcs was fitted",
+    )  # fmt: skip
+
+
+def _alike(fit: LawFit, lagrangian: Expression, friction: Expression) -> tuple[str, ...]:
+    """Pairs of coefficients that the record cannot tell apart."""
+    covariance = fit.covariance()
+    scale = np.sqrt(np.diag(covariance))
+    with np.errstate(all="ignore"):
+        correlation = covariance / scale / scale[:, None]
+    texts = dict(zip(fit.structure.terms, (t.term for t in lagrangian.terms), strict=True))
+    texts |= dict(zip(fit.structure.friction, (t.term for t in friction.terms), strict=True))
+    names = [texts.get(key[1], " ".join(map(str, key))) for key in fit.values]
+    return tuple(
+        f"{names[i]} and {names[j]} ({correlation[i, j]:+.3f})"
+        for i, j in zip(*np.nonzero(np.triu(np.abs(correlation) > _ALIKE, 1)), strict=True)
+    )
+
+
+def _energy(
+    law: Any, friction: Expression, inputs: tuple[str, ...], states: Any, times: list[np.ndarray]
+) -> dict[str, Any]:
+    """Energy per second, means over the record: stored, lost by each friction, supplied by each
+    input, and what these leave unexplained."""
+    q, v, u = states
+    energy = law.energy(q, v)
+    lost, supplied = law.power(q, v, u)
+    ends = np.cumsum([0, *map(len, times)])
+    total = sum(t[-1] - t[0] for t in times)
+
+    def mean(rate: np.ndarray) -> float:
+        parts = zip(times, ends[:-1], ends[1:], strict=True)
+        return float(sum(np.trapezoid(rate[a:b], t) for t, a, b in parts) / total)
+
+    stored = float(sum(energy[b - 1] - energy[a] for a, b in pairwise(ends)))
+    by_friction = {t.term: mean(lost[:, k]) for k, t in enumerate(friction.terms)}
+    by_input = {name: mean(supplied[:, k]) for k, name in enumerate(inputs)}
+    closure = stored / total - sum(by_input.values()) + sum(by_friction.values())
+    return {
+        "stored": stored / total, "lost": by_friction, "supplied": by_input, "closure": closure,
+    }  # fmt: skip

@@ -1,0 +1,284 @@
+"""A map and its sensors: states estimated from a recording, and forecasts with bands.
+
+The samples before a time are fitted by one arc of the law, its first state unknown: that gives the
+state there with its covariance. A forecast is the orbit from it. Its band holds the error of that
+state, of the law's coefficients, the noise of a sample, and the law's own misfit, as forecasts of
+the data that it was learned from have shown it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.dataset.local_cubics import smooth
+from gfnn_jax.errors import InputError
+from gfnn_jax.families.lagrangian import Lagrangian
+from gfnn_jax.flows.motion import Form
+from gfnn_jax.flows.schedules import interpolate, stage_times
+from gfnn_jax.maps.laws import law_of_map
+from gfnn_jax.maps.sensors import Sensors
+from gfnn_jax.solve.latent_arcs import Observed, Steps, fit_arcs
+
+FEWEST = 5  # samples from which a state is estimated
+_MOST = 160  # samples of a window that are used
+_FINE = 0.16  # radians of the fastest motion in a step
+
+
+class Forecast(NamedTuple):
+    """Positions ahead: column name -> (runs, n), and their standard deviations."""
+
+    times: np.ndarray
+    values: dict[str, np.ndarray]
+    std: dict[str, np.ndarray]
+
+
+class Window(NamedTuple):
+    """Samples of one run before a time: t (n,), positions y (n, d), and that run's inputs."""
+
+    t: np.ndarray
+    y: np.ndarray
+    inputs_t: np.ndarray
+    inputs: np.ndarray
+
+
+class Law(NamedTuple):
+    """A law in use: its form with all coefficients given, a root of their covariance (rootᵀ root),
+    and its sensors."""
+
+    form: Form
+    p: np.ndarray
+    root: np.ndarray
+    sensors: Sensors
+
+
+def law_in_use(law: Lagrangian, root: np.ndarray | None, sensors: Sensors) -> Law:
+    """Of a Lagrangian without uniform friction and the root (m, n) of the covariance of (θ, ρ,
+    G)."""
+    count = law.terms.count
+    form = Form(law.terms, np.zeros(count), np.eye(count), law.friction, law.num_inputs)
+    p = np.concatenate([law.coefficients, law.losses, np.ravel(law.gains)])
+    return Law(form, p, np.zeros((0, len(p))) if root is None else np.asarray(root), sensors)
+
+
+def law_of(map_: Any) -> Law:
+    """Of a map that was learned from a recording. Raises InputError for any other."""
+    if map_.sensors is None:
+        raise InputError(
+            "expected a map that was learned from a recording, which knows its sensors"
+        )
+    law = law_of_map(map_)
+    law = Lagrangian(*(_numpy(getattr(law, f.name)) for f in dataclasses.fields(law)))
+    root = None if map_.posterior is None else map_.posterior.root
+    return law_in_use(law, root, map_.sensors)
+
+
+def _numpy(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return type(value)(*(np.asarray(getattr(value, f.name)) for f in dataclasses.fields(value)))
+    return np.asarray(value)
+
+
+def estimate(map_: Any, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """`SymplecticMap.estimate`."""
+    law = law_of(map_)
+    windows = windows_of(law.sensors, recording)
+    x, covariance = estimate_states(law, windows)
+    lagrangian, d = law.form.lagrangian(law.p), law.form.dim
+    found = lagrangian.derivatives(x[:, :d], x[:, d:])
+    z = np.concatenate([x[:, :d], found.by_v], axis=1)
+    turn = np.zeros_like(covariance)
+    turn[:, :d, :d] = np.eye(d)
+    turn[:, d:, :d], turn[:, d:, d:] = found.by_vq, found.by_vv
+    return z, turn @ covariance @ turn.swapaxes(1, 2)
+
+
+def forecast(
+    map_: Any, recording: Recording, times: Any, inputs: Recording | None = None
+) -> Forecast:
+    """`SymplecticMap.forecast`."""
+    law = law_of(map_)
+    sensors = law.sensors
+    times = np.atleast_1d(np.asarray(times, float))
+    windows = windows_of(sensors, recording)
+    last = np.array([np.max(w.t) for w in windows])
+    if times.ndim != 1 or not np.all(np.diff(times) > 0) or not np.all(times[0] >= last):
+        raise InputError(
+            f"expected rising times from the end of each run on ({last.max():g} s), got "
+            f"{times.ravel()[0]:g} to {times.ravel()[-1]:g} s"
+        )
+    if sensors.inputs and inputs is None:
+        raise InputError(f"expected inputs {', '.join(sensors.inputs)} ahead of time: inputs=")
+    if inputs is not None and sensors.inputs:
+        windows = [
+            _with_inputs(window, inputs, sensors, run)
+            for window, run in zip(windows, recording.runs, strict=True)
+        ]
+    x, covariance = estimate_states(law, windows)
+    ahead = np.broadcast_to(times, (len(windows), len(times)))
+    orbits = propagate(law, windows, x, covariance, last, ahead)
+    names = sensors.positions
+    return Forecast(
+        times,
+        {n: orbits.values[..., i] for i, n in enumerate(names)},
+        {n: orbits.std[..., i] for i, n in enumerate(names)},
+    )
+
+
+def windows_of(sensors: Sensors, recording: Recording) -> list[Window]:
+    """The last samples of each run. Raises InputError where a column is missing or they are few."""
+    missing = [n for n in (*sensors.positions, *sensors.inputs) if n not in recording.columns]
+    if missing:
+        raise InputError(f"{recording.source}: expected columns {', '.join(missing)}")
+    windows = []
+    for run in recording.runs:
+        t = recording.times(run)
+        columns = [
+            recording.unwrapped(n, run) if n in recording.angles else recording.values(n, run)
+            for n in sensors.positions
+        ]
+        y = np.stack(columns, axis=1)
+        u = [recording.values(n, run) for n in sensors.inputs]
+        u = np.stack(u, axis=1) if u else np.zeros((len(t), 0))
+        known = np.isfinite(u).all(axis=1)
+        seen = np.isfinite(y).all(axis=1)
+        if np.sum(seen) < FEWEST:
+            raise InputError(
+                f"{recording.source}: run {run}: expected at least {FEWEST} samples to estimate "
+                f"the state from, got {np.sum(seen)}"
+            )
+        times, places = t[seen], y[seen]
+        recent = times >= times[-FEWEST:].min()
+        recent |= times >= times.max() - sensors.window
+        windows.append(thinned(Window(times[recent], places[recent], t[known], u[known])))
+    return windows
+
+
+def thinned(window: Window) -> Window:
+    """The window with every so many of its samples, counted from the last one: more tell no
+    more."""
+    every = -(-len(window.t) // _MOST)
+    return window._replace(t=window.t[::-every][::-1], y=window.y[::-every][::-1])
+
+
+def _with_inputs(window: Window, inputs: Recording, sensors: Sensors, run: str) -> Window:
+    """The window with inputs behind its own."""
+    run = run if len(inputs.runs) > 1 else next(iter(inputs.runs))
+    t = inputs.times(run)
+    u = np.stack([inputs.values(n, run) for n in sensors.inputs], axis=1)
+    later = t > np.max(window.inputs_t, initial=-np.inf)
+    return window._replace(
+        inputs_t=np.concatenate([window.inputs_t, t[later]]),
+        inputs=np.concatenate([window.inputs, u[later]]),
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Windows:
+    """Windows of equal length as arcs whose law is known: what `fit_arcs` asks for."""
+
+    law: Law
+    h: np.ndarray
+    u: np.ndarray
+
+    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
+        arcs, length, m = x.shape
+        num = arcs * (length - 1)
+        u = self.u.reshape(num, *self.u.shape[2:])
+        start = x[:, :-1].reshape(num, m)
+        step = self.law.form.step(self.law.p, start, self.h.reshape(num), u, sensitive=False)
+        shape = (arcs, length - 1, m)
+        return Steps(
+            step.states.reshape(shape), step.by_state.reshape(*shape, m), np.zeros((*shape, 0))
+        )
+
+    def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
+        d = self.law.form.dim
+        by_state = np.zeros((*x.shape[:2], d, 2 * d))
+        by_state[..., range(d), range(d)] = 1.0
+        return Observed(x[..., :d], by_state, np.zeros((*x.shape[:2], d, 0)))
+
+
+def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np.ndarray]:
+    """(q, v) (B, 2d) at the last sample of each window, and its covariance (B, 2d, 2d) in the
+    law."""
+    d, sensors = law.form.dim, law.sensors
+    length = max(len(w.t) for w in windows)
+    t, y, x = [], [], []
+    for w in windows:
+        pad = length - len(w.t)  # before the window: steps of no time, nothing seen
+        start = smooth(w.t, w.y, min(len(w.t), _near(sensors, w.t)))[0]
+        own = np.concatenate([start.q, start.v], axis=1)
+        t.append(np.concatenate([np.full(pad, w.t[0]), w.t]))
+        y.append(np.concatenate([np.full((pad, d), np.nan), w.y]))
+        x.append(np.concatenate([np.repeat(own[:1], pad, axis=0), own]))
+    t, y, x = np.array(t), np.array(y), np.array(x)
+    u, _ = _inputs(law, windows, t, substeps_of(sensors, np.max(np.diff(t, axis=1), initial=0.0)))
+    arcs = _Windows(law, np.diff(t, axis=1), u)
+    scale = np.concatenate([sensors.sigma, sensors.sigma * sensors.omega])
+    found = fit_arcs(arcs, np.zeros(0), x, y, sensors.sigma, scale)
+    return found.x[:, -1], found.last_covariance()
+
+
+def _near(sensors: Sensors, t: np.ndarray) -> int:
+    """Samples within a sixth of a period, over which a cubic follows the motion."""
+    step = np.median(np.diff(t))
+    return max(3, int(np.pi / 3 / sensors.omega / step))
+
+
+class Orbits(NamedTuple):
+    """Positions (B, n, d) at the times asked, their standard deviations, and the states (B, n,
+    2d)."""
+
+    values: np.ndarray
+    std: np.ndarray
+    states: np.ndarray
+
+
+def propagate(
+    law: Law, windows: Sequence[Window], x: np.ndarray, covariance: np.ndarray, last: np.ndarray,
+    times: np.ndarray,
+) -> Orbits:  # fmt: skip
+    """Orbits from states x (B, 2d) with their covariance at times ``last`` (B,), to times (B,
+    n)."""
+    d, sensors, count = law.form.dim, law.sensors, len(law.p)
+    steps = np.diff(np.concatenate([last[:, None], times], axis=1), axis=1)
+    root = np.linalg.cholesky(covariance + 1e-300 * np.eye(2 * d)) if len(x) else covariance
+    spread = np.concatenate([root, np.zeros((len(x), 2 * d, law.root.shape[0]))], axis=2)
+    values, deviations, states, now = [], [], [], last
+    for k in range(times.shape[1]):
+        parts = substeps_of(sensors, np.max(steps[:, k], initial=0.0))
+        both = np.stack([now, times[:, k]], axis=1)
+        u, _ = _inputs(law, windows, both, parts)
+        step = law.form.step(law.p, x, steps[:, k], u[:, 0])
+        x, now = step.states, times[:, k]
+        spread = step.by_state @ spread
+        spread[..., 2 * d :] += step.by_coefficients[..., :count] @ law.root.T
+        own = np.sum(spread[:, :d] ** 2, axis=2) + sensors.sigma**2
+        own = own + sensors.misfit_at(now - last) ** 2
+        values.append(x[:, :d])
+        deviations.append(np.sqrt(own))
+        states.append(x)
+    return Orbits(*(np.stack(a, axis=1) for a in (values, deviations, states)))
+
+
+def substeps_of(sensors: Sensors, h: float) -> int:
+    """Runge–Kutta steps that a step h is made of."""
+    return max(1, int(np.ceil(h * sensors.omega / _FINE)))
+
+
+def _inputs(
+    law: Law, windows: Sequence[Window], t: np.ndarray, substeps: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs (B, L − 1, substeps, 6, k) of the steps between times t (B, L), and their times."""
+    at = stage_times(t, substeps) - law.sensors.delay
+    starts = np.broadcast_to(at[..., :1], at.shape)
+    u = np.stack([
+        interpolate(w.inputs_t, w.inputs, a, law.sensors.hold, s)
+        for w, a, s in zip(windows, at, starts, strict=True)
+    ])  # fmt: skip
+    return u, at

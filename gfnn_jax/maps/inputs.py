@@ -1,0 +1,143 @@
+"""Inputs of a map: what acts on the system during a step, sampled once a step, and in between held,
+linear, or band-limited.
+
+A step sees each input as a polynomial in the time since it began (`flows.forces`). Whatever the
+rule between samples, its coefficients are linear in the samples, so that a rollout can be
+differentiated in its inputs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from gfnn_jax.arrays import as_row, namespace
+
+HOLDS = ("hold", "linear", "band")
+_DEGREE = {"hold": 0, "linear": 1, "band": 9}
+# Samples to either side of a band-limited value, and the shape of their window (Kaiser's β).
+_TAPS, _BETA = 32, 8.0
+
+
+class Scheduled(NamedTuple):
+    """What rollouts take as args: the values of parameters, or None, and the inputs' coefficients
+    of every step (N, K) or (B, N, K)."""
+
+    params: Any
+    coefficients: Any
+
+    def at(self, params, steps):
+        """The args (B, ·) of the steps of these numbers (B,), with these parameters (…, k)."""
+        xp, found = namespace(steps, self.coefficients), self.coefficients
+        n = xp.clip(steps, 0, found.shape[-2] - 1)
+        own = found[n] if found.ndim == 2 else found[np.arange(len(found)), n]
+        return own if params is None else _behind(params, own)
+
+
+@dataclasses.dataclass(frozen=True)
+class Signals:
+    """The inputs of a map by name, and the rule between their samples.
+
+    hold: "hold", the value at a step's begin; "linear"; or "band", the band-limited interpolation
+    of evenly sampled values, by a windowed sinc of 64 samples.
+    """
+
+    names: tuple[str, ...]
+    hold: str = "hold"
+
+    def __post_init__(self):
+        if self.hold not in HOLDS:
+            raise ValueError(f"expected hold among {', '.join(HOLDS)}; got {self.hold!r}")
+
+    @property
+    def degree(self) -> int:
+        """Of the polynomials."""
+        return _DEGREE[self.hold]
+
+    def constant(self, args, inputs, shape: tuple, dtype):
+        """The args of a step of states of this shape during which the inputs, (k,) or (B, k), do
+        not change; None: none acts. Raises ValueError for another shape."""
+        count = len(self.names)
+        u = np.zeros(count, dtype) if inputs is None else _numbers(inputs, dtype)
+        if u.shape not in ((count,), (*shape[:-1], count)):
+            raise ValueError(f"expected inputs {self._named} of shape ({count},), got {u.shape}")
+        u = u if u.ndim == 2 else u[None]
+        rest = np.zeros((*u.shape[:-1], self.degree * count), dtype)
+        own = namespace(u).concatenate([u, rest], axis=-1)
+        return own if args is None else _behind(args, own)
+
+    def scheduled(self, args, inputs, shape: tuple, dtype, dt, num_steps: int | None) -> Scheduled:
+        """The args of rollouts from states of this shape.
+
+        inputs: (N, k) or (B, N, k), of each step's begin; a row more is that at the end of the
+        last. None: none acts. Raises ValueError for another shape.
+        """
+        count = len(self.names)
+        u = np.zeros((1, count), dtype) if inputs is None else _numbers(inputs, dtype)
+        lanes = u.shape[:-2] in ((), shape[:-1])
+        long = (
+            num_steps is None
+            or inputs is None
+            or u.shape[-2:-1] in ((num_steps,), (num_steps + 1,))
+        )
+        if u.ndim < 2 or u.shape[-1] != count or not lanes or not long:
+            steps = "N" if num_steps is None else str(num_steps)
+            raise ValueError(
+                f"expected inputs {self._named} of shape ({steps}, {count}), or that of each "
+                f"rollout, got {u.shape}"
+            )
+        return Scheduled(args, self.coefficients(u, dt))
+
+    def coefficients(self, u, dt):
+        """Of samples u (..., N, k) a time dt apart the coefficients (..., N, K) of the polynomials
+        in each step; beyond the ends the samples are those at the ends. NumPy or JAX."""
+        xp, (first, weights) = namespace(u, dt), _stencil(self.hold)
+        count = u.shape[-2]
+        places = np.arange(count)[:, None] + first + np.arange(weights.shape[1])
+        near = u[..., np.clip(places, 0, count - 1), :]  # (..., N, samples, k)
+        found = xp.einsum("js,...nsk->...njk", weights.astype(u.dtype), near)
+        unit = xp.asarray(dt, u.dtype) ** np.arange(len(weights), dtype=u.dtype)
+        return (found / as_row(unit[:, None], found)).reshape(*u.shape[:-1], -1)
+
+    @property
+    def _named(self) -> str:
+        return ", ".join(self.names)
+
+
+@cache
+def _stencil(hold: str) -> tuple[int, np.ndarray]:
+    """(first, weights): where the samples begin that a step takes, counted from its own, and the
+    coefficients (degree + 1, samples) of their polynomial in units of dt."""
+    if hold == "hold":
+        return 0, np.ones((1, 1))
+    if hold == "linear":
+        return 0, np.array([[1.0, 0.0], [-1.0, 1.0]])
+    count = _DEGREE[hold] + 1
+    at = 0.5 - 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / count)  # Chebyshev's
+    first = 1 - _TAPS
+    distance = at[:, None] - (first + np.arange(2 * _TAPS))
+    window = np.i0(_BETA * np.sqrt(np.clip(1 - (distance / _TAPS) ** 2, 0, None)))
+    values = np.sinc(distance) * window
+    values /= values.sum(axis=1, keepdims=True)
+    return first, np.linalg.solve(np.vander(at, increasing=True), values)
+
+
+def _behind(params, own):
+    """Values of parameters (..., k) before those of inputs (B, K)."""
+    xp = namespace(params, own)
+    axes = np.broadcast_shapes(params.shape[:-1], own.shape[:-1])
+    both = (xp.broadcast_to(a, (*axes, a.shape[-1])) for a in (params, own))
+    return xp.concatenate(list(both), axis=-1)
+
+
+def _numbers(values: Any, dtype) -> Any:
+    if isinstance(values, jax.Array):
+        return values if values.dtype == dtype else values.astype(dtype)
+    try:
+        return np.asarray(values, dtype)
+    except (TypeError, ValueError):
+        raise ValueError(f"expected numbers as inputs, got {type(values).__name__}") from None

@@ -1,0 +1,132 @@
+"""The map of a law: the flow of a Lagrangian with friction and inputs, over the time of a sample.
+
+States are z = (q, p) with p = ∂L/∂v; `maps.laws.states_of` and `velocities_of` change to
+velocities and back. Where only uniform friction acts, or none, the map is conformally symplectic.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.coordinates import Coordinates, lift
+from gfnn_jax.families.lagrangian import DRY, Lagrangian
+from gfnn_jax.flows.collocation import Steps, images
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.legendre import Legendre, family_of, law_of
+from gfnn_jax.flows.uniform import without_forces
+from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.inputs import Signals
+from gfnn_jax.maps.posterior import Posterior
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.phase_space import sizes, split, symplectic_form
+
+_STAGES, _SUBSTEPS = (3, 4, 6, 8), (1, 2, 4, 8, 16, 32)  # that are tried, by rising order
+# h × the fastest rate of a substep: of what fixed-point iterations solve, and Newton's method.
+_CONTRACTING, _STIFFEST = 1.0, 30.0
+_JUDGED = 64  # states whose step tells the error of these
+_NEARLY = 0.95  # of them, whose steps are to be within the tolerance
+
+
+def map_of_law(
+    law: Lagrangian,
+    z,
+    dt: float,
+    *,
+    angles: Sequence[int] = (),
+    signals: Signals | None = None,
+    inputs: Any = None,
+    root: Any = None,
+    tolerance: float = 1e-9,
+) -> SymplecticMap:
+    """The map over dt of a law that was learned from states z (N, 2d), NumPy.
+
+    angles: indices of q that have period 2π. signals: the inputs, where the law has gains of any;
+    inputs: (N, k) at these states, by which the steps are chosen too. root: (m, m), rootᵀ root the
+    covariance of the law's coefficients (θ, ρ, G row by row, and γ where there is uniform
+    friction). tolerance: of the step's own error, ÷ sizes of the coordinates.
+
+    Raises ValueError where ``signals`` are not as many as the law has inputs.
+    """
+    count = 0 if signals is None else len(signals.names)
+    if count != law.num_inputs:
+        raise ValueError(f"expected signals of {law.num_inputs} inputs, got {count}")
+    family, params = family_of(law, 0 if signals is None else signals.degree)
+    coordinates = Coordinates("cartesian", angles=tuple(angles))
+    z, _, centre, covered = lift(np.asarray(z, float), np.asarray(z, float), coordinates)
+    whole = tuple(a for a, all_of_it in zip(angles, covered, strict=True) if all_of_it)
+    scale, some = sizes(z), slice(None, None, -(-len(z) // _JUDGED))
+    args = None
+    if signals is not None:
+        u = np.zeros((len(z), count)) if inputs is None else np.asarray(inputs, float)
+        args = signals.constant(None, u[some], z[some].shape, np.float64)
+    steps = _steps(law, family, params, z[some], dt, scale, args, tolerance)
+    flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, steps.newton)
+    posterior = None if root is None else Posterior(0, np.asarray(root))
+    return SymplecticMap(
+        (flow,), coordinates, covering(z, ignore=whole), scale, centre, float(dt),
+        posterior=posterior, signals=signals,
+    )  # fmt: skip
+
+
+def sticking(law: Lagrangian, noise: float, duration: float) -> Lagrangian:
+    """The law with dry friction narrow enough for forecasts across a stop.
+
+    With |v| as √(v² + ε²) − ε a body that dry friction holds creeps at up to about ε. Over a
+    forecast of this duration it creeps by no more than ``noise``, in units of the positions, where
+    ε is noise ÷ duration: a smaller one would cost steps and tell nothing.
+    """
+    friction = law.friction
+    widths = np.where(friction.kinds == DRY, noise / duration, friction.widths)
+    return dataclasses.replace(law, friction=dataclasses.replace(friction, widths=widths))
+
+
+def law_of_map(map_: SymplecticMap) -> Lagrangian:
+    """The law whose flow the map is. Raises ValueError for any other map."""
+    piece = map_.pieces[0]
+    flow = len(map_.pieces) == 1 and isinstance(piece, Flow)
+    if not flow or not isinstance(without_forces(piece.family), Legendre):
+        raise ValueError("expected the map of a Lagrangian")
+    return law_of(piece.family, np.asarray(piece.params))
+
+
+def states_of(map_: SymplecticMap, q, v):
+    """z = (q, p) (..., 2d) of positions and velocities (..., d)."""
+    law = law_of_map(map_)
+    return np.concatenate([q, law.momentum(np.asarray(q), np.asarray(v))], axis=-1)
+
+
+def velocities_of(map_: SymplecticMap, z):
+    """v (..., d) of states z = (q, p) (..., 2d)."""
+    law = law_of_map(map_)
+    return Legendre(law.terms).velocity(law.coefficients, np.asarray(z))
+
+
+def _steps(law: Lagrangian, family, params, z, dt: float, scale, args, tolerance: float):
+    """The cheapest steps whose own error is within the tolerance at nearly all of these states;
+    and whether Newton's method is to solve them: where dry friction is stiff, whose force turns
+    over within ε, and no more than Newton's method bears in a substep."""
+    stiffness = 0.0
+    if np.any(law.friction.kinds == DRY):
+        q = split(z)[0]
+        resting = np.concatenate([q, law.momentum(q, 0 * q)], axis=1)
+        slopes = family.gradient_and_hessian(params, resting, args)[1]
+        turned = symplectic_form(law.dim) @ slopes
+        stiffness = dt * np.abs(np.linalg.eigvals(turned)).max()
+    fewest, stiff = stiffness / _STIFFEST, bool(stiffness > _CONTRACTING)
+    finest = Steps(_STAGES[-1], 2 * _SUBSTEPS[-1])
+    reference = images(family, params, z, dt, finest, args=args).states
+    steps = Steps(_STAGES[-1], _SUBSTEPS[-1], stiff)
+    for _, stages, substeps in sorted((s**2 * n, s, n) for s in _STAGES for n in _SUBSTEPS):
+        tried = Steps(stages, substeps, stiff)
+        if substeps < min(fewest, _SUBSTEPS[-1]):
+            continue
+        found = images(family, params, z, dt, tried, args=args).states
+        off = np.abs((found - reference) / scale).max(axis=1)
+        if np.mean(off <= tolerance) >= _NEARLY:
+            steps = tried
+            break
+    return steps

@@ -1,0 +1,126 @@
+"""A Lagrangian with forces: its closed forms against JAX's derivatives of the plain sum."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, Friction, Lagrangian, Terms
+
+ROWS = [
+    ((2, 0), (0, 0), (0, 0), 0.0),
+    ((0, 2), (0, 0), (0, 0), 0.0),
+    ((1, 1), (0, 0), (1, -1), 0.0),
+    ((0, 2), (1, 2), (0, 0), 0.0),
+    ((1, 0), (0, 1), (2, 0), -np.pi / 2),
+    ((0, 0), (0, 0), (1, 0), 0.0),
+    ((0, 0), (2, 1), (0, 3), 0.4),
+]
+THETA = np.array([1.0, 0.7, 0.3, 0.1, 0.2, 2.0, -0.6])
+FRICTION = [((1, 0), LINEAR, 1.0), ((-1, 1), QUADRATIC, 1.0), ((0, 1), DRY, 0.1)]
+RHO = np.array([0.1, 0.2, 0.05])
+GAINS = np.array([[1.0, 0.0, 0.5], [0.0, -2.0, 0.3]])
+
+
+def law():
+    terms, friction = Terms.of(ROWS, 2), Friction.of(FRICTION, 2)
+    return Lagrangian(terms, THETA, friction, RHO, 0.03, GAINS)
+
+
+def plain(q, v):
+    """L, term by term, as a person would write it."""
+    total = 0.0
+    for theta, (k, n, m, phase) in zip(THETA, ROWS, strict=True):
+        wave = jnp.cos(m[0] * q[0] + m[1] * q[1] + phase)
+        product = v[0] ** k[0] * v[1] ** k[1] * q[0] ** n[0] * q[1] ** n[1]
+        total = total + theta * product * wave
+    return total
+
+
+def rayleigh(v):
+    s = v[1] - v[0]
+    return (
+        RHO[0] * v[0] ** 2 / 2 + RHO[1] * jnp.abs(s) ** 3 / 3 + RHO[2] * jnp.sqrt(v[1] ** 2 + 0.01)
+    )
+
+
+def states(count=5):
+    return np.random.default_rng(0).normal(size=(2, count, 2))
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_derivatives_are_those_of_the_plain_sum(xp):
+    q, v = states()
+    found = law().derivatives(xp.asarray(q), xp.asarray(v))
+    over = lambda f: jax.vmap(f)(jnp.asarray(q), jnp.asarray(v))  # noqa: E731
+    expected = (
+        over(plain), over(jax.grad(plain)), over(jax.grad(plain, 1)), over(jax.hessian(plain)),
+        over(jax.jacfwd(jax.grad(plain, 1))), over(jax.hessian(plain, 1)),
+    )  # fmt: skip
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(law().momentum(xp.asarray(q), xp.asarray(v)), expected[2], 1e-12)
+
+
+def test_acceleration_solves_the_equation_of_motion():
+    q, v = states()
+    u = np.random.default_rng(1).normal(size=(5, 3))
+    a = law().acceleration(q, v, u)
+
+    def momentum_along(t, q, v, a):
+        return jax.grad(plain, 1)(q + t * v, v + t * a)
+
+    for k in range(5):
+        rate = jax.jacfwd(momentum_along)(0.0, q[k], v[k], a[k])
+        force = jax.grad(plain)(q[k], v[k]) - jax.grad(rayleigh)(v[k]) + GAINS @ u[k]
+        force = force - 0.03 * jax.grad(plain, 1)(q[k], v[k])
+        np.testing.assert_allclose(rate, force, rtol=1e-11, atol=1e-11)
+    terms = law().terms.residuals(q, v, a)
+    rest = np.einsum("npd,p->nd", terms, THETA) - law().forces(q, v, u)
+    np.testing.assert_allclose(rest, 0, atol=1e-11)
+
+
+def test_energy_changes_by_the_power_of_the_forces():
+    q, v = states()
+    u = np.random.default_rng(1).normal(size=(5, 3))
+    model, a = law(), law().acceleration(q, v, u)
+    h = 1e-5
+    rate = (model.energy(q + h * v, v + h * a) - model.energy(q - h * v, v - h * a)) / (2 * h)
+    lost, supplied = model.power(q, v, u)
+    np.testing.assert_allclose(rate, supplied.sum(-1) - lost.sum(-1), rtol=1e-7)
+
+
+def test_padding_moves_nothing():
+    q, v = states()
+    model = law()
+    longer = Lagrangian(
+        model.terms.padded(12), np.pad(THETA, (0, 5)), model.friction.padded(6),
+        np.pad(RHO, (0, 3)), 0.03, GAINS,
+    )  # fmt: skip
+    np.testing.assert_allclose(longer.acceleration(q, v), model.acceleration(q, v), rtol=1e-13)
+
+
+def test_padded_laws_share_one_program():
+    count = 0
+
+    @jax.jit
+    def acceleration(model, q, v):
+        nonlocal count
+        count += 1
+        return model.acceleration(q, v)
+
+    q, v = states()
+    for keep in (slice(0, 5), slice(0, 7)):
+        terms, theta = law().terms.take(keep), THETA[keep]
+        theta = np.pad(theta, (0, 8 - len(theta)))
+        friction = law().friction
+        model = Lagrangian(terms.padded(8), theta, friction, RHO, np.float64(0.03), GAINS)
+        np.testing.assert_allclose(acceleration(model, q, v), model.acceleration(q, v), rtol=1e-10)
+    assert count == 1
+
+
+def test_bad_terms_are_refused():
+    with pytest.raises(ValueError, match="two factors v"):
+        Terms.of([((2, 1), (0, 0), (0, 0), 0.0)], 2)
+    with pytest.raises(ValueError, match="powers"):
+        Terms.of([((0, 0), (9, 0), (0, 0), 0.0)], 2)

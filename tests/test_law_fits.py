@@ -1,0 +1,258 @@
+"""From simulated positions to the law: the engine, the start, the search, forecasts and files."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+from gfnn_jax.cli import main
+from gfnn_jax.dataset.local_cubics import choose_half, smooth
+from gfnn_jax.errors import InputError
+from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, Friction, Lagrangian, Terms
+from gfnn_jax.flows.motion import Form
+from gfnn_jax.flows.schedules import interpolate
+from gfnn_jax.models.law_text import speed_names, terms_of
+from gfnn_jax.solve.latent_arcs import Observed, Steps, fit_arcs
+
+
+def pendulum(gamma=0.05, noise=1e-3, end=40.0, dt=0.05, amplitude=1.2):
+    """θ̈ = −2 sin θ − γ θ̇, by SciPy."""
+    t = np.arange(0, end, dt)
+    found = solve_ivp(
+        lambda _, x: [x[1], -2 * np.sin(x[0]) - gamma * x[1]], (0, end), [amplitude, 0.0],
+        t_eval=t, rtol=1e-10, atol=1e-12,
+    )  # fmt: skip
+    return t, found.y[0] + noise * np.random.default_rng(0).normal(size=len(t))
+
+
+def chain(noise=1e-3, runs=3, end=12.0, dt=0.02):
+    """A double pendulum with linear friction, by SciPy from its own equations of motion."""
+    tables, rng = [], np.random.default_rng(1)
+
+    def rate(_, x):
+        (q1, q2), v = x[:2], x[2:]
+        c, s = np.cos(q1 - q2), np.sin(q1 - q2)
+        M = np.array([[1.0, 0.4 * c], [0.4 * c, 0.5]])
+        force = [-0.4 * s * v[1] ** 2 - 20 * np.sin(q1) - 0.03 * v[0],
+                 0.4 * s * v[0] ** 2 - 8 * np.sin(q2) - 0.02 * v[1]]  # fmt: skip
+        return [*v, *np.linalg.solve(M, force)]
+
+    t = np.arange(0, end, dt)
+    for run in range(runs):
+        start = [*rng.uniform(-1.8, 1.8, 2), 0.0, 0.0]
+        found = solve_ivp(rate, (0, end), start, t_eval=t, rtol=1e-10, atol=1e-12)
+        q = found.y[:2] + noise * rng.normal(size=(2, len(t)))
+        tables.append({"run": np.full(len(t), str(run)), "t": t, "theta1": q[0], "theta2": q[1]})
+    return gfnn.Recording(tables, positions=["theta1", "theta2"], angles=["theta1", "theta2"])
+
+
+class _Decay:
+    """x' = −k x sampled at times 0.1 apart, seen directly: what `fit_arcs` asks of a model."""
+
+    def steps(self, p, x):
+        factor = np.exp(-0.1 * p[0])
+        here = x[:, :-1]
+        by_state = np.full((*here.shape, 1), factor)
+        return Steps(factor * here, by_state, -0.1 * factor * here[..., None])
+
+    def observe(self, p, x):
+        return Observed(x, np.ones((*x.shape, 1)), np.zeros((*x.shape, 1)))
+
+
+def test_arcs_with_latent_states_find_a_rate_and_its_error():
+    rng = np.random.default_rng(0)
+    t, k, sigma = 0.1 * np.arange(20), 0.7, 0.01
+    found = []
+    for _ in range(60):
+        y = np.array([[2.0], [-1.5]]) * np.exp(-k * t) + sigma * rng.normal(size=(2, 20))
+        y = y[..., None]
+        y[0, 3] = np.nan
+        x = np.where(np.isfinite(y), y, 0.0)
+        fit = fit_arcs(_Decay(), np.array([0.1]), x, y, np.array([sigma]), np.array([sigma]))
+        assert fit.converged
+        found.append([fit.p[0], np.sqrt(fit.covariance()[0, 0])])
+    p, std = np.array(found).T
+    assert abs(p.mean() - k) < 4 * p.std() / np.sqrt(60)
+    assert 0.75 < std.mean() / p.std() < 1.35
+    fit = fit_arcs(_Decay(), np.array([0.1]), x, y, np.array([sigma]), np.array([sigma]))
+    np.testing.assert_allclose(fit.x[:, 1:], np.exp(-0.1 * fit.p[0]) * fit.x[:, :-1], atol=1e-6)
+
+
+def test_steps_have_the_derivatives_of_finite_differences():
+    rows = [((2, 0), (0, 0), (0, 0), 0.0), ((1, 1), (0, 0), (1, -1), 0.0),
+            ((0, 2), (1, 1), (0, 0), 0.0), ((0, 2), (0, 0), (0, 0), 0.0),
+            ((0, 0), (0, 0), (1, 0), 0.2)]  # fmt: skip
+    friction = Friction.of([((1, 0), LINEAR, 0), ((-1, 1), QUADRATIC, 0), ((0, 1), DRY, 0.2)], 2)
+    form = Form(Terms.of(rows, 2), np.zeros(5), np.eye(5), friction, 1)
+    p = np.array([0.5, 0.2, 0.02, 0.4, 2.0, 0.1, 0.05, 0.1, 1.0, -0.5])
+    rng = np.random.default_rng(0)
+    x, u, h = rng.normal(size=(3, 4)), rng.normal(size=(3, 2, 6, 1)), np.full(3, 0.1)
+    step = form.step(p, x, h, u)
+    e = 1e-6
+    by_state = [form.step(p, x + e * d, h, u).states - form.step(p, x - e * d, h, u).states
+                for d in np.eye(4)]  # fmt: skip
+    by_p = [form.step(p + e * d, x, h, u).states - form.step(p - e * d, x, h, u).states
+            for d in np.eye(len(p))]  # fmt: skip
+    np.testing.assert_allclose(step.by_state, np.stack(by_state, -1) / (2 * e), atol=1e-8)
+    np.testing.assert_allclose(step.by_coefficients, np.stack(by_p, -1) / (2 * e), atol=1e-8)
+
+    law = form.lagrangian(p)
+
+    def rate(_, state):
+        a = law.acceleration(state[None, :2], state[None, 2:], u[0, 0, 0][None])
+        return [*state[2:], *a[0]]
+
+    exact = solve_ivp(rate, (0, 0.1), x[0], rtol=1e-12, atol=1e-13).y[:, -1]
+    errors = []
+    for substeps in (4, 8):
+        held = np.broadcast_to(u[:1, :1, :1], (1, substeps, 6, 1))
+        errors.append(np.abs(form.step(p, x[:1], h[:1], held).states[0] - exact).max())
+    assert errors[0] < 1e-6
+    assert errors[1] < errors[0] / 8  # friction that is not smooth costs order
+
+
+def test_local_cubics_measure_the_noise_and_follow_the_motion():
+    t = np.arange(0, 20, 0.02)
+    y = np.sin(2 * t)[:, None] + 1e-3 * np.random.default_rng(0).normal(size=(len(t), 1))
+    half, sigma = choose_half([(t, y)])
+    assert 0.85e-3 < sigma[0] < 1.15e-3
+    found = smooth(t, y, half)[0]
+    assert np.sqrt(np.mean((found.v[50:-50, 0] - 2 * np.cos(2 * t[50:-50])) ** 2)) < 5e-3
+
+
+def test_inputs_between_samples():
+    t = np.arange(0, 10, 0.1)
+    u = np.sin(3 * t)[:, None]
+    at = np.linspace(4, 6, 41)
+    assert np.abs(interpolate(t, u, at, "band")[:, 0] - np.sin(3 * at)).max() < 1e-3
+    assert np.abs(interpolate(t, u, at, "linear")[:, 0] - np.sin(3 * at)).max() < 0.02
+    np.testing.assert_array_equal(interpolate(t, u, np.array([4.05]), "hold")[0], u[40])
+
+
+def test_text_of_a_law():
+    terms = Terms.of([((2, 0), (0, 0), (0, 0), 0.0), ((1, 1), (0, 0), (1, -1), 0.1)], 2)
+    names = ("theta1", "theta2")
+    speeds = speed_names(names, ())
+    found = terms_of(terms, np.array([0.5, 0.25]), np.array([0, 0.01]), names, speeds)
+    assert found.formula == "0.5*omega1**2 + 0.25*omega1*omega2*cos(theta1 - theta2 + 0.1)"
+    assert str(found) == "0.5 ω₁² + 0.25(1) ω₁ ω₂ cos(θ₁−θ₂ + 0.1)"
+    assert found.latex().startswith(r"0.5 \omega_{1}^{2} + 0.25 \omega_{1} \, \omega_{2}")
+
+
+@pytest.fixture(scope="module")
+def swing():
+    t, theta = pendulum()
+    recording = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
+    return recording, gfnn.fit(recording.slice(stop=28.0))
+
+
+def test_a_damped_pendulum_from_noisy_angles(swing):
+    _, fit = swing
+    (kinetic, potential), (loss,) = fit.lagrangian.terms, fit.friction.terms
+    assert kinetic.term == "omega**2"
+    assert kinetic.coefficient == pytest.approx(0.5)
+    assert abs(potential.coefficient - 2) < 4 * potential.std < 0.02
+    assert loss.term == "omega**2"
+    assert abs(loss.coefficient - 0.025) < 4 * loss.std < 0.003
+    assert fit.noise["theta"] == pytest.approx(1e-3, rel=0.2)
+    assert abs(fit.energy["closure"]) < 0.01 * abs(fit.energy["stored"])
+
+
+def test_forecasts_hold_what_their_bands_say(swing):
+    recording, fit = swing
+    clean = pendulum(noise=0.0)[1]
+    t = recording.times("0")
+    inside = []
+    for start in np.arange(28.0, 33.0, 0.7):
+        past = recording.slice(start - 2.0, start)
+        times = t[(t > start)][:100:5]
+        found = fit.map.forecast(past, times)
+        error = found.values["theta"][0] - clean[np.searchsorted(t, times)]
+        assert np.abs(error).max() < 0.01
+        inside.append(np.abs(error) <= 2 * found.std["theta"][0])
+    assert np.mean(inside) > 0.85
+    states, covariance = fit.map.estimate(recording.slice(26.0, 28.0))
+    assert states.shape == (1, 2)
+    assert covariance.shape == (1, 2, 2)
+    assert abs(states[0, 0] - clean[560]) < 5 * np.sqrt(covariance[0, 0, 0]) + 2e-3
+
+
+def test_a_law_is_saved_with_its_sensors(swing, tmp_path):
+    recording, fit = swing
+    fit.map.save(tmp_path / "model")
+    again = gfnn.load(tmp_path / "model")
+    past, times = recording.slice(26.0, 28.0), np.array([28.5, 30.0])
+    for name, values in fit.map.forecast(past, times).values.items():
+        np.testing.assert_array_equal(values, again.forecast(past, times).values[name])
+
+
+def test_bad_recordings_and_options_are_refused(swing):
+    recording, fit = swing
+    with pytest.raises(InputError, match="learn auto or lagrangian"):
+        gfnn.fit(recording, learn="map")
+    with pytest.raises(InputError, match="friction"):
+        gfnn.fit(recording, friction="sticky")
+    with pytest.raises(InputError, match="mass"):
+        gfnn.fit(recording, mass={"x": 1.0})
+    with pytest.raises(InputError, match="rising times"):
+        fit.map.forecast(recording, [1.0, 2.0])
+    with pytest.raises(InputError, match="at least 5 samples"):
+        fit.map.estimate(recording.slice(0.0, 0.15))
+
+
+@pytest.mark.slow
+def test_a_double_pendulum_has_its_five_terms():
+    fit = gfnn.fit(chain())
+    found = {t.term.split(" + ")[0].split("- 0")[0].strip(): t for t in fit.lagrangian.terms}
+    assert len(fit.lagrangian.terms) == 5, fit.formula
+    expected = {"omega1**2": 0.5, "omega2**2": 0.25, "omega1*omega2*cos(theta1 - theta2": 0.4}
+    for name, value in expected.items():
+        term = next(t for key, t in found.items() if key.startswith(name))
+        assert abs(term.coefficient - value) <= 4 * term.std + 1e-12, name
+    losses = {t.term: t.coefficient for t in fit.friction.terms}
+    assert losses["omega1**2"] == pytest.approx(0.015, rel=0.3)
+
+
+def test_a_known_mass_scales_the_law():
+    t, theta = pendulum(end=15.0)
+    recording = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
+    fit = gfnn.fit(recording, friction="linear", mass={"theta": 3.0})
+    assert fit.lagrangian.terms[0].coefficient == pytest.approx(1.5)
+    assert fit.lagrangian.terms[1].coefficient == pytest.approx(6.0, rel=0.01)
+
+
+def test_a_lagrangian_of_the_search_is_a_pytree():
+    law = Lagrangian(Terms.of([((2,), (0,), (0,), 0.0)], 1), np.ones(1), Friction.of([], 1),
+                     np.zeros(0), 0.0, np.zeros((1, 0)))  # fmt: skip
+    assert jax.tree.map(np.shape, law).coefficients == (1,)
+
+
+def test_the_command_line_learns_and_forecasts(tmp_path, capsys):
+    t, theta = pendulum(end=15.0)
+    clean = pendulum(end=20.0, noise=0.0)
+    for name, rows in (("past", (t, theta)), ("all", clean)):
+        lines = ["t,theta", *(f"{a:.4f},{b:.6f}" for a, b in zip(*rows, strict=True))]
+        (tmp_path / f"{name}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    past, model = str(tmp_path / "past.csv"), str(tmp_path / "model")
+    assert main(["fit", past, "--out", model, "--friction", "linear"]) == 0
+    report = json.loads((tmp_path / "model" / "report.json").read_text(encoding="utf-8"))
+    assert report["model"]["learns"] == "lagrangian"
+    assert report["lagrangian"]["terms"][0]["term"] == "omega**2"
+    assert set(report) >= {"hamiltonian", "friction", "inputs", "noise", "gauge", "energy"}
+    assert report["rollout"] is None
+    everything = str(tmp_path / "all.csv")
+    out = tmp_path / "forecast.csv"
+    arguments = ["predict", model, "--initial", past, "--out", str(out)]
+    assert main([*arguments, "--compare", everything, "--estimate-from", "40"]) == 0
+    told = capsys.readouterr().out
+    assert "within two standard deviations" in told
+    rows = np.genfromtxt(out, delimiter=",", names=True)
+    wanted = np.interp(rows["t"], *clean)
+    assert np.abs(rows["theta"] - wanted).max() < 0.01
+    assert main([*arguments, "--num-steps", "20", "--overwrite"]) == 0
+    assert len(np.genfromtxt(out, delimiter=",", names=True)) == 20
+    assert main([*arguments, "--overwrite"]) == 2
+    assert "--num-steps" in capsys.readouterr().err

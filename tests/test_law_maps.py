@@ -1,0 +1,184 @@
+"""The map of a law: forecasts with inputs and their gradient, bands, files, the energy's ledger."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+
+import gfnn_jax as gfnn
+from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Lagrangian, Terms
+from gfnn_jax.maps.energy import ledger
+from gfnn_jax.maps.inputs import Signals
+from gfnn_jax.maps.laws import law_of_map, map_of_law, states_of, sticking, velocities_of
+
+# A pendulum whose pivot is driven by a motor.
+TERMS = Terms.of([((2,), (0,), (0,), 0.0), ((0,), (0,), (1,), 0.0)], 1)
+LAW = Lagrangian(
+    TERMS, np.array([0.5, 9.0]), Friction.of([((1,), LINEAR, 0.0), ((1,), DRY, 0.3)], 1),
+    np.array([0.2, 0.1]), 0.0, np.array([[1.5]]),
+)  # fmt: skip
+DT, STEPS = 0.05, 30
+RNG = np.random.default_rng(0)
+Z = np.stack([RNG.uniform(-1, 1, 200), RNG.normal(size=200)], axis=1)
+TIMES = DT * np.arange(STEPS + 1)
+U = np.sin(3 * TIMES[:, None] + [0.0])
+
+
+def map_with(hold="linear", **options):
+    return map_of_law(LAW, Z, DT, angles=(0,), signals=Signals(("torque",), hold), **options)
+
+
+MAP = map_with(root=1e-3 * np.eye(5))
+
+
+def forecast(z, input_at):
+    """States (STEPS + 1, 2) by another integrator, step by step."""
+
+    def field(t, y):
+        u = np.array([[input_at(t)]])
+        return [y[1], LAW.acceleration(y[None, :1], y[None, 1:], u)[0, 0]]
+
+    states = [z]
+    for n in range(STEPS):
+        span = (n * DT, (n + 1) * DT - 1e-12)
+        solved = scipy.integrate.solve_ivp(
+            field, span, states[-1], method="DOP853", rtol=1e-12, atol=1e-13
+        )
+        states.append(solved.y[:, -1])
+    return np.array(states)
+
+
+@pytest.mark.parametrize(
+    ("hold", "input_at"),
+    [
+        pytest.param("hold", lambda t: U[int(t / DT + 1e-6), 0], marks=pytest.mark.slow),
+        ("linear", lambda t: np.interp(t, TIMES, U[:, 0])),
+    ],
+)
+def test_inputs_between_their_samples(hold, input_at):
+    states, info = map_with(hold).rollout(Z[:2], STEPS, inputs=U)
+    assert (np.asarray(info.status) < 3).all()
+    np.testing.assert_allclose(states[0], forecast(Z[0], input_at), atol=1e-6)
+    if hold == "linear":
+        each, _ = MAP.rollout(Z[:2], STEPS, inputs=np.stack([U, 0 * U])[:, :-1])
+        none, _ = MAP.rollout(Z[:2], STEPS)
+        np.testing.assert_array_equal(each[1], none[1])
+        np.testing.assert_allclose(each[0, :-1], states[0, :-1], atol=1e-14)
+
+
+def test_band_limited_inputs():
+    """Sampled at 1.5 times the Nyquist rate, away from the ends, to the window's accuracy."""
+    n = np.arange(200)
+    signals = Signals(("u",), "band")
+    coefficients = signals.coefficients(np.cos(2 * np.pi * n / 3 + 1)[:, None], 1.0)
+    part = np.linspace(0, 1, 7)
+    found = coefficients @ part ** np.arange(10)[:, None]
+    expected = np.cos(2 * np.pi * (n[:, None] + part) / 3 + 1)
+    np.testing.assert_allclose(found[40:-40], expected[40:-40], atol=3e-4)
+
+
+def test_gradient_of_a_forecast_in_the_inputs():
+    @jax.jit
+    def cost(u):
+        return jnp.sum(MAP.rollout(Z[0], STEPS, inputs=u)[0][-1] ** 2)
+
+    slope = jax.jit(jax.grad(cost))(U)
+    for n in (0, 15, STEPS):
+        e = np.zeros_like(U)
+        e[n] = 1e-5
+        expected = (cost(U + e) - cost(U - e)) / 2e-5
+        np.testing.assert_allclose(slope[n, 0], expected, atol=1e-8)
+
+
+def test_the_law_beside_its_map(tmp_path):
+    """Velocities, the linear map, power, bands; saved and loaded the same."""
+    assert MAP.multiplier() is None
+    z = Z[:3]
+    v = velocities_of(MAP, z)
+    np.testing.assert_allclose(states_of(MAP, z[:, :1], v), z, atol=1e-15)
+    np.testing.assert_array_equal(law_of_map(MAP).losses, LAW.losses)
+    step = MAP.step
+    A, B = MAP.linearise(z[0], [0.4])
+    for j, e in enumerate(1e-5 * np.eye(2)):
+        slope = (step(z[0] + e, inputs=[0.4])[0] - step(z[0] - e, inputs=[0.4])[0]) / 2e-5
+        np.testing.assert_allclose(A[:, j], slope, atol=1e-8)
+    slope = (step(z[0], inputs=[0.4 + 1e-5])[0] - step(z[0], inputs=[0.4 - 1e-5])[0]) / 2e-5
+    np.testing.assert_allclose(B[:, 0], slope, atol=1e-8)
+    lost, supplied = MAP.power(z, inputs=U[:3])
+    expected = LAW.power(z[:, :1], v, U[:3])
+    np.testing.assert_allclose(lost, expected[0][:, :-1], atol=1e-14)
+    np.testing.assert_allclose(supplied, expected[1], atol=1e-14)
+    _, info = MAP.rollout(z, STEPS, inputs=U, samples=5, key=jax.random.key(0))
+    assert 0 < info.bands.std[0, -1, 0] < 0.1
+    MAP.save(tmp_path / "m")
+    again = gfnn.load(tmp_path / "m")
+    np.testing.assert_array_equal(
+        again.rollout(z, STEPS, inputs=U)[0], MAP.rollout(z, STEPS, inputs=U)[0]
+    )
+
+
+def test_the_ledger_closes():
+    """What is stored is what is supplied less what is lost, to the order of the steps."""
+    found = ledger(MAP, Z[:4], STEPS, inputs=U)
+    assert found.lost.shape == (4, 2)
+    assert (np.asarray(found.lost) > 0).all()
+    assert np.abs(found.supplied).min() > 1e-3
+    assert np.abs(found.closure).max() < 1e-9
+
+
+def test_uniform_friction_of_a_law_is_conformal():
+    law = Lagrangian(
+        TERMS, LAW.coefficients, Friction.of([], 1), np.zeros(0), 0.3, np.zeros((1, 0))
+    )
+    map_ = map_of_law(law, Z, DT)
+    assert map_.multiplier() == pytest.approx(np.exp(-0.3 * DT), rel=1e-15)
+    assert np.asarray(map_.defect(Z[:20])).max() < 1e-15
+    found = ledger(map_, Z[:2], STEPS)
+    assert np.abs(found.closure).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"inputs": np.zeros((STEPS - 1, 1))}, "expected inputs torque of shape (30, 1)"),
+        ({"inputs": np.zeros((STEPS, 2))}, "expected inputs torque of shape (30, 1)"),
+        ({"inputs": "all"}, "expected numbers as inputs"),
+    ],
+)
+def test_inputs_that_are_none(options, message):
+    with pytest.raises(ValueError, match=message.replace("(", r"\(").replace(")", r"\)")):
+        MAP.rollout(Z[:2], STEPS, **options)
+
+
+def test_signals_that_are_not_the_laws():
+    with pytest.raises(ValueError, match="expected signals of 1 inputs, got 0"):
+        map_of_law(LAW, Z, DT)
+    with pytest.raises(ValueError, match="expected hold among hold, linear, band"):
+        Signals(("u",), "cubic")
+
+
+@pytest.mark.slow
+def test_a_forecast_across_a_stop():
+    """A block on a spring, held by dry friction: half turns about ±μ until it sticks (exact)."""
+    friction, dt, count = 0.05, 0.1, 300
+    spring = Terms.of([((2,), (0,), (0,), 0.0), ((0,), (2,), (0,), 0.0)], 1)
+    wide = Lagrangian(
+        spring, np.array([0.5, -0.5]), Friction.of([((1,), DRY, 0.05)], 1), np.array([friction]),
+        0.0, np.zeros((1, 0)),
+    )  # fmt: skip
+    law = sticking(wide, noise=1e-3, duration=dt * count)
+    z = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
+    map_ = map_of_law(law, z, dt)
+    found, info = map_.rollout(np.array([0.52, 0.0]), count)
+    time, turn, expected = dt * np.arange(count + 1), 0.52, np.zeros(count + 1)
+    for n, t in enumerate(time):
+        if n and int(t // np.pi) > int(time[n - 1] // np.pi) and abs(turn) > friction:
+            turn = 2 * friction * np.sign(turn) - turn
+        centre = friction * np.sign(turn)
+        moving = abs(turn) > friction
+        expected[n] = centre + (turn - centre) * np.cos(t % np.pi) if moving else turn
+    assert int(info.status) == 0
+    assert abs(turn) < friction  # it has stopped, and not where the spring is slack
+    np.testing.assert_allclose(found[:, 0], expected, atol=1e-3)
+    assert np.abs(map_of_law(wide, z, dt).rollout([0.52, 0.0], count)[0][-1, 0] - turn) > 1e-2

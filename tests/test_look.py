@@ -1,0 +1,183 @@
+"""`gfnn look`: every mistake is named with what mends it, nothing is said of a clean recording."""
+
+import json
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+
+from recordings.generated import MISTAKES, sheet
+
+import gfnn_jax as gfnn
+from gfnn_jax.cli import main
+from gfnn_jax.data.recording_summary import summarise
+from gfnn_jax.errors import InputError
+
+
+def found(path, **options):
+    """(kind, line) of what is said of a file."""
+    try:
+        recording = gfnn.read(path, **options)
+    except InputError as error:
+        return [("refused", str(error))]
+    return [(fault.kind, str(fault)) for fault in recording.summary().faults]
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_each_mistake_is_named(tmp_path, name):
+    kinds, make = MISTAKES[name]
+    wrong, has_runs = make(11)
+    said = found(wrong.written(tmp_path / "r.csv", with_runs=has_runs))
+    assert any(kind in kinds or any(k in line for k in kinds) for kind, line in said), said
+
+
+@pytest.mark.parametrize("seed", range(900, 912))
+def test_nothing_is_said_of_a_clean_recording(tmp_path, seed):
+    assert found(sheet(seed).written(tmp_path / "r.csv")) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [("wrong order", 6), ("interleaved", 7), ("wrong dt", 8), ("degrees", 6), ("wrong sign", 6)],
+)
+def test_the_command_to_type_mends_it(tmp_path, name, seed):
+    wrong, has_runs = MISTAKES[name][1](seed)
+    path = wrong.written(tmp_path / "r.csv", with_runs=has_runs)
+    summary = gfnn.read(path).summary()
+    assert any(fault.wrong for fault in summary.faults)
+    typed = summary.command.split(f"{path}", 1)[1].rpartition(" --out")[0]
+    options = {}
+    for option in typed.split(" --")[1:]:
+        key, value = option.split(" ")
+        options[key.replace("-", "_")] = value if key == "time-unit" else tuple(value.split(","))
+    assert not [fault for fault in gfnn.read(path, **options).summary().faults if fault.wrong]
+
+
+def clean(t):
+    return 0.8 * np.exp(-0.05 * t) * np.cos(4 * t)
+
+
+def a_swing(path, **changes):
+    t = np.arange(0, 8, 0.01)
+    rng = np.random.default_rng(3)
+    theta = clean(t) + 1e-3 * rng.standard_normal(len(t))
+    columns = {"t": t, "theta": theta, **{n: f(t, theta) for n, f in changes.items()}}
+    lines = [",".join(columns)]
+    lines += [",".join(f"{x:.9g}" for x in row) for row in zip(*columns.values(), strict=True)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_summary_says_what_the_record_is(tmp_path):
+    summary = gfnn.read(a_swing(tmp_path / "r.csv")).summary()
+    (column,) = summary.columns
+    assert column.sigma == pytest.approx(1e-3, rel=0.2)
+    assert column.frequencies[0] == pytest.approx(4 / (2 * np.pi), rel=0.02)
+    assert summary.period == pytest.approx(np.pi / 2, rel=0.05)
+    assert summary.loss.per_period == pytest.approx(0.1 * np.pi / 2, rel=0.05)
+    text = str(summary)
+    assert "800 samples" in text
+    assert "friction takes 16" in text
+    assert max(map(len, text.splitlines())) <= 110
+    html = summary._repr_html_()
+    assert html.startswith("<pre")
+    assert "theta" in html
+
+
+def test_columns_keep_the_unit_of_the_file(tmp_path):
+    path = a_swing(tmp_path / "r.csv", alpha=lambda t, x: np.degrees(x))
+    options = {"positions": "alpha", "degrees": "alpha"}
+    degrees = summarise(gfnn.read(path, **options), options).columns[0]
+    radians = gfnn.read(path, positions="theta").summary().columns[0]
+    assert degrees.sigma == pytest.approx(np.degrees(radians.sigma), rel=1e-6)
+    assert degrees.high == pytest.approx(np.degrees(radians.high), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        ({"theta2": lambda t, x: 0 * t + 3}, "constant"),
+        ({"theta2": lambda t, x: x}, "repeated"),
+        ({"omega": lambda t, x: np.gradient(x, t)}, "difference"),
+        ({"omega": lambda t, x: np.cos(17 * t)}, "no derivative"),
+        ({"omega": lambda t, x: 0.9 * np.gradient(clean(t - 0.03), t)}, "filtered"),
+        ({"omega": lambda t, x: 2.5 * np.gradient(clean(t), t)}, "factor"),
+        ({"q2": lambda t, x: np.angle(np.exp(1j * (2 * t + x)))}, "wrapped"),
+        ({"theta2": lambda t, x: np.degrees(np.angle(np.exp(1j * (2 * t + x))))}, "degrees"),
+        ({"theta2": lambda t, x: np.angle(np.exp(1j * 1.1 * np.pi * t / 0.01))}, "coarse"),
+        ({"x": lambda t, x: x + np.where(np.abs(t - 5) < 1e-3, 0.5, 0)}, "outliers"),
+    ],
+)
+def test_columns_that_are_odd_are_named(tmp_path, change, kind):
+    path = a_swing(tmp_path / "r.csv", **change)
+    assert kind in [k for k, _ in found(path)]
+
+
+# The command line
+
+
+def test_look_prints_a_screen_and_draws_a_figure(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    a_swing(tmp_path / "r.csv")
+    assert main(["look", "r.csv"]) == 0
+    out = capsys.readouterr().out
+    assert "next: gfnn fit r.csv --out model" in out
+    assert (tmp_path / "runs" / "look-r.png").stat().st_size > 10_000
+    assert main(["look", "r.csv", "--figure", "runs/look-r.png"]) == 2
+
+
+def test_look_as_json(tmp_path, capsys):
+    path = a_swing(tmp_path / "r.csv", omega=lambda t, x: -3.2 * np.sin(4 * t) * np.exp(-0.05 * t))
+    assert main(["look", str(path), "--json", "--std", "theta=0.002", "--mass", "theta=2"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["runs"] == ["0"]
+    assert said["dt_median"] == pytest.approx(0.01)
+    assert said["gaps"] == []
+    theta, omega = said["columns"]["theta"], said["columns"]["omega"]
+    assert (theta["role"], theta["angle"], theta["sigma"]) == ("positions", True, 0.002)
+    assert (omega["role"], omega["derivative_of"]) == ("velocities", "theta")
+    assert said["loss_per_period"] == pytest.approx(0.157, rel=0.1)
+    assert said["command"] == f"gfnn fit {path} --std theta=0.002 --mass theta=2 --out model"
+
+
+def test_strict_look_fails_where_something_is_wrong(tmp_path, capsys):
+    path = a_swing(tmp_path / "r.csv", omega=lambda t, x: np.cos(17 * t))
+    assert main(["look", str(path), "--json"]) == 0
+    assert main(["look", str(path), "--json", "--strict"]) == 1
+    assert main(["look", str(tmp_path / "none.csv")]) == 2
+    assert main(["look", str(path), "--positions", "phi"]) == 2
+    assert "no column phi" in capsys.readouterr().err
+
+
+def test_look_at_states(tmp_path, capsys):
+    t = 0.1 * np.arange(100)
+    swings = np.stack([np.stack([a * np.cos(t), -a * np.sin(t)], axis=1) for a in (1.0, 2.0)])
+    np.savez(tmp_path / "s.npz", trajectories=swings, dt=0.1)
+    assert main(["look", str(tmp_path / "s.npz"), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["runs"] == ["0", "1"]
+    assert said["columns"]["p1"]["role"] == "momenta"
+    np.savez(tmp_path / "p.npz", z0=swings[0, :-1], z1=swings[0, 1:], dt=0.1)
+    assert main(["look", str(tmp_path / "p.npz"), "--json"]) == 2
+
+
+@pytest.mark.slow
+def test_a_million_rows_in_ten_seconds_and_a_gigabyte(tmp_path):
+    t = 1e-3 * np.arange(1_000_000)
+    rng = np.random.default_rng(0)
+    columns = [t, *(np.sin(w * t) + 1e-3 * rng.standard_normal(len(t)) for w in (5, 6, 7, 8))]
+    header = "t,x1,x2,x3,x4"
+    np.savetxt(tmp_path / "r.csv", np.stack(columns, 1), "%.7g", ",", header=header, comments="")
+    code = f"from gfnn_jax.cli import main; raise SystemExit(main(['look', '{tmp_path}/r.csv']))"
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=False,
+                          env={"PYTHONPATH": str(Path(__file__).parent.parent)})  # fmt: skip
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert done.returncode == 0
+    assert after.ru_utime - before.ru_utime < 10
+    assert after.ru_maxrss < 1 << 20  # kB
