@@ -894,3 +894,21 @@ def test_compiled_programs_are_kept_in_the_users_cache(tmp_path, monkeypatch):
         assert jax.config.jax_compilation_cache_dir == str(tmp_path / "gfnn_jax")
     finally:
         jax.config.update("jax_compilation_cache_dir", of_the_tests)
+
+
+@pytest.mark.parametrize(
+    ("met", "noise", "terms", "line"),
+    [
+        (True, None, 30, "H = q1²"),
+        (False, [1e-3, 1e-3], 2, "H = q1²"),
+        (False, [1e-3, 1e-3], 30, "best partial law: 30 terms, leaves 2.0e-02 of the spread over"),
+        (False, None, 2, "best partial law: 2 terms, leaves 2.0e-02 of the spread over"),
+    ],
+)
+def test_a_law_that_has_met_nothing_is_not_printed_as_h(met, noise, terms, line):
+    report = {
+        "fit": {"tolerance_met": met, "validation_relative": 0.02},
+        "hamiltonian": {"formula": "q1²", "terms": [{}] * terms},
+        "model": {"learns": "hamiltonian"}, "data": {"noise": noise},
+    }  # fmt: skip
+    assert cli.law_line(report) == line
