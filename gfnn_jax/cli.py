@@ -675,6 +675,8 @@ def _summarise(ran: Any, out: Path) -> None:
     if report["hamiltonian"] is not None:
         also = "" if report["model"]["learns"] == "hamiltonian" else "not chosen: "
         print(f"{also}H = {report['hamiltonian']['formula']}")
+        for loss in report["hamiltonian"]["friction"]:
+            print(f"{loss['term']}: {loss['coefficient']:.6g} ± {loss['std']:.1g}")
     print(fit["ended"])
     rollout = report["rollout"]
     if rollout is not None:

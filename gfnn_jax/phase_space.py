@@ -94,12 +94,12 @@ def symplecticity_defect(jacobian, scale=None, multiplier: Any = 1.0):
 
 
 def defect_of_pairs(before, after, scale, multiplier: Any = 1.0):
-    """The largest |after_uᵀ J after_v − μ before_uᵀ J before_v| (...) over pairs of tangent
-    vectors, the first half with the second: (2k, ..., 2d) each, ÷ the largest of scale_q scale_p
-    (2d,).
+    """Largest |after_uᵀ J after_v − μ before_uᵀ J before_v| (...) over pairs (u, v) of tangents.
 
-    For random signs of length 1 in units of ``scale`` it is about ‖MᵀJM − J‖ ÷ √(2d), Frobenius'
-    norm: what the entries of a row come to. NumPy or JAX.
+    before, after: tangent vectors (2k, ..., 2d); u runs over the first half, v over the second.
+    The result is divided by the largest product of scale_q and scale_p, scale (2d,). For tangents
+    of random signs, of length 1 in units of ``scale``, it is about ‖MᵀJM − J‖ ÷ √(2d) in
+    Frobenius' norm, the size of a row. NumPy or JAX.
     """
     xp, half, dim = namespace(after), len(before) // 2, len(scale) // 2
     form = [xp.sum(t[:half] * apply_j(t[half:]), axis=-1) for t in (after, before)]

@@ -306,7 +306,8 @@ def read_report(folder):
     assert all(set(candidate) >= CANDIDATE_KEYS for candidate in report["candidates"])
     assert [c["chosen"] for c in report["candidates"]].count(True) == 1
     law = report["hamiltonian"]
-    assert law is None or {"formula", "terms", "dropped", "search_cut_short"} <= set(law)
+    keys = {"formula", "terms", "friction", "dropped", "search_cut_short"}
+    assert law is None or keys <= set(law)
     assert report["fit"]["ended"]
     return report
 

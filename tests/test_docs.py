@@ -13,8 +13,9 @@ from gfnn_jax import cli
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
-# What these show is tested always elsewhere: README, tests/test_args.py, tests/test_lattices.py.
-SLOW = ("your-own-data", "args", "many")
+# What these show is tested always elsewhere: README, tests/test_args.py, tests/test_lattices.py,
+# tests/test_friction.py, tests/test_law_maps.py.
+SLOW = ("your-own-data", "args", "many", "friction-and-inputs")
 sys.path.insert(0, str(ROOT / "benchmarks"))
 INSTALL = ("python3 -m venv ", ".venv/bin/pip install ")
 

@@ -20,6 +20,7 @@ from gfnn_jax import cli, scenes
 from gfnn_jax.coordinates import CARTESIAN, Coordinates, polar, to_inner
 from gfnn_jax.exports.export import SUFFIXES
 from gfnn_jax.exports.symbols import Tape
+from gfnn_jax.families import lagrangian
 from gfnn_jax.families.expressions import parse
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.jets import jets
@@ -30,6 +31,7 @@ from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE1, TYPE2, TYPE3
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import fit_predictors
 from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.laws import map_of_law
 from gfnn_jax.maps.parameters import sampled
 from gfnn_jax.phase_space import symplectic_form
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, OK
@@ -102,12 +104,28 @@ def in_polar():
     return map_of(piece, y, coordinates=coordinates, scale=np.full(4, 0.1)), z
 
 
+def two_rods():
+    """A double pendulum by its Lagrangian."""
+    none = (0, 0)
+    terms = lagrangian.Terms.of(
+        [((2, 0), none, none, 0.0), ((0, 2), none, none, 0.0), ((1, 1), none, (1, -1), 0.0),
+         (none, none, (1, 0), 0.0), (none, (0, 2), none, 0.0)], 2,
+    )  # fmt: skip
+    law = lagrangian.Lagrangian(
+        terms, np.array([1.0, 0.5, 1.0, 2.0, -0.5]), lagrangian.Friction.of([], 2), np.zeros(0),
+        0.0, np.zeros((2, 0)),
+    )  # fmt: skip
+    z = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 4))
+    return map_of_law(law, z, 0.05, tolerance=1e-13), z
+
+
 QUICK = {
     "type 1": lambda: map_in(TYPE1, 1, 4, predicted=False),
     "type 2, angles": lambda: map_in(TYPE2, 1, 4, angles=(0, 1)),
     "type 3, base map": lambda: map_in(TYPE3, 1, 4, around=(turning(1),)),
     "midpoint": lambda: map_in(MIDPOINT, 2, 3),
     "law": law,
+    "Lagrangian": two_rods,
 }
 MAPS = {
     **QUICK,

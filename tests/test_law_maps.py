@@ -10,7 +10,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Lagrangian, Terms
 from gfnn_jax.maps.energy import ledger
 from gfnn_jax.maps.inputs import Signals
-from gfnn_jax.maps.laws import law_of_map, map_of_law, states_of, velocities_of
+from gfnn_jax.maps.laws import law_of_map, map_of_law, states_of, sticking, velocities_of
 
 # A pendulum whose pivot is driven by a motor.
 TERMS = Terms.of([((2,), (0,), (0,), 0.0), ((0,), (0,), (1,), 0.0)], 1)
@@ -52,7 +52,7 @@ def forecast(z, input_at):
 @pytest.mark.parametrize(
     ("hold", "input_at"),
     [
-        ("hold", lambda t: U[int(t / DT + 1e-6), 0]),
+        pytest.param("hold", lambda t: U[int(t / DT + 1e-6), 0], marks=pytest.mark.slow),
         ("linear", lambda t: np.interp(t, TIMES, U[:, 0])),
     ],
 )
@@ -156,3 +156,29 @@ def test_signals_that_are_not_the_laws():
         map_of_law(LAW, Z, DT)
     with pytest.raises(ValueError, match="expected hold among hold, linear, band"):
         Signals(("u",), "cubic")
+
+
+@pytest.mark.slow
+def test_a_forecast_across_a_stop():
+    """A block on a spring, held by dry friction: half turns about ±μ until it sticks (exact)."""
+    friction, dt, count = 0.05, 0.1, 300
+    spring = Terms.of([((2,), (0,), (0,), 0.0), ((0,), (2,), (0,), 0.0)], 1)
+    wide = Lagrangian(
+        spring, np.array([0.5, -0.5]), Friction.of([((1,), DRY, 0.05)], 1), np.array([friction]),
+        0.0, np.zeros((1, 0)),
+    )  # fmt: skip
+    law = sticking(wide, noise=1e-3, duration=dt * count)
+    z = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
+    map_ = map_of_law(law, z, dt)
+    found, info = map_.rollout(np.array([0.52, 0.0]), count)
+    time, turn, expected = dt * np.arange(count + 1), 0.52, np.zeros(count + 1)
+    for n, t in enumerate(time):
+        if n and int(t // np.pi) > int(time[n - 1] // np.pi) and abs(turn) > friction:
+            turn = 2 * friction * np.sign(turn) - turn
+        centre = friction * np.sign(turn)
+        moving = abs(turn) > friction
+        expected[n] = centre + (turn - centre) * np.cos(t % np.pi) if moving else turn
+    assert int(info.status) == 0
+    assert abs(turn) < friction  # it has stopped, and not where the spring is slack
+    np.testing.assert_allclose(found[:, 0], expected, atol=1e-3)
+    assert np.abs(map_of_law(wide, z, dt).rollout([0.52, 0.0], count)[0][-1, 0] - turn) > 1e-2

@@ -118,6 +118,7 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
     return {
         "formula": fit.formula,
         "terms": [term._asdict() for term in law.terms],
+        "friction": [term._asdict() for term in law.friction],
         "dropped": law.dropped._asdict() if law.dropped is not None else None,
         "search_cut_short": law.ended or None,
     }

@@ -16,6 +16,7 @@ from gfnn_jax.families.products import Products
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.gauss import gauss
+from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.generating.generated import Generated, ImplicitStep
 from gfnn_jax.generating.predictor import PolynomialModel
 from gfnn_jax.maps.affine import Affine
@@ -29,7 +30,9 @@ def why_not_piece(piece: Any) -> str | None:
     if not isinstance(piece, (Generated, Flow)):
         return f"the map has a piece {type(piece).__name__}"
     family = piece.family
-    if not isinstance(family, (Products, Terms)):
+    if isinstance(family, Legendre) and family.dim > COFACTORS_UP_TO:
+        return f"the masses of {family.dim} degrees of freedom are no small system"
+    if not isinstance(family, (Products, Terms, Legendre)):
         return f"the map is one of {getattr(family, 'label', type(family).__name__)}"
     if isinstance(piece, Flow) and piece.newton:
         return "the stages of the flow are solved by Newton's method"

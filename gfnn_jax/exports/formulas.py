@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.jets import jets
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.traced import traced
+from gfnn_jax.flows.legendre import Legendre
 
 
 class Formulas(Inputs):
@@ -33,8 +35,25 @@ class Formulas(Inputs):
         return tuple(tables)
 
 
+class _Phase(float):
+    """Number whose cosine NumPy finds in an object array, as it finds that of a symbol."""
+
+    def __radd__(self, other):
+        total = other + float(self)
+        return _Phase(total) if isinstance(total, float) else total
+
+    def cos(self) -> float:
+        return math.cos(self)
+
+    def sin(self) -> float:
+        return math.sin(self)
+
+
 def on_symbols(family: Any) -> Any:
     """Make the family run on symbols. Raises InputError for a feature that is no formula."""
+    if isinstance(family, Legendre):
+        phases = np.array([_Phase(phase) for phase in family.terms.phases], dtype=object)
+        return Legendre(dataclasses.replace(family.terms, phases=phases))
     if not isinstance(family, Products) or family.inputs.features is None:
         return family
     inputs = family.inputs

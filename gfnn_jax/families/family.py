@@ -50,9 +50,11 @@ class Family(Protocol):
 
 
 def at_time(family: Any, args: Any, after: Any) -> Any:
-    """args (..., k) as they are a time ``after`` (...) later: the last of them is the time where
-    the family depends on it, the others stay; or as a family says that has an ``at_time`` of its
-    own. NumPy or JAX."""
+    """Advance args (..., k) by a time ``after`` (...). NumPy or JAX.
+
+    Where the family depends on time, it is the last of the args and grows; the others stay. A
+    family may have an ``at_time`` of its own instead.
+    """
     own = getattr(family, "at_time", None)
     if own is not None:
         return own(args, after)

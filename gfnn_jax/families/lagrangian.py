@@ -190,6 +190,11 @@ class Friction:
             for k in range(self.count)
         ]
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Each term as it stands in a formula: "½ v1²", "⅓ |v1 - v2|³", "|v2|"."""
+        return tuple(_friction_named(c, kind) for c, kind, _ in self.rows())
+
     def take(self, keep: Any) -> Friction:
         return Friction(self.directions[keep], self.kinds[keep], self.widths[keep])
 
@@ -320,6 +325,15 @@ class Lagrangian:
         lost = xp.concatenate([lost, even[..., None]], axis=-1)
         supplied = matmul(v, self.gains) * (0.0 if u is None else u)
         return lost, supplied
+
+
+def _friction_named(direction: tuple[int, ...], kind: int) -> str:
+    parts = [f"{'-' if c < 0 else '+'} {abs(c) if abs(c) > 1 else ''}v{i + 1}"
+             for i, c in enumerate(direction) if c]  # fmt: skip
+    speed = " ".join(parts).removeprefix("+ ")
+    if kind == LINEAR:
+        return f"½ ({speed})²" if len(parts) > 1 else f"½ {speed}²"
+    return f"⅓ |{speed}|³" if kind == QUADRATIC else f"|{speed}|"
 
 
 def _monomials(x: Any, n: Any, order: int) -> tuple[Any, Any, Any]:

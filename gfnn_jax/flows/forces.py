@@ -21,7 +21,7 @@ import numpy as np
 
 from gfnn_jax.arrays import as_row, matmul, namespace
 from gfnn_jax.families.family import at_time, parameter_gradients
-from gfnn_jax.families.lagrangian import Friction
+from gfnn_jax.families.lagrangian import LINEAR, Friction
 from gfnn_jax.phase_space import split
 
 
@@ -68,6 +68,17 @@ class Forced:
         return self.family.num_parameters + self.friction.count + self.dim * self.num_inputs
 
     @property
+    def term_names(self) -> tuple[str, ...]:
+        """Those of H, of R, and of G."""
+        gains = [f"u{j + 1} on q{i + 1}" for i in range(self.dim) for j in range(self.num_inputs)]
+        return (*self.family.term_names, *self.friction.names, *gains)
+
+    @property
+    def quadratic(self) -> bool:
+        """Whether the field is affine."""
+        return self.family.quadratic and not np.any(self.friction.kinds != LINEAR)
+
+    @property
     def operations(self) -> tuple[int, int]:
         """Those of H, with the Hessian that friction's derivative takes."""
         gradient, with_hessian = self.family.operations
@@ -77,6 +88,26 @@ class Forced:
     def unflatten(self, coefficients):
         """The parameters are the coefficients themselves."""
         return coefficients
+
+    def take(self, rows) -> Any:
+        """The family of these terms of H and R alone, all gains with them; the one of H where no
+        forces are left."""
+        of_h, losses = self.family.num_parameters, self.friction.count
+        own = self.family.take([j for j in rows if j < of_h])
+        kept = [j - of_h for j in rows if of_h <= j < of_h + losses]
+        if not kept and not self.num_inputs:
+            return own
+        return dataclasses.replace(self, family=own, friction=self.friction.take(kept))
+
+    def term_gradients(self, w, args=None):
+        """The field of every term of H and R (..., 2d, m), those of R as if v were p: to start
+        from. NumPy."""
+        _, slope, _ = self.friction.tables(split(w)[1])
+        frictions = slope[..., None, :] * self.friction.directions.T.astype(w.dtype)
+        frictions = np.concatenate([frictions, np.zeros_like(frictions)], axis=-2)
+        return np.concatenate(
+            [self.family.term_gradients(w, self._inner(args)), frictions], axis=-1
+        )
 
     def multiplier(self, params, dt) -> None:
         """None: no multiple of the symplectic form is kept."""

@@ -23,6 +23,8 @@ from gfnn_jax.flows.uniform import Uniform
 from gfnn_jax.phase_space import split
 from gfnn_jax.solve.linear import small_solve
 
+_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
 
 @partial(jax.tree_util.register_dataclass, data_fields=("terms",), meta_fields=())
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -32,10 +34,20 @@ class Legendre:
     terms: Terms
 
     name = "Lagrangian"
+    prefix = "Legendre transform of L = "  # of a formula
 
     @property
     def label(self) -> str:
         return f"L of {self.num_parameters} terms"
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """Each ℓ_j as it stands in a formula: "v1 v2 cos(q1 - q2)"."""
+        return tuple(_named(*row) for row in self.terms.rows())
+
+    def take(self, rows) -> Legendre:
+        """The family of these terms alone."""
+        return Legendre(self.terms.take(list(rows)))
 
     @property
     def dim(self) -> int:
@@ -99,6 +111,8 @@ class Legendre:
     def parameter_gradients(self, params, w, args=None, along=None):
         """∂/∂θ of the gradient (..., 2d, P), or in the coefficients of a family ``along`` of other
         terms: ∂v/∂θ_j = −M⁻¹ ∂ℓ_j/∂v and −∂ℓ_j/∂q − L_qv ∂v/∂θ_j. NumPy."""
+        if along is not None and not isinstance(along, Legendre):
+            return along.term_gradients(w, args)
         q = split(w)[0]
         v, found = self._derivatives(params, w)
         terms = self.terms if along is None else along.terms
@@ -118,6 +132,21 @@ class Legendre:
         return Lagrangian(
             self.terms, params, Friction.of([], self.dim), none, 0.0, none.reshape(self.dim, 0)
         )
+
+
+def _named(speeds, powers, mode, phase: float) -> str:
+    parts = []
+    for letter, exponents in (("v", speeds), ("q", powers)):
+        for i, n in enumerate(exponents, 1):
+            parts += [f"{letter}{i}" + ("" if n == 1 else str(n).translate(_DIGITS))] if n else []
+    if any(mode):
+        sign = "".join(
+            f" {'-' if m < 0 else '+'} {'' if abs(m) == 1 else f'{abs(m)} '}q{i}"
+            for i, m in enumerate(mode, 1) if m
+        )  # fmt: skip
+        angle = sign[3:] if sign.startswith(" +") else "-" + sign[3:]
+        parts.append(f"{'cos' if phase == 0 else 'sin'}({angle})")
+    return " ".join(parts)
 
 
 def _solved(matrix, rows):

@@ -62,6 +62,11 @@ class Uniform:
         return (*self.family.term_names, FRICTION)
 
     @property
+    def quadratic(self) -> bool:
+        """Whether the field is affine."""
+        return self.family.quadratic
+
+    @property
     def operations(self) -> tuple[int, int]:
         """Those of H; friction adds a few."""
         return self.family.operations
@@ -140,6 +145,13 @@ class Uniform:
         if by_params.shape[-1] == self.num_parameters:
             by_params[:, dim:, -1] -= h * image[:, dim:]
         return by_state, by_params
+
+
+def without_forces(family) -> Any:
+    """The family of H alone."""
+    while isinstance(family, (Uniform, Forced)):
+        family = family.family
+    return family
 
 
 class Power(NamedTuple):

@@ -128,6 +128,8 @@ class Fit:
         if self.hamiltonian is None or self.formula is None:
             raise FitError("expected a fit with a Hamiltonian that meets its tolerance, got none")
         assert self.pairs is not None
+        if self.hamiltonian.friction:
+            raise FitError("expected a fit without friction: a generated map keeps areas")
         if self.map.parameters is not None:
             raise FitError("expected a fit without parameters: a generated map has none")
         if isinstance(self.map.domain, Ranges):

@@ -32,6 +32,7 @@ from gfnn_jax.learn.arcs import arcs_of
 from gfnn_jax.learn.candidates import Judges, OneStepError
 from gfnn_jax.learn.centrifugal import centrifugal_terms
 from gfnn_jax.learn.clock import Budget
+from gfnn_jax.learn.friction import Forces, beside_friction, libraries_with, mechanical
 from gfnn_jax.learn.law_libraries import (
     angles_and_others,
     check_finite,
@@ -107,15 +108,20 @@ def learn_hamiltonian(
     else:  # a state of many sites is in the middle and far out at once
         outer = np.zeros(len(judges.training), bool)
     judges = dataclasses.replace(everywhere, training=everywhere.training[~outer])
-    if prepared.args is not None:
-        best = _walked(problem, work, prepared, judges, scene, terms, options, say)
-    elif basis is not None:
-        best = _grown(problem, work, basis, prepared, judges, options, say)
-    else:
-        found = _searched(problem, work, prepared, judges, scene, terms, options, say)
-        if not terms and prepared.structure is None:
-            found = _beside_centrifugal(problem, work, found, prepared, judges, options, say)
-        best, options = found
+    with_masses = None
+    if not terms and scene is None:
+        with_masses = mechanical(problem, work, prepared, judges)
+    best = with_masses
+    if best is None or not best.error.bound <= judges.tolerance.bound:
+        try:
+            best, options = _of_libraries(
+                problem, work, basis, prepared, judges, scene, terms, options, say
+            )
+        except (OutOfTime, FitError):
+            if best is None:
+                raise
+        if with_masses is not None and with_masses.error.relative <= best.error.relative:
+            best = with_masses._replace(noisy=True)
     everyone = np.arange(len(prepared.y0))
     if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
         raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
@@ -164,18 +170,47 @@ def learn_hamiltonian(
     return dataclasses.replace(learned, candidate=candidate, ended=work.ended)
 
 
+def _of_libraries(
+    problem, work: LawWork, basis: Modes | None, prepared, judges: Judges, scene, terms,
+    options: Options, say,
+) -> tuple[FittedLaw, Options]:  # fmt: skip
+    """The best library of terms of H, without friction or with it, and the options for fewer."""
+
+    def search(forces: Forces | None = None) -> tuple[FittedLaw, Options]:
+        return _searched(problem, work, prepared, judges, scene, terms, options, say, forces)
+
+    if prepared.args is not None:
+        found = _walked(problem, work, prepared, judges, scene, terms, options, say), options
+    elif basis is not None:
+        found = _grown(problem, work, basis, prepared, judges, options, say), options
+    else:
+        found = search()
+        if not terms and prepared.structure is None:
+            found = _beside_centrifugal(problem, work, found, prepared, judges, options, say)
+    return beside_friction(problem, work, found, prepared, judges, search)
+
+
 def _searched(
-    problem, work: LawWork, prepared, judges: Judges, scene, terms, options: Options, say
+    problem,
+    work: LawWork,
+    prepared,
+    judges: Judges,
+    scene,
+    terms,
+    options: Options,
+    say,
+    forces: Forces | None = None,
 ) -> tuple[FittedLaw, Options]:
     """The smallest library that meets the tolerance, else the best; and the options, which try no
-    fewer terms where the tolerance is out of reach."""
+    fewer terms where the tolerance is out of reach. forces: friction, that libraries have too."""
     bound = judges.tolerance.bound
     best: FittedLaw | None = None
     structured = prepared.structure is not None
     most_poor = _POOR_STRUCTURED if structured else _POOR_GIVEN if terms else _POOR
     tried: list[FittedLaw] = []
     poor, errors = 0, []
-    libraries = list(libraries_of(prepared, judges, scene, terms, options))
+    known = libraries_of if forces is None else partial(libraries_with, forces)
+    libraries = list(known(prepared, judges, scene, terms, options))
     if len(libraries) > 1 and libraries[0].quadratic and not prepared.varied:
         affine = affine_error(prepared, judges).bound
         if affine > _HOPELESS * bound:

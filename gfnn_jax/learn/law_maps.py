@@ -12,6 +12,7 @@ from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.choose_charts import Charts
 from gfnn_jax.learn.clock import FLOW, Budget
@@ -153,6 +154,8 @@ def strongest(
     """The law's one, two … strongest terms, with coefficients fitted anew, as far as their flow
     explains most of the motion."""
     family, c = law.flow.family, np.asarray(law.flow.params)
+    if isinstance(family, Legendre):  # its terms are those of L
+        return []
     rows = judges.training[:TRIAL_PAIRS]
     slopes = family.term_gradients(plain.y0[rows]) * plain.scale[:, None]
     strength = np.abs(c) * np.sqrt(np.mean(np.sum(slopes**2, axis=1), axis=0))

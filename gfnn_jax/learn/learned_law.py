@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
-from gfnn_jax.families.sums import Sums, matrix_free
+from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
 from gfnn_jax.fitting.gauss_newton import (
@@ -24,6 +24,8 @@ from gfnn_jax.fitting.gauss_newton import (
 )
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.legendre import Legendre
+from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.learn.assemble import Assembled, composed, measured
 from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
 from gfnn_jax.learn.clock import Budget
@@ -60,7 +62,8 @@ class LearnedHamiltonian:
     resolve. stalled: whether larger libraries were no more accurate. covariance: makes ``root``;
     None of a network. unmet: that the tolerance is missed, and what that may be from; "" where it
     is met. ended: what cut the search for it short, "" where nothing did. dropped: terms that went
-    in the end.
+    in the end. friction: γ where that is uniform, else the terms of Rayleigh's R; of a system
+    without, ().
     """
 
     candidate: Candidate
@@ -81,6 +84,7 @@ class LearnedHamiltonian:
     unmet: str = ""
     ended: str = ""
     dropped: Dropped | None = None
+    friction: tuple[Term, ...] = ()
 
     @cached_property
     def root(self) -> np.ndarray | None:
@@ -111,7 +115,7 @@ class FittedLaw(NamedTuple):
     of those. dropped: terms that went in the end. whole:
     what whole sequences tell, where they were fitted."""
 
-    family: Terms | Sums
+    family: Any  # of terms of H, or of L, with friction or without
     fit: FlowFit
     rows: np.ndarray
     error: OneStepError
@@ -150,7 +154,7 @@ def learned_from(
     of_all = dataclasses.replace(steps, substeps=longest)
     error = error_of_steps(family, fit.coefficients, of_all, prepared, judges)
     candidate = Candidate(
-        label=f"H, {family.num_parameters} terms", family=family.name, chart="flow",
+        label=_label(family), family=family.name, chart="flow",
         num_parameters=family.num_parameters,
         operations=operations_of(family, 2 * family.dim, fastest, prepared.dt, steps),
         validation_rms=error.rms, validation_relative=error.relative,
@@ -164,6 +168,8 @@ def learned_from(
             family.term_names, fit.coefficients.tolist(), fit.standard_errors.tolist(), strict=True
         )
     )
+    of_h = without_forces(family).num_parameters
+    terms, friction = terms[:of_h], terms[of_h:]
     omega_h = omega_h_of(family, fit.coefficients, prepared, fastest)
     left_out = len(np.setdiff1d(found.rows, fit.used))
     resolved = np.abs(off).max(axis=1) <= bound_of(judges, prepared.scale)
@@ -171,7 +177,8 @@ def learned_from(
     if whole is not None:
         covariance = partial(np.asarray, whole.root)
     return LearnedHamiltonian(
-        with_error(candidate, error), flow, terms, getattr(family, "prefix", "") + formula(terms),
+        with_error(candidate, error), flow, terms,
+        getattr(without_forces(family), "prefix", "") + formula(terms),
         float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
         tuple(_messages(error, omega_h, prepared, judges, found, left_out, int((~resolved).sum()))),
@@ -179,7 +186,14 @@ def learned_from(
         covariance=covariance, noise=None if whole is None else whole.noise,
         arcs=0 if whole is None else whole.arcs,
         dropped=found.dropped, unmet=_unmet(error, omega_h, prepared, judges, found),
+        friction=friction,
     )  # fmt: skip
+
+
+def _label(family) -> str:
+    of_h = without_forces(family)
+    what = "L" if isinstance(of_h, Legendre) else "H"
+    return f"{what}, {of_h.num_parameters} terms" + (", friction" if of_h is not family else "")
 
 
 def held_out_error(family, fit: FlowFit, prepared, judges: Judges) -> OneStepError:
@@ -249,7 +263,8 @@ def covariance_root(
         return np.full((count, count), np.nan)
     slopes = images.by_coefficient / scale[:, None]
     left, scores, states, noise = residual / scale, None, None, None
-    if isinstance(found.family, Terms):  # of many coordinates both would take too much
+    family = without_forces(found.family)
+    if isinstance(family, Terms):  # of many coordinates both would take too much
         if goes_on.any():
             first = images.by_state * scale
             second = np.broadcast_to(-np.diag(scale), first.shape)
@@ -257,7 +272,7 @@ def covariance_root(
                 slopes, left, first / scale[:, None], second / scale[:, None], goes_on
             )
             states = first, second, goes_on
-        degree = int(np.max(np.sum(found.family.powers, axis=1)))
+        degree = int(np.max(np.sum(family.powers, axis=1)))
         noise = unexplained(prepared, rows, residual, count, degree, states)
     return uncertainty.root(
         fit.triangle, count, slopes.reshape(-1, count), np.hypot(left, _NEAR_ROUNDOFF).ravel(),

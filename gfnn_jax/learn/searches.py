@@ -93,7 +93,8 @@ def searched(
     climb.climb(dearest)
     found = climb.found()
     dearest /= DEARER  # of maps that would be chosen
-    if plain.varied:  # pairs of a law's flow are drawn, and factored out, at one dt
+    lossy = law is not None and bool(law.friction)
+    if plain.varied or lossy:  # pairs of H's flow are drawn, and factored out, at one dt
         pass
     elif (
         law is not None

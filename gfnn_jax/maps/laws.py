@@ -6,24 +6,29 @@ velocities and back. Where only uniform friction acts, or none, the map is confo
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from gfnn_jax.coordinates import Coordinates, lift
-from gfnn_jax.families.lagrangian import Lagrangian
+from gfnn_jax.families.lagrangian import DRY, Lagrangian
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre, family_of, law_of
+from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.phase_space import sizes
+from gfnn_jax.phase_space import sizes, split, symplectic_form
 
-_STAGES, _SUBSTEPS = (3, 4, 6, 8), (1, 2, 4, 8, 16)  # that are tried, by rising order
+_STAGES, _SUBSTEPS = (3, 4, 6, 8), (1, 2, 4, 8, 16, 32)  # that are tried, by rising order
+# h × the fastest rate of a substep: of what fixed-point iterations solve, and Newton's method.
+_CONTRACTING, _STIFFEST = 1.0, 30.0
 _JUDGED = 64  # states whose step tells the error of these
+_NEARLY = 0.95  # of them, whose steps are to be within the tolerance
 
 
 def map_of_law(
@@ -58,8 +63,8 @@ def map_of_law(
     if signals is not None:
         u = np.zeros((len(z), count)) if inputs is None else np.asarray(inputs, float)
         args = signals.constant(None, u[some], z[some].shape, np.float64)
-    steps = _steps(family, params, z[some], dt, scale, args, tolerance)
-    flow = Flow(family, params, dt, scale, steps.stages, steps.substeps)
+    steps = _steps(law, family, params, z[some], dt, scale, args, tolerance)
+    flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, steps.newton)
     posterior = None if root is None else Posterior(0, np.asarray(root))
     return SymplecticMap(
         (flow,), coordinates, covering(z, ignore=whole), scale, centre, float(dt),
@@ -67,13 +72,23 @@ def map_of_law(
     )  # fmt: skip
 
 
+def sticking(law: Lagrangian, noise: float, duration: float) -> Lagrangian:
+    """The law with dry friction narrow enough for forecasts across a stop.
+
+    With |v| as √(v² + ε²) − ε a body that dry friction holds creeps at up to about ε. Over a
+    forecast of this duration it creeps by no more than ``noise``, in units of the positions, where
+    ε is noise ÷ duration: a smaller one would cost steps and tell nothing.
+    """
+    friction = law.friction
+    widths = np.where(friction.kinds == DRY, noise / duration, friction.widths)
+    return dataclasses.replace(law, friction=dataclasses.replace(friction, widths=widths))
+
+
 def law_of_map(map_: SymplecticMap) -> Lagrangian:
     """The law whose flow the map is. Raises ValueError for any other map."""
     piece = map_.pieces[0]
-    inner = getattr(piece, "family", None)
-    while hasattr(inner, "family"):
-        inner = inner.family
-    if len(map_.pieces) != 1 or not isinstance(inner, Legendre):
+    flow = len(map_.pieces) == 1 and isinstance(piece, Flow)
+    if not flow or not isinstance(without_forces(piece.family), Legendre):
         raise ValueError("expected the map of a Lagrangian")
     return law_of(piece.family, np.asarray(piece.params))
 
@@ -90,15 +105,28 @@ def velocities_of(map_: SymplecticMap, z):
     return Legendre(law.terms).velocity(law.coefficients, np.asarray(z))
 
 
-def _steps(family, params, z, dt: float, scale, args, tolerance: float) -> Steps:
-    """The cheapest steps whose own error is within the tolerance at nearly all of these states."""
+def _steps(law: Lagrangian, family, params, z, dt: float, scale, args, tolerance: float):
+    """The cheapest steps whose own error is within the tolerance at nearly all of these states;
+    and whether Newton's method is to solve them: where dry friction is stiff, whose force turns
+    over within ε, and no more than Newton's method bears in a substep."""
+    stiffness = 0.0
+    if np.any(law.friction.kinds == DRY):
+        q = split(z)[0]
+        resting = np.concatenate([q, law.momentum(q, 0 * q)], axis=1)
+        slopes = family.gradient_and_hessian(params, resting, args)[1]
+        turned = symplectic_form(law.dim) @ slopes
+        stiffness = dt * np.abs(np.linalg.eigvals(turned)).max()
+    fewest, stiff = stiffness / _STIFFEST, bool(stiffness > _CONTRACTING)
     finest = Steps(_STAGES[-1], 2 * _SUBSTEPS[-1])
     reference = images(family, params, z, dt, finest, args=args).states
-    tried = sorted((s**2 * n, s, n) for s in _STAGES for n in _SUBSTEPS)
-    for _, stages, substeps in tried:
-        steps = Steps(stages, substeps, newton=False)
-        found = images(family, params, z, dt, steps, args=args).states
+    steps = Steps(_STAGES[-1], _SUBSTEPS[-1], stiff)
+    for _, stages, substeps in sorted((s**2 * n, s, n) for s in _STAGES for n in _SUBSTEPS):
+        tried = Steps(stages, substeps, stiff)
+        if substeps < min(fewest, _SUBSTEPS[-1]):
+            continue
+        found = images(family, params, z, dt, tried, args=args).states
         off = np.abs((found - reference) / scale).max(axis=1)
-        if np.mean(off <= tolerance) >= 0.95:
-            return steps
-    return Steps(_STAGES[-1], _SUBSTEPS[-1])
+        if np.mean(off <= tolerance) >= _NEARLY:
+            steps = tried
+            break
+    return steps

@@ -83,11 +83,12 @@ class Samples:
         save_every: int = 1,
         stop_outside: bool = False,
     ) -> tuple[Any, RolloutInfo]:
-        """Predict with every map: states (n, B, 1 + num_steps // save_every, 2d), and a RolloutInfo
-        of (n, B). z0: (B, 2d), or (n, B, 2d) where every sample has its own.
+        """Predict with every map.
 
-        inputs: as of `SymplecticMap.rollout`. Compiled once, whatever the samples. Raises
-        ValueError where a shape is wrong.
+        z0: (B, 2d), or (n, B, 2d) where each sample has its own. inputs: argument of
+        `SymplecticMap.rollout`. Returns the states (n, B, 1 + num_steps // save_every, 2d), and a
+        RolloutInfo of leaves (n, B). Other samples of the same kind use the same compiled program.
+        Raises ValueError where a shape is wrong.
         """
         z0, _ = self._given(z0, params, t0)
         args = self.map._schedule(params, self.map._states(z0[0]), t0, inputs, num_steps)

@@ -59,7 +59,7 @@ _TYPES: dict[str, type] = {
         Sensors,
     )
 } | {"LagrangianTerms": lagrangian.Terms}  # fmt: skip
-_NAMES = {kind: name for name, kind in _TYPES.items()}
+_OTHERWISE = {lagrangian.Terms: "LagrangianTerms"}  # families.terms has Terms too
 
 
 def register(kind: type) -> type:
@@ -73,7 +73,7 @@ def register(kind: type) -> type:
         raise InputError(f"expected a dataclass to register, got {kind!r}")
     if _TYPES.get(kind.__name__, kind).__module__ != kind.__module__:
         raise InputError(f"another type is registered as {kind.__name__}: choose another name")
-    _TYPES[kind.__name__], _NAMES[kind] = kind, kind.__name__
+    _TYPES[kind.__name__] = kind
     return kind
 
 
@@ -225,11 +225,11 @@ def _encode(value: Any) -> tuple[Any, Any]:
         text = {"name": value.name, "angles": list(value.angles), "cyclic": list(value.cyclic)}
         change = None if value.forward is CARTESIAN.forward else _OF_SCENE
         return {"type": "Coordinates", **text, "change": change}, None
-    if type(value) in _NAMES:
+    if type(value) in _TYPES.values():
         items = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
         if items.get("features") is not None:
             items["features"] = _OF_SCENE  # _lender has found whose they are
-        return _encode_all(items, {"type": _NAMES[type(value)]})
+        return _encode_all(items, {"type": _OTHERWISE.get(type(value), type(value).__name__)})
     if isinstance(value, tuple) and any(dataclasses.is_dataclass(item) for item in value):
         return _encode_all({str(i): item for i, item in enumerate(value)}, {"type": "tuple"})
     if isinstance(value, tuple):

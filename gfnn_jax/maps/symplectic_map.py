@@ -5,9 +5,9 @@
 Of a system with friction a piece multiplies the symplectic form by a factor μ, its multiplier, or
 keeps no multiple of it; so does the map.
 
-Maps are pytrees: their numbers can be passed through ``jit`` and differentiated; what is static
-(the kind of family, chart, coordinates) is a hashable constant, and what is compiled for one map
-serves all of its kind.
+Maps are pytrees: their numbers can be passed through ``jit`` and differentiated. The kind of
+family, the chart and the coordinates are static, hashable constants. A program compiled for one map
+serves all maps of the same kind.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _TWO_PI_REST = 2.4492935982947064e-16  # 2π minus its float64 value
 
 @runtime_checkable
 class Piece(Protocol):
-    """One map of a row, batch first: z (B, 2d), by JAX.
+    """Map in a row of such, batch first: z (B, 2d), by JAX.
 
     A piece is a pytree. ``unrolled`` makes derivatives those of the iterations that ran; a number
     also bounds the number of updates.
@@ -125,22 +125,23 @@ class SymplecticMap:
     domain:       region that the data covered, in the inner coordinates.
     scale:        (2d,) sizes of the user's coordinates.
     angle_centre: (a,) centre of the interval of length 2π in which each angle is kept.
-    dt:           the time one step takes; of a reversed map below 0.
-    parameters:   what the system depends on beside its state, where it was learned with that.
-    dt_range:     (2,) the lowest and highest dt of the data, of a map that was learned with dt as a
-                  variable of S.
-    signals:      the inputs that act on the system, where it has any. sensors:      what was
-    measured and how well, where the map was learned from a recording; no leaf. posterior:    how
-    well the coefficients are known, where that is; no leaf: what makes another
-                  map of the leaves (``jit``, ``jax.tree.map``) leaves it out.
+    dt:           time of one step; negative for a reversed map.
+    parameters:   names and ranges of the parameters that the map was learned with, or None.
+    dt_range:     (2,) the lowest and highest dt of the data, for a map that was learned with dt as
+                  a variable of S.
+    signals:      names of the inputs that act on the system, or None.
+    sensors:      what was measured and how well, of a map learned from a recording; no leaf either.
+    posterior:    posterior of the coefficients, or None. It is no leaf: a map that is made of the
+                  leaves (``jit``, ``jax.tree.map``) has none.
 
-    Methods take states z (2d,) or (B, 2d), NumPy or JAX, and answer with JAX arrays. A map that was
+    Methods take states z (2d,) or (B, 2d), NumPy or JAX, and return JAX arrays. A map that was
     learned with parameters takes their values too: name -> a number or (B,), or an array (k,) or
-    (B, k); that of a driven system takes t0, the time of the drive at z, a number or (B,), which
-    goes on with the steps. One with inputs takes these: (k,) or (B, k) during a step, (N, k) or
-    (B, N, k) of the N steps of a rollout; where they are not given, none acts. They can be
-    differentiated, in forward and reverse mode, in z, in the parameters' values, the inputs and the
-    map's own leaves, by the implicit-function theorem; ``jax.vmap`` and ``jax.jit`` work over them.
+    (B, k). A map of a driven system takes t0, the time of the drive at z, a number or (B,), which
+    advances with the steps. A map with inputs takes these: (k,) or (B, k) during a step, (N, k) or
+    (B, N, k) of the N steps of a rollout; where they are not given, none acts. Methods can be
+    differentiated, in forward and reverse mode, in z, in the parameters' values, in the inputs and
+    in the map's own leaves, by the implicit-function theorem. ``jax.vmap`` and ``jax.jit`` work
+    over them.
     """
 
     pieces: tuple
@@ -191,8 +192,8 @@ class SymplecticMap:
         return sharded.Sharded(self, sharded.local_devices(devices))
 
     def step(self, z, args=None, *, dt=None, t0=None, inputs=None):
-        """One step: (Z, Info); Info's leaves are () or (B,). dt: of `over`. inputs: that act
-        during the step."""
+        """Make one step: (Z, Info); Info's leaves are () or (B,). dt: argument of `over`. inputs:
+        that act during the step."""
         z = self._states(z)
         map_ = self if dt is None else self.over(dt, z.shape[:-1])
         return _step(map_, z, self._args(args, z, t0, inputs))
@@ -271,12 +272,13 @@ class SymplecticMap:
         return None if any(factor is None for factor in factors) else math.prod(factors, start=1.0)
 
     def defect(self, z, args=None, *, t0=None):
-        """Symplecticity defect ‖AᵀJA − μJ‖ () or (B,) of the step's unrolled derivative A at z, in
-        units of ``scale``, μ the multiplier; NaN where there is none. Of many degrees of freedom by
-        random pairs of tangent vectors.
+        """Symplecticity defect ‖AᵀJA − μJ‖ () or (B,) of the step's derivative A at z.
 
-        By forward differentiation through the iterations that ran, never by the implicit rule,
-        which would look symplectic however badly the solve had converged.
+        It is in units of ``scale``, μ the multiplier; NaN where there is none.
+
+        The derivative is the unrolled one, by forward differentiation through the iterations that
+        ran. That of the implicit rule would look symplectic however badly the solve had converged.
+        For many degrees of freedom the defect is estimated by random pairs of tangent vectors.
         """
         z = self._states(z)
         args = self._args(args, z, t0)
@@ -335,16 +337,19 @@ class SymplecticMap:
         return _linearised(self, z, self._args(args, z, t0, inputs))
 
     def modified_hamiltonian(self, z, args=None) -> ModifiedHamiltonian:
-        """The Hamiltonian H̃ whose flow over dt is this map, at z: its value and the error of that,
-        each () or (B,), in units of H. Its constant is that of S.
+        """Value and error, each () or (B,), of the Hamiltonian H̃ whose flow over dt is this map.
 
-        From 32 steps to either side of z (`maps.modified_hamiltonian`). The error is small where
-        the orbit turns slowly against a step (Hénon–Heiles: 1e-12 at dt 0.4, 1e-8 at 0.8), and of
-        the size of H̃ for a map that is near no flow. NaN where one of these steps fails. Raises
-        ValueError for a driven map, which keeps no energy.
+        Both are in units of H; the constant is that of S. They come from 32 steps to either side of
+        z (`maps.modified_hamiltonian`). The error is small where the orbit turns slowly against a
+        step (Hénon–Heiles: 1e-12 at dt 0.4, 1e-8 at 0.8), and as large as H̃ for a map that is near
+        no flow. Both are NaN where one of these steps fails. Raises ValueError for a driven map,
+        and for one with friction, which conserve no energy.
         """
         if self.parameters is not None and self.parameters.period is not None:
-            raise ValueError("expected a map without a drive: a driven one keeps no energy")
+            raise ValueError("expected a map without a drive: a driven one conserves no energy")
+        multiplier = self.multiplier()
+        if not (isinstance(multiplier, float) and multiplier == 1.0):
+            raise ValueError("expected a map without friction: one with it conserves no energy")
         z = self._states(z)
         return _modified(self, z, self._args(args, z))
 
@@ -357,9 +362,11 @@ class SymplecticMap:
         self, lanes: Lanes, num_saved: int, *, params=None, t0=None, inputs=None,
         save_every: int = 1, stop_outside: bool = False,
     ) -> tuple[Lanes, Any]:  # fmt: skip
-        """``num_saved`` blocks of ``save_every`` steps: the lanes after them, and the saved states
-        (B, num_saved, 2d). params, t0: those that the lanes were started with; inputs: of all
-        steps from their start on."""
+        """Advance by ``num_saved`` blocks of ``save_every`` steps.
+
+        Returns the lanes after them, and the saved states (B, num_saved, 2d). params, t0: those
+        that the lanes were started with. inputs: of all steps from their start on.
+        """
         args = self._schedule(params, lanes.y, t0, inputs)
         return _advance(self, lanes, args, num_saved, save_every, stop_outside)
 
@@ -369,16 +376,15 @@ class SymplecticMap:
     ) -> tuple[Any, RolloutInfo]:  # fmt: skip
         """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d).
 
-        params: the values of a map's parameters. t0: the time of a drive at z0; it goes on with the
-        steps. inputs: of each step's begin, (num_steps, k) or (B, num_steps, k), and, as one row
-        more, at the last one's end. dt: of `over`, for each step. samples, key: how many maps are
-        drawn from the posterior by which key of ``jax.random``; the states of all of them are held
-        at once.
+        params: the values of a map's parameters. t0: the time of a drive at z0; it advances with
+        the steps. inputs: of each step's begin, (num_steps, k) or (B, num_steps, k), and, as one
+        row more, at the last one's end. dt: argument of `over`. samples: number of maps drawn from
+        the posterior with key, of ``jax.random``; the states of all of them are in memory at once.
         Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first, and a
-        RolloutInfo; with samples its ``bands`` have their std about the states, median and
-        quantiles. A lane whose step fails, or that leaves the domain with ``stop_outside``,
-        repeats NaN from there on. Raises ValueError where a number of steps or a shape is wrong,
-        and where samples are asked for without a key or of a map without posterior.
+        RolloutInfo. With samples its ``bands`` have their std about the states, and quantiles. A
+        lane is NaN from where its step fails, or from where it leaves the domain with
+        ``stop_outside``. Raises ValueError where a number of steps or a shape is wrong, and where
+        samples are asked for without a key or from a map without a posterior.
         """
         for name, number in (("num_steps", num_steps), ("save_every", save_every)):
             if not isinstance(number, Integral):
@@ -399,7 +405,7 @@ class SymplecticMap:
         if samples is None:
             return states, info
         if key is None:
-            raise ValueError("expected a key of jax.random beside samples")
+            raise ValueError("expected a key as well as samples, e.g. key=jax.random.key(0)")
         options = {"params": params, "t0": t0, "inputs": inputs, "save_every": save_every}
         drawn, _ = map_.sample(key, samples).rollout(
             np.atleast_2d(z0), num_steps, stop_outside=stop_outside, **options
@@ -433,7 +439,7 @@ class SymplecticMap:
         return self.signals.scheduled(args, inputs, z.shape, dtype, self.dt, num_steps)
 
     def _after(self, args, steps):
-        """args that many steps (B,) later."""
+        """Advance args by a number of steps (B,)."""
         if isinstance(args, Scheduled):
             return args.at(self._after(args.params, steps), steps)
         return args if self.parameters is None else self.parameters.after(args, steps, self.dt)
@@ -571,14 +577,15 @@ def _defect(map_, z, args, unrolled):
 @compiled_sooner
 @_or_one_state
 def _linearised(map_, z, args):
-    width, signals, given = z.shape[1], map_.signals, args
+    width, signals = z.shape[1], map_.signals
     count = 0 if signals is None else len(signals.names)
-    if count:
-        given = jnp.broadcast_to(args, (len(z), args.shape[-1]))
-        first = args.shape[-1] - (signals.degree + 1) * count
 
     def step(moved):
-        acting = given.at[:, first : first + count].add(moved[:, width:]) if count else given
+        acting = args
+        if signals is not None:  # the constant coefficients of the inputs come first of theirs
+            first = args.shape[-1] - (signals.degree + 1) * count
+            acting = jnp.broadcast_to(args, (len(z), args.shape[-1]))
+            acting = acting.at[:, first : first + count].add(moved[:, width:])
         return map_._apply(z + moved[:, :width], acting)[0]
 
     def along(unit):

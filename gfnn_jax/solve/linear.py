@@ -23,6 +23,8 @@ def small_solve(matrix, rhs):
     own residual makes up for that. The solution is linear in ``rhs`` and can be transposed. A
     singular system gives non-finite numbers.
     """
+    if rhs.shape[-1] <= COFACTORS_UP_TO:
+        return by_cofactors(matrix, rhs)[0]
     return solve_and_sign(matrix, rhs)[0]
 
 

@@ -1,0 +1,136 @@
+"""Friction that is learned with H: uniform, whose flow keeps a multiple of J, or linear in v."""
+
+import numpy as np
+import pytest
+import scipy.integrate
+
+import gfnn_jax as gfnn
+from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
+
+
+def pairs_of(field, z, dt):
+    """Pairs by another integrator."""
+    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-15}
+    images = [scipy.integrate.solve_ivp(field, (0, dt), y, **options).y[:, -1] for y in z]
+    return gfnn.Pairs(z, np.stack(images), dt)
+
+
+def states(count=200, seed=0, dim=2):
+    return np.random.default_rng(seed).uniform(-0.4, 0.4, (count, 2 * dim))
+
+
+def henon_heiles(gammas):
+    def field(_, z):
+        q1, q2, p1, p2 = z
+        return [p1, p2, -q1 - 2 * q1 * q2 - gammas[0] * p1, -q2 - q1**2 + q2**2 - gammas[1] * p2]
+
+    return field
+
+
+def law_of(fit):
+    return {t.term: t.coefficient for t in fit.hamiltonian.terms}
+
+
+HENON_HEILES = {"q1²": 0.5, "q2²": 0.5, "p1²": 0.5, "p2²": 0.5, "q1² q2": 1.0, "q2³": -1 / 3}
+
+
+@pytest.fixture(scope="module")
+def damped():
+    pairs = pairs_of(henon_heiles([0.01, 0.01]), states(), 0.5)
+    return gfnn.fit(pairs, tolerance=1e-10, learn="hamiltonian")
+
+
+def test_uniform_friction_is_learned_with_h(damped, tmp_path):
+    assert law_of(damped) == pytest.approx(HENON_HEILES, rel=1e-12)
+    (rate,) = damped.hamiltonian.friction
+    assert rate.coefficient == pytest.approx(0.01, abs=1e-13)
+    assert damped.chosen.validation_relative < 1e-13
+    assert damped.map.multiplier() == pytest.approx(np.exp(-0.005), rel=1e-14)
+    assert damped.symplecticity_defect < 1e-14
+    damped.map.save(tmp_path / "m")
+    z = states(5, 1)
+    again = gfnn.load(tmp_path / "m")
+    np.testing.assert_array_equal(again.step(z)[0], damped.map.step(z)[0])
+    assert again.multiplier() == damped.map.multiplier()
+    with pytest.raises(ValueError, match="without friction"):
+        damped.map.modified_hamiltonian(z)
+
+
+def test_a_damped_forecast_and_its_energy(damped):
+    """1,000 steps against another integrator: the energy falls to e⁻⁵ of itself."""
+    z = states(3, 2)
+    found, _ = damped.map.rollout(z, 1_000)
+    exact = pairs_of(henon_heiles([0.01, 0.01]), z, 500.0).z1
+    energies = (damped.map.hamiltonian(np.asarray(s)) for s in (found[:, -1], exact, z))
+    energy, expected, start = map(np.asarray, energies)
+    assert np.abs(energy - expected).max() < 1e-10 * start.min()
+    assert (energy < 0.02 * start).all()
+
+
+def test_a_pendulum_with_friction():
+    rng = np.random.default_rng(0)
+    z = np.stack([rng.uniform(-np.pi, np.pi, 200), rng.uniform(-1.5, 1.5, 200)], axis=1)
+    pairs = pairs_of(lambda _, z: [z[1], -np.sin(z[0]) - 0.07 * z[1]], z, 0.3)
+    fit = gfnn.fit(pairs, tolerance=1e-10, angles=(0,), learn="hamiltonian")
+    assert law_of(fit) == pytest.approx({"cos(q1)": -1.0, "p1²": 0.5}, rel=1e-12)
+    assert fit.hamiltonian.friction[0].coefficient == pytest.approx(0.07, abs=1e-13)
+    assert fit.symplecticity_defect < 1e-14
+
+
+def test_rates_that_differ_are_no_uniform_friction():
+    """A constant determinant, and no multiple of J."""
+    pairs = pairs_of(henon_heiles([0.1, 0.3]), states(), 0.5)
+    fit = gfnn.fit(pairs, tolerance=1e-10, learn="hamiltonian")
+    assert law_of(fit) == pytest.approx(HENON_HEILES, rel=1e-11)
+    found = {t.term: t.coefficient for t in fit.hamiltonian.friction}
+    assert found == pytest.approx({"½ v1²": 0.1, "½ v2²": 0.3}, rel=1e-11)
+    assert fit.map.multiplier() is None
+    assert np.isnan(fit.symplecticity_defect)
+    with pytest.raises(gfnn.FitError, match="without friction"):
+        fit.accelerate()
+
+
+@pytest.mark.filterwarnings("ignore::gfnn_jax.FitWarning")
+@pytest.mark.parametrize("noise", [0.0, 1e-5])
+def test_a_system_that_keeps_its_energy_gets_no_friction(noise):
+    pairs = pairs_of(henon_heiles([0.0, 0.0]), states(), 0.5)
+    image = pairs.z1 + noise * np.random.default_rng(1).normal(size=pairs.z1.shape)
+    fit = gfnn.fit(gfnn.Pairs(pairs.z0, image, 0.5), tolerance=1e-10, learn="hamiltonian")
+    assert fit.hamiltonian.friction == ()
+    assert fit.map.multiplier() == 1.0
+
+
+def double_pendulum(gamma, count=200, dt=0.2):
+    """Pairs of two equal rods, from the accelerations of their Lagrangian."""
+    z0 = np.random.default_rng(0).uniform(-1, 1, (count, 4)) * [1.5, 1.5, 0.7, 0.7]
+    none = (0, 0)
+    terms = Terms.of(
+        [((2, 0), none, none, 0.0), ((0, 2), none, none, 0.0), ((1, 1), none, (1, -1), 0.0),
+         (none, none, (1, 0), 0.0), (none, none, (0, 1), 0.0)], 2,
+    )  # fmt: skip
+    law = Lagrangian(
+        terms, np.array([1.0, 0.5, 1.0, 2.0, 1.0]), Friction.of([], 2), np.zeros(0), gamma,
+        np.zeros((2, 0)),
+    )  # fmt: skip
+
+    def field(_, y):
+        return np.concatenate([y[2:], law.acceleration(y[None, :2], y[None, 2:])[0]])
+
+    z1 = pairs_of(field, z0, dt).z1
+    both = (np.c_[z[:, :2], law.momentum(z[:, :2], z[:, 2:])] for z in (z0, z1))
+    return gfnn.Pairs(*both, dt)
+
+
+@pytest.mark.slow
+def test_a_double_pendulum_is_a_lagrangian_of_five_terms():
+    fit = gfnn.fit(
+        double_pendulum(0.01), tolerance=1e-10, angles=(0, 1), learn="hamiltonian",
+        max_seconds=None,
+    )  # fmt: skip
+    expected = {"v1²": 1, "v2²": 0.5, "v1 v2 cos(q1 - q2)": 1, "cos(q1)": 2, "cos(q2)": 1}
+    assert law_of(fit) == pytest.approx(expected, rel=1e-11)
+    assert fit.hamiltonian.friction[0].coefficient == pytest.approx(0.01, abs=1e-12)
+    assert fit.chosen.validation_relative < 1e-12
+    assert fit.symplecticity_defect < 1e-14
+    assert fit.formula is not None
+    assert fit.formula.startswith("Legendre transform of L = ")
