@@ -334,6 +334,22 @@ def degrees_as_angle() -> Case:
     return dataclasses.replace(degrees(), angles=(0,), meets=False, words=words, quiet=False)
 
 
+def wrapped_angle() -> Case:
+    """Rotating pendulums whose angle is kept within ±π, and not declared as an angle."""
+
+    def draw(num: int, seed: int) -> np.ndarray:
+        return np.array([0.0, 2.8]) + box([np.pi, 0.6])(num, seed)
+
+    def wrap(z: np.ndarray) -> np.ndarray:
+        return np.stack([np.remainder(z[:, 0] + np.pi, 2 * np.pi) - np.pi, z[:, 1]], axis=1)
+
+    data, fresh = (changed(pairs, wrap) for pairs in drawn(pendulum, draw, 0.1, 1_000))
+    return Case(
+        data, fresh, max_seconds=20.0, meets=False, words=("jumps of 2π", "--angles 0"),
+        never=("noise",),
+    )  # fmt: skip
+
+
 def interleaved() -> Case:
     """Columns in the order q1, p1, q2, p2."""
     laws = drawn(henon_heiles, box([0.3] * 4), 0.2, 2_000)
@@ -374,6 +390,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "friction": friction,
     "degrees": degrees,
     "degrees-as-angle": degrees_as_angle,
+    "wrapped-angle": wrapped_angle,
     "interleaved": interleaved,
     **{f"noise-pendulum-{s:.0e}": partial(noisy, pendulum, [1.0] * 2, s) for s in SIGMAS},
     **{f"noise-henon-heiles-{s:.0e}": partial(noisy, henon_heiles, [0.3] * 4, s) for s in SIGMAS},

@@ -14,7 +14,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gfnn_jax import scenes
+    from gfnn_jax import records, scenes
     from gfnn_jax.compiling import enable_compile_cache
     from gfnn_jax.data.recording import Recording, read
     from gfnn_jax.errors import FitError, FitWarning, InputError, WorkError
@@ -38,7 +38,12 @@ if TYPE_CHECKING:
 
     __version__: str
 
-_MODULES = {"figures": "evaluate.figures", "metrics": "evaluate.metrics", "scenes": "scenes"}
+_MODULES = {
+    "figures": "evaluate.figures",
+    "metrics": "evaluate.metrics",
+    "records": "records",
+    "scenes": "scenes",
+}
 _HOMES = {
     "CHARTS": "generating.charts",
     "Chart": "generating.charts",
@@ -89,6 +94,7 @@ __all__ = [
     "load",
     "metrics",
     "read",
+    "records",
     "reference_trajectories",
     "register",
     "sample_pairs",

@@ -132,6 +132,8 @@ def _parser() -> argparse.ArgumentParser:
 
     command = commands.add_parser("scenes", help="list the scenes")
     command.set_defaults(command=_scenes)
+    command = commands.add_parser("records", help="list the measured records of the package")
+    command.set_defaults(command=_records)
 
     command = commands.add_parser(
         "run", help="a scene from reference data to figures",
@@ -213,7 +215,8 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
     command.add_argument(
         "--initial", type=Path, metavar="FILE", required=True,
-        help="initial states, or a trajectory file: its sequences continue from their last states",
+        help="initial states, or a trajectory file: its sequences continue from their last states; "
+        "of a map of positions a recording, whose runs continue from their last two",
     )  # fmt: skip
     command.add_argument("--num-steps", type=_count, metavar="N")
     command.add_argument(
@@ -423,6 +426,15 @@ def _max_seconds(arguments: argparse.Namespace) -> float | None:
 # The commands. The heavy imports are here, after the checks that need none of them.
 
 
+def _records(arguments: argparse.Namespace) -> None:
+    from gfnn_jax.records import RECORDS, path
+
+    for name, record in RECORDS.items():
+        options = f"--positions {','.join(record.positions)}"
+        options += f" --angles {','.join(record.angles)}" if record.angles else ""
+        print(f"{name:16} {record.what}\n{'':16} gfnn fit {path(name)} {options} --out {name}")
+
+
 def _scenes(arguments: argparse.Namespace) -> None:
     from gfnn_jax.scenes import SCENES
 
@@ -484,9 +496,13 @@ def _fit(arguments: argparse.Namespace) -> None:
     for path in arguments.data:
         _check_exists(path)
     columns = column_options(arguments)
-    if are_recordings(arguments.data, with_roles=names_roles(columns)):
+    with_roles = names_roles(columns)
+    asked = with_roles or arguments.learn == "map"
+    if asked and are_recordings(arguments.data, with_roles=with_roles):
         if arguments.dt is not None:
             columns["dt"] = arguments.dt
+        if arguments.learn == "map":
+            return _fit_positions(arguments, columns)
         return _fit_law(arguments, columns)
     if arguments.learn == "lagrangian":
         raise InputError("--learn lagrangian: expected a recording, got states q, p")
@@ -516,6 +532,25 @@ def _fit_law(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
     print(f"written to {arguments.out}")
     print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
           "--out forecast.csv")  # fmt: skip
+
+
+def _fit_positions(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
+    """Learn the map of a recording of positions."""
+    _set_up_jax()
+    from gfnn_jax.jobs.fit_positions import fit_positions
+
+    with progress.on_stderr() as shown:
+        ran = fit_positions(
+            arguments.data, out=arguments.out, columns=columns, seed=arguments.seed,
+            tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
+            absolute_tolerance=arguments.absolute_tolerance, structure=arguments.structure,
+            max_seconds=_max_seconds(arguments), max_operations=arguments.max_operations,
+            progress=shown,
+        )  # fmt: skip
+    _summarise(ran, arguments.out)
+    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
+          "--out prediction.npz")  # fmt: skip
+    _hold_to(arguments.strict, arguments.out)
 
 
 def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) -> None:
@@ -568,7 +603,7 @@ def _predict(arguments: argparse.Namespace) -> None:
     for path in (arguments.model, arguments.initial, arguments.inputs, arguments.compare):
         if path is not None:
             _check_exists(path)
-    if are_recordings(arguments.initial):
+    if are_recordings(arguments.initial) and _is_law(arguments.model):
         return _forecast(arguments)
     if arguments.num_steps is None:
         raise InputError("expected --num-steps: how many steps to predict")
@@ -580,6 +615,14 @@ def _predict(arguments: argparse.Namespace) -> None:
         if arguments.distributed:
             share = processes.join()
         _predict_and_tell(arguments, share)
+
+
+def _is_law(model: Path) -> bool:
+    """Whether the model is the law of a recording, and no map of its positions."""
+    _set_up_jax()
+    from gfnn_jax.maps.saved import record
+
+    return "lagrangian" in record(model)
 
 
 def _forecast(arguments: argparse.Namespace) -> None:

@@ -76,6 +76,10 @@ def _names(text: str) -> tuple[str, ...]:
 
 def _names_or_indices(text: str) -> tuple[str, ...] | tuple[int, ...]:
     names = _names(text)
+    if len(names) < len(text.split(",")):
+        raise argparse.ArgumentTypeError(
+            f"expected different names or indices separated by commas, got '{text}'"
+        )
     return tuple(map(int, names)) if all(name.isdecimal() for name in names) else names
 
 

@@ -6,6 +6,7 @@ import pytest
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.learn.diagnose import (
     data_defect,
+    differs_between_sequences,
     judge_chart,
     local_jacobians,
     look_symplectic,
@@ -76,6 +77,10 @@ def test_outliers_are_found_and_right_pairs_are_not(sigma):
 def test_few_or_coinciding_pairs_are_no_outliers():
     z = np.random.default_rng(3).uniform(-1, 1, (5, 2))
     assert len(outliers(z, turned(z), z.std(axis=0))) == 0
+    q, p = np.random.default_rng(1642).uniform(-1, 1, (2, 20))  # the worst of 4,000 such draws
+    ahead = q + 0.5 * p
+    pairs = np.c_[q, p], np.c_[ahead, p - np.sin(ahead)]
+    assert len(outliers(*pairs, pairs[0].std(axis=0))) == 0
     many = np.tile(z, (20, 1))
     assert len(outliers(many, turned(many), many.std(axis=0))) == 0
 
@@ -120,3 +125,26 @@ def test_many_degrees_of_freedom_are_diagnosed_in_seconds():
     assert len(outliers(z, z1, scale)) == 0
     z1[7, 3] += 1.0
     np.testing.assert_array_equal(outliers(z, z1, scale), [7])
+
+
+def arcs(rng, dim, dt):
+    """States (1000, 2d) of 20 arcs of oscillators of several frequencies, 50 states each."""
+    phase = rng.uniform(0, 2 * np.pi, (20, 1, dim)) + dt * np.arange(50)[:, None] * (
+        1 + 0.3 * np.arange(dim)
+    )
+    size = rng.uniform(0.3, 1, (20, 1, dim))
+    z = np.concatenate([size * np.cos(phase), -size * np.sin(phase)], axis=2)
+    return z.reshape(-1, 2 * dim)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_a_misfit_does_not_differ_between_sequences(dim):
+    """It is as smooth along a sequence as across; a hidden parameter is not."""
+    rng, sequence = np.random.default_rng(4), np.repeat(np.arange(20), 50)
+    wave = rng.normal(size=(2 * dim, 2 * dim))
+    for dt in (0.02, 0.05, 0.2):
+        z = arcs(rng, dim, dt)
+        for steep in (1.0, 3.0, 6.0):
+            assert not differs_between_sequences(z, np.sin(steep * z @ wave), sequence)
+    hidden = rng.normal(size=20)[sequence, None]
+    assert differs_between_sequences(z, hidden * z[:, ::-1], sequence)

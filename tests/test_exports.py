@@ -31,6 +31,7 @@ from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE1, TYPE2, TYPE3
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import fit_predictors
 from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.damping import Damping
 from gfnn_jax.maps.laws import map_of_law
 from gfnn_jax.maps.parameters import sampled
 from gfnn_jax.phase_space import symplectic_form
@@ -124,6 +125,7 @@ QUICK = {
     "type 2, angles": lambda: map_in(TYPE2, 1, 4, angles=(0, 1)),
     "type 3, base map": lambda: map_in(TYPE3, 1, 4, around=(turning(1),)),
     "midpoint": lambda: map_in(MIDPOINT, 2, 3),
+    "damping": lambda: map_in(TYPE2, 1, 4, around=(Damping(np.asarray(0.9), np.full(1, 0.05)),)),
     "law": law,
     "Lagrangian": two_rods,
 }

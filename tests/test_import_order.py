@@ -15,14 +15,14 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 # A module imports only from rooms before its own; the modules of a room share its place.
 ORDER = (
     "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes",
-    "storage", "signals", "data", "dataset", "scenes", "families", "solve", "generating", "flows",
-    "maps", "exports", "fitting", "models", "learn", "baselines", "evaluate", "jobs", "cli_columns",
-    "cli", "__main__",
+    "storage", "signals", "data", "records", "dataset", "scenes", "families", "solve", "generating",
+    "flows", "maps", "exports", "fitting", "models", "learn", "baselines", "evaluate", "jobs",
+    "cli_columns", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {
     ("maps.symplectic_map", f"maps.{name}")
-    for name in ("saved", "samples", "sharded", "energy", "estimates")
+    for name in ("positions", "saved", "samples", "sharded", "energy", "estimates")
 }
 SHORTHANDS |= {
     ("data.recording", "data.recording_summary"),
@@ -35,7 +35,7 @@ HOMES = {  # the module, and those whose names begin as its own does
     "matplotlib": "evaluate.figures",
     "optax": "fitting.adam",
     "orbax": "storage.checkpoints",
-    "pandas": "data.tables",
+    "pandas": "data.text_files",
 }
 
 

@@ -1,7 +1,8 @@
-"""Fifty mistakes that users of the Python API make: each is refused before any work, in one line
+"""Mistakes that users of the Python API make: each is refused before any work, in one line
 that says what was expected. Those of the command line are in tests/test_cli.py, those of files in
 tests/test_files.py; what only a fit can see (degrees, friction), benchmarks/as_a_user.py has."""
 
+import dataclasses
 import re
 
 import jax
@@ -9,7 +10,9 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
+from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.learn.check import unnamed_angles
 
 DT = 0.1
 RNG = np.random.default_rng(0)
@@ -19,6 +22,9 @@ Z1 = Z0 @ TURN.T
 PAIRS = gfnn.Pairs(Z0, Z1, DT)
 SCENE = gfnn.scenes.make("two-body")
 KEY = jax.random.key(0)
+OF_NUMPY = dataclasses.replace(
+    SCENE, flow=None, step=None, section=None, hamiltonian=lambda z, t=0.0: np.sum(np.cos(z)),
+)  # fmt: skip
 LENGTH = RNG.uniform(0.5, 2, 200)
 
 
@@ -38,6 +44,8 @@ MISTAKES = {
     "sequences as pairs": (lambda: fit(Z0.reshape(10, 20, 2), Z1), "(N, 2d), got (10, 20, 2)"),
     "transposed": (lambda: fit(Z0.T, Z1.T), "a row is a state; are the arrays transposed?"),
     "the same state all over": (lambda: fit(0 * Z0, 0 * Z1), "at least 8 different pairs"),
+    "the same columns twice": (
+        lambda: fit(Z0, Z0), "z1 = z0 in every pair: H = 0, or the same columns twice?"),
     "seven pairs": (lambda: fit(Z0[:7], Z1[:7]), "at least 8 different pairs for d = 1, got 7"),
     "complex numbers": (lambda: fit(Z0 + 0j), "z0 of real numbers, got complex128"),
     "numbers as text": (lambda: fit(Z0, Z1.astype(str)), "z1 of real numbers, got <U"),
@@ -73,6 +81,7 @@ MISTAKES = {
     "an angle that is no index": (lambda: fit(angles=("q1",)), "angles as a tuple of indices"),
     "an angle beyond the last": (lambda: fit(angles=(2,)), "different angles among 0..1, got (2,)"),
     "one term without a list": (lambda: fit(terms="p1**2"), "a sequence of terms, got the text"),
+    "None as terms": (lambda: fit(terms=None), "a sequence of terms, () for none; got None"),
     "a power as ^": (lambda: fit(terms=["p1^2"]), "a power is written **"),
     "an unknown name in a term": (lambda: fit(terms=["x1**2"]), "the name 'x1': expected numbers"),
     "code in a term": (lambda: fit(terms=['__import__("os")']), "a call of '__import__'"),
@@ -84,15 +93,16 @@ MISTAKES = {
         lambda: gfnn.scenes.make("twobody"), "unknown scene 'twobody', did you mean 'two-body'?"),
     "a name to draw from": (
         lambda: gfnn.sample_pairs("two-body", 10, KEY), "e.g. gfnn.scenes.make('two-body'), got"),
+    "a Hamiltonian of NumPy": (
+        lambda: gfnn.sample_pairs(OF_NUMPY, 10, KEY), "the hamiltonian of the scene two-body"),
+    "a flow of NumPy": (
+        lambda: gfnn.sample_pairs(dataclasses.replace(OF_NUMPY, flow=OF_NUMPY.hamiltonian), 9, KEY),
+        "expected the flow of the scene two-body written with jax.numpy"),
     "no pairs": (lambda: gfnn.sample_pairs(SCENE, 0, KEY), "number of states ≥ 1, got 0"),
     "a number as key": (lambda: gfnn.sample_pairs(SCENE, 10, 0), "e.g. jax.random.key(0), got 0"),
     "a folder that is not there": (lambda: gfnn.load("nowhere"), "nowhere: no such folder"),
     "a file instead of the folder": (lambda: gfnn.load(__file__), "no such folder"),
 }  # fmt: skip
-
-
-def test_there_are_fifty():
-    assert len(MISTAKES) == 50
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
@@ -115,8 +125,9 @@ WITH_A_MAP = {
     "transposed states": (lambda m: m.rollout(Z0[:5].T, 9), "(2,) or (B, 2), got (2, 5)"),
     "steps that are no whole number": (
         lambda m: m.rollout(Z0[:3], 1e3), "whole number as num_steps"),
-    "steps back": (lambda m: m.rollout(Z0[:3], -5), "num_steps >= 0"),
+    "the inverse of no state": (lambda m: m.inverse(), "map.inverse(z); the inverse map itself is"),
     "nothing saved": (lambda m: m.rollout(Z0[:3], 9, save_every=0), "save_every >= 1"),
+    "dt < 0": (lambda m: m.rollout(Z0[:3], 9, dt=-DT), "give rollout a negative num_steps"),
     "another dt": (lambda m: m.rollout(Z0[:3], 9, dt=0.2), "fit with learn='hamiltonian'"),
     "parameters that it has not": (
         lambda m: m.rollout(Z0[:3], 9, params={"l": 1.0}), "learned without"),
@@ -138,3 +149,28 @@ def test_a_map_is_not_overwritten_unasked(learned, tmp_path):
     learned.save(tmp_path / "model")
     with pytest.raises(InputError, match=r"exists already .* overwrite=True"):
         learned.save(tmp_path / "model")
+
+
+def test_a_negative_number_of_steps_goes_back(learned):
+    ahead, _ = learned.rollout(Z0[:3], 100)
+    back, info = learned.rollout(np.asarray(ahead[:, -1]), -100, save_every=20)
+    assert not info.status.any()
+    np.testing.assert_allclose(back, ahead[:, ::-20], rtol=0, atol=1e-13)
+
+
+def test_an_angle_that_is_wrapped_is_named():
+    """Rotors pass ±π or 0; swings within half a turn, and jumps by more than a kick's, are none."""
+    rng = np.random.default_rng(1)
+    q, p, cartesian = rng.uniform(-9, 9, 300), rng.uniform(-3, 3, 300), Coordinates("cartesian")
+    for centre in (0.0, np.pi):
+        ends = [
+            np.c_[p, centre + np.remainder(x - centre + np.pi, 2 * np.pi) - np.pi]
+            for x in (q, q + 0.2 * p)
+        ]
+        (said,) = unnamed_angles(gfnn.Pairs(*ends, 0.2), cartesian)
+        assert "coordinate 1 of z: jumps of 2π in" in said
+        assert "--angles 1, angles=(1,)" in said
+        assert unnamed_angles(gfnn.Pairs(*ends, 0.2), Coordinates("cartesian", angles=(1,))) == []
+    assert unnamed_angles(PAIRS, cartesian) == []
+    kicked = gfnn.Pairs(Z0, rng.uniform(-3, 3, Z0.shape), 1.0)
+    assert unnamed_angles(kicked, cartesian) == []

@@ -1,15 +1,23 @@
 """The noise of the states from the residuals of a map that is known exactly."""
 
+from types import SimpleNamespace
+
 import jax
 import numpy as np
 import pytest
 from analytic import exact_oscillator, generated, map_of, oscillator, rotated
 
 import gfnn_jax as gfnn
+from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.noise import of_differences, of_residuals, robust
 from gfnn_jax.dataset.runs import identified
+from gfnn_jax.families.terms import given_terms
+from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import MIDPOINT
+from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.noise import noise_of_sites, state_noise
+from gfnn_jax.learn.prepare import prepare
+from gfnn_jax.learn.white import leaves_white
 from gfnn_jax.scenes import froeschle
 
 
@@ -91,3 +99,15 @@ def test_residuals_tell_the_noise_without_gross_errors():
     np.testing.assert_allclose(robust(residual, axis=0), sigma, rtol=0.05)
     np.testing.assert_allclose(of_residuals(residual, 1.0, 5.0), sigma, rtol=0.03)
     np.testing.assert_allclose(of_residuals(residual, 0.25, 5.0), 2 * sigma, rtol=0.03)
+
+
+@pytest.mark.parametrize("num_steps", [1, 50])
+@pytest.mark.parametrize(
+    ("frequency", "white"), [(1.0, True), (1.0005, True), (1.02, False), (0.9, False)]
+)
+def test_a_law_is_right_where_it_leaves_white_noise_over(frequency, white, num_steps):
+    """Noise of 1e-3 on turns by 0.2; a law of another frequency leaves a rotation over."""
+    pairs = noisy_turns(0.2, np.array([1e-3, 1e-3]), num_steps)[1]
+    flow = Flow(given_terms(1, ["q1**2", "p1**2"]), 0.5 * frequency * np.ones(2), 0.2, np.ones(2))
+    prepared, judges = prepare(pairs, CARTESIAN), Judges.of(pairs, 0, Tolerance(1e-6))
+    assert leaves_white(SimpleNamespace(flow=flow), prepared, judges) == white

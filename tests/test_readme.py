@@ -28,7 +28,7 @@ def gfnn_commands():
 def example():
     """The text of the example and the names that it leaves behind, after a hundredth of its steps:
     the programs of the tests are compiled quickly, and step slowly."""
-    code, _ = blocks("python")
+    _, code, _ = blocks("python")
     fewer = code.replace("num_steps=100_000, save_every=100", "num_steps=1_000, save_every=1")
     assert fewer != code
     names: dict = {}
@@ -48,6 +48,19 @@ def test_the_example_runs(example):
     assert names["states"].shape == (10, 1001, 4)
     assert not np.any(names["info"].status)
     assert names["fit"].met
+
+
+@pytest.mark.slow
+def test_a_recording_gives_its_law():
+    """The law of a measured double pendulum, and a forecast beside what was measured."""
+    code, names = blocks("python")[0], {}
+    exec(compile(code, "README.md", "exec"), names)
+    assert len(code.splitlines()) <= 12
+    values, std = names["ahead"].values["theta1"], names["ahead"].std["theta1"]
+    assert values.shape == std.shape == (1, 10)
+    times = names["record"].times(names["record"].runs[0])
+    measured = np.interp(3.6, times, names["record"].unwrapped("theta1", names["record"].runs[0]))
+    assert abs(values[0, 0] - measured) < 0.03
 
 
 def test_the_gradient_is_one(example):

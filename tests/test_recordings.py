@@ -61,6 +61,8 @@ TEXTS = {
     "a byte-order mark": "\ufefft,theta,omega\r\n" + rows(T, THETA, OMEGA).replace("\n", "\r\n"),
     "a separator at the end": "t;theta;omega;\n"
     + rows(T, THETA, OMEGA, separator=";").replace("\n", ";\n"),
+    "decimal commas in quotes": '"t","theta","omega"\n'
+    + '"' + rows(T, THETA, OMEGA, separator='","', decimal=",")[:-1].replace("\n", '"\n"') + '"\n',
     "another order": "omega,t,theta\n" + rows(OMEGA, T, THETA),
 }  # fmt: skip
 
@@ -68,6 +70,15 @@ TEXTS = {
 @pytest.mark.parametrize("name", TEXTS)
 def test_text_files_of_every_dialect(tmp_path, name):
     check(gfnn.read(write(tmp_path / "r.csv", TEXTS[name])))
+
+
+def test_times_of_day(tmp_path):
+    text = "time,x\n2024-05-01 23:59:59.5,1\n2024-05-02 00:00:00.25,2\n2024-05-02 00:00:01,3\n"
+    recording = gfnn.read(write(tmp_path / "r.csv", text))
+    np.testing.assert_allclose(recording.times("0"), [0, 0.75, 1.5], atol=1e-12)
+    bad = write(tmp_path / "bad.csv", text + "2024-05-02 00:00:99,4\n")
+    with pytest.raises(InputError, match="00:00:99"):
+        gfnn.read(bad)
 
 
 def test_tables_in_memory_and_arrays(tmp_path):
@@ -129,6 +140,26 @@ def test_roles_that_are_given_leave_the_other_columns_out():
     assert recording.ignored == ("x",)
     assert recording.std == {"a": 0.1, "b": None}
     assert recording.angles == ()
+
+
+def test_data_tell_roles_that_names_do_not():
+    t = 0.01 * np.arange(600)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal((4, len(t)))
+    motion = np.stack([np.sin(3 * t), 3 * np.cos(3 * t), np.cos(5 * t), -5 * np.sin(5 * t)])
+    motion += noise
+    table = {"t": t, "b": motion[1], "a": motion[0], "d": motion[2], "e": motion[3]}
+    recording = gfnn.Recording(table)
+    assert (recording.positions, recording.velocities) == (("a", "d"), ("b", "e"))
+    assert "derivatives" in recording.notes[0]
+    with pytest.raises(InputError, match="d may be motion or what drives it"):
+        gfnn.Recording({name: table[name] for name in "tabd"})
+
+
+def test_columns_that_differ_from_run_to_run_are_parameters():
+    table = {"run": [0, 0, 1, 1], "t": [0, 1, 0, 1], "x": [0.0, 1, 2, 3], "mass": [1.0, 1, 2, 2]}
+    recording = gfnn.Recording({**table, "day": [7, 7, 7, 7]})
+    assert recording.parameters == ("mass",)
+    assert recording.ignored == ("day",)
 
 
 def test_an_angle_is_lifted_and_a_lift_is_trusted():

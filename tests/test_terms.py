@@ -9,10 +9,11 @@ import pytest
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.families import Family, LinearFamily
-from gfnn_jax.families.expressions import parse, to_text
+from gfnn_jax.families.expressions import parse, plain, to_text
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
 from gfnn_jax.families.traced import traced
+from gfnn_jax.learn.formula import Term, formula
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.pcr3bp import features
 
@@ -151,3 +152,27 @@ def test_terms_are_joined_and_taken():
     assert some.term_names == (both.term_names[0], both.term_names[3])
     assert set(some.variables) < set(both.variables)
     assert hash(some) == hash(both.take([0, 3]))  # static: what is compiled for one serves both
+
+
+@pytest.mark.parametrize(
+    ("shown", "code"),
+    [
+        ("0.5 q1² + 0.25 p1⁴ − cos(q1)", "0.5*q1**2 + 0.25*p1**4 - cos(q1)"),
+        ("-2.5e-05 p1² (1/(2 + cos(q1)))²", "-2.5e-05*p1**2*(1/(2 + cos(q1)))**2"),
+        ("0.5 (q1**2 - q2**2) - 2 sin (q1 - q2)", "0.5*(q1**2 - q2**2) - 2*sin(q1 - q2)"),
+        ("q1 ** 2 * p2", "q1**2*p2"),
+    ],
+)
+def test_a_formula_is_read_as_it_is_shown(shown, code):
+    assert parse(shown, 2) == parse(code, 2)
+
+
+def test_what_a_fit_shows_can_be_given_to_it_and_to_sympy():
+    sympy = pytest.importorskip("sympy")
+    family = given_terms(2, ["q1² p2", "1/sqrt(q1**2 + q2**2)", "0.5 (p1² + p2²)"])
+    shown = formula([Term(t, c, 0.0) for t, c in zip(family.term_names, (2, -1, 3), strict=True)])
+    value = family.value(np.array([2.0, -1.0, 3.0]), W)
+    again = given_terms(2, [shown])
+    np.testing.assert_allclose(again.value(np.ones(1), W), value, rtol=1e-14)
+    by_sympy = sympy.lambdify(sympy.symbols("q1 q2 p1 p2"), sympy.sympify(plain(shown)))
+    np.testing.assert_allclose(by_sympy(*np.moveaxis(W, -1, 0)), value, rtol=1e-14)

@@ -18,16 +18,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gfnn_jax.data.roles import ROLES, by_name, is_angle, is_run, is_time, plain
-from gfnn_jax.data.tables import Table, from_arrays, from_memory, from_text
+from gfnn_jax.data.columns import (
+    SECONDS,
+    Names,
+    angles_of,
+    check_known,
+    factors_of,
+    listed,
+    roles_of,
+    time_unit_of,
+)
+from gfnn_jax.data.roles import ROLES, is_run, is_time
+from gfnn_jax.data.runs import restarts, runs_of
+from gfnn_jax.data.tables import Table, from_arrays, from_memory
+from gfnn_jax.data.text_files import from_text
 from gfnn_jax.errors import InputError
 
 if TYPE_CHECKING:
     from gfnn_jax.data.recording_summary import RecordingSummary
 
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 _TURN = 2 * np.pi
-Names = Sequence[str] | str | None
 
 
 @dataclasses.dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -88,58 +98,62 @@ class Recording:
         degrees: columns in degrees, or degrees per second; a position among them is an angle.
         time_unit: s (the default), ms, us, ns, min or h; a header's own unit serves too.
         std:     σ of columns, in their own unit.
-        columns: those to take; all others are as if they were not there.
+        columns: those to take beside times and runs; all others are as if they were not there.
         dt:      seconds between rows, in place of a column of times.
         offset, scale: columns that a sensor shows shifted, or scaled, by an unknown amount.
         Raises InputError where names, times or values do not fit.
         """
         given = {
-            "positions": _names(positions), "velocities": _names(velocities),
-            "momenta": _names(momenta), "inputs": _names(inputs),
-            "parameters": _names(parameters),
+            "positions": listed(positions), "velocities": listed(velocities),
+            "momenta": listed(momenta), "inputs": listed(inputs),
+            "parameters": listed(parameters),
         }  # fmt: skip
         tables = [from_memory(t) for t in (table if isinstance(table, (list, tuple)) else [table])]
         if not tables:
             raise InputError("expected at least one table, got none")
-        tables = [_selected(t, _names(columns)) for t in tables]
+        tables = [_selected(t, listed(columns)) for t in tables]
         source = ", ".join(dict.fromkeys(t.source for t in tables))
         names = list(dict.fromkeys(name for t in tables for name in t.columns))
         units = {name: unit for t in reversed(tables) for name, unit in t.units.items()}
         numbers = [name for name in names if not is_run(name) and not is_time(name)]
-        roles = _roles(source, numbers, given, tables)
+        unit = time_unit_of(source, names, units, time_unit)
+        runs = runs_of(tables, numbers, SECONDS[unit], dt)
+        roles, decided = roles_of(source, numbers, given, runs)
         with_role = [name for role in ROLES for name in roles[role]]
-        angular = _angles(source, roles, _names(angles), _names(degrees), angles is None, units)
-        factors = {
-            name: math.pi / 180 if name in angular[1] else 1.0 for name in numbers
-        }  # fmt: skip
-        unit = _time_unit(source, names, units, time_unit)
-        runs = _runs(tables, numbers, factors, SECONDS[unit], dt)
         empty = [n for n in with_role if not any(np.isfinite(v[n]).any() for _, v in runs.values())]
         if empty:
             raise InputError(f"{source}: no value in column {', '.join(empty)}")
-        std = dict(std or {})
-        for what, wanted in (("std", std), ("offset", _names(offset)), ("scale", _names(scale))):
-            _check_known(source, what, wanted, with_role)
-        bad = {n: s for n, s in std.items() if not (math.isfinite(s) and s >= 0)}
-        if bad:
-            raise InputError(f"expected a finite σ, 0 or above, got std = {bad}")
+        angular, in_degrees = angles_of(
+            source, roles, listed(angles), listed(degrees), angles is None, units
+        )
+        factors = factors_of(numbers, in_degrees)
+        values = {
+            run: {name: column * factors[name] for name, column in of_run.items()}
+            for run, (_, of_run) in runs.items()
+        }
+        for what, wanted in (
+            ("std", std or {}),
+            ("offset", listed(offset)),
+            ("scale", listed(scale)),
+        ):
+            check_known(source, what, wanted, with_role)
         fields = {
             **roles,
             "runs": tuple(runs),
-            "angles": angular[0],
-            "std": {n: std[n] * factors[n] if n in std else None for n in with_role},
+            "angles": angular,
+            "std": _std(std or {}, with_role, factors),
             "units": {n: u for n, u in units.items() if n in numbers},
             "factors": factors,
             "time_unit": unit,
-            "offsets": _names(offset),
-            "scales": _names(scale),
+            "offsets": listed(offset),
+            "scales": listed(scale),
             "ignored": tuple(n for n in numbers if n not in with_role)
             + tuple(dict.fromkeys(n for t in tables for n in t.text)),
             "angles_given": angles is not None or degrees is not None,
-            "notes": (*(n for t in tables for n in t.notes), *_restarts(tables, runs)),
+            "notes": (*(n for t in tables for n in t.notes), *restarts(tables, runs), *decided),
             "source": source,
             "_times": {run: times for run, (times, _) in runs.items()},
-            "_values": {run: values for run, (_, values) in runs.items()},
+            "_values": values,
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -249,16 +263,17 @@ def read(
     paths:    ``.csv`` and other text (separated by commas, semicolons, tabs or blanks; decimal
               points or commas; lines of comments; a line of units below the names), ``.npz`` of
               named arrays, ``.npy``.
-    columns:  names of those to read; of all, in order, where a file names none.
+    columns:  names of those to read beside times and runs; of all, in order, where a file names
+              none.
     start, stop, every: rows to keep: between these times (in the file's unit), every so many.
     options:  positions, velocities, momenta, inputs, parameters, angles, degrees, time_unit, std,
               dt, offset, scale: as of `Recording`.
     Raises InputError, one line with the file and the line, where a file cannot be used.
     """
-    listed = [paths] if isinstance(paths, (str, Path)) else list(paths)
-    chosen = _names(columns)
+    several = [paths] if isinstance(paths, (str, Path)) else list(paths)
+    chosen = listed(columns)
     tables = []
-    for path in map(Path, listed):
+    for path in map(Path, several):
         if not path.is_file():
             raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
         if path.suffix.lower() in (".npz", ".npy"):
@@ -277,10 +292,6 @@ def _rows_of(table: Table, start: float, stop: float, every: int) -> Table:
     return dataclasses.replace(table, columns={n: v[keep] for n, v in table.columns.items()})
 
 
-def _names(given: Names) -> tuple[str, ...]:
-    return (given,) if isinstance(given, str) else tuple(given or ())
-
-
 def _number(text: str) -> float | None:
     try:
         return float(text)
@@ -296,182 +307,15 @@ def _selected(table: Table, columns: tuple[str, ...]) -> Table:
         raise InputError(
             f"{table.source}: no column {', '.join(missing)}, found {', '.join(table.columns)}"
         )
-    return dataclasses.replace(table, columns={n: table.columns[n] for n in columns})
+    kept = {n: x for n, x in table.columns.items() if n in columns or is_time(n) or is_run(n)}
+    return dataclasses.replace(table, columns=kept)
 
 
-def _roles(
-    source: str, names: list[str], given: dict[str, tuple[str, ...]], tables: list[Table]
-) -> dict[str, tuple[str, ...]]:
-    """The columns of each role: those given, or by name; constants of runs are parameters."""
-    wanted = [name for of_role in given.values() for name in of_role]
-    if wanted:
-        for role, of_role in given.items():
-            _check_known(source, role, of_role, names)
-        twice = [name for name in dict.fromkeys(wanted) if wanted.count(name) > 1]
-        if twice:
-            raise InputError(
-                f"{source}: expected one role of each column, got {', '.join(twice)} twice"
-            )
-        return given
-    roles = by_name(names)
-    if not any(roles[role] for role in ("positions", "velocities", "momenta")):
-        raise InputError(
-            f"{source}: the names {', '.join(names)} do not tell what was measured: say "
-            "--positions, --velocities, --inputs (positions=, velocities=, inputs=)"
-        )
-    for role in ("velocities", "momenta"):
-        if len(roles[role]) > len(roles["positions"]) > 0:
-            raise InputError(
-                f"{source}: {role} by their names {', '.join(roles[role])}, positions "
-                f"{', '.join(roles['positions'])}: say which, --positions and --{role}"
-            )
-    return roles
-
-
-def _angles(
-    source: str, roles: Mapping[str, tuple[str, ...]], given: tuple[str, ...],
-    degrees: tuple[str, ...], by_names: bool, units: Mapping[str, str],
-) -> tuple[tuple[str, ...], set[str]]:  # fmt: skip
-    """(angles in the order of the positions, columns in degrees)."""
-    known = (*roles["positions"], *roles["velocities"])
-    _check_known(source, "angles", given, roles["positions"])
-    _check_known(source, "degrees", degrees, known)
-    in_degrees = set(degrees) | {n for n in known if _unit(units, n).startswith(("deg", "°"))}
-    angles = set(given) | {n for n in roles["positions"] if n in in_degrees}
-    if by_names:
-        told = ("deg", "°", "rad")
-        angles |= {
-            n for n in roles["positions"]
-            if (is_angle(n) and not _unit(units, n)) or _unit(units, n).startswith(told)
-        }  # fmt: skip
-    return tuple(n for n in roles["positions"] if n in angles), in_degrees
-
-
-def _unit(units: Mapping[str, str], name: str) -> str:
-    return units.get(name, "").strip().lower()
-
-
-def _check_known(source: str, what: str, wanted: Any, known: Sequence[str]) -> None:
-    missing = [name for name in wanted if name not in known]
-    if missing:
-        raise InputError(
-            f"{source}: {what}: no column {', '.join(map(str, missing))} among "
-            f"{', '.join(known) or 'none'}"
-        )
-
-
-def _time_unit(source: str, names: list[str], units: Mapping[str, str], given: str | None) -> str:
-    """The unit of the times: the given one, the header's, that at the end of their name, or s."""
-    if given is not None:
-        if given not in SECONDS:
-            raise InputError(f"expected a time unit among {', '.join(SECONDS)}, got {given!r}")
-        return given
-    for name in names:
-        if is_time(name):
-            end = plain(name).rpartition("_")[2]
-            for unit in (_unit(units, name), end):
-                unit = unit.removesuffix("ec") if unit in ("sec", "msec", "usec") else unit
-                if unit in SECONDS:
-                    return unit
-            if _unit(units, name) and _unit(units, name) not in ("seconds", "second"):
-                raise InputError(
-                    f"{source}: {name}: unit {units[name]!r} is not known: say --time-unit "
-                    f"{'|'.join(SECONDS)}"
-                )
-    return "s"
-
-
-def _runs(
-    tables: list[Table], names: list[str], factors: Mapping[str, float], second: float,
-    dt: float | None,
-) -> dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]:  # fmt: skip
-    """Run -> times (n,) in seconds and columns (n,) by name, in order of appearance."""
-    found: dict[str, tuple[np.ndarray, dict[str, np.ndarray]]] = {}
-    stems = [Path(table.source).stem for table in tables]
-    for table, stem in zip(tables, stems, strict=True):
-        length = len(next(iter(table.columns.values()), ()))
-        if length == 0:
-            raise InputError(f"{table.source}: holds no rows")
-        parts = _parts(table, length, dt, second)
-        for inner, (rows, times) in parts.items():
-            name = inner
-            if len(tables) > 1 and len(set(stems)) == len(stems):
-                name = stem if len(parts) == 1 and not _run_column(table) else f"{stem}/{inner}"
-            elif name in found:
-                name = str(len(found))
-            nothing = np.full(len(rows), np.nan)
-            values = {
-                n: table.columns[n][rows] * factors[n] if n in table.columns else nothing
-                for n in names
-            }
-            _check_finite(table, rows, values)
-            found[name] = (times, values)
-    return found
-
-
-def _run_column(table: Table) -> str | None:
-    return next((name for name in table.columns if is_run(name)), None)
-
-
-def _parts(
-    table: Table, length: int, dt: float | None, second: float
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Run -> its rows (n,) and their times (n,) in seconds."""
-    column = _run_column(table)
-    time = next((name for name in table.columns if is_time(name)), None)
-    if time is None and dt is None:
-        raise InputError(
-            f"{table.source}: expected a column t or time, found {', '.join(table.columns)}; give "
-            "the time between rows: --dt (dt=)"
-        )
-    if column is not None:
-        labels, first, inverse = np.unique(
-            table.columns[column], return_index=True, return_inverse=True
-        )
-        groups = {str(labels[i]): np.flatnonzero(inverse == i) for i in np.argsort(first)}
-    elif dt is None:
-        assert time is not None
-        falls = np.flatnonzero(np.diff(table.columns[time]) < 0) + 1
-        groups = {str(i): rows for i, rows in enumerate(np.split(np.arange(length), falls))}
-    else:
-        groups = {"0": np.arange(length)}
-    if dt is not None:
-        return {run: (rows, dt * np.arange(len(rows))) for run, rows in groups.items()}
-    assert time is not None
-    parts = {}
-    for run, rows in groups.items():
-        times = table.columns[time][rows]
-        _check_times(table, time, rows, times)
-        parts[run] = (rows, times * second)
-    return parts
-
-
-def _restarts(tables: list[Table], runs: Mapping[str, Any]) -> list[str]:
-    """A note where times that fall have made runs."""
-    if len(runs) == len(tables) or any(_run_column(table) for table in tables):
-        return []
-    return [f"the times run back {len(runs) - len(tables)} times, and a run begins there"]
-
-
-def _check_times(table: Table, name: str, rows: np.ndarray, times: np.ndarray) -> None:
-    """Raises InputError where the times of a run are missing or do not rise."""
-    if not np.isfinite(times).all():
-        row = int(rows[np.argmin(np.isfinite(times))])
-        raise InputError(f"{table.source}: {table.locate(row)}: {name} is missing")
-    falls = np.flatnonzero(np.diff(times) <= 0)
-    if len(falls):
-        row, at = int(rows[falls[0] + 1]), int(falls[0])
-        same = times[at + 1] == times[at]
-        what = "is the same as" if same else "runs back from"
-        remedy = "keep one row of each time" if same else "number the runs in a column run"
-        raise InputError(
-            f"{table.source}: {table.locate(row)}: {name} = {times[at + 1]:.9g} {what} "
-            f"{times[at]:.9g} before it ({len(falls)} such rows): {remedy}"
-        )
-
-
-def _check_finite(table: Table, rows: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
-    for name, column in values.items():
-        if np.isinf(column).any():
-            row = int(rows[np.argmax(np.isinf(column))])
-            raise InputError(f"{table.source}: {table.locate(row)}, {name}: infinite")
+def _std(
+    given: Mapping[str, float], names: Sequence[str], factors: Mapping[str, float]
+) -> dict[str, float | None]:
+    """σ of each column, inside. Raises InputError where one is no size."""
+    bad = {name: s for name, s in given.items() if not (math.isfinite(s) and s >= 0)}
+    if bad:
+        raise InputError(f"expected a finite σ, 0 or above, got std = {bad}")
+    return {name: given[name] * factors[name] if name in given else None for name in names}

@@ -7,7 +7,10 @@ import unicodedata
 from collections.abc import Iterable
 
 ROLES = ("positions", "velocities", "momenta", "inputs", "parameters")
-TIMES = ("t", "time", "times", "timestamp", "timestamps", "elapsed", "clock", "sec", "seconds")
+TIMES = (
+    "t", "time", "times", "timestamp", "timestamps", "date", "datetime", "elapsed", "clock", "sec",
+    "seconds", "zeit", "temps", "tiempo", "tempo",
+)  # fmt: skip
 RUNS = ("run", "trial", "sequence", "seq", "episode", "experiment", "trajectory")
 
 _GREEK = {

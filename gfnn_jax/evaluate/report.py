@@ -81,6 +81,8 @@ def assemble(
         "hamiltonian": _hamiltonian(fit),
         "map": {
             "multiplier": fit.map.multiplier(),
+            "damping": _damping(fit),
+            "positions": None if fit.positions is None else vars(fit.positions),
             "symplecticity_defect": fit.symplecticity_defect if fit.tells_defect else None,
             "chart_determinant_min": fit.model_determinant_min,
             "chart_determinants_of_data": {n: j.low for n, j in fit.judgements.items()},
@@ -110,6 +112,14 @@ def assemble(
     }
 
 
+def _damping(fit: Fit) -> dict[str, Any] | None:
+    """The factor of areas, one or each degree of freedom's, with its standard error, and the drift
+    of the momenta; of a map that keeps areas none."""
+    if fit.damping is None:
+        return None
+    return {name: values.tolist() for name, values in vars(fit.damping).items()}
+
+
 def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
     """Learned H as formula and terms, where its flow meets the tolerance or was chosen."""
     if fit.hamiltonian is None or fit.formula is None:
@@ -117,6 +127,7 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
     law = fit.hamiltonian
     return {
         "formula": fit.formula,
+        "text": law.text,
         "terms": [term._asdict() for term in law.terms],
         "friction": [term._asdict() for term in law.friction],
         "dropped": law.dropped._asdict() if law.dropped is not None else None,

@@ -20,12 +20,13 @@ from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.generating.generated import Generated, ImplicitStep
 from gfnn_jax.generating.predictor import PolynomialModel
 from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.damping import Damping
 from gfnn_jax.solve.linear import COFACTORS_UP_TO, by_cofactors
 
 
 def why_not_piece(piece: Any) -> str | None:
     """Why a piece cannot be written in C; None where it can."""
-    if isinstance(piece, Affine):
+    if isinstance(piece, (Affine, Damping)):
         return None
     if not isinstance(piece, (Generated, Flow)):
         return f"the map has a piece {type(piece).__name__}"
@@ -52,7 +53,7 @@ def unknowns(piece: Generated, dim: int) -> int:
 def piece_functions(name: str, piece: Any, back: Any, width: int, more: int = 0) -> list[str]:
     """The functions of a piece and of its inverse ``back``, for states (width,), which ``more``
     args follow."""
-    if isinstance(piece, Affine):
+    if isinstance(piece, (Affine, Damping)):
         return [*_affine(f"{name}_step", piece, width), *_affine(f"{name}_back", back, width)]
     family, params = on_symbols(piece.family), np.asarray(piece.params)
     tape = Tape()
@@ -75,7 +76,7 @@ def _with_args(tape: Tape, name: str, width: int, more: int) -> tuple[np.ndarray
     return both[:, :width], both[:, width:] if more else None
 
 
-def _affine(name: str, piece: Affine, width: int) -> list[str]:
+def _affine(name: str, piece: Affine | Damping, width: int) -> list[str]:
     tape = Tape()
     image = tape.function(f"{name}_image", {"Z": piece.image(tape.inputs("z", width))})
     return [image, f"""\

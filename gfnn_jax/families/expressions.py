@@ -11,6 +11,7 @@ import ast
 import dataclasses
 import keyword
 import math
+import re
 from collections.abc import Sequence
 from functools import cache, cached_property
 from typing import Any
@@ -160,9 +161,29 @@ def check_names(dim: int, names: Sequence[str]) -> None:
             )
 
 
+_POWERS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹", "0123456789")
+_FACTORS = re.compile(r"([\w.]+|\)) +(?=(\w+|\())")
+
+
+def plain(text: str) -> str:
+    """Write a formula as people read it, "0.5 p1² − cos(q1)", as code does: "0.5*p1**2 - cos(q1)".
+
+    Text that is code already stays as it is.
+    """
+    text = re.sub("[⁰¹²³⁴⁵⁶⁷⁸⁹]+", lambda found: f"**{found[0].translate(_POWERS)}", text)
+
+    def times(found) -> str:
+        called = found[1] in {*FUNCTIONS, *_OTHER_NAMES} and found[2] == "("
+        code = called or any(keyword.iskeyword(word) for word in found.groups())
+        return found[0] if code else f"{found[1]}*"
+
+    return _FACTORS.sub(times, text.replace("−", "-"))
+
+
 @cache
 def parse(text: str, dim: int, parameters: tuple[str, ...] = ()) -> Expression:
-    """Parse an expression in q1..qd, p1..pd (q, p where d = 1) and the parameters into a tree.
+    """Parse an expression in q1..qd, p1..pd (q, p where d = 1) and the parameters into a tree,
+    written as code, "p1**2*q1", or as a formula is shown, "p1² q1".
 
     Raises InputError, in one line, for anything but numbers, + - * / **, the coordinates, the
     parameters and the functions of `FUNCTIONS`.
@@ -174,7 +195,7 @@ def parse(text: str, dim: int, parameters: tuple[str, ...] = ()) -> Expression:
         names.update(q=coordinate(0), p=coordinate(1))
     names.update({name: parameter(i) for i, name in enumerate(parameters)})
     try:
-        tree = ast.parse(text.strip(), mode="eval").body
+        tree = ast.parse(plain(text.strip()), mode="eval").body
         return _parsed(tree, names, text, 0)
     except (SyntaxError, ValueError, RecursionError, MemoryError, OverflowError) as error:
         if isinstance(error, InputError):

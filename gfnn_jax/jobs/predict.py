@@ -11,12 +11,15 @@ import jax
 import numpy as np
 
 from gfnn_jax.data.files import read_initial, read_initial_noise
+from gfnn_jax.data.kinds import are_recordings
 from gfnn_jax.data.parts import number_of_parts, part_of, put_together
 from gfnn_jax.data.predictions import PredictionWriter, is_done, job_of
+from gfnn_jax.data.recording import read
 from gfnn_jax.errors import InputError
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.bands import bands, horizon
+from gfnn_jax.maps.positions import starts_from_positions
 from gfnn_jax.maps.samples import Samples
 from gfnn_jax.maps.sharded import Sharded
 from gfnn_jax.maps.symplectic_map import Lanes, SymplecticMap
@@ -115,7 +118,10 @@ def predict(
             raise InputError(f"--dt: {error}") from error
     dt = float(map_.dt)
     names = () if map_.parameters is None else map_.parameters.names
-    z0, params = read_initial(initial, map_.dim, names)
+    if starts_from_positions(map_) and are_recordings(initial):
+        z0, params = _last_states(map_, model, initial), None
+    else:
+        z0, params = read_initial(initial, map_.dim, names)
     digest = hashlib.sha256(np.ascontiguousarray(z0).data)
     if params is not None:
         digest.update(np.ascontiguousarray(params).data)
@@ -173,6 +179,19 @@ def predict(
         for name in ("status", "left_at")
     )
     return Predicted(status, left_at, dt, sum(part.seconds for part in predicted))
+
+
+def _last_states(map_: SymplecticMap, model: Path, initial: Path) -> np.ndarray:
+    """(B, 2d): the states at the end of every run, from its last two positions."""
+    job = saved.record(model).get("job", {})
+    names = job.get("positions")
+    recording = read(initial, positions=names, angles=job.get("angles"))
+    ends = np.array([recording.array("positions", run)[-2:] for run in recording.runs])
+    if ends.shape[1:] != (2, map_.dim) or not np.isfinite(ends).all():
+        raise InputError(
+            f"{initial}: expected two positions of {map_.dim} coordinates at the end of every run"
+        )
+    return np.asarray(map_.step(map_.from_positions(ends[:, 0], ends[:, 1]))[0])
 
 
 def _written(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numbers
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -28,6 +29,8 @@ _OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; tho
 _COMPARED = 100
 FEWEST = 8  # pairs of a structure: 4 train, 4 are held out
 _COARSE = 0.01  # of what a step moves
+_FEWEST_JUMPS = 3  # by 2π, that make an angle
+_STILL = 1e-15  # of the spread: no move
 
 
 def check_request(
@@ -105,9 +108,14 @@ def check_request(
     if pairs.period is not None and chart == "type1":
         raise FitError("expected another chart than type1, which a driven map has not")
     if not own_dt and not 0 < float(pairs.dt) < np.inf:
-        raise FitError(f"expected a time step that is finite and above 0, got {pairs.dt}")
+        raise FitError(
+            f"expected a time step that is finite and above 0, got {pairs.dt}"
+            + (float(pairs.dt) < 0) * ": of steps back, z1 are the states and z0 their images"
+        )
     if isinstance(terms, str):
         raise FitError(f"expected a sequence of terms, got the text '{terms}'")
+    if not isinstance(terms, Sequence):
+        raise FitError(f"expected a sequence of terms, () for none; got {terms!r}")
     if any(not (isinstance(term, str) or callable(term)) for term in terms):
         raise FitError(f"expected terms as texts or functions of z, got {terms!r}")
     if structure is not None:
@@ -143,6 +151,12 @@ def check_request(
                 f"expected finite states, got {int((~finite).sum())} rows of {name} with NaN or "
                 f"infinity, the first is row {int(np.argmin(finite))}"
             )
+    z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
+    if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= _STILL:
+        raise FitError(
+            "expected states that move, got z1 = z0 in every pair: H = 0, or the same columns "
+            "twice?"
+        )
     if structure is None:
         check_number(pairs)
     elif len(pairs) < FEWEST:
@@ -263,4 +277,37 @@ def not_radians(pairs: Pairs, coordinates: Coordinates) -> list[str]:
         f"{move[a]:.3g} in a step: an angle has period 2π (radians); are these degrees?"
         for a in coordinates.angles
         if range_[a] > 2 * TWO_PI and move[a] > np.pi
+    ]
+
+
+def wrapped(pairs: Pairs, coordinates: Coordinates) -> list[int]:
+    """Indices in z of what jumps by 2π, as an angle does that is wrapped and was not named: its
+    values lie within one turn, some moves are beyond half a turn, and those are moves of the size
+    of the others where 2π is taken from them."""
+    if coordinates.forward is not CARTESIAN.forward:
+        return []
+    z0, move = np.asarray(pairs.z0), np.asarray(pairs.z1) - np.asarray(pairs.z0)
+    found = []
+    for i in (i for i in range(2 * pairs.dim) if i not in coordinates.angles):
+        size = np.abs(move[:, i])
+        jumps = size > np.pi
+        if not _FEWEST_JUMPS <= jumps.sum() < len(size) / 2 or np.ptp(z0[:, i]) > TWO_PI:
+            continue
+        most = min(1.5 * size[~jumps].max(), np.pi / 2)
+        if np.abs(size[jumps] - TWO_PI).max() <= most:
+            found.append(i)
+    return found
+
+
+def unnamed_angles(pairs: Pairs, coordinates: Coordinates) -> list[str]:
+    """A warning that names the coordinates which are `wrapped` angles, and the option."""
+    found = wrapped(pairs, coordinates)
+    if not found:
+        return []
+    move = np.abs(np.asarray(pairs.z1) - np.asarray(pairs.z0))
+    count, indices = int((move[:, found] > np.pi).any(axis=1).sum()), ",".join(map(str, found))
+    named = "coordinate " + indices if len(found) == 1 else f"coordinates {indices}"
+    return [
+        f"{named} of z: jumps of 2π in {count} of {len(pairs)} pairs, as of an angle that is "
+        f"wrapped; name it: --angles {indices}, angles=({indices},)"
     ]

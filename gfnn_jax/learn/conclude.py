@@ -10,7 +10,7 @@ from gfnn_jax.coordinates import CARTESIAN, nearest_image
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.learn.assemble import stepped
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance
-from gfnn_jax.learn.check import not_radians
+from gfnn_jax.learn.check import not_radians, wrapped
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.choose_law import long_step
 from gfnn_jax.learn.clock import SOLVE
@@ -21,11 +21,13 @@ from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import AS_FAR, MET, Entry
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.learn.sweeps import OF_SOLVE, OF_STEPS, LinearSweep
+from gfnn_jax.learn.white import leaves_white
 
 _NO_MORE = {
     False: "no larger library of terms promised to meet it",
     True: "the training of the network gained no more",
 }
+_RIGHT = "H is right, as far as these pairs tell, and what it leaves over is noise"
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _SHARE = 0.1  # of the residual, that a change of volume must explain
 _KNOWN = 1.5  # times the noise that was given: up to it, what is left over is that noise
@@ -67,8 +69,11 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     if met:
         return Conclusion(ended, searched.judges.pairs.std, [*messages, *request.budget.left_out])
     diagnosis: list[str] = []
+    jumps = wrapped(request.pairs, request.coordinates)
     structured = request.structure is not None  # too few pairs to look at their neighbours
-    if candidate.validation_relative > _ROUNDOFF and searched.linear is None:
+    if jumps:
+        ended = reason = "no map follows the jumps of an angle that is wrapped and was not named"
+    elif candidate.validation_relative > _ROUNDOFF and searched.linear is None:
         stalled = _stalled(candidate, chosen.entry, searched)
         left = _left_of_sites if structured else _what_is_left
         work = _work(chosen.entry or next(iter(found.ranking), None))
@@ -88,7 +93,10 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         diagnosis += proposed(searched.plain)
     if unmet and noise is None and not reason:  # else it is known why
         messages = [unmet, *messages]
-    messages += [not_met(candidate, request.tolerance, ended), *diagnosis]
+    unmet = not_met(candidate, request.tolerance, ended)
+    messages = (
+        [*diagnosis, *messages, unmet] if reason == _RIGHT else [*messages, unmet, *diagnosis]
+    )
     messages += request.budget.left_out
     return Conclusion(ended, noise, messages)
 
@@ -214,7 +222,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         noise = np.minimum(law.noise, noise)
     if judges.pairs.std is not None:
         return _beside_known(noise, judges.pairs.std)
-    own = ""
+    own, sizes_of_noise = "", ", ".join(f"{sigma:.1e}" for sigma in noise)
     if candidate.learns == "map" and entry is not None and isinstance(entry.sweep, LinearSweep):
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))
         own = f" (the map's own error is then about {part:.1g} of it)"
@@ -224,9 +232,16 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
             "or to depend on something that the states do not hold (a parameter, a drive), which "
             "single pairs do not tell from noise, "
         )
+    of_law = candidate.learns == "hamiltonian" and law is not None
+    if of_law and not hidden and leaves_white(law, searched.plain, judges):
+        message = (
+            "H is right, as far as these pairs tell: what it leaves over is white, noise of about "
+            f"{sizes_of_noise} on the coordinates in their order"
+        )
+        return _LeftOver(noise, [message], _RIGHT)
     message = (
         "larger models are no more accurate: the pairs seem to carry noise of about "
-        f"{', '.join(f'{sigma:.1e}' for sigma in noise)} on the coordinates in their order{own}, "
+        f"{sizes_of_noise} on the coordinates in their order{own}, "
         f"{hidden}or to have a structure that these functions cannot represent"
     )
     return _LeftOver(noise, [message])

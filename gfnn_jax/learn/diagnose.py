@@ -36,6 +36,10 @@ _SLOPE_ERROR = 0.05
 _KNOWN, _ERRORS, _MISSED = 0.06, 3.0, 0.1
 # A pair is an outlier that its neighbours' fit misses by so many standard deviations.
 _OUTLYING, _OUTLIER_ROUNDS = 30.0, 5
+# Where there are fewer pairs than so many neighbourhoods hold, more deviations make an outlier, by
+# that factor. Of 4,000 times 20 clean pairs of a kicked pendulum the most is 102 deviations: a fit
+# to a few neighbours is now and then good by chance.
+_NEIGHBOURHOODS = 10
 # Pairs that are looked at for gross errors, in blocks of a sequence: 50,000 take two seconds.
 _MOST_LOOKED_AT, _BLOCK = 50_000, 1_000
 # Of more terms than a few (above) only pairs are looked at that an affine map of all misses by so
@@ -47,6 +51,9 @@ _THIN = 0.05
 # What an affine fit within sequences may leave of a residual that agrees within them; neighbours
 # among which the nearest one of another sequence is sought.
 _EXPLAINED, _SEQUENCE_NEIGHBOURS = 0.25, 50
+# Times as much as a neighbour as far in the same sequence leaves over, one of another sequence does
+# where something differs between them.
+_ACROSS = 3.0
 # A cubic law is fitted where there are so many pairs for each of its terms.
 _PAIRS_PER_TERM = 10
 # The changes of volume of the inner half of the states and of the outer: within a factor, or by so
@@ -94,7 +101,7 @@ def local_jacobians(
     fewest = _NEIGHBOURS_PER_TERM * terms
     count = min(n, max(fewest, min(_MOST_NEIGHBOURS, fewest * n // _LOCAL_ENOUGH)))
     affordable = max(_FEWEST_CENTRES, int(_OPERATIONS / (6 * count * terms**2)))
-    chosen = np.random.default_rng(seed).permutation(n)[: min(_CENTRES, affordable)]
+    chosen = _centres(n, min(_CENTRES, affordable), seed)
     tree = cKDTree(x)
     while True:
         _, near = tree.query(x[chosen], k=count)
@@ -121,6 +128,15 @@ def local_jacobians(
     return slope * scale[:, None] / scale[None, :], known
 
 
+def centres(y0, jacobians, seed: int) -> np.ndarray:
+    """(n, 2d): the states among y0 (N, 2d) at which `local_jacobians` of this seed are."""
+    return np.asarray(y0)[_centres(len(y0), len(jacobians), seed)]
+
+
+def _centres(count: int, most: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).permutation(count)[:most]
+
+
 def outliers(y0, y1, scale, given=None) -> np.ndarray:
     """Rows of the pairs whose move contradicts that of the pairs around them.
 
@@ -133,8 +149,9 @@ def outliers(y0, y1, scale, given=None) -> np.ndarray:
     x, move = np.asarray(y0) / scale, (np.asarray(y1) - np.asarray(y0)) / scale
     x = x if given is None else np.concatenate([x, given], axis=1)
     rows, found = looked_for_errors(len(x)), []
+    few = _NEIGHBOURHOODS * _NEIGHBOURS_PER_TERM * (1 + x.shape[1]) / len(x)
     for _ in range(_OUTLIER_ROUNDS):
-        outlying = _studentised(x[rows], move[rows]) > _OUTLYING
+        outlying = _studentised(x[rows], move[rows]) > _OUTLYING * max(1.0, few)
         if not outlying.any():
             break
         found.append(rows[outlying])
@@ -325,7 +342,9 @@ def differs_between_sequences(z, residual, sequence) -> bool:
 
     z, residual: (N, 2d), in units of the coordinates' sizes; sequence: (N,). Within, every other
     pair of a sequence is predicted by an affine fit to the rest of it; between, a pair by its
-    nearest neighbours in other sequences. Noise is predicted by neither, a misfit by both.
+    nearest neighbour in other sequences, and by the next one of its own that is no nearer. Noise is
+    predicted by none of them, a misfit by as far a neighbour of whichever sequence; where that is
+    too far away to tell, as in many dimensions, nothing is.
     """
     z, residual = np.asarray(z), np.asarray(residual)
     total, within, rows = 0.0, 0.0, []
@@ -344,8 +363,12 @@ def differs_between_sequences(z, residual, sequence) -> bool:
     count = min(len(rows), _SEQUENCE_NEIGHBOURS)
     _, near = cKDTree(z[rows]).query(z[rows], k=count)
     other = sequence[rows][near] != sequence[rows][:, None]
-    known = other.any(axis=1)
     first = np.argmax(other, axis=1)  # the nearest of another sequence
-    guess = residual[rows][near[np.arange(len(rows)), first]]
-    error = np.sum((residual[rows] - guess)[known] ** 2)
-    return bool(error > 0.5 * np.sum(residual[rows][known] ** 2))
+    as_far = ~other & (np.arange(count) > first[:, None])
+    known = other.any(axis=1) & as_far.any(axis=1)
+    residual, near, places = residual[rows], near[known], np.arange(len(rows))[known]
+    across, along = (
+        np.sum((residual[places] - residual[near[np.arange(len(near)), k[known]]]) ** 2)
+        for k in (first, np.argmax(as_far, axis=1))
+    )
+    return bool(across > 0.5 * np.sum(residual[places] ** 2) and across > _ACROSS * along)

@@ -7,8 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.families.terms import given_terms
+from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.choose_charts import Charts, choose_charts
+from gfnn_jax.learn.damping import LearnedDamping, learn_damping, where_areas_differ
 from gfnn_jax.learn.diagnose import (
+    centres,
     data_defect,
     local_jacobians,
     look_symplectic,
@@ -21,44 +24,63 @@ from gfnn_jax.learn.varied import given_by
 
 
 class Diagnosis(NamedTuple):
+    """prepared: without what was factored out. plain: without base map and law, yet without a
+    ``damping`` of areas, where one was found."""
+
     prepared: Prepared
+    plain: Prepared
     charts: Charts
     data_defect: float
     messages: list[str]
+    damping: LearnedDamping | None = None
 
 
-def diagnose_request(request: Request, plain: Prepared) -> Diagnosis:
+def diagnose_request(request: Request, plain: Prepared, judges: Judges) -> Diagnosis:
     """The diagnosis of the pairs that a fit takes; a law that the user knows is factored out.
 
-    Raises FitError where no chart covers the data.
+    plain: the judges' pairs as prepared. Raises FitError where no chart covers the data.
     """
     if plain.varied or plain.structure is not None:  # H or a sum of terms is looked for first
-        return Diagnosis(plain, Charts([], None, {}, []), float("nan"), [])
+        return Diagnosis(plain, plain, Charts([], None, {}, []), float("nan"), [])
     prepared = plain
     if request.base is not None:
         known = given_terms(plain.dim, (request.base,))
         flow = flow_of(known, np.ones(known.num_parameters), plain)
         _, prepared = factored_out([flow], plain, request.seed)
-    return diagnosed(prepared, request.chart, request.reversor, request.seed)
-
-
-def diagnosed(prepared: Prepared, chart: str, reversor, seed: int) -> Diagnosis:
-    """What the local Jacobians say: whether the pairs look symplectic, and which charts cover
-    them; the base map is factored out where one is needed."""
-    jacobians, error = local_jacobians(
-        prepared.y0, prepared.y1, prepared.scale, given_by(prepared), seed=seed
+    # A law of the user's keeps areas, and so does what H of an autonomous system generates.
+    may_lose = request.base is None and request.learn != "hamiltonian" and not plain.after
+    return diagnosed(
+        prepared, request.chart, request.reversor, request.seed, judges if may_lose else None
     )
-    defect, messages = data_defect(jacobians, prepared.scale), _thin(prepared)
-    if not look_symplectic(jacobians, error, prepared.scale):
+
+
+def diagnosed(
+    prepared: Prepared, chart: str, reversor, seed: int, damped: Judges | None = None
+) -> Diagnosis:
+    """What the local Jacobians say: whether the pairs look symplectic, and which charts cover
+    them; the base map is factored out where one is needed.
+
+    damped: of these pairs, where a map that loses area is looked for: its D_b is factored out too.
+    """
+    plain = prepared
+    jacobians, error = local_jacobians(plain.y0, plain.y1, plain.scale, given_by(plain), seed=seed)
+    defect, messages, damping = data_defect(jacobians, plain.scale), _thin(plain), None
+    if damped is not None:
+        damping = learn_damping(plain, damped, jacobians, error, chart, reversor)
+    if damping is not None:
+        jacobians = damping.undone(jacobians)
+        prepared = plain = plain.without(None, damping.piece)
+    elif not look_symplectic(jacobians, error, plain.scale):
+        differing = where_areas_differ(jacobians, centres(plain.y0, jacobians, seed), plain.scale)
         messages.append(
             f"the pairs do not look symplectic: ‖MᵀJM − J‖ is about {defect:.2g}, known to within "
             f"{error:.1g} (0 for a symplectic map): are q and p in order, p momenta and not "
-            "velocities, and no friction?"
+            f"velocities, and no friction?{differing}"
         )
     charts = choose_charts(chart, prepared, reversor, jacobians)
     if charts.half is not None:
         prepared = prepared.without(charts.half, charts.half)
-    return Diagnosis(prepared, charts, defect, [*messages, *charts.messages])
+    return Diagnosis(prepared, plain, charts, defect, [*messages, *charts.messages], damping)
 
 
 def _thin(prepared: Prepared) -> list[str]:

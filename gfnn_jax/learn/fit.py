@@ -29,12 +29,14 @@ from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.clean import clean
 from gfnn_jax.learn.clock import COMPILE, ROWS, Budget
 from gfnn_jax.learn.conclude import conclude
+from gfnn_jax.learn.damping import LearnedDamping
 from gfnn_jax.learn.diagnose import ChartJudgement, looked_for_errors
 from gfnn_jax.learn.diagnosed import diagnose_request
 from gfnn_jax.learn.draw import NUM_PAIRS, drawn
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.noisy_sweeps import without_bias
+from gfnn_jax.learn.positions import OfPositions, learn_positions
 from gfnn_jax.learn.posterior import with_posterior, work_of_posterior
 from gfnn_jax.learn.recordings import fit_recording
 from gfnn_jax.learn.request import checked
@@ -67,7 +69,9 @@ class Fit:
     test_states: (n, 2d) held-out states, test_args their parameters. model_determinant_min: the
     chosen chart's determinant there, where it is closest to 0; NaN for a flow, which has no chart.
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
-    scene: as given. stated_by: the pairs by which the chosen candidate's error was measured.
+    scene: as given. damping: of a map that loses area, by how much of it in a step. positions: of a
+    map that was learned from positions alone, what its S is like; num_pairs are then triples.
+    stated_by: the pairs by which the chosen candidate's error was measured.
     validation_pairs, test_pairs: that chose, and that stated the error; None where the pairs were
     too few for these. operations: of the search, as counted; as ``max_operations`` they give this
     map again, whatever the clock. budget: what is left of it. tells_defect: whether there is
@@ -93,6 +97,8 @@ class Fit:
     hamiltonian: LearnedHamiltonian | None = None
     pairs: Pairs | None = None
     scene: Scene | None = None
+    damping: LearnedDamping | None = None
+    positions: OfPositions | None = None
     stated_by: str = ""
     test_pairs: Pairs | None = None
     operations: int = 0
@@ -280,8 +286,9 @@ def fit(
 
     Of a `Recording` learn its law, a Lagrangian with friction and inputs, from its positions: a
     `models.learned_law.LearnedLaw`; of the options ``learn`` ("auto" or "lagrangian"),
-    ``friction``, ``input_hold``, ``mass`` and ``on_progress`` apply (`learn.recordings`). Of pairs
-    a `Fit`.
+    ``friction``, ``input_hold``, ``mass`` and ``on_progress`` apply (`learn.recordings`). With
+    learn="map" learn the map of its positions instead, a `Fit`: see `fit_positions`. Of pairs a
+    `Fit`.
 
     pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order.
                Of different dt, S is a function of dt too, in the midpoint chart. With parameters
@@ -333,10 +340,21 @@ def fit(
     (a few are left out), and where the pairs do not look symplectic.
     """
     if isinstance(pairs, Recording):
-        if learn not in ("auto", "lagrangian"):
-            raise InputError(f"expected learn auto or lagrangian of a recording, got {learn!r}")
-        if scene is not None or terms or base is not None or structure is not None:
-            raise InputError("expected no scene, terms, base or structure of a recording")
+        if learn not in ("auto", "lagrangian", "map"):
+            raise InputError(
+                f"expected learn auto, lagrangian or map of a recording, got {learn!r}"
+            )
+        if scene is not None or terms or base is not None:
+            raise InputError("expected no scene, terms or base of a recording")
+        if learn == "map":
+            return fit_positions(
+                pairs, tolerance=tolerance, absolute_tolerance=absolute_tolerance,
+                structure=structure, seed=seed, max_seconds=max_seconds,
+                max_operations=max_operations, clock=clock, on_progress=on_progress,
+                on_candidate=on_candidate,
+            )  # fmt: skip
+        if structure is not None:
+            raise InputError("expected no structure of a recording whose law is learned")
         return fit_recording(
             pairs, friction=friction, input_hold=input_hold, mass=mass, on_progress=on_progress
         )
@@ -369,9 +387,11 @@ def fit(
                 f"a look for gross errors at all but {looked_at:,} of {len(request.pairs):,} pairs",
                 "those that the map misses by far are found in the end",
             )
-        seen = diagnose_request(request, plain)
-        warn(seen.messages)
         judges = Judges.of(pairs, seed, request.tolerance)
+        seen = diagnose_request(request, plain, judges)
+        warn(seen.messages)
+        if seen.damping is not None:
+            on_progress(str(seen.damping))
         found = searched(request, plain, seen, judges, on_better)
         seen, found, about_pairs = without_gross_errors(request, seen, found, row)
         warn(about_pairs)
@@ -405,11 +425,56 @@ def fit(
         model_determinant_min=_smallest_determinant(chosen),
         pairs=pairs,
         scene=scene,
+        damping=seen.damping if chosen.candidate.learns == "map" else None,
         stated_by=error.words,
         test_pairs=pairs.take(found.judges.test) if len(found.judges.test) else None,
         operations=budget.operations,
         budget=budget,
     )
+
+
+def fit_positions(
+    recording: Recording, *, tolerance: float = 1e-6, absolute_tolerance: float | None = None,
+    structure: str | None = None, seed: int = 0, max_seconds: float | None = MAX_SECONDS,
+    max_operations: int | None = None, clock: Callable[[], float] = time.perf_counter,
+    on_progress: Callable[[str], Any] = lambda message: None,
+    on_candidate: Callable[[Candidate], Any] = lambda candidate: None,
+) -> Fit:  # fmt: skip
+    """Learn the map behind positions alone, at even times or by turns: S(q, Q) of chart type 1.
+
+    recording: its positions, of one run or many; an angle's values that range over more than one
+    turn are a lift and trusted, others known modulo 2π. structure: "ring" or "chain" of equal
+    sites. The rest as of `fit`; errors are those of the next position.
+
+    The map acts on z = (q, p), p = −h ∂S/∂q: ``map.from_positions`` and
+    ``map.rollout(positions=(q, Q), …)`` start it. Positions of one place tell p but for a factor
+    and a gauge, which `models.discrete_lagrangian` fixes: frequencies, positions and stability do
+    not depend on them, the size of p, energies and areas do.
+    Raises FitError where the recording has no positions at even times, or too few.
+    """
+    require_x64("a fit")
+    relative = absolute_tolerance is None
+    asked = Tolerance(tolerance if absolute_tolerance is None else absolute_tolerance, relative)
+    budget = Budget(max_seconds, max_operations, clock, len(recording.positions) or None)
+    found = learn_positions(
+        recording, tolerance=asked, structure=structure, seed=seed, budget=budget,
+        say=on_progress, tell=on_candidate,
+    )  # fmt: skip
+    for message in found.messages:
+        warnings.warn(message, FitWarning, stacklevel=3)
+    test = found.states.take(found.test[: min(_JUDGED, block_of(2 * found.map.dim))])
+    determinant = np.asarray(found.map.determinant(test.z0))
+    return Fit(
+        map=found.map, candidates=found.candidates, asked=asked,
+        num_pairs=found.positions.num_triples, judgements={}, data_defect=float("nan"),
+        base_map=False, noise=None, messages=tuple(found.messages), ended=found.ended,
+        seconds=budget.seconds, compile_seconds=found.compile_seconds,
+        test_states=np.asarray(test.z0),
+        model_determinant_min=float(determinant[np.argmin(np.abs(determinant))]),
+        pairs=found.states, positions=found.positions, stated_by=found.stated_by,
+        validation_pairs=found.states.take(found.validation),
+        operations=budget.operations, budget=budget,
+    )  # fmt: skip
 
 
 def _devices(devices: int | str | None) -> tuple[Any, ...]:

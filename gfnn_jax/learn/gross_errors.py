@@ -67,8 +67,8 @@ def without_gross_errors(
         pairs, plain = found.judges.pairs, found.plain
         pairs, plain = pairs.take(others), plain.take(others)
         request.say(f"without {gone + len(rows)} of {count} pairs that are gross errors")
-        diagnosis = diagnose_request(request, plain)
         judges = Judges.of(pairs, request.seed, request.tolerance)
+        diagnosis = diagnose_request(request, plain, judges)
         again = searched(request, plain, diagnosis, judges, None)
         left = _residuals(again)
         if left is not None and not _rms(left) <= _RISE * _rms(size[others]):

@@ -11,6 +11,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.runs import looked_at
+from gfnn_jax.families.expressions import plain
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sums import matrix_free
@@ -91,6 +92,13 @@ class LearnedHamiltonian:
         """(m, m): rootᵀ root is the coefficients' covariance; None of a network. Computed when it
         is first asked for."""
         return None if self.covariance is None else self.covariance()
+
+    @property
+    def text(self) -> str | None:
+        """The formula as code, which sympy reads: "0.5*p1**2 - cos(q1)". None of a network, and of
+        a sum over sites or bodies, whose formula is that of a general one."""
+        whole = self.formula is not None and isinstance(self.flow.family, Terms)
+        return plain(self.formula) if whole and self.formula else None
 
     @property
     def fast(self) -> bool:

@@ -13,8 +13,11 @@ from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.learn.structures import Sites, Structure
 from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.damping import Damping
 from gfnn_jax.maps.domain import Domain, Ranges, covering
 from gfnn_jax.phase_space import Pairs, sizes
+
+Factored = Affine | Damping | Flow  # pieces that can be factored out of pairs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,8 +28,9 @@ class Prepared:
     of the inner coordinates. angle_centre: (a,) of each angle's interval. whole: the angles that
     cover their circle. before, after: pieces that were factored out, in the order in which they
     are applied around what is learned: R^½ on both sides for an affine base map R, the flow of a
-    law. dt: of all pairs, or in the middle of those that differ, which are ``own_dt`` (N,). args:
-    (N, k) values of the ``parameters``, or None. period: of a drive, whose time is their last.
+    law, D_b behind a map that loses area. dt: of all pairs, or in the middle of those that differ,
+    which are ``own_dt`` (N,). args: (N, k) values of the ``parameters``, or None. period: of a
+    drive, whose time is their last.
     structure: of many degrees of freedom, whose sizes and domain are then those of its parts.
     """
 
@@ -38,8 +42,8 @@ class Prepared:
     whole: tuple[int, ...]
     coordinates: Coordinates
     dt: float
-    before: tuple[Affine | Flow, ...] = ()
-    after: tuple[Affine | Flow, ...] = ()
+    before: tuple[Factored, ...] = ()
+    after: tuple[Factored, ...] = ()
     own_dt: np.ndarray | None = None
     args: np.ndarray | None = None
     parameters: tuple[str, ...] = ()
@@ -84,7 +88,7 @@ class Prepared:
             dataclasses.replace(self, y0=self.y0[rows], y1=self.y1[rows], own_dt=own_dt, args=args)
         )
 
-    def without(self, before: Affine | Flow | None, after: Affine | Flow | None) -> Prepared:
+    def without(self, before: Factored | None, after: Factored | None) -> Prepared:
         """These pieces factored out: before(z) -> after⁻¹(Z). The domain stays that of the
         states."""
         found = self

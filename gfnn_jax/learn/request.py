@@ -10,7 +10,12 @@ import numpy as np
 
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.learn.candidates import Candidate, Tolerance
-from gfnn_jax.learn.check import check_request, coarse_tolerance, unlike_the_scene
+from gfnn_jax.learn.check import (
+    check_request,
+    coarse_tolerance,
+    unlike_the_scene,
+    unnamed_angles,
+)
 from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.structures import Structure, structure_of
 from gfnn_jax.learn.varied import as_varied
@@ -99,7 +104,7 @@ def checked(
     )
     if scene is not None and scene.features is not None and family in ("auto", "features"):
         messages += unlike_the_scene(pairs, scene)
-    messages += coarse_tolerance(pairs, bound)
+    messages += [*coarse_tolerance(pairs, bound), *unnamed_angles(pairs, coordinates)]
     return Request(
         pairs, scene, coordinates, bound, learn, terms, base, found, family, model, chart, ensemble,
         seed,

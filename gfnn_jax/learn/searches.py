@@ -93,7 +93,7 @@ def searched(
     climb.climb(dearest)
     found = climb.found()
     dearest /= DEARER  # of maps that would be chosen
-    lossy = law is not None and bool(law.friction)
+    lossy = seen.damping is not None or (law is not None and bool(law.friction))
     if plain.varied or lossy:  # pairs of H's flow are drawn, and factored out, at one dt
         pass
     elif (
@@ -120,7 +120,7 @@ def searched(
     best = min((c.validation_bound for c in known), default=np.inf)
     linear = None
     if budget.over and best > bound.bound:
-        linear = linear_map(plain, judges)
+        linear = linear_map(seen.plain, judges)
         if linear is not None and linear.validation_bound < best:
             tell(linear)
         elif known:

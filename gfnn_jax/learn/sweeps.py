@@ -30,6 +30,7 @@ from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.rows import of_rows, rows_of
 from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.damping import Damping
 
 # Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
 # judged from one factor of the rows of its largest.
@@ -378,7 +379,9 @@ class LinearSweep(Generates):
     @property
     def moved_by_states(self) -> bool:
         """Whether ``of_states`` is all that states' noise does: not behind the flow of a law."""
-        return all(isinstance(p, Affine) for p in (*self.prepared.before, *self.prepared.after))
+        return all(
+            isinstance(p, (Affine, Damping)) for p in (*self.prepared.before, *self.prepared.after)
+        )
 
     @property
     def largest_known(self) -> Size:

@@ -21,6 +21,7 @@ import numpy as np
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.errors import InputError
 from gfnn_jax.families import lagrangian
+from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.ensemble import Ensemble
 from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.lagrangian import Friction
@@ -38,6 +39,7 @@ from gfnn_jax.generating.charts import Chart, TypeOne
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import PolynomialModel, Predictor
 from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.damping import Damping
 from gfnn_jax.maps.domain import Domain, Ranges
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.parameters import Parameters
@@ -56,10 +58,10 @@ _TYPES: dict[str, type] = {
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
         Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
         Windows, Groups, Ranges, OfTimeStep, Ensemble, Uniform, Forced, Legendre, Friction, Signals,
-        Sensors,
+        Sensors, Damping, OfDisplacement,
     )
 } | {"LagrangianTerms": lagrangian.Terms}  # fmt: skip
-_OTHERWISE = {lagrangian.Terms: "LagrangianTerms"}  # families.terms has Terms too
+_NAMES = {kind: name for name, kind in _TYPES.items()}
 
 
 def register(kind: type) -> type:
@@ -73,7 +75,7 @@ def register(kind: type) -> type:
         raise InputError(f"expected a dataclass to register, got {kind!r}")
     if _TYPES.get(kind.__name__, kind).__module__ != kind.__module__:
         raise InputError(f"another type is registered as {kind.__name__}: choose another name")
-    _TYPES[kind.__name__] = kind
+    _TYPES[kind.__name__], _NAMES[kind] = kind, kind.__name__
     return kind
 
 
@@ -229,7 +231,7 @@ def _encode(value: Any) -> tuple[Any, Any]:
         items = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
         if items.get("features") is not None:
             items["features"] = _OF_SCENE  # _lender has found whose they are
-        return _encode_all(items, {"type": _OTHERWISE.get(type(value), type(value).__name__)})
+        return _encode_all(items, {"type": _NAMES[type(value)]})
     if isinstance(value, tuple) and any(dataclasses.is_dataclass(item) for item in value):
         return _encode_all({str(i): item for i, item in enumerate(value)}, {"type": "tuple"})
     if isinstance(value, tuple):

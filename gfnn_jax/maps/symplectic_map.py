@@ -130,7 +130,8 @@ class SymplecticMap:
     dt_range:     (2,) the lowest and highest dt of the data, for a map that was learned with dt as
                   a variable of S.
     signals:      names of the inputs that act on the system, or None.
-    sensors:      what was measured and how well, of a map learned from a recording; no leaf either.
+    sensors:      columns of the recording that the map was learned from, with their noise, or None.
+                  They are no leaf.
     posterior:    posterior of the coefficients, or None. It is no leaf: a map that is made of the
                   leaves (``jit``, ``jax.tree.map``) has none.
 
@@ -198,8 +199,14 @@ class SymplecticMap:
         map_ = self if dt is None else self.over(dt, z.shape[:-1])
         return _step(map_, z, self._args(args, z, t0, inputs))
 
-    def inverse(self, z, args=None, *, t0=None):
-        """Make one step back, from Z to (z, Info). t0: the time at z, not at Z."""
+    def inverse(self, z=None, args=None, *, t0=None):
+        """Make one step back, from Z to (z, Info). t0: the time at z, not at Z. Raises ValueError
+        without states: the inverse map itself is ``reversed()``."""
+        if z is None:
+            raise ValueError(
+                "expected states to step back from, map.inverse(z); the inverse map itself is "
+                "map.reversed()"
+            )
         args = self._args(args, z := self._states(z), t0)
         if self.parameters is not None:
             args = self.parameters.after(args, 1, self.dt)
@@ -215,21 +222,35 @@ class SymplecticMap:
         known = not any(isinstance(value, Tracer) for value in (dt, self.dt))
         if known and np.ndim(dt) == 0 and np.array_equal(dt, self.dt):  # inside jit too
             return self
+        if not isinstance(dt, jax.Array):
+            dt = np.asarray(dt)
+            if dt.dtype.kind not in "fiu" or not (np.isfinite(dt) & (dt > 0)).all():
+                raise ValueError(
+                    f"expected a time step that is finite and above 0, got {dt}; for steps back "
+                    "give rollout a negative num_steps, or use inverse"
+                )
         if len(self.pieces) != 1 or not serves_any_dt(self.pieces[0]):
             raise ValueError(
                 "only the flow of a Hamiltonian can step another dt, got a map of dt = "
                 f"{float(np.asarray(self.dt)):g} only: fit with learn='hamiltonian'"
             )
-        if not isinstance(dt, jax.Array):
-            dt = np.asarray(dt)
-            if dt.dtype.kind not in "fiu" or not (np.isfinite(dt) & (dt > 0)).all():
-                raise ValueError(f"expected a time step that is finite and above 0, got {dt}")
         if dt.shape not in ((), lanes):
             raise ValueError(
                 f"expected one time step, or one per state {lanes}; got shape {dt.shape}"
             )
         dt = dt.astype(self.scale.dtype)
         return dataclasses.replace(self, pieces=(self.pieces[0].over(dt),), dt=dt)
+
+    def from_positions(self, q, other):
+        """The state z = (q, p) at q, (2d,) or (B, 2d), of a map that was learned from positions
+        alone, from q and the position ``other`` a step later, (d,) or (B, d) each: p = −h ∂S/∂q.
+
+        Where angles were learned from readings modulo their period, the move is taken modulo it;
+        else a lift is trusted. Raises ValueError for another map, or another shape.
+        """
+        from gfnn_jax.maps import positions  # stands after this module: a shorthand
+
+        return positions.state_at(self, q, other)
 
     def then(self, other: SymplecticMap) -> SymplecticMap:
         """Compose this map and the other one after it: sectors of a ring, phases of a period.
@@ -371,16 +392,19 @@ class SymplecticMap:
         return _advance(self, lanes, args, num_saved, save_every, stop_outside)
 
     def rollout(
-        self, z0, num_steps: int, *, params=None, t0=None, inputs=None, dt=None,
+        self, z0=None, num_steps: int = 0, *, positions=None, params=None, t0=None, inputs=None,
+        dt=None,
         save_every: int = 1, stop_outside: bool = False, samples: int | None = None, key=None,
     ) -> tuple[Any, RolloutInfo]:  # fmt: skip
-        """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d).
+        """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d), back by the inverse map where the
+        number is negative.
 
+        positions: (q, Q) in place of z0, of `from_positions`: the first two positions.
         params: the values of a map's parameters. t0: the time of a drive at z0; it advances with
         the steps. inputs: of each step's begin, (num_steps, k) or (B, num_steps, k), and, as one
         row more, at the last one's end. dt: argument of `over`. samples: number of maps drawn from
         the posterior with key, of ``jax.random``; the states of all of them are in memory at once.
-        Returns the states (B, 1 + num_steps // save_every, 2d), the initial ones first, and a
+        Returns the states (B, 1 + |num_steps| // save_every, 2d), the initial ones first, and a
         RolloutInfo. With samples its ``bands`` have their std about the states, and quantiles. A
         lane is NaN from where its step fails, or from where it leaves the domain with
         ``stop_outside``. Raises ValueError where a number of steps or a shape is wrong, and where
@@ -389,15 +413,23 @@ class SymplecticMap:
         for name, number in (("num_steps", num_steps), ("save_every", save_every)):
             if not isinstance(number, Integral):
                 raise ValueError(f"expected a whole number as {name}, got {number!r}")
-        if save_every < 1 or num_steps < 0:
-            raise ValueError(
-                f"expected num_steps >= 0 and save_every >= 1, got {num_steps} and {save_every}"
-            )
+        if save_every < 1:
+            raise ValueError(f"expected save_every >= 1, got {save_every}")
+        if num_steps < 0:
+            map_ = self if dt is None else self.over(dt, np.shape(z0)[:-1])
+            return map_.reversed().rollout(
+                z0, -num_steps, params=params, t0=t0, save_every=save_every,
+                stop_outside=stop_outside, samples=samples, key=key,
+            )  # fmt: skip
         if save_every > num_steps > 0:
             raise ValueError(
                 f"expected save_every <= num_steps, got {save_every} and {num_steps}: only the "
                 "initial states would be saved"
             )
+        if (z0 is None) == (positions is None):
+            raise ValueError("expected either states z0 or two positions (q, Q) to start from")
+        if positions is not None:
+            z0 = self.from_positions(*positions)
         z0 = self._states(z0)
         map_ = self if dt is None else self.over(dt, z0.shape[:-1])
         args = map_._schedule(params, z0, t0, inputs, num_steps)

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gfnn_jax.coordinates import TWO_PI, to_inner, to_user
+from gfnn_jax.errors import InputError
 from gfnn_jax.phase_space import Pairs, hamiltonian_vector_field, require_x64
 from gfnn_jax.scenes.scene import AroundOrbit, DrawnFrom, Scene
 
@@ -149,8 +150,28 @@ def _trajectories(z0, save_every, num_saved, dt, flow, step, section, hamiltonia
 
 
 def _reference(scene: Scene) -> tuple:
-    """Everything that a trajectory of the scene depends on, as arguments of `_trajectories`."""
+    """Everything that a trajectory of the scene depends on, as arguments of `_trajectories`.
+
+    Raises InputError where the scene's flow, map or Hamiltonian is written with NumPy.
+    """
     hamiltonian = scene.hamiltonian
+    z, t = jax.ShapeDtypeStruct((2 * scene.dim,), jnp.float64), 0.0
+    given = (jnp.zeros(len(scene.parameters)),) if scene.parameters else ()
+    name, function, arguments = next(
+        (name, function, arguments)
+        for name, function, arguments in (
+            ("flow", scene.flow, (z, t)), ("step", scene.step, (z,)), ("", scene.section, ()),
+            ("hamiltonian", hamiltonian, (z, t, *given)),
+        )
+        if function is not None
+    )  # fmt: skip
+    try:
+        _ = name and jax.eval_shape(function, *arguments)
+    except jax.errors.TracerArrayConversionError:
+        raise InputError(
+            f"expected the {name} of the scene {scene.name} written with jax.numpy, which JAX can "
+            "trace; it uses NumPy's functions"
+        ) from None
     if scene.parameters or scene.any_phase:
         assert hamiltonian is not None
         hamiltonian = _WithArgs(hamiltonian, 2 * scene.dim, scene.any_phase)

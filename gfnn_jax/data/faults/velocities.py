@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from gfnn_jax.data.columns import SECONDS
 from gfnn_jax.data.faults import angles
 from gfnn_jax.data.faults.fault import Fault
-from gfnn_jax.data.recording import SECONDS
 from gfnn_jax.data.traits import Traits
 from gfnn_jax.signals.derivatives import Relation, difference
 
@@ -60,22 +60,13 @@ def _jumps(traits: Traits, x: str) -> bool:
     return found is not None and not (x in traits.recording.angles and found[0] < 10)
 
 
-def _score(relation: Relation | None) -> float:
-    """How well a pair is a position and its velocity: 1 where v = ẋ, lower for other factors."""
-    if relation is None or not np.isfinite(relation.factor):
-        return 0.0
-    unlike = 1 - np.exp(-abs(np.log(abs(relation.factor))))
-    return relation.explained - 0.3 * unlike - 0.3 * (relation.factor < 0)
-
-
 def _other_order(traits: Traits, declared: list[tuple[str, str]]) -> list[tuple[str, str]] | None:
     """The pairs of the same columns that fit much better than the declared ones, or None."""
     if not 1 <= len(declared) <= 3:
         return None
     names = [name for pair in declared for name in pair]
-    scores = {
-        pair: _score(traits.relation(*pair)) for pair in itertools.permutations(names, 2)
-    }  # fmt: skip
+    related = {pair: traits.relation(*pair) for pair in itertools.permutations(names, 2)}
+    scores = {pair: 0.0 if r is None else r.likeness for pair, r in related.items()}
     best = max(_pairings(names), key=lambda pairs: sum(scores[pair] for pair in pairs))
     now = sum(scores[pair] for pair in declared)
     better = sum(scores[pair] for pair in best) > now + _BETTER

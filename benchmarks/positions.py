@@ -1,0 +1,158 @@
+"""Maps learned from positions alone: one step, long rollouts, what noise does.
+
+    python benchmarks/positions.py                 pieces without a result, then the table
+    python benchmarks/positions.py --only ring-64 --overwrite
+    python benchmarks/positions.py --quick         small sizes, into runs/positions, no table
+
+A piece's result is one JSON file, positions-*.json in benchmarks/results; the section of
+benchmarks/RESULTS.md is made from these files alone. Test positions are of runs that no fit saw.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from functools import partial
+
+# Sets float64, so it comes before all of JAX.
+from harness import SEED, TABLES, Numbers, between_markers, markdown, number, provenance, results
+from harness import main as run_pieces
+
+# isort: split
+import numpy as np
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+from gfnn_jax.coordinates import nearest_image
+
+KICK, COUPLING_KICK, COUPLING, SITES = 0.6, 0.5, 0.1, 64
+NOISE = 1e-4
+
+
+def standard_map(number: int, steps: int, seed: int) -> np.ndarray:
+    """θ (number, steps + 1, 1), lifted: all of the torus, K = 0.6."""
+    theta, p = np.random.default_rng(seed).uniform(0, 2 * np.pi, (2, number))
+    read = [theta]
+    for _ in range(steps):
+        p = p + KICK * np.sin(theta)
+        theta = theta + p
+        read.append(theta)
+    return np.stack(read, axis=1)[..., None]
+
+
+def ring(number: int, steps: int, seed: int) -> np.ndarray:
+    """θ of Froeschlé's ring of 64 (number, steps + 1, 64)."""
+    q, p = np.random.default_rng(seed).uniform(-np.pi, np.pi, (2, number, SITES))
+    read = [q]
+    for _ in range(steps):
+        bond = COUPLING * np.sin(np.roll(q, -1, axis=1) - q)
+        p = p + COUPLING_KICK * np.sin(q) + bond - np.roll(bond, 1, axis=1)
+        q = q + p
+        read.append(q)
+    return np.stack(read, axis=1)
+
+
+def henon_heiles(number: int, steps: int, seed: int) -> np.ndarray:
+    """x, y (number, steps + 1, 2) below E = 1/12, dt 0.5."""
+    rng, starts = np.random.default_rng(seed), []
+    while len(starts) < number:
+        q, energy, angle = rng.uniform(-0.5, 0.5, 2), rng.uniform(0, 1 / 12), rng.uniform(0, 7)
+        left = energy - (0.5 * q @ q + q[0] ** 2 * q[1] - q[1] ** 3 / 3)
+        if left > 0:
+            speed = np.sqrt(2 * left)
+            starts.append([*q, speed * np.cos(angle), speed * np.sin(angle)])
+
+    def field(_, z):
+        x, y, px, py = z.reshape(4, -1)
+        return np.concatenate([px, py, -x - 2 * x * y, -y - x**2 + y**2])
+
+    solution = solve_ivp(
+        field, (0, 0.5 * steps), np.array(starts).T.ravel(), method="DOP853", rtol=1e-13,
+        atol=1e-15, t_eval=0.5 * np.arange(steps + 1),
+    )  # fmt: skip
+    return solution.y.reshape(4, number, -1).transpose(1, 2, 0)[..., :2]
+
+
+def recorded(q: np.ndarray, dt: float, angles: bool) -> gfnn.Recording:
+    """Positions (runs, steps, d) as a recording."""
+    runs, steps, dim = q.shape
+    names = [f"q{i + 1}" for i in range(dim)]
+    table = {"run": np.repeat(np.arange(runs), steps), "t": np.tile(dt * np.arange(steps), runs)}
+    table |= {name: q[..., i].ravel() for i, name in enumerate(names)}
+    return gfnn.Recording(table, positions=names, angles=names if angles else ())
+
+
+def measured(
+    quick: bool, *, sample: Callable, triples: int, last: int, dt: float = 1.0,
+    angles: bool = False, wrapped: bool = False, structure: str | None = None,
+    tolerance: float = 1e-12, noise: float = 0.0,
+) -> Numbers:  # fmt: skip
+    """A fit to so many triples, and its rollouts to step ``last`` from two positions."""
+    triples = triples // 4 if quick else triples
+    given, test = sample(triples, 2, SEED), sample(40, last, SEED + 1)
+    given = given + noise * np.random.default_rng(SEED + 2).normal(size=given.shape)
+    if wrapped:
+        given, test = np.mod(given, 2 * np.pi), np.mod(test, 2 * np.pi)
+    started = time.process_time()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)
+        fit = gfnn.fit(
+            recorded(given, dt, angles), learn="map", structure=structure, tolerance=tolerance,
+            max_seconds=None,
+        )  # fmt: skip
+    seconds = time.process_time() - started
+    states, _ = fit.map.rollout(positions=(test[:, 0], test[:, 1]), num_steps=last)
+    error = np.asarray(states)[..., : test.shape[2]] - test
+    error = nearest_image(error, tuple(range(test.shape[2])) if angles else ())
+    size = np.linalg.norm(error, axis=-1)
+    found = {
+        "triples": triples, "terms": fit.chosen.num_parameters, "rank": fit.chosen.rank,
+        "symmetric": fit.positions is not None and fit.positions.symmetric,
+        "one_step": float(np.sqrt(np.mean(error[:, 2] ** 2))), "last": last,
+        "median_at_last": float(np.median(size[:, last])), "defect": fit.symplecticity_defect,
+        "cpu_seconds": seconds,
+    }  # fmt: skip
+    if test.shape[2] == 2:  # masses at rest: of Hénon–Heiles equal
+        piece = fit.map.pieces[0]
+        hessian = np.asarray(piece.family.gradient_and_hessian(piece.params, np.zeros((1, 4)))[1])
+        found["mass_ratio"] = float(hessian[0, 0, 2] / hessian[0, 1, 3])
+    return found
+
+
+PIECES = {
+    "standard-map-lifted": partial(
+        measured, sample=standard_map, triples=2_000, last=100, angles=True
+    ),
+    "standard-map-wrapped": partial(
+        measured, sample=standard_map, triples=2_000, last=100, angles=True, wrapped=True
+    ),
+    "henon-heiles": partial(measured, sample=henon_heiles, triples=3_000, last=300, dt=0.5),
+    "henon-heiles-noise": partial(
+        measured, sample=henon_heiles, triples=3_000, last=300, dt=0.5, noise=NOISE, tolerance=1e-3
+    ),
+    "ring-64": partial(
+        measured, sample=ring, triples=200, last=10, angles=True, wrapped=True, structure="ring",
+        tolerance=1e-10,
+    ),
+}  # fmt: skip
+
+
+def tables() -> None:
+    found = results(PIECES, "positions")
+    rows = [
+        [
+            name, number(m["triples"]), number(m["terms"]), number(m["one_step"]),
+            f"{number(m['median_at_last'])} (step {m['last']})", number(m["defect"]),
+            f"{m['mass_ratio']:.4f}" if "mass_ratio" in m else "–", number(m["cpu_seconds"]),
+        ]
+        for name, m in ((name, result["measured"]) for name, result in found.items())
+    ]  # fmt: skip
+    heads = ("from positions alone", "triples", "terms of S", "one step, RMS", "median error",
+             "‖MᵀJM − J‖", "mass ratio", "CPU s")  # fmt: skip
+    text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
+    between_markers(TABLES, "positions", text)
+
+
+if __name__ == "__main__":
+    run_pieces(__doc__ or "", PIECES, "positions", tables, None)

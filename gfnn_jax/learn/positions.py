@@ -1,0 +1,377 @@
+"""``gfnn.fit`` of positions alone: the map behind them, by an S(q, Q) that is learned from triples.
+
+triples → sizes of S by rising degree, symmetric first → the smallest that meets the tolerance, else
+the best → its map, judged by its own steps from positions that were held out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from gfnn_jax.coordinates import Coordinates, circle_centre, nearest_image, whole_turns
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.dataset.runs import identified
+from gfnn_jax.dataset.split import Split, split_rows
+from gfnn_jax.errors import FitError, OutOfTime
+from gfnn_jax.families.displacements import OfDisplacement
+from gfnn_jax.families.inputs import box_inputs, variable_signs
+from gfnn_jax.families.products import Products
+from gfnn_jax.families.sums import matrix_free
+from gfnn_jax.generating.charts import TYPE1
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.generating.predictor import affordable, fit_predictors
+from gfnn_jax.learn.assemble import stepped
+from gfnn_jax.learn.candidates import Candidate, OneStepError, Tolerance, one_step_error
+from gfnn_jax.learn.clock import ROWS, Budget
+from gfnn_jax.learn.search import MET
+from gfnn_jax.learn.structures import Sites, structure_of
+from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.discrete_lagrangian import left_over, solve
+from gfnn_jax.models.triples import Triples, triples_of
+from gfnn_jax.phase_space import Pairs, sizes
+
+_DEGREES = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)
+_ROWS_PER_TERM, _MOST_OPERATIONS = 3, 2e10  # of one solve: a few seconds on one core
+_FEWEST = 20  # triples
+_BETTER, _WORSE = 0.9, 3  # of the residual: sizes in a row that leave more end a sweep
+_GAIN = 0.5  # of the residual: what an S without symmetry must lower it to
+_ROUNDOFF = 1e-15  # of the spread
+_SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved
+_TURNS = 1e-8  # radians, to which momenta must turn with the moves to be angles
+
+
+@dataclasses.dataclass(frozen=True)
+class OfPositions:
+    """What an S of positions alone is like.
+
+    symmetric: whether S(q, Q) = S(Q, q). rank: how many combinations of its terms the data tell;
+    the others, the factor of S among them, are those of free motion. condition: of those told.
+    """
+
+    symmetric: bool
+    num_parameters: int
+    rank: int
+    condition: float
+    num_triples: int
+
+    def __str__(self) -> str:
+        """What was learned, in a line."""
+        left = self.num_parameters - self.rank
+        kind = "symmetric, as of a reversible map" if self.symmetric else "of no symmetry"
+        return (
+            f"S(q, Q) of {self.num_triples:,} triples of positions, {kind}; its factor, and so the "
+            "unit of momenta, is fixed by its mixed term"
+            + (f"; {left} more combinations of terms are left open, and are 0" if left else "")
+        )
+
+
+class LearnedPositions(NamedTuple):
+    """The map, every size that was tried, what its S is like, all states as pairs, the rows that
+    chose and those that state the error, and what is to be said."""
+
+    map: SymplecticMap
+    candidates: tuple[Candidate, ...]
+    positions: OfPositions
+    states: Pairs
+    validation: np.ndarray
+    test: np.ndarray
+    stated_by: str
+    messages: list[str]
+    ended: str
+    compile_seconds: float
+
+
+def learn_positions(
+    recording: Recording, *, tolerance: Tolerance, budget: Budget, structure: str | None = None,
+    seed: int = 0, say: Callable[[str], Any] = lambda message: None,
+    tell: Callable[[Candidate], Any] = lambda candidate: None,
+) -> LearnedPositions:  # fmt: skip
+    """The map behind the positions of a recording, at even times or by turns.
+
+    structure: "ring" or "chain" of equal sites. Raises FitError where the triples are too few for
+    the smallest S, or no S explains them.
+    """
+    triples = triples_of(recording, sites=structure is not None)
+    sites = structure_of(structure, triples.dim, Coordinates("positions", triples.angles))
+    if sites is not None and not isinstance(sites, Sites):
+        raise FitError(f"expected a ring or a chain of positions, got {structure!r}")
+    if len(triples) < _FEWEST:
+        raise FitError(f"expected at least {_FEWEST} triples of positions, got {len(triples)}")
+    sweep = _Sweep(triples, sites, _split(triples, seed), tolerance, budget, say, tell)
+    best = sweep.best(symmetric=True)
+    if best is None or best.candidate.validation_bound > tolerance.bound:
+        other = sweep.best(symmetric=False)
+        if other is not None and (best is None or _clearly_better(other, best)):
+            best = other
+    if best is None:
+        raise FitError(
+            f"expected more triples of positions, or more time: {len(triples)} are too few for the "
+            "smallest S, or no S of theirs has a step"
+        )
+    return sweep.learned(best, say)
+
+
+class _Found(NamedTuple):
+    piece: Generated
+    candidate: Candidate
+    about: OfPositions
+
+
+def _clearly_better(one: _Found, other: _Found) -> bool:
+    return one.candidate.validation_bound < _GAIN * other.candidate.validation_bound
+
+
+@dataclasses.dataclass
+class _Sweep:
+    """The triples, which of them train, choose and test, and every size that was tried."""
+
+    triples: Triples
+    sites: Sites | None
+    split: Split
+    tolerance: Tolerance
+    budget: Budget
+    say: Callable[[str], Any]
+    tell: Callable[[Candidate], Any]
+    tried: list[Candidate] = dataclasses.field(default_factory=list)
+
+    @property
+    def spread(self) -> np.ndarray:
+        """(d,) of the positions; of an angle at most that of its circle."""
+        size = sizes(self.triples.middle)
+        angles = list(self.triples.angles)
+        size[angles] = np.minimum(size[angles], np.pi / np.sqrt(3))
+        return size
+
+    def best(self, *, symmetric: bool) -> _Found | None:
+        """The smallest S whose steps meet the tolerance, else the most accurate; None where the
+        triples are too few for any, or no S has a step."""
+        found: _Found | None = None
+        worse = 0
+        for family in self._families(symmetric):
+            rows = len(self.split.training) * self.triples.dim
+            try:
+                with self.budget.unit(
+                    f"S of {family.label}", ROWS, rows * family.num_parameters**2
+                ):
+                    new = self._fitted(family, symmetric)
+            except OutOfTime:
+                break
+            if found is None or not new.candidate.validation_bound >= (
+                _BETTER * found.candidate.validation_bound
+            ):
+                found, worse = new, 0
+            else:
+                worse += 1
+            met = found.candidate.validation_bound <= max(self.tolerance.bound, _ROUNDOFF)
+            if met or worse == _WORSE:
+                break
+        if found is None or not np.isfinite(found.candidate.validation_bound):
+            return None
+        return found
+
+    def _families(self, symmetric: bool) -> Iterator[OfDisplacement]:
+        """By rising size, as many as the training triples determine."""
+        triples, rows = self.triples, len(self.split.training) * self.triples.dim
+        # An angle stays as it is: the middle of two would be known by half a turn only.
+        part, moves = 0.0 if triples.angles else 0.5, _centres_of_moves(triples)
+        for k, inner in enumerate(self._inner(symmetric, part)):
+            both = symmetric and getattr(inner, "signs", None) is None
+            family = OfDisplacement(inner, part, both, moves)
+            terms = family.num_parameters
+            if _ROWS_PER_TERM * terms > rows or (k and rows * terms**2 > _MOST_OPERATIONS):
+                return
+            yield family
+
+    def _inner(self, symmetric: bool, part: float) -> Iterator[Any]:
+        """The F of S, of a position and a displacement."""
+        dim = self.triples.dim
+        if self.sites is not None:
+            yield from self.sites.libraries(dim)
+            return
+        q, other = np.split(self.triples.ends, 2, axis=1)
+        x = np.concatenate([q + part * (other - q), other - q], axis=1)
+        if part:
+            turned = (1,) * dim + (-1,) * dim
+            inputs = box_inputs(x, reversor=turned)
+            signs = variable_signs(inputs, turned, x) if symmetric else None
+            yield from (Products(inputs, degree, signs) for degree in _DEGREES)
+            return
+        if symmetric:
+            x = np.concatenate([x, np.concatenate([other, q - other], axis=1)])
+        inputs = box_inputs(x, angles=self.triples.angles)
+        yield from (Products(inputs, degree) for degree in _DEGREES)
+
+    def _fitted(self, family: OfDisplacement, symmetric: bool) -> _Found:
+        """S of this family, and the error of its steps from positions that were held out."""
+        self.say(f"S of {family.label}, {family.num_parameters} terms")
+        started, triples = time.perf_counter(), self.triples
+        training, held = (triples.take(r) for r in (self.split.training, self.split.validation))
+        solved = solve(family, training)
+        params = family.unflatten(solved.coefficients)
+        states = _states(family, params, triples)
+        piece = Generated(family, params, TYPE1, triples.dt, sizes(states[0]))
+        left = left_over(family, params, training) / self.spread
+        error = self.error_of(_images(piece, held), self.split.validation)
+        gradient, with_hessian = family.operations
+        candidate = Candidate(
+            label=family.label, family=family.name, chart=TYPE1.name,
+            num_parameters=family.num_parameters, operations=float(gradient + with_hessian),
+            validation_rms=error.rms, validation_relative=error.relative,
+            validation_bound=error.bound, deviations=error.deviations,
+            train_rms=float(np.sqrt(np.mean(left**2))), validated=True,
+            fit_seconds=time.perf_counter() - started, condition=solved.condition,
+            rank=solved.rank,
+        )  # fmt: skip
+        self.tried.append(candidate)
+        self.tell(candidate)
+        about = OfPositions(
+            symmetric, family.num_parameters, solved.rank, solved.condition, len(triples)
+        )
+        return _Found(piece, candidate, about)
+
+    def error_of(self, positions: np.ndarray, rows: np.ndarray) -> OneStepError:
+        """Of the last positions (n, d) of these rows, as predicted."""
+        error = nearest_image(positions - self.triples.after[rows], self.triples.angles)
+        return one_step_error(error, self.spread, self.tolerance, self.split.stretch[rows])
+
+    def learned(self, best: _Found, say: Callable[[str], Any]) -> LearnedPositions:
+        """The map of the best S, its error that of the steps that users run, on triples that chose
+        nothing where there are enough."""
+        say(f"compiling the step of {best.candidate.label}")
+        map_, states = _map_of(best.piece, self.triples, self.sites)
+        test = self.split.test if len(self.split.test) else self.split.validation
+        steps = stepped(map_, states.z1[test])
+        images = np.where(steps.failed[:, None], np.nan, steps.images)[:, : self.triples.dim]
+        error = self.error_of(images, test)
+        chosen = dataclasses.replace(
+            best.candidate, validation_rms=error.rms, validation_relative=error.relative,
+            validation_bound=error.bound, deviations=error.deviations, map=map_, chosen=True,
+            newton_iterations_max=int(steps.iterations.max()),
+            microseconds_per_step=steps.microseconds_per_step,
+        )  # fmt: skip
+        others = [c for c in self.tried if c is not best.candidate]
+        met, messages = chosen.validation_bound <= self.tolerance.bound, []
+        ended = MET if met else self.budget.ended or "larger S are no more accurate"
+        if not met:
+            messages.append(
+                f"no S of positions meets the tolerance {self.tolerance.bound:g}: the most "
+                f"accurate has a one-step error of {chosen.validation_relative:.2e} of the spread "
+                f"(95 % bound {chosen.validation_bound:.2e}); the search ended because {ended}"
+            )
+        say(str(best.about))
+        part = "took no part in the fit or its choices" if test is self.split.test else "also chose"
+        return LearnedPositions(
+            map_, tuple(sorted([*others, chosen], key=lambda c: c.operations)), best.about, states,
+            self.split.validation, test, f"{len(test):,} triples that {part}", messages, ended,
+            steps.compile_seconds,
+        )  # fmt: skip
+
+
+def _split(triples: Triples, seed: int) -> Split:
+    """By runs, or of few runs by blocks of time, as pairs of states (q, Q − q) are split."""
+    coming, going = np.split(triples.moves, 2)
+    z0 = np.concatenate([triples.middle, coming], axis=1)
+    z1 = np.concatenate([triples.after, going], axis=1)
+    pairs = Pairs(z0, z1, triples.dt, run=triples.run, place=triples.place)
+    return split_rows(identified(pairs).pairs, seed)
+
+
+def _centres_of_moves(triples: Triples) -> np.ndarray | None:
+    """As `OfDisplacement` has them."""
+    if not triples.wrapped:
+        return None
+    centres = np.full(triples.dim, np.nan)
+    for i in triples.angles:
+        centres[i] = 0.5 * (triples.moves[:, i].min() + triples.moves[:, i].max())
+    return centres
+
+
+def _states(family: OfDisplacement, params: Any, triples: Triples) -> tuple[np.ndarray, np.ndarray]:
+    """z = (q, p) at q₋ and at q, (N, 2d) each: p = −h ∂S/∂q on the way from q₋, h ∂S/∂Q on that to
+    q."""
+    w = triples.ends[: len(triples)]
+    into, out = np.split(triples.dt * np.asarray(family.gradient(params, w)), 2, axis=1)
+    before = np.concatenate([triples.before, -into], axis=1)
+    return before, np.concatenate([triples.middle, out], axis=1)
+
+
+def _images(piece: Generated, triples: Triples) -> np.ndarray:
+    """q₊ as the step from q predicts it (N, d), NaN where it does not converge. NumPy."""
+    z = _states(piece.family, piece.params, triples)[1]
+    images, error = piece.refined_step(z, triples.ends[len(triples) :])
+    solved = (error < _SOLVED) & np.isfinite(images).all(axis=1)
+    return np.where(solved[:, None], images, np.nan)[:, : triples.dim]
+
+
+def _map_of(
+    piece: Generated, triples: Triples, sites: Sites | None
+) -> tuple[SymplecticMap, Pairs]:  # fmt: skip
+    """The map of this S, and its states at q₋ and at q, as pairs."""
+    dim, angles = triples.dim, list(triples.angles)
+    turning = _turning(piece, triples)
+    piece = turning or piece
+    before, middle = _states(piece.family, piece.params, triples)
+    centres, whole = _reduced(before, middle, angles, angles)
+    if turning is not None:
+        momenta = [dim + i for i in angles]
+        own, covered = _reduced(before, middle, momenta, [*momenta, *angles])
+        centres, whole, angles = [*centres, *own], [*whole, *covered], [*angles, *momenta]
+    domain = covering(before, ignore=tuple(whole)) if sites is None else sites.domain(before)
+    if sites is not None and turning is not None:
+        domain = dataclasses.replace(sites, angles="qp").domain(before)
+    if not matrix_free(piece.family):
+        fitted = fit_predictors(TYPE1, before, middle, triples.dt, angles=tuple(angles))
+        piece = dataclasses.replace(piece, predictor=affordable(fitted, piece.family).predictor)
+    map_ = SymplecticMap(
+        pieces=(piece,), coordinates=Coordinates("positions", tuple(angles)),
+        domain=domain, scale=sizes(before), angle_centre=np.array(centres), dt=triples.dt,
+    )  # fmt: skip
+    return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_), Pairs(
+        before, middle, triples.dt
+    )
+
+
+def _reduced(before, middle, of: list[int], moved: list[int]) -> tuple[list[float], list[int]]:
+    """The angles ``of`` of the states before reduced, in place, by whole turns that are taken from
+    the angles ``moved`` of the images too: their centres, and which cover their circle."""
+    centres, whole = [], []
+    for k, i in enumerate(of):
+        centre, covered = circle_centre(before[:, i])
+        turns = whole_turns(before[:, i] - centre)
+        before[:, i] -= turns
+        for j in moved[k :: len(of)]:
+            middle[:, j] -= turns
+        centres.append(centre)
+        whole += [i] if covered else []
+    return centres, whole
+
+
+def _turning(piece: Generated, triples: Triples) -> Generated | None:
+    """The piece, where a move that is longer by a turn only adds a turn to both momenta: a map of
+    angles that were measured modulo their period has momenta of this period too. Else None.
+
+    S is scaled so that it is a turn to the last digit; its mixed term is a mean of differences.
+    """
+    if not triples.wrapped:
+        return None
+    w, dim, turn = triples.ends[: len(triples)], triples.dim, 2 * np.pi
+    gradient, added = np.asarray(piece.family.gradient(piece.params, w)), []
+    for i in triples.angles:
+        further = w.copy()
+        further[:, dim + i] += turn
+        slope = np.asarray(piece.family.gradient(piece.params, further))
+        moved = triples.dt * (slope - gradient)
+        added.append(-moved[:, i])
+        moved[:, i] += turn
+        moved[:, dim + i] -= turn
+        if not np.abs(moved).max() < _TURNS:
+            return None
+    params = jax.tree.map(lambda leaf: leaf * (turn / np.mean(added)), piece.params)
+    return dataclasses.replace(piece, params=params)

@@ -1,0 +1,154 @@
+"""Maps that lose area: the factor, the map behind it, and what its orbits tend to."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+import gfnn_jax as gfnn
+from gfnn_jax.coordinates import nearest_image
+from gfnn_jax.evaluate.orbits import periodic_orbit, rotation_number
+from gfnn_jax.phase_space import Pairs, symplectic_form
+
+B, K, DRIFT = 0.9, 0.6, 0.2
+
+
+def damped_standard_map(z):
+    q, p = np.asarray(z).T
+    p = B * p + DRIFT + K * np.sin(q)
+    return np.stack([q + p, p], axis=-1)
+
+
+def states_of(number, seed):
+    return np.random.default_rng(seed).uniform([0, -2], [2 * np.pi, 4], (number, 2))
+
+
+@pytest.fixture(scope="module")
+def learned():
+    z = states_of(1_000, 0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return gfnn.fit(Pairs(z, damped_standard_map(z), 1.0), angles=(0,))
+
+
+def test_the_factor_and_the_drift_are_learned(learned):
+    assert learned.met
+    assert abs(learned.damping.factor - B) < 1e-12
+    assert np.abs(learned.damping.shift - DRIFT).max() < 1e-12
+    assert 0 < learned.damping.std < 1e-12
+    assert abs(learned.map.multiplier() - B) < 1e-12
+    assert "multiplies areas by 0.9" in str(learned.damping)
+
+
+def test_a_step_is_the_maps_and_conformally_symplectic(learned):
+    z = states_of(300, 1)
+    image = np.asarray(learned.map.step(z)[0])
+    assert np.abs(nearest_image(image - damped_standard_map(z), (0,))).max() < 1e-12
+    assert learned.symplecticity_defect < 1e-14
+    near = 1e-6 * np.eye(2)  # the executed step, by differences
+    up, down = (np.asarray(learned.map.step(z[0] + s * near)[0]) for s in (1, -1))
+    jacobian, form = (up - down).T / 2e-6, symplectic_form(1)
+    assert np.abs(jacobian.T @ form @ jacobian - B * form).max() < 1e-8
+    back = np.asarray(learned.map.inverse(image)[0])
+    assert np.abs(nearest_image(back - z, (0,))).max() < 1e-12
+
+
+def test_the_rotation_number_of_its_attractor_is_the_maps(learned):
+    states, _ = learned.map.rollout(np.array([1.0, 0.5]), 12_000)
+    true = [np.array([1.0, 0.5])]
+    for _ in range(12_000):
+        true.append(damped_standard_map(true[-1]))
+    predicted, expected = (
+        rotation_number(np.asarray(angle)[2_000:, 0]) for angle in (states, np.array(true))
+    )
+    assert expected.error < 1e-10
+    assert abs(predicted.value - expected.value) < 1e-10
+
+
+def test_it_is_saved_and_loaded(learned, tmp_path):
+    learned.map.save(tmp_path / "model")
+    loaded = gfnn.load(tmp_path / "model")
+    z = states_of(20, 2)
+    assert np.array_equal(loaded.step(z)[0], learned.map.step(z)[0])
+    assert loaded.multiplier() == learned.map.multiplier()
+
+
+def test_oscillators_of_different_friction_keep_no_multiple_of_the_form():
+    """Their determinant is the same everywhere, which would pass for one factor."""
+    rates = np.array([0.1, 0.3])
+    field = np.zeros((4, 4))
+    field[[0, 1], [2, 3]], field[[2, 3], [0, 1]] = 1.0, [-1.0, -2.0]
+    field[[2, 3], [2, 3]] = -rates
+    z = np.random.default_rng(0).normal(size=(600, 4))
+    learned = gfnn.fit(Pairs(z, z @ expm(0.5 * field).T, 0.5))
+    assert np.abs(learned.damping.factor - np.exp(-0.5 * rates)).max() < 1e-12
+    assert learned.map.multiplier() is None
+    assert "no multiple of the symplectic form" in str(learned.damping)
+    fresh = np.random.default_rng(1).normal(size=(50, 4))
+    error = np.asarray(learned.map.step(fresh)[0]) - fresh @ expm(0.5 * field).T
+    assert np.abs(error).max() < 1e-12
+
+
+def test_friction_that_differs_over_phase_space_is_said_to():
+    z = np.random.default_rng(0).normal(size=(600, 2))
+
+    def field(_, y):
+        q, v = np.split(y, 2)
+        return np.concatenate([v, -q - 0.3 * q**2 * v])
+
+    end = solve_ivp(field, (0, 0.3), z.T.ravel(), rtol=1e-10, atol=1e-10).y[:, -1]
+    pairs = Pairs(z, end.reshape(2, -1).T, 0.3)
+    with pytest.warns(gfnn.FitWarning) as told:
+        learned = gfnn.fit(pairs, family="polynomial")
+    assert learned.damping is None
+    assert any("differs over phase space, from" in str(w.message) for w in told)
+    assert any(" at q1 = " in str(w.message) for w in told)
+
+
+@pytest.mark.slow  # two seconds of reference, five of fitting
+def test_a_damped_driven_pendulum_by_its_period():
+    rate, period = 0.02, 2 * np.pi
+    rng = np.random.default_rng(0)
+
+    def pairs_of(number):
+        radius, angle = 0.8 * np.sqrt(rng.uniform(size=number)), rng.uniform(0, 2 * np.pi, number)
+        z = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+
+        def field(t, y):
+            q, p = np.split(y, 2)
+            return np.concatenate([p, -np.sin(q) - rate * p + 0.15 * np.cos(t)])
+
+        end = solve_ivp(
+            field, (0, period), z.T.ravel(), method="DOP853", rtol=1e-13, atol=1e-14
+        ).y[:, -1]  # fmt: skip
+        return Pairs(z, end.reshape(2, -1).T, period)
+
+    learned, test = gfnn.fit(pairs_of(3_000), tolerance=1e-10), pairs_of(300)
+    assert abs(learned.damping.factor / np.exp(-rate * period) - 1) < 1e-10
+    error = np.asarray(learned.map.step(test.z0)[0]) - test.z1
+    assert np.sqrt(np.mean(error**2)) < 1e-9
+    assert learned.symplecticity_defect < 1e-14
+
+
+def test_a_rotation_number_is_the_golden_mean():
+    golden = (np.sqrt(5) - 1) / 2
+    steps = np.arange(4_001)
+    phase = 2 * np.pi * golden * steps
+    found = rotation_number(phase + 0.3 * np.sin(phase) + 0.1 * np.cos(3 * phase))
+    assert abs(found.value - golden) < 1e-13
+    assert found.error < 1e-10
+
+
+def test_a_periodic_orbit_closes_and_loses_area(learned):
+    """(π, 2π) is a fixed point where the drift is 2π (1 − b)."""
+    z = states_of(1_000, 3)
+    image = damped_standard_map(z) - DRIFT + 2 * np.pi * (1 - B)
+    fit = gfnn.fit(Pairs(z, image, 1.0), angles=(0,))
+    orbit = periodic_orbit(fit.map, np.array([3.0, 6.2]), 1, angles=(0,))
+    assert np.abs(nearest_image(orbit.states - [np.pi, 2 * np.pi], (0,))).max() < 1e-12
+    assert abs(np.prod(orbit.eigenvalues) - B) < 1e-12
+    assert (np.abs(orbit.eigenvalues) < 1).all()
+    with pytest.raises(ValueError, match="found none"):
+        periodic_orbit(fit.map, np.array([np.nan, 0.0]), 1)

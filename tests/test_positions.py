@@ -1,0 +1,284 @@
+"""Maps that are learned from positions alone: discrete Lagrangians and the maps they generate."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+from gfnn_jax import cli
+from gfnn_jax.coordinates import nearest_image
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.families.displacements import OfDisplacement
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.products import Products
+from gfnn_jax.models.discrete_lagrangian import left_over, solve
+from gfnn_jax.models.triples import Triples, triples_of
+
+K = 0.6
+
+
+def turns(number, steps, seed):
+    """θ (number, steps + 1, 1) of standard maps, lifted: what one monitor reads turn by turn."""
+    theta, p = np.random.default_rng(seed).uniform(0, 2 * np.pi, (2, number))
+    read = [theta]
+    for _ in range(steps):
+        p = p + K * np.sin(theta)
+        theta = theta + p
+        read.append(theta)
+    return np.stack(read, axis=1)[..., None]
+
+
+def recorded(q, names, angles=(), dt=1.0):
+    """Positions (runs, steps, d) as a recording."""
+    runs, steps, _ = q.shape
+    table = {"run": np.repeat(np.arange(runs), steps), "t": np.tile(dt * np.arange(steps), runs)}
+    return Recording(
+        table | {name: q[..., i].ravel() for i, name in enumerate(names)},
+        positions=names, angles=angles,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def lifted():
+    recording = recorded(turns(2_000, 2, 0), ["theta"], ["theta"])
+    return gfnn.fit(recording, learn="map", tolerance=1e-12)
+
+
+@pytest.fixture(scope="module")
+def wrapped():
+    recording = recorded(np.mod(turns(2_000, 2, 0), 2 * np.pi), ["theta"], ["theta"])
+    return gfnn.fit(recording, learn="map", tolerance=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["lifted", "wrapped"])
+def test_the_standard_map_from_its_angle_alone(kind, request):
+    learned = request.getfixturevalue(kind)
+    assert learned.met
+    assert learned.positions.symmetric
+    read = turns(100, 100, 1)
+    given = read if kind == "lifted" else np.mod(read, 2 * np.pi)
+    states, _ = learned.map.rollout(positions=(given[:, 0], given[:, 1]), num_steps=100)
+    error = np.abs(nearest_image(np.asarray(states)[..., :1] - read, (0,)))[..., 0]
+    assert error[:, 2].max() < 1e-12
+    assert np.median(error[:, 100]) < 1e-11
+    if kind == "lifted":
+        assert learned.symplecticity_defect < 1e-14
+
+
+def test_a_lift_is_trusted(lifted):
+    """Rollouts of lifted readings go on with their turns."""
+    read = turns(50, 10, 2)
+    states, _ = lifted.map.rollout(positions=(read[:, 0], read[:, 1]), num_steps=10)
+    assert np.abs(np.asarray(states)[:, 1:3, :1] - read[:, 1:3]).max() < 1e-11
+
+
+def test_momenta_are_the_maps_own(lifted):
+    """Of S = ½ (Q − q)² + ½ K (cos q + cos Q): p is the move less half a kick."""
+    read = turns(50, 1, 3)
+    q, other = read[:, 0], read[:, 1]
+    z = np.asarray(lifted.map.from_positions(q, other))
+    assert np.array_equal(z[:, :1], q)
+    assert np.abs(z[:, 1:] - (other - q - 0.5 * K * np.sin(q))).max() < 1e-11
+    one = np.asarray(lifted.map.from_positions(q[0], other[0]))
+    assert np.array_equal(one, z[0])
+
+
+def test_it_is_saved_and_loaded(wrapped, tmp_path):
+    wrapped.map.save(tmp_path / "model")
+    loaded = gfnn.load(tmp_path / "model")
+    q, other = np.mod(turns(20, 1, 4), 2 * np.pi).swapaxes(0, 1)
+    assert np.array_equal(loaded.from_positions(q, other), wrapped.map.from_positions(q, other))
+    z = np.asarray(loaded.from_positions(q, other))
+    assert np.array_equal(loaded.step(z)[0], wrapped.map.step(z)[0])
+
+
+def henon_heiles(number, steps, seed):
+    """x, y (number, steps + 1, 2) below E = 1/12 at dt 0.5."""
+    rng, starts = np.random.default_rng(seed), []
+    while len(starts) < number:
+        q, energy, angle = rng.uniform(-0.5, 0.5, 2), rng.uniform(0, 1 / 12), rng.uniform(0, 7)
+        left = energy - (0.5 * q @ q + q[0] ** 2 * q[1] - q[1] ** 3 / 3)
+        if left > 0:
+            speed = np.sqrt(2 * left)
+            starts.append([*q, speed * np.cos(angle), speed * np.sin(angle)])
+
+    def field(_, z):
+        x, y, px, py = z.reshape(4, -1)
+        return np.concatenate([px, py, -x - 2 * x * y, -y - x**2 + y**2])
+
+    solution = solve_ivp(
+        field, (0, 0.5 * steps), np.array(starts).T.ravel(), method="DOP853", rtol=1e-13,
+        atol=1e-15, t_eval=0.5 * np.arange(steps + 1),
+    )  # fmt: skip
+    return solution.y.reshape(4, number, -1).transpose(1, 2, 0)[..., :2]
+
+
+@pytest.mark.slow  # nine seconds of fitting
+def test_henon_heiles_from_positions_alone():
+    recording = recorded(henon_heiles(3_000, 2, 0), ["x", "y"], dt=0.5)
+    learned = gfnn.fit(recording, learn="map", tolerance=1e-12)
+    assert learned.met
+    read = henon_heiles(40, 300, 1)
+    states, _ = learned.map.rollout(positions=(read[:, 0], read[:, 1]), num_steps=300)
+    error = np.linalg.norm(np.asarray(states)[..., :2] - read, axis=-1)
+    assert error[:, 2].max() < 1e-12
+    assert np.median(error[:, 300]) < 1e-10
+    assert learned.symplecticity_defect < 1e-14
+
+
+def ring(number, steps, dim, seed):
+    """θ of Froeschlé's rings (number, steps + 1, dim), wrapped."""
+    q, p = np.random.default_rng(seed).uniform(-np.pi, np.pi, (2, number, dim))
+    read = [q]
+    for _ in range(steps):
+        bond = 0.1 * np.sin(np.roll(q, -1, axis=1) - q)
+        p = p + 0.5 * np.sin(q) + bond - np.roll(bond, 1, axis=1)
+        q = q + p
+        read.append(q)
+    return np.mod(np.stack(read, axis=1), 2 * np.pi)
+
+
+def test_a_ring_of_64_that_is_told_to_be_one():
+    names = [f"theta{i}" for i in range(1, 65)]
+    recording = recorded(ring(200, 2, 64, 0), names, names)
+    learned = gfnn.fit(recording, learn="map", structure="ring", tolerance=1e-10)
+    assert learned.met
+    read = ring(20, 2, 64, 1)
+    states, _ = learned.map.rollout(positions=(read[:, 0], read[:, 1]), num_steps=2)
+    error = nearest_image(np.asarray(states)[:, 2, :64] - read[:, 2], tuple(range(64)))
+    assert np.sqrt(np.mean(error**2)) < 1e-10
+
+
+def test_a_map_that_is_not_reversible_needs_an_s_without_symmetry():
+    """S = ½ (Q − q)² + V(q) + 0.1 (Q − q)³, whose kicks differ from those of its inverse."""
+    rng = np.random.default_rng(0)
+
+    def next_of(q, other):
+        """−(x + 0.3 x²) = (d + 0.3 d²) … solved for the move x from ``other``."""
+        d = other - q
+        momentum = d + 0.3 * d**2 - 0.2 * other
+        return other + (np.sqrt(1 + 1.2 * momentum) - 1) / 0.6
+
+    q, move = rng.uniform(-0.5, 0.5, (2, 600, 1))
+    read = [q, q + 0.5 * move]
+    read.append(next_of(*read[-2:]))
+    recording = recorded(np.stack(read, axis=1), ["x"])
+    learned = gfnn.fit(recording, learn="map", tolerance=1e-12)
+    assert learned.met
+    assert not learned.positions.symmetric
+
+
+# What positions leave open
+
+
+def test_s_is_fixed_by_its_mixed_term_and_nearest_to_free_motion():
+    """Two oscillators without coupling: the ratio of their factors is open too, and is 1."""
+    rates, dt = np.array([1.0, 1.7]), 0.4
+    phase = np.random.default_rng(0).uniform(0, 2 * np.pi, (400, 1, 2))
+    size = np.random.default_rng(1).uniform(0.1, 1.0, (400, 1, 2))
+    read = size * np.cos(phase + rates * dt * np.arange(3)[:, None])
+    triples = triples_of(recorded(read, ["x", "y"], dt=dt))
+    box = np.random.default_rng(2).uniform(-1, 1, (100, 4))
+    inputs = box_inputs(box, reversor=(1, 1, -1, -1))
+    family = OfDisplacement(Products(inputs, 2), 0.5)
+    solved = solve(family, triples)
+    params = family.unflatten(solved.coefficients)
+    assert np.abs(left_over(family, params, triples)).max() < 1e-13
+    assert solved.rank < family.num_parameters - 4
+    hessian = family.gradient_and_hessian(params, triples.ends[:1])[1][0]
+    mixed = -(dt**2) * hessian[:2, 2:]
+    move = np.mean(triples.moves**2, axis=0)
+    assert abs(np.sum(mixed.diagonal() * move) / move.sum() - 1) < 1e-9
+    assert np.abs(mixed - np.diag(mixed.diagonal())).max() < 1e-9
+    # The terms hold Q² − q² = 2 m (Q − q), which no triple tells: without it S is symmetric.
+    values = [family.value(params, w) for w in (triples.ends, np.roll(triples.ends, 2, axis=1))]
+    assert np.abs(values[0] - values[1]).max() < 1e-12
+
+
+def test_the_family_of_displacements_is_differentiated_right():
+    rng = np.random.default_rng(0)
+    w = rng.uniform(-1, 1, (20, 4))
+    for part, both in ((0.0, False), (0.0, True), (0.5, True), (0.5, False)):
+        family = OfDisplacement(Products(box_inputs(rng.uniform(-2, 2, (50, 4))), 4), part, both)
+        params = family.unflatten(rng.normal(size=family.num_parameters))
+        gradient, hessian = family.gradient_and_hessian(params, w)
+        assert np.array_equal(gradient, family.gradient(params, w))
+        for i, off in enumerate(1e-6 * np.eye(4)):
+            slope = (family.value(params, w + off) - family.value(params, w - off)) / 2e-6
+            np.testing.assert_allclose(slope, gradient[:, i], atol=1e-6)
+            bend = family.gradient(params, w + off) - family.gradient(params, w - off)
+            np.testing.assert_allclose(bend / 2e-6, hessian[:, i], atol=1e-5)
+        turned = np.roll(w, 2, axis=1)
+        if both:
+            assert np.array_equal(family.value(params, w), family.value(params, turned))
+
+
+# The command line
+
+
+def test_positions_in_a_file_are_fitted_and_continued(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    def written(name, read):
+        runs, steps = read.shape[:2]
+        rows = np.column_stack([
+            np.repeat(np.arange(runs), steps), np.tile(np.arange(steps), runs), read.ravel()
+        ])  # fmt: skip
+        np.savetxt(name, rows, delimiter=",", header="run,t,theta", comments="", fmt="%.17g")
+
+    read = np.mod(turns(300, 7, 5), 2 * np.pi)[..., 0]
+    written("turns.csv", turns(500, 2, 0)[..., 0] % (2 * np.pi))
+    written("begun.csv", read[:20, :4])
+    said = ["fit", "turns.csv", "--positions", "theta", "--angles", "theta", "--out", "model"]
+    assert cli.main([*said, "--learn", "hamiltonian"]) == 2
+    assert "expected --learn map" in capsys.readouterr().err
+    assert cli.main([*said, "--learn", "map", "--tolerance", "1e-12"]) == 0
+    report = json.loads(Path("model/report.json").read_text())
+    assert report["model"]["chart"] == "type1"
+    assert report["fit"]["tolerance_met"]
+    assert report["map"]["positions"]["symmetric"]
+    go_on = ["predict", "model", "--initial", "begun.csv", "--num-steps", "4", "--out", "on.npz"]
+    assert cli.main(go_on) == 0
+    ahead = np.load("on.npz")["trajectories"][..., 0]
+    assert np.abs(nearest_image(ahead - read[:20, 3:], tuple(range(5)))).max() < 1e-11
+
+
+# What is refused, in a line
+
+
+def test_what_no_map_can_be_learned_from_is_refused():
+    read = turns(4, 2, 0)
+    with pytest.raises(gfnn.FitError, match="at least 20 triples of positions, got 4"):
+        gfnn.fit(recorded(read, ["x"]), learn="map")
+    with pytest.raises(gfnn.FitError, match="three positions in a row"):
+        gfnn.fit(recorded(read[:, :2], ["x"]), learn="map")
+    uneven = Recording(
+        {"t": [0.0, 1.0, 2.5, 3.0, 4.0], "x": np.arange(5.0)}, positions=["x"]
+    )  # fmt: skip
+    with pytest.raises(gfnn.FitError, match="even times"):
+        gfnn.fit(uneven, learn="map")
+
+
+def test_missing_readings_break_a_run():
+    read = turns(3, 6, 0)[..., 0]
+    read[1, 3] = np.nan
+    triples = triples_of(recorded(read[..., None], ["x"]))
+    assert isinstance(triples, Triples)
+    assert len(triples) == 5 + 2 + 5
+    assert np.bincount(triples.run).tolist() == [5, 2, 5]
+
+
+def test_only_maps_of_positions_start_from_positions(lifted):
+    scene = gfnn.scenes.standard_map()
+    z = np.random.default_rng(0).uniform(0, 6, (200, 2))
+    image = np.asarray([np.asarray(scene.step(state)) for state in z])
+    pairs = gfnn.Pairs(z, image, 1.0)
+    with pytest.raises(ValueError, match="learned from positions"):
+        gfnn.fit(pairs, scene).map.from_positions(np.zeros(1), np.ones(1))
+    with pytest.raises(ValueError, match="two positions of shape"):
+        lifted.map.from_positions(np.zeros(2), np.ones(2))
+    with pytest.raises(ValueError, match="either states z0 or two positions"):
+        lifted.map.rollout(num_steps=3)
