@@ -489,8 +489,7 @@ def _fit(arguments: argparse.Namespace) -> None:
         _check_exists(path)
     columns = column_options(arguments)
     with_roles = names_roles(columns)
-    asked = with_roles or arguments.learn == "map"
-    if asked and are_recordings(arguments.data, with_roles=with_roles):
+    if are_recordings(arguments.data, with_roles=with_roles):
         if arguments.dt is not None:
             columns["dt"] = arguments.dt
         if arguments.learn == "map":

@@ -191,8 +191,8 @@ def test_a_law_is_saved_with_its_sensors(swing, tmp_path):
 
 def test_bad_recordings_and_options_are_refused(swing):
     recording, fit = swing
-    with pytest.raises(InputError, match="learn auto or lagrangian"):
-        gfnn.fit(recording, learn="map")
+    with pytest.raises(InputError, match="learn auto, lagrangian"):
+        gfnn.fit(recording, learn="hamiltonian")
     with pytest.raises(InputError, match="friction"):
         gfnn.fit(recording, friction="sticky")
     with pytest.raises(InputError, match="mass"):

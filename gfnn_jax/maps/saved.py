@@ -75,7 +75,7 @@ def register(kind: type) -> type:
         raise InputError(f"expected a dataclass to register, got {kind!r}")
     if _TYPES.get(kind.__name__, kind).__module__ != kind.__module__:
         raise InputError(f"another type is registered as {kind.__name__}: choose another name")
-    _TYPES[kind.__name__] = kind
+    _TYPES[kind.__name__], _NAMES[kind] = kind, kind.__name__
     return kind
 
 
