@@ -535,7 +535,7 @@ def _fit_positions(arguments: argparse.Namespace, columns: dict[str, Any]) -> No
             arguments.data, out=arguments.out, columns=columns, seed=arguments.seed,
             tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
             absolute_tolerance=arguments.absolute_tolerance, structure=arguments.structure,
-            max_seconds=_max_seconds(arguments), max_operations=arguments.max_operations,
+            max_seconds=arguments.max_seconds or "auto", max_operations=arguments.max_operations,
             progress=shown,
         )  # fmt: skip
     _summarise(ran, arguments.out)

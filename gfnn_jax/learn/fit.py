@@ -433,7 +433,8 @@ def fit(
 
 def fit_positions(
     recording: Recording, *, tolerance: float = 1e-6, absolute_tolerance: float | None = None,
-    structure: str | None = None, seed: int = 0, max_seconds: float | None = MAX_SECONDS,
+    structure: str | None = None, seed: int = 0,
+    max_seconds: float | Literal["auto"] | None = "auto",
     max_operations: int | None = None, clock: Callable[[], float] = time.perf_counter,
     on_progress: Callable[[str], Any] = lambda message: None,
     on_candidate: Callable[[Candidate], Any] = lambda candidate: None,
@@ -453,7 +454,8 @@ def fit_positions(
     require_x64("a fit")
     relative = absolute_tolerance is None
     asked = Tolerance(tolerance if absolute_tolerance is None else absolute_tolerance, relative)
-    budget = Budget(max_seconds, max_operations, clock, len(recording.positions) or None)
+    seconds = seconds_allowed(max_seconds, max_operations)
+    budget = Budget(seconds, max_operations, clock, len(recording.positions) or None)
     found = learn_positions(
         recording, tolerance=asked, structure=structure, seed=seed, budget=budget,
         say=on_progress, tell=on_candidate,
