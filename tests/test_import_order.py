@@ -36,6 +36,7 @@ HOMES = {  # the module, and those whose names begin as its own does
     "optax": "fitting.adam",
     "orbax": "storage.checkpoints",
     "pandas": "data.text_files",
+    "sympy": "exports.symbolic",
 }
 
 

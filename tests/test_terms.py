@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import sympy
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.families import Family, LinearFamily
@@ -14,6 +15,8 @@ from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
 from gfnn_jax.families.traced import traced
 from gfnn_jax.learn.formula import Term, formula
+from gfnn_jax.models.law_text import Term as LawTerm
+from gfnn_jax.models.learned_law import Hamiltonian
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.pcr3bp import features
 
@@ -168,7 +171,6 @@ def test_a_formula_is_read_as_it_is_shown(shown, code):
 
 
 def test_what_a_fit_shows_can_be_given_to_it_and_to_sympy():
-    sympy = pytest.importorskip("sympy")
     family = given_terms(2, ["q1² p2", "1/sqrt(q1**2 + q2**2)", "0.5 (p1² + p2²)"])
     shown = formula([Term(t, c, 0.0) for t, c in zip(family.term_names, (2, -1, 3), strict=True)])
     value = family.value(np.array([2.0, -1.0, 3.0]), W)
@@ -176,3 +178,14 @@ def test_what_a_fit_shows_can_be_given_to_it_and_to_sympy():
     np.testing.assert_allclose(again.value(np.ones(1), W), value, rtol=1e-14)
     by_sympy = sympy.lambdify(sympy.symbols("q1 q2 p1 p2"), sympy.sympify(plain(shown)))
     np.testing.assert_allclose(by_sympy(*np.moveaxis(W, -1, 0)), value, rtol=1e-14)
+
+
+def test_h_of_a_law_is_whole_for_sympy():
+    """½ pᵀM⁻¹p + V at one state, of an M that depends on the angles."""
+    listed = (("M11: 1", 1.0), ("M12: cos(a - b)", 0.4), ("M22: 1", 0.3), ("cos(a)", -2.0))
+    law = Hamiltonian(tuple(LawTerm(term, c, 0.0) for term, c in listed))
+    state = {"a": 0.3, "b": -1.1, "p1": 0.7, "p2": -0.2}
+    p, mixed = np.array([0.7, -0.2]), 0.4 * np.cos(1.4)
+    expected = p @ np.linalg.solve([[1.0, mixed], [mixed, 0.3]], p) / 2 - 2 * np.cos(0.3)
+    assert float(law.sympy().subs(state)) == pytest.approx(expected, rel=1e-14)
+    assert r"\cos(a)" in law.latex()

@@ -11,6 +11,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.runs import looked_at
+from gfnn_jax.exports.symbolic import as_latex, as_sympy
 from gfnn_jax.families.expressions import plain
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
@@ -99,6 +100,20 @@ class LearnedHamiltonian:
         a sum over sites or bodies, whose formula is that of a general one."""
         whole = self.formula is not None and isinstance(self.flow.family, Terms)
         return plain(self.formula) if whole and self.formula else None
+
+    def sympy(self) -> Any:
+        """H as a sympy expression. Raises ValueError where it has no ``text``."""
+        return as_sympy(self._code)
+
+    def latex(self) -> str:
+        """H in LaTeX's notation. Raises ValueError where it has no ``text``."""
+        return as_latex(self._code)
+
+    @property
+    def _code(self) -> str:
+        if self.text is None:
+            raise ValueError("expected an H of terms, got a network, or a sum over sites or bodies")
+        return self.text
 
     @property
     def fast(self) -> bool:

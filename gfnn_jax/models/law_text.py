@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.errors import InputError
+from gfnn_jax.exports.symbolic import as_sympy
 from gfnn_jax.families.lagrangian import LINEAR, QUADRATIC, Friction, Terms
 
 _GREEK = {
@@ -43,12 +43,8 @@ class Expression:
         return _sum(f"{_measured(c, s)} {_pretty(t)}" for t, c, s in self.terms) or "0"
 
     def sympy(self) -> Any:
-        """As a sympy expression. Raises InputError where sympy is not installed."""
-        try:
-            import sympy
-        except ImportError as error:
-            raise InputError("expected sympy: pip install sympy") from error
-        return sympy.sympify(self.formula)
+        """As a sympy expression."""
+        return as_sympy(self.formula)
 
     def latex(self) -> str:
         return _sum(f"{_digits(c, s)} {_latex(t)}" for t, c, s in self.terms) or "0"

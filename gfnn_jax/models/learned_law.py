@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.exports import symbolic
 from gfnn_jax.families.lagrangian import Lagrangian, Terms
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.calibration import Horizon
@@ -84,17 +85,28 @@ class Hamiltonian:
 
     @property
     def formula(self) -> str:
+        """V as code, and the entries of M."""
         mass = ", ".join(f"{t} {c:.6g}" for t, c, _ in self.terms if t.startswith("M"))
-        rest = Expression(tuple(t for t in self.terms if not t.term.startswith("M"))).formula
-        return f"p·M⁻¹p/2 + {rest}, {mass}"
+        return f"p·M⁻¹p/2 + {self._potential.formula}, {mass}"
 
     def sympy(self) -> Any:
-        """V alone; M is a matrix of functions of q."""
-        return Expression(tuple(t for t in self.terms if not t.term.startswith("M"))).sympy()
+        """H in the positions' names and p1, …, pd, as a sympy expression."""
+        entries: dict[tuple[int, int], list[str]] = {}
+        for name, coefficient, _ in self.terms:
+            if name.startswith("M"):
+                place, _, factor = name.partition(": ")
+                i, j = (int(digit) - 1 for digit in place[1:])
+                entries.setdefault((i, j), []).append(f"{coefficient!r}*({factor})")
+        dim = 1 + max(j for _, j in entries)
+        return symbolic.hamiltonian(entries, self._potential.formula, dim)
 
     def latex(self) -> str:
-        rest = Expression(tuple(t for t in self.terms if not t.term.startswith("M"))).latex()
-        return rf"\tfrac12 p^\top M(q)^{{-1}} p + {rest}"
+        """H in LaTeX's notation, M as a matrix of its own."""
+        return rf"\tfrac12 p^\top M(q)^{{-1}} p + {self._potential.latex()}"
+
+    @property
+    def _potential(self) -> Expression:
+        return Expression(tuple(t for t in self.terms if not t.term.startswith("M")))
 
 
 def hamiltonian_of(terms: Terms, lagrangian: Expression, names: tuple[str, ...]) -> Hamiltonian:

@@ -1,0 +1,36 @@
+"""Formulas as text, read by sympy: its home."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+
+def as_sympy(text: str) -> Any:
+    """The expression that a formula in Python's notation says."""
+    import sympy  # loaded when first used
+
+    return sympy.sympify(text)
+
+
+def as_latex(text: str) -> str:
+    """The formula in LaTeX's notation."""
+    import sympy
+
+    return sympy.latex(sympy.sympify(text))
+
+
+def hamiltonian(
+    mass: Mapping[tuple[int, int], Sequence[str]], potential: str, dim: int
+) -> Any:  # fmt: skip
+    """½ pᵀ M⁻¹ p + V in p1, …, pd: of the summands of the entries (i, j), i <= j, of M, and V."""
+    import sympy
+
+    entries = sympy.zeros(dim, dim)
+    for (i, j), summands in mass.items():
+        for summand in summands:
+            entries[i, j] += sympy.sympify(summand)
+        entries[j, i] = entries[i, j]
+    p = sympy.Matrix(sympy.symbols(f"p1:{dim + 1}"))
+    kinetic = (p.T * entries.inv() * p)[0, 0] / 2
+    return kinetic + sympy.sympify(potential)
