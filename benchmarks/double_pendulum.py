@@ -43,7 +43,7 @@ def measured() -> dict:
     forecasts, errors, inside = [], [], []
     for k in np.linspace(SAMPLES - 1, last, 24).astype(int):
         rows = np.flatnonzero((t > t[k]) & (t <= t[k] + AHEAD))
-        start = record.slice(start=t[k - SAMPLES + 1], stop=t[k])
+        start = record.slice(float(t[k - SAMPLES + 1]), float(t[k]))
         found = fit.map.forecast(start, t[rows])
         values, std = (np.array([of[n][0] for n in ANGLES]) for of in (found.values, found.std))
         off = values - angles[:, rows]

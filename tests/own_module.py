@@ -38,7 +38,7 @@ def double_well(dt=0.3):
     meta_fields=("num_parameters", "width"),
 )  # fmt: skip
 @dataclasses.dataclass(frozen=True, eq=False)
-class Bumps:
+class RadialBumps:
     """S(c, w) = Σ c_j exp(−|x − a_j|²/2s²), x the variables of w scaled to [−1, 1]."""
 
     inputs: Inputs
@@ -97,7 +97,7 @@ class Bumps:
 @gfnn.register
 @partial(jax.tree_util.register_dataclass, data_fields=("force", "dt"), meta_fields=())
 @dataclasses.dataclass(frozen=True, eq=False)
-class Leapfrog:
+class Verlet:
     """A step of Störmer and Verlet, of order 2: half a kick, a drift, half a kick. The force is a
     polynomial Σ force_k q^k of one coordinate."""
 
@@ -118,6 +118,9 @@ class Leapfrog:
         image, info = self.step(z + compensation, args)
         return image, jnp.zeros_like(image), info
 
+    def multiplier(self, args=None):
+        return 1.0
+
     def inverse(self):
         return dataclasses.replace(self, dt=-self.dt)  # it is symmetric in time
 
@@ -135,5 +138,5 @@ class Kicks:
         powers = np.arange(size + 1)
         design = data.dt / 2 * (q0[:, None] ** powers + q1[:, None] ** powers)
         force = np.linalg.lstsq(design, p1 - p0, rcond=None)[0]
-        piece = Leapfrog(force, float(data.dt))
+        piece = Verlet(force, float(data.dt))
         return gfnn.Fitted(piece, f"kicks {size}", size + 1, 8.0 * size)

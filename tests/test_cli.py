@@ -195,9 +195,9 @@ BAD_USAGE = [
     (("fit", "{data}", "--out", "{new}", "--scene", "two-body"), "has dim 2, the pairs have 1"),
     (("fit", "{data}", "--out", "{new}", "--scene", "pluto"), "unknown scene 'pluto'"),
     (("fit", "{data}", "--out", "{new}", "--angles", "5"), "different angles among 0..1, got (5,)"),
-    (("fit", "{data}", "--out", "{new}", "--angles", "q"), "expected indices in z as 0,2, got q"),
+    (("fit", "{data}", "--out", "{new}", "--angles", "q"), "different whole numbers"),
     (("fit", "{data}", "--out", "{new}", "--angles", "0,0"), "expected different names"),
-    (("fit", "{data}", "--out", "{new}", "--angles", "0, 00"), "expected different angles"),
+    (("fit", "{data}", "--out", "{new}", "--angles", "0, 00"), "different whole numbers"),
     (("fit", "{data}", "--out", "{new}", "--angles", "0,"), "different names or indices"),
     (("fit", "{data}", "--out", "{new}", "--tolerance", "0"), "expected a finite number > 0"),
     (("fit", "{data}", "--out", "{new}", "--family", "features"), "needs a scene that declares"),
@@ -894,3 +894,21 @@ def test_compiled_programs_are_kept_in_the_users_cache(tmp_path, monkeypatch):
         assert jax.config.jax_compilation_cache_dir == str(tmp_path / "gfnn_jax")
     finally:
         jax.config.update("jax_compilation_cache_dir", of_the_tests)
+
+
+@pytest.mark.parametrize(
+    ("met", "noise", "terms", "line"),
+    [
+        (True, None, 30, "H = q1²"),
+        (False, [1e-3, 1e-3], 2, "H = q1²"),
+        (False, [1e-3, 1e-3], 30, "best partial law: 30 terms, leaves 2.0e-02 of the spread over"),
+        (False, None, 2, "best partial law: 2 terms, leaves 2.0e-02 of the spread over"),
+    ],
+)
+def test_a_law_that_has_met_nothing_is_not_printed_as_h(met, noise, terms, line):
+    report = {
+        "fit": {"tolerance_met": met, "validation_relative": 0.02},
+        "hamiltonian": {"formula": "q1²", "terms": [{}] * terms},
+        "model": {"learns": "hamiltonian"}, "data": {"noise": noise},
+    }  # fmt: skip
+    assert cli.law_line(report) == line

@@ -175,7 +175,7 @@ def test_features_in_other_units_are_noticed(unit, words):
     """1/r₁ of kilometres means nothing: the scene's lengths are in the distance of its bodies."""
 
     z = np.array([[0.49, 0.0, 0.0, 1.4]]) + 0.1 * np.random.default_rng(0).normal(size=(100, 4))
-    pairs = gfnn.Pairs(unit * z, unit * z, 0.1)
+    pairs = gfnn.Pairs(unit * z, unit * (z + 1e-2 * z[::-1]), 0.1)
     with warnings.catch_warnings(record=True) as caught, pytest.raises(LookedAt):
         gfnn.fit(pairs, gfnn.scenes.pcr3bp(), on_progress=stop)
     told = [str(w.message) for w in caught]

@@ -191,8 +191,8 @@ def test_a_law_is_saved_with_its_sensors(swing, tmp_path):
 
 def test_bad_recordings_and_options_are_refused(swing):
     recording, fit = swing
-    with pytest.raises(InputError, match="learn auto or lagrangian"):
-        gfnn.fit(recording, learn="map")
+    with pytest.raises(InputError, match="learn auto, lagrangian"):
+        gfnn.fit(recording, learn="hamiltonian")
     with pytest.raises(InputError, match="friction"):
         gfnn.fit(recording, friction="sticky")
     with pytest.raises(InputError, match="mass"):
@@ -256,3 +256,31 @@ def test_the_command_line_learns_and_forecasts(tmp_path, capsys):
     assert len(np.genfromtxt(out, delimiter=",", names=True)) == 20
     assert main([*arguments, "--overwrite"]) == 2
     assert "--num-steps" in capsys.readouterr().err
+
+
+def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs():
+    """ẍ = −4 x − 0.2 ẋ + 3 u, and an input that does nothing."""
+    t = np.arange(0, 30, 0.05)
+    rng = np.random.default_rng(0)
+    wave = np.sin(0.7 * t) + 0.7 * np.sin(1.9 * t + 1) + 0.5 * np.sin(3.1 * t + 2)
+
+    def rate(s, x):
+        return [x[1], -4 * x[0] - 0.2 * x[1] + 3 * np.interp(s, t, wave)]
+
+    x = solve_ivp(rate, (0, t[-1]), [0.5, 0.0], t_eval=t, rtol=1e-9, max_step=0.05).y[0]
+    table = {
+        "t": t,
+        "x": x + 1e-3 * rng.normal(size=len(t)),
+        "u": wave,
+        "w": rng.normal(size=len(t)),
+    }
+    recording = gfnn.Recording(table, positions=["x"], inputs=["u", "w"])
+    fit = gfnn.fit(recording, friction="linear", input_hold="linear")
+    for name, value in (("u", 3.0), ("w", 0.0)):
+        gain, std = fit.gains[name]["x"]
+        assert abs(gain - value) < 4 * std < 0.05, name
+    assert fit.friction.terms[0].coefficient == pytest.approx(0.1, rel=0.05)
+    ahead = gfnn.Recording({k: v[500:] for k, v in table.items()}, positions=["x"],
+                           inputs=["u", "w"])  # fmt: skip
+    found = fit.map.forecast(recording.slice(20.0, 24.95), t[501:], ahead)
+    assert np.abs(found.values["x"][0] - x[501:]).max() < 0.02

@@ -32,7 +32,7 @@ def kept(map_, folder):
 
 def test_a_family(pairs, fresh, tmp_path):
     def sizes(inputs):
-        return (own_module.Bumps(inputs, n, width=0.5) for n in (20, 40, 80))
+        return (own_module.RadialBumps(inputs, n, width=0.5) for n in (20, 40, 80))
 
     fit = gfnn.fit(pairs, SCENE, family=sizes, chart="midpoint", tolerance=1e-2)
     assert fit.met

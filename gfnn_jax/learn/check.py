@@ -151,12 +151,6 @@ def check_request(
                 f"expected finite states, got {int((~finite).sum())} rows of {name} with NaN or "
                 f"infinity, the first is row {int(np.argmin(finite))}"
             )
-    z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
-    if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= _STILL:
-        raise FitError(
-            "expected states that move, got z1 = z0 in every pair: H = 0, or the same columns "
-            "twice?"
-        )
     if structure is None:
         check_number(pairs)
     elif len(pairs) < FEWEST:
@@ -175,6 +169,16 @@ def _check_model(model, learn, terms, base, structure, family, chart) -> None:
         raise FitError(
             "a model of one's own is all that is learned: expected no learn, terms, base, "
             "structure, family or chart beside it"
+        )
+
+
+def check_moves(pairs: Pairs) -> None:
+    """Raises FitError where no state moves."""
+    z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
+    if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= _STILL:
+        raise FitError(
+            "expected states that move, got z1 = z0 in every pair: H = 0, or the same columns "
+            "twice?"
         )
 
 

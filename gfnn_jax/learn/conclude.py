@@ -232,8 +232,8 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
             "or to depend on something that the states do not hold (a parameter, a drive), which "
             "single pairs do not tell from noise, "
         )
-    of_law = candidate.learns == "hamiltonian" and law is not None
-    if of_law and not hidden and leaves_white(law, searched.plain, judges):
+    of_law = law if candidate.learns == "hamiltonian" and not hidden else None
+    if of_law is not None and leaves_white(of_law, searched.plain, judges):
         message = (
             "H is right, as far as these pairs tell: what it leaves over is white, noise of about "
             f"{sizes_of_noise} on the coordinates in their order"

@@ -11,6 +11,7 @@ import numpy as np
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.learn.candidates import Candidate, Tolerance
 from gfnn_jax.learn.check import (
+    check_moves,
     check_request,
     coarse_tolerance,
     unlike_the_scene,
@@ -102,6 +103,7 @@ def checked(
     pairs, learn, messages = as_varied(
         pairs, learn=learn, family=family, chart=chart, base=base, structure=structure
     )
+    check_moves(pairs)
     if scene is not None and scene.features is not None and family in ("auto", "features"):
         messages += unlike_the_scene(pairs, scene)
     messages += [*coarse_tolerance(pairs, bound), *unnamed_angles(pairs, coordinates)]

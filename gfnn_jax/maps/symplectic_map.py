@@ -415,6 +415,11 @@ class SymplecticMap:
                 raise ValueError(f"expected a whole number as {name}, got {number!r}")
         if save_every < 1:
             raise ValueError(f"expected save_every >= 1, got {save_every}")
+        if (z0 is None) == (positions is None):
+            raise ValueError("expected either states z0 or two positions (q, Q) to start from")
+        if positions is not None:
+            z0 = self.from_positions(*positions)
+        z0 = self._states(z0)
         if num_steps < 0:
             map_ = self if dt is None else self.over(dt, np.shape(z0)[:-1])
             return map_.reversed().rollout(
@@ -426,11 +431,6 @@ class SymplecticMap:
                 f"expected save_every <= num_steps, got {save_every} and {num_steps}: only the "
                 "initial states would be saved"
             )
-        if (z0 is None) == (positions is None):
-            raise ValueError("expected either states z0 or two positions (q, Q) to start from")
-        if positions is not None:
-            z0 = self.from_positions(*positions)
-        z0 = self._states(z0)
         map_ = self if dt is None else self.over(dt, z0.shape[:-1])
         args = map_._schedule(params, z0, t0, inputs, num_steps)
         states, info = _rollout(map_, z0, args, num_steps // save_every, save_every, stop_outside)

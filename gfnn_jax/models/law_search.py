@@ -148,7 +148,8 @@ def prune(
     costs = None
     while True:
         z = significance(fit)
-        fixed = protected(fit.structure) | refused
+        gains_of_inputs = {k for k in z if k[0] == "gain"}  # always there
+        fixed = protected(fit.structure) | refused | gains_of_inputs
         z = {k: size for k, size in z.items() if k not in fixed and size < options.significant}
         if not z:
             return fit

@@ -149,29 +149,29 @@ def _trajectories(z0, save_every, num_saved, dt, flow, step, section, hamiltonia
     return jax.lax.scan(save, z0, save_every * jnp.arange(num_saved))[1]
 
 
+def _check_traceable(scene: Scene) -> None:
+    z, t = jax.ShapeDtypeStruct((2 * scene.dim,), jnp.float64), 0.0
+    given = tuple(jax.ShapeDtypeStruct((n,), jnp.float64) for n in [len(scene.parameters)] if n)
+    for name, function, arguments in (
+        ("flow", scene.flow, (z, t)), ("step", scene.step, (z,)),
+        ("hamiltonian", scene.hamiltonian, (z, t, *given)),
+    ):  # fmt: skip
+        try:
+            _ = None if function is None else jax.eval_shape(function, *arguments)
+        except jax.errors.TracerArrayConversionError:
+            raise InputError(
+                f"expected the {name} of the scene {scene.name} written with jax.numpy, which JAX "
+                "can trace; it uses NumPy's functions"
+            ) from None
+
+
 def _reference(scene: Scene) -> tuple:
     """Everything that a trajectory of the scene depends on, as arguments of `_trajectories`.
 
     Raises InputError where the scene's flow, map or Hamiltonian is written with NumPy.
     """
+    _check_traceable(scene)
     hamiltonian = scene.hamiltonian
-    z, t = jax.ShapeDtypeStruct((2 * scene.dim,), jnp.float64), 0.0
-    given = (jnp.zeros(len(scene.parameters)),) if scene.parameters else ()
-    name, function, arguments = next(
-        (name, function, arguments)
-        for name, function, arguments in (
-            ("flow", scene.flow, (z, t)), ("step", scene.step, (z,)), ("", scene.section, ()),
-            ("hamiltonian", hamiltonian, (z, t, *given)),
-        )
-        if function is not None
-    )  # fmt: skip
-    try:
-        _ = name and jax.eval_shape(function, *arguments)
-    except jax.errors.TracerArrayConversionError:
-        raise InputError(
-            f"expected the {name} of the scene {scene.name} written with jax.numpy, which JAX can "
-            "trace; it uses NumPy's functions"
-        ) from None
     if scene.parameters or scene.any_phase:
         assert hamiltonian is not None
         hamiltonian = _WithArgs(hamiltonian, 2 * scene.dim, scene.any_phase)
