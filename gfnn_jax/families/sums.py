@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from gfnn_jax.arrays import matmul, namespace
+from gfnn_jax.arrays import as_row, matmul, namespace
 from gfnn_jax.families.expressions import depends_on, parse
 from gfnn_jax.families.terms import Terms, exponents, given_terms, joined
 from gfnn_jax.phase_space import split
@@ -279,9 +279,10 @@ class Sums:
         v may have further leading axes.
         """
         xp = namespace(v)
+        rows = [part.over.gather(v)[..., None, :] for part in self.parts]
         return sum(
-            part.over.scatter(xp.sum(bend * part.over.gather(v)[..., None, :], axis=-1))
-            for part, bend in zip(self.parts, curvatures, strict=True)
+            part.over.scatter(xp.sum(as_row(bend, row) * row, axis=-1))
+            for part, bend, row in zip(self.parts, curvatures, rows, strict=True)
         )
 
     def gradient_and_hessian(self, params, w, args=None):
