@@ -90,7 +90,7 @@ def mine(tmp_path, monkeypatch):
 
 def test_your_own_data_in_python(mine):
     names = {"gfnn": gfnn_jax, **mine}
-    exec(compile(blocks("python")[1], "README.md", "exec"), names)
+    exec(compile(blocks("python")[2], "README.md", "exec"), names)
     assert names["fit"].met
     assert names["states"].shape == (200, 1001, 2)
 

@@ -30,7 +30,7 @@ def sampled(count, seed=0):
 
 @pytest.fixture(scope="module")
 def learned():
-    return gfnn.fit(sampled(600), learn="map", tolerance=1e-5)
+    return gfnn.fit(sampled(1_000), learn="map", tolerance=1e-5)
 
 
 def test_derivatives_are_those_of_jax():
