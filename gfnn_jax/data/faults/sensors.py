@@ -92,4 +92,4 @@ def outliers(traits: Traits) -> Iterator[Fault]:
         if count:
             first = float(np.concatenate(traits.times)[traits.noise[name].outliers[0]])
             found = f"{name} has {count} outliers, the first at t = {first:.6g} s"
-            yield Fault("outliers", found, "nothing: a fit leaves them out", wrong=False)
+            yield Fault("outliers", found, "a fit leaves them out", wrong=False)
