@@ -35,7 +35,7 @@ def pytest_configure(config):
     if config.getoption("typecheck"):
         from jaxtyping import install_import_hook
 
-        install_import_hook("gfnn_jax", "beartype.beartype")
+        install_import_hook("gfnn_jax", "typechecker.checked")
     if "XLA_FLAGS" not in os.environ:  # which JAX reads when it is first used
         # XLA ends a process that asks for what it does not know: that of another release might.
         tried = subprocess.run(

@@ -133,7 +133,7 @@ class Triangle:
         t, target = self.leading(size)
         off = t @ coefficients - (target if coefficients.ndim == 1 else target[:, None])
         off = np.linalg.norm(off, axis=None if coefficients.ndim == 1 else 0)
-        return np.hypot(off, self.residual_norm(size))
+        return np.asarray(np.hypot(off, self.residual_norm(size)))
 
     def image_norm(self, coefficients: np.ndarray) -> float:
         """‖A c‖ of the leading terms."""

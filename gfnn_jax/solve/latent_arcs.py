@@ -18,7 +18,7 @@ an orbit of the law. Residuals enter in units of the noise through Huber's soft-
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -45,6 +45,7 @@ class Observed(NamedTuple):
     by_coefficients: np.ndarray
 
 
+@runtime_checkable
 class Model(Protocol):
     """States that move and are seen: what `fit_arcs` asks of a law, or of any other map."""
 
