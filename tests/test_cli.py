@@ -573,8 +573,8 @@ def test_strict(fitted, tmp_path, capsys, monkeypatch):
 def test_the_former_name_of_an_option(fitted, tmp_path, monkeypatch):
     asked = []
 
-    def remember(*args, family, **kwargs):
-        asked.append(family)
+    def remember(*args, options, **kwargs):
+        asked.append(options.family)
         return fitted
 
     monkeypatch.setattr(search, "fit", remember)

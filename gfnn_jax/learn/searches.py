@@ -73,7 +73,7 @@ def searched(
     early = not prepared.of_terms or options.model is not None
     climb = Search(_sweeps(request, plain, seen, judges) if early else [], *given)
     climb.climb(most=_SMALL)
-    law = _law(request, plain, judges, better)
+    law = _law(request, plain, judges, better, DEARER * climb.cheapest)
     of_terms, failed = None, None
     met_by_law = law is not None and judges.met_by(law.candidate)
     wanted = not early and options.learn != "hamiltonian" and not met_by_law
@@ -140,9 +140,10 @@ def _met(found: LearnedMap | None, judges: Judges) -> bool:
 
 
 def _law(
-    request: Request, plain: Prepared, judges: Judges, better: _Better | None
+    request: Request, plain: Prepared, judges: Judges, better: _Better | None, dearest: float
 ) -> LearnedHamiltonian | None:
-    """H, where one is looked for and found."""
+    """H, where one is looked for and found. dearest: operations of a step of a law that is chosen
+    beside the maps at hand."""
     options = request.options
     if not request.seeks_law:
         return None
@@ -153,8 +154,9 @@ def _law(
         )  # fmt: skip
     else:
         law = law_of(
-            plain, judges, request.scene, options.learn, options.terms, request.budget, request.say
-        )
+            plain, judges, request.scene, options.learn, options.terms, request.budget, request.say,
+            dearest,
+        )  # fmt: skip
     if law is not None:
         if better is not None:
             better.offer(law.candidate, lambda: composed(law.flow, plain, judges))
