@@ -47,8 +47,8 @@ def law_of(
     the first.
 
     prepared: without a base map. dearest: operations of a step of H that is chosen beside a map
-    that meets the tolerance; of use where H is not asked for. Raises FitError where a Hamiltonian is asked for and there is none
-    to learn.
+    that meets the tolerance; of use where H is not asked for. Raises FitError where a Hamiltonian
+    is asked for and there is none to learn.
     """
     unfit = unfit_for_law(prepared, scene)
     if unfit is not None:
