@@ -190,6 +190,10 @@ def _parser() -> argparse.ArgumentParser:
         help="of a recording: how inputs go on between samples (default %(default)s)",
     )  # fmt: skip
     command.add_argument(
+        "--despite", type=_kinds, metavar="KIND", default=(),
+        help="of a recording: a mistake that gfnn look names and that is none, by its kind",
+    )  # fmt: skip
+    command.add_argument(
         "--devices", type=_devices, metavar="all|N",
         help="number of devices that share the rows, and the networks of an ensemble; on a CPU "
         "these are its cores",
@@ -382,6 +386,10 @@ def _count(text: str) -> int:
     return _whole(text, 1, 2**53, "from 1 to 2**53 - 1")
 
 
+def _kinds(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(","))
+
+
 def _devices(text: str) -> int | str:
     return text if text == "all" else _whole(text, 1, 2**31, "from 1 to 2**31 - 1, or all")
 
@@ -517,7 +525,8 @@ def _fit_law(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
         learned = fit_recording(
             arguments.data, out=arguments.out, columns=columns, learn=arguments.learn,
             friction=arguments.friction, input_hold=arguments.input_hold,
-            mass=masses(arguments), seed=arguments.seed, progress=shown,
+            mass=masses(arguments), despite=arguments.despite, seed=arguments.seed,
+            progress=shown,
         )  # fmt: skip
     print(learned.fit.table)
     print(f"written to {arguments.out}")
@@ -533,6 +542,7 @@ def _fit_positions(arguments: argparse.Namespace, columns: dict[str, Any]) -> No
     with progress.on_stderr() as shown:
         ran = fit_positions(
             arguments.data, out=arguments.out, columns=columns, seed=arguments.seed,
+            despite=arguments.despite,
             tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
             absolute_tolerance=arguments.absolute_tolerance, structure=arguments.structure,
             max_seconds=arguments.max_seconds or "auto", max_operations=arguments.max_operations,

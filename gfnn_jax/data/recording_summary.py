@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from gfnn_jax.data.faults import Fault, faults
 from gfnn_jax.data.roles import ROLES
 from gfnn_jax.data.traits import Traits, traits
+from gfnn_jax.errors import InputError
 from gfnn_jax.signals import energy
 from gfnn_jax.signals.spectra import dominant_frequencies
 from gfnn_jax.signals.steps import gaps
@@ -158,6 +159,16 @@ def summarise(recording: Recording, options: Mapping[str, Any] | None = None) ->
         period, _coarsest(known), loss, bool(recording.inputs), found,
         _command(recording, found, options or {}),
     )  # fmt: skip
+
+
+def refuse_mistakes(recording: Recording, despite: Sequence[str] = ()) -> None:
+    """Raises InputError, a line with what mends it, where the samples show a mistake that makes a
+    fit meaningless; kinds of `Fault` in ``despite`` are let pass."""
+    wrong = [f for f in faults(traits(recording)) if f.wrong and f.kind not in despite]
+    if wrong:
+        more = f"; {len(wrong) - 1} more: gfnn look" if len(wrong) > 1 else ""
+        kind = shlex.quote(wrong[0].kind)
+        raise InputError(f"{recording.source}: {wrong[0]} (or --despite {kind}){more}")
 
 
 def _motion(known: Traits) -> tuple[float | None, energy.Loss | None]:
