@@ -250,13 +250,20 @@ def _command(recording: Recording, found: tuple[Fault, ...], options: Mapping[st
     return f"gfnn fit {files}{as_typed(typed)} --out model"
 
 
+def _short(value: Any) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
 def as_typed(options: Mapping[str, Any]) -> str:
     """Keywords of `gfnn_jax.read` as options of the command line, with a blank before each."""
     words = {"start": "from", "stop": "to", "time_unit": "time-unit"}
     said = []
     for option, value in options.items():
+        if option == "observe":
+            said += [f" --observe {shlex.quote(f'{c} = {f}')}" for c, f in value.items()]
+            continue
         if isinstance(value, Mapping):
-            value = ",".join(f"{name}={number:g}" for name, number in value.items())
+            value = ",".join(f"{name}={_short(number)}" for name, number in value.items())
         elif isinstance(value, (tuple, list)):
             value = ",".join(map(str, value))
         said.append(f" --{words.get(option, option)} {shlex.quote(str(value))}")

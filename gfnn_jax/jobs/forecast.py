@@ -70,7 +70,7 @@ def forecast_recording(
             steps = np.arange(save_every, num_steps + 1, save_every)
             times = last + float(np.asarray(map_.dt)) * steps
         found[run] = forecast(map_, part, times, ahead)
-    _write(out, sensors.positions, found)
+    _write(out, tuple(next(iter(found.values())).values), found)
     return found, None if measured is None else _judged(sensors, found, measured)
 
 
@@ -83,7 +83,7 @@ def _last_samples(recording: Recording, run: str, count: int | None) -> Recordin
 
 def _judged(sensors: Any, found: dict[str, Forecast], measured: Recording) -> Judged:
     columns, count = {}, 0
-    for name in sensors.positions:
+    for name in sensors.seen.channels:
         errors, stds = [], []
         for run, one in found.items():
             own = run if len(measured.runs) > 1 else next(iter(measured.runs))
