@@ -637,7 +637,7 @@ def _forecast(arguments: argparse.Namespace) -> None:
         inputs=arguments.inputs, compare=arguments.compare, overwrite=arguments.overwrite,
     )  # fmt: skip
     times = [f.times[-1] for f in found.values()]
-    print(f"{arguments.out}: forecasts of {len(found)} runs, up to {max(times):g} s")
+    print(f"{arguments.out}: forecasts of {len(found)} runs, up to t = {max(times):g}")
     if judged is not None:
         for name, (rms, median, within) in judged.columns.items():
             print(f"{name}: error {rms:.4g} rms, {median:.4g} median; {within:.0%} of "

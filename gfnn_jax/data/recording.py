@@ -154,7 +154,12 @@ class Recording:
         if empty:
             raise InputError(f"{source}: no value in column {', '.join(empty)}")
         angular, in_degrees = angles_of(
-            source, {**roles, "positions": seen}, listed(angles), listed(degrees), angles is None, units
+            source,
+            {**roles, "positions": seen},
+            listed(angles),
+            listed(degrees),
+            angles is None,
+            units,
         )
         factors = factors_of(numbers, in_degrees)
         factors |= {of: factors[name] for name, of in sigmas.items()}
@@ -215,6 +220,11 @@ class Recording:
     def columns(self) -> tuple[str, ...]:
         """Names of the columns that have a role, role by role."""
         return tuple(name for role in ROLES for name in getattr(self, role))
+
+    @property
+    def explained(self) -> frozenset[str]:
+        """Columns whose sensor is told by ``observe``, an offset or a scale."""
+        return frozenset({*self.observe, *self.offsets, *self.scales})
 
     def times(self, run: str | float) -> np.ndarray:
         """Times (n,) of a run in seconds, rising."""

@@ -182,7 +182,9 @@ def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:
     """σ (k,) of channels, each where it was seen."""
     sigma = []
     for k in range(found[0].y.shape[1]):
-        known = [(s.t[have], s.y[have, k : k + 1]) for s in found for have in [~np.isnan(s.y[:, k])]]
+        known = [
+            (s.t[have], s.y[have, k : k + 1]) for s in found for have in [~np.isnan(s.y[:, k])]
+        ]
         known = [pair for pair in known if len(pair[0]) >= _SHORTEST]
         if not known:
             raise FitError(f"expected channels with {_SHORTEST} samples in a row, got fewer")

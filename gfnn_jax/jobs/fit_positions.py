@@ -26,7 +26,8 @@ def fit_positions(
     """Learn the map of recordings of positions, and write it with its report into the folder out.
 
     columns: keywords of `gfnn_jax.read`. despite: kinds of mistakes that the files may show.
-    options: those of `learn.fit.fit_positions`. Raises InputError where `gfnn look` finds a mistake.
+    options: those of `learn.fit.fit_positions`. Raises InputError where `gfnn look` finds a
+    mistake.
     """
     recording = read(list(data), **columns)
     refuse_mistakes(recording, despite)

@@ -43,7 +43,11 @@ def fit_recording(
     )  # fmt: skip
     result = law_report.assemble(fitted, source=recording.source, seed=seed)
     kept = ("seed", "device", "data", "fit", "map", "lagrangian", "friction", "gauge")
-    job = {"command": "fit", "data": recording.source, "friction": friction}
+    job = {
+        "command": "fit", "data": recording.source, "friction": friction,
+        "degrees": [name for name, factor in recording.factors.items() if factor != 1],
+        "time_unit": recording.time_unit,
+    }  # fmt: skip
     record = {"job": job, **report.finite({key: result[key] for key in kept})}
     with atomic_folder(out) as folder:
         saved.save(fitted.map, folder, record=record)

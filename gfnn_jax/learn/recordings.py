@@ -154,15 +154,13 @@ def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
     if open_:
         shown = ", ".join(names[i] for i in lengths)
         raise InputError(
-            f"{', '.join(open_)}: every scale of {shown} has a law of the same terms: leave it out, "
-            "or observe a velocity of known scale beside"
+            f"{', '.join(open_)}: every scale of {shown} has a law of the same terms: leave it "
+            "out, or observe a velocity of known scale beside"
         )
     return seen, angles
 
 
-def _stretches(
-    recording: Recording, seen: Observation, angles: tuple[int, ...]
-) -> list[Stretch]:
+def _stretches(recording: Recording, seen: Observation, angles: tuple[int, ...]) -> list[Stretch]:
     """The stretches of a recording, as the parameters of ``seen`` show its coordinates."""
     if seen.is_plain:
         return stretches(recording)
@@ -204,6 +202,7 @@ def _described(
     names = recording.coordinates
     speeds = speed_names(names, recording.velocities)
     channels = map_.sensors.seen.channels
+    factors = np.array([recording.factors[name] for name in channels])
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     count, lost = law.terms.count, law.friction.count
     lagrangian = terms_of(law.terms, law.coefficients, std[:count], names, speeds)
@@ -234,8 +233,8 @@ def _described(
     return LearnedLaw(
         map=map_, lagrangian=lagrangian, friction=friction, gains=gains,
         hamiltonian=hamiltonian_of(law.terms, lagrangian, names), zeros=zeros,
-        noise=dict(zip(channels, map(float, map_.sensors.sigma), strict=True)),
-        residual=dict(zip(channels, map(float, fit.rms()), strict=True)), gauge=gauge,
+        noise=dict(zip(channels, map(float, map_.sensors.sigma / factors), strict=True)),
+        residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)), gauge=gauge,
         observe={n: f for n, f in formulas.items() if n != f}, sensors=sensors,
         alike=_alike(fit, lagrangian, friction), horizon=tuple(horizons),
         energy=_energy(law, friction, recording.inputs, states, times),

@@ -167,9 +167,7 @@ def thinned(window: Window) -> Window:
     more."""
     every = -(-len(window.t) // _MOST)
     noise = None if window.noise is None else window.noise[::-every][::-1]
-    return window._replace(
-        t=window.t[::-every][::-1], y=window.y[::-every][::-1], noise=noise
-    )
+    return window._replace(t=window.t[::-every][::-1], y=window.y[::-every][::-1], noise=noise)
 
 
 def _with_inputs(window: Window, inputs: Recording, sensors: Sensors, run: str) -> Window:
@@ -211,7 +209,7 @@ class _Windows:
 def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np.ndarray]:
     """(q, v) (B, 2d) at the last sample of each window, and its covariance (B, 2d, 2d) in the
     law."""
-    d, sensors = law.form.dim, law.sensors
+    sensors = law.sensors
     length = max(len(w.t) for w in windows)
     count = windows[0].y.shape[1]
     t, y, x, noise = [], [], [], []

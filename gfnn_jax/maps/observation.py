@@ -106,7 +106,8 @@ class Observation:
         return Observed(g, by[..., : 2 * d], by[..., 2 * d :])
 
     def coordinates_of(self, y: np.ndarray, angles: Sequence[int]) -> np.ndarray:
-        """The coordinates (n, d) that channels y (n, k) show at ``values``, each sample for itself.
+        """The coordinates (n, d) that channels y (n, k) show at ``values``, each sample for itself;
+        ``angles`` that no column shows directly in (−π, π].
 
         Raises InputError where the channels leave a coordinate open.
         """
@@ -136,6 +137,9 @@ class Observation:
                 f"observe: {', '.join(self.channels)} do not tell {', '.join(self.coordinates)}: "
                 "each needs a channel that shows it"
             )
+        for i in angles:
+            if own[i] is None:
+                q[:, i] = np.pi - (np.pi - q[:, i]) % (2 * np.pi)
         return q
 
     def _followed(
@@ -249,13 +253,13 @@ def _text_of(function: Callable, starts: dict[str, float]) -> str:
     """The formula of a function of named arguments, whose defaults become ``starts``."""
     try:
         arguments = inspect.signature(function).parameters
+        for name, argument in arguments.items():
+            if argument.default is not argument.empty:
+                starts.setdefault(name, float(argument.default))
     except (TypeError, ValueError) as error:
         raise InputError(
             f"observe: expected text or a function of named arguments ({error})"
         ) from None
-    for name, argument in arguments.items():
-        if argument.default is not argument.empty:
-            starts.setdefault(name, float(argument.default))
     names, size = tuple(arguments), len(arguments)
     try:
         trees = traced(lambda z: function(*(z[i] for i in range(size))), -(-size // 2))

@@ -23,10 +23,11 @@ class LearnedLaw:
     names of columns, with standard errors. gains: input -> force on each position, with its
     standard error. hamiltonian: H in words, its terms as of L. zeros: angle -> (where it is zero,
     standard error), already inside the formula. observe: column -> what its sensor shows, where
-    that is not the coordinate; sensors: the parameters in it, fitted, with standard errors. noise: column -> σ of its samples; residual: of
-    the fit's arcs. gauge: what fixes the scale of L. alike: coefficients that the record cannot
-    tell apart. horizon: for how long a forecast can be trusted. energy: stored, lost, supplied per
-    second, means over the record. messages: warnings. steps: what the search did, line by line.
+    that is not the coordinate; sensors: the parameters in it, fitted, with standard errors. noise:
+    column -> σ of its samples; residual: of the fit's arcs, both in the file's unit. gauge: what
+    fixes the scale of L. alike: coefficients that the record cannot tell apart. horizon: for how
+    long a forecast can be trusted. energy: stored, lost, supplied per second, means over the
+    record. messages: warnings. steps: what the search did, line by line.
     num_samples, seconds (of the processor). ended: why the search ended.
     """
 
