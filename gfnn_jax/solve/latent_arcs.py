@@ -96,8 +96,8 @@ def fit_arcs(
 
     Entries of y that are NaN were not seen. ``sigma`` (k,) or (A, L, k) is the noise of y,
     ``state_scale`` (m,) the defect that counts as one standard deviation. While defects matter, an
-    iteration has to close them; then it has to lower the cost. Ends where it lowers it by less than ``tolerance``
-    of itself. The cost is infinite where the defects could not be closed.
+    iteration has to close them; then it has to lower the cost. Ends where it lowers it by less than
+    ``tolerance`` of itself. The cost is infinite where the defects could not be closed.
     """
     seen = np.isfinite(y)
     known = np.where(seen, y, 0.0)
