@@ -8,8 +8,8 @@
 Each case (benchmarks/users) makes pairs as a user would have them, calls the public ``gfnn.fit`` or
 the command ``gfnn fit``, and measures the true one-step error on fresh states: the RMS over
 coordinates of error divided by spread. What was said is then compared with what is true. A mistake
-of the user's must be refused in one line. Seconds are those of the processor, in the budget too. The result is
-benchmarks/results/as-a-user.json, and a section of benchmarks/RESULTS.md.
+of the user's must be refused in one line. Seconds, of budgets too, are those of the processor. The
+result is benchmarks/results/as-a-user.json, and a section of benchmarks/RESULTS.md.
 """
 
 from __future__ import annotations

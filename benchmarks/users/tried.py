@@ -66,9 +66,9 @@ def of_box(text: str, dim: int, half: float, dt: float, num: int, **options) -> 
 def near_bodies(num: int, seed: int, num_steps: int) -> np.ndarray:
     """Trajectories (num, 1 + num_steps, 4) beside three bodies that come no closer than 0.1."""
     rng = np.random.default_rng([SEED, seed])
-    r, turn = rng.uniform(0.4, 0.7, 4 * num), rng.uniform(0, 2 * np.pi, 4 * num)
+    r, turn = rng.uniform(0.35, 0.5, 4 * num), rng.uniform(0, 2 * np.pi, 4 * num)
     q = r * np.stack([np.cos(turn), np.sin(turn)])
-    speed = rng.uniform(0.8, 1.1, 4 * num) / np.sqrt(r)
+    speed = rng.uniform(0.9, 1.05, 4 * num) / np.sqrt(r / 0.9)
     z = np.concatenate([q, speed * np.stack([-q[1], q[0]]) / r]).T
     z[:, 0] -= 0.075
     states = sequences(of_energy(FOUR_BODIES, 2), z, 0.1, num_steps)

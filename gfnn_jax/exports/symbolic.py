@@ -14,7 +14,7 @@ def as_sympy(text: str) -> Any:
 
     named = re.findall(r"[A-Za-z_]\w*\b(?!\()", text)
     known: dict[str, Any] = {"arctan": sympy.atan} | {name: sympy.Symbol(name) for name in named}
-    return sympy.sympify(text, locals=known)
+    return sympy.sympify(text, locals=known)  # pyright: ignore[reportCallIssue]
 
 
 def as_latex(text: str) -> str:
