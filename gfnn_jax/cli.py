@@ -176,6 +176,10 @@ def _parser() -> argparse.ArgumentParser:
     _add_fit_options(command)
     add_column_options(command)
     command.add_argument(
+        "--despite", type=_kinds, metavar="KIND", default=(),
+        help="of a recording: a mistake that gfnn look names and that is none, by its kind",
+    )  # fmt: skip
+    command.add_argument(
         "--distributed", action="store_true",
         help="this is one of several processes that srun or another launcher has started: each "
         "reads its own rows of DATA, or its own files",
@@ -193,7 +197,9 @@ def _parser() -> argparse.ArgumentParser:
         help="initial states, or a trajectory file: its sequences continue from their last states; "
         "of a map of positions a recording, whose runs continue from their last two",
     )  # fmt: skip
-    command.add_argument("--num-steps", type=_count, metavar="N")
+    command.add_argument(
+        "--num-steps", type=_steps, metavar="N", help="steps to predict, backwards where N < 0"
+    )
     command.add_argument(
         "--estimate-from", type=_count, metavar="K",
         help="of a recording: samples that the state at its end is estimated from",
@@ -322,6 +328,13 @@ def _reader(kind: Kind) -> Callable[[str], Any]:
 
 
 _positive, _count, _seed, _devices = (_reader(kind) for kind in (POSITIVE, COUNT, SEED, DEVICES))
+_steps = _reader(
+    Kind("a whole number from 1 to 2**53 - 1, or its negative", lambda v: COUNT.holds(abs(v)), int)
+)
+
+
+def _kinds(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(","))
 
 
 def _check_exists(path: Path) -> None:
@@ -437,7 +450,7 @@ def _fit_law(
     with progress.on_stderr() as shown:
         learned = fit_recording(
             arguments.data, out=arguments.out, columns=columns, mass=masses(arguments),
-            progress=shown, **options,
+            despite=arguments.despite, progress=shown, **options,
         )  # fmt: skip
     print(learned.fit.table)
     print(f"written to {arguments.out}")
@@ -454,7 +467,8 @@ def _fit_positions(
 
     with progress.on_stderr() as shown:
         ran = fit_positions(
-            arguments.data, out=arguments.out, columns=columns, progress=shown, **options
+            arguments.data, out=arguments.out, columns=columns, despite=arguments.despite,
+            progress=shown, **options,
         )  # fmt: skip
     _summarise(ran, arguments.out)
     print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
@@ -541,7 +555,7 @@ def _forecast(arguments: argparse.Namespace) -> None:
         inputs=arguments.inputs, compare=arguments.compare, overwrite=arguments.overwrite,
     )  # fmt: skip
     times = [f.times[-1] for f in found.values()]
-    print(f"{arguments.out}: forecasts of {len(found)} runs, up to {max(times):g} s")
+    print(f"{arguments.out}: forecasts of {len(found)} runs, up to t = {max(times):g}")
     if judged is not None:
         for name, (rms, median, within) in judged.columns.items():
             print(f"{name}: error {rms:.4g} rms, {median:.4g} median; {within:.0%} of "
@@ -564,7 +578,8 @@ def _predict_and_tell(arguments: argparse.Namespace, share: processes.Share | No
         print(f"process {share.index} of {share.count}: {num_lanes} trajectories, "
               f"{predicted.seconds:.1f} s")  # fmt: skip
         return
-    print(f"{arguments.out}: {num_lanes} trajectories of {arguments.num_steps} steps, "
+    back = " backwards" if arguments.num_steps < 0 else ""
+    print(f"{arguments.out}: {num_lanes} trajectories of {abs(arguments.num_steps)} steps{back}, "
           f"{predicted.seconds:.1f} s")  # fmt: skip
     _print_status(predicted.status, predicted.left_at)
     if predicted.horizon is not None:

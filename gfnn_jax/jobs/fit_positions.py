@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.data.recording import read
+from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.evaluate import report
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.search import failures_of_arithmetic, line, refusals
@@ -19,16 +20,18 @@ from gfnn_jax.storage.outputs import atomic_folder
 
 
 def fit_positions(
-    data: Sequence[Path], *, out: Path, columns: dict[str, Any],
+    data: Sequence[Path], *, out: Path, columns: dict[str, Any], despite: Sequence[str] = (),
     progress: Progress = SILENT, **options: Any,
 ) -> Ran:  # fmt: skip
     """Learn the map of recordings of positions, and write it with its report into the folder out.
 
-    columns: keywords of `gfnn_jax.read`. options: `FitOptions`.
+    columns: keywords of `gfnn_jax.read`. despite: kinds of mistakes that the files may show.
+    options: `FitOptions`. Raises InputError where `gfnn look` finds a mistake.
     """
     with refusals():
         asked = FitOptions(**{**options, "learn": "map"})
     recording = read(list(data), **columns)
+    refuse_mistakes(recording, despite)
     with refusals(), failures_of_arithmetic():
         fitted = learn_fit(
             recording, options=asked, on_progress=progress.say,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gfnn_jax.data.recording import read
+from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.evaluate import law_report, report
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.search import refusals
@@ -27,20 +28,26 @@ class Learned(NamedTuple):
 
 
 def fit_recording(
-    data: Sequence[Path], *, out: Path, columns: dict[str, Any],
+    data: Sequence[Path], *, out: Path, columns: dict[str, Any], despite: Sequence[str] = (),
     progress: Progress = SILENT, **options: Any,
 ) -> Learned:  # fmt: skip
     """Learn the law of recordings (files), and write it with its report into the folder ``out``.
 
-    columns: keywords of `gfnn_jax.read`. options: `FitOptions`.
+    columns: keywords of `gfnn_jax.read`. despite: kinds of mistakes that the files may show.
+    options: `FitOptions`. Raises InputError where `gfnn look` finds a mistake.
     """
     with refusals():
         asked = FitOptions(**options)
     recording = read(list(data), **columns)
+    refuse_mistakes(recording, despite)
     fitted = learn_fit(recording, options=asked, on_progress=progress.tell)
     result = law_report.assemble(fitted, source=recording.source, seed=asked.seed)
     kept = ("seed", "device", "data", "fit", "map", "lagrangian", "friction", "gauge")
-    job = {"command": "fit", "data": recording.source, **asked.deciding}
+    job = {
+        "command": "fit", "data": recording.source, **asked.deciding,
+        "degrees": [name for name, factor in recording.factors.items() if factor != 1],
+        "time_unit": recording.time_unit,
+    }  # fmt: skip
     record = {"job": job, **report.finite({key: result[key] for key in kept})}
     with atomic_folder(out) as folder:
         saved.save(fitted.map, folder, record=record)
