@@ -537,7 +537,7 @@ def _predict(arguments: argparse.Namespace) -> None:
 
 
 def _is_law(model: Path) -> bool:
-    """Whether the model is the law of a recording, and no map of its positions."""
+    """Return whether the model is the law of a recording, and no map of its positions."""
     _set_up_jax()
     from gfnn_jax.maps.saved import record
 
@@ -545,7 +545,7 @@ def _is_law(model: Path) -> bool:
 
 
 def _forecast(arguments: argparse.Namespace) -> None:
-    """From the end of a recording."""
+    """Forecast from the end of a recording."""
     _set_up_jax()
     from gfnn_jax.jobs.forecast import forecast_recording
 
