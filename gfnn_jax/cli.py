@@ -327,17 +327,14 @@ def _reader(kind: Kind) -> Callable[[str], Any]:
     return read
 
 
+_positive, _count, _seed, _devices = (_reader(kind) for kind in (POSITIVE, COUNT, SEED, DEVICES))
+_steps = _reader(
+    Kind("a whole number from 1 to 2**53 - 1, or its negative", lambda v: COUNT.holds(abs(v)), int)
+)
+
+
 def _kinds(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(","))
-
-
-_STEPS = Kind(
-    f"{COUNT.words}, or its negative",
-    lambda value: COUNT.holds(abs(value)), int,
-)  # fmt: skip
-_positive, _count, _seed, _devices, _steps = (
-    _reader(kind) for kind in (POSITIVE, COUNT, SEED, DEVICES, _STEPS)
-)
 
 
 def _check_exists(path: Path) -> None:
