@@ -327,14 +327,17 @@ def _reader(kind: Kind) -> Callable[[str], Any]:
     return read
 
 
-_positive, _count, _seed, _devices = (_reader(kind) for kind in (POSITIVE, COUNT, SEED, DEVICES))
-_steps = _reader(
-    Kind("a whole number from 1 to 2**53 - 1, or its negative", lambda v: COUNT.holds(abs(v)), int)
-)
-
-
 def _kinds(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(","))
+
+
+_STEPS = Kind(
+    f"{COUNT.words}, or its negative",
+    lambda value: COUNT.holds(abs(value)), int,
+)  # fmt: skip
+_positive, _count, _seed, _devices, _steps = (
+    _reader(kind) for kind in (POSITIVE, COUNT, SEED, DEVICES, _STEPS)
+)
 
 
 def _check_exists(path: Path) -> None:
@@ -537,7 +540,7 @@ def _predict(arguments: argparse.Namespace) -> None:
 
 
 def _is_law(model: Path) -> bool:
-    """Whether the model is the law of a recording, and no map of its positions."""
+    """Return whether the model is the law of a recording, and no map of its positions."""
     _set_up_jax()
     from gfnn_jax.maps.saved import record
 
@@ -545,7 +548,7 @@ def _is_law(model: Path) -> bool:
 
 
 def _forecast(arguments: argparse.Namespace) -> None:
-    """From the end of a recording."""
+    """Forecast from the end of a recording."""
     _set_up_jax()
     from gfnn_jax.jobs.forecast import forecast_recording
 

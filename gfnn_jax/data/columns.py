@@ -87,7 +87,7 @@ def angles_of(
 
 
 def factors_of(names: Sequence[str], in_degrees: set[str]) -> dict[str, float]:
-    """By name what a number in the file is multiplied by: π/180 for degrees, else 1."""
+    """Factors of the numbers in the file, by column: π/180 for degrees, else 1."""
     return {name: math.pi / 180 if name in in_degrees else 1.0 for name in names}
 
 

@@ -47,17 +47,17 @@ def plain(name: str) -> str:
 
 
 def is_time(name: str) -> bool:
-    """Whether this is the name of a column of times."""
+    """Return whether this is the name of a column of times."""
     return re.sub(r"_?(s|ms|us|µs|ns)$", "", plain(name)) in TIMES or plain(name) in TIMES
 
 
 def is_run(name: str) -> bool:
-    """Whether this is the name of a column that tells runs apart."""
+    """Return whether this is the name of a column that tells runs apart."""
     return re.sub(r"_?(id|no|nr|number|index)$", "", plain(name)) in RUNS
 
 
 def is_angle(name: str) -> bool:
-    """Whether this is the usual name of an angle."""
+    """Return whether this is the usual name of an angle."""
     found = _INDEXED.fullmatch(plain(name))
     return bool(found) and found[1] in _ANGLES
 

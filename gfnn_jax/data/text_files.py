@@ -28,7 +28,7 @@ _BRACKETS = re.compile(r"^\s*([^\[(]*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))?\s*$")
 
 @dataclasses.dataclass(frozen=True)
 class _Format:
-    """How a text file is written: what its first lines tell."""
+    """Dialect of a text file, from its first lines."""
 
     separator: str  # or r"\s+"
     decimal: str

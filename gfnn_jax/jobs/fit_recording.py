@@ -1,4 +1,4 @@
-"""What ``gfnn fit RECORDING`` does: a recording in, a model folder with its report out."""
+"""Job of ``gfnn fit RECORDING``: a recording in, a model folder with its report out."""
 
 from __future__ import annotations
 

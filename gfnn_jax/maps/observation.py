@@ -1,4 +1,4 @@
-"""What sensors show of a state: channels g(q, v; c) with unknown parameters c.
+"""Observation of a state by sensors: channels g(q, v; c) with unknown parameters c.
 
     theta  =  theta + zero              an angle whose zero is unknown
     omega  =  k*omega                   a gyroscope of unknown scale
@@ -64,12 +64,12 @@ class Observation:
 
     @property
     def is_plain(self) -> bool:
-        """Whether every channel is the coordinate of its name, and none is missing."""
+        """Return whether every channel is the coordinate of its name, and none is missing."""
         return self.channels == self.formulas == self.coordinates
 
     @cached_property
     def _trees(self) -> tuple[Expression | None, ...]:
-        """Of each channel; None where it is the coordinate of its name."""
+        """Syntax trees of the channels; None where one is the coordinate of its name."""
         names = (*self.coordinates, *self.speeds, *self.parameters)
         same = zip(self.channels, self.formulas, strict=True)
         return tuple(
@@ -172,8 +172,8 @@ class Observation:
         return tuple(i for i in range(self.dim) if _spans(by_values, by_state[:, [i]]))
 
     def shifted(self, by: np.ndarray) -> Observation:
-        """With parameters that show coordinates which are lower by these amounts (d,) as before,
-        where they can: g(q, v; c) = g(q − by, v; c′), to first order."""
+        """Change the parameters so that coordinates which are lower by these amounts (d,) show as
+        before, where they can: g(q, v; c) = g(q − by, v; c′), to first order."""
         by_state, by_values = self._anywhere()
         change = np.linalg.lstsq(by_values, by_state @ by, rcond=None)[0]
         return dataclasses.replace(self, values=self.values + change)
@@ -300,7 +300,7 @@ def _started(g: Observation) -> np.ndarray:
 
 
 def _spans(table: np.ndarray, column: np.ndarray) -> bool:
-    """Whether a column is a combination of those of a table."""
+    """Return whether a column is a combination of those of a table."""
     size = np.linalg.norm(column)
     if not table.shape[1] or size == 0:
         return False

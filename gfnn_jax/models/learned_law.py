@@ -1,4 +1,4 @@
-"""What was learned from a recording: the law in words and numbers, and its map."""
+"""Law that was learned from a recording: the law in words and numbers, and its map."""
 
 from __future__ import annotations
 
