@@ -142,6 +142,12 @@ def test_text_of_a_law():
     assert found.latex().startswith(r"0.5 \omega_{1}^{2} + 0.25 \omega_{1} \, \omega_{2}")
 
 
+def test_names_of_functions_are_columns_all_the_same():
+    terms = Terms.of([((2, 0), (0, 0), (0, 0), 0.0), ((0, 0), (0, 0), (1, 0), 0.0)], 2)
+    found = terms_of(terms, np.ones(2), np.zeros(2), ("beta", "E"), ("gamma", "I"))
+    assert str(found.sympy()) == "gamma**2 + cos(beta)"
+
+
 @pytest.fixture(scope="module")
 def swing():
     t, theta = pendulum()

@@ -5,19 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from gfnn_jax.families.expressions import names_in
+
 
 def as_sympy(text: str) -> Any:
     """The expression that a formula in Python's notation says."""
     import sympy  # loaded when first used
 
-    return sympy.sympify(text)
+    own = {name: sympy.Symbol(name) for name in names_in(text)}  # beta is a column, no function
+    return sympy.sympify(text, locals=own)
 
 
 def as_latex(text: str) -> str:
     """The formula in LaTeX's notation."""
     import sympy
 
-    return sympy.latex(sympy.sympify(text))
+    return sympy.latex(as_sympy(text))
 
 
 def hamiltonian(
@@ -29,8 +32,8 @@ def hamiltonian(
     entries = sympy.zeros(dim, dim)
     for (i, j), summands in mass.items():
         for summand in summands:
-            entries[i, j] += sympy.sympify(summand)
+            entries[i, j] += as_sympy(summand)
         entries[j, i] = entries[i, j]
     p = sympy.Matrix(sympy.symbols(f"p1:{dim + 1}"))
     kinetic = (p.T * entries.inv() * p)[0, 0] / 2
-    return kinetic + sympy.sympify(potential)
+    return kinetic + as_sympy(potential)

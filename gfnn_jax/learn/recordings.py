@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.roles import symbols
 from gfnn_jax.dataset.stretches import Scales, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.maps.estimates import law_in_use
@@ -201,12 +202,14 @@ def _described(
     """The law in the words of the recording."""
     names = recording.coordinates
     speeds = speed_names(names, recording.velocities)
+    in_formulas = symbols((*names, *speeds))
+    codes, of_speeds = in_formulas[: len(names)], in_formulas[len(names) :]
     channels = map_.sensors.seen.channels
     factors = np.array([recording.factors[name] for name in channels])
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     count, lost = law.terms.count, law.friction.count
-    lagrangian = terms_of(law.terms, law.coefficients, std[:count], names, speeds)
-    friction = friction_of(law.friction, law.losses, std[count : count + lost], speeds)
+    lagrangian = terms_of(law.terms, law.coefficients, std[:count], codes, of_speeds)
+    friction = friction_of(law.friction, law.losses, std[count : count + lost], of_speeds)
     of_gains = std[count + lost :].reshape(law.gains.shape)
     gains = {
         u: {q: (float(law.gains[i, j]), float(of_gains[i, j])) for i, q in enumerate(names)}
@@ -232,7 +235,7 @@ def _described(
         messages.append("friction with a negative coefficient: the record shows energy gained")
     return LearnedLaw(
         map=map_, lagrangian=lagrangian, friction=friction, gains=gains,
-        hamiltonian=hamiltonian_of(law.terms, lagrangian, names), zeros=zeros,
+        hamiltonian=hamiltonian_of(law.terms, lagrangian, codes), zeros=zeros,
         noise=dict(zip(channels, map(float, map_.sensors.sigma / factors), strict=True)),
         residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)), gauge=gauge,
         observe={n: f for n, f in formulas.items() if n != f}, sensors=sensors,
