@@ -220,7 +220,9 @@ def _parser() -> argparse.ArgumentParser:
         help="initial states, or a trajectory file: its sequences continue from their last states; "
         "of a map of positions a recording, whose runs continue from their last two",
     )  # fmt: skip
-    command.add_argument("--num-steps", type=_count, metavar="N")
+    command.add_argument(
+        "--num-steps", type=_steps, metavar="N", help="steps to predict, backwards where N < 0"
+    )
     command.add_argument(
         "--estimate-from", type=_count, metavar="K",
         help="of a recording: samples that the state at its end is estimated from",
@@ -388,6 +390,11 @@ def _count(text: str) -> int:
 
 def _kinds(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(","))
+
+
+def _steps(text: str) -> int:
+    sign = -1 if text.startswith("-") else 1
+    return sign * _whole(text.removeprefix("-"), 1, 2**53, "from 1 to 2**53 - 1, or its negative")
 
 
 def _devices(text: str) -> int | str:
@@ -660,7 +667,8 @@ def _predict_and_tell(arguments: argparse.Namespace, share: processes.Share | No
         print(f"process {share.index} of {share.count}: {num_lanes} trajectories, "
               f"{predicted.seconds:.1f} s")  # fmt: skip
         return
-    print(f"{arguments.out}: {num_lanes} trajectories of {arguments.num_steps} steps, "
+    back = " backwards" if arguments.num_steps < 0 else ""
+    print(f"{arguments.out}: {num_lanes} trajectories of {abs(arguments.num_steps)} steps{back}, "
           f"{predicted.seconds:.1f} s")  # fmt: skip
     _print_status(predicted.status, predicted.left_at)
     if predicted.horizon is not None:

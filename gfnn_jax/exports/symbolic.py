@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gfnn_jax.families.expressions import names_in
-
 
 def as_sympy(text: str) -> Any:
-    """The expression that a formula in Python's notation says."""
+    """The expression that a formula in Python's notation says; every name but a function's is a
+    symbol, those that sympy has for its own (S, N, E, …) too."""
     import sympy  # loaded when first used
 
-    own = {name: sympy.Symbol(name) for name in names_in(text)}  # beta is a column, no function
-    return sympy.sympify(text, locals=own)
+    named = re.findall(r"[A-Za-z_]\w*\b(?!\()", text)
+    known: dict[str, Any] = {"arctan": sympy.atan} | {name: sympy.Symbol(name) for name in named}
+    return sympy.sympify(text, locals=known)  # pyright: ignore[reportCallIssue]
 
 
 def as_latex(text: str) -> str:
