@@ -249,6 +249,9 @@ def test_the_command_line_learns_and_forecasts(tmp_path, capsys):
     assert report["lagrangian"]["terms"][0]["term"] == "omega**2"
     assert set(report) >= {"hamiltonian", "friction", "inputs", "noise", "gauge", "energy"}
     assert report["rollout"] is None
+    assert report["whiteness"]["theta"]["white"]
+    assert report["whiteness"]["theta"]["fit_percent"] > 99.5
+    assert (tmp_path / "model" / "law.png").stat().st_size > 10_000
     everything = str(tmp_path / "all.csv")
     out = tmp_path / "forecast.csv"
     arguments = ["predict", model, "--initial", past, "--out", str(out)]
