@@ -102,7 +102,8 @@ def whiteness(
 
 
 def _correlation(a: Sequence[np.ndarray], b: Sequence[np.ndarray], lag: int) -> float:
-    """Of a with b ``lag`` samples later, within arcs; NaN counts as nothing."""
+    """Of a with b ``lag`` samples later, within arcs, in units of all of both, so that few pairs of
+    a long lag count for as little; NaN counts as nothing."""
     early, late = [], []
     for one, other in zip(a, b, strict=True):
         n = len(one)
@@ -114,5 +115,5 @@ def _correlation(a: Sequence[np.ndarray], b: Sequence[np.ndarray], lag: int) -> 
         return 0.0
     x, y = np.concatenate(early), np.concatenate(late)
     known = np.isfinite(x) & np.isfinite(y)
-    size = np.sqrt(np.sum(x[known] ** 2) * np.sum(y[known] ** 2))
+    size = np.sqrt(np.prod([np.nansum(np.concatenate(every) ** 2) for every in (a, b)]))
     return float(np.sum(x[known] * y[known]) / size) if size > 0 else 0.0
