@@ -11,7 +11,8 @@ import numpy as np
 
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
-from gfnn_jax.fitting.levenberg_marquardt import LMResult, LMState, levenberg_marquardt
+from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
+from gfnn_jax.fitting.training import LMResult, LMState
 from gfnn_jax.learn.candidates import Candidate, Judges, validated
 from gfnn_jax.learn.clock import NETWORK, Budget
 from gfnn_jax.learn.rows import rows_of
