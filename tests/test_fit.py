@@ -314,12 +314,12 @@ def test_what_is_found_on_the_way_is_handed_on(pendulum_fit):
 
 def test_a_map_without_all_images_is_still_given(monkeypatch):
     """The most accurate there is, with a warning, even where no step could be judged."""
-    from gfnn_jax.learn import candidates
+    from gfnn_jax.dataset import measured_error
 
     def failing(error, spread, tolerance, block=None):
-        return candidates.OneStepError(np.inf, np.inf, np.inf, np.full(2, np.inf))
+        return measured_error.OneStepError(np.inf, np.inf, np.inf, np.full(2, np.inf))
 
-    monkeypatch.setattr(candidates, "one_step_error", failing)
+    monkeypatch.setattr(measured_error, "one_step_error", failing)
     with pytest.warns(gfnn.FitWarning, match="leaves held-out states without an image"):
         fit = gfnn.fit(pendulum_pairs(60), chart="midpoint", family="polynomial")
     assert not fit.met
