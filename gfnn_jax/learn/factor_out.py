@@ -10,8 +10,9 @@ import numpy as np
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.fitting.gauss_newton import Problem, rates
+from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.rates import rates
 from gfnn_jax.learn.cost_of_flow import CONTRACTING, FREQUENCY_STATES, contraction_of
 from gfnn_jax.learn.sweeps import trial_residual
 

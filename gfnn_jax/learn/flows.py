@@ -22,14 +22,10 @@ from gfnn_jax.dataset.split import outermost
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.fitting.gauss_newton import (
-    MOST_SUBSTEPS,
-    Problem,
-    null_terms,
-    significant,
-    significant_terms,
-)
+from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.growth import grow
+from gfnn_jax.fitting.significance import null_terms, significant, significant_terms
+from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.learn.arcs import arcs_of
 from gfnn_jax.learn.centrifugal import centrifugal_terms
 from gfnn_jax.learn.clock import Budget

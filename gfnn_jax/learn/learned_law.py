@@ -20,15 +20,11 @@ from gfnn_jax.families.products import Products
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
-from gfnn_jax.fitting.gauss_newton import (
-    MOST_SUBSTEPS,
-    FlowFit,
-    Problem,
-    rates,
-)
+from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre
+from gfnn_jax.flows.rates import MOST_SUBSTEPS, rates
 from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.learn.assemble import Assembled, composed, measured
 from gfnn_jax.learn.candidates import Candidate, with_error

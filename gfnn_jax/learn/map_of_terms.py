@@ -24,7 +24,8 @@ from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting import least_squares, uncertainty
-from gfnn_jax.fitting.gauss_newton import fitted_gradients, null_terms, significant
+from gfnn_jax.fitting.linear_starts import fitted_gradients
+from gfnn_jax.fitting.significance import null_terms, significant
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import CHARTS, AnyChart
 from gfnn_jax.generating.generated import Generated

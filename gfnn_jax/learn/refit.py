@@ -22,6 +22,7 @@ from gfnn_jax.errors import FitWarning
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import gauss_newton, least_squares
+from gfnn_jax.fitting.descent import descended
 from gfnn_jax.fitting.gauss_newton import FlowFit
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps
@@ -325,7 +326,7 @@ class _Refit:
                 solved = least_squares.solve(train, judge, size)
                 coefficients, train_rms = solved.coefficients, solved.train_rms
         else:
-            c, found, made = gauss_newton.descended(
+            c, found, made = descended(
                 lambda c: _triangle(asked(c)), self.piece.params, gauss_newton.OPTIONS.most
             )
             rows = found.rows
