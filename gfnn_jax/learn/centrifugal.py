@@ -49,7 +49,8 @@ def centrifugal_terms(data: Dataset, rows: np.ndarray, family: Terms | Sums) -> 
 
 
 def _between_poles(q: np.ndarray, pole: float) -> bool:
-    """Whether the values lie between two neighbouring poles, at ``pole`` and every π from it."""
+    """Return whether the values lie between two neighbouring poles, at ``pole`` and every π from
+    it."""
     return bool(np.ptp(np.floor((q - pole) / np.pi)) == 0)
 
 

@@ -1,4 +1,4 @@
-"""What a step of a flow costs: how fast its stages converge, in counted operations."""
+"""Cost of a step of a flow, in counted operations: how fast its stages converge."""
 
 from __future__ import annotations
 

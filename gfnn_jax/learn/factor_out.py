@@ -53,7 +53,7 @@ def flow_of(family: Terms, params, data: Dataset) -> Flow:
 
 
 def around(flow: Flow) -> list[tuple[Flow | None, Flow | None]]:
-    """(before, after) what is learned: half of the flow on either side, which keeps the symmetry in
-    time, or all of it on one, which suits a kick."""
+    """Pieces (before, after) around what is learned: half of the flow on either side, which
+    keeps the symmetry in time, or all of it on one, which suits a kick."""
     half = dataclasses.replace(flow, dt=0.5 * flow.dt)
     return [(half, half), (flow, None), (None, flow)]

@@ -1,4 +1,4 @@
-"""Where the descent to H starts: the start whose flow is nearest to the pairs."""
+"""Start of the descent to H: the start whose flow is nearest to the pairs."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ def too_dear(
     tolerance: Tolerance,
     dearest: float,
 ) -> bool:
-    """Whether a step of no law of this library costs up to ``dearest`` operations.
+    """Return whether a step of no law of this library costs up to ``dearest`` operations.
 
     One Gauss–Newton problem at the last law tells which terms the tolerance asks for: those whose
     absence would double the mean square that it allows. What the linear problem leaves unknown is

@@ -47,7 +47,7 @@ class NetworkSweep(Generates):
         self._params: Any = None
 
     def named(self, size: Size) -> str:
-        """What is done to judge the size."""
+        """Name of the unit that judges the size."""
         return f"{self.chart.name} {size.family.label}"
 
     def work(self, size: Size) -> float:

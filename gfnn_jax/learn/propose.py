@@ -1,4 +1,4 @@
-"""What a fit of many degrees of freedom proposes where it met nothing: a structure to be told."""
+"""Proposal of a structure, where a fit of many degrees of freedom met nothing."""
 
 from __future__ import annotations
 

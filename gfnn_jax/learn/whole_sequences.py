@@ -76,7 +76,7 @@ def fitted_to_sequences(
         return None
 
     def left(terms, coefficients) -> float:
-        """Of the held-out arcs, each from the state that suits it."""
+        """Residuals of the held-out arcs, each from the state that suits it."""
         found = held.fit(terms, coefficients, only_states=True)
         return np.inf if found is None else float(np.linalg.norm(found.noise / problem.scale))
 
