@@ -336,8 +336,8 @@ def fit(
         found = without_bias(found, request)
         data = found.data
         chosen = with_posterior(choose(found, request), found)
-        on_progress("the test pairs: the error that is stated")
-        error = stated(chosen, found)
+        on_progress("the error that is stated, of pairs that chose nothing")
+        error = stated(chosen, found, budget)
         chosen = chosen._replace(candidate=error.candidate)
         conclusion = conclude(chosen, found, request)
         warn(conclusion.messages)
