@@ -37,7 +37,7 @@ class Tolerance:
         return cls(options.absolute_tolerance, relative=False)
 
     def met_by(self, candidate: Any) -> bool:
-        """Whether the candidate's error is within it, at 95 %."""
+        """Return whether the candidate's error is within it, at 95 %."""
         return candidate.validation_bound <= self.bound
 
 

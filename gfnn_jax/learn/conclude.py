@@ -1,4 +1,4 @@
-"""What a fit says in the end: why the search ended, and what is left over where nothing is met."""
+"""Conclusion of a fit: why the search ended, and the residuals where nothing is met."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ _NOISE_NUMBERS = 8_192  # the same of many sites: numbers of so many pairs
 
 
 class Conclusion(NamedTuple):
-    """Why the search ended; the noise (2d,) that the residuals suggest, or None; warnings."""
+    """Reason why the search ended; the noise (2d,) that the residuals suggest, or None;
+    warnings."""
 
     ended: str
     noise: np.ndarray | None
@@ -48,7 +49,7 @@ class Conclusion(NamedTuple):
 
 
 def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion:
-    """What is to be said of the chosen map."""
+    """Conclude on the chosen map."""
     candidate, law, found = chosen.candidate, searched.law, searched.found
     met = searched.tolerance.met_by(candidate)
     ended, noise, messages, unmet, reason = found.ended, None, [], "", ""
@@ -116,7 +117,7 @@ def _with_clock(ended: str, budget: Budget) -> str:
 
 
 def only_noise(entry: Entry, searched: Searched) -> bool:
-    """Whether what this entry leaves over is noise, as far as its residuals tell."""
+    """Return whether what this entry leaves over is noise, as far as its residuals tell."""
     if not _stalled(entry.candidate, entry, searched):
         return False
     return _no_noise(_residuals_of_sample(entry.candidate, entry, searched), True) is None
@@ -134,8 +135,8 @@ def _work(entry: Entry | None) -> float:
 
 
 def _stalled(candidate: Candidate, entry: Entry | None, searched: Searched) -> bool:
-    """Whether larger models stopped helping: in the chosen sweep, in another that has come as far,
-    or, where no S was found, among the libraries of H."""
+    """Return whether larger models stopped helping: in the chosen sweep, in another that has come
+    as far, or, where no S was found, among the libraries of H."""
     found = searched.found
     if searched.of_terms is not None and candidate.learns == "map":
         return searched.of_terms.stalled
@@ -150,7 +151,7 @@ def _stalled(candidate: Candidate, entry: Entry | None, searched: Searched) -> b
 
 
 class _LeftOver(NamedTuple):
-    """What the residuals suggest: the noise (2d,), what is said of them, and the reason why no
+    """Findings in the residuals: the noise (2d,), messages, and the reason why no
     larger model would help where that is known."""
 
     noise: np.ndarray | None
@@ -183,7 +184,7 @@ def _residuals_of_sample(
 
 
 def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
-    """What these residuals are, where they are something else than noise."""
+    """Describe these residuals, where they are something else than noise."""
     _, y0, residual, scale, sequence = sample
     if differs_between_sequences(y0 / scale, residual / scale, sequence):
         message = (

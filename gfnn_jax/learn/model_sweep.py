@@ -46,7 +46,7 @@ class ModelSweep:
         self._fitted: dict[int, Fitted] = {}
 
     def named(self, size: ModelSize) -> str:
-        """What is done to judge the size."""
+        """Name of the unit that judges the size."""
         return f"{self.model.name} {size.own}"
 
     def work(self, size: ModelSize) -> float:
@@ -82,7 +82,7 @@ class ModelSweep:
         return judged
 
     def at(self, extent: float) -> str:
-        """What the size of this number is called."""
+        """Name of the size of this number."""
         return f"size {round(extent)} of {self.model.name}"
 
     def piece(self, size: ModelSize) -> Any:
@@ -113,7 +113,7 @@ class ModelSweep:
 
 
 def training_data(data: Dataset, rows: np.ndarray) -> TrainingData:
-    """What a model is given of these rows."""
+    """Data of these rows that a model is given."""
     dt, args = data.given(rows)
     coordinates, pairs = data.coordinates, data.pairs.take(rows)
     return TrainingData(

@@ -196,7 +196,7 @@ class NoisySweep(LinearSweep):
         return Whitened(family)
 
     def judge(self, size: Size, budget: Budget, say) -> Candidate:
-        """As the sweep that was corrected judges it, by the measured points."""
+        """Judge as the sweep that was corrected does, by the measured points."""
         return self.plain.judge(size, budget, say)
 
     def validate(self, size: Size, judged: Candidate, budget: Budget, say) -> Candidate:
@@ -211,7 +211,7 @@ class NoisySweep(LinearSweep):
         return self._predicted(size, self._rows(others), rows)
 
     def own_error(self, size: Size) -> float:
-        """That of the measured points."""
+        """Own error of the measured points."""
         return self.plain.own_error(size)
 
     def by_states(self, family, params, w, whitening) -> tuple[np.ndarray, np.ndarray]:

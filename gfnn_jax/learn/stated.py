@@ -46,7 +46,7 @@ class Stated(NamedTuple):
 
     @property
     def words(self) -> str:
-        """What the error was measured by, as text."""
+        """Text about what the error was measured by."""
         count = f"{self.pairs:,} pairs"
         if self.clusters < self.pairs:
             count += f" of {self.clusters:,} {'runs' if self.runs else 'independent stretches'}"
@@ -110,7 +110,8 @@ def _by_folds(
 
 
 def _images_of(chosen: Chosen, found: Searched, rows: np.ndarray) -> np.ndarray:
-    """By the steps that users run; in NumPy where the budget had no room for compiling them."""
+    """Images by the steps that users run; in NumPy where the budget had no room for compiling
+    them."""
     candidate, data, entry = chosen.candidate, chosen.data, chosen.entry
     pairs = found.data.pairs.take(rows)
     if candidate.microseconds_per_step is None and found.linear is not None:

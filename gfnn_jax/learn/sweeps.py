@@ -119,8 +119,8 @@ def sweep_of_dt(data: Dataset, tolerance: Tolerance, scene, factors=None) -> Lin
 
 
 class _Factors(NamedTuple):
-    """Of the training rows, of those held out, and of the training rows without the outermost
-    twentieth and of that twentieth alone."""
+    """Factors of the training rows, of those held out, and of the training rows without the
+    outermost twentieth and of that twentieth alone."""
 
     train: Triangle
     held: Triangle
@@ -134,14 +134,14 @@ class _Factors(NamedTuple):
 
 
 class Generates:
-    """What sweeps of S have in common: a solved size makes a piece."""
+    """Base of the sweeps of S: a solved size makes a piece."""
 
     data: Dataset
     chart: AnyChart
     tolerance: Tolerance
 
     def solve(self, size: Size, budget: Budget, say) -> tuple[Any, Any]:
-        """What is known of the solution, and the params of the size's family."""
+        """Solve for the params of the size's family; with them what is known of the solution."""
         raise NotImplementedError
 
     def piece(self, size: Size) -> Generated:
@@ -211,7 +211,7 @@ class LinearSweep(Generates):
         self._solved: dict[int, least_squares.LeastSquaresFit] = {}  # by the number of terms
 
     def named(self, size: Size) -> str:
-        """What is done to judge the size."""
+        """Name of the unit that judges the size."""
         return f"{self.chart.name} {self._prefix}{size.family.label}"
 
     def work(self, size: Size) -> float:
@@ -264,7 +264,7 @@ class LinearSweep(Generates):
         return dataclasses.replace(candidate, fit_seconds=seconds)
 
     def at(self, extent: float) -> str:
-        """What the size of this extent is, how many terms it has, and how many pairs they take."""
+        """Describe the size of this extent: its terms, and how many pairs they take."""
         family = self.sizes[0].family
         if not hasattr(family, "degree"):
             label = f"{family.name} {(terms := round(2**extent))}"
@@ -312,7 +312,7 @@ class LinearSweep(Generates):
         return weight * (gradient - target)
 
     def own_error(self, size: Size) -> float:
-        """What noise leaves wrong in the size's ∇S, in the measure of train_rms: half of the
+        """Error of the size's ∇S by noise, in the measure of train_rms: half of the
         difference between the fits to either half of the training pairs, blocks in time."""
         half = self.data.training // _HALVES_BLOCK % 2
         train, held = self.factors(size.group, Budget(), lambda message: None)[:2]
@@ -388,7 +388,8 @@ class LinearSweep(Generates):
 
     @property
     def moved_by_states(self) -> bool:
-        """Whether ``of_states`` is all that states' noise does: not behind the flow of a law."""
+        """Return whether ``of_states`` is all that states' noise does: not behind the flow of a
+        law."""
         return all(isinstance(p, (Affine, Damping)) for p in (*self.data.before, *self.data.after))
 
     @property
@@ -483,7 +484,7 @@ class LinearSweep(Generates):
         return further[-1] if further else None
 
     def factors(self, group, budget: Budget, say) -> _Factors:
-        """Those of a group's largest family, which answer for all of its sizes."""
+        """Factors of a group's largest family, which answer for all of its sizes."""
         if group not in self._factors:
             self._factors[group] = self._known(group) or self._computed(group, budget, say)
         return self._factors[group]
@@ -551,8 +552,8 @@ class _WithOdd:
 
 
 def is_even(data: Dataset) -> bool:
-    """Whether S(−w) = S(w) as far as any size of a sweep could tell: odd terms beside the even ones
-    of the highest degree that a sweep has do not make the held-out residual smaller.
+    """Return whether S(−w) = S(w) as far as any size of a sweep could tell: odd terms beside the
+    even ones of the highest degree that a sweep has do not make the held-out residual smaller.
 
     False where terms are not scarce, where angles or args are, or where the test would take too
     much.
