@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -25,6 +25,8 @@ from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.arc_inputs import ArcInputs
 from gfnn_jax.models.calibration import calibrated
+from gfnn_jax.models.given_law import fit_given
+from gfnn_jax.models.given_terms import Given, given_terms
 from gfnn_jax.models.law_fit import LawFit
 from gfnn_jax.models.law_search import FRICTIONS, SearchOptions, search
 from gfnn_jax.models.law_text import Expression, friction_of, speed_names, terms_of
@@ -37,7 +39,7 @@ _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apa
 
 def fit_recording(
     recording: Recording, *, friction: str = "auto", input_hold: str = "auto",
-    mass: Mapping[str, float] | None = None,
+    mass: Mapping[str, float] | None = None, terms: Sequence[str] = (),
     on_progress: Callable[[str], Any] = lambda message: None,
 ) -> LearnedLaw:  # fmt: skip
     """The law of a recording, from its positions and inputs.
@@ -45,6 +47,8 @@ def fit_recording(
     friction: "auto", "none", "linear", "quadratic", "dry", or several of them, as
     "linear+dry". input_hold: "auto", or how inputs go on between samples: "hold", "linear" or
     "band". mass: the known mass (or moment of inertia) of one position, which fixes the scale of L.
+    terms: those of L, V and R, as text in the names of columns (`models.given_terms`), which are
+    then all that is fitted.
     Raises InputError for bad options or a recording without positions, FitError where no law is
     found.
     """
@@ -67,15 +71,15 @@ def fit_recording(
     scales = measure(found)
     given = np.array([recording.std[name] or np.nan for name in seen.channels])
     scales = dataclasses.replace(scales, sigma=np.where(given > 0, given, scales.sigma))
+    asked = _asked(terms, seen, options.dry_width * float(np.mean(scales.speed)))
     nodes = nodes_of(found, scales)
     if not recording.inputs:
         holds: tuple[str, ...] = ("hold",)
     else:
         holds = HOLDS if input_hold == "auto" else (input_hold,)
     inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
-    fit, hold, nodes = search(
-        nodes, scales, angles, len(recording.inputs), inputs, seen, told, options
-    )
+    record = (nodes, scales, angles, len(recording.inputs), inputs, seen, told, options)
+    fit, hold, nodes = search(*record) if asked is None else fit_given(asked, *record)
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
         raise FitError("no law of the library follows this recording: its arcs could not be closed")
     first = fit.form.count + len(fit.structure.zeros)
@@ -183,6 +187,12 @@ def _check_told(fit: LawFit, seen: Observation) -> None:
                 f"{name}: the record does not tell it from the coefficients of the law: leave it "
                 "out, or give it as a number"
             )
+
+
+def _asked(terms: Sequence[str], seen: Observation, width: float) -> Given | None:
+    """The terms that were given, by the names of formulas."""
+    names = symbols((*seen.coordinates, *seen.speeds))
+    return given_terms(terms, names[: seen.dim], names[seen.dim :], width) if terms else None
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
