@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,7 +32,7 @@ class Given(NamedTuple):
 
 
 def given_terms(
-    texts: Sequence[str], positions: Sequence[str], speeds: Sequence[str], width: float
+    texts: Sequence[Any], positions: Sequence[str], speeds: Sequence[str], width: float
 ) -> Given:
     """The terms that these texts name. ``width`` is ε of dry friction where a text has none.
 
@@ -208,8 +208,9 @@ def _number(node: Node) -> float | None:
 
 def _called(node: Node) -> str | None:
     """The name of the function of one argument that a node calls."""
-    one = isinstance(node, ast.Call) and len(node.args) == 1 and not node.keywords
-    return node.func.id if one and isinstance(node.func, ast.Name) else None
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+        return node.func.id if len(node.args) == 1 and not node.keywords else None
+    return None
 
 
 def _times(linear: tuple[dict[str, int], float], factor: int) -> tuple[dict[str, int], float]:
