@@ -117,6 +117,13 @@ class Dataset:
         (N, 2d); None where it is to be estimated."""
         return self.pairs.std
 
+    @property
+    def noise_of_channels(self) -> np.ndarray | None:
+        """(2d,): of noise of each value the root of the mean square."""
+        if self.noise is None or self.noise.ndim == 1:
+            return self.noise
+        return np.sqrt(np.mean(self.noise**2, axis=0))
+
     @cached_property
     def spread(self) -> np.ndarray:
         """(2d,) sizes of the user's coordinates."""

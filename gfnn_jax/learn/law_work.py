@@ -82,3 +82,8 @@ class LawWork:
     def _one(self, family, rows: int) -> float:
         """Operations of an evaluation."""
         return rows * operations(family, self._problem.z0.shape[1], _STEPS, family)
+
+
+def work_of_refit(family, rows: int, dim: int, steps: Steps) -> float:
+    """Operations of a fit of terms that are close to their optimum to so many pairs."""
+    return _CLOSE * rows * operations(family, 2 * dim, steps, family)

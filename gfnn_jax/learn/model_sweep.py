@@ -57,6 +57,10 @@ class ModelSweep:
         """The steps are made when the size is judged."""
         return 0.0
 
+    def work_of_refit(self, size: ModelSize) -> float:
+        """A fit to other rows counts one operation, too."""
+        return 1.0
+
     def judge(self, size: ModelSize, budget: Budget, say: Callable[[str], Any]) -> Candidate:
         """The size fitted, and its error measured by steps on the validation rows."""
         started = time.perf_counter()

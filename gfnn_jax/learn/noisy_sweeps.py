@@ -187,6 +187,7 @@ class NoisySweep(LinearSweep):
             )
             return found.points, found.target, found.whitening
 
+        self._rows = rows
         self._train, self._held = (rows(r) for r in (self.data.training, self.data.validation))
         self._weight = np.ones(len(deviations))
 
@@ -204,6 +205,10 @@ class NoisySweep(LinearSweep):
         solved, params = self.solve(size, budget, say)
         candidate = dataclasses.replace(plain, condition=solved.condition, rank=solved.rank)
         return validated(candidate, self.data, self.tolerance, self.chart, size.family, params)
+
+    def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """By a fit to the states that other rows most likely had."""
+        return self._predicted(size, self._rows(others), rows)
 
     def own_error(self, size: Size) -> float:
         """Own error of the measured points."""

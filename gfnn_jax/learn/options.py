@@ -145,7 +145,8 @@ class FitOptions:
     ))  # fmt: skip
     terms: Sequence[str | Callable] = field(default=(), metadata=_about(
         _TERMS,
-        'known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"; in Python also functions of z', "TEXT",
+        'known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"; in Python also functions of z; of a '
+        'recording those of its law: "omega**2; V: cos(theta); R: omega**2"', "TEXT",
     ))  # fmt: skip
     base: str | Callable | None = field(default=None, metadata=_about(
         _LAW,

@@ -35,6 +35,7 @@ from gfnn_jax.learn.fit import Fit
 from gfnn_jax.learn.formula import Term, formula
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.rows import of_rows, residual_weight
+from gfnn_jax.learn.stated import FEWEST_TESTED
 from gfnn_jax.maps.saved import packed, unpacked
 from gfnn_jax.maps.symplectic_map import SymplecticMap, serves_any_dt
 from gfnn_jax.phase_space import Pairs
@@ -126,7 +127,9 @@ def refit(
             )
         if found.map is not None:
             after = worker.error(found.map, held, tolerance).rms
-            candidate = with_error(old, worker.error(found.map, test, tolerance))
+            # Test pairs of few runs did not state the sample's error either, which then stands.
+            few = test.run is not None and len(np.unique(test.run)) < FEWEST_TESTED
+            candidate = old if few else with_error(old, worker.error(found.map, test, tolerance))
             chosen = dataclasses.replace(candidate, map=found.map, train_rms=found.train_rms)
             num_pairs = found.count
     else:

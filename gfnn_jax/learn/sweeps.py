@@ -230,6 +230,11 @@ class LinearSweep(Generates):
         steps = len(self.data.validation) * size.operations
         return OF_SOLVE * size.family.num_parameters**3 + OF_STEPS * steps
 
+    def work_of_refit(self, size: Size) -> float:
+        """Operations that a fit of the size to other rows takes."""
+        count, width = size.family.num_parameters, self._train[1].shape[1]
+        return 2.0 * len(self.data) * width * (count + 1) ** 2 + OF_SOLVE * count**3
+
     def judge(self, size: Size, budget: Budget, say: Callable[[str], Any]) -> Candidate:
         """The size with its error estimated from the held-out residual of the gradient."""
         started = time.perf_counter()
@@ -285,8 +290,11 @@ class LinearSweep(Generates):
     def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Images (n, 2d) of these rows, in the user's coordinates, by a fit to other rows; NaN
         where a step is not solved."""
+        return self._predicted(size, rows_of(self.data, self.chart, others)[0], rows)
+
+    def _predicted(self, size: Size, fitted_to, rows: np.ndarray) -> np.ndarray:
         data, family = self.data, self.in_rows(size.family)
-        train = least_squares.reduce(family, [rows_of(data, self.chart, others)[0]], self._weight)
+        train = least_squares.reduce(family, [fitted_to], self._weight)
         held = least_squares.reduce(family, [self._held], self._weight)
         solved = least_squares.solve(train, held, size.family.num_parameters)
         params = size.family.unflatten(solved.coefficients)
