@@ -153,8 +153,8 @@ class Fit:
         )  # fmt: skip
 
     def settled(self) -> Fit:
-        """With what a report and a saved model hold beside the map, as far as the budget goes: the
-        posterior, which is left out of the map where it does not fit, and the defect of a step.
+        """Compute what a report and a saved model hold beside the map, as far as the budget goes:
+        the posterior, which is left out of the map where it does not fit, and the defect of a step.
         Warns (FitWarning) of what is left out."""
         told, map_, tells = len(self.budget.left_out), self.map, True
         if map_.posterior is not None and not map_.posterior.known:
@@ -228,7 +228,8 @@ class Fit:
 
     @property
     def met(self) -> bool:
-        """Whether the chosen candidate's validation error is within the tolerance, at 95 %."""
+        """Return whether the chosen candidate's validation error is within the tolerance, at 95
+        %."""
         return self._met_by(self.chosen)
 
     def _met_by(self, candidate: Candidate) -> bool:
@@ -336,8 +337,8 @@ def fit(
         found = without_bias(found, request)
         data = found.data
         chosen = with_posterior(choose(found, request), found)
-        on_progress("the test pairs: the error that is stated")
-        error = stated(chosen, found)
+        on_progress("the error that is stated, of pairs that chose nothing")
+        error = stated(chosen, found, budget)
         chosen = chosen._replace(candidate=error.candidate)
         conclusion = conclude(chosen, found, request)
         warn(conclusion.messages)

@@ -168,7 +168,7 @@ def _check(recording: Recording, input_hold: str, mass: Mapping[str, float] | No
 
 
 def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
-    """How the columns show the coordinates, and which of these are angles.
+    """Observation of the coordinates by the columns, and the angles among them.
 
     Raises InputError where a sensor's parameter is one that every law has.
     """
