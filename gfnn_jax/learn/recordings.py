@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.data.recording import Recording
-from gfnn_jax.dataset.stretches import Scales, measure, nodes_of, stretches
+from gfnn_jax.dataset.stretches import measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.maps.estimates import law_in_use
 from gfnn_jax.maps.inputs import HOLDS, Signals
@@ -23,8 +23,16 @@ from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.arc_inputs import ArcInputs
 from gfnn_jax.models.calibration import calibrated
 from gfnn_jax.models.law_fit import LawFit
-from gfnn_jax.models.law_search import FRICTIONS, SearchOptions, search
-from gfnn_jax.models.law_text import Expression, friction_of, speed_names, terms_of
+from gfnn_jax.models.law_search import SearchOptions, search
+from gfnn_jax.models.law_text import (
+    Expression,
+    WhichFriction,
+    friction_of,
+    speed_names,
+    terms_of,
+    which_friction_told,
+)
+from gfnn_jax.models.libraries import FRICTIONS
 from gfnn_jax.models.learned_law import LearnedLaw, hamiltonian_of, in_columns, scaled
 
 _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apart
@@ -61,15 +69,19 @@ def fit_recording(
     else:
         holds = HOLDS if input_hold == "auto" else (input_hold,)
     inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
-    fit, hold, nodes = search(nodes, scales, angles, len(recording.inputs), inputs, told, options)
+    fit, choice, hold, nodes = search(
+        nodes, scales, angles, len(recording.inputs), inputs, told, options
+    )
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
         raise FitError("no law of the library follows this recording: its arcs could not be closed")
     law, covariance = in_columns(fit)
     gauge = f"the mean of M11 over the data is 1 ({recording.positions[0]})"
+    scale = 1.0
     if mass:
         (name, value), i = next(iter(mass.items())), recording.positions.index(next(iter(mass)))
         masses = law.masses(np.concatenate([n.x[:, : fit.form.dim] for n in nodes]))
-        law, covariance = scaled(law, covariance, value / float(np.mean(masses[:, i, i])))
+        scale = value / float(np.mean(masses[:, i, i]))
+        law, covariance = scaled(law, covariance, scale)
         gauge = f"the mean mass of {name} over the data is {value:g}"
     x = np.concatenate([n.x for n in nodes])
     d = fit.form.dim
@@ -92,7 +104,9 @@ def fit_recording(
         law, z, scales.dt, angles=angles, signals=signals, inputs=u if signals else None, root=root
     )
     map_ = _with_sensors(map_, used.sensors)
-    return _described(recording, fit, map_, law, covariance, horizons, gauge, tuple(steps), scales,
+    speeds = speed_names(recording.positions, recording.velocities)
+    which = which_friction_told(choice, d, speeds, scale)
+    return _described(recording, fit, map_, law, covariance, which, horizons, gauge, tuple(steps),
                       (q, v, u), [n.t for n in nodes], time.process_time() - started)  # fmt: skip
 
 
@@ -135,7 +149,7 @@ def _with_sensors(map_: Any, sensors: Sensors) -> Any:
 
 def _described(
     recording: Recording, fit: LawFit, map_: Any, law: Any, covariance: np.ndarray,
-    horizons: Any, gauge: str, steps: tuple[str, ...], scales: Scales, states: Any,
+    which: WhichFriction, horizons: Any, gauge: str, steps: tuple[str, ...], states: Any,
     times: list[np.ndarray], seconds: float,
 ) -> LearnedLaw:  # fmt: skip
     """The law in the words of the recording."""
@@ -159,7 +173,7 @@ def _described(
     if any(rho < 0 for rho in law.losses):
         messages.append("friction with a negative coefficient: the record shows energy gained")
     return LearnedLaw(
-        map=map_, lagrangian=lagrangian, friction=friction, gains=gains,
+        map=map_, lagrangian=lagrangian, friction=friction, which_friction=which, gains=gains,
         hamiltonian=hamiltonian_of(law.terms, lagrangian, names), zeros=zeros,
         noise=dict(zip(names, map(float, map_.sensors.sigma), strict=True)),
         residual=dict(zip(names, map(float, fit.rms()), strict=True)), gauge=gauge,

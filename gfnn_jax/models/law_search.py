@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,11 +18,11 @@ from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of, with_states
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import LINEAR
 from gfnn_jax.models import libraries
-from gfnn_jax.models.law_fit import LawFit, Workbench
+from gfnn_jax.models.friction_choice import FrictionChoice, which_friction
+from gfnn_jax.models.law_fit import FOLDS, LawFit, Workbench
+from gfnn_jax.models.libraries import FRICTIONS
 from gfnn_jax.models.structure import Key, Loss, Structure
 from gfnn_jax.models.weak_start import protected, weak_start
-
-FRICTIONS = ("linear", "quadratic", "dry")  # in the order of libraries.KINDS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,10 +38,20 @@ class SearchOptions:
         1.5  # times the residual of the larger library, the textbook's may have
     )
     gain: float = 0.05  # of the held-out cost, that a term has to bring
-    friction_gain: float = 0.1  # of the held-out cost, that another kind of friction has to bring
+    choices: int = 3  # of the friction, each close to the fit with the one before
     dry_width: float = 0.05  # ε of dry friction, in rms speeds
     frictions: tuple[str, ...] = FRICTIONS
     choose_friction: bool = True  # by held-out arcs; else all of these
+
+
+class Found(NamedTuple):
+    """What a search found: the fit to the longest arcs, which friction and how sure that is, the
+    rule of the inputs between samples, and the nodes with their states."""
+
+    fit: LawFit
+    choice: FrictionChoice
+    hold: str
+    nodes: list[Nodes]
 
 
 def search(
@@ -52,9 +62,9 @@ def search(
     inputs: Mapping[str, Callable],
     told: Callable[[str], object] = lambda line: None,
     options: SearchOptions = SearchOptions(),
-) -> tuple[LawFit, str, list[Nodes]]:
-    """The law of these nodes: its fit to the longest arcs; of the rules between samples of the
-    ``inputs`` (hold -> inputs of arcs) the best; and the nodes with the states found."""
+) -> Found:
+    """The law of these nodes, by the best of the rules between samples of the ``inputs`` (hold ->
+    inputs of arcs)."""
     d = nodes[0].y.shape[1]
     gauge = np.concatenate([n.x[:, :d] for n in nodes])
     state_scale = np.repeat([1.0, scales.omega], d)
@@ -124,11 +134,15 @@ def search(
             fit = grow(bench, nodes, fit, every, told, options)
         nodes = with_states(nodes, fit.arcs, fit.fitted.x)
         told(f"{periods:g} periods: {describe(fit)}")
-    fit = choose_friction(bench, nodes, fit, width, told, options)
-    fit = prune(bench, nodes, fit, told, options)
-    fit = grow(bench, nodes, fit, every, told, options)
-    fit = prune(bench, nodes, fit, told, options)
-    return fit, hold, with_states(nodes, fit.arcs, fit.fitted.x)
+    fit, choice = choose_friction(bench, nodes, fit, every, told, options)
+    terms = dataclasses.replace(every, friction=())
+    before = fit.structure
+    fit = prune(bench, nodes, fit, told, options, friction=False)
+    fit = grow(bench, nodes, fit, terms, told, options)
+    fit = prune(bench, nodes, fit, told, options, friction=False)
+    if fit.structure != before:
+        fit, choice = choose_friction(bench, nodes, fit, every, told, options)
+    return Found(fit, choice, hold, with_states(nodes, fit.arcs, fit.fitted.x))
 
 
 def describe(fit: LawFit) -> str:
@@ -140,16 +154,17 @@ def describe(fit: LawFit) -> str:
 
 
 def prune(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, told: Callable, options: SearchOptions
-) -> LawFit:
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, told: Callable, options: SearchOptions,
+    friction: bool = True,
+) -> LawFit:  # fmt: skip
     """The fit without terms that are not seen, the least seen first, as long as held-out arcs do
-    not lose; and without friction that would drive."""
+    not lose; and, unless ``friction`` has been chosen, without that which would drive."""
     refused: set[Key] = set()
     costs = None
     while True:
         z = significance(fit)
-        gains_of_inputs = {k for k in z if k[0] == "gain"}  # always there
-        fixed = protected(fit.structure) | refused | gains_of_inputs
+        stays = {k for k in z if k[0] == "gain" or (k[0] == "loss" and not friction)}
+        fixed = protected(fit.structure) | refused | stays
         z = {k: size for k, size in z.items() if k not in fixed and size < options.significant}
         if not z:
             return fit
@@ -213,48 +228,27 @@ def grow(
 
 
 def choose_friction(
-    bench: Workbench,
-    nodes: Sequence[Nodes],
-    fit: LawFit,
-    width: float,
-    told: Callable,
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, every: Structure, told: Callable,
     options: SearchOptions,
-) -> LawFit:
-    """The fit with the friction that predicts held-out arcs best; the smaller where two tie."""
-    d = fit.structure.dim
-    bare = dataclasses.replace(fit.structure, friction=())
-    kinds = [libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions]
-    best, lowest = bare, np.full(1, np.inf)
-    counts = range(len(kinds) + 1) if options.choose_friction else [len(kinds)]
-    for count in counts:
-        for chosen in combinations(kinds, count):
-            rows = libraries.losses(d, chosen, width)
-            structure = dataclasses.replace(bare, friction=tuple(rows))
-            structure = without_drives(bench, fit, structure)
-            costs = bench.cross_validate(nodes, fit, structure, fit.values)
-            told(f"  friction {structure.friction}: held-out {np.sum(costs):.5g}")
-            if gains(lowest, costs, options.friction_gain):
-                best, lowest = structure, costs
-    arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
-    return bench.fit(best, fit.values, arcs, fit.sigma)
-
-
-def without_drives(bench: Workbench, fit: LawFit, structure: Structure) -> Structure:
-    """The structure without friction that a fit would make negative, the worst first; that of a
-    relative speed gives way to that of the sum."""
-    arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
-    known = fit.values
-    while structure.friction:
-        found = bench.fit(structure, known, arcs, fit.sigma, rescale=False)
-        z = significance(found)
-        worst = min((("loss", row) for row in structure.friction), key=lambda k: z[k])
-        if z[worst] >= 0:
+) -> tuple[LawFit, FrictionChoice]:  # fmt: skip
+    """The fit with the friction that held-out arcs choose, and how sure that is. Arcs are as long
+    as those of the fit, or as long as three of them can be. A choice holds close to its fit, so
+    that it is made again until it stands."""
+    whole, sigma = dataclasses.replace(fit.arcs, x=fit.fitted.x), fit.sigma
+    length = min(whole.t.shape[1], sum(len(n.t) for n in nodes) // FOLDS)
+    arcs = arcs_of(with_states(nodes, whole, whole.x), length)
+    if arcs.t.shape != whole.t.shape:
+        fit = bench.fit(fit.structure, fit.values, arcs, sigma)
+    choice = None
+    for _ in range(options.choices):
+        choice = which_friction(bench, fit, every.friction, options.choose_friction, choice)
+        told(f"  friction: {choice.rows}")
+        if set(choice.rows) == set(fit.structure.friction):
             break
-        turned = libraries.opposite(worst[1])
-        structure, known = structure.without({worst}), found.values
-        if turned is not None:
-            structure = structure.plus([("loss", turned)])
-    return structure
+        structure = dataclasses.replace(fit.structure, friction=choice.rows)
+        arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+        fit = bench.fit(structure, fit.values, arcs, fit.sigma)
+    return bench.fit(fit.structure, fit.values, whole, sigma), choice
 
 
 def _with_opposites(rows: list[Loss]) -> tuple[Loss, ...]:
