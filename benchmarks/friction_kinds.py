@@ -101,7 +101,8 @@ def case(system: str, kinds: tuple[str, ...], seed: int) -> Numbers:
         "system": system, "true": list(kinds), "seed": seed,
         "found": list(fit.which_friction.kinds), "odds": fit.which_friction.odds,
         "limits": fit.which_friction.limits, "text": str(fit.which_friction),
-        "standard_errors": max(errors, default=None), "friction": {t.term: [t.coefficient, t.std] for t in fit.friction.terms},
+        "standard_errors": max(errors, default=None),
+        "friction": {t.term: [t.coefficient, t.std] for t in fit.friction.terms},
         "processor_seconds": done.processor_seconds,
     }  # fmt: skip
 

@@ -11,9 +11,9 @@ found from them as well, so that the odds of B, residuals being normal, are
 
     (S_A / S_B)^(N / 2τ),
 
-where of N residuals those that are correlated, over τ samples, count once. Of the sets against which
-the best has odds of less than 20 the one with the fewest kinds is taken, linear friction before
-quadratic, and that before dry friction.
+where of N residuals those that are correlated, over τ samples, count once. Of the sets against
+which the best has odds of less than 20 the one with the fewest kinds is taken, linear friction
+before quadratic, and that before dry friction.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class _Table:
         larger = structure.plus([("loss", row) for row in others])
         p = larger.start(fit.values)
         model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
-        rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, fit.sigma)
+        rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, fit.sigma * fit.arcs.noise)
         keys = larger.keys()
         own = [keys.index(("loss", row)) for row in candidates]
         rest = [k for k in range(len(keys)) if k not in own]
