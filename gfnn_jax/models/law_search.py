@@ -247,15 +247,16 @@ def choose_friction(
     arcs = arcs_of(with_states(nodes, whole, whole.x), length)
     if arcs.t.shape != whole.t.shape:
         fit = bench.fit(fit.structure, fit.values, arcs, sigma)
-    choice = None
+    choice = which_friction(bench, fit, every.friction, options.choose_friction)
     for _ in range(options.choices):
-        choice = which_friction(bench, fit, every.friction, options.choose_friction, choice)
         told(f"  friction: {choice.rows}")
         if set(choice.rows) == set(fit.structure.friction):
             break
         structure = dataclasses.replace(fit.structure, friction=choice.rows)
         arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
         fit = bench.fit(structure, fit.values, arcs, fit.sigma)
+        choice = which_friction(bench, fit, every.friction, options.choose_friction, choice)
+    choice = choice._replace(rows=fit.structure.friction)
     return bench.fit(fit.structure, fit.values, whole, sigma), choice
 
 
