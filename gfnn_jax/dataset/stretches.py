@@ -55,7 +55,7 @@ class Nodes:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scales:
-    """What the samples say about themselves: noise σ (k,) of the channels, rms speeds (d,), the
+    """Scales of the samples, from the samples: noise σ (k,) of the channels, rms speeds (d,), the
     fastest frequency ω (1/s), the median step dt, and the window of the local cubics (samples to
     either side)."""
 

@@ -69,18 +69,18 @@ class Forced:
 
     @property
     def term_names(self) -> tuple[str, ...]:
-        """Those of H, of R, and of G."""
+        """Names of the terms of H, of R, and of G."""
         gains = [f"u{j + 1} on q{i + 1}" for i in range(self.dim) for j in range(self.num_inputs)]
         return (*self.family.term_names, *self.friction.names, *gains)
 
     @property
     def quadratic(self) -> bool:
-        """Whether the field is affine."""
+        """Return whether the field is affine."""
         return self.family.quadratic and not np.any(self.friction.kinds != LINEAR)
 
     @property
     def operations(self) -> tuple[int, int]:
-        """Those of H, with the Hessian that friction's derivative takes."""
+        """Operations of H, with the Hessian that friction's derivative takes."""
         gradient, with_hessian = self.family.operations
         more = 8 * self.friction.count * self.dim + 2 * self.dim * self.num_inputs
         return gradient + more, with_hessian + more + 4 * self.dim**3
@@ -110,7 +110,7 @@ class Forced:
         )
 
     def multiplier(self, params, dt) -> None:
-        """None: no multiple of the symplectic form is kept."""
+        """Return None: no multiple of the symplectic form is kept."""
         return None
 
     def at_time(self, args, after):
@@ -151,7 +151,7 @@ class Forced:
         return self._field(gradient, slope, losses, gains, args)
 
     def gradient_and_hessian(self, params, w, args=None):
-        """That field, and its derivative (..., 2d, 2d), which is not symmetric."""
+        """Field and its derivative (..., 2d, 2d), which is not symmetric."""
         own, losses, gains = self.parts(params)
         gradient, hessian = self.family.gradient_and_hessian(own, w, self._inner(args))
         _, slope, curvature = self.friction.tables(split(gradient)[1])

@@ -58,17 +58,17 @@ class Uniform:
 
     @property
     def term_names(self) -> tuple[str, ...]:
-        """Those of H, and that of γ."""
+        """Names of the terms of H, and γ."""
         return (*self.family.term_names, FRICTION)
 
     @property
     def quadratic(self) -> bool:
-        """Whether the field is affine."""
+        """Return whether the field is affine."""
         return self.family.quadratic
 
     @property
     def operations(self) -> tuple[int, int]:
-        """Those of H; friction adds a few."""
+        """Operations of H; friction adds a few."""
         return self.family.operations
 
     def unflatten(self, coefficients):
@@ -103,7 +103,7 @@ class Uniform:
         return self.family.gradient(params[:-1], w, args) + params[-1] * _momenta(w)
 
     def gradient_and_hessian(self, params, w, args=None):
-        """That field, and its derivative (..., 2d, 2d), which is not symmetric."""
+        """Field and its derivative (..., 2d, 2d), which is not symmetric."""
         gradient, hessian = self.family.gradient_and_hessian(params[:-1], w, args)
         more = np.eye(2 * self.dim, k=self.dim, dtype=hessian.dtype)  # of (p, 0) in (q, p)
         field = gradient + params[-1] * _momenta(w)
@@ -163,7 +163,7 @@ class Power(NamedTuple):
 
 
 def power(family, params, w, args=None) -> Power:
-    """What forces do at states w (..., 2d), where ``family`` holds any. NumPy or JAX."""
+    """Power of the forces at states w (..., 2d), where ``family`` holds any. NumPy or JAX."""
     if isinstance(family, Uniform):
         lost, supplied = power(family.family, params[:-1], w, args)
         v = split(family.family.gradient(params[:-1], w, args))[1]

@@ -24,7 +24,7 @@ _TAPS, _BETA = 32, 8.0
 
 
 class Scheduled(NamedTuple):
-    """What rollouts take as args: the values of parameters, or None, and the inputs' coefficients
+    """Args of rollouts: the values of parameters, or None, and the inputs' coefficients
     of every step (N, K) or (B, N, K)."""
 
     params: Any
@@ -55,7 +55,7 @@ class Signals:
 
     @property
     def degree(self) -> int:
-        """Of the polynomials."""
+        """Degree of the polynomials."""
         return _DEGREE[self.hold]
 
     def constant(self, args, inputs, shape: tuple, dtype):
@@ -93,7 +93,7 @@ class Signals:
         return Scheduled(args, self.coefficients(u, dt))
 
     def coefficients(self, u, dt):
-        """Of samples u (..., N, k) a time dt apart the coefficients (..., N, K) of the polynomials
+        """Coefficients (..., N, K), from samples u (..., N, k) a time dt apart, of the polynomials
         in each step; beyond the ends the samples are those at the ends. NumPy or JAX."""
         xp, (first, weights) = namespace(u, dt), _stencil(self.hold)
         count = u.shape[-2]
