@@ -207,6 +207,14 @@ def test_the_friction_that_a_record_shows(swing):
     assert all(term.coefficient > 0 for term in dry.friction.terms)
 
 
+def test_energy_that_no_input_explains_is_named():
+    t, theta = pendulum(gamma=-0.03, end=25.0, amplitude=0.6)
+    recording = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
+    fit = gfnn.fit(recording)
+    assert fit.friction.terms == ()
+    assert any("gains energy that no input explains" in message for message in fit.messages)
+
+
 def test_forecasts_hold_what_their_bands_say(swing):
     recording, fit = swing
     clean = pendulum(noise=0.0)[1]
@@ -328,6 +336,9 @@ def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs():
     for name, value in (("u", 3.0), ("w", 0.0)):
         gain, std = fit.gains[name]["x"]
         assert abs(gain - value) < 4 * std < 0.05, name
+    named = [message for message in fit.messages if message.startswith("no force of input")]
+    assert len(named) == 1
+    assert "input w " in named[0]
     assert fit.friction.terms[0].coefficient == pytest.approx(0.1, rel=0.05)
     ahead = gfnn.Recording({k: v[500:] for k, v in table.items()}, positions=["x"],
                            inputs=["u", "w"])  # fmt: skip

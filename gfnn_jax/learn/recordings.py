@@ -40,6 +40,7 @@ from gfnn_jax.models.libraries import FRICTIONS
 from gfnn_jax.models.residuals import Trace, whiteness
 
 _IMITATED = 1e-4  # of what a sensor's parameter changes, that no coefficient of the law does
+_SEEN = 3.0  # standard errors of a gain, below which its input is not seen to act
 _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apart
 
 
@@ -210,8 +211,7 @@ def _with_sensors(map_: Any, sensors: Sensors) -> Any:
 def _described(
     recording: Recording, fit: LawFit, map_: Any, law: Any, covariance: np.ndarray,
     chosen: tuple[FrictionChoice, float], horizons: Any, gauge: str, steps: tuple[str, ...],
-    traces: tuple[Trace, ...], states: Any,
-    times: list[np.ndarray], seconds: float,
+    traces: tuple[Trace, ...], states: Any, times: list[np.ndarray], seconds: float,
 ) -> LearnedLaw:  # fmt: skip
     """The law in the words of the recording."""
     names = recording.coordinates
@@ -245,8 +245,15 @@ def _described(
         for k, i in enumerate(fit.structure.zeros)
     }
     messages = [] if fit.fitted.converged else ["the last fit had not converged"]
-    if any(rho < 0 for rho in law.losses):
-        messages.append("friction with a negative coefficient: the record shows energy gained")
+    if chosen[0].gains:
+        messages.append(
+            "the record gains energy that no input explains: is a drive missing among the inputs?"
+        )
+    messages += [
+        f"no force of input {u} is seen: it hardly varies, or moves nothing"
+        for u, forces in gains.items()
+        if all(abs(gain) < _SEEN * error for gain, error in forces.values())
+    ]
     return LearnedLaw(
         map=map_, lagrangian=lagrangian, friction=friction, gains=gains,
         which_friction=which_friction_told(*chosen, law.dim, of_speeds),

@@ -34,16 +34,19 @@ from gfnn_jax.solve.latent_arcs import rows_of_arcs
 _DECIDED = 20.0  # odds, below which two sets are as good
 _NEEDED = 3.0  # odds, below which a direction is left out
 _SURE = 20.0  # the logarithm of the largest odds that are told
+_GAINS = 5.0  # standard errors below zero, at which friction would have to drive
 _LIMIT = 2.0  # standard errors of a coefficient, above its value: its upper limit
 
 
 class FrictionChoice(NamedTuple):
     """The frictions that were taken; the odds that they forecast better than other sets of
-    kinds; and upper limits of ρ of those not taken."""
+    kinds; upper limits of ρ of those not taken; and whether the record gains energy: none was
+    taken, and one alone would be below zero."""
 
     rows: tuple[Loss, ...]
     odds: dict[tuple[int, ...], float]
     limits: dict[Loss, float]
+    gains: bool
 
     @property
     def kinds(self) -> tuple[int, ...]:
@@ -92,7 +95,10 @@ def which_friction(
     known = before.kinds if before else ()
     taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, s.kinds))
     odds = {s.kinds: evidence.odds(taken, s) for s in sets if s is not taken}
-    return FrictionChoice(taken.rows, odds, table.limits(taken.rows))
+    others = table.others(taken.rows)
+    limits = {row: max(rho, 0.0) + _LIMIT * error for row, (rho, error) in others.items()}
+    gains = not taken.rows and any(rho < -_GAINS * error for rho, error in others.values())
+    return FrictionChoice(taken.rows, odds, limits, gains)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,8 +206,9 @@ class _Table:
                 return here
             here, subset = least, [self.candidates.index(row) for row in least.rows]
 
-    def limits(self, taken: tuple[Loss, ...]) -> dict[Loss, float]:
-        """Upper limits of the candidates that were not taken, each alone beside those that were."""
+    def others(self, taken: tuple[Loss, ...]) -> dict[Loss, tuple[float, float]]:
+        """ρ, of either sign, and its standard error of the candidates that were not taken, each
+        alone beside those that were."""
         f, triangle = self.width, self.triangles[-1]
         base = [*range(f), *(f + k for k, row in enumerate(self.candidates) if row in taken)]
         found = {}
@@ -213,7 +220,7 @@ class _Table:
             if size < 1e-3 * np.linalg.norm(triangle[:, f + k]):
                 continue  # the others imitate it: the record sets no limit
             error = np.sqrt(self.correlation * self._variance(R[-1, -1])) / size
-            found[row] = max(R[-2, -1] / R[-2, -2], 0.0) + _LIMIT * error
+            found[row] = float(R[-2, -1] / R[-2, -2]), float(error)
         return found
 
     def _variance(self, rest: float) -> float:
