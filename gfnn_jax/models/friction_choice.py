@@ -122,7 +122,7 @@ class _Evidence:
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Table:
     """Rows (A, L, k, n + 1) of the arcs, the candidates' columns last but the residuals, which are
-    those without friction; the arcs of each third (FOLDS, A); the correlation of residuals."""
+    those without friction; the arcs of each third (thirds, A); the correlation of residuals."""
 
     candidates: tuple[Loss, ...]
     rows: np.ndarray
@@ -143,7 +143,7 @@ class _Table:
         rows = rows[..., [*rest, *own, len(keys)]]
         rows[..., -1] += rows[..., len(rest) : -1] @ p[own]  # as if there were no friction
         place = np.arange(len(rows)) * FOLDS // len(rows)
-        folds = place == np.arange(FOLDS)[:, None]
+        folds = place == np.unique(place)[:, None]
         return _Table(tuple(candidates), rows, folds, fit.correlation)
 
     @property
@@ -175,7 +175,7 @@ class _Table:
         """ρ of all candidates, of these at least 0, of the others 0."""
         own = triangle[self.width :, self.width :]
         losses, columns = np.zeros(len(self.candidates)), list(subset)
-        if columns:
+        if columns and len(own):  # a single arc leaves nothing to find them from
             scale = np.maximum(np.linalg.norm(own[:, columns], axis=0), 1e-300)
             losses[columns] = nnls(own[:, columns] / scale, own[:, -1])[0] / scale
         return losses

@@ -28,7 +28,7 @@ from gfnn_jax.models.weak_start import protected, weak_start
 
 @dataclasses.dataclass(frozen=True)
 class SearchOptions:
-    """Constants of the search, the same for all records (`python -m benchmarks measured`)."""
+    """Constants of the search, the same for all records (`python benchmarks/measured.py DIR`)."""
 
     periods: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)  # lengths of arcs
     significant: float = 4.0  # standard errors, below which a term may be dropped
@@ -244,7 +244,7 @@ def choose_friction(
     as those of the fit, or as long as three of them can be. A choice holds close to its fit, so
     that it is made again until it stands."""
     whole, sigma = dataclasses.replace(fit.arcs, x=fit.fitted.x), fit.sigma
-    length = min(whole.t.shape[1], sum(len(n.t) for n in nodes) // FOLDS)
+    length = max(6, min(whole.t.shape[1], sum(len(n.t) for n in nodes) // FOLDS))
     arcs = arcs_of(with_states(nodes, whole, whole.x), length)
     if arcs.t.shape != whole.t.shape:
         fit = bench.fit(fit.structure, fit.values, arcs, sigma)
