@@ -129,14 +129,16 @@ def draw(found: dict[str, Numbers]) -> None:
     for ax, (name, result) in zip(axes.ravel(), found.items(), strict=False):
         for third, m in sorted(result["measured"].items()):
             seen = [(float(t), e) for t, e in m["median"].items() if e is not None]
-            ax.plot(*zip(*seen, strict=True), ".-", label=THIRDS[int(third)])
+            look = {"label": THIRDS[int(third)], "color": f"C{third}"}
+            ax.plot(*zip(*seen, strict=True), ".-", **look)
         asked = [(t, e) for t, e in RECORDS[name][2].items() if t != "rest"]
         if asked:
             ax.plot(*zip(*asked, strict=True), "k_", ms=10)
-        ax.set(title=name, yscale="log")
+        ax.set_title(name)
+        ax.set_ylim(bottom=0)
     axes[0, 0].legend(title="third held out", fontsize=7, title_fontsize=7)
     grid.supxlabel("time ahead [s]")
-    grid.supylabel("median error of the worst coordinate [mrad, units, mV]")
+    grid.supylabel("median error [mrad, units, mV]")
     FIGURES.mkdir(exist_ok=True)
     figures.save(grid, FIGURES / "measured.png")
 

@@ -77,7 +77,6 @@ def search(
     def length(periods: float) -> int:
         return max(6, round(periods * scales.per_period))
 
-    width = options.dry_width * float(np.mean(scales.speed))
     linear = libraries.losses(d, (LINEAR,), 0.0)
     starts = []
     plain = [libraries.textbook(d, angles)]
@@ -122,12 +121,8 @@ def search(
         d, libraries.without_forces(
             (*libraries.first(d, angles), *libraries.more(d, angles)), shifted
         ),
-        _with_opposites(libraries.losses(d, libraries.KINDS, width)), turned, num_inputs, sensors,
+        frictions_tried(d, scales, options), turned, num_inputs, sensors,
     )  # fmt: skip
-    allowed = tuple(libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions)
-    every = dataclasses.replace(
-        every, friction=tuple(row for row in every.friction if row[1] in allowed)
-    )
     frictions = dataclasses.replace(every, terms=every.terms[:1])
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     for periods in options.periods[1:]:
@@ -141,14 +136,14 @@ def search(
             fit = grow(bench, nodes, fit, every, told, options)
         nodes = with_states(nodes, fit.arcs, fit.fitted.x)
         told(f"{periods:g} periods: {describe(fit)}")
-    fit, choice = choose_friction(bench, nodes, fit, every, told, options)
+    fit, choice = choose_friction(bench, nodes, fit, every.friction, told, options)
     terms = dataclasses.replace(every, friction=())
     before = fit.structure
     fit = prune(bench, nodes, fit, told, options, friction=False)
     fit = grow(bench, nodes, fit, terms, told, options)
     fit = prune(bench, nodes, fit, told, options, friction=False)
     if fit.structure != before:
-        fit, choice = choose_friction(bench, nodes, fit, every, told, options)
+        fit, choice = choose_friction(bench, nodes, fit, every.friction, told, options)
     return Found(fit, choice, hold, with_states(nodes, fit.arcs, fit.fitted.x))
 
 
@@ -237,8 +232,8 @@ def grow(
 
 
 def choose_friction(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, every: Structure, told: Callable,
-    options: SearchOptions,
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, candidates: Sequence[Loss],
+    told: Callable, options: SearchOptions,
 ) -> tuple[LawFit, FrictionChoice]:  # fmt: skip
     """The fit with the friction that held-out arcs choose, and how sure that is. Arcs are as long
     as those of the fit, or as long as three of them can be. A choice holds close to its fit, so
@@ -248,7 +243,7 @@ def choose_friction(
     arcs = arcs_of(with_states(nodes, whole, whole.x), length)
     if arcs.t.shape != whole.t.shape:
         fit = bench.fit(fit.structure, fit.values, arcs, sigma)
-    choice = which_friction(bench, fit, every.friction, options.choose_friction)
+    choice = which_friction(bench, fit, candidates, options.choose_friction)
     for _ in range(options.choices):
         told(f"  friction: {choice.rows}")
         if set(choice.rows) == set(fit.structure.friction):
@@ -256,11 +251,14 @@ def choose_friction(
         structure = dataclasses.replace(fit.structure, friction=choice.rows)
         arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
         fit = bench.fit(structure, fit.values, arcs, fit.sigma)
-        choice = which_friction(bench, fit, every.friction, options.choose_friction, choice)
+        choice = which_friction(bench, fit, candidates, options.choose_friction, choice)
     choice = choice._replace(rows=fit.structure.friction)
     return bench.fit(fit.structure, fit.values, whole, sigma), choice
 
 
-def _with_opposites(rows: list[Loss]) -> tuple[Loss, ...]:
+def frictions_tried(dim: int, scales: Scales, options: SearchOptions) -> tuple[Loss, ...]:
+    """Friction of all the kinds that are asked for, in every direction."""
+    kinds = tuple(libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions)
+    rows = libraries.losses(dim, kinds, options.dry_width * float(np.mean(scales.speed)))
     turned = (libraries.opposite(row) for row in rows)
     return (*rows, *(row for row in turned if row is not None))
