@@ -89,12 +89,17 @@ def of_halves(residual: np.ndarray, grown: np.ndarray) -> np.ndarray:
     return np.sqrt(mean * found)[halves]
 
 
-def of_residuals(residual: np.ndarray, free: float, outlying: float) -> np.ndarray:
-    """(2d,) from residuals (n, 2d) that are the noise of one state each.
+def of_residuals(residual: np.ndarray, free: np.ndarray | float, outlying: float) -> np.ndarray:
+    """(k,) from residuals (..., k) that are the noise of one number each; NaN where there is none.
 
-    free: the part of their degrees of freedom that a fit has left. outlying: robust deviations
-    beyond which a number is a gross error, and does not count.
+    free: (..., k) the part of each that what was fitted does not follow, 1 − its leverage: the sum
+    of squares of a coordinate is that much of its variances (Förstner, Z. Vermess. 104 (1979) 41).
+    outlying: robust deviations beyond which a number is a gross error, and does not count.
     """
-    inside = np.abs(residual) <= outlying * robust(residual, axis=0)
+    k = residual.shape[-1]
+    residual, free = residual.reshape(-1, k), np.broadcast_to(free, residual.shape).reshape(-1, k)
+    size = np.array([robust(column[np.isfinite(column)]) for column in residual.T])
+    inside = np.abs(residual) <= outlying * size
     square = np.sum(np.where(inside, residual, 0.0) ** 2, axis=0)
-    return np.sqrt(square / np.maximum(inside.sum(axis=0), 1) / free)
+    left = np.sum(np.where(inside, free, 0.0), axis=0)
+    return np.sqrt(square / np.maximum(left, 1e-3 * np.maximum(inside.sum(axis=0), 1)))

@@ -12,7 +12,7 @@ from gfnn_jax.dataset.stretches import Arcs, Nodes, arcs_of, with_states
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.models.law_arcs import LawOnArcs
 from gfnn_jax.models.structure import Key, Structure
-from gfnn_jax.solve.latent_arcs import Fitted, fit_arcs, loss, sensitivities
+from gfnn_jax.solve.latent_arcs import SOFT_L1, Fitted, eliminated_rows, fit_arcs
 
 _SETTLED = 1.15  # a noise scale that changed by less needs no second fit
 FOLDS = 3
@@ -90,7 +90,7 @@ class Workbench:
         found = fit_arcs(model, np.zeros(0), arcs.x, arcs.y, fit.sigma, scale, 15, 1e-3)
         if not np.isfinite(found.cost):
             return np.full(len(arcs.home), np.inf)
-        return np.nansum(loss(found.residuals), axis=(1, 2))
+        return np.nansum(SOFT_L1.of(found.residuals), axis=(1, 2))
 
     def cross_validate(
         self, nodes: Sequence[Nodes], fit: LawFit, structure: Structure, known: Mapping[Key, float]
@@ -117,7 +117,8 @@ class Workbench:
         keys = larger.keys()
         p = larger.start(known)
         model = self.model(larger, fit.arcs, p, np.arange(len(p)))
-        R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, fit.sigma)
+        rows = eliminated_rows(model, p, fit.fitted.x, fit.arcs.y, fit.sigma)
+        R = np.linalg.qr(rows, mode="r")
         old = [keys.index(k) for k in known]
         own = [keys.index(k) for k in new]
         Q = np.linalg.qr(R[:, old])[0] if old else np.zeros((len(R), 0))
