@@ -17,7 +17,7 @@ class Arcs(NamedTuple):
     @property
     def measured(self) -> np.ndarray:
         """(A, L) which states were measured."""
-        return np.isfinite(self.states).all(axis=-1)
+        return np.asarray(np.isfinite(self.states).all(axis=-1))
 
 
 def arcs_of_pairs(z0, z1, longest: int, steps=None) -> Arcs | None:

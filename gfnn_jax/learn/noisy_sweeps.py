@@ -2,31 +2,36 @@
 
 A search judges sizes by residuals that are nearly all noise, and fits at measured points. Where
 that is what stopped it, the sweeps that came as far as the best are fitted again to the states that
-the pairs most likely had (`fitting.nearest_states`). In these rows the residual is a distance from
-the map's graph in units of the noise, whatever the chart, and the expected error of every size on
+the pairs most likely had (`models.map_arcs`). In these rows the residual is a distance from the
+map's graph in units of the noise, whatever the chart, and the expected error of every size on
 fresh pairs follows from one factor, as Mallows' C_p does (Technometrics 15 (1973) 661).
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.dataset.arcs import arcs_of_pairs
+from gfnn_jax.dataset.runs import steps_between
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import uncertainty
-from gfnn_jax.fitting.nearest_states import Whitened, nearest
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.learn.candidates import Candidate, validated
 from gfnn_jax.learn.choose_law import preferred
 from gfnn_jax.learn.clock import ROWS, Budget
 from gfnn_jax.learn.conclude import only_noise
+from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
-from gfnn_jax.learn.rows import rows_of
 from gfnn_jax.learn.search import AS_FAR, Entry
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.learn.sweeps import LinearSweep, Size
+from gfnn_jax.learn.sweeps import SAMPLE_ROWS, Factors, LinearSweep, Size, part_of_noise
+from gfnn_jax.models.map_arcs import LONGEST, GeneratedOnArcs, NearestArcs
+from gfnn_jax.phase_space import Pairs
 
 _MOST_SWEEPS = 3
 _WHAT = "the fit of S to the states that noisy pairs most likely had"
@@ -164,7 +169,7 @@ def _corrected(rivals: list[Entry], request: Request) -> Entry:
 
 
 class NoisySweep(LinearSweep):
-    """The sizes of a sweep, in rows of the states that its pairs most likely had.
+    """The sizes of a sweep, in rows of the states that its arcs most likely had.
 
     plain: the sweep. near: one whose solution of ``size`` says where those states are. deviations:
     (2d,) of the noise of each coordinate, ÷ its scale.
@@ -174,25 +179,39 @@ class NoisySweep(LinearSweep):
         self, plain: LinearSweep, near: LinearSweep, size: Size, deviations: np.ndarray
     ):  # fmt: skip
         self.__dict__.update(plain.__dict__)
-        self.__dict__.pop("of_states", None)
         self.plain, self._kept, self._factors, self._solved = plain, None, {}, {}
-        family, params = size.family, near.solve(size, Budget(), lambda message: None)[1]
-        of_noise = np.tile(deviations, 2)
-        of_point, of_target = (of * of_noise for of in plain.of_states)
+        prepared, coefficients = self.prepared, near.solve(size, Budget(), _quiet)[0].coefficients
 
-        def rows(which):
-            (w, target), _ = rows_of(self.prepared, self.chart, which)
-            found = nearest(
-                lambda w: family.gradient_and_hessian(params, w), w, target, of_point, of_target
+        def nearest(rows) -> NearestArcs:
+            arcs = arcs_of_pairs(*_chained(prepared, self.judges.pairs, np.sort(rows)))
+            assert arcs is not None
+            model = GeneratedOnArcs(
+                size.family, self.chart, prepared.dt, arcs.moves, (prepared.before, prepared.after)
             )
-            return found.points, found.target, found.whitening
+            return NearestArcs.of(model, coefficients, arcs, deviations * prepared.scale)
 
-        self._train, self._held = (rows(r) for r in (self.judges.training, self.judges.held_out))
-        self._weight = np.ones(len(deviations))
+        self._nearest, self._nearest_held = map(
+            nearest, (self.judges.training, self.judges.held_out)
+        )
 
-    def in_rows(self, family: Any) -> Any:
-        """The family whose terms make the rows of this sweep."""
-        return Whitened(family)
+    def _computed(self, group, budget: Budget, say) -> Factors:
+        pairs, width = self._rows_of(group)
+        train = self._part(pairs * width).triangle(group, budget.check)
+        held = self._nearest_held.triangle(group, budget.check)
+        return Factors(train, held, train, Triangle.empty(group.num_parameters))
+
+    def _part(self, numbers: int) -> NearestArcs:
+        """Arcs that stand for about so many numbers, drawn at random."""
+        arcs = len(self._nearest.x)
+        share = numbers / (len(self.judges.training) * self._width)
+        if share >= 1:
+            return self._nearest
+        drawn = np.random.default_rng(0).permutation(arcs)[: max(1, int(np.ceil(share * arcs)))]
+        return self._nearest.take(np.sort(drawn))
+
+    def freedoms(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
+        """As many as there are terms: the rows of an arc are independent."""
+        return [float(count) for count in counts]
 
     def judge(self, size: Size, budget: Budget, say) -> Candidate:
         """As the sweep that was corrected judges it, by the measured points."""
@@ -209,9 +228,46 @@ class NoisySweep(LinearSweep):
         """That of the measured points."""
         return self.plain.own_error(size)
 
-    def by_states(self, family, params, w, whitening) -> tuple[np.ndarray, np.ndarray]:
-        """The residual's derivatives in z₀ and z₁ (n, 2d, 2d), those ÷ their scale."""
-        hessian = family.gradient_and_hessian(params, w)[1]
-        of_point, of_target = self.of_states
-        by = whitening @ (hessian @ of_point - of_target)
-        return by[..., : len(of_point)], by[..., len(of_point) :]
+    def root(self, size: Size) -> np.ndarray:
+        """As that of the sweep, of rows that are independent."""
+        train, count = self.factors(size.group, Budget(), _quiet).train, size.family.num_parameters
+        solved, larger = self.solve(size, Budget(), _quiet)[0], self._larger(size)
+        most = size.family if larger is None else larger.family
+        sample = self._part(SAMPLE_ROWS * most.num_parameters)
+        rows = np.concatenate([rows for rows, _ in sample.rows(most)])
+        of_sample = Triangle.of(rows)
+        numbers = sum(numbers for _, numbers in sample.rows(most))
+
+        def left(of: Size) -> tuple[float, float, int]:
+            terms, known = of.family.num_parameters, larger and larger.group in self._factors
+            triangle = self._factors[of.group].train if known else of_sample
+            rows = triangle.rows if known else numbers
+            return triangle.residual_norm(terms) ** 2 / rows, float(terms), rows
+
+        noise = None if larger is None else part_of_noise(size, larger, left(size), left(larger))
+        slopes = rows[:, :count]
+        return uncertainty.root(
+            train, count, slopes, slopes @ solved.coefficients - rows[:, -1], noise=noise,
+            ridge=solved.ridge,
+        )  # fmt: skip
+
+
+def _chained(prepared: Prepared, pairs: Pairs, rows) -> tuple[np.ndarray, np.ndarray, int, Any]:
+    """What `arcs_of_pairs` takes of these rows, in the inner coordinates without a base map, angles
+    lifted along an arc. A p of period 2π is none to S: its pairs are arcs of their own."""
+    z0, z1 = prepared.y0[rows], prepared.whole_image(prepared.y1[rows])
+    for piece in reversed(prepared.before):
+        z0 = piece.inverse().image(z0)
+    onward, angles = steps_between(pairs.take(rows)), list(prepared.coordinates.angles)
+    if angles:
+        turns = np.round((z1[:-1] - z0[1:])[:, angles] / (2 * np.pi)) * (onward == 1)[:, None]
+        onward = onward * (max(angles) < prepared.dim) * (onward == 1)
+        lifted = 2 * np.pi * np.concatenate([np.zeros((1, len(angles))), np.cumsum(turns, axis=0)])
+        z0, z1 = z0.copy(), z1.copy()
+        z0[:, angles] += lifted
+        z1[:, angles] += lifted
+    return z0, z1, LONGEST, onward
+
+
+def _quiet(message: str) -> None:
+    """Of what is known already nothing is said."""

@@ -118,7 +118,7 @@ class Workbench:
         p = larger.start(known)
         model = self.model(larger, fit.arcs, p, np.arange(len(p)))
         rows = eliminated_rows(model, p, fit.fitted.x, fit.arcs.y, fit.sigma)
-        R = np.linalg.qr(rows, mode="r")
+        R = np.asarray(np.linalg.qr(rows, mode="r"))
         old = [keys.index(k) for k in known]
         own = [keys.index(k) for k in new]
         Q = np.linalg.qr(R[:, old])[0] if old else np.zeros((len(R), 0))

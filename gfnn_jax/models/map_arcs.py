@@ -36,7 +36,8 @@ from gfnn_jax.solve.robust import Biweight
 from gfnn_jax.threads import one_thread
 
 LONGEST = 10  # steps of an arc: what S cannot represent adds up along a longer one
-BIWEIGHT = Biweight()
+# Of normal residuals it takes one part in forty, so that rows keep their variance of one.
+BIWEIGHT = Biweight(15.0)
 _SETTLED = 1e-3  # of the squared distance: what the states still gain moves no coefficient
 _BLOCK_BYTES = 4 * 2**20  # of the rows of a block of arcs: they stay in the cache
 

@@ -22,7 +22,6 @@ units of the noise through a robust loss (`solve.robust`). The noise may be esti
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -301,7 +300,8 @@ def _reduced(at: _Iterate, *, leverage: bool = False) -> _Rows:
 
 def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
     """Weighted rows (a, L k, m + n + 1) of [δx_0, δp, r] of these arcs, and their transports."""
-    steps, observed = (type(part)(*(a[block] for a in part)) for part in (at.steps, at.observed))
+    steps = Steps(*(part[block] for part in at.steps))
+    observed = Observed(*(part[block] for part in at.observed))
     residuals, sigma = at.residuals[block], at.units.sigma
     num_arcs, length, k, m = observed.by_state.shape
     n = observed.by_coefficients.shape[-1]
