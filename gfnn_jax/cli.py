@@ -190,6 +190,10 @@ def _parser() -> argparse.ArgumentParser:
         help="of a recording: how inputs go on between samples (default %(default)s)",
     )  # fmt: skip
     command.add_argument(
+        "--despite", type=_kinds, metavar="KIND", default=(),
+        help="of a recording: a mistake that gfnn look names and that is none, by its kind",
+    )  # fmt: skip
+    command.add_argument(
         "--devices", type=_devices, metavar="all|N",
         help="number of devices that share the rows, and the networks of an ensemble; on a CPU "
         "these are its cores",
@@ -216,7 +220,9 @@ def _parser() -> argparse.ArgumentParser:
         help="initial states, or a trajectory file: its sequences continue from their last states; "
         "of a map of positions a recording, whose runs continue from their last two",
     )  # fmt: skip
-    command.add_argument("--num-steps", type=_count, metavar="N")
+    command.add_argument(
+        "--num-steps", type=_steps, metavar="N", help="steps to predict, backwards where N < 0"
+    )
     command.add_argument(
         "--estimate-from", type=_count, metavar="K",
         help="of a recording: samples that the state at its end is estimated from",
@@ -382,6 +388,15 @@ def _count(text: str) -> int:
     return _whole(text, 1, 2**53, "from 1 to 2**53 - 1")
 
 
+def _kinds(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(","))
+
+
+def _steps(text: str) -> int:
+    sign = -1 if text.startswith("-") else 1
+    return sign * _whole(text.removeprefix("-"), 1, 2**53, "from 1 to 2**53 - 1, or its negative")
+
+
 def _devices(text: str) -> int | str:
     return text if text == "all" else _whole(text, 1, 2**31, "from 1 to 2**31 - 1, or all")
 
@@ -517,7 +532,8 @@ def _fit_law(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
         learned = fit_recording(
             arguments.data, out=arguments.out, columns=columns, learn=arguments.learn,
             friction=arguments.friction, input_hold=arguments.input_hold,
-            mass=masses(arguments), seed=arguments.seed, progress=shown,
+            mass=masses(arguments), despite=arguments.despite, seed=arguments.seed,
+            progress=shown,
         )  # fmt: skip
     print(learned.fit.table)
     print(f"written to {arguments.out}")
@@ -533,6 +549,7 @@ def _fit_positions(arguments: argparse.Namespace, columns: dict[str, Any]) -> No
     with progress.on_stderr() as shown:
         ran = fit_positions(
             arguments.data, out=arguments.out, columns=columns, seed=arguments.seed,
+            despite=arguments.despite,
             tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
             absolute_tolerance=arguments.absolute_tolerance, structure=arguments.structure,
             max_seconds=arguments.max_seconds or "auto", max_operations=arguments.max_operations,
@@ -627,7 +644,7 @@ def _forecast(arguments: argparse.Namespace) -> None:
         inputs=arguments.inputs, compare=arguments.compare, overwrite=arguments.overwrite,
     )  # fmt: skip
     times = [f.times[-1] for f in found.values()]
-    print(f"{arguments.out}: forecasts of {len(found)} runs, up to {max(times):g} s")
+    print(f"{arguments.out}: forecasts of {len(found)} runs, up to t = {max(times):g}")
     if judged is not None:
         for name, (rms, median, within) in judged.columns.items():
             print(f"{name}: error {rms:.4g} rms, {median:.4g} median; {within:.0%} of "
@@ -650,7 +667,8 @@ def _predict_and_tell(arguments: argparse.Namespace, share: processes.Share | No
         print(f"process {share.index} of {share.count}: {num_lanes} trajectories, "
               f"{predicted.seconds:.1f} s")  # fmt: skip
         return
-    print(f"{arguments.out}: {num_lanes} trajectories of {arguments.num_steps} steps, "
+    back = " backwards" if arguments.num_steps < 0 else ""
+    print(f"{arguments.out}: {num_lanes} trajectories of {abs(arguments.num_steps)} steps{back}, "
           f"{predicted.seconds:.1f} s")  # fmt: skip
     _print_status(predicted.status, predicted.left_at)
     if predicted.horizon is not None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.data.recording import read
+from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.evaluate import report
 from gfnn_jax.jobs.progress import SILENT, Progress
@@ -20,13 +21,16 @@ from gfnn_jax.storage.outputs import atomic_folder
 
 def fit_positions(
     data: Sequence[Path], *, out: Path, columns: dict[str, Any], seed: int = 0,
-    progress: Progress = SILENT, **options: Any,
+    despite: Sequence[str] = (), progress: Progress = SILENT, **options: Any,
 ) -> Ran:  # fmt: skip
     """Learn the map of recordings of positions, and write it with its report into the folder out.
 
-    columns: keywords of `gfnn_jax.read`. options: those of `learn.fit.fit_positions`.
+    columns: keywords of `gfnn_jax.read`. despite: kinds of mistakes that the files may show.
+    options: those of `learn.fit.fit_positions`. Raises InputError where `gfnn look` finds a
+    mistake.
     """
     recording = read(list(data), **columns)
+    refuse_mistakes(recording, despite)
     try:
         with failures_of_arithmetic():
             fitted = learn_positions(

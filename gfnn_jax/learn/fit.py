@@ -209,7 +209,8 @@ class Fit:
 
     @property
     def formula(self) -> str | None:
-        """H as text, where one was found that meets the tolerance or was chosen."""
+        """H as text that ``terms`` and sympy read, where one was found that meets the tolerance or
+        was chosen; ``print(fit.hamiltonian)`` shows it as people read it."""
         law = self.hamiltonian
         if law is None or not (self.chosen.learns == "hamiltonian" or self._met_by(law.candidate)):
             return None

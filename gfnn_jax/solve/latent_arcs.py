@@ -89,7 +89,7 @@ class Known:
 @dataclasses.dataclass(frozen=True)
 class Fitted:
     """The fit of all arcs: coefficients p (n,), states x (A, L, m), residuals (A, L, k) in units
-    of the noise (NaN where nothing was seen), the noise σ (k,), the triangle (n + 1, n + 1) of
+    of the noise (NaN where nothing was seen), the noise σ as given or estimated, the triangle (n + 1, n + 1) of
     [∂r/∂p, r] without the states (RᵀR of its first n columns is the information matrix of p), each
     arc's part (A, n) of the gradient in p, those of δx_0 (A, m, m) of each arc with p fixed,
     ∂x_{L−1}/∂x_0 (A, m, m), and whether it converged. cost: infinite where the defects could not be
@@ -137,13 +137,13 @@ def fit_arcs(
 ) -> Fitted:
     """Fit p (n,) and the states x (A, L, m), from what they start at, to y (A, L, k).
 
-    Entries of y that are NaN were not seen. ``sigma`` (k,) is the noise of y, ``state_scale`` (m,)
-    the defect that counts as one standard deviation. While defects matter, an iteration has to
-    close them; then it has to lower the cost. Ends where it lowers it by less than ``tolerance``
-    of itself. The cost is infinite where the defects could not be closed.
+    Entries of y that are NaN were not seen. ``sigma`` (k,) or (A, L, k) is the noise of y,
+    ``state_scale`` (m,) the defect that counts as one standard deviation. While defects matter, an
+    iteration has to close them; then it has to lower the cost. Ends where it lowers it by less than
+    ``tolerance`` of itself. The cost is infinite where the defects could not be closed.
 
-    least: (k,) what of the residuals is no noise; sigma is then where the noise starts from, and is
-    estimated by every iteration. None: sigma is known.
+    least: (k,) what of the residuals is no noise; sigma (k,) is then where the noise starts from,
+    and is estimated by every iteration. None: sigma is known.
     """
     seen = np.isfinite(y)
     known = np.where(seen, y, 0.0)
@@ -213,7 +213,7 @@ def eliminated_rows(
 
 
 class _Units(NamedTuple):
-    """σ (k,) of what is seen, the defects (m,) that count as much, and the loss."""
+    """σ of what is seen, the defects (m,) that count as much, and the loss."""
 
     sigma: np.ndarray
     state: np.ndarray
@@ -302,7 +302,8 @@ def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
     """Weighted rows (a, L k, m + n + 1) of [δx_0, δp, r] of these arcs, and their transports."""
     steps = Steps(*(part[block] for part in at.steps))
     observed = Observed(*(part[block] for part in at.observed))
-    residuals, sigma = at.residuals[block], at.units.sigma
+    residuals = at.residuals[block]
+    sigma = np.broadcast_to(at.units.sigma, at.residuals.shape)[block]
     num_arcs, length, k, m = observed.by_state.shape
     n = observed.by_coefficients.shape[-1]
     S = np.zeros((num_arcs, length, m, m + n + 1))
@@ -313,7 +314,7 @@ def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
         S[:, i + 1, :, -1] += steps.closing[:, i]
     J = observed.by_state @ S
     J[..., m : m + n] += observed.by_coefficients
-    J /= sigma[:, None]
+    J /= sigma[..., None]
     J[..., -1] = residuals - J[..., -1]
     weight = np.where(at.seen[block], np.sqrt(at.units.loss.weights(residuals)), 0.0)
     J *= weight[..., None]
