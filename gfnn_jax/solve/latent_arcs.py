@@ -88,12 +88,14 @@ class Known:
 
 @dataclasses.dataclass(frozen=True)
 class Fitted:
-    """The fit of all arcs: coefficients p (n,), states x (A, L, m), residuals (A, L, k) in units
-    of the noise (NaN where nothing was seen), the noise σ as given or estimated, the triangle (n + 1, n + 1) of
-    [∂r/∂p, r] without the states (RᵀR of its first n columns is the information matrix of p), each
-    arc's part (A, n) of the gradient in p, those of δx_0 (A, m, m) of each arc with p fixed,
-    ∂x_{L−1}/∂x_0 (A, m, m), and whether it converged. cost: infinite where the defects could not be
-    closed."""
+    """The fit of all arcs.
+
+    p: (n,) coefficients. x: (A, L, m) states. residuals: (A, L, k) in units of the noise, NaN where
+    nothing was seen. sigma: the noise as given, or (k,) as estimated. factor: the triangle
+    (n + 1, n + 1) of [∂r/∂p, r] without the states. scores: (A, n) each arc's part of the gradient
+    in p. arcs: (A, m, m) triangles of each δx_0 with p fixed. transports: (A, m, m) ∂x_{L−1}/∂x_0.
+    cost: infinite where the defects could not be closed.
+    """
 
     p: np.ndarray
     x: np.ndarray
