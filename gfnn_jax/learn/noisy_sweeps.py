@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.dataset.arcs import arcs_of_pairs
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.runs import steps_between
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.products import Products
@@ -25,13 +26,11 @@ from gfnn_jax.learn.candidates import Candidate, validated
 from gfnn_jax.learn.choose_law import preferred
 from gfnn_jax.learn.clock import ROWS, Budget
 from gfnn_jax.learn.conclude import only_noise
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import AS_FAR, Entry
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.learn.sweeps import SAMPLE_ROWS, Factors, LinearSweep, Size, part_of_noise
 from gfnn_jax.models.map_arcs import LONGEST, GeneratedOnArcs, NearestArcs
-from gfnn_jax.phase_space import Pairs
 
 _MOST_SWEEPS = 3
 _WHAT = "the fit of S to the states that noisy pairs most likely had"
@@ -49,7 +48,7 @@ def without_bias(found: Searched, request: Request) -> Searched:
     if not ranking or request.structure is not None or found.of_terms is not None:
         return found
     best = ranking[0]
-    met = found.judges.met_by(best.candidate)
+    met = found.tolerance.met_by(best.candidate)
     if met or (law is not None and preferred(law.candidate, best.candidate, np.inf)):
         return found
     rivals = _as_far(found)
@@ -93,7 +92,7 @@ def _can_be_corrected(entry: Entry) -> bool:
     plain = isinstance(entry.sweep, LinearSweep) and isinstance(entry.size.family, Products)
     if not plain:
         return False
-    return not entry.sweep.prepared.varied and entry.sweep.moved_by_states
+    return not entry.sweep.data.varied and entry.sweep.moved_by_states
 
 
 class Expected(NamedTuple):
@@ -180,19 +179,17 @@ class NoisySweep(LinearSweep):
     ):  # fmt: skip
         self.__dict__.update(plain.__dict__)
         self.plain, self._kept, self._factors, self._solved = plain, None, {}, {}
-        prepared, coefficients = self.prepared, near.solve(size, Budget(), _quiet)[0].coefficients
+        data, coefficients = self.data, near.solve(size, Budget(), _quiet)[0].coefficients
 
         def nearest(rows) -> NearestArcs:
-            arcs = arcs_of_pairs(*_chained(prepared, self.judges.pairs, np.sort(rows)))
+            arcs = arcs_of_pairs(*_chained(data, np.sort(rows)))
             assert arcs is not None
             model = GeneratedOnArcs(
-                size.family, self.chart, prepared.dt, arcs.moves, (prepared.before, prepared.after)
+                size.family, self.chart, data.dt, arcs.moves, (data.before, data.after)
             )
-            return NearestArcs.of(model, coefficients, arcs, deviations * prepared.scale)
+            return NearestArcs.of(model, coefficients, arcs, deviations * data.scale)
 
-        self._nearest, self._nearest_held = map(
-            nearest, (self.judges.training, self.judges.held_out)
-        )
+        self._nearest, self._nearest_held = map(nearest, (data.training, data.validation))
 
     def _computed(self, group, budget: Budget, say) -> Factors:
         pairs, width = self._rows_of(group)
@@ -203,7 +200,7 @@ class NoisySweep(LinearSweep):
     def _part(self, numbers: int) -> NearestArcs:
         """Arcs that stand for about so many numbers, drawn at random."""
         arcs = len(self._nearest.x)
-        share = numbers / (len(self.judges.training) * self._width)
+        share = numbers / (len(self.data.training) * self._width)
         if share >= 1:
             return self._nearest
         drawn = np.random.default_rng(0).permutation(arcs)[: max(1, int(np.ceil(share * arcs)))]
@@ -222,7 +219,7 @@ class NoisySweep(LinearSweep):
         plain = self.plain.validate(size, judged, budget, say)
         solved, params = self.solve(size, budget, say)
         candidate = dataclasses.replace(plain, condition=solved.condition, rank=solved.rank)
-        return validated(candidate, self.prepared, self.chart, size.family, params, self.judges)
+        return validated(candidate, self.data, self.tolerance, self.chart, size.family, params)
 
     def own_error(self, size: Size) -> float:
         """That of the measured points."""
@@ -252,16 +249,16 @@ class NoisySweep(LinearSweep):
         )  # fmt: skip
 
 
-def _chained(prepared: Prepared, pairs: Pairs, rows) -> tuple[np.ndarray, np.ndarray, int, Any]:
+def _chained(data: Dataset, rows) -> tuple[np.ndarray, np.ndarray, int, Any]:
     """What `arcs_of_pairs` takes of these rows, in the inner coordinates without a base map, angles
     lifted along an arc. A p of period 2π is none to S: its pairs are arcs of their own."""
-    z0, z1 = prepared.y0[rows], prepared.whole_image(prepared.y1[rows])
-    for piece in reversed(prepared.before):
+    z0, z1 = data.y0[rows], data.whole_image(data.y1[rows])
+    for piece in reversed(data.before):
         z0 = piece.inverse().image(z0)
-    onward, angles = steps_between(pairs.take(rows)), list(prepared.coordinates.angles)
+    onward, angles = steps_between(data.pairs.take(rows)), list(data.coordinates.angles)
     if angles:
         turns = np.round((z1[:-1] - z0[1:])[:, angles] / (2 * np.pi)) * (onward == 1)[:, None]
-        onward = onward * (max(angles) < prepared.dim) * (onward == 1)
+        onward = onward * (max(angles) < data.dim) * (onward == 1)
         lifted = 2 * np.pi * np.concatenate([np.zeros((1, len(angles))), np.cumsum(turns, axis=0)])
         z0, z1 = z0.copy(), z1.copy()
         z0[:, angles] += lifted

@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.dataset.arcs import Arcs
-from gfnn_jax.dataset.noise import robust
 from gfnn_jax.flows.collocation import Steps as FlowSteps
 from gfnn_jax.flows.collocation import images
 from gfnn_jax.solve.latent_arcs import Fitted, Known, Observed, Steps, fit_arcs, observed_whole
-from gfnn_jax.solve.robust import Biweight
+from gfnn_jax.solve.robust import Biweight, robust
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,8 +15,7 @@ not be followed from its first state (multiple shooting; Bock, Springer Ser. Che
 c_n the move of x_{n+1} that would close the defect, which makes δx_n a function of δx_0 and δp
 alone. The arc's own δx_0 is eliminated by its own QR; what remains of all arcs are rows for δp.
 Where it converges the defects are zero, and each arc is an orbit of the model. Residuals enter in
-units of the noise through a robust loss (`solve.robust`). The noise may be estimated on the way
-(`dataset.noise.of_residuals`).
+units of the noise through a robust loss (`solve.robust`). The noise may be estimated on the way.
 """
 
 from __future__ import annotations
@@ -26,8 +25,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from gfnn_jax.dataset.noise import of_residuals
-from gfnn_jax.solve.robust import Loss, SoftL1
+from gfnn_jax.solve.robust import Loss, SoftL1, of_residuals
 
 _DEFECT = 0.1  # a defect of this many standard deviations costs as much as a residual of one
 _CLOSED = 0.1  # standard deviations, rms: arcs whose defects are smaller are orbits of the model
