@@ -13,6 +13,7 @@ from math import comb
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
+from gfnn_jax.dataset.structure_names import EXPECTED
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.sums import (
     Part,
@@ -23,7 +24,6 @@ from gfnn_jax.families.sums import (
     site_terms,
 )
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.learn.options import STRUCTURE
 from gfnn_jax.maps.domain import Ranges, ranges_of
 from gfnn_jax.phase_space import sizes
 
@@ -176,7 +176,7 @@ def structure_of(
         return Bodies(count, dim // count, species)
     kind, fields = str(text).partition(":")[0], fields_of(str(text))
     if fields == 0:
-        raise FitError(f"expected {STRUCTURE.words}, got {text!r}")
+        raise FitError(f"expected {EXPECTED}, got {text!r}")
     if dim % fields:
         raise FitError(f"expected {fields} q of every site; got {dim} degrees of freedom")
     if dim // fields < _FEWEST_SITES:

@@ -15,11 +15,11 @@ from dataclasses import field
 from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple
 
+from gfnn_jax.dataset.structure_names import EXPECTED, STRUCTURES
 from gfnn_jax.errors import FitError
 from gfnn_jax.learn.clock import Budget, seconds_allowed
 
 RUN, FIT = ("gfnn run", "gfnn fit"), ("gfnn fit",)
-STRUCTURES = ("ring", "chain", "bodies:N", "ring:FIELDS", "chain:FIELDS", "bodies:N:SPECIES")
 _SITES, _BODIES = r"(ring|chain)(:[1-9][0-9]?)?", r"bodies:0*([2-9]|[1-9][0-9]+)(:[A-Za-z]+)?"
 
 
@@ -77,7 +77,7 @@ DEVICES = Kind(
     lambda text: "all" if text == "all" else int(text),
 )  # fmt: skip
 STRUCTURE = Kind(
-    f"a structure among {', '.join(STRUCTURES)}",
+    EXPECTED,
     lambda v: isinstance(v, str) and bool(re.fullmatch(f"{_SITES}|{_BODIES}", v)),
 )
 _SECONDS = Kind(
