@@ -149,6 +149,7 @@ def test_misfit_weighs_as_much_as_in_the_posterior(misfit, count):
     sizes = [Size(SimpleNamespace(num_parameters=n), larger, float(n)) for n in counts]
     sweep = SimpleNamespace(
         sizes=sizes,
+        alike=uncertainty.ALIKE,
         factors=lambda *_: SimpleNamespace(train=Triangle(factor, rows)),
         freedoms=lambda near, most, counts: list(map(float, counts)),
     )

@@ -126,7 +126,7 @@ def best_size(sweep: LinearSweep, near: Size, most: Size, budget: Budget, say) -
         added = np.maximum(-np.diff(left) - noise * np.diff(taken), 0.0)
         misfit = np.append(np.cumsum(added[::-1])[::-1], 0.0)
         own = noise * taken / train.rows
-        errors = noise + own + uncertainty.ALIKE * misfit / train.rows
+        errors = noise + own + sweep.alike * misfit / train.rows
         best = int(np.argmin(errors))
         if best < place or place + 1 == len(sweep.sizes):
             return Expected(sizes[best], float(errors[best]), float(own[best]), noise)
@@ -205,6 +205,11 @@ class NoisySweep(LinearSweep):
             return self._nearest
         drawn = np.random.default_rng(0).permutation(arcs)[: max(1, int(np.ceil(share * arcs)))]
         return self._nearest.take(np.sort(drawn))
+
+    @property
+    def alike(self) -> float:
+        """Misfit's weight: along arcs of several steps it adds up in the rows themselves."""
+        return uncertainty.ALIKE if self._nearest.x.shape[1] == 2 else 1.0
 
     def freedoms(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
         """As many as there are terms: the rows of an arc are independent."""

@@ -384,6 +384,11 @@ class LinearSweep(Generates):
         return all(isinstance(p, (Affine, Damping)) for p in (*self.data.before, *self.data.after))
 
     @property
+    def alike(self) -> float:
+        """The weight of misfit beside noise, where a size is chosen by its expected error."""
+        return uncertainty.ALIKE
+
+    @property
     def largest_known(self) -> Size:
         """The largest size that a factor answers for."""
         return [size for size in self.sizes if size.group in self._factors][-1]
