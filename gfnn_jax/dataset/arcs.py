@@ -6,6 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.dataset.runs import steps_between
+from gfnn_jax.phase_space import Pairs
+
 
 class Arcs(NamedTuple):
     """states: (A, L, 2d), NaN where nothing was measured, within an arc or beyond its end. moves:
@@ -18,6 +21,13 @@ class Arcs(NamedTuple):
     def measured(self) -> np.ndarray:
         """(A, L) which states were measured."""
         return np.asarray(np.isfinite(self.states).all(axis=-1))
+
+
+def onward(pairs: Pairs, rows: np.ndarray) -> np.ndarray:
+    """(n − 1,) steps from the state of each of these rising rows to that of the next of them; 0
+    where rows between them are not among these: what was left out of the pairs is bridged, what is
+    held out is not."""
+    return np.where(np.diff(rows) == 1, steps_between(pairs)[rows[:-1]], 0)
 
 
 def arcs_of_pairs(z0, z1, longest: int, steps=None) -> Arcs | None:

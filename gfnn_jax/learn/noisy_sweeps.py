@@ -15,9 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.dataset.arcs import arcs_of_pairs
+from gfnn_jax.dataset.arcs import arcs_of_pairs, onward
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.runs import steps_between
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import uncertainty
@@ -236,9 +235,9 @@ class NoisySweep(LinearSweep):
         solved, larger = self.solve(size, Budget(), _quiet)[0], self._larger(size)
         most = size.family if larger is None else larger.family
         sample = self._part(SAMPLE_ROWS * most.num_parameters)
-        rows = np.concatenate([rows for rows, _ in sample.rows(most)])
+        blocks = list(sample.rows(most))
+        rows, numbers = np.concatenate([rows for rows, _ in blocks]), sum(n for _, n in blocks)
         of_sample = Triangle.of(rows)
-        numbers = sum(numbers for _, numbers in sample.rows(most))
 
         def left(of: Size) -> tuple[float, float, int]:
             terms, known = of.family.num_parameters, larger and larger.group in self._factors
@@ -260,15 +259,15 @@ def _chained(data: Dataset, rows) -> tuple[np.ndarray, np.ndarray, int, Any]:
     z0, z1 = data.y0[rows], data.whole_image(data.y1[rows])
     for piece in reversed(data.before):
         z0 = piece.inverse().image(z0)
-    onward, angles = steps_between(data.pairs.take(rows)), list(data.coordinates.angles)
+    steps, angles = onward(data.pairs, rows), list(data.coordinates.angles)
     if angles:
-        turns = np.round((z1[:-1] - z0[1:])[:, angles] / (2 * np.pi)) * (onward == 1)[:, None]
-        onward = onward * (max(angles) < data.dim) * (onward == 1)
+        steps = np.where(max(angles) < data.dim, steps == 1, False).astype(int)
+        turns = np.round((z1[:-1] - z0[1:])[:, angles] / (2 * np.pi)) * steps[:, None]
         lifted = 2 * np.pi * np.concatenate([np.zeros((1, len(angles))), np.cumsum(turns, axis=0)])
         z0, z1 = z0.copy(), z1.copy()
         z0[:, angles] += lifted
         z1[:, angles] += lifted
-    return z0, z1, LONGEST, onward
+    return z0, z1, LONGEST, steps
 
 
 def _quiet(message: str) -> None:

@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.dataset.arcs import Arcs, arcs_of_pairs
+from gfnn_jax.dataset.arcs import Arcs, arcs_of_pairs, onward
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.runs import steps_between
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem, significant
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.models.flow_arcs import BIWEIGHT, FlowOnArcs, fit_flow, longest_arc
@@ -58,15 +57,12 @@ def fitted_to_sequences(
         return None
     resolved = _STEP_ERROR * rms
     steps = problem.fine_steps(family, c, data.training, (resolved,))[0]
-    between = steps_between(data.pairs)
     longest = longest_arc(family, c, data.y0[some], data.dt, steps, rms)
 
     def along(rows) -> Arcs | None:
         rows, pairs = np.sort(rows), data.pairs
-        # What was left out is bridged, what is held out is not.
-        onward = np.where(np.diff(rows) == 1, between[rows[:-1]], 0)
         z0, z1 = np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows]
-        arcs = arcs_of_pairs(z0, z1, longest, onward)
+        arcs = arcs_of_pairs(z0, z1, longest, onward(pairs, rows))
         if arcs is None or np.median(arcs.measured.sum(axis=1)) <= _SHORTEST:
             return None
         return arcs

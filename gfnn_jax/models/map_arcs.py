@@ -39,6 +39,7 @@ LONGEST = 10  # steps of an arc: what S cannot represent adds up along a longer 
 # Of normal residuals it takes one part in forty, so that rows keep their variance of one.
 BIWEIGHT = Biweight(15.0)
 _SETTLED = 1e-3  # of the squared distance: what the states still gain moves no coefficient
+_LANES = 4_096  # steps whose matrices are computed at once
 _BLOCK_BYTES = 4 * 2**20  # of the rows of a block of arcs: they stay in the cache
 
 
@@ -59,8 +60,18 @@ class GeneratedOnArcs:
     along: Any = None
 
     def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
-        width, (before, after) = x.shape[-1], self._of_states(x.shape[-1])
-        y0, y1 = x[:, :-1][self.moves], x[:, 1:][self.moves]
+        width, free = x.shape[-1], 0 if self.along is None else self.along.num_parameters
+        found = np.zeros((*self.moves.shape, width, 1 + width + free))
+        found[..., 1 : 1 + width] = np.eye(width)
+        lanes = np.flatnonzero(self.moves)
+        for first in range(0, len(lanes), _LANES):
+            some = np.unravel_index(lanes[first : first + _LANES], self.moves.shape)
+            found[some] = self._linearised(p, x[:, :-1][some], x[:, 1:][some])
+        return Steps(found[..., 0], found[..., 1 : 1 + width], found[..., 1 + width :])
+
+    def _linearised(self, p: np.ndarray, y0: np.ndarray, y1: np.ndarray) -> np.ndarray:
+        """[c, Φ, Γ] (n, 2d, 1 + 2d + free) of steps from z to Z (n, 2d)."""
+        before, after = self._of_states(y0.shape[-1])
         for piece in self.ends[0]:
             y0 = piece.image(y0)
         for piece in reversed(self.ends[1]):
@@ -72,11 +83,7 @@ class GeneratedOnArcs:
         if self.along is not None:
             parts.append(self.along.term_gradients(w))
         # F + ∂F/∂z δz + ∂F/∂Z δZ + ∇φ δc = 0, for δZ.
-        found = -np.linalg.solve(hessian @ after[0] - after[1], np.concatenate(parts, axis=-1))
-        every = np.zeros((*self.moves.shape, width, found.shape[-1]))
-        every[..., 1 : 1 + width] = np.eye(width)
-        every[self.moves] = found
-        return Steps(every[..., 0], every[..., 1 : 1 + width], every[..., 1 + width :])
+        return -np.linalg.solve(hessian @ after[0] - after[1], np.concatenate(parts, axis=-1))
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         return observed_whole(x, 0 if self.along is None else self.along.num_parameters)
