@@ -63,7 +63,7 @@ def test_arcs_are_the_sequences_in_parts():
 
 
 def test_errors_are_those_that_the_covariance_says():
-    """Of 8 sets of data, the squares of error ÷ deviation: chi squared of 24, 12 to 39 in 95 %."""
+    """In 8 sets of data, the squares of error ÷ deviation: chi squared of 24, 12 to 39 in 95 %."""
     squares = noise = 0.0
     for seed in range(8):
         found = shot(measured(seed)[0])
@@ -96,7 +96,7 @@ def test_gross_errors_change_nothing_and_are_counted():
 
 
 def test_a_coordinate_without_noise_has_no_outliers():
-    """What the steps' own error leaves of it is no noise, beside which others would be gross."""
+    """The steps' own error is no noise, beside which others would be gross."""
     states = measured(0, length=40, noise=np.array([NOISE, 0.0]))[0]
     found = shot(states, TRUE, Steps(2, 1), least=3e-4)  # off by 3e-4 in a step
     assert outliers(found) == 0

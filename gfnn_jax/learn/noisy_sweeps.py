@@ -188,6 +188,7 @@ class NoisySweep(LinearSweep):
             )
             return NearestArcs.of(model, coefficients, arcs, deviations * data.scale)
 
+        self._along = nearest
         self._nearest, self._nearest_held = map(nearest, (data.training, data.validation))
 
     def _computed(self, group, budget: Budget, say) -> Factors:
@@ -211,11 +212,11 @@ class NoisySweep(LinearSweep):
         return uncertainty.ALIKE if self._nearest.x.shape[1] == 2 else 1.0
 
     def freedoms(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
-        """As many as there are terms: the rows of an arc are independent."""
+        """Count the terms: the rows of an arc are independent."""
         return [float(count) for count in counts]
 
     def judge(self, size: Size, budget: Budget, say) -> Candidate:
-        """As the sweep that was corrected judges it, by the measured points."""
+        """Judge as the sweep that was corrected does, by the measured points."""
         return self.plain.judge(size, budget, say)
 
     def validate(self, size: Size, judged: Candidate, budget: Budget, say) -> Candidate:
@@ -225,12 +226,18 @@ class NoisySweep(LinearSweep):
         candidate = dataclasses.replace(plain, condition=solved.condition, rank=solved.rank)
         return validated(candidate, self.data, self.tolerance, self.chart, size.family, params)
 
+    def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Images by a fit to the states that other rows most likely had."""
+        of = size.family
+        fitted_to, held = self._along(others).triangle(of), self._nearest_held.triangle(of)
+        return self._predicted(size, fitted_to, held, rows)
+
     def own_error(self, size: Size) -> float:
-        """That of the measured points."""
+        """Own error of the measured points."""
         return self.plain.own_error(size)
 
     def root(self, size: Size) -> np.ndarray:
-        """As that of the sweep, of rows that are independent."""
+        """Root of the covariance, as the sweep's own, of rows that are independent."""
         train, count = self.factors(size.group, Budget(), _quiet).train, size.family.num_parameters
         solved, larger = self.solve(size, Budget(), _quiet)[0], self._larger(size)
         most = size.family if larger is None else larger.family
@@ -254,8 +261,8 @@ class NoisySweep(LinearSweep):
 
 
 def _chained(data: Dataset, rows) -> tuple[np.ndarray, np.ndarray, int, Any]:
-    """What `arcs_of_pairs` takes of these rows, in the inner coordinates without a base map, angles
-    lifted along an arc. A p of period 2π is none to S: its pairs are arcs of their own."""
+    """Arguments of `arcs_of_pairs` for these rows: inner coordinates without a base map, angles lifted
+    along an arc. A p of period 2π is none to S: its pairs are arcs of their own."""
     z0, z1 = data.y0[rows], data.whole_image(data.y1[rows])
     for piece in reversed(data.before):
         z0 = piece.inverse().image(z0)
@@ -271,4 +278,4 @@ def _chained(data: Dataset, rows) -> tuple[np.ndarray, np.ndarray, int, Any]:
 
 
 def _quiet(message: str) -> None:
-    """Of what is known already nothing is said."""
+    """Say nothing of what is known already."""

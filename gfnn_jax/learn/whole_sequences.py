@@ -10,7 +10,8 @@ import numpy as np
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.arcs import Arcs, arcs_of_pairs, onward
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.fitting.gauss_newton import FlowFit, Problem, significant
+from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
+from gfnn_jax.fitting.significance import significant
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.models.flow_arcs import BIWEIGHT, FlowOnArcs, fit_flow, longest_arc
 from gfnn_jax.solve.latent_arcs import OUTLYING, Fitted
@@ -77,7 +78,7 @@ def fitted_to_sequences(
         return fit_flow(model, coefficients, arcs, least, coordinates.angles, **options)
 
     def left(terms, coefficients) -> float:
-        """Of the held-out arcs, each from the state that suits it."""
+        """Noise of the held-out arcs, each from the state that suits it."""
         found = fitted(held, terms, coefficients, only_states=True)
         return np.inf if found is None else float(np.linalg.norm(found.sigma / problem.scale))
 
@@ -105,7 +106,7 @@ def fitted_to_sequences(
 
 
 def _triangle(found: Fitted) -> Triangle:
-    """Of [∂r/∂c, r] without the latent states, r predicted less measured, for the numbers that have
+    """Triangle of [∂r/∂c, r] without the latent states, r predicted less measured, for the numbers that have
     weight."""
     factor = found.factor.copy()
     factor[:, -1] *= -1

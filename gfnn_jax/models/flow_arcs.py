@@ -72,7 +72,7 @@ class FlowOnArcs:
         return observed_whole(x, len(p))
 
     def images(self, p: np.ndarray, z: np.ndarray, direction: int = 1) -> np.ndarray:
-        """Of states z (n, 2d), a step ahead or back."""
+        """Images of states z (n, 2d), a step ahead or back."""
         self.check()
         return images(self.family, p, z, direction * self.dt, self.how).states
 
@@ -143,7 +143,7 @@ def _starts(model: FlowOnArcs, c, arcs: Arcs) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _defects(model: FlowOnArcs, c, arcs: Arcs) -> np.ndarray:
-    """What each measured state leaves of the next (A, L − 1, 2d); NaN where either is missing."""
+    """Defects between each measured state and the next (A, L − 1, 2d); NaN where either is missing."""
     off = np.full(arcs.states[:, 1:].shape, np.nan)
     both = arcs.measured[:, :-1] & arcs.measured[:, 1:] & model.moves
     off[both] = model.images(c, arcs.states[:, :-1][both]) - arcs.states[:, 1:][both]

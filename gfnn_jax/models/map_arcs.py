@@ -141,7 +141,7 @@ class NearestArcs:
             yield rows, int(np.isfinite(y).sum()) - len(y) * width
 
     def triangle(self, along: Any, on_block: Callable[[], Any] = lambda: None) -> Triangle:
-        """Of the rows of a family; on_block: called before each block of rows."""
+        """Triangle of the rows of a family; on_block: called before each block of rows."""
         found = Triangle.empty(along.num_parameters)
         factor, count = found.factor, 0
         for rows, numbers in self.rows(along):
@@ -152,7 +152,7 @@ class NearestArcs:
         return Triangle(factor, count)
 
     def take(self, arcs: np.ndarray) -> NearestArcs:
-        """Of these arcs alone."""
+        """Keep these arcs alone."""
         model = dataclasses.replace(self.model, moves=self.model.moves[arcs])
         chosen = Arcs(self.arcs.states[arcs], self.arcs.moves[arcs])
         return NearestArcs(model, self.p, chosen, self.x[arcs], self.sigma)

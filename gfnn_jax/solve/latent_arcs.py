@@ -118,7 +118,7 @@ class Fitted:
         return inverse @ inverse.T
 
     def last_covariance(self) -> np.ndarray:
-        """Of the last state of each arc (A, m, m), with p as it is."""
+        """Covariance of the last state of each arc (A, m, m), with p as it is."""
         root = self.transports @ np.linalg.pinv(self.arcs)
         return root @ root.swapaxes(1, 2)
 
