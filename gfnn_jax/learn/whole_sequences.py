@@ -106,8 +106,8 @@ def fitted_to_sequences(
 
 
 def _triangle(found: Fitted) -> Triangle:
-    """Triangle of [∂r/∂c, r] without the latent states, r predicted less measured, for the numbers that have
-    weight."""
+    """Triangle of [∂r/∂c, r] without the latent states, r predicted less measured, for the numbers
+    that have weight."""
     factor = found.factor.copy()
     factor[:, -1] *= -1
     return Triangle(factor, int((np.abs(found.residuals) < BIWEIGHT.k).sum()))

@@ -143,7 +143,7 @@ def _starts(model: FlowOnArcs, c, arcs: Arcs) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _defects(model: FlowOnArcs, c, arcs: Arcs) -> np.ndarray:
-    """Defects between each measured state and the next (A, L − 1, 2d); NaN where either is missing."""
+    """Defects between measured states and the next (A, L − 1, 2d); NaN where one is missing."""
     off = np.full(arcs.states[:, 1:].shape, np.nan)
     both = arcs.measured[:, :-1] & arcs.measured[:, 1:] & model.moves
     off[both] = model.images(c, arcs.states[:, :-1][both]) - arcs.states[:, 1:][both]

@@ -13,7 +13,7 @@ from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.law_arcs import LawOnArcs
 from gfnn_jax.models.structure import Key, Structure
-from gfnn_jax.solve.latent_arcs import SOFT_L1, Fitted, eliminated_rows, fit_arcs
+from gfnn_jax.solve.latent_arcs import SOFT_L1, Fitted, fit_arcs, sensitivities
 
 _SETTLED = 1.15  # a noise scale that changed by less needs no second fit
 FOLDS = 3
@@ -132,8 +132,7 @@ class Workbench:
         p = larger.start(known)
         model = self.model(larger, fit.arcs, p, np.arange(len(p)))
         noise = fit.sigma * fit.arcs.noise
-        rows = eliminated_rows(model, p, fit.fitted.x, fit.arcs.y, noise)
-        R = np.asarray(np.linalg.qr(rows, mode="r"))
+        R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise)
         old = [keys.index(k) for k in known]
         own = [keys.index(k) for k in new]
         Q = np.linalg.qr(R[:, old])[0] if old else np.zeros((len(R), 0))

@@ -212,6 +212,14 @@ def eliminated_rows(
     return (across.swapaxes(1, 2) @ J[..., m:]).reshape(-1, J.shape[-1] - m)
 
 
+def sensitivities(
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
+) -> np.ndarray:
+    """The triangle (n + 1, n + 1) of `eliminated_rows`: what a test of coefficients needs."""
+    factor = np.asarray(np.linalg.qr(eliminated_rows(model, p, x, y, sigma), mode="r"))
+    return np.concatenate([factor, np.zeros((factor.shape[1] - len(factor), factor.shape[1]))])
+
+
 class _Units(NamedTuple):
     """σ of what is seen, the defects (m,) that count as much, and the loss."""
 
