@@ -33,6 +33,20 @@ class Split(NamedTuple):
     test: np.ndarray
     stretch: np.ndarray
 
+    @classmethod
+    def of_training(cls, rows: np.ndarray, count: int) -> Split:
+        """These of ``count`` rows train, and nothing is kept apart; each errs independently."""
+        return cls(rows, np.zeros(0, int), np.zeros(0, int), np.arange(count))
+
+    def take(self, rows: np.ndarray) -> Split:
+        """The split of these rows alone, (n,) of the N rows, each in its part."""
+        place = np.full(len(self.stretch), -1)
+        place[rows] = np.arange(len(rows))
+        training, validation, test = (
+            kept[kept >= 0] for kept in (place[part] for part in self[:3])
+        )
+        return Split(training, validation, test, self.stretch[rows])
+
 
 def split_rows(pairs: Pairs, seed: int) -> Split:
     """Training, validation and test rows, drawn by the seed.

@@ -14,8 +14,8 @@ from itertools import pairwise
 import numpy as np
 
 from gfnn_jax.data.recording import Recording
-from gfnn_jax.dataset.local_cubics import choose_half, smooth
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.signals.local_cubics import choose_half, smooth
 
 GAP = 3.5  # median steps: a longer one ends a stretch
 PER_PERIOD = 40  # nodes
