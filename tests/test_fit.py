@@ -344,7 +344,7 @@ def noisy_pairs():
 
 @pytest.fixture(scope="module")
 def noisy_fit(noisy_pairs):
-    with pytest.warns(gfnn.FitWarning, match="carry noise"):
+    with pytest.warns(gfnn.FitWarning, match="noise of about"):
         return gfnn.fit(noisy_pairs, chart="midpoint", tolerance=1e-18)
 
 

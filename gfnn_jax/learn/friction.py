@@ -106,9 +106,7 @@ def mechanical(
     return beside_friction(problem, work, (alone, OPTIONS), data, tolerance, search)[0]
 
 
-def libraries_with(
-    forces: Forces, data: Dataset, scene, terms, options: Options
-) -> Iterator[Any]:
+def libraries_with(forces: Forces, data: Dataset, scene, terms, options: Options) -> Iterator[Any]:
     """The families of H by rising size, each with these forces; of angles their shortest modes."""
     basis = modes_of(data, scene, terms)
     if basis is None:

@@ -219,7 +219,7 @@ def learned_from(
         stalled=found.stalled,
         covariance=covariance, noise=None if whole is None else whole.noise,
         arcs=0 if whole is None else whole.arcs,
-        dropped=found.dropped, unmet=_unmet(error, omega_h, data, tolerance, found),
+        dropped=found.dropped, unmet=_unmet(error, omega_h, tolerance, found),
         friction=friction,
     )  # fmt: skip
 
@@ -354,14 +354,20 @@ def unexplained(
     return part if part < 1 - by_chance else 1.0
 
 
-def _unmet(error: OneStepError, omega_h: float, data, tolerance, found: FittedLaw) -> str:
+def _unmet(error: OneStepError, omega_h: float, tolerance, found: FittedLaw) -> str:
     if error.bound <= tolerance.bound:
         return ""
+    why = "; terms that you know would help (terms)"
+    if omega_h > FAST:
+        why = (
+            f"; it oscillates by {omega_h:.2g} radians in a step, and beyond π one dt does not "
+            "tell H: sample with a shorter one"
+        )
+    elif found.ended:
+        why = f"; modes were added until {found.ended}"
     return (
-        f"no H of the terms tried meets the tolerance (best {error.relative:.2e} of the spread, "
-        f"its fastest oscillation {omega_h:.2g} in a step): the pairs carry noise, other terms are "
-        f"needed, the map has no flow, or ωh > π at dt = {data.dt:g}, and then only a shorter "
-        "dt tells H" + (f"; modes were added until {found.ended}" if found.ended else "")
+        "no H of the terms tried meets the tolerance: the best misses the images by "
+        f"{error.relative:.2e} of the spread{why}"
     )
 
 
