@@ -1,6 +1,6 @@
 """The command line: ``gfnn scenes | run | look | fit | predict | export | compare``.
 
-Each exit status but 0 comes with one line that gives the reason (`EXIT_STATUS`). JAX is imported
+Each exit status but 0 comes with one line that gives the reason (`cli_parser`). JAX is imported
 only after the usage has been checked.
 """
 
@@ -11,16 +11,16 @@ import contextlib
 import json
 import math
 import os
-import re
 import signal
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from gfnn_jax import processes
-from gfnn_jax.cli_columns import add_column_options, column_options, masses, names_roles
+from gfnn_jax.cli_columns import column_options, masses, names_roles
+from gfnn_jax.cli_parser import fit_options, parser
 from gfnn_jax.compiling import enable_compile_cache
 from gfnn_jax.data.kinds import are_recordings
 from gfnn_jax.errors import InputError, WorkError
@@ -28,31 +28,7 @@ from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new
 from gfnn_jax.storage.partial import unfinished_note
 
-# Copies of the choices in `learn.check` and `exports.export`, whose import would load JAX; a test
-# compares them.
-CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
-FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
-LEARN = ("auto", "map", "hamiltonian", "lagrangian")
-STRUCTURES = ("ring", "chain", "bodies:N", "ring:FIELDS", "chain:FIELDS", "bodies:N:SPECIES")
-EXPORTS = ("c", "stablehlo")
 _FEW_TERMS = 15  # of a law with noise that is shown as H
-
-EXIT_STATUS = """\
-exit status:
-  0    success
-  1    a failure during the work (a full disk); with --strict also a missed tolerance
-  2    bad usage or bad input, before any long work
-  130  stopped by Ctrl-C
-  143  stopped by SIGTERM"""
-DISTRIBUTED_STATUS = "  134  with --distributed: another process of the job was lost"
-WORDS = """\
-the table of candidates:
-  chart      where the generating function S is evaluated: type2 at (q, P), type3 at (Q, p),
-             midpoint at ((q + Q)/2, (p + P)/2), type1 at (q, Q); capitals are one step later
-  error      one-step error of held-out pairs; relative: RMS over coordinates of error divided by
-             that coordinate's spread
-  95 % bound the tolerance is met where this upper bound of the relative error is within it
-  outside    relative error at the outermost twentieth of the states, of a fit without them"""
 
 
 class _Terminated(KeyboardInterrupt):
@@ -65,20 +41,15 @@ _TO_BEGIN = (
 )
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message} (see {self.prog} --help)")
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line ``argv`` (without the program's name) and return the exit status."""
     arguments, argv = argparse.Namespace(), sys.argv[1:] if argv is None else argv
     try:
         if not argv:
             raise InputError(f"expected a command, got none: {_TO_BEGIN}")
-        arguments = _parser().parse_args(argv)
+        arguments = parser().parse_args(argv)
         with _sigterm(), _warnings_in_one_line():
-            arguments.command(arguments)
+            _COMMANDS[arguments.command](arguments)
         return 0
     except InputError as error:
         return _fail(2, error)
@@ -104,299 +75,6 @@ def _fail(status: int, why: object) -> int:
     return status
 
 
-class _Version(argparse.Action):
-    def __call__(self, parser, namespace, values, option_string=None) -> NoReturn:
-        from gfnn_jax import __version__
-
-        print(f"gfnn {__version__}")
-        parser.exit()
-
-
-def _with_status(options: dict[str, Any]) -> dict[str, Any]:
-    """Extend the options of a command that has --distributed."""
-    return {**options, "epilog": f"{options['epilog']}\n{DISTRIBUTED_STATUS}"}
-
-
-def _parser() -> argparse.ArgumentParser:
-    plain: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
-    parser = _Parser(
-        prog="gfnn", description="Learn exactly symplectic maps, predict with them.",
-        epilog=f"{EXIT_STATUS}\n{DISTRIBUTED_STATUS}", **plain,
-    )  # fmt: skip
-    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    fitting: dict[str, Any] = {"epilog": f"{WORDS}\n\n{EXIT_STATUS}", **plain}
-    others: dict[str, Any] = {"epilog": EXIT_STATUS, **plain}
-
-    command = commands.add_parser("scenes", help="list the scenes")
-    command.set_defaults(command=_scenes)
-    command = commands.add_parser("records", help="list the measured records of the package")
-    command.set_defaults(command=_records)
-
-    command = commands.add_parser(
-        "run", help="a scene from reference data to figures",
-        description="Reference data of a scene, fit, rollouts, metrics, figures, report.json.",
-        **fitting,
-    )  # fmt: skip
-    command.set_defaults(command=_run)
-    command.add_argument("scene", metavar="SCENE", help="a name that `gfnn scenes` lists")
-    command.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/SCENE)")
-    command.add_argument("--quick", action="store_true", help="fewer pairs and rollouts")
-    command.add_argument("--dt", type=_positive, metavar="H", help="another time step")
-    _add_fit_options(command, "the scene's own, close to the best attainable")
-
-    command = commands.add_parser(
-        "look", help="what a recording holds, before anything is learned",
-        description="Runs, rates, gaps, noise, friction and mistakes of a recording, told by the "
-        "file itself: .csv and other text, .npz, .npy.", **others,
-    )  # fmt: skip
-    command.set_defaults(command=_look)
-    command.add_argument("data", type=Path, metavar="FILE", nargs="+", help="one file or several")
-    add_column_options(command)
-    command.add_argument("--dt", type=_positive, metavar="H", help="seconds between rows")
-    command.add_argument("--json", action="store_true", help="print plain data, and draw nothing")
-    command.add_argument(
-        "--figure", type=Path, metavar="FILE", help="default runs/look-NAME.png, written anew"
-    )
-    command.add_argument("--overwrite", action="store_true", help="replace an existing --figure")
-    command.add_argument(
-        "--strict", action="store_true", help="exit status 1 where something is wrong"
-    )
-
-    command = commands.add_parser(
-        "fit", help="learn the map of your own trajectories",
-        description="Learn the map of a .npz, .npy or .csv file; q first.",
-        **_with_status(fitting),
-    )  # fmt: skip
-    command.set_defaults(command=_fit)
-    command.add_argument(
-        "data", type=Path, metavar="DATA", nargs="+", help="one file, or several with the same dt"
-    )
-    command.add_argument("--out", type=Path, metavar="MODEL", required=True, help="folder to write")
-    command.add_argument("--dt", type=_positive, metavar="H", help="time step, if DATA has none")
-    command.add_argument(
-        "--scene", metavar="NAME",
-        help="scene whose coordinates and features are used; features assume the scene's units",
-    )  # fmt: skip
-    _add_fit_options(command, "1e-6")
-    add_column_options(command)
-    command.add_argument(
-        "--friction", default="auto", metavar="KIND",
-        help="of a recording: auto, none, linear, quadratic, dry, or some joined by + "
-        "(default %(default)s)",
-    )  # fmt: skip
-    command.add_argument(
-        "--input-hold", choices=("auto", "hold", "linear", "band"), default="auto",
-        help="of a recording: how inputs go on between samples (default %(default)s)",
-    )  # fmt: skip
-    command.add_argument(
-        "--devices", type=_devices, metavar="all|N",
-        help="number of devices that share the rows, and the networks of an ensemble; on a CPU "
-        "these are its cores",
-    )  # fmt: skip
-    command.add_argument(
-        "--distributed", action="store_true",
-        help="this is one of several processes that srun or another launcher has started: each "
-        "reads its own rows of DATA, or its own files",
-    )  # fmt: skip
-    command.add_argument(
-        "--absolute-tolerance", type=_positive, metavar="E",
-        help="instead of --tolerance: bound on the RMS per component, in the data's units",
-    )  # fmt: skip
-
-    command = commands.add_parser(
-        "predict", help="predict with a learned map",
-        description="Predict from initial states (.npy, .npz with z0, or a trajectory file).",
-        **_with_status(others),
-    )  # fmt: skip
-    command.set_defaults(command=_predict)
-    command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
-    command.add_argument(
-        "--initial", type=Path, metavar="FILE", required=True,
-        help="initial states, or a trajectory file: its sequences continue from their last states; "
-        "of a map of positions a recording, whose runs continue from their last two",
-    )  # fmt: skip
-    command.add_argument(
-        "--num-steps", type=_steps, metavar="N", help="steps to predict, backwards where N < 0"
-    )
-    command.add_argument(
-        "--estimate-from", type=_count, metavar="K",
-        help="of a recording: samples that the state at its end is estimated from",
-    )  # fmt: skip
-    command.add_argument(
-        "--inputs", type=Path, metavar="FILE", help="of a recording: the inputs ahead of its end"
-    )
-    command.add_argument(
-        "--compare", type=Path, metavar="FILE",
-        help="of a recording: what was measured after its end, which the forecast is held to",
-    )  # fmt: skip
-    command.add_argument(
-        "--save-every", type=_count, metavar="K", default=1,
-        help="save the state of every K-th step (default %(default)s)",
-    )  # fmt: skip
-    command.add_argument(
-        "--dt", type=_positive, metavar="H",
-        help="another time step than that of the data, for a model of a Hamiltonian or of pairs "
-        "with several time steps",
-    )  # fmt: skip
-    command.add_argument("--out", type=Path, metavar="FILE", required=True, help=".npz to write")
-    command.add_argument(
-        "--samples", type=_count, metavar="N",
-        help="maps drawn from the model's posterior: adds std and quantiles to FILE",
-    )  # fmt: skip
-    command.add_argument(
-        "--horizon", type=_positive, metavar="SIZE",
-        help="with --samples: adds the step at which the band of the position exceeds SIZE",
-    )  # fmt: skip
-    command.add_argument(
-        "--outside", choices=("continue", "stop"), default="continue",
-        help="what to do where a trajectory leaves the data's domain (default %(default)s)",
-    )  # fmt: skip
-    command.add_argument(
-        "--devices", type=_devices, metavar="all|N",
-        help="number of devices that share the trajectories; on a CPU these are its cores",
-    )  # fmt: skip
-    command.add_argument(
-        "--distributed", action="store_true",
-        help="this is one of several processes that srun or another launcher has started",
-    )  # fmt: skip
-    _add_output_options(command)
-
-    command = commands.add_parser(
-        "export", help="write a learned map for other programs",
-        description="One file: step, inverse and status of a learned map, in C or as StableHLO.",
-        **others,
-    )  # fmt: skip
-    command.set_defaults(command=_export)
-    command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
-    command.add_argument(
-        "--to", choices=EXPORTS, required=True,
-        help="c: C99 for one state at a time, of polynomials, Fourier harmonics and formulas; "
-        "stablehlo: batches by jax.export, of any map",
-    )  # fmt: skip
-    command.add_argument(
-        "--out", type=Path, metavar="FILE", help="default: beside MODEL, of its name"
-    )
-    command.add_argument("--overwrite", action="store_true", help="replace an existing output")
-
-    command = commands.add_parser(
-        "compare", help="the same data through other methods",
-        description="A scene learned by GFNN and by the methods that the paper compares with.",
-        **others,
-    )  # fmt: skip
-    command.set_defaults(command=_compare)
-    command.add_argument("scene", metavar="SCENE", help="a name that `gfnn scenes` lists")
-    command.add_argument(
-        "--methods", type=_names, default=(), metavar="A,B", help="default: all that apply"
-    )
-    command.add_argument("--out", type=Path, metavar="DIR", help="default runs/compare-SCENE")
-    command.add_argument("--quick", action="store_true", help="fewer pairs, a cap of 2 s")
-    command.add_argument("--seed", type=_seed, default=0, metavar="N")
-    command.add_argument(
-        "--cap", type=_positive, metavar="SECONDS",
-        help="most training time of a method (default 60)",
-    )  # fmt: skip
-    _add_output_options(command)
-    return parser
-
-
-def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
-    command.add_argument(
-        "--tolerance", type=_positive, metavar="E",
-        help="bound on the one-step error, RMS over coordinates of error divided by spread "
-        f"(default {tolerance})",
-    )  # fmt: skip
-    command.add_argument(
-        "--learn", choices=LEARN, default="auto", help="what is learned (default %(default)s)"
-    )
-    command.add_argument(
-        "--terms", type=_texts, default=(), metavar="TEXT",
-        help='known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"',
-    )  # fmt: skip
-    command.add_argument(
-        "--base", metavar="TEXT",
-        help='known part of H: "p1**2/2 - cos(q1)"; its flow is factored out, and S learns the '
-        "remainder",
-    )  # fmt: skip
-    command.add_argument(
-        "--structure", type=_structure, metavar="|".join(STRUCTURES),
-        help="structure of many degrees of freedom: H is a sum over equal sites, with --terms in "
-        "q1, p1 of a site and q2, p2, … of the next ones (ring:2 has two q at every site, side by "
-        "side); or over bodies and pairs of bodies (bodies:4:abbb: the last three are alike)",
-    )  # fmt: skip
-    command.add_argument("--chart", choices=CHARTS, default="auto", help="default %(default)s")
-    command.add_argument(
-        "--family", choices=FAMILIES, default="auto",
-        help="family of the generating function (default %(default)s)",
-    )  # fmt: skip
-    command.add_argument(
-        "--scalar", dest="family", choices=FAMILIES, default=argparse.SUPPRESS,
-        help=argparse.SUPPRESS,  # the old name of --family
-    )  # fmt: skip
-    command.add_argument(
-        "--ensemble", type=_count, default=1, metavar="N",
-        help="with --family mlp: number of networks trained together; their mean is the map, their "
-        "spread its bands",
-    )  # fmt: skip
-    command.add_argument("--seed", type=_seed, default=0, metavar="N")
-    command.add_argument(
-        "--max-seconds", type=_positive, default=None, metavar="S",
-        help="time for the fit, after which the best map so far is kept (default 120, or none with "
-        "--max-operations)",
-    )  # fmt: skip
-    command.add_argument(
-        "--max-operations", type=_count, default=None, metavar="N",
-        help="counted operations for the fit: the value of fit.max_operations in a report gives "
-        "the same model again, also where time had ended that fit",
-    )  # fmt: skip
-    command.add_argument(
-        "--strict", action="store_true", help="exit status 1 where the tolerance is not met"
-    )
-    _add_output_options(command)
-
-
-def _add_output_options(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--overwrite", action="store_true", help="replace an existing output")
-    command.add_argument("--resume", action="store_true", help="continue an unfinished output")
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"expected a finite number > 0, got {text}")
-    return value
-
-
-def _whole(text: str, low: int, high: int, what: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = low - 1
-    if not low <= value < high:
-        raise argparse.ArgumentTypeError(f"expected a whole number {what}, got {text}")
-    return value
-
-
-def _count(text: str) -> int:
-    return _whole(text, 1, 2**53, "from 1 to 2**53 - 1")
-
-
-def _steps(text: str) -> int:
-    sign = -1 if text.startswith("-") else 1
-    return sign * _whole(text.removeprefix("-"), 1, 2**53, "from 1 to 2**53 - 1, or its negative")
-
-
-def _devices(text: str) -> int | str:
-    return text if text == "all" else _whole(text, 1, 2**31, "from 1 to 2**31 - 1, or all")
-
-
-def _seed(text: str) -> int:
-    return _whole(text, 0, 2**32, "from 0 to 2**32 - 1")
-
-
 def _check_exists(path: Path) -> None:
     try:
         if path.exists():
@@ -404,22 +82,6 @@ def _check_exists(path: Path) -> None:
     except OSError as error:  # a name too long, a folder that may not be entered
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     raise InputError(f"{path}: no such file or folder")
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(part.strip() for part in text.split(","))
-
-
-def _structure(text: str) -> str:
-    bodies = re.fullmatch(r"bodies:([0-9]+)(:[A-Za-z]+)?", text)
-    sites = re.fullmatch(r"(ring|chain)(:[1-9][0-9]?)?", text)
-    if sites or (bodies and int(bodies[1]) > 1):
-        return text
-    raise argparse.ArgumentTypeError(f"expected {', '.join(STRUCTURES)}; got '{text}'")
-
-
-def _texts(text: str) -> tuple[str, ...]:
-    return tuple(part.strip() for part in text.split(";") if part.strip())
 
 
 # The commands. The heavy imports are here, after the checks that need none of them.
@@ -451,13 +113,9 @@ def _run(arguments: argparse.Namespace) -> None:
 
     with progress.on_stderr() as shown:
         ran = run(
-            arguments.scene, out=out, quick=arguments.quick, seed=arguments.seed, dt=arguments.dt,
-            tolerance=arguments.tolerance,
-            max_seconds=arguments.max_seconds or "auto", max_operations=arguments.max_operations,
-            chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
-            base=arguments.base, structure=arguments.structure,
-            family=arguments.family, ensemble=arguments.ensemble, overwrite=arguments.overwrite,
-            resume=arguments.resume, progress=shown,
+            arguments.scene, out=out, quick=arguments.quick, dt=arguments.dt,
+            overwrite=arguments.overwrite, resume=arguments.resume, progress=shown,
+            **fit_options(arguments),
         )  # fmt: skip
     _summarise(ran, out)
     _hold_to(arguments.strict, out / "model")
@@ -488,7 +146,8 @@ def _look(arguments: argparse.Namespace) -> None:
 
 
 def _fit(arguments: argparse.Namespace) -> None:
-    if arguments.tolerance is not None and arguments.absolute_tolerance is not None:
+    options = fit_options(arguments)
+    if {"tolerance", "absolute_tolerance"} <= set(options):
         raise InputError("expected --tolerance or --absolute-tolerance, not both")
     if not arguments.resume:
         ensure_new(arguments.out, arguments.overwrite, folder=True)
@@ -499,32 +158,33 @@ def _fit(arguments: argparse.Namespace) -> None:
     if are_recordings(arguments.data, with_roles=with_roles):
         if arguments.dt is not None:
             columns["dt"] = arguments.dt
-        if arguments.learn == "map":
-            return _fit_positions(arguments, columns)
-        return _fit_law(arguments, columns)
-    if arguments.learn == "lagrangian":
+        if options.get("learn") == "map":
+            return _fit_positions(arguments, columns, options)
+        return _fit_law(arguments, columns, options)
+    if options.get("learn") == "lagrangian":
         raise InputError("--learn lagrangian: expected a recording, got states q, p")
-    arguments.angles = _as_indices(columns)
+    options["angles"] = _as_indices(columns)
     with contextlib.ExitStack() as stack:
         group = None
         if arguments.distributed:
             stack.enter_context(processes.watched(f"gfnn: {processes.LOST}"))
-        _set_up_jax(arguments.devices)
+        _set_up_jax(options.get("devices"))
         if arguments.distributed:
             group = processes.Group(processes.join())
-        _fit_and_tell(arguments, group)
+        _fit_and_tell(arguments, options, group)
 
 
-def _fit_law(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
+def _fit_law(
+    arguments: argparse.Namespace, columns: dict[str, Any], options: dict[str, Any]
+) -> None:
     """The law of a recording."""
     _set_up_jax()
     from gfnn_jax.jobs.fit_recording import fit_recording
 
     with progress.on_stderr() as shown:
         learned = fit_recording(
-            arguments.data, out=arguments.out, columns=columns, learn=arguments.learn,
-            friction=arguments.friction, input_hold=arguments.input_hold,
-            mass=masses(arguments), seed=arguments.seed, progress=shown,
+            arguments.data, out=arguments.out, columns=columns, mass=masses(arguments),
+            despite=arguments.despite, progress=shown, **options,
         )  # fmt: skip
     print(learned.fit.table)
     print(f"written to {arguments.out}")
@@ -532,18 +192,17 @@ def _fit_law(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
           "--out forecast.csv")  # fmt: skip
 
 
-def _fit_positions(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
+def _fit_positions(
+    arguments: argparse.Namespace, columns: dict[str, Any], options: dict[str, Any]
+) -> None:
     """Learn the map of a recording of positions."""
     _set_up_jax()
     from gfnn_jax.jobs.fit_positions import fit_positions
 
     with progress.on_stderr() as shown:
         ran = fit_positions(
-            arguments.data, out=arguments.out, columns=columns, seed=arguments.seed,
-            tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
-            absolute_tolerance=arguments.absolute_tolerance, structure=arguments.structure,
-            max_seconds=arguments.max_seconds or "auto", max_operations=arguments.max_operations,
-            progress=shown,
+            arguments.data, out=arguments.out, columns=columns, despite=arguments.despite,
+            progress=shown, **options,
         )  # fmt: skip
     _summarise(ran, arguments.out)
     print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
@@ -551,20 +210,16 @@ def _fit_positions(arguments: argparse.Namespace, columns: dict[str, Any]) -> No
     _hold_to(arguments.strict, arguments.out)
 
 
-def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) -> None:
+def _fit_and_tell(
+    arguments: argparse.Namespace, options: dict[str, Any], group: processes.Group | None
+) -> None:
     from gfnn_jax.jobs.fit import fit
 
     with progress.on_stderr() as shown:
         ran = fit(
-            arguments.data, out=arguments.out, dt=arguments.dt,
-            tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
-            absolute_tolerance=arguments.absolute_tolerance,
-            max_seconds=arguments.max_seconds or "auto", max_operations=arguments.max_operations,
-            chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
-            base=arguments.base, structure=arguments.structure,
-            family=arguments.family, ensemble=arguments.ensemble, scene_name=arguments.scene,
-            angles=arguments.angles, seed=arguments.seed, overwrite=arguments.overwrite,
-            resume=arguments.resume, devices=arguments.devices, group=group, progress=shown,
+            arguments.data, out=arguments.out, dt=arguments.dt, scene_name=arguments.scene,
+            overwrite=arguments.overwrite, resume=arguments.resume, group=group, progress=shown,
+            **options,
         )  # fmt: skip
     if group is not None:
         processes.wait_for_all()
@@ -616,7 +271,7 @@ def _predict(arguments: argparse.Namespace) -> None:
 
 
 def _is_law(model: Path) -> bool:
-    """Whether the model is the law of a recording, and no map of its positions."""
+    """Return whether the model is the law of a recording, and no map of its positions."""
     _set_up_jax()
     from gfnn_jax.maps.saved import record
 
@@ -624,7 +279,7 @@ def _is_law(model: Path) -> bool:
 
 
 def _forecast(arguments: argparse.Namespace) -> None:
-    """From the end of a recording."""
+    """Forecast from the end of a recording."""
     _set_up_jax()
     from gfnn_jax.jobs.forecast import forecast_recording
 
@@ -634,7 +289,7 @@ def _forecast(arguments: argparse.Namespace) -> None:
         inputs=arguments.inputs, compare=arguments.compare, overwrite=arguments.overwrite,
     )  # fmt: skip
     times = [f.times[-1] for f in found.values()]
-    print(f"{arguments.out}: forecasts of {len(found)} runs, up to {max(times):g} s")
+    print(f"{arguments.out}: forecasts of {len(found)} runs, up to t = {max(times):g}")
     if judged is not None:
         for name, (rms, median, within) in judged.columns.items():
             print(f"{name}: error {rms:.4g} rms, {median:.4g} median; {within:.0%} of "
@@ -697,6 +352,12 @@ def _compare(arguments: argparse.Namespace) -> None:
         return
     _print_table(table(compared.report))
     print(f"written to {out}")
+
+
+_COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
+    "scenes": _scenes, "records": _records, "run": _run, "look": _look, "fit": _fit,
+    "predict": _predict, "export": _export, "compare": _compare,
+}  # fmt: skip
 
 
 def law_line(report: dict[str, Any]) -> str:

@@ -19,12 +19,11 @@ import pytest
 
 from gfnn_jax import cli, scenes
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.dataset import structures
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitWarning
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
-from gfnn_jax.generating.charts import MIDPOINT
+from gfnn_jax.generating.charts import CHARTS, MIDPOINT
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.jobs import fit as jobs_fit
 from gfnn_jax.jobs import predict as predict_job
@@ -32,8 +31,10 @@ from gfnn_jax.jobs import progress, search
 from gfnn_jax.learn import check
 from gfnn_jax.learn import fit as learn_fit
 from gfnn_jax.learn.candidates import Candidate
+from gfnn_jax.learn.options import OPTIONS
 from gfnn_jax.maps import saved as models
 from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.inputs import HOLDS
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.storage import checkpoints
@@ -113,10 +114,10 @@ def files(folder):
 
 
 def test_choices_are_those_of_the_fit():
-    assert cli.CHARTS == check.CHART_NAMES
-    assert cli.FAMILIES == check.FAMILIES
-    assert set(cli.LEARN) == {*check.LEARNS, "lagrangian"}  # of a recording
-    assert cli.STRUCTURES == structures.NAMES
+    chosen = {name: about.kind.choices for name, about in OPTIONS.items()}
+    assert chosen["chart"] == ("auto", *CHARTS)
+    assert set(chosen["learn"]) == {*check.LEARNS, "lagrangian"}  # of a recording
+    assert chosen["input_hold"] == ("auto", *HOLDS)
 
 
 def test_scenes(capsys):
@@ -574,8 +575,8 @@ def test_strict(fitted, tmp_path, capsys, monkeypatch):
 def test_the_former_name_of_an_option(fitted, tmp_path, monkeypatch):
     asked = []
 
-    def remember(*args, family, **kwargs):
-        asked.append(family)
+    def remember(*args, options, **kwargs):
+        asked.append(options.family)
         return fitted
 
     monkeypatch.setattr(search, "fit", remember)

@@ -17,7 +17,7 @@ ORDER = (
     "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes",
     "storage", "signals", "data", "records", "scenes", "families", "solve", "generating", "flows",
     "maps", "dataset", "exports", "fitting", "models", "learn", "baselines", "evaluate", "jobs",
-    "cli_columns", "cli", "__main__",
+    "cli_columns", "cli_parser", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {

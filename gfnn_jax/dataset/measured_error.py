@@ -24,6 +24,13 @@ class Tolerance:
     bound: float
     relative: bool = True
 
+    @classmethod
+    def of(cls, options: Any) -> Tolerance:
+        """Tolerance that the options of a fit ask for, which have one of either kind."""
+        if options.absolute_tolerance is None:
+            return cls(options.tolerance)
+        return cls(options.absolute_tolerance, relative=False)
+
     def met_by(self, candidate: Any) -> bool:
         """Whether the candidate's error is within it, at 95 %."""
         return candidate.validation_bound <= self.bound

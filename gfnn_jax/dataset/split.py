@@ -1,4 +1,4 @@
-"""Which pairs a fit is trained on, which ones choose, and which ones state the error.
+"""Split of the pairs: those that train a fit, those that choose, those that state the error.
 
 Training rows determine coefficients. Validation rows choose: size, chart, terms. Test rows are
 looked at once, when all is chosen, and state the error. Runs are kept whole, or cut into
@@ -117,7 +117,7 @@ def correlation_time(pairs: Pairs, goes_on: np.ndarray) -> int:
 
 
 def outermost(y: np.ndarray, free: tuple[int, ...] = ()) -> np.ndarray:
-    """Which of the states y (N, 2d) are of the outermost twentieth, (N,) bool, by Mahalanobis'
+    """Mark the outermost twentieth of the states y (N, 2d), (N,) bool, by Mahalanobis'
     distance. free: coordinates that do not count, as angles that cover their circle."""
     seen = y[:, [i for i in range(y.shape[1]) if i not in free]]
     centred = seen - seen.mean(axis=0)

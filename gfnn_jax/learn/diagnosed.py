@@ -41,14 +41,14 @@ def diagnose_request(request: Request, plain: Dataset) -> Diagnosis:
     """
     if plain.varied or plain.structure is not None:  # H or a sum of terms is looked for first
         return Diagnosis(plain, plain, Charts([], None, {}, []), float("nan"), [])
-    data = plain
-    if request.base is not None:
-        known = given_terms(plain.dim, (request.base,))
+    data, options = plain, request.options
+    if options.base is not None:
+        known = given_terms(plain.dim, (options.base,))
         flow = flow_of(known, np.ones(known.num_parameters), plain)
-        _, data = factored_out([flow], plain, request.seed)
+        _, data = factored_out([flow], plain, options.seed)
     # A law of the user's keeps areas, and so does what H of an autonomous system generates.
-    may_lose = request.base is None and request.learn != "hamiltonian" and not plain.after
-    return diagnosed(data, request.chart, request.reversor, request.seed, may_lose=may_lose)
+    may_lose = options.base is None and options.learn != "hamiltonian" and not plain.after
+    return diagnosed(data, options.chart, request.reversor, options.seed, may_lose=may_lose)
 
 
 def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = False) -> Diagnosis:

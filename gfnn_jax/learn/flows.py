@@ -44,6 +44,7 @@ from gfnn_jax.learn.law_libraries import (
 from gfnn_jax.learn.law_options import OPTIONS, Options
 from gfnn_jax.learn.law_starts import starts
 from gfnn_jax.learn.law_work import LawWork
+from gfnn_jax.learn.law_worth import too_dear
 from gfnn_jax.learn.learned_law import (
     Dropped,
     FittedLaw,
@@ -75,10 +76,12 @@ def learn_hamiltonian(
     budget: Budget | None = None,
     say: Callable[[str], Any] = lambda message: None,
     options: Options = OPTIONS,
+    dearest: float = np.inf,
 ) -> LearnedHamiltonian:
     """The Hamiltonian of these pairs: the smallest library that meets the tolerance, else the best.
 
     data: without a base map. scene: lends its features and reversor. terms: a user's own.
+    dearest: as of `LawWork`.
 
     Raises FitError where no library can be tried, OutOfTime where the budget ends before the first.
     """
@@ -98,7 +101,7 @@ def learn_hamiltonian(
         data = arcs.data
     problem = Problem(data.y0, data.y1, data.each_dt, data.scale, args=data.args)
     most = options.max_operations if basis is None else options.mode_operations
-    work = LawWork(problem, budget, most)
+    work = LawWork(problem, budget, most, dearest)
     everywhere, free = data, (*data.coordinates.cyclic, *data.whole)
     if data.structure is None:
         outer = outermost(data.y0[data.training], free)
@@ -135,7 +138,9 @@ def learn_hamiltonian(
         if outer.any():
             there = everywhere.validated_on(everywhere.training[outer])
             outside = validation_error(best.family, best.fit, there, tolerance).relative
-        if best.error.relative > _ROUNDOFF and len(best.fit.used) < len(everywhere.training):
+        misses = best.error.bound > tolerance.bound and np.isfinite(dearest)
+        few = len(best.fit.used) < len(everywhere.training)
+        if best.error.relative > _ROUNDOFF and few and not misses:
             what = "the fit of H to all pairs"
             with work.again(what, best.family, len(everywhere.training)):
                 best = _refitted(problem, best, everywhere.training, data, tolerance)
@@ -213,6 +218,9 @@ def _searched(
             del libraries[0]
     try:
         for family in libraries:
+            if tried and too_dear(problem, family, tried[-1], data, tolerance, work.dearest):
+                say(f"H: {family.num_parameters} terms would cost more than the map at hand")
+                continue
             say(f"H: {family.num_parameters} terms")
             found = _fitted(
                 problem, work, family, data, tolerance, tried[-1] if tried else None, options, say

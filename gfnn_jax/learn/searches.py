@@ -66,25 +66,25 @@ def searched(
 ) -> Searched:
     """Every candidate. Raises FitError where there is none."""
     tolerance, budget, say, tell = request.tolerance, request.budget, request.say, request.tell
-    scene, charts = request.scene, seen.charts
+    options, scene, charts = request.options, request.scene, seen.charts
     better = _Better(on_better) if on_better is not None else None
     given = tolerance.bound, budget, say, tell, better
     # Small sizes first: a map is then there, however long the search for H.
-    early = not _of_terms(data) or request.model is not None
+    early = not _of_terms(data) or options.model is not None
     climb = Search(_sweeps(request, data, seen) if early else [], *given)
     climb.climb(most=_SMALL)
-    law = _law(request, data, better)
+    law = _law(request, data, better, DEARER * climb.cheapest)
     of_terms, failed = None, None
     met_by_law = law is not None and tolerance.met_by(law.candidate)
-    wanted = not early and request.learn != "hamiltonian" and not met_by_law
-    if wanted and request.family == "auto":
+    wanted = not early and options.learn != "hamiltonian" and not met_by_law
+    if wanted and options.family == "auto":
         try:
-            of_terms = map_of(seen.data, tolerance, scene, request.chart, law, budget, say)
+            of_terms = map_of(seen.data, tolerance, scene, options.chart, law, budget, say)
         except FitError as error:
             failed = error
     if wanted and data.args is not None and not _met(of_terms, tolerance):
         try:
-            seen = diagnosed(data, request.chart, request.reversor, request.seed)
+            seen = diagnosed(data, options.chart, request.reversor, options.seed)
         except FitError as error:
             failed = failed or error
         charts = seen.charts
@@ -104,7 +104,7 @@ def searched(
     ):
         say("drawing pairs from the flow of H")
         drawn = search_of_law(
-            law, data, tolerance, scene, dearest, budget, say, tell, request.seed
+            law, data, tolerance, scene, dearest, budget, say, tell, options.seed
         )  # fmt: skip
         if drawn is not None:
             found, charts = drawn
@@ -113,7 +113,7 @@ def searched(
         and law_explains_most(law, found, tolerance, budget)
     ):  # fmt: skip
         say(f"learning what the flow of {law.candidate.label} leaves over")
-        around = search_around(law, data, tolerance, scene, budget, say, tell, better, request.seed)
+        around = search_around(law, data, tolerance, scene, budget, say, tell, better, options.seed)
         if around is not None and better_than(around.found, found, law):
             found, charts = around
     known = [f.candidate for f in (law, of_terms, *found.ranking[:1]) if f is not None]
@@ -144,19 +144,23 @@ def _of_terms(data: Dataset) -> bool:
     return sites or data.args is not None
 
 
-def _law(request: Request, data: Dataset, better: _Better | None) -> LearnedHamiltonian | None:
-    """H, where one is looked for and found."""
+def _law(
+    request: Request, data: Dataset, better: _Better | None, dearest: float
+) -> LearnedHamiltonian | None:
+    """H, where one is looked for and found. dearest: operations of a step of a law that is chosen
+    beside the maps at hand."""
+    options = request.options
     if not request.seeks_law:
         return None
     if request.of_network:
         law = learn_network(
-            data, request.tolerance, request.scene, seed=request.seed, budget=request.budget,
-            say=request.say, max_iterations=request.max_iterations,
+            data, request.tolerance, request.scene, seed=options.seed, budget=request.budget,
+            say=request.say, max_iterations=options.max_iterations,
         )  # fmt: skip
     else:
         law = law_of(
-            data, request.tolerance, request.scene, request.learn, request.terms, request.budget,
-            request.say,
+            data, request.tolerance, request.scene, options.learn, options.terms, request.budget,
+            request.say, dearest,
         )  # fmt: skip
     if law is not None:
         if better is not None:
@@ -169,19 +173,20 @@ def _sweeps(request: Request, taken: Dataset, seen: Diagnosis) -> list[Any]:
     """The sweeps of S over the charts that cover the data; none where H alone is learned, or the
     pairs are driven, or differ in dt and in parameters too."""
     charts, data, tolerance = seen.charts.charts, seen.data, request.tolerance
-    if request.model is not None:
-        return [ModelSweep(request.model, taken, tolerance)]
-    if request.learn == "hamiltonian" or data.period is not None:
+    options = request.options
+    if options.model is not None:
+        return [ModelSweep(options.model, taken, tolerance)]
+    if options.learn == "hamiltonian" or data.period is not None:
         return []
     if data.own_dt is not None:
         alone = data.structure is None and data.args is None
         return [sweep_of_dt(data, tolerance, request.scene, request.factors)] if alone else []
-    if request.family == "mlp":
-        given = (data, tolerance, charts[0], request.max_iterations, request.seed,
+    if options.family == "mlp":
+        given = (data, tolerance, charts[0], options.max_iterations, options.seed,
                  request.checkpoints)  # fmt: skip
-        count = request.ensemble
+        count = options.ensemble
         return [NetworkSweep(*given) if count == 1 else EnsembleSweep(*given, count=count)]
-    return list(sweeps_for(request.family, charts, data, tolerance, request.scene, request.factors))
+    return list(sweeps_for(options.family, charts, data, tolerance, request.scene, request.factors))
 
 
 def _nothing_found(num_pairs: int, budget: Budget) -> str:
