@@ -67,7 +67,9 @@ def one_record(seed: int) -> Kind:
     start = np.array([[0.6 + 0.1 * np.random.default_rng(seed).random(), 0.3]])
     states = sequences(pendulum, start, 0.2, 600)
     between = flow(pendulum, states[0, :: 600 // STATES][:STATES], 0.1)
-    return Kind(in_sequence(with_noise(states, np.random.default_rng(seed)), 0.2), pendulum, between)
+    return Kind(
+        in_sequence(with_noise(states, np.random.default_rng(seed)), 0.2), pendulum, between
+    )
 
 
 def single_pairs(seed: int) -> Kind:

@@ -60,7 +60,8 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         ended = MET if met else cut or _NO_MORE[request.of_network]
     if ended.startswith(MET) and not met:
         ended = (
-            "the pairs that chose the map meet it, those that state its error do not"
+            "the validation pairs, which choose, meet the tolerance; the test pairs, which state "
+            "the error, do not"
             if np.isfinite(candidate.validation_relative)
             else "the steps of a map that was to meet it do not converge from some of the states"
         )

@@ -173,6 +173,7 @@ def learned_from(
     z, args = data.y0[rows], data.given(rows)[1]
     some = slice(FREQUENCY_STATES)
     fastest = rates(family, fit.coefficients, data.y0[some], data.given(some)[1])
+    by_row = problem  # each at its own dt
     if data.own_dt is not None:  # the map's own dt, from which others follow
         problem = Problem(data.y0, data.y1, data.dt, data.scale, args=data.args)
     steps = _cheapest(problem, family, fit, fastest, data, tolerance, options)
@@ -207,7 +208,8 @@ def learned_from(
     omega_h = omega_h_of(family, fit.coefficients, data, fastest)
     left_out = len(np.setdiff1d(found.rows, fit.used))
     resolved = np.abs(off).max(axis=1) <= bound_of(tolerance, data.scale)
-    covariance = of_arcs or partial(covariance_root, found, problem, data, steps)
+    of_rows = steps if data.own_dt is None else of_all
+    covariance = of_arcs or partial(covariance_root, found, by_row, data, of_rows)
     if whole is not None:
         covariance = partial(np.asarray, whole.root)
     return LearnedHamiltonian(
@@ -397,13 +399,13 @@ def _messages(
         )
     if left_out:
         yield (
-            f"{left_out} of {len(found.rows)} pairs, as of close passages, are not resolved by the "
-            "steps of the fit: they are left out of it"
+            f"the steps of the fit are too coarse for {left_out} of {len(found.rows)} pairs, as of "
+            "close passages: it goes without them"
         )
     if unresolved:
         yield (
-            f"{unresolved} of {len(data.validation)} held-out pairs are not resolved to the "
-            "tolerance by the flow's own steps: there the map is in error, and not the law"
+            f"the steps of the flow are too coarse for {unresolved} of {len(data.validation)} "
+            "held-out pairs: there the map errs, and not H"
         )
 
 
