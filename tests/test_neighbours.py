@@ -73,7 +73,7 @@ def test_a_loose_tolerance_hides_no_friction(friction):
     image = solve_ivp(slope, (0, 0.2), z.T.ravel(), rtol=1e-10, atol=1e-12).y[:, -1]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
-        fit = gfnn.fit(gfnn.Pairs(z, image.reshape(2, -1).T, 0.2), tolerance=1e-2, learn="map")
+        fit = gfnn.fit(gfnn.Pairs(z, image.reshape(2, -1).T, 0.2), tolerance=2e-2, learn="map")
     assert fit.met
     told = [m for m in fit.messages if "as by friction" in m]
     assert bool(told or fit.damping is not None) == (friction > 0)
