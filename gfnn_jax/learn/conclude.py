@@ -134,7 +134,7 @@ def _hidden(chosen: Chosen, searched: Searched) -> list[str]:
 
 
 def _with_clock(ended: str, budget: Budget) -> str:
-    """Why the search ended, and that a budget did, wherever a unit of it was left out."""
+    """Reason why the search ended, and that a budget did, wherever a unit of it was left out."""
     clock = budget.ended
     if not clock or clock in ended:
         return ended
