@@ -1,10 +1,13 @@
 """Velocities of a file: used where they are honest, and not where they were made of positions."""
 
+import json
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
+from gfnn_jax.cli import main
 
 
 def swing(end=16.0, dt=0.04):
@@ -63,3 +66,23 @@ def test_others_are_not(record, made, what):
     if what != "colour":
         right = {"scale": 0.97, "lag": 0.02, "bias": 0.05}[what]
         assert abs(getattr(of, what)[0] - right) < 5 * getattr(of, what)[1]
+
+
+def test_a_file_without_the_velocity_is_forecast_all_the_same(record, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    columns = [record["t"], np.degrees(record["theta"]), np.degrees(record["omega"])]
+    header = "t,theta [deg],omega [deg/s]"
+    np.savetxt("both.csv", np.stack(columns, 1), "%.9g", ",", header=header, comments="")
+    np.savetxt("angle.csv", np.stack(columns[:2], 1), "%.9g", ",", header=header[:13], comments="")
+    terms = "V: cos(theta); R: omega**2"
+    assert main(["fit", "both.csv", "--out", "model", "--terms", terms]) == 0
+    report = json.loads((tmp_path / "model" / "report.json").read_text())
+    assert report["velocities"]["omega"]["used"]
+    assert report["velocities"]["omega"]["sigma"] == pytest.approx(np.degrees(2e-3), rel=0.2)
+    found = []
+    for name in ("both", "angle"):
+        arguments = ["--initial", f"{name}.csv", "--out", f"{name}_ahead.csv", "--num-steps", "20"]
+        assert main(["predict", "model", *arguments]) == 0
+        found.append(np.genfromtxt(f"{name}_ahead.csv", delimiter=",", names=True))
+    for column in ("theta", "omega"):
+        assert np.abs(found[0][column] - found[1][column]).max() < 0.3  # degrees

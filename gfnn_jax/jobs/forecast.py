@@ -51,12 +51,11 @@ def forecast_recording(
         raise InputError(f"{model}: was not learned from a recording: --initial needs states q, p")
     sensors = map_.sensors
     job = record(model).get("job", {})
-    roles = _roles(sensors, job) | (columns or {})
-    recording = read(initial, **roles)
+    recording, roles = _read(initial, sensors, job, columns or {})
     bare = ("positions", "velocities", "sensors", "coordinates", "angles", "degrees")
     only_inputs = {**roles, **dict.fromkeys(bare)}
     ahead = None if inputs is None else read(inputs, **only_inputs)
-    measured = None if compare is None else read(compare, **roles)
+    measured = None if compare is None else _read(compare, sensors, job, columns or {})[0]
     if num_steps is None and measured is None:
         raise InputError("expected --num-steps, or --compare, whose times the forecast is for")
     if ahead is None and sensors.inputs and measured is not None:
@@ -77,14 +76,31 @@ def forecast_recording(
             times = last + float(np.asarray(map_.dt)) * steps
         found[run] = forecast(map_, part, times, ahead)
     second = SECONDS[recording.time_unit]
-    found = {run: _in_units(one, recording.factors, second) for run, one in found.items()}
+    factors = dict.fromkeys(job.get("degrees", ()), np.pi / 180) | recording.factors
+    found = {run: _in_units(one, factors, second) for run, one in found.items()}
     _write(out, tuple(next(iter(found.values())).values), found)
     return found, None if measured is None else _judged(sensors, found, measured)
 
 
-def _roles(sensors: Sensors, job: dict[str, Any]) -> dict[str, Any]:
-    """Keywords of `read` for a recording with the columns that the law was learned from."""
-    channels, speeds = sensors.seen.channels, sensors.seen.speeds
+def _read(
+    path: Path, sensors: Sensors, job: dict[str, Any], columns: dict[str, Any]
+) -> tuple[Recording, dict[str, Any]]:
+    """Read a recording with the columns that the law was learned from, but for velocities that it
+    may lack, and return the keywords of `read` too."""
+    seen = sensors.seen
+    roles = _roles(sensors, job, seen.channels) | columns
+    try:
+        return read(path, **roles), roles
+    except InputError:
+        if seen.needed == seen.channels:
+            raise
+    roles = _roles(sensors, job, seen.needed) | columns
+    return read(path, **roles), roles
+
+
+def _roles(sensors: Sensors, job: dict[str, Any], channels: tuple[str, ...]) -> dict[str, Any]:
+    """Keywords of `read` for a recording with these columns."""
+    speeds = sensors.seen.speeds
     roles: dict[str, Any] = {
         "positions": tuple(n for n in channels if n in sensors.positions),
         "velocities": tuple(n for n in channels if n in speeds),
@@ -114,7 +130,7 @@ def _last_samples(recording: Recording, run: str, count: int | None) -> Recordin
 
 def _judged(sensors: Sensors, found: dict[str, Forecast], measured: Recording) -> Judged:
     columns, count = {}, 0
-    for name in sensors.seen.channels:
+    for name in (n for n in sensors.seen.channels if n in measured.columns):
         errors, stds = [], []
         for run, one in found.items():
             own = run if len(measured.runs) > 1 else next(iter(measured.runs))

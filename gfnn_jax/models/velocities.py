@@ -40,6 +40,11 @@ class Velocity(NamedTuple):
     white: bool
     used: bool
 
+    def scaled(self, factor: float) -> Velocity:
+        """In a unit of which ``factor`` make one."""
+        bias = self.bias[0] * factor, self.bias[1] * factor
+        return self._replace(bias=bias, sigma=self.sigma * factor)
+
     @property
     def text(self) -> str:
         """A line for people."""
