@@ -21,8 +21,8 @@ _SMOOTH = 0.3
 
 
 def is_noise(z, residual, run, place) -> bool | None:
-    """Whether the residuals differ between close neighbours as much as between any two; None where
-    the pairs lie too far apart for a smooth function to tell.
+    """Tell whether the residuals differ between close neighbours as much as between any two; None
+    where the pairs lie too far apart for a smooth function to tell.
 
     z, residual: (N, 2d) in units of the coordinates' sizes. run, place: (N,) of each row: rows that
     follow each other share a state, and its noise, and are no neighbours.
