@@ -52,7 +52,9 @@ def test_friction_is_told_apart_from_what_a_map_misses():
     """A loss of 0.31 % beside forces that the map has 5 % too weak."""
     z = RNG.uniform(-1, 1, (400, 2))
     image = kicked(z, 0.95, 1.0)
-    change, error = hidden_friction(image, kicked(z, 1.0, 0.9969) - image)
+    found = hidden_friction(image, kicked(z, 1.0, 0.9969) - image)
+    assert found is not None
+    change, error = found
     assert change == pytest.approx(-0.0031, rel=0.01)
     assert error < 1e-5
     assert hidden_friction(image, kicked(z, 1.0, 1.0) - image) is None

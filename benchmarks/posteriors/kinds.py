@@ -21,7 +21,7 @@ from users.systems import fput, pendulum
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import nearest_image
 
-NOISE, STEPS, FITS, FIRST, STATES = 1e-3, (1, 10, 100), 10, 21, 40
+NOISE, STEPS, FITS, FIRST, STATES = 1e-3, (1, 10, 100), 3, 21, 40
 
 
 class Kind(NamedTuple):

@@ -123,9 +123,9 @@ def with_channels(
         s = node.stretch
         if id(s) not in wider:
             y, noise = (
-                np.concatenate([_column(recording, s, n, k) for n in names], axis=1) for k in (0, 1)
+                np.concatenate([own, *(_column(recording, s, n, k) for n in names)], axis=1)
+                for k, own in enumerate((s.y, s.noise))
             )
-            y, noise = np.concatenate([s.y, y], axis=1), np.concatenate([s.noise, noise], axis=1)
             wider[id(s)] = dataclasses.replace(s, y=y, noise=noise)
         extended.append(dataclasses.replace(node, stretch=wider[id(s)], y=wider[id(s)].y[node.at]))
     y = _at_nodes(arcs, extended, [node.stretch.y for node in extended])
