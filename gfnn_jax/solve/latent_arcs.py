@@ -204,12 +204,31 @@ def eliminated_rows(
 ) -> np.ndarray:  # fmt: skip
     """Rows (R, n + 1) of [∂r/∂p, r] at p and x, without the states of each arc: what its own state
     does not explain."""
-    seen, steps, observed = np.isfinite(y), model.steps(p, x), model.observe(p, x)
-    off = np.where(seen, np.where(seen, y, 0.0) - observed.values, 0.0)
-    units, m = _Units(sigma, np.ones(x.shape[-1]), loss), x.shape[-1]
-    J, _ = _linearised(_Iterate.at(p, x, steps, observed, seen, off, units), slice(None))
+    J, m = _rows_at(model, p, x, y, sigma, loss), x.shape[-1]
     across = np.linalg.qr(J[..., :m], mode="complete")[0][..., m:]
     return (across.swapaxes(1, 2) @ J[..., m:]).reshape(-1, J.shape[-1] - m)
+
+
+def rows_of_arcs(
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
+) -> np.ndarray:
+    """Rows (A, L, k, n + 1) of the coefficients and the residuals, weighted as robust loss has it,
+    after each arc's own δx_0 was projected out: residuals − rows · δp are those of any other
+    coefficients near p, each arc with the state that suits them best."""
+    J, m = _rows_at(model, p, x, y, sigma, SOFT_L1), x.shape[-1]
+    Q = np.linalg.qr(J[..., :m])[0]
+    return (J[..., m:] - Q @ (Q.swapaxes(1, 2) @ J[..., m:])).reshape(*y.shape, -1)
+
+
+def _rows_at(
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray, loss: Loss
+) -> np.ndarray:
+    """Weighted rows (A, L k, m + n + 1) of [δx_0, δp, r] at p and x."""
+    seen, steps, observed = np.isfinite(y), model.steps(p, x), model.observe(p, x)
+    off = np.where(seen, np.where(seen, y, 0.0) - observed.values, 0.0)
+    units = _Units(sigma, np.ones(x.shape[-1]), loss)
+    at = _Iterate.at(p, x, steps, observed, seen, off, units)
+    return _linearised(at, slice(None))[0]
 
 
 def sensitivities(
@@ -258,8 +277,8 @@ class _Iterate(NamedTuple):
         return self.cost + (self.gap / _DEFECT) ** 2
 
     def rescaled(self, rows: _Rows, least: np.ndarray) -> _Iterate:
-        """In units of the noise that these residuals tell: of each number as much is left as the
-        latent state of its arc, and the coefficients, do not follow."""
+        """Iterate in units of the noise that these residuals tell: of each number as much is left as
+        the latent state of its arc, and the coefficients, do not follow."""
         off = self.residuals * self.units.sigma
         free = np.where(self.seen, 1.0 - rows.leverage, 0.0)
         free *= max(1.0 - len(self.p) / free.sum(), 1e-3)
