@@ -227,7 +227,7 @@ class NoisySweep(LinearSweep):
         return validated(candidate, self.data, self.tolerance, self.chart, size.family, params)
 
     def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Images by a fit to the states that other rows most likely had."""
+        """Predict by a fit to the states that other rows most likely had."""
         of = size.family
         fitted_to, held = self._along(others).triangle(of), self._nearest_held.triangle(of)
         return self._predicted(size, fitted_to, held, rows)

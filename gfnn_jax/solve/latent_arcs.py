@@ -220,6 +220,14 @@ def rows_of_arcs(
     return (J[..., m:] - Q @ (Q.swapaxes(1, 2) @ J[..., m:])).reshape(*y.shape, -1)
 
 
+def sensitivities(
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
+) -> np.ndarray:
+    """The triangle (n + 1, n + 1) of `eliminated_rows`: what a test of coefficients needs."""
+    factor = np.asarray(np.linalg.qr(eliminated_rows(model, p, x, y, sigma), mode="r"))
+    return np.concatenate([factor, np.zeros((factor.shape[1] - len(factor), factor.shape[1]))])
+
+
 def _rows_at(
     model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray, loss: Loss
 ) -> np.ndarray:
@@ -227,16 +235,7 @@ def _rows_at(
     seen, steps, observed = np.isfinite(y), model.steps(p, x), model.observe(p, x)
     off = np.where(seen, np.where(seen, y, 0.0) - observed.values, 0.0)
     units = _Units(sigma, np.ones(x.shape[-1]), loss)
-    at = _Iterate.at(p, x, steps, observed, seen, off, units)
-    return _linearised(at, slice(None))[0]
-
-
-def sensitivities(
-    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
-) -> np.ndarray:
-    """The triangle (n + 1, n + 1) of `eliminated_rows`: what a test of coefficients needs."""
-    factor = np.asarray(np.linalg.qr(eliminated_rows(model, p, x, y, sigma), mode="r"))
-    return np.concatenate([factor, np.zeros((factor.shape[1] - len(factor), factor.shape[1]))])
+    return _linearised(_Iterate.at(p, x, steps, observed, seen, off, units), slice(None))[0]
 
 
 class _Units(NamedTuple):
@@ -277,8 +276,8 @@ class _Iterate(NamedTuple):
         return self.cost + (self.gap / _DEFECT) ** 2
 
     def rescaled(self, rows: _Rows, least: np.ndarray) -> _Iterate:
-        """Iterate in units of the noise that these residuals tell: of each number as much is left
-        as the latent state of its arc, and the coefficients, do not follow."""
+        """In units of the noise that these residuals tell: of each number as much is left as the
+        latent state of its arc, and the coefficients, do not follow."""
         off = self.residuals * self.units.sigma
         free = np.where(self.seen, 1.0 - rows.leverage, 0.0)
         free *= max(1.0 - len(self.p) / free.sum(), 1e-3)
@@ -340,7 +339,7 @@ def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
         S[:, i + 1, :, m : m + n] += steps.by_coefficients[:, i]
         S[:, i + 1, :, -1] += steps.closing[:, i]
     J = observed.by_state @ S
-    J[..., m : m + n] += observed.by_coefficients
+    J[..., m:-1] += observed.by_coefficients
     J /= sigma[..., None]
     J[..., -1] = residuals - J[..., -1]
     weight = np.where(at.seen[block], np.sqrt(at.units.loss.weights(residuals)), 0.0)
