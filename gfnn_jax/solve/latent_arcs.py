@@ -276,8 +276,8 @@ class _Iterate(NamedTuple):
         return self.cost + (self.gap / _DEFECT) ** 2
 
     def rescaled(self, rows: _Rows, least: np.ndarray) -> _Iterate:
-        """Rescale to units of the noise that these residuals tell: of each number as much is
-        left as the latent state of its arc, and the coefficients, do not follow."""
+        """Iterate in units of the noise that these residuals tell: of each number as much is left
+        as the latent state of its arc, and the coefficients, do not follow."""
         off = self.residuals * self.units.sigma
         free = np.where(self.seen, 1.0 - rows.leverage, 0.0)
         free *= max(1.0 - len(self.p) / free.sum(), 1e-3)
