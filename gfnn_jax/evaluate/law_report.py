@@ -68,6 +68,7 @@ def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:
         "observe": fit.observe,
         "sensors": {name: {"value": c, "std": s} for name, (c, s) in fit.sensors.items()},
         "noise": {n: {"sigma": s, "residual": fit.residual[n]} for n, s in fit.noise.items()},
+        "velocities": {name: one._asdict() for name, one in fit.velocities.items()},
         "whiteness": {
             name: {
                 "white": of.white,

@@ -34,7 +34,7 @@ from gfnn_jax.learn.clock import ROWS, Budget
 from gfnn_jax.learn.search import MET
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.discrete_lagrangian import left_over, solve
+from gfnn_jax.models.discrete_lagrangian import residuals, solve
 from gfnn_jax.models.triples import Triples, triples_of
 from gfnn_jax.phase_space import Pairs, sizes
 
@@ -218,7 +218,7 @@ class _Sweep:
         params = family.unflatten(solved.coefficients)
         states = _states(family, params, triples)
         piece = Generated(family, params, TYPE1, triples.dt, sizes(states[0]))
-        left = left_over(family, params, training) / self.spread
+        left = residuals(family, params, training) / self.spread
         error = self.error_of(_images(piece, held), self.split.validation)
         gradient, with_hessian = family.operations
         candidate = Candidate(

@@ -42,6 +42,7 @@ from gfnn_jax.models.learned_law import LearnedLaw, NextMotion, hamiltonian_of, 
 from gfnn_jax.models.libraries import FRICTIONS
 from gfnn_jax.models.next_motion import Motion, next_motions
 from gfnn_jax.models.residuals import Trace, whiteness
+from gfnn_jax.models.velocities import Velocity, velocities, with_channels
 
 _IMITATED = 1e-4  # of what a sensor's parameter changes, that no coefficient of the law does
 _SEEN = 3.0  # standard errors of a gain, below which its input is not seen to act
@@ -94,6 +95,19 @@ def fit_recording(
     fit, choice, hold, nodes = search(*record) if asked is None else fit_given(asked, *record)
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
         raise FitError("no law of the library follows this recording: its arcs could not be closed")
+    speeds = velocities(recording, fit, nodes)
+    used = tuple(name for name, one in speeds.items() if one.used)
+    for name, one in speeds.items():
+        told(f"{name}: {one.text}")
+    if used:
+        own = np.array([speeds[name].sigma for name in used])
+        seen = seen.beside({n: recording.velocities.index(n) for n in used})
+        nodes, arcs = with_channels(recording, nodes, fit.arcs, fit.fitted.x, used)
+        bench = Workbench(gauge_of, inputs[hold], scales.omega, seen)
+        fit = bench.fit(fit.structure, fit.values, arcs, np.concatenate([fit.sigma, own]))
+        scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, own]))
+        given = np.array([recording.std[name] or np.nan for name in seen.channels])
+        found = _stretches(recording, seen, angles)
     first = fit.form.count + len(fit.structure.zeros)
     fitted = dataclasses.replace(seen, values=fit.p[first:])
     _check_told(fit, fitted)
@@ -134,7 +148,7 @@ def fit_recording(
     motions = next_motions(bench, fit, angles)
     return _described(
         recording, fit, map_, law, covariance, (choice, scale), horizons, gauge, tuple(steps),
-        traces, motions, (q, v, u), [n.t for n in nodes], time.process_time() - started,
+        traces, motions, (q, v, u), [n.t for n in nodes], time.process_time() - started, speeds,
     )  # fmt: skip
 
 
@@ -228,8 +242,8 @@ def _with_sensors(map_: Any, sensors: Sensors) -> Any:
 def _described(
     recording: Recording, fit: LawFit, map_: Any, law: Any, covariance: np.ndarray,
     chosen: tuple[FrictionChoice, float], horizons: Any, gauge: str, steps: tuple[str, ...],
-    traces: tuple[Trace, ...], motions: list[Motion], states: Any,
-    times: list[np.ndarray], seconds: float,
+    traces: tuple[Trace, ...], motions: list[Motion], states: Any, times: list[np.ndarray],
+    seconds: float, told_of: dict[str, Velocity],
 ) -> LearnedLaw:  # fmt: skip
     """The law in the words of the recording."""
     names = recording.coordinates
@@ -278,7 +292,7 @@ def _described(
         hamiltonian=hamiltonian_of(law.terms, lagrangian, codes), zeros=zeros,
         noise=dict(zip(channels, map(float, map_.sensors.sigma / factors), strict=True)),
         residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)), gauge=gauge,
-        whiteness=whiteness(traces, channels, recording.inputs), traces=traces,
+        velocities=told_of, whiteness=whiteness(traces, channels, recording.inputs), traces=traces,
         next_motions=_in_words(motions, fit, recording, codes, of_speeds),
         observe={n: f for n, f in formulas.items() if n != f}, sensors=sensors,
         alike=_alike(fit, lagrangian, friction), horizon=tuple(horizons),
