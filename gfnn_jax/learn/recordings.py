@@ -96,13 +96,13 @@ def fit_recording(
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
         raise FitError("no law of the library follows this recording: its arcs could not be closed")
     speeds = velocities(recording, fit, nodes)
-    used = tuple(name for name, one in speeds.items() if one.used)
+    honest = tuple(name for name, one in speeds.items() if one.used)
     for name, one in speeds.items():
         told(f"{name}: {one.text}")
-    if used:
-        own = np.array([speeds[name].sigma for name in used])
-        seen = seen.beside({n: recording.velocities.index(n) for n in used})
-        nodes, arcs = with_channels(recording, nodes, fit.arcs, fit.fitted.x, used)
+    if honest:
+        own = np.array([speeds[name].sigma for name in honest])
+        seen = seen.beside({n: recording.velocities.index(n) for n in honest})
+        nodes, arcs = with_channels(recording, nodes, fit.arcs, fit.fitted.x, honest)
         bench = Workbench(gauge_of, inputs[hold], scales.omega, seen)
         fit = bench.fit(fit.structure, fit.values, arcs, np.concatenate([fit.sigma, own]))
         scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, own]))
