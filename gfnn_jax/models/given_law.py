@@ -29,7 +29,7 @@ def fit_given(
     inputs: Mapping[str, Callable], seen: Observation, told: Callable[[str], object],
     options: SearchOptions,
 ) -> Found:  # fmt: skip
-    """What `law_search.search` returns, with exactly the terms that are given."""
+    """Fit exactly the terms that are given, with the result of `law_search.search`."""
     d = seen.dim
     gauge = np.concatenate([n.x[:, :d] for n in nodes])
     benches = {hold: Workbench(gauge, u, scales.omega, seen) for hold, u in inputs.items()}

@@ -29,7 +29,7 @@ _SHRINK, _GROW = 0.2, 5.0  # of the damping
 
 
 class Steps(NamedTuple):
-    """What a model gives for states (A, L, m): those after each step (A, L − 1, m), and derivatives
+    """Steps of a model from states (A, L, m): those after each step (A, L − 1, m), and derivatives
     in the states before (…, m, m) and in the n coefficients (…, m, n)."""
 
     states: np.ndarray
@@ -77,7 +77,7 @@ class Fitted:
         return inverse @ inverse.T
 
     def last_covariance(self) -> np.ndarray:
-        """Of the last state of each arc (A, m, m), with p as it is."""
+        """Covariance of the last state of each arc (A, m, m), with p as it is."""
         root = self.transports @ np.linalg.pinv(self.arcs)
         return root @ root.swapaxes(1, 2)
 
@@ -178,7 +178,7 @@ def loss(residuals: np.ndarray) -> np.ndarray:
 
 
 class _Iterate(NamedTuple):
-    """Where an iteration stands: residuals in units of σ, defects, the cost of the residuals, and
+    """Iterate: residuals in units of σ, defects, the cost of the residuals, and
     the norm of the defects in units of ``state_scale``."""
 
     p: np.ndarray
