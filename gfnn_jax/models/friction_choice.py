@@ -1,4 +1,4 @@
-"""Which friction a record shows: held-out arcs say, and with what odds.
+"""Choice of the friction that a record shows: held-out arcs say, and with what odds.
 
 Close to a fit its residuals are linear in small changes of the coefficients, so that one evaluation
 of the arcs serves every set of frictions: of each set the coefficients are found from some of the
@@ -114,7 +114,7 @@ class _Evidence:
         return np.count_nonzero(residuals) / correlation_time(residuals)
 
     def odds(self, one: _Judged, other: _Judged) -> float:
-        """That the first forecasts better than the other."""
+        """Odds that the first forecasts better than the other."""
         log = 0.5 * self.count * np.log(max(other.cost, 1e-300) / max(one.cost, 1e-300))
         return float(np.exp(np.clip(log, -_SURE, _SURE)))
 
@@ -153,7 +153,7 @@ class _Table:
 
     @functools.cached_property
     def triangles(self) -> list[np.ndarray]:
-        """Of the arcs without each third, and of all."""
+        """Triangles of the arcs without each third, and of all."""
         kept = [*~self.folds, np.ones(self.folds.shape[1], bool)]
         flat = [self.rows[keep].reshape(-1, self.rows.shape[-1]) for keep in kept]
         return [np.asarray(np.linalg.qr(part, mode="r")) for part in flat]
@@ -181,7 +181,7 @@ class _Table:
         return losses
 
     def judged(self, subset: Sequence[int]) -> _Judged:
-        """These candidates' residuals on the thirds that their coefficients are not from."""
+        """Residuals of these candidates on the thirds that their coefficients are not from."""
         residuals = np.zeros(self.rows.shape[:3])
         for triangle, held, rows in zip(self.triangles[:-1], self.folds, self.held, strict=True):
             residuals[held] = rows @ np.append(-self.solve(triangle, subset), 1.0)
@@ -224,6 +224,6 @@ class _Table:
         return found
 
     def _variance(self, rest: float) -> float:
-        """Of the residuals, of their norm."""
+        """Variance of the residuals, by their norm."""
         count = np.count_nonzero(self.rows[..., -1]) - self.rows.shape[-1]
         return float(rest**2 / max(count, 1))

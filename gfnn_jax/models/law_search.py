@@ -46,7 +46,7 @@ class SearchOptions:
 
 
 class Found(NamedTuple):
-    """What a search found: the fit to the longest arcs, which friction and how sure that is, the
+    """Findings of a search: the fit to the longest arcs, which friction and how sure that is, the
     rule of the inputs between samples, and the nodes with their states."""
 
     fit: LawFit
