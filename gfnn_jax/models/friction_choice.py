@@ -1,4 +1,4 @@
-"""Friction that a record shows, chosen by held-out arcs, with its odds.
+"""Choice of the friction that a record shows: held-out arcs say, and with what odds.
 
 Close to a fit its residuals are linear in small changes of the coefficients, so that one evaluation
 of the arcs serves every set of frictions: of each set the coefficients are found from some of the
@@ -224,6 +224,6 @@ class _Table:
         return found
 
     def _variance(self, rest: float) -> float:
-        """Of the residuals, of their norm."""
+        """Variance of the residuals, by their norm."""
         count = np.count_nonzero(self.rows[..., -1]) - self.rows.shape[-1]
         return float(rest**2 / max(count, 1))
