@@ -156,13 +156,25 @@ def sensitivities(
 ) -> np.ndarray:
     """The triangle (n + 1, n + 1) of the coefficients and the residuals, the states of each arc
     eliminated, at p and x: what a test of coefficients needs."""
+    return _rows_at(model, p, x, y, sigma).triangle
+
+
+def last_by_coefficients(
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
+) -> np.ndarray:
+    """Derivative (A, m, n) in p of the last state of each arc that was fitted to y with p fixed."""
+    rows, m = _rows_at(model, p, x, y, sigma), x.shape[-1]
+    first = np.linalg.solve(rows.arcs[:, :, :m], -rows.arcs[:, :, m:-1])
+    last = rows.sensitivities[:, -1]
+    return last[..., :m] @ first + last[..., m:-1]
+
+
+def _rows_at(model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray) -> _Rows:
     seen = np.isfinite(y)
     steps, observed = model.steps(p, x), model.observe(p, x)
     residuals = np.where(seen, (np.where(seen, y, 0.0) - observed.values) / sigma, 0.0)
     defects = steps.states - x[:, 1:]
-    return _reduced(
-        _Iterate(p, x, steps, observed, seen, residuals, defects, 0.0, 0.0), sigma
-    ).triangle
+    return _reduced(_Iterate(p, x, steps, observed, seen, residuals, defects, 0.0, 0.0), sigma)
 
 
 def loss(residuals: np.ndarray) -> np.ndarray:
