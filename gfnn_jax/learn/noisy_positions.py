@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.errors import OutOfTime
-from gfnn_jax.learn.clock import ROWS, Budget
+from gfnn_jax.learn.clock import FLOW, Budget
 from gfnn_jax.models.discrete_lagrangian import Solved, solve
 from gfnn_jax.models.latent_positions import (
     LatentFit,
@@ -26,7 +26,8 @@ from gfnn_jax.models.triples import Triples
 
 _CERTAIN = 2.0  # standard errors, by which least squares has to be better to be kept
 _WORSE = 2  # sizes in a row that are no better end the search
-_PASSES = 8.0  # over the rows: some four iterations, twice
+_PASSES = 32.0  # over the rows: some four iterations, twice, with all derivatives
+_MOST_OPERATIONS = 2e10  # of one size: about a minute
 
 
 class Latent(NamedTuple):
@@ -47,9 +48,11 @@ def without_noise(
     best: Latent | None = None
     sigma, worse = None, 0
     for family in families:
-        numbers = arcs.size * (family.num_parameters + 2 * training.dim) ** 2
+        work = _PASSES * arcs.size * (family.num_parameters + 2 * training.dim) ** 2
+        if best is not None and work > _MOST_OPERATIONS:
+            break
         try:
-            with budget.unit(f"latent positions, S of {family.label}", ROWS, _PASSES * numbers):
+            with budget.unit(f"latent positions, S of {family.label}", FLOW, work):
                 say(f"latent positions, S of {family.label}, {family.num_parameters} terms")
                 solved = solve(family, training)
                 if sigma is None:

@@ -20,7 +20,7 @@ from gfnn_jax.solve.latent_arcs import fit_arcs, loss
 from gfnn_jax.threads import one_thread
 
 _LONGEST = 24  # nodes of an arc: its own two positions cost a twelfth of what it tells
-_MOST_NODES = 40_000  # of all arcs; half a gigabyte at a hundred coefficients of two coordinates
+_MOST_NODES = 20_000  # of all arcs: a minute and a quarter of a gigabyte at a hundred terms
 _SETTLED = 1.05  # a noise scale that changed by less needs no further fit
 _SCALES = 4  # fits, at most, that find it
 _GROSS = 5.0  # standard deviations: of what is not noise
