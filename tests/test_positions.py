@@ -16,6 +16,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
+from gfnn_jax.jobs.forecast import forecast_recording
 from gfnn_jax.models.discrete_lagrangian import left_over, solve
 from gfnn_jax.models.latent_positions import arcs_of, fit_latent, starting_noise
 from gfnn_jax.models.triples import Triples, triples_of
@@ -307,6 +308,22 @@ def test_it_forecasts_the_same_when_loaded(of_noisy, tmp_path):
     )
     assert np.array_equal(ours.values["theta"], theirs.values["theta"])
     assert np.array_equal(ours.std["theta"], theirs.std["theta"])
+
+
+def test_a_forecast_is_compared_with_what_was_read(of_noisy, tmp_path):
+    read = noisy(turns(20, 15, 1), 1e-3, 5)[..., 0]
+    run, turn = np.indices(read.shape)
+    rows = np.stack([run, turn, read], axis=-1)
+    for name, part in (("begun.csv", rows[:, :11]), ("read.csv", rows)):
+        np.savetxt(tmp_path / name, part.reshape(-1, 3), delimiter=",", header="run,t,theta",
+                   comments="", fmt="%.17g")  # fmt: skip
+    of_noisy.map.save(tmp_path / "model")
+    files = {"out": tmp_path / "on.csv", "compare": tmp_path / "read.csv"}
+    found, judged = forecast_recording(tmp_path / "model", tmp_path / "begun.csv", **files)
+    assert len(found) == 20
+    rms, _, within = judged.columns["theta"]
+    assert rms < 5e-3
+    assert within > 0.85
 
 
 # The command line

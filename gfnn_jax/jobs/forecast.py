@@ -1,4 +1,4 @@
-"""What ``gfnn predict MODEL --initial RECORDING`` does: forecasts from the end of each run.
+"""Job of ``gfnn predict MODEL --initial RECORDING``: forecasts from the end of each run.
 
 The file written has times (R, n), values and std (R, n, d) by runs and columns; with .csv at its
 end, columns run, t, each position and std_ of each. Times and values are in the units of the
@@ -16,7 +16,7 @@ import numpy as np
 
 from gfnn_jax.data.recording import SECONDS, Recording, read
 from gfnn_jax.errors import InputError
-from gfnn_jax.maps.estimates import Forecast, forecast
+from gfnn_jax.maps.estimates import Forecast
 from gfnn_jax.maps.saved import load, record
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.storage.outputs import atomic_write, ensure_new
@@ -75,7 +75,7 @@ def forecast_recording(
             assert num_steps is not None
             steps = np.arange(save_every, num_steps + 1, save_every)
             times = last + float(np.asarray(map_.dt)) * steps
-        found[run] = forecast(map_, part, times, ahead)
+        found[run] = map_.forecast(part, times, ahead)
     second = SECONDS[recording.time_unit]
     found = {run: _in_units(one, recording.factors, second) for run, one in found.items()}
     _write(out, tuple(next(iter(found.values())).values), found)
@@ -96,7 +96,7 @@ def _roles(sensors: Sensors, job: dict[str, Any]) -> dict[str, Any]:
 
 
 def _in_units(one: Forecast, factors: Mapping[str, float], second: float) -> Forecast:
-    """In the units of the file."""
+    """Convert to the units of the file."""
     values, std = (
         {name: array / factors.get(name, 1.0) for name, array in of.items()}
         for of in (one.values, one.std)

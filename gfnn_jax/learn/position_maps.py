@@ -9,12 +9,12 @@ import jax
 import numpy as np
 
 from gfnn_jax.coordinates import Coordinates, circle_centre, whole_turns
+from gfnn_jax.dataset.structures import Sites
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.generating.charts import TYPE1
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
-from gfnn_jax.learn.structures import Sites
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.sensors import Sensors
