@@ -45,6 +45,7 @@ def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:
             "messages": list(fit.messages),
             "steps": list(fit.steps),
             "alike": list(fit.alike),
+            "next_motions": [motion._asdict() for motion in fit.next_motions],
         },
         "hamiltonian": _law(fit.hamiltonian),
         "lagrangian": {**_law(fit.lagrangian), "text": str(fit.lagrangian)},

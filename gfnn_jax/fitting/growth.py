@@ -17,7 +17,9 @@ import numpy as np
 
 from gfnn_jax.families.modes import Mode, Modes
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.fitting.gauss_newton import Problem, midpoint_start, null_terms, significant
+from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.fitting.linear_starts import midpoint_start
+from gfnn_jax.fitting.significance import null_terms, significant
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps
 

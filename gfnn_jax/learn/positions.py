@@ -52,7 +52,7 @@ _WINDOW = 40  # steps, from whose readings a state is estimated
 
 @dataclasses.dataclass(frozen=True)
 class OfPositions:
-    """What an S of positions alone is like.
+    """Traits of an S of positions alone.
 
     symmetric: whether S(q, Q) = S(Q, q). rank: how many combinations of its terms the data tell;
     the others, the factor of S among them, are those of free motion. condition: of those told.
@@ -67,7 +67,7 @@ class OfPositions:
     noise: tuple[float, ...] | None = None
 
     def __str__(self) -> str:
-        """What was learned, in a line."""
+        """Line about what was learned."""
         left = self.num_parameters - self.rank
         kind = "symmetric, as of a reversible map" if self.symmetric else "of no symmetry"
         listed = "" if self.noise is None else ", ".join(f"{s:.3g}" for s in self.noise)
@@ -191,7 +191,7 @@ class _Sweep:
         return found
 
     def _families(self, symmetric: bool) -> Iterator[OfDisplacement]:
-        """By rising size, as many as the training triples determine."""
+        """Families by rising size, as many as the training triples determine."""
         triples, rows = self.triples, len(self.split.training) * self.triples.dim
         # An angle stays as it is: the middle of two would be known by half a turn only.
         part, moves = 0.0 if triples.angles else 0.5, _centres_of_moves(triples)
@@ -306,7 +306,7 @@ class _Sweep:
         return _Found(piece, candidate, about, root, noise)
 
     def error_of(self, positions: np.ndarray, rows: np.ndarray) -> OneStepError:
-        """Of the last positions (n, d) of these rows, as predicted."""
+        """Error of the last positions (n, d) of these rows, as predicted."""
         error = nearest_image(positions - self.triples.after[rows], self.triples.angles)
         return one_step_error(error, self.spread, self.tolerance, self.split.stretch[rows])
 
@@ -345,7 +345,7 @@ class _Sweep:
 
 
 def _split(triples: Triples, seed: int) -> Split:
-    """By runs, or of few runs by blocks of time, as pairs of states (q, Q − q) are split."""
+    """Split by runs, or of few runs by blocks of time, as pairs of states (q, Q − q) are split."""
     coming, going = np.split(triples.moves, 2)
     z0 = np.concatenate([triples.middle, coming], axis=1)
     z1 = np.concatenate([triples.after, going], axis=1)
@@ -354,7 +354,7 @@ def _split(triples: Triples, seed: int) -> Split:
 
 
 def _centres_of_moves(triples: Triples) -> np.ndarray | None:
-    """As `OfDisplacement` has them."""
+    """Centres as `OfDisplacement` has them."""
     if not triples.wrapped:
         return None
     centres = np.full(triples.dim, np.nan)

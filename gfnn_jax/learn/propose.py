@@ -1,4 +1,4 @@
-"""What a fit of many degrees of freedom proposes where it met nothing: a structure to be told."""
+"""Proposal of a structure, where a fit of many degrees of freedom met nothing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.structures import structure_of
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.sums import Sums
-from gfnn_jax.fitting.gauss_newton import fitted_gradients
+from gfnn_jax.fitting.linear_starts import fitted_gradients
 from gfnn_jax.generating.charts import CHARTS
 
 _FEWEST_DIM = 6  # below it a fit needs no structure

@@ -139,7 +139,7 @@ def _met(found: LearnedMap | None, tolerance: Tolerance) -> bool:
 
 
 def _of_terms(data: Dataset) -> bool:
-    """Whether S, where it is learned, is a sum of terms: with parameters, or over sites."""
+    """Return whether S, where it is learned, is a sum of terms: with parameters, or over sites."""
     sites = isinstance(data.structure, Sites) and data.own_dt is None
     return sites or data.args is not None
 
