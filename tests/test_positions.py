@@ -17,7 +17,7 @@ from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
 from gfnn_jax.jobs.forecast import forecast_recording
-from gfnn_jax.models.discrete_lagrangian import left_over, solve
+from gfnn_jax.models.discrete_lagrangian import residuals, solve
 from gfnn_jax.models.latent_positions import arcs_of, fit_latent, starting_noise
 from gfnn_jax.models.triples import Triples, triples_of
 
@@ -190,7 +190,7 @@ def test_s_is_fixed_by_its_mixed_term_and_nearest_to_free_motion():
     family = OfDisplacement(Products(inputs, 2), 0.5)
     solved = solve(family, triples)
     params = family.unflatten(solved.coefficients)
-    assert np.abs(left_over(family, params, triples)).max() < 1e-13
+    assert np.abs(residuals(family, params, triples)).max() < 1e-13
     assert solved.rank < family.num_parameters - 4
     hessian = family.gradient_and_hessian(params, triples.ends[:1])[1][0]
     mixed = -(dt**2) * hessian[:2, 2:]

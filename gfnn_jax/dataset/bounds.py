@@ -34,5 +34,5 @@ def bound_of_mean(square: np.ndarray, block: np.ndarray, worst: int = 2) -> floa
     if not variance > 0:
         return mean
     variance *= (stdtrit(blocks - 1, _LEVEL) / _NORMAL) ** 2
-    freedom = 2 * mean**2 / variance
-    return float(mean * freedom / (2 * gammaincinv(0.5 * freedom, 1 - _LEVEL)))
+    degrees = 2 * mean**2 / variance
+    return float(mean * degrees / (2 * gammaincinv(0.5 * degrees, 1 - _LEVEL)))

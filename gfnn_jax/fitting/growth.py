@@ -203,7 +203,7 @@ class _Look:
     def candidates(self, tried: list[Mode], rest, span, room: int, options: Options) -> list[Mode]:
         """Select among the modes that are tried those that the residual asks for: the heaviest,
         then the one that is heaviest beside it, and so on. rest, span: as `solved` gives them."""
-        freedom = np.sqrt(max(len(rest) - span.shape[1], 0))
+        degrees = np.sqrt(max(len(rest) - span.shape[1], 0))
         columns, heaviest = np.zeros((len(rest), 0)), np.zeros(0, dtype=int)
         for first in range(0, len(tried), options.block):
             part = np.arange(first, min(first + options.block, len(tried)))
@@ -217,7 +217,7 @@ class _Look:
             left = np.linalg.norm(columns, axis=0)
             new = left > options.null * size
             weights = np.abs(rest @ columns) / np.where(new, left, np.inf)
-            weights *= freedom / np.linalg.norm(rest)
+            weights *= degrees / np.linalg.norm(rest)
             j = int(np.argmax(weights))
             least = least or max(options.significant, options.weighty * weights[j])
             if not weights[j] >= least:

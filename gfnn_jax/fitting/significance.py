@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from gfnn_jax.fitting.triangle import Triangle
 NULL = 1e-10  # of a term's size; one closer to the span of those before it is not known apart
 
 
+@runtime_checkable
 class Solved(Protocol):
     """Fit at whose coefficients the triangle of its problem is known."""
 

@@ -26,7 +26,7 @@ _BESIDE = dataclasses.replace(
     OPTIONS, most_terms=60, most_modes=150, max_operations=1e10, mode_operations=2e10
 )
 # A law holds outside the data and at any time step: so much dearer a step it may be.
-DEARER = 4.0
+MAX_COST_RATIO = 4.0
 # Where none meets the tolerance, errors that the noise of held-out pairs does not tell apart.
 _AS_GOOD = 1.01
 # Of the error that a library must leave to have helped, where noise hides what it brings.
@@ -114,7 +114,10 @@ def preferred(law: Candidate, chosen: Candidate, bound: float) -> bool:
     """Return whether the law is taken instead of the map that was chosen: where it alone meets the
     tolerance, or meets it and is not four times dearer, or none meets it and it is as good."""
     if law.validation_bound <= bound:
-        return not chosen.validation_bound <= bound or law.operations <= DEARER * chosen.operations
+        return (
+            not chosen.validation_bound <= bound
+            or law.operations <= MAX_COST_RATIO * chosen.operations
+        )
     if chosen.validation_bound <= bound or not np.isfinite(law.validation_relative):
         return False
     return law.validation_relative <= _AS_GOOD * chosen.validation_relative

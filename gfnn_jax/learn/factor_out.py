@@ -23,12 +23,12 @@ def factored_out(flows: Sequence[Flow], data: Dataset, seed: int) -> tuple[Flow,
     """The pairs without one of these flows: before, after, or half on either side of what is
     learned, whichever leaves the map that a small S comes closest to."""
 
-    def left_over(rest: Dataset) -> float:
+    def misfit(rest: Dataset) -> float:
         rows = np.random.default_rng(seed).permutation(len(rest))[:TRIAL_PAIRS]
         return trial_residual(rest.take(rows))
 
     tried = [(flow, data.without(*pieces)) for flow in flows for pieces in around(flow)]
-    errors = [left_over(rest) for _, rest in tried]
+    errors = [misfit(rest) for _, rest in tried]
     return tried[0] if errors[0] <= 2 * min(errors) else tried[int(np.argmin(errors))]
 
 

@@ -342,7 +342,7 @@ def unexplained(
         scores = shared_noise.scores(
             slopes, weight * target, to_target @ first, to_target @ second, goes_on
         )
-        freedom = shared_noise.freedom(slopes, weight * target, scores)
+        freedom = shared_noise.degrees_of_freedom(slopes, weight * target, scores)
     left = reduced.norm**2 / max(reduced.rows - taken, 1)
     if left == 0:
         return 1.0

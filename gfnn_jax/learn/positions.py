@@ -34,7 +34,7 @@ from gfnn_jax.learn.position_maps import images_of, map_of, states_of
 from gfnn_jax.learn.search import MET
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.discrete_lagrangian import displacement, left_over, solve
+from gfnn_jax.models.discrete_lagrangian import displacement, residuals, solve
 from gfnn_jax.models.latent_positions import starting_noise
 from gfnn_jax.models.triples import Triples, triples_of
 from gfnn_jax.phase_space import Pairs, sizes
@@ -273,7 +273,7 @@ class _Sweep:
         about = OfPositions(
             symmetric, family.num_parameters, solved.rank, solved.condition, len(self.triples)
         )
-        left = left_over(family, family.unflatten(solved.coefficients), training)
+        left = residuals(family, family.unflatten(solved.coefficients), training)
         deviation = np.sqrt(np.mean((left / displacement(training)) ** 2))
         noise = starting_noise(family, solved.coefficients, training)
         root = deviation * solved.root
@@ -289,7 +289,7 @@ class _Sweep:
         params = family.unflatten(coefficients)
         states = states_of(family, params, triples)
         piece = Generated(family, params, TYPE1, triples.dt, sizes(states[0]))
-        left = left_over(family, params, training) / self.spread
+        left = residuals(family, params, training) / self.spread
         error = self.error_of(images_of(piece, held), self.split.validation)
         gradient, with_hessian = family.operations
         candidate = Candidate(

@@ -26,7 +26,7 @@ def proposed(data: Dataset) -> list[str]:
     where none does. data: without a base map or a structure."""
     if data.dim < _FEWEST_DIM or data.varied or data.coordinates.angles:
         return []
-    left = {text: _left_over(text, data) for text in _possible(data.dim)}
+    left = {text: _misfit(text, data) for text in _possible(data.dim)}
     best = min(left, key=lambda text: left[text])
     if not left[best] < _EXPLAINED:
         return []
@@ -42,7 +42,7 @@ def _possible(dim: int) -> Iterator[str]:
     yield from (f"bodies:{dim // k}" for k in (3, 2, 1) if dim % k == 0 and dim // k > 1)
 
 
-def _left_over(text: str, data: Dataset) -> float:
+def _misfit(text: str, data: Dataset) -> float:
     """The least part of the held-out target gradients that a library of the structure leaves."""
     structure = structure_of(text, data.dim)
     assert structure is not None

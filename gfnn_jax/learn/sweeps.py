@@ -423,7 +423,7 @@ class LinearSweep(Generates):
         states = residual, *self.by_states(near.family, params, w, *args), goes_on
         scores = shared_noise.scores(slopes, *states)
         return [
-            shared_noise.freedom(slopes[..., :count], residual, scores[:, :count])
+            shared_noise.degrees_of_freedom(slopes[..., :count], residual, scores[:, :count])
             for count in counts
         ]
 
@@ -454,13 +454,13 @@ class LinearSweep(Generates):
                 self._factors[of.group].train if larger.group in self._factors
                 else least_squares.reduce(self.in_rows(of.family), [data], self._weight)
             )  # fmt: skip
-            freedom = float(count)
+            degrees = float(count)
             if states is not None:
                 slopes = self._slopes(of.family, data[0], *data[2:])
                 scores = shared_noise.scores(slopes, *states)
-                freedom = shared_noise.freedom(slopes, states[0], scores)
+                degrees = shared_noise.degrees_of_freedom(slopes, states[0], scores)
             square = reduced.residual_norm(count) ** 2 / max(reduced.rows, 1)
-            return square, freedom, reduced.rows
+            return square, degrees, reduced.rows
 
         (of_all, taken, _), (of_rest, more, rows) = left(size), left(larger)
         noise = of_rest / max(1.0 - more / rows, 1.0 / rows)

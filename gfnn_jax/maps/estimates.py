@@ -138,7 +138,8 @@ def forecast(
 def windows_of(sensors: Sensors, recording: Recording) -> list[Window]:
     """The last samples of each run. Raises InputError where a column is missing or they are few."""
     channels = sensors.seen.channels
-    missing = [n for n in (*channels, *sensors.inputs) if n not in recording.columns]
+    needed = (*sensors.seen.needed, *sensors.inputs)
+    missing = [n for n in needed if n not in recording.columns]
     if missing:
         raise InputError(f"{recording.source}: expected columns {', '.join(missing)}")
     windows = []

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.generating.position_arcs import PositionArcs, nodes_of
-from gfnn_jax.models.discrete_lagrangian import Solved, left_over
+from gfnn_jax.models.discrete_lagrangian import Solved, residuals
 from gfnn_jax.models.triples import Triples
 from gfnn_jax.solve.latent_arcs import fit_arcs, loss
 from gfnn_jax.threads import one_thread
@@ -64,7 +64,7 @@ def arcs_of(triples: Triples) -> np.ndarray:
 
 def starting_noise(family: Any, coefficients: np.ndarray, triples: Triples) -> np.ndarray:
     """σ (d,) as large as what S leaves of the equations suggests."""
-    left = left_over(family, family.unflatten(coefficients), triples)
+    left = residuals(family, family.unflatten(coefficients), triples)
     return np.maximum(np.median(np.abs(left), axis=0) / 0.6745 / _OF_EQUATION, np.finfo(float).tiny)
 
 

@@ -12,8 +12,9 @@ from gfnn_jax.families.lagrangian import Lagrangian, Terms
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.calibration import Horizon
 from gfnn_jax.models.law_fit import LawFit
-from gfnn_jax.models.law_text import Expression, Term, measured, terms_of
+from gfnn_jax.models.law_text import Expression, Term, WhichFriction, measured, terms_of
 from gfnn_jax.models.residuals import Trace, Whiteness
+from gfnn_jax.models.velocities import Velocity
 
 
 class NextMotion(NamedTuple):
@@ -34,11 +35,13 @@ class LearnedLaw:
     """A law that was learned from a recording.
 
     map: its flow, which estimates and forecasts. lagrangian: L, and friction: Rayleigh's R, by the
-    names of columns, with standard errors. gains: input -> force on each position, with its
+    names of columns, with standard errors. which_friction: its kinds, with what odds, and limits of
+    those that were not seen. gains: input -> force on each position, with its
     standard error. hamiltonian: H in words, its terms as of L. zeros: angle -> (where it is zero,
     standard error), already inside the formula. observe: column -> what its sensor shows, where
     that is not the coordinate; sensors: the parameters in it, fitted, with standard errors. noise:
-    column -> σ of its samples; residual: of the fit's arcs, both in the file's unit. whiteness: of
+    column -> σ of its samples; residual: of the fit's arcs, both in the file's unit. velocities:
+    columns of these against the law of the positions, and whether they were used. whiteness: of
     the residuals, column by column; traces: the arcs that were fitted. gauge: what fixes the scale
     of L. alike: coefficients that the record cannot tell apart. next_motions: those that
     would tell the most, the best first. horizon: for how long a forecast
@@ -50,6 +53,7 @@ class LearnedLaw:
     map: SymplecticMap
     lagrangian: Expression
     friction: Expression
+    which_friction: WhichFriction
     gains: dict[str, dict[str, tuple[float, float]]]
     hamiltonian: Hamiltonian
     zeros: dict[str, tuple[float, float]]
@@ -57,6 +61,7 @@ class LearnedLaw:
     sensors: dict[str, tuple[float, float]]
     noise: dict[str, float]
     residual: dict[str, float]
+    velocities: dict[str, Velocity]
     whiteness: dict[str, Whiteness]
     traces: tuple[Trace, ...]
     gauge: str
@@ -78,12 +83,14 @@ class LearnedLaw:
     @property
     def table(self) -> str:
         """The law, its errors and its horizon, a line each."""
-        lines = [f"L = {self.lagrangian}", f"R = {self.friction}", f"gauge: {self.gauge}"]
+        lines = [f"L = {self.lagrangian}", f"R = {self.friction}"]
+        lines += [f"friction: {self.which_friction}", f"gauge: {self.gauge}"]
         lines += [
             f"{name}: zero at {zero:.5f}({std:.5f})" for name, (zero, std) in self.zeros.items()
         ]
         lines += [f"{column} shows {formula}" for column, formula in self.observe.items()]
         lines += [f"{name} = {measured(value, std)}" for name, (value, std) in self.sensors.items()]
+        lines += [f"{name}: {one.text}" for name, one in self.velocities.items()]
         for name, forces in self.gains.items():
             told = ", ".join(f"{q} {g:.6g} ± {s:.2g}" for q, (g, s) in forces.items())
             lines.append(f"force of {name}: {told}")
