@@ -230,16 +230,20 @@ def turn(quick: bool) -> Numbers:
 # Tunes
 
 
-def tune(signal) -> float:
-    """The frequency, in cycles per turn, of the largest line of a complex signal (N,): Laskar's
-    frequency analysis with a Hann window."""
+def tune(signal, near: float | None = None) -> float:
+    """The frequency, in cycles per turn, of the largest line of a signal (N,): Laskar's frequency
+    analysis with a Hann window. near: a frequency, from which the line is at most 0.02 away: the
+    line of its own plane, where that of the other one may be larger."""
     n = np.arange(len(signal))
     window = np.hanning(len(signal)) * signal
 
     def power(frequency):
         return -abs(window @ np.exp(-2j * np.pi * frequency * n))
 
-    coarse = np.argmax(np.abs(np.fft.fft(window))) / len(signal)
+    lines, frequencies_ = np.abs(np.fft.fft(window)), np.arange(len(signal)) / len(signal)
+    if near is not None:
+        lines[np.abs(frequencies_ - near) > 0.02] = 0.0
+    coarse = frequencies_[np.argmax(lines)]
     width = 1 / len(signal)
     found = minimize_scalar(
         power, bounds=(coarse - width, coarse + width), method="bounded", options={"xatol": 1e-12}

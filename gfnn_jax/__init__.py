@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from gfnn_jax.families import from_function
     from gfnn_jax.generating.charts import CHARTS, Chart
     from gfnn_jax.learn.fit import Fit, fit
+    from gfnn_jax.learn.monitors import Monitors, fit_monitors
     from gfnn_jax.learn.options import FitOptions
     from gfnn_jax.maps.saved import load, register
     from gfnn_jax.maps.stroboscopic import stroboscopic
@@ -54,6 +55,7 @@ _HOMES = {
     "FitWarning": "errors",
     "Fitted": "models.model",
     "InputError": "errors",
+    "Monitors": "learn.monitors",
     "Pairs": "phase_space",
     "Recording": "data.recording",
     "Scene": "scenes",
@@ -63,6 +65,7 @@ _HOMES = {
     "enable_compile_cache": "compiling",
     "export": "exports.export",
     "fit": "learn.fit",
+    "fit_monitors": "learn.monitors",
     "from_function": "families",
     "load": "maps.saved",
     "read": "data.recording",
@@ -83,6 +86,7 @@ __all__ = [
     "FitWarning",
     "Fitted",
     "InputError",
+    "Monitors",
     "Pairs",
     "Recording",
     "Scene",
@@ -93,6 +97,7 @@ __all__ = [
     "export",
     "figures",
     "fit",
+    "fit_monitors",
     "from_function",
     "load",
     "metrics",

@@ -256,7 +256,9 @@ def _predict(arguments: argparse.Namespace) -> None:
     for path in (arguments.model, arguments.initial, arguments.inputs, arguments.compare):
         if path is not None:
             _check_exists(path)
-    if are_recordings(arguments.initial) and _is_law(arguments.model):
+    if are_recordings(arguments.initial) and (
+        arguments.compare is not None or _is_law(arguments.model)
+    ):  # a map of positions has no bands in its file of states: with --compare it forecasts too
         return _forecast(arguments)
     if arguments.num_steps is None:
         raise InputError("expected --num-steps: how many steps to predict")

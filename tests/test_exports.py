@@ -21,6 +21,7 @@ from gfnn_jax.coordinates import CARTESIAN, Coordinates, polar, to_inner
 from gfnn_jax.exports.export import SUFFIXES
 from gfnn_jax.exports.symbols import Tape
 from gfnn_jax.families import lagrangian
+from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.expressions import parse
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.jets import jets
@@ -120,7 +121,30 @@ def two_rods():
     return map_of_law(law, z, 0.05, tolerance=1e-13), z
 
 
+def of_positions(part, both, angles=()):
+    """S(q, Q) of a map of positions: free motion, and a potential."""
+    rng, dim = np.random.default_rng(4), 1
+    q, move = rng.uniform(-1, 1, (2, 300, dim))
+    w = np.concatenate([q, q + move], axis=1)
+    inner = Products(box_inputs(np.concatenate([q + part * move, move], axis=1), angles=angles), 4)
+    family = OfDisplacement(inner, part, both)
+    terms = family.term_gradients(w)
+    kick = 0.3 * np.sin(w)
+    wanted = np.concatenate([-move, move], axis=1) + kick
+    coefficients = np.linalg.lstsq(terms.reshape(w.size, -1), wanted.ravel())[0]
+    params = family.unflatten(coefficients)
+    gradient = family.gradient(params, w)
+    z = np.concatenate([q, -DT * gradient[:, :dim]], axis=1)
+    piece = Generated(family, params, TYPE1, DT, np.full(2 * dim, SIZE))
+    image = np.concatenate([w[:, dim:], DT * gradient[:, dim:]], axis=1)
+    found = fit_predictors(TYPE1, z, image, DT, angles=angles)
+    piece = dataclasses.replace(piece, predictor=found[-1].predictor)
+    return map_of(piece, z, scale=np.full(2 * dim, SIZE)), z
+
+
 QUICK = {
+    "positions": lambda: of_positions(0.5, False),
+    "positions both ways": lambda: of_positions(0.0, True, (0,)),
     "type 1": lambda: map_in(TYPE1, 1, 4, predicted=False),
     "type 2, angles": lambda: map_in(TYPE2, 1, 4, angles=(0, 1)),
     "type 3, base map": lambda: map_in(TYPE3, 1, 4, around=(turning(1),)),

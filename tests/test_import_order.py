@@ -22,7 +22,15 @@ ORDER = (
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {
     ("maps.symplectic_map", f"maps.{name}")
-    for name in ("positions", "saved", "samples", "sharded", "energy", "estimates")
+    for name in (
+        "positions",
+        "saved",
+        "samples",
+        "sharded",
+        "energy",
+        "estimates",
+        "position_estimates",
+    )
 }
 SHORTHANDS |= {
     ("data.recording", "data.recording_summary"),

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -11,10 +12,13 @@ import gfnn_jax as gfnn
 from gfnn_jax import cli
 from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.data.recording import Recording
+from gfnn_jax.errors import InputError
 from gfnn_jax.families.displacements import OfDisplacement
-from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
+from gfnn_jax.jobs.forecast import forecast_recording
 from gfnn_jax.models.discrete_lagrangian import residuals, solve
+from gfnn_jax.models.latent_positions import arcs_of, fit_latent, starting_noise
 from gfnn_jax.models.triples import Triples, triples_of
 
 K = 0.6
@@ -214,6 +218,112 @@ def test_the_family_of_displacements_is_differentiated_right():
         turned = np.roll(w, 2, axis=1)
         if both:
             assert np.array_equal(family.value(params, w), family.value(params, turned))
+
+
+# Noise of readings
+
+
+def noisy(q, noise, seed):
+    return q + noise * np.random.default_rng(seed).normal(size=q.shape)
+
+
+def test_latent_positions_take_the_bias_of_noise_away():
+    """Hénon–Heiles, of equal masses, from runs whose noise is 1e-3: least squares of the same terms
+    finds masses that differ by some four per cent."""
+    read = noisy(henon_heiles(200, 16, 0), 1e-3, 2)
+    triples = triples_of(recorded(read, ["x", "y"], dt=0.5))
+    middle, moves = 0.5 * (triples.ends[:, :2] + triples.ends[:, 2:]), triples.moves
+    x, turned = np.concatenate([middle, moves], axis=1), (1, 1, -1, -1)
+    inputs = box_inputs(x, reversor=turned)
+    family = OfDisplacement(Products(inputs, 4, variable_signs(inputs, turned, x)), 0.5)
+    solved = solve(family, triples)
+    sigma = starting_noise(family, solved.coefficients, triples)
+    found = fit_latent(family, solved, triples, sigma, arcs_of(triples))
+
+    def ratio(coefficients):
+        params = family.unflatten(coefficients)
+        hessian = family.gradient_and_hessian(params, np.zeros((1, 4)))[1][0]
+        return hessian[0, 2] / hessian[1, 3]
+
+    steps = 1e-5 * np.eye(len(found.coefficients))
+    slope = [ratio(found.coefficients + s) - ratio(found.coefficients - s) for s in steps]
+    std = np.linalg.norm(found.root @ np.array(slope)) / 2e-5
+    assert found.converged
+    assert np.abs(found.sigma / 1e-3 - 1).max() < 0.05
+    assert abs(ratio(solved.coefficients) - 1) > 0.02
+    assert abs(ratio(found.coefficients) - 1) < 3 * std < 0.01
+
+
+@pytest.fixture(scope="module")
+def of_noisy():
+    read = noisy(turns(150, 12, 0), 1e-3, 50)
+    return gfnn.fit(recorded(read, ["theta"], ["theta"]), learn="map", tolerance=1e-2)
+
+
+def test_bands_of_forecasts_hold(of_noisy):
+    """Of what is read, and, without the noise of a reading, of what is true."""
+    (sigma,) = of_noisy.positions.noise
+    assert abs(sigma / 1e-3 - 1) < 0.1
+    true = turns(300, 30, 1)
+    read, ahead = noisy(true, 1e-3, 51), np.array([1, 5, 20])
+    found = of_noisy.map.forecast(recorded(read[:, :11], ["theta"], ["theta"]), 10.0 + ahead)
+    std = found.std["theta"]
+    off = found.values["theta"] - read[:, 10 + ahead, 0]
+    assert ((np.abs(off) < 2 * std).mean(axis=0) > 0.9).all()
+    off = np.abs(found.values["theta"] - true[:, 10 + ahead, 0])
+    inside = (off < 2 * np.sqrt(std**2 - sigma**2)).mean(axis=0)
+    assert ((inside > 0.9) & (inside < 0.99)).all()
+    assert np.median(off[:, 0]) < 0.6e-3  # a reading's own error is 0.67e-3 in the median
+
+
+def test_a_state_is_estimated_from_all_readings_before_it(of_noisy):
+    true = turns(300, 10, 1)
+    recording = recorded(noisy(true, 1e-3, 51), ["theta"], ["theta"])
+    z, covariance = of_noisy.map.estimate(recording)
+    off = np.abs(z[:, 0] - true[:, 10, 0]) / np.sqrt(covariance[:, 0, 0])
+    assert 0.9 < (off < 2).mean() < 0.99
+    with pytest.raises(InputError, match="whole steps of 1 s"):
+        of_noisy.map.forecast(recording, 10.5)
+
+
+def test_samples_start_from_the_same_two_positions(of_noisy):
+    """Each with the momentum of its own S; their spread is that of the coefficients."""
+    read = turns(5, 8, 3)
+    positions = read[:, 0], read[:, 1]
+    options = {"num_steps": 8, "samples": 50, "key": jax.random.key(0)}
+    states, info = of_noisy.map.rollout(positions=positions, **options)
+    std = np.asarray(info.bands.std)[..., 0]
+    assert std[:, 1].max() < 1e-12  # the second position is given
+    assert (std[:, 8] > 1e-6).all()
+    off = np.abs(np.asarray(states)[..., 0] - read[..., 0])[:, 2:]
+    assert (off < 4 * std[:, 2:]).mean() > 0.9
+
+
+def test_it_forecasts_the_same_when_loaded(of_noisy, tmp_path):
+    of_noisy.map.save(tmp_path / "model")
+    recording = recorded(noisy(turns(5, 10, 1), 1e-3, 5), ["theta"], ["theta"])
+    ours, theirs = (
+        map_.forecast(recording, 10.0 + np.arange(1, 6))
+        for map_ in (of_noisy.map, gfnn.load(tmp_path / "model"))
+    )
+    assert np.array_equal(ours.values["theta"], theirs.values["theta"])
+    assert np.array_equal(ours.std["theta"], theirs.std["theta"])
+
+
+def test_a_forecast_is_compared_with_what_was_read(of_noisy, tmp_path):
+    read = noisy(turns(20, 15, 1), 1e-3, 5)[..., 0]
+    run, turn = np.indices(read.shape)
+    rows = np.stack([run, turn, read], axis=-1)
+    for name, part in (("begun.csv", rows[:, :11]), ("read.csv", rows)):
+        np.savetxt(tmp_path / name, part.reshape(-1, 3), delimiter=",", header="run,t,theta",
+                   comments="", fmt="%.17g")  # fmt: skip
+    of_noisy.map.save(tmp_path / "model")
+    files = {"out": tmp_path / "on.csv", "compare": tmp_path / "read.csv"}
+    found, judged = forecast_recording(tmp_path / "model", tmp_path / "begun.csv", **files)
+    assert len(found) == 20
+    rms, _, within = judged.columns["theta"]
+    assert rms < 5e-3
+    assert within > 0.85
 
 
 # The command line

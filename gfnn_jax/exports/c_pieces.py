@@ -12,6 +12,7 @@ import numpy as np
 from gfnn_jax.errors import InputError
 from gfnn_jax.exports.formulas import on_symbols
 from gfnn_jax.exports.symbols import Tape, literal
+from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.flows.flow import Flow
@@ -33,7 +34,8 @@ def why_not_piece(piece: Any) -> str | None:
     family = piece.family
     if isinstance(family, Legendre) and family.dim > COFACTORS_UP_TO:
         return f"the masses of {family.dim} degrees of freedom are no small system"
-    if not isinstance(family, (Products, Terms, Legendre)):
+    inner = family.family if isinstance(family, OfDisplacement) else family
+    if not isinstance(inner, (Products, Terms, Legendre)):
         return f"the map is one of {getattr(family, 'label', type(family).__name__)}"
     if isinstance(piece, Flow) and piece.newton:
         return "the stages of the flow are solved by Newton's method"

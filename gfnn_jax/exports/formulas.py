@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.jets import jets
 from gfnn_jax.families.products import Products
@@ -54,6 +55,8 @@ def on_symbols(family: Any) -> Any:
     if isinstance(family, Legendre):
         phases = np.array([_Phase(phase) for phase in family.terms.phases], dtype=object)
         return Legendre(dataclasses.replace(family.terms, phases=phases))
+    if isinstance(family, OfDisplacement):
+        return dataclasses.replace(family, family=on_symbols(family.family))
     if not isinstance(family, Products) or family.inputs.features is None:
         return family
     inputs = family.inputs

@@ -16,7 +16,7 @@ import numpy as np
 
 from gfnn_jax.data.recording import SECONDS, Recording, read
 from gfnn_jax.errors import InputError
-from gfnn_jax.maps.estimates import Forecast, forecast
+from gfnn_jax.maps.estimates import Forecast
 from gfnn_jax.maps.saved import load, record
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.storage.outputs import atomic_write, ensure_new
@@ -74,7 +74,7 @@ def forecast_recording(
             assert num_steps is not None
             steps = np.arange(save_every, num_steps + 1, save_every)
             times = last + float(np.asarray(map_.dt)) * steps
-        found[run] = forecast(map_, part, times, ahead)
+        found[run] = map_.forecast(part, times, ahead)
     second = SECONDS[recording.time_unit]
     factors = dict.fromkeys(job.get("degrees", ()), np.pi / 180) | recording.factors
     found = {run: _in_units(one, factors, second) for run, one in found.items()}

@@ -1,7 +1,8 @@
 """``gfnn.fit`` of positions alone: the map behind them, by an S(q, Q) that is learned from triples.
 
 triples → sizes of S by rising degree, symmetric first → the smallest that meets the tolerance, else
-the best → its map, judged by its own steps from positions that were held out.
+the best → where larger ones leave as much, and so the readings have noise, S with latent positions
+→ its map, judged by its own steps from positions that were held out.
 """
 
 from __future__ import annotations
@@ -11,10 +12,9 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
-from gfnn_jax.coordinates import Coordinates, circle_centre, nearest_image, whole_turns
+from gfnn_jax.coordinates import Coordinates, nearest_image
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, one_step_error
 from gfnn_jax.dataset.runs import identified
@@ -24,17 +24,18 @@ from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
-from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.generating.charts import TYPE1
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.generating.predictor import affordable, fit_predictors
 from gfnn_jax.learn.assemble import stepped
 from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.clock import ROWS, Budget
+from gfnn_jax.learn.noisy_positions import without_noise
+from gfnn_jax.learn.position_maps import images_of, map_of, states_of
 from gfnn_jax.learn.search import MET
-from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.discrete_lagrangian import residuals, solve
+from gfnn_jax.models.discrete_lagrangian import displacement, residuals, solve
+from gfnn_jax.models.latent_positions import starting_noise
 from gfnn_jax.models.triples import Triples, triples_of
 from gfnn_jax.phase_space import Pairs, sizes
 
@@ -44,8 +45,9 @@ _FEWEST = 20  # triples
 _BETTER, _WORSE = 0.9, 3  # of the residual: sizes in a row that leave more end a sweep
 _GAIN = 0.5  # of the residual: what an S without symmetry must lower it to
 _ROUNDOFF = 1e-15  # of the spread
-_SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved
-_TURNS = 1e-8  # radians, to which momenta must turn with the moves to be angles
+_EXACT = 1e-10  # of the spread: readings whose S leaves less have no noise worth the name
+_STALLED = 0.5  # of the residual, that a larger S leaves at least where readings have noise
+_WINDOW = 40  # steps, from whose readings a state is estimated
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +56,7 @@ class OfPositions:
 
     symmetric: whether S(q, Q) = S(Q, q). rank: how many combinations of its terms the data tell;
     the others, the factor of S among them, are those of free motion. condition: of those told.
+    noise: σ (d,) of the readings, where they have noise and S was fitted with latent positions.
     """
 
     symmetric: bool
@@ -61,15 +64,18 @@ class OfPositions:
     rank: int
     condition: float
     num_triples: int
+    noise: tuple[float, ...] | None = None
 
     def __str__(self) -> str:
         """Line about what was learned."""
         left = self.num_parameters - self.rank
         kind = "symmetric, as of a reversible map" if self.symmetric else "of no symmetry"
+        listed = "" if self.noise is None else ", ".join(f"{s:.3g}" for s in self.noise)
         return (
             f"S(q, Q) of {self.num_triples:,} triples of positions, {kind}; its factor, and so the "
             "unit of momenta, is fixed by its mixed term"
             + (f"; {left} more combinations of terms are left open, and are 0" if left else "")
+            + (f"; the readings have noise of {listed}" if listed else "")
         )
 
 
@@ -105,7 +111,11 @@ def learn_positions(
         raise FitError(f"expected a ring or a chain of positions, got {structure!r}")
     if len(triples) < _FEWEST:
         raise FitError(f"expected at least {_FEWEST} triples of positions, got {len(triples)}")
-    sweep = _Sweep(triples, sites, _split(triples, seed), tolerance, budget, say, tell)
+    sensors = Sensors(
+        recording.positions, (), recording.angles, np.zeros(triples.dim), 0.0,
+        _WINDOW * triples.dt, "hold", 0.0, np.array([triples.dt]), np.zeros((1, triples.dim)),
+    )  # fmt: skip
+    sweep = _Sweep(triples, sites, _split(triples, seed), tolerance, budget, say, tell, sensors)
     best = sweep.best(symmetric=True)
     if best is None or best.candidate.validation_bound > tolerance.bound:
         other = sweep.best(symmetric=False)
@@ -116,13 +126,18 @@ def learn_positions(
             f"expected more triples of positions, or more time: {len(triples)} are too few for the "
             "smallest S, or no S of theirs has a step"
         )
-    return sweep.learned(best, say)
+    return sweep.learned(sweep.without_noise(best), say)
 
 
 class _Found(NamedTuple):
+    """A piece, its error, what its S is like, a root (k, m) of the covariance of its coefficients,
+    and the noise (d,) of readings."""
+
     piece: Generated
     candidate: Candidate
     about: OfPositions
+    root: np.ndarray
+    noise: np.ndarray
 
 
 def _clearly_better(one: _Found, other: _Found) -> bool:
@@ -140,6 +155,7 @@ class _Sweep:
     budget: Budget
     say: Callable[[str], Any]
     tell: Callable[[Candidate], Any]
+    sensors: Sensors
     tried: list[Candidate] = dataclasses.field(default_factory=list)
 
     @property
@@ -156,11 +172,8 @@ class _Sweep:
         found: _Found | None = None
         worse = 0
         for family in self._families(symmetric):
-            rows = len(self.split.training) * self.triples.dim
             try:
-                with self.budget.unit(
-                    f"S of {family.label}", ROWS, rows * family.num_parameters**2
-                ):
+                with self.budget.unit(f"S of {family.label}", ROWS, self._work(family)):
                     new = self._fitted(family, symmetric)
             except OutOfTime:
                 break
@@ -209,17 +222,75 @@ class _Sweep:
         inputs = box_inputs(x, angles=self.triples.angles)
         yield from (Products(inputs, degree) for degree in _DEGREES)
 
+    def without_noise(self, best: _Found) -> _Found:
+        """S with latent positions where the readings have noise, by which least squares is biased;
+        else the best as it is."""
+        if self.sites is not None or not self._stalls(best):
+            return best
+        self.say("larger S leave as much: the readings have noise")
+        symmetric, split = best.about.symmetric, self.split
+        training, held_out = (
+            self.triples.take(np.sort(rows)) for rows in (split.training, split.validation)
+        )
+        families = self._families(symmetric)
+        found = without_noise(families, training, held_out, self.budget, self.say)
+        if found is None:
+            return best
+        started = time.perf_counter()
+        noise = tuple(map(float, found.fit.sigma))
+        about = dataclasses.replace(
+            best.about, num_parameters=found.family.num_parameters, rank=found.solved.rank,
+            condition=found.solved.condition, noise=noise,
+        )  # fmt: skip
+        own = found.fit.coefficients, found.fit.root, found.fit.sigma
+        return self._found(found.family, about, *own, started)
+
+    def _stalls(self, best: _Found) -> bool:
+        """Whether the next larger S leaves as much as the best one does."""
+        error, terms = best.candidate.validation_relative, best.candidate.num_parameters
+        families = self._families(best.about.symmetric)
+        larger = next((f for f in families if f.num_parameters > terms), None)
+        if error <= _EXACT or larger is None:
+            return False
+        known = next((c for c in self.tried if c.num_parameters == larger.num_parameters), None)
+        if known is None:
+            try:
+                with self.budget.unit(f"S of {larger.label}", ROWS, self._work(larger)):
+                    known = self._fitted(larger, best.about.symmetric).candidate
+            except OutOfTime:
+                return False
+        return known.validation_relative > _STALLED * error
+
+    def _work(self, family: OfDisplacement) -> float:
+        """Operations of a solve."""
+        return float(len(self.split.training) * self.triples.dim * family.num_parameters**2)
+
     def _fitted(self, family: OfDisplacement, symmetric: bool) -> _Found:
-        """S of this family, and the error of its steps from positions that were held out."""
+        """S of this family by least squares."""
         self.say(f"S of {family.label}, {family.num_parameters} terms")
-        started, triples = time.perf_counter(), self.triples
-        training, held = (triples.take(r) for r in (self.split.training, self.split.validation))
+        started, training = time.perf_counter(), self.triples.take(self.split.training)
         solved = solve(family, training)
-        params = family.unflatten(solved.coefficients)
-        states = _states(family, params, triples)
+        about = OfPositions(
+            symmetric, family.num_parameters, solved.rank, solved.condition, len(self.triples)
+        )
+        left = residuals(family, family.unflatten(solved.coefficients), training)
+        deviation = np.sqrt(np.mean((left / displacement(training)) ** 2))
+        noise = starting_noise(family, solved.coefficients, training)
+        root = deviation * solved.root
+        return self._found(family, about, solved.coefficients, root, noise, started)
+
+    def _found(
+        self, family: OfDisplacement, about: OfPositions, coefficients: np.ndarray,
+        root: np.ndarray, noise: np.ndarray, started: float,
+    ) -> _Found:  # fmt: skip
+        """A candidate, with the error of its steps from positions that were held out."""
+        triples = self.triples
+        training, held = (triples.take(r) for r in (self.split.training, self.split.validation))
+        params = family.unflatten(coefficients)
+        states = states_of(family, params, triples)
         piece = Generated(family, params, TYPE1, triples.dt, sizes(states[0]))
         left = residuals(family, params, training) / self.spread
-        error = self.error_of(_images(piece, held), self.split.validation)
+        error = self.error_of(images_of(piece, held), self.split.validation)
         gradient, with_hessian = family.operations
         candidate = Candidate(
             label=family.label, family=family.name, chart=TYPE1.name,
@@ -227,15 +298,12 @@ class _Sweep:
             validation_rms=error.rms, validation_relative=error.relative,
             validation_bound=error.bound, deviations=error.deviations,
             train_rms=float(np.sqrt(np.mean(left**2))), validated=True,
-            fit_seconds=time.perf_counter() - started, condition=solved.condition,
-            rank=solved.rank,
+            fit_seconds=time.perf_counter() - started, condition=about.condition,
+            rank=about.rank,
         )  # fmt: skip
         self.tried.append(candidate)
         self.tell(candidate)
-        about = OfPositions(
-            symmetric, family.num_parameters, solved.rank, solved.condition, len(triples)
-        )
-        return _Found(piece, candidate, about)
+        return _Found(piece, candidate, about, root, noise)
 
     def error_of(self, positions: np.ndarray, rows: np.ndarray) -> OneStepError:
         """Error of the last positions (n, d) of these rows, as predicted."""
@@ -246,7 +314,8 @@ class _Sweep:
         """The map of the best S, its error that of the steps that users run, on triples that chose
         nothing where there are enough."""
         say(f"compiling the step of {best.candidate.label}")
-        map_, states = _map_of(best.piece, self.triples, self.sites)
+        sensors = dataclasses.replace(self.sensors, sigma=best.noise)
+        map_, states = map_of(best.piece, best.root, sensors, self.triples, self.sites)
         test = self.split.test if len(self.split.test) else self.split.validation
         steps = stepped(map_, states.z1[test])
         images = np.where(steps.failed[:, None], np.nan, steps.images)[:, : self.triples.dim]
@@ -292,87 +361,3 @@ def _centres_of_moves(triples: Triples) -> np.ndarray | None:
     for i in triples.angles:
         centres[i] = 0.5 * (triples.moves[:, i].min() + triples.moves[:, i].max())
     return centres
-
-
-def _states(family: OfDisplacement, params: Any, triples: Triples) -> tuple[np.ndarray, np.ndarray]:
-    """z = (q, p) at q₋ and at q, (N, 2d) each: p = −h ∂S/∂q on the way from q₋, h ∂S/∂Q on that to
-    q."""
-    w = triples.ends[: len(triples)]
-    into, out = np.split(triples.dt * np.asarray(family.gradient(params, w)), 2, axis=1)
-    before = np.concatenate([triples.before, -into], axis=1)
-    return before, np.concatenate([triples.middle, out], axis=1)
-
-
-def _images(piece: Generated, triples: Triples) -> np.ndarray:
-    """q₊ as the step from q predicts it (N, d), NaN where it does not converge. NumPy."""
-    z = _states(piece.family, piece.params, triples)[1]
-    images, error = piece.refined_step(z, triples.ends[len(triples) :])
-    solved = (error < _SOLVED) & np.isfinite(images).all(axis=1)
-    return np.where(solved[:, None], images, np.nan)[:, : triples.dim]
-
-
-def _map_of(
-    piece: Generated, triples: Triples, sites: Sites | None
-) -> tuple[SymplecticMap, Pairs]:  # fmt: skip
-    """The map of this S, and its states at q₋ and at q, as pairs."""
-    dim, angles = triples.dim, list(triples.angles)
-    turning = _turning(piece, triples)
-    piece = turning or piece
-    before, middle = _states(piece.family, piece.params, triples)
-    centres, whole = _reduced(before, middle, angles, angles)
-    if turning is not None:
-        momenta = [dim + i for i in angles]
-        own, covered = _reduced(before, middle, momenta, [*momenta, *angles])
-        centres, whole, angles = [*centres, *own], [*whole, *covered], [*angles, *momenta]
-    domain = covering(before, ignore=tuple(whole)) if sites is None else sites.domain(before)
-    if sites is not None and turning is not None:
-        domain = dataclasses.replace(sites, angles="qp").domain(before)
-    if not matrix_free(piece.family):
-        fitted = fit_predictors(TYPE1, before, middle, triples.dt, angles=tuple(angles))
-        piece = dataclasses.replace(piece, predictor=affordable(fitted, piece.family).predictor)
-    map_ = SymplecticMap(
-        pieces=(piece,), coordinates=Coordinates("positions", tuple(angles)),
-        domain=domain, scale=sizes(before), angle_centre=np.array(centres), dt=triples.dt,
-    )  # fmt: skip
-    return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_), Pairs(
-        before, middle, triples.dt
-    )
-
-
-def _reduced(before, middle, of: list[int], moved: list[int]) -> tuple[list[float], list[int]]:
-    """The angles ``of`` of the states before reduced, in place, by whole turns that are taken from
-    the angles ``moved`` of the images too: their centres, and which cover their circle."""
-    centres, whole = [], []
-    for k, i in enumerate(of):
-        centre, covered = circle_centre(before[:, i])
-        turns = whole_turns(before[:, i] - centre)
-        before[:, i] -= turns
-        for j in moved[k :: len(of)]:
-            middle[:, j] -= turns
-        centres.append(centre)
-        whole += [i] if covered else []
-    return centres, whole
-
-
-def _turning(piece: Generated, triples: Triples) -> Generated | None:
-    """The piece, where a move that is longer by a turn only adds a turn to both momenta: a map of
-    angles that were measured modulo their period has momenta of this period too. Else None.
-
-    S is scaled so that it is a turn to the last digit; its mixed term is a mean of differences.
-    """
-    if not triples.wrapped:
-        return None
-    w, dim, turn = triples.ends[: len(triples)], triples.dim, 2 * np.pi
-    gradient, added = np.asarray(piece.family.gradient(piece.params, w)), []
-    for i in triples.angles:
-        further = w.copy()
-        further[:, dim + i] += turn
-        slope = np.asarray(piece.family.gradient(piece.params, further))
-        moved = triples.dt * (slope - gradient)
-        added.append(-moved[:, i])
-        moved[:, i] += turn
-        moved[:, dim + i] -= turn
-        if not np.abs(moved).max() < _TURNS:
-            return None
-    params = jax.tree.map(lambda leaf: leaf * (turn / np.mean(added)), piece.params)
-    return dataclasses.replace(piece, params=params)

@@ -333,22 +333,31 @@ class SymplecticMap:
 
     def estimate(self, recording) -> tuple[np.ndarray, np.ndarray]:
         """States z = (q, p) (runs, 2d) at each run's last time and their covariance (runs, 2d, 2d),
-        from the samples of the recording before it: `maps.estimates`. Raises InputError for a map
-        that was not learned from a recording, or where columns or samples are missing."""
+        from the samples of the recording before it: `maps.estimates`, `maps.position_estimates`.
+        Raises InputError for a map that was not learned from a recording, or where columns or
+        samples are missing."""
         from gfnn_jax.maps import (
             estimates,
-        )  # stands after this module: a shorthand for its function
+            position_estimates,
+            positions,
+        )  # stand after this module
 
-        return estimates.estimate(self, recording)
+        alone = positions.starts_from_positions(self)
+        return (position_estimates if alone else estimates).estimate(self, recording)
 
     def forecast(self, recording, times, inputs=None):
         """`maps.estimates.Forecast` of the positions at ``times`` (n,), the recording's clock, from
         the state at each run's end; ``inputs`` are a recording of those ahead, matched by run where
-        it has several. Raises InputError as `estimate` does, and for times before a run's end."""
+        it has several. Raises InputError as `estimate` does, for times before a run's end, and of a
+        map of positions alone for times between its steps."""
         from gfnn_jax.maps import (
             estimates,
-        )  # stands after this module: a shorthand for its function
+            position_estimates,
+            positions,
+        )  # stand after this module
 
+        if positions.starts_from_positions(self):
+            return position_estimates.forecast(self, recording, times)
         return estimates.forecast(self, recording, times, inputs)
 
     def linearise(self, z, inputs=None, args=None, *, t0=None):
@@ -441,9 +450,10 @@ class SymplecticMap:
         if key is None:
             raise ValueError("expected a key as well as samples, e.g. key=jax.random.key(0)")
         options = {"params": params, "t0": t0, "inputs": inputs, "save_every": save_every}
-        drawn, _ = map_.sample(key, samples).rollout(
-            np.atleast_2d(z0), num_steps, stop_outside=stop_outside, **options
-        )
+        maps, begun = map_.sample(key, samples), np.atleast_2d(z0)
+        if positions is not None:  # each with the momentum of its own S
+            begun = np.stack([np.atleast_2d(one.from_positions(*positions)) for one in maps])
+        drawn, _ = maps.rollout(begun, num_steps, stop_outside=stop_outside, **options)
         found = bands(drawn, states if z0.ndim == 2 else states[None], self.angles_of_z)
         if z0.ndim == 1:
             found = Bands(found.std[0], found.quantiles[:, 0])

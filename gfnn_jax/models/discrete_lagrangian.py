@@ -31,11 +31,20 @@ _DIFFERENCE = 1e-4  # of a displacement, by which mixed derivatives of terms are
 
 class Solved(NamedTuple):
     """The coefficients of S (m,), how many of their combinations the data tell, and the condition
-    number of these."""
+    number of these.
+
+    All S of this mixed term that the data can tell apart are ``free`` (m,), free motion, plus
+    combinations of the columns of ``told`` (m, n), which are orthonormal. root: (n, m), rootᵀ root
+    the covariance of the coefficients where what is left of the equations, in units of
+    displacements, has standard deviation 1.
+    """
 
     coefficients: np.ndarray
     rank: int
     condition: float
+    free: np.ndarray
+    told: np.ndarray
+    root: np.ndarray
 
 
 def equations(family: Any, triples: Triples, size: np.ndarray) -> np.ndarray:
@@ -65,7 +74,10 @@ def solve(family: Any, triples: Triples) -> Solved:
     told = values > _NULL * values[0]
     along = u[:, told].T @ (triangle @ free)
     coefficients = free - others @ (v[told].T @ (along / values[told]))
-    return Solved(coefficients, 1 + int(told.sum()), float(values[0] / values[told][-1]))
+    condition = float(values[0] / values[told][-1])
+    directions = others @ v[told].T
+    root = (directions / values[told]).T
+    return Solved(coefficients, 1 + int(told.sum()), condition, free, directions, root)
 
 
 def residuals(family: Any, params: Any, triples: Triples) -> np.ndarray:

@@ -11,6 +11,7 @@ from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import FitError
 
 _EVEN = 0.01  # of a time step, by which times may miss an even grid
+_HALF_TURN = np.pi  # moves of two lifts differ by whole turns
 _ONE_TURN = 2 * np.pi * (1 + 1e-3)  # a column that ranges over more is a lift
 
 
@@ -45,6 +46,18 @@ class Triples:
         """Triples of these rows."""
         names = ("before", "middle", "after", "run", "place")
         return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+    def stretches(self) -> list[np.ndarray]:
+        """Positions (n + 2, d) of every n triples in a row: those of one run whose moves go on from
+        one to the next, each read once."""
+        goes_on = (np.diff(self.run) == 0) & (np.diff(self.place) == 1)
+        coming, going = np.split(self.moves, 2)
+        goes_on &= np.abs(coming[1:] - going[:-1]).max(axis=1, initial=0.0) < _HALF_TURN
+        found = []
+        for rows in np.split(np.arange(len(self)), 1 + np.flatnonzero(~goes_on)):
+            moves = np.concatenate([coming[rows[:1]], going[rows]])
+            found.append(np.cumsum(np.concatenate([self.before[rows[:1]], moves]), axis=0))
+        return found
 
     @property
     def moves(self) -> np.ndarray:

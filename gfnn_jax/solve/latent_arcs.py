@@ -209,6 +209,16 @@ def eliminated_rows(
     return (across.swapaxes(1, 2) @ J[..., m:]).reshape(-1, J.shape[-1] - m)
 
 
+def last_by_coefficients(
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
+) -> np.ndarray:
+    """Derivative (A, m, n) in p of the last state of each arc that was fitted to y with p fixed."""
+    rows, m = _reduced(_evaluated(model, p, x, y, sigma), sigma), x.shape[-1]
+    first = np.linalg.solve(rows.arcs[:, :, :m], -rows.arcs[:, :, m:-1])
+    last = rows.sensitivities[:, -1]
+    return last[..., :m] @ first + last[..., m:-1]
+
+
 def rows_of_arcs(
     model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
 ) -> np.ndarray:

@@ -1,0 +1,203 @@
+"""Maps between the monitors of a ring, of which two or more lie to either side of a known stretch.
+
+One monitor tells positions, and p only but for a factor and a gauge. Across a stretch whose map is
+known and linear, a drift or lenses,
+
+    Q = A q + B p,   P = C q + D p,
+
+two monitors tell p = B⁻¹ (Q − A q) and P, in their own unit: slopes in metres per metre across a
+drift. Every other stretch, from one place to the next, is then learned from canonical pairs, and
+the maps of all places in a row are that of a turn.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.learn.fit import Fit, fit
+from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.phase_space import Pairs, sizes, symplectic_form
+
+_SYMPLECTIC = 1e-9  # ‖MᵀJM − J‖ of a stretch that is known
+_SEEN = 1e-8  # smallest singular value of B, ÷ its largest, that tells momenta
+_EVEN = 0.01  # of a turn, by which times may miss an even grid
+
+
+@dataclasses.dataclass(frozen=True)
+class Monitors:
+    """Maps from each place to the next, the last one to the first place of the next turn.
+
+    places: the columns of each monitor, d each. maps: one for each stretch, in the order of the
+    places. fits: how each was learned; None where it was known.
+    """
+
+    places: tuple[tuple[str, ...], ...]
+    maps: tuple[SymplecticMap, ...]
+    fits: tuple[Fit | None, ...]
+    _known: tuple[np.ndarray | None, ...] = dataclasses.field(repr=False)
+
+    def turn(self, place: int = 0) -> SymplecticMap:
+        """The map of a turn that begins at a place, by its number: all maps in a row."""
+        row = [*self.maps[place:], *self.maps[:place]]
+        return reduce(SymplecticMap.then, row)
+
+    def states(self, recording: Recording, place: int = 0) -> dict[str, np.ndarray]:
+        """z = (q, p) (turns, 2d) at a place, by the names of the runs, from both monitors of a
+        known stretch; NaN where a reading is missing. Turns whose momenta would need readings of
+        the turn before the first, or after the last, are NaN too."""
+        found = {}
+        for run in recording.runs:
+            q = [_readings(recording, names, run) for names in self.places]
+            found[run] = _states(q, self._known)[place]
+        return found
+
+
+def fit_monitors(
+    recording: Recording,
+    places: Sequence[Sequence[str]],
+    between: Sequence[float | np.ndarray | None],
+    **options: Any,
+) -> Monitors:
+    """Learn the maps between monitors, some of which have a known stretch between them.
+
+    recording: readings turn by turn, a row a turn, a column for each monitor and coordinate.
+    places: the columns of each monitor along a turn, such as [("x1", "y1"), ("x2", "y2")].
+    between: of each place to the next, and of the last to the first: the length of a drift, a
+    symplectic matrix (2d, 2d) in (q, p), or None where the stretch is to be learned. options: of
+    `gfnn.fit`, for each stretch that is learned.
+
+    Raises InputError where places and stretches do not fit together, no stretch or all are known, a
+    known one tells no momenta, or a place lies at none: its momenta are not known then.
+    """
+    places = tuple(tuple(names) for names in places)
+    if len({len(names) for names in places}) != 1 or len(places) < 2:
+        raise InputError(f"expected two places or more, of as many columns each, got {places}")
+    missing = [n for names in places for n in names if n not in recording.columns]
+    if missing:
+        raise InputError(f"{recording.source}: expected columns {', '.join(missing)}")
+    if set(recording.angles) & {n for names in places for n in names}:
+        raise InputError("expected displacements at monitors, got angles")
+    if len(between) != len(places):
+        raise InputError(
+            f"expected {len(places)} stretches between {len(places)} places of a ring, got "
+            f"{len(between)}"
+        )
+    known = tuple(_matrix(stretch, len(places[0])) for stretch in between)
+    if all(m is None for m in known) or all(m is not None for m in known):
+        raise InputError("expected some stretches that are known, and some that are not")
+    lost = [k for k in range(len(places)) if known[k] is None and known[k - 1] is None]
+    if lost:
+        raise InputError(
+            f"place {', '.join(str(k + 1) for k in lost)} lies at no known stretch, so that its "
+            "momenta are not known: leave it out"
+        )
+    runs = [[_readings(recording, names, run) for names in places] for run in recording.runs]
+    states = [_states(q, known) for q in runs]
+    dt = _turn_of(recording) / len(places)
+    fits: list[Fit | None] = []
+    maps: list[SymplecticMap | None] = []
+    for k, matrix in enumerate(known):
+        one = None if matrix is not None else fit(_pairs(states, k, dt), learn="map", **options)
+        fits.append(one)
+        maps.append(None if one is None else one.map)
+    like = next(m for m in maps if m is not None)
+    whole = [
+        map_ if map_ is not None else _linear(matrix, _pairs(states, k, dt), like)
+        for k, (map_, matrix) in enumerate(zip(maps, known, strict=True))
+    ]
+    return Monitors(places, tuple(whole), tuple(fits), known)
+
+
+def _matrix(stretch: float | np.ndarray | None, dim: int) -> np.ndarray | None:
+    """(2d, 2d) of a known stretch. Raises InputError where it is not symplectic or tells no p."""
+    if stretch is None:
+        return None
+    if np.ndim(stretch) == 0:
+        matrix = np.eye(2 * dim)
+        matrix[:dim, dim:] = float(stretch) * np.eye(dim)
+    else:
+        matrix = np.asarray(stretch, float)
+    if matrix.shape != (2 * dim, 2 * dim) or not np.isfinite(matrix).all():
+        raise InputError(
+            f"expected the length of a drift or a matrix of shape {(2 * dim, 2 * dim)}, got "
+            f"{np.shape(stretch)}"
+        )
+    form = symplectic_form(dim)
+    defect = np.abs(matrix.T @ form @ matrix - form).max()
+    if not defect < _SYMPLECTIC * max(1.0, np.abs(matrix).max() ** 2):
+        raise InputError(f"expected a symplectic matrix, got one of defect {defect:.2g}")
+    values = np.linalg.svd(matrix[:dim, dim:], compute_uv=False)
+    if not values[-1] > _SEEN * max(values[0], 1e-300):
+        raise InputError("a known stretch maps no momenta to positions: it does not tell them")
+    return matrix
+
+
+def _readings(recording: Recording, names: tuple[str, ...], run: str) -> np.ndarray:
+    """(turns, d) of a monitor."""
+    return np.stack([recording.values(name, run) for name in names], axis=1)
+
+
+def _states(q: list[np.ndarray], known: tuple[np.ndarray | None, ...]) -> list[np.ndarray]:
+    """z (turns, 2d) at each place of a run, of the readings (turns, d) at all of them."""
+    found = [np.full((len(one), 2 * one.shape[1]), np.nan) for one in q]
+    for k, matrix in enumerate(known):
+        if matrix is None:
+            continue
+        first, second = _ends(q, k)
+        dim = first.shape[1]
+        across = np.linalg.solve(matrix[:dim, dim:], (second - first @ matrix[:dim, :dim].T).T).T
+        z = np.concatenate([first, across], axis=1)
+        places = _ends(found, k)
+        places[0][:], places[1][:] = z, z @ matrix.T
+    return found
+
+
+def _ends(rows: list[np.ndarray], k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of values (turns, n) at each place those at the ends of stretch k, turn by turn: the last
+    stretch ends at the first place one turn later."""
+    last = k + 1 == len(rows)
+    return (rows[k][:-1], rows[0][1:]) if last else (rows[k], rows[k + 1])
+
+
+def _pairs(states: list[list[np.ndarray]], k: int, dt: float) -> Pairs:
+    """The states of all runs at the ends of stretch k."""
+    ends = [_ends(of_run, k) for of_run in states]
+    known = [np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1) for a, b in ends]
+    z0, z1 = (
+        np.concatenate([e[side][rows] for e, rows in zip(ends, known, strict=True)])
+        for side in (0, 1)
+    )
+    if not len(z0):
+        raise FitError("expected turns with readings of all monitors, found none")
+    run = np.repeat(np.arange(len(ends)), [rows.sum() for rows in known])
+    place = np.concatenate([np.flatnonzero(rows) for rows in known])
+    return Pairs(z0, z1, dt, run=run, place=place)
+
+
+def _linear(matrix: np.ndarray | None, pairs: Pairs, like: SymplecticMap) -> SymplecticMap:
+    """The map of a known stretch, in the coordinates of a learned one."""
+    assert matrix is not None
+    none = np.zeros(len(matrix))
+    return SymplecticMap(
+        pieces=(Affine(matrix, none, none),), coordinates=like.coordinates,
+        domain=covering(pairs.z0), scale=sizes(pairs.z0), angle_centre=np.zeros(0), dt=pairs.dt,
+    )  # fmt: skip
+
+
+def _turn_of(recording: Recording) -> float:
+    """The time of a turn. Raises InputError where turns are missing."""
+    steps = [np.diff(recording.times(run)) for run in recording.runs]
+    whole = np.concatenate(steps)
+    turn = float(np.median(whole)) if len(whole) else 1.0
+    if len(whole) and np.abs(whole - turn).max() > _EVEN * turn:
+        raise InputError(f"{recording.source}: expected a row for every turn, {turn:g} s apart")
+    return turn

@@ -1,0 +1,141 @@
+"""A map of positions and its readings: states estimated from noisy ones, and forecasts with bands.
+
+The readings before a time are fitted by one orbit of S(q, Q), its positions latent; that gives the
+last two with their covariance. A forecast is the rollout from them. Its band holds their error,
+that of the coefficients of S, by which the estimate and the rollout err together, and the noise of
+a reading; all to first order.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.errors import InputError
+from gfnn_jax.generating.position_arcs import PositionArcs, nodes_of
+from gfnn_jax.maps.estimates import Forecast
+from gfnn_jax.solve.latent_arcs import fit_arcs, last_by_coefficients
+
+_EVEN = 0.01  # of a time step, by which times may miss an even grid
+
+
+class _Ends(NamedTuple):
+    """The last two positions (B, 2d) of every run, a root (B, 2d, 2d) of their covariance with S as
+    it is, and how far each direction of the posterior of S, a row of its root, moves them (B, 2d,
+    k)."""
+
+    positions: np.ndarray
+    root: np.ndarray
+    by_posterior: np.ndarray
+
+    @property
+    def spread(self) -> np.ndarray:
+        """(B, 2d, 2d + k), of which spread spreadᵀ is the covariance."""
+        return np.concatenate([self.root, self.by_posterior], axis=2)
+
+
+def estimate(map_: Any, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """`SymplecticMap.estimate`, of a map that was learned from positions alone."""
+    piece = jax.tree.map(np.asarray, map_.pieces[0])
+    ends = _ends(map_, piece, recording)
+    return _states(piece, ends)
+
+
+def forecast(map_: Any, recording: Recording, times: Any) -> Forecast:
+    """`SymplecticMap.forecast`, of a map that was learned from positions alone."""
+    piece, sensors, dim = jax.tree.map(np.asarray, map_.pieces[0]), map_.sensors, map_.dim
+    times, dt = np.atleast_1d(np.asarray(times, float)), float(piece.dt)
+    last = np.array([np.max(recording.times(run)) for run in recording.runs])
+    ahead = (times - last[:, None]) / dt
+    steps = np.round(ahead).astype(int)
+    if times.ndim != 1 or not (steps > 0).all() or not np.abs(ahead - steps).max() < _EVEN:
+        raise InputError(
+            f"expected times that are whole steps of {dt:g} s after the end of each run "
+            f"({last.max():g} s), got {times.ravel()[0]:g} to {times.ravel()[-1]:g} s"
+        )
+    ends = _ends(map_, piece, recording)
+    orbits = np.asarray(map_.rollout(_states(piece, ends)[0], int(steps.max()))[0])[..., :dim]
+    before = ends.positions[:, None, :dim] + orbits[:, :1] - ends.positions[:, None, dim:]
+    nodes = nodes_of(np.concatenate([before, orbits], axis=1))[0]
+    arcs, spread = _arcs(map_, piece), ends.spread
+    moved = arcs.steps(np.zeros(arcs.basis.shape[1]), nodes)
+    deviations = np.empty((len(spread), 1 + steps.max(), dim))
+    for k in range(steps.max() + 1):
+        deviations[:, k] = np.sqrt(np.sum(spread[:, dim:] ** 2, axis=2) + sensors.sigma**2)
+        if k < steps.max():
+            spread = moved.by_state[:, k] @ spread
+            spread[..., 2 * dim :] += moved.by_coefficients[:, k]
+    rows = np.arange(len(steps))[:, None]
+    values, std = orbits[rows, steps], deviations[rows, steps]
+    return Forecast(
+        times,
+        {name: values[..., i] for i, name in enumerate(sensors.positions)},
+        {name: std[..., i] for i, name in enumerate(sensors.positions)},
+    )
+
+
+def _states(piece: Any, ends: _Ends) -> tuple[np.ndarray, np.ndarray]:
+    """z = (q, p) (B, 2d) at the last positions, p = h ∂S/∂Q, and its covariance."""
+    dim, w = ends.positions.shape[1] // 2, ends.positions
+    gradient, hessian = piece.family.gradient_and_hessian(piece.params, w)
+    turn = np.concatenate([np.zeros((len(w), dim, 2 * dim)), piece.dt * hessian[:, dim:]], axis=1)
+    turn[:, range(dim), range(dim, 2 * dim)] = 1.0
+    z = np.concatenate([w[:, dim:], piece.dt * gradient[:, dim:]], axis=1)
+    spread = turn @ ends.spread
+    return z, spread @ spread.swapaxes(1, 2)
+
+
+def _arcs(map_: Any, piece: Any) -> PositionArcs:
+    """S along arcs, beside it the directions of its posterior."""
+    terms = piece.family.num_parameters
+    root = np.zeros((0, terms)) if map_.posterior is None else np.asarray(map_.posterior.root)
+    return PositionArcs(piece.family, float(piece.dt), piece.params, root.T)
+
+
+def _ends(map_: Any, piece: Any, recording: Recording) -> _Ends:
+    """By an orbit of S through the last readings of every run."""
+    sensors, dim = map_.sensors, map_.dim
+    if sensors is None:
+        raise InputError("expected a map that knows its sensors: one that this release has learned")
+    windows = [_window(map_, piece, recording, run) for run in recording.runs]
+    arcs, sigma = _arcs(map_, piece), np.tile(sensors.sigma, 2)
+    known = dataclasses.replace(arcs, basis=arcs.basis[:, :0])
+    directions, num = arcs.basis.shape[1], len(windows)
+    positions, root = np.empty((num, 2 * dim)), np.empty((num, 2 * dim, 2 * dim))
+    by_posterior = np.empty((num, 2 * dim, directions))
+    lengths = np.array([len(window) for window in windows])
+    for length in np.unique(lengths):
+        rows = np.flatnonzero(lengths == length)
+        x, y = nodes_of(np.array([windows[row] for row in rows]))
+        found = fit_arcs(known, np.zeros(0), x, y, sigma, sigma)
+        positions[rows] = found.x[:, -1]
+        root[rows] = found.transports @ np.linalg.pinv(found.arcs)
+        by_posterior[rows] = last_by_coefficients(arcs, np.zeros(directions), found.x, y, sigma)
+    return _Ends(positions, root, by_posterior)
+
+
+def _window(map_: Any, piece: Any, recording: Recording, run: str) -> np.ndarray:
+    """The last readings (n, d) of a run without a gap, angles as the map lifts moves."""
+    sensors, dt = map_.sensors, float(piece.dt)
+    missing = [name for name in sensors.positions if name not in recording.columns]
+    if missing:
+        raise InputError(f"{recording.source}: expected columns {', '.join(missing)}")
+    q = np.stack([recording.values(name, run) for name in sensors.positions], axis=1)
+    times = recording.times(run)
+    apart = ~np.isfinite(q[1:] + q[:-1]).all(axis=1)
+    apart |= np.abs(np.diff(times) - dt) > _EVEN * dt
+    first = 1 + int(np.flatnonzero(apart)[-1]) if apart.any() else 0
+    first = max(first, int(np.searchsorted(times, times[-1] - sensors.window)))
+    q = q[first:]
+    if len(q) < 2 or not np.isfinite(q).all():
+        raise InputError(
+            f"{recording.source}: run {run}: expected at least two positions {dt:g} s apart at its "
+            "end"
+        )
+    for k in range(1, len(q)):
+        q[k] = piece.family.lifted(q[k - 1], q[k])
+    return q
