@@ -1,0 +1,265 @@
+"""The search for a law of physics behind pairs, told nothing: H of few atoms.
+
+The gradient of H is known at the midpoints of the pairs to second order in dt: −J(z₁ − z₀)/h. Atoms
+are matched to it (`models.matching`) within a second; a law so found is put through its flow, and
+what that misses of z₁ corrects the gradients: ∇H ← ∇H_law − J(z₁ − Φ_law(z₀))/h (deferred
+correction). Of a law that is the right one, coefficients and constants converge to roundoff, by a
+factor of about (ωh)² a time; others stall. That is how the right one is told from the others, and
+the corrected gradients of the law that came closest are what the next round of matching is given.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.errors import InputError
+from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
+from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.flows.collocation import Steps, of_lanes
+from gfnn_jax.models.arguments import Argument, arguments_of
+from gfnn_jax.models.atoms import (
+    Atom,
+    atom_text,
+    blocks_of,
+    dictionary_of,
+    powers_of,
+    weight_of,
+)
+from gfnn_jax.models.matching import Match, Matching
+from gfnn_jax.phase_space import apply_j
+
+_STEPS = Steps(6, 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Tuned on the laws of benchmarks/textbook.py.
+
+    rows: pairs that are looked at; quiet: the part of them that move least, which is used: their
+    midpoints say more. degree: of products of coordinates, by rising dimension from 1. atoms: of a
+    law, beside the coordinates and products of two. rounds: of matching. finalists: matches that go
+    through their flow. corrections: of gradients, at most; contracted: by which each must lower
+    what is left over. roundoff: of the coordinates' sizes; a law that leaves no more is exact.
+    lost: part of the pairs whose flow may fail. most_dim: beyond which the dictionary is too large.
+    """
+
+    rows: int = 260
+    quiet: float = 0.6
+    degrees: tuple[int, ...] = (6, 4, 4)
+    atoms: int = 5
+    rounds: int = 4
+    finalists: int = 6
+    corrections: int = 30
+    contracted: float = 0.6
+    roundoff: float = 1e-11
+    lost: float = 0.1
+    most_dim: int = 4
+
+
+OPTIONS = Options()
+
+
+class Law(NamedTuple):
+    """A family of terms of H, their coefficients, and the RMS of Φ(z₀) − z₁ ÷ scale."""
+
+    family: Terms
+    coefficients: np.ndarray
+    left: float
+
+
+class _State(NamedTuple):
+    """A match, its law, and the gradients that are as accurate as that law."""
+
+    match: Match
+    law: Law
+    target: np.ndarray
+
+
+def textbook_law(
+    problem: Problem, rows: np.ndarray, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
+    noise: float = 0.0, options: Options = OPTIONS, say: Callable[[str], Any] = lambda message: None,
+) -> Law | None:  # fmt: skip
+    """The simplest law whose flow takes z₀ to z₁, or None where none is found.
+
+    rows: of the problem's pairs, which have no args. angles, cyclic: indices of z. noise: RMS of
+    the noise of Φ(z₀) − z₁ ÷ scale, 0 of clean pairs.
+    """
+    if problem.z0.shape[1] > 2 * options.most_dim:
+        return None
+    search = _Search(problem, rows, tuple(angles), tuple(cyclic), noise, options, say)
+    with np.errstate(all="ignore"):
+        for products in (False, True):
+            found = search.found(products)
+            if found is not None:
+                return search.simplified(found).law
+    return None
+
+
+class _Search:
+    def __init__(self, problem, rows, angles, cyclic, noise, options: Options, say):
+        self._problem, self._options, self._say = problem, options, say
+        rows = np.asarray(rows[: options.rows])
+        moved = np.linalg.norm((problem.z1 - problem.z0)[rows] / problem.scale, axis=1)
+        self._rows = np.sort(rows[np.argsort(moved)[: int(np.ceil(options.quiet * len(rows)))]])
+        z0, z1 = problem.z0[self._rows], problem.z1[self._rows]
+        dt = of_lanes(problem.dt, self._rows)
+        self._h = dt[:, None] if np.ndim(dt) else dt
+        self._dim = z0.shape[1] // 2
+        self._z0, self._z1, self._middle = z0, z1, 0.5 * (z0 + z1)
+        self._weight = 1.0 / np.roll(problem.scale, self._dim)
+        self._arguments = arguments_of(self._middle, angles, cyclic)
+        self._base = polynomial_terms(self._dim, 2, cyclic=(*angles, *cyclic))
+        columns = self._base.term_gradients(self._middle) * self._weight[:, None]
+        self._columns = columns.reshape(-1, columns.shape[-1])
+        self._target = -apply_j(z1 - z0) / self._h
+        self._exact = max(options.roundoff, 1.2 * noise)
+
+    @property
+    def _degree(self) -> int:
+        degrees = self._options.degrees
+        return degrees[self._dim - 1] if self._dim <= len(degrees) else 3
+
+    def _matching(self, target: np.ndarray) -> Matching:
+        flat = (target * self._weight).ravel()
+        return Matching(self._columns, flat, self._weight, self._arguments)
+
+    def found(self, products: bool) -> _State | None:
+        """The simplest law that is exact, of a dictionary with products or without."""
+        options = self._options
+        dictionary = dictionary_of(
+            self._arguments, self._weight, degree=self._degree, products=products
+        )
+        self._say(f"H: {len(dictionary.atoms)} atoms of laws of physics")
+        blocks = [] if products else blocks_of(self._arguments, self._degree)
+        rows = self._middle.size
+        blocks = [b for b in blocks if 1.6 * (len(b) + self._columns.shape[1]) < rows]
+        target, last = self._target, np.inf
+        for _ in range(options.rounds):
+            matching = self._matching(target)
+            tried = matching.best(dictionary, options.atoms)[: options.finalists]
+            whole = sorted((matching.refined(b) for b in blocks), key=lambda m: m.left)
+            tried += [m for m in whole if m.left < 10 * tried[0].left][:2]
+            states = [s for m in tried for s in [self._converged(m, target)] if s is not None]
+            exact = [s for s in states if s.law.left <= self._exact]
+            if exact:
+                return min(exact, key=lambda s: weight_of(s.match.atoms))
+            if not states:
+                return None
+            best = min(states, key=lambda s: s.law.left)
+            if not best.law.left < options.contracted * last:
+                return None
+            target, last = best.target, best.law.left
+        return None
+
+    def _converged(self, match: Match, target: np.ndarray) -> _State | None:
+        """The match with coefficients and constants as far as corrections lead; None where its
+        flow fails."""
+        best, options = None, self._options
+        for _ in range(options.corrections):
+            law, corrected = self._corrected(match, target)
+            if law is None:
+                return best
+            if best is not None and not law.left < options.contracted * best.law.left:
+                return best if best.law.left <= law.left else _State(match, law, corrected)
+            best, target = _State(match, law, corrected), corrected
+            match = self._matching(target).refined(match.atoms)
+        return best
+
+    def _corrected(self, match: Match, target: np.ndarray) -> tuple[Law | None, np.ndarray]:
+        """The law of these atoms with the coefficients that the gradients ask for, and the
+        gradients as its flow corrects them."""
+        try:
+            family = self._family(match.atoms)
+        except InputError:  # a constant that has run away
+            return None, target
+        columns = family.term_gradients(self._middle) * self._weight[:, None]
+        columns = columns.reshape(-1, columns.shape[-1])
+        size = np.linalg.norm(columns, axis=0)
+        if not np.isfinite(size).all():
+            return None, target
+        size = np.where(size > 0, size, 1.0)
+        flat = (target * self._weight).ravel()
+        c = np.linalg.lstsq(columns / size, flat, rcond=1e-13)[0] / size
+        images = self._problem.images(family, c, self._rows, _STEPS).states
+        off = (images - self._z1) / self._problem.scale
+        known = np.isfinite(off).all(axis=1)
+        if np.mean(~known) > self._options.lost:
+            return None, target
+        corrected = family.gradient(c, self._middle) - apply_j(self._z1 - images) / self._h
+        corrected = np.where(known[:, None], corrected, target)
+        return Law(family, c, float(np.sqrt(np.mean(off[known] ** 2)))), corrected
+
+    def _family(self, atoms: Sequence[Atom]) -> Terms:
+        """Terms of the coordinates, products of two, and these atoms."""
+        width = 2 * self._dim
+        rows, texts = [], []
+        for atom in atoms:
+            row = powers_of(atom, self._arguments, width)
+            if row is None:
+                texts.append(atom_text(atom, self._arguments))
+            else:
+                rows.append(row)
+        family = self._base
+        if rows:
+            names = polynomial_terms(self._dim, 1).variables
+            family = joined(family, Terms(self._dim, names, tuple(dict.fromkeys(rows))))
+        return joined(family, given_terms(self._dim, texts)) if texts else family
+
+    # Simpler ways to say the same
+
+    def simplified(self, state: _State) -> _State:
+        """The simplest law that is as exact: other atoms that match the corrected gradients, fewer
+        of them, constants of fewer digits."""
+        dictionary = dictionary_of(
+            self._arguments, self._weight, degree=self._degree, products=False
+        )
+        matching = self._matching(state.target)
+        bound = max(self._exact, 3 * state.law.left)
+        options = [
+            m for m in matching.best(dictionary, min(3, len(state.match.atoms)))
+            if m.left <= 1e3 * max(state.match.left, 1e-14)
+        ]  # fmt: skip
+        for match in sorted(options, key=lambda m: weight_of(m.atoms)):
+            if weight_of(match.atoms) >= weight_of(state.match.atoms):
+                break
+            found = self._converged(match, state.target)
+            if found is not None and found.law.left <= bound:
+                state = found
+                break
+        state = self._fewer(state, bound)
+        return self._rounded(state, bound)
+
+    def _fewer(self, state: _State, bound: float) -> _State:
+        """Without the atoms that are not needed."""
+        for atom in sorted(state.match.atoms, key=lambda a: -weight_of((a,))):
+            atoms = tuple(a for a in state.match.atoms if a != atom)
+            matching = self._matching(state.target)
+            if matching.left_over(atoms) > 1e3 * max(state.match.left, 1e-14):
+                continue
+            found = self._converged(matching.refined(atoms), state.target)
+            if found is not None and found.law.left <= bound:
+                state = found
+        return state
+
+    def _rounded(self, state: _State, bound: float) -> _State:
+        """With each constant of as few digits as leave the law as exact."""
+        for i, atom in enumerate(state.match.atoms):
+            for k, factor in enumerate(atom):
+                if factor.theta is None:
+                    continue
+                for digits in range(1, 13):
+                    theta = float(f"{factor.theta:.{digits}g}")
+                    if abs(theta - factor.theta) > 1e-8 * abs(factor.theta):
+                        continue
+                    atoms = [list(a) for a in state.match.atoms]
+                    atoms[i][k] = dataclasses.replace(factor, theta=theta)
+                    match = Match(tuple(map(tuple, atoms)), state.match.left)
+                    law, corrected = self._corrected(match, state.target)
+                    if law is not None and law.left <= max(bound / 3, 2 * state.law.left):
+                        state = _State(match, law, corrected)
+                        break
+        return state
