@@ -92,6 +92,18 @@ class Law:
             found.append(solved.y[:, -1].reshape(part.shape))
         return np.concatenate(found)
 
+    def followed(self, z, num_steps: int) -> np.ndarray:
+        """The states (n, 2d) after so many steps of a law without a drive, one by one."""
+        span = (0.0, num_steps * self.dt)
+        solved = [
+            solve_ivp(
+                lambda t, y: apply_j(self.gradient(y[None]))[0], span, y0, "DOP853",
+                rtol=_PRECISE, atol=_PRECISE,
+            )
+            for y0 in z
+        ]  # fmt: skip
+        return np.stack([s.y[:, -1] for s in solved])
+
     def pairs(self, count: int, seed: int) -> gfnn.Pairs:
         """Pairs drawn with this seed."""
         rng = np.random.default_rng(seed)

@@ -54,6 +54,7 @@ from gfnn_jax.learn.learned_law import (
 )
 from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
 from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.learn.textbook import law_of_physics
 from gfnn_jax.learn.whole_sequences import fitted_to_sequences
 
 _ROUNDOFF = 1e-12  # of the spread: above it the pairs carry noise, and every one of them counts
@@ -108,10 +109,11 @@ def learn_hamiltonian(
     else:  # a state of many sites is in the middle and far out at once
         outer = np.zeros(len(judges.training), bool)
     judges = dataclasses.replace(everywhere, training=everywhere.training[~outer])
-    with_masses = None
+    with_masses, best = None, None
     if not terms and scene is None:
-        with_masses = mechanical(problem, work, prepared, judges)
-    best = with_masses
+        best = law_of_physics(problem, work, prepared, judges, say)
+        if best is None:
+            best = with_masses = mechanical(problem, work, prepared, judges)
     if best is None or not best.error.bound <= judges.tolerance.bound:
         try:
             best, options = _of_libraries(

@@ -27,6 +27,8 @@ from gfnn_jax.models.shapes import (
 
 _STEP = 1e-30  # of a complex step
 _COARSE = 3  # of the constants tried of one factor, those of a product
+_SMALL = 4  # coordinates 2d; beyond them products have no constants: they are too many
+_INDEPENDENT = 1e-6  # of a column's length, that the base does not span
 _MOST_MONOMIALS = 500  # of the dictionary
 
 
@@ -89,7 +91,8 @@ def weight_of(atoms: Sequence[Atom]) -> float:
 
 
 class Dictionary(NamedTuple):
-    """Atoms and their gradients, weighted by coordinate, as columns of unit length (rows, atoms)."""
+    """Atoms and their gradients, weighted by coordinate, without what a base spans of them, as
+    columns of unit length (rows, atoms)."""
 
     atoms: list[Atom]
     columns: np.ndarray
@@ -104,9 +107,11 @@ class _Singles(NamedTuple):
 
 
 def dictionary_of(
-    arguments: Sequence[Argument], weight: np.ndarray, *, degree: int, products: bool
-) -> Dictionary:
-    """The atoms that are tried. weight (2d,): by which gradients are multiplied.
+    arguments: Sequence[Argument], weight: np.ndarray, base: np.ndarray, *, degree: int,
+    products: bool,
+) -> Dictionary:  # fmt: skip
+    """The atoms that are tried. weight (2d,): by which gradients are multiplied. base: orthonormal
+    columns (rows, n), beside which atoms are looked for.
 
     Shapes of one argument, and products of coordinates from the third to this degree, without the
     coordinates and products of two, which are in every law. products: of a coordinate, a product
@@ -123,7 +128,8 @@ def dictionary_of(
         atoms += mixed
         gradients += [gradient_of(atom, arguments)[None] for atom in mixed]
         if products:
-            coarse = [_singles(p, argument, _COARSE) for p, argument in enumerate(arguments)]
+            every = _COARSE if len(weight) <= _SMALL else None
+            coarse = [_singles(p, argument, every) for p, argument in enumerate(arguments)]
             for multiplier in _multipliers(arguments):
                 used = {index for f in multiplier for index in _entering(arguments[f.place])}
                 value, gradient = _value_of(multiplier, arguments), gradient_of(multiplier, arguments)
@@ -136,7 +142,12 @@ def dictionary_of(
         rows = (np.concatenate(gradients) * weight).reshape(len(atoms), -1)
         size = np.linalg.norm(rows, axis=1)
     kept = np.flatnonzero(np.isfinite(size) & (size > 0))
-    return Dictionary([atoms[i] for i in kept], (rows[kept] / size[kept, None]).T.copy())
+    columns = (rows[kept] / size[kept, None]).T
+    for _ in range(2):  # the second time makes them orthogonal to roundoff
+        columns = columns - base @ (base.T @ columns)
+    size = np.linalg.norm(columns, axis=0)
+    told = np.flatnonzero(size > _INDEPENDENT)
+    return Dictionary([atoms[kept[i]] for i in told], columns[:, told] / size[told])
 
 
 def blocks_of(arguments: Sequence[Argument], degree: int) -> list[tuple[Atom, ...]]:
@@ -158,13 +169,16 @@ def blocks_of(arguments: Sequence[Argument], degree: int) -> list[tuple[Atom, ..
     return found
 
 
-def _singles(place: int, argument: Argument, every: int) -> _Singles:
-    """Shapes of the argument, with every so manieth of the constants that are tried."""
+def _singles(place: int, argument: Argument, every: int | None) -> _Singles:
+    """Shapes of the argument, with every so manieth of the constants that are tried; None: those
+    without constants."""
     x, factors, f, slopes = argument.value, [], [], []
     kinds = kinds_for(x, distance=bool(argument.square), circular=argument.circular)
     for kind in kinds:
         if argument.index >= 0 and kind in (("power", 1.0), ("power", 2.0)):
             continue  # these are in every law
+        if every is None and has_constant(kind):
+            continue
         thetas = constants_for(kind, x)[::every].tolist() if has_constant(kind) else [None]
         for theta in thetas:
             value, slope = values(kind, x, theta)

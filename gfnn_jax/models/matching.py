@@ -20,7 +20,8 @@ from gfnn_jax.models.atoms import Atom, Dictionary, gradient_of, weight_of
 _BEAM = 4  # states that go on
 _PAIRED = 160  # atoms, those that explain most, whose pairs are tried
 _BRANCHES = 4  # atoms, and pairs of them, that each state is continued by
-_INDEPENDENT = 1e-6  # of a column, that those before it do not span
+_INDEPENDENT = 1e-5  # of a column, that those before it do not span
+_HARDLY = 4.0  # times what a match leaves over, that a plainer one may leave
 _REFINEMENTS = 8  # Gauss–Newton steps of inner constants
 _FLOOR = 1e-13  # of what is left over: below it is roundoff
 _SAID = 0.5  # halvings of what is left over that a unit of complexity must bring
@@ -37,7 +38,7 @@ class Match:
 class Matching:
     """The search for atoms that, beside a base, have the gradient ``target`` (rows,).
 
-    base: (rows, terms) columns that are always there. weight: (2d,) by which gradients are
+    base: (rows, n) orthonormal columns that are always there. weight: (2d,) by which gradients are
     multiplied. arguments: at the states of the rows.
     """
 
@@ -45,7 +46,7 @@ class Matching:
         self, base: np.ndarray, target: np.ndarray, weight: np.ndarray, arguments: list[Argument]
     ):
         self.weight, self.arguments = weight, arguments
-        self.base, self.target = _orthonormal(base), target
+        self.base, self.target = base, target
         self.size = float(np.linalg.norm(target))
 
     def columns(self, atoms: Sequence[Atom]) -> np.ndarray:
@@ -73,6 +74,31 @@ class Matching:
             beam = sorted(grown.values(), key=cost)[:_BEAM]
             found.update({frozenset(m.atoms): m for m in beam})
         return sorted(found.values(), key=cost)
+
+    def plainer(self, match: Match, dictionary: Dictionary) -> Match:
+        """The match with each atom, in turn, in a plainer shape of the same argument, where that
+        leaves hardly more: what is left over is not yet that of the pairs."""
+        for i, atom in enumerate(match.atoms):
+            others = match.atoms[:i] + match.atoms[i + 1 :]
+            places = [f.place for f in atom]
+            said = weight_of((atom,))
+            own = [
+                j for j, a in enumerate(dictionary.atoms)
+                if [f.place for f in a] == places and weight_of((a,)) < said
+            ]  # fmt: skip
+            residual, basis, _ = self._residual(others)
+            if not own or not np.isfinite(residual).all():
+                continue
+            columns = dictionary.columns[:, own]
+            columns = columns - basis @ (basis.T @ columns)
+            size = np.linalg.norm(columns, axis=0)
+            part = np.where(size > _INDEPENDENT, residual @ columns, 0.0) / np.maximum(size, 1e-300)
+            first = _apart(np.argsort(-(part**2)), [dictionary.atoms[j] for j in own], _BRANCHES)
+            tried = [self.refined((*others, dictionary.atoms[own[k]])) for k in first]
+            best = min(tried, key=cost)
+            if best.left < _HARDLY * match.left:
+                match = best
+        return match
 
     def refined(self, atoms: tuple[Atom, ...]) -> Match:
         """The match with the inner constants that leave least."""
@@ -144,10 +170,11 @@ class Matching:
         residual, basis, _ = self._residual(match.atoms)
         if not np.isfinite(residual).all():
             return []
-        matrix = dictionary.columns - basis @ (basis.T @ dictionary.columns)
-        size = np.linalg.norm(matrix, axis=0)
+        own = basis[:, self.base.shape[1] :]  # the dictionary is without the base already
+        columns = dictionary.columns
+        size = np.sqrt(np.maximum(1 - np.sum((own.T @ columns) ** 2, axis=0), 0.0))
         independent = size > _INDEPENDENT
-        part = np.where(independent, residual @ matrix / np.where(independent, size, 1.0), 0.0)
+        part = np.where(independent, residual @ columns / np.where(independent, size, 1.0), 0.0)
         gain = part**2
         singles = _apart(np.argsort(-gain), dictionary.atoms, _BRANCHES)
         found: list[tuple[Atom, ...]] = [(dictionary.atoms[i],) for i in singles]
@@ -155,7 +182,7 @@ class Matching:
             return found
         top = np.argsort(-gain)[:_PAIRED]
         top = top[independent[top]]
-        unit = matrix[:, top] / size[top]
+        unit = (columns[:, top] - own @ (own.T @ columns[:, top])) / size[top]
         gram = unit.T @ unit
         a, b = part[top][:, None], part[top][None, :]
         free = 1 - gram**2
@@ -206,7 +233,7 @@ def _moved(atoms, inner: list[tuple[int, int]], step) -> tuple[Atom, ...]:
     return tuple(map(tuple, moved))
 
 
-def _orthonormal(columns: np.ndarray) -> np.ndarray:
+def orthonormal(columns: np.ndarray) -> np.ndarray:
     """A basis of what the columns span."""
     if not columns.shape[1]:
         return columns

@@ -11,7 +11,7 @@ the corrected gradients of the law that came closest are what the next round of 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,16 +23,20 @@ from gfnn_jax.flows.collocation import Steps, of_lanes
 from gfnn_jax.models.arguments import Argument, arguments_of
 from gfnn_jax.models.atoms import (
     Atom,
+    Dictionary,
     atom_text,
     blocks_of,
     dictionary_of,
     powers_of,
     weight_of,
 )
-from gfnn_jax.models.matching import Match, Matching
+from gfnn_jax.models.matching import Match, Matching, orthonormal
 from gfnn_jax.phase_space import apply_j
 
 _STEPS = Steps(6, 1)
+_ROUNDED = 1e-8  # of a constant, that may be rounded away where the law stays as exact
+_MATCHED = 1e-14  # of gradients: a match at roundoff
+_AS_WELL = 1e3  # times what a match leaves over: below it a simpler one is looked at
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +46,7 @@ class Options:
     rows: pairs that are looked at; quiet: the part of them that move least, which is used: their
     midpoints say more. degree: of products of coordinates, by rising dimension from 1. atoms: of a
     law, beside the coordinates and products of two. rounds: of matching. finalists: matches that go
-    through their flow. corrections: of gradients, at most; contracted: by which each must lower
+    through their flow; plainer: of them, that are tried in plainer shapes too. corrections: of gradients, at most; contracted: by which each must lower
     what is left over. roundoff: of the coordinates' sizes; a law that leaves no more is exact.
     lost: part of the pairs whose flow may fail. most_dim: beyond which the dictionary is too large.
     """
@@ -53,6 +57,7 @@ class Options:
     atoms: int = 5
     rounds: int = 4
     finalists: int = 6
+    plainer: int = 2
     corrections: int = 30
     contracted: float = 0.6
     roundoff: float = 1e-11
@@ -115,6 +120,7 @@ class _Search:
         self._base = polynomial_terms(self._dim, 2, cyclic=(*angles, *cyclic))
         columns = self._base.term_gradients(self._middle) * self._weight[:, None]
         self._columns = columns.reshape(-1, columns.shape[-1])
+        self._spanned = orthonormal(self._columns)
         self._target = -apply_j(z1 - z0) / self._h
         self._exact = max(options.roundoff, 1.2 * noise)
 
@@ -123,16 +129,19 @@ class _Search:
         degrees = self._options.degrees
         return degrees[self._dim - 1] if self._dim <= len(degrees) else 3
 
+    def _dictionary(self, products: bool) -> Dictionary:
+        return dictionary_of(
+            self._arguments, self._weight, self._spanned, degree=self._degree, products=products
+        )
+
     def _matching(self, target: np.ndarray) -> Matching:
         flat = (target * self._weight).ravel()
-        return Matching(self._columns, flat, self._weight, self._arguments)
+        return Matching(self._spanned, flat, self._weight, self._arguments)
 
     def found(self, products: bool) -> _State | None:
         """The simplest law that is exact, of a dictionary with products or without."""
         options = self._options
-        dictionary = dictionary_of(
-            self._arguments, self._weight, degree=self._degree, products=products
-        )
+        dictionary = self._dictionary(products)
         self._say(f"H: {len(dictionary.atoms)} atoms of laws of physics")
         blocks = [] if products else blocks_of(self._arguments, self._degree)
         rows = self._middle.size
@@ -141,6 +150,8 @@ class _Search:
         for _ in range(options.rounds):
             matching = self._matching(target)
             tried = matching.best(dictionary, options.atoms)[: options.finalists]
+            plainer = [matching.plainer(m, dictionary) for m in tried[: options.plainer]]
+            tried = list({m.atoms: m for m in [*plainer, *tried]}.values())
             whole = sorted((matching.refined(b) for b in blocks), key=lambda m: m.left)
             tried += [m for m in whole if m.left < 10 * tried[0].left][:2]
             states = [s for m in tried for s in [self._converged(m, target)] if s is not None]
@@ -214,14 +225,12 @@ class _Search:
     def simplified(self, state: _State) -> _State:
         """The simplest law that is as exact: other atoms that match the corrected gradients, fewer
         of them, constants of fewer digits."""
-        dictionary = dictionary_of(
-            self._arguments, self._weight, degree=self._degree, products=False
-        )
+        dictionary = self._dictionary(False)
         matching = self._matching(state.target)
         bound = max(self._exact, 3 * state.law.left)
         options = [
             m for m in matching.best(dictionary, min(3, len(state.match.atoms)))
-            if m.left <= 1e3 * max(state.match.left, 1e-14)
+            if m.left <= _AS_WELL * max(state.match.left, _MATCHED)
         ]  # fmt: skip
         for match in sorted(options, key=lambda m: weight_of(m.atoms)):
             if weight_of(match.atoms) >= weight_of(state.match.atoms):
@@ -234,15 +243,16 @@ class _Search:
         return self._rounded(state, bound)
 
     def _fewer(self, state: _State, bound: float) -> _State:
-        """Without the atoms that are not needed."""
-        for atom in sorted(state.match.atoms, key=lambda a: -weight_of((a,))):
-            atoms = tuple(a for a in state.match.atoms if a != atom)
-            matching = self._matching(state.target)
-            if matching.left_over(atoms) > 1e3 * max(state.match.left, 1e-14):
+        """Without the atoms, and their factors, that are not needed."""
+        matching = self._matching(state.target)
+        for atoms in _shorter(state.match.atoms):
+            if weight_of(atoms) >= weight_of(state.match.atoms):
+                continue
+            if matching.left_over(atoms) > _AS_WELL * max(state.match.left, _MATCHED):
                 continue
             found = self._converged(matching.refined(atoms), state.target)
             if found is not None and found.law.left <= bound:
-                state = found
+                return self._fewer(found, bound)
         return state
 
     def _rounded(self, state: _State, bound: float) -> _State:
@@ -253,7 +263,7 @@ class _Search:
                     continue
                 for digits in range(1, 13):
                     theta = float(f"{factor.theta:.{digits}g}")
-                    if abs(theta - factor.theta) > 1e-8 * abs(factor.theta):
+                    if abs(theta - factor.theta) > _ROUNDED * abs(factor.theta):
                         continue
                     atoms = [list(a) for a in state.match.atoms]
                     atoms[i][k] = dataclasses.replace(factor, theta=theta)
@@ -263,3 +273,13 @@ class _Search:
                         state = _State(match, law, corrected)
                         break
         return state
+
+
+def _shorter(atoms: tuple[Atom, ...]) -> Iterator[tuple[Atom, ...]]:
+    """The atoms without one of them, or without one factor."""
+    for i, atom in enumerate(atoms):
+        rest = atoms[:i] + atoms[i + 1 :]
+        yield rest
+        if len(atom) > 1:
+            for k in range(len(atom)):
+                yield (*rest, atom[:k] + atom[k + 1 :])

@@ -1,0 +1,73 @@
+"""Laws of physics, tried before libraries of terms: see `models.textbook`.
+
+What the search finds is fitted through its flow as any library is, and taken where held-out pairs
+bear it out to the tolerance: an H of few terms, with the constants inside them, or none at all.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.errors import OutOfTime
+from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.learn.candidates import Judges
+from gfnn_jax.learn.clock import MATCHING
+from gfnn_jax.learn.law_work import LawWork
+from gfnn_jax.learn.learned_law import FittedLaw, held_out_error
+from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.models.textbook import OPTIONS, Law, textbook_law
+
+# Operations of a search, by degrees of freedom from 1: of the laws of benchmarks/textbook.py the
+# longest.
+_OPERATIONS = (2e9, 4e9, 8e9, 1e10)
+_FEWEST = 60  # pairs
+_NOTHING = 1e-9  # of the largest term: a term so small is roundoff
+_EXACT = 1e-9  # of the spread: the error of a law that is no approximation
+
+
+def law_of_physics(
+    problem: Problem, work: LawWork, prepared: Prepared, judges: Judges, say: Callable[[str], Any]
+) -> FittedLaw | None:
+    """The law, or None where none is found, or the pairs are of no autonomous flow of a few degrees
+    of freedom in plain coordinates and angles."""
+    simple = prepared.args is None and prepared.structure is None
+    if not simple or prepared.dim > OPTIONS.most_dim or len(judges.training) < _FEWEST:
+        return None
+    rows, coordinates = judges.training, prepared.coordinates
+    own = copy.copy(problem)  # its flows are no part of what libraries may take
+    own.spend = lambda operations: None
+    name = "laws of physics"
+    try:
+        with work.budget.unit(name, MATCHING, _OPERATIONS[prepared.dim - 1]):
+            law = textbook_law(
+                own, rows, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+                cyclic=coordinates.cyclic, say=say,
+            )  # fmt: skip
+    except OutOfTime:
+        work.budget.leave_out(name, work.ended)
+        return None
+    if law is None:
+        return None
+    family, start = _without_nothing(law, prepared.y0[rows], prepared.scale)
+    try:
+        with work.library(f"H of {family.num_parameters} terms", family, len(rows)):
+            fit = problem.fit(family, start, rows, rounds=False)
+            error = held_out_error(family, fit, prepared, judges)
+    except OutOfTime:
+        work.budget.leave_out(name, work.ended)
+        return None
+    if not (error.bound <= judges.tolerance.bound and error.relative <= _EXACT):
+        return None
+    return FittedLaw(family, fit, rows, error, ())
+
+
+def _without_nothing(law: Law, z: np.ndarray, scale: np.ndarray):
+    """(family, coefficients) of the terms whose part in the gradients is not roundoff."""
+    gradients = law.family.term_gradients(z) * scale[:, None]
+    part = np.abs(law.coefficients) * np.sqrt(np.mean(gradients**2, axis=(0, 1)))
+    kept = np.flatnonzero(part > _NOTHING * part.max())
+    return law.family.take(kept.tolist()), law.coefficients[kept]
