@@ -1,4 +1,4 @@
-"""Thirty laws of the textbooks, as data: H, the states that are drawn, the step, what a fit is told.
+"""Laws of the textbooks, as data: H, the states that are drawn, the step, what a fit is told.
 
 A law is a sum of terms with coefficients, which is what a fit is to find. Pairs are integrated by
 SciPy's DOP853 at 1e-13, which no part of the package uses. Of constants that no symmetry of the

@@ -44,9 +44,7 @@ class Factor:
 Atom = tuple[Factor, ...]
 
 
-def gradient_of(
-    atom: Atom, arguments: Sequence[Argument], along: int | None = None
-) -> np.ndarray:
+def gradient_of(atom: Atom, arguments: Sequence[Argument], along: int | None = None) -> np.ndarray:
     """∇ (N, 2d) of the atom; with ``along`` its derivative in the constant of that factor."""
     parts = []
     for k, factor in enumerate(atom):
@@ -132,7 +130,10 @@ def dictionary_of(
             coarse = [_singles(p, argument, every) for p, argument in enumerate(arguments)]
             for multiplier in _multipliers(arguments):
                 used = {index for f in multiplier for index in _entering(arguments[f.place])}
-                value, gradient = _value_of(multiplier, arguments), gradient_of(multiplier, arguments)
+                value, gradient = (
+                    _value_of(multiplier, arguments),
+                    gradient_of(multiplier, arguments),
+                )
                 for argument, single in zip(arguments, coarse, strict=True):
                     if used == _entering(argument):
                         continue
@@ -201,7 +202,7 @@ def _monomials(arguments: Sequence[Argument], degree: int, *, alone: bool = Fals
 def _multipliers(arguments: Sequence[Argument]) -> list[Atom]:
     """Coordinates, products of two of them, sines and cosines: what shapes are multiplied by."""
     plain = [place for place, argument in enumerate(arguments) if argument.index >= 0]
-    found = [(Factor(place, ("power", 1.0)),) for place in plain]
+    found: list[Atom] = [(Factor(place, ("power", 1.0)),) for place in plain]
     for i, j in combinations_with_replacement(plain, 2):
         if i == j:
             found.append((Factor(i, ("power", 2.0)),))

@@ -20,7 +20,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps, of_lanes
-from gfnn_jax.models.arguments import Argument, arguments_of
+from gfnn_jax.models.arguments import arguments_of
 from gfnn_jax.models.atoms import (
     Atom,
     Dictionary,
@@ -44,11 +44,12 @@ class Options:
     """Tuned on the laws of benchmarks/textbook.py.
 
     rows: pairs that are looked at; quiet: the part of them that move least, which is used: their
-    midpoints say more. degree: of products of coordinates, by rising dimension from 1. atoms: of a
-    law, beside the coordinates and products of two. rounds: of matching. finalists: matches that go
-    through their flow; plainer: of them, that are tried in plainer shapes too. corrections: of gradients, at most; contracted: by which each must lower
-    what is left over. roundoff: of the coordinates' sizes; a law that leaves no more is exact.
-    lost: part of the pairs whose flow may fail. most_dim: beyond which the dictionary is too large.
+    midpoints say more. degrees: of products of coordinates, by degrees of freedom from 1. atoms: of
+    a law, beside the coordinates and products of two. rounds: of matching. finalists: matches that
+    go through their flow; plainer: of them, that are tried in plainer shapes too. corrections: of
+    gradients, at most; contracted: by which each must lower what is left over. roundoff: of the
+    coordinates' sizes; a law that leaves no more is exact. lost: part of the pairs whose flow may
+    fail. most_dim: degrees of freedom beyond which the dictionary is too large.
     """
 
     rows: int = 260
@@ -86,16 +87,15 @@ class _State(NamedTuple):
 
 def textbook_law(
     problem: Problem, rows: np.ndarray, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
-    noise: float = 0.0, options: Options = OPTIONS, say: Callable[[str], Any] = lambda message: None,
+    options: Options = OPTIONS, say: Callable[[str], Any] = lambda message: None,
 ) -> Law | None:  # fmt: skip
     """The simplest law whose flow takes z₀ to z₁, or None where none is found.
 
-    rows: of the problem's pairs, which have no args. angles, cyclic: indices of z. noise: RMS of
-    the noise of Φ(z₀) − z₁ ÷ scale, 0 of clean pairs.
+    rows: of the problem's pairs, which have no args. angles, cyclic: indices of z.
     """
     if problem.z0.shape[1] > 2 * options.most_dim:
         return None
-    search = _Search(problem, rows, tuple(angles), tuple(cyclic), noise, options, say)
+    search = _Search(problem, rows, tuple(angles), tuple(cyclic), options, say)
     with np.errstate(all="ignore"):
         for products in (False, True):
             found = search.found(products)
@@ -105,7 +105,7 @@ def textbook_law(
 
 
 class _Search:
-    def __init__(self, problem, rows, angles, cyclic, noise, options: Options, say):
+    def __init__(self, problem, rows, angles, cyclic, options: Options, say):
         self._problem, self._options, self._say = problem, options, say
         rows = np.asarray(rows[: options.rows])
         moved = np.linalg.norm((problem.z1 - problem.z0)[rows] / problem.scale, axis=1)
@@ -122,7 +122,6 @@ class _Search:
         self._columns = columns.reshape(-1, columns.shape[-1])
         self._spanned = orthonormal(self._columns)
         self._target = -apply_j(z1 - z0) / self._h
-        self._exact = max(options.roundoff, 1.2 * noise)
 
     @property
     def _degree(self) -> int:
@@ -155,7 +154,7 @@ class _Search:
             whole = sorted((matching.refined(b) for b in blocks), key=lambda m: m.left)
             tried += [m for m in whole if m.left < 10 * tried[0].left][:2]
             states = [s for m in tried for s in [self._converged(m, target)] if s is not None]
-            exact = [s for s in states if s.law.left <= self._exact]
+            exact = [s for s in states if s.law.left <= self._options.roundoff]
             if exact:
                 return min(exact, key=lambda s: weight_of(s.match.atoms))
             if not states:
@@ -227,7 +226,7 @@ class _Search:
         of them, constants of fewer digits."""
         dictionary = self._dictionary(False)
         matching = self._matching(state.target)
-        bound = max(self._exact, 3 * state.law.left)
+        bound = max(self._options.roundoff, 3 * state.law.left)
         options = [
             m for m in matching.best(dictionary, min(3, len(state.match.atoms)))
             if m.left <= _AS_WELL * max(state.match.left, _MATCHED)
