@@ -24,7 +24,7 @@ _INDEPENDENT = 1e-5  # of a column, that those before it do not span
 _HARDLY = 4.0  # times what a match leaves over, that a plainer one may leave
 _REFINEMENTS = 8  # Gauss–Newton steps of inner constants
 _FLOOR = 1e-13  # of what is left over: below it is roundoff
-_SAID = 0.5  # halvings of what is left over that a unit of complexity must bring
+SAID = 0.5  # halvings of what is left over that a unit of complexity must bring, of clean pairs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,13 +39,15 @@ class Matching:
     """The search for atoms that, beside a base, have the gradient ``target`` (rows,).
 
     base: (rows, n) orthonormal columns that are always there. weight: (2d,) by which gradients are
-    multiplied. arguments: at the states of the rows.
+    multiplied. arguments: at the states of the rows. said: halvings of what is left over that a
+    unit of complexity must bring.
     """
 
     def __init__(
-        self, base: np.ndarray, target: np.ndarray, weight: np.ndarray, arguments: list[Argument]
-    ):
-        self.weight, self.arguments = weight, arguments
+        self, base: np.ndarray, target: np.ndarray, weight: np.ndarray, arguments: list[Argument],
+        said: float = SAID,
+    ):  # fmt: skip
+        self.weight, self.arguments, self._said = weight, arguments, said
         self.base, self.target = base, target
         self.size = float(np.linalg.norm(target))
 
@@ -71,9 +73,13 @@ class Matching:
                         grown.setdefault(frozenset(refined.atoms), refined)
             if not grown:
                 break
-            beam = sorted(grown.values(), key=cost)[:_BEAM]
+            beam = sorted(grown.values(), key=self.cost)[:_BEAM]
             found.update({frozenset(m.atoms): m for m in beam})
-        return sorted(found.values(), key=cost)
+        return sorted(found.values(), key=self.cost)
+
+    def cost(self, match: Match) -> float:
+        """The logarithm of what is left over, and what there is to say of the atoms."""
+        return float(np.log2(max(match.left, _FLOOR)) + self._said * weight_of(match.atoms))
 
     def plainer(self, match: Match, dictionary: Dictionary) -> Match:
         """The match with each atom, in turn, in a plainer shape of the same argument, where that
@@ -95,7 +101,7 @@ class Matching:
             part = np.where(size > _INDEPENDENT, residual @ columns, 0.0) / np.maximum(size, 1e-300)
             first = _apart(np.argsort(-(part**2)), [dictionary.atoms[j] for j in own], _BRANCHES)
             tried = [self.refined((*others, dictionary.atoms[own[k]])) for k in first]
-            best = min(tried, key=cost)
+            best = min(tried, key=self.cost)
             if best.left < _HARDLY * match.left:
                 match = best
         return match
@@ -204,11 +210,6 @@ class Matching:
 
     def _flat(self, gradient: np.ndarray) -> np.ndarray:
         return (gradient * self.weight).ravel()
-
-
-def cost(match: Match) -> float:
-    """The logarithm of what is left over, and what there is to say of the atoms."""
-    return float(np.log2(max(match.left, _FLOOR)) + _SAID * weight_of(match.atoms))
 
 
 def _apart(order: np.ndarray, atoms: list[Atom], count: int) -> list[int]:

@@ -116,6 +116,9 @@ def text_of(kind: Kind, x: str, square: str, theta: float | None) -> str:
         case "log":
             return f"log({square or x})"
         case "exp":
+            if theta is not None and theta < 0 and " - " in x and not square and n == 0:
+                first, second = x.split(" - ")  # of a difference: its opposite
+                inner, t = f"({second} - {first})", number(-theta)
             grown = f"exp({t}*{inner})"
             if n == 0:
                 return grown

@@ -30,7 +30,7 @@ from gfnn_jax.models.atoms import (
     powers_of,
     weight_of,
 )
-from gfnn_jax.models.matching import Match, Matching, orthonormal
+from gfnn_jax.models.matching import SAID, Match, Matching, orthonormal
 from gfnn_jax.phase_space import apply_j
 
 _STEPS = Steps(6, 1)
@@ -64,6 +64,9 @@ class Options:
     roundoff: float = 1e-11
     lost: float = 0.1
     most_dim: int = 4
+    noisy_rows: int = 1_000
+    settled: int = 4
+    certain: float = 8.0
 
 
 OPTIONS = Options()
@@ -104,6 +107,21 @@ def textbook_law(
     return None
 
 
+def noisy_law(
+    problem: Problem, rows: np.ndarray, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
+    options: Options = OPTIONS, say: Callable[[str], Any] = lambda message: None,
+) -> Law | None:  # fmt: skip
+    """The law of shortest description of pairs with noise: as `textbook_law`, without a claim that
+    it is exact. None where its flow fails."""
+    if problem.z0.shape[1] > 2 * options.most_dim:
+        return None
+    options = dataclasses.replace(options, rows=options.noisy_rows)
+    search = _Search(problem, rows, tuple(angles), tuple(cyclic), options, say)
+    with np.errstate(all="ignore"):
+        found = search.shortest()
+    return None if found is None else found.law
+
+
 class _Search:
     def __init__(self, problem, rows, angles, cyclic, options: Options, say):
         self._problem, self._options, self._say = problem, options, say
@@ -133,9 +151,9 @@ class _Search:
             self._arguments, self._weight, self._spanned, degree=self._degree, products=products
         )
 
-    def _matching(self, target: np.ndarray) -> Matching:
+    def _matching(self, target: np.ndarray, said: float = SAID) -> Matching:
         flat = (target * self._weight).ravel()
-        return Matching(self._spanned, flat, self._weight, self._arguments)
+        return Matching(self._spanned, flat, self._weight, self._arguments, said)
 
     def found(self, products: bool) -> _State | None:
         """The simplest law that is exact, of a dictionary with products or without."""
@@ -148,9 +166,7 @@ class _Search:
         target, last = self._target, np.inf
         for _ in range(options.rounds):
             matching = self._matching(target)
-            tried = matching.best(dictionary, options.atoms)[: options.finalists]
-            plainer = [matching.plainer(m, dictionary) for m in tried[: options.plainer]]
-            tried = list({m.atoms: m for m in [*plainer, *tried]}.values())
+            tried = self._finalists(matching, dictionary)
             whole = sorted((matching.refined(b) for b in blocks), key=lambda m: m.left)
             tried += [m for m in whole if m.left < 10 * tried[0].left][:2]
             states = [s for m in tried for s in [self._converged(m, target)] if s is not None]
@@ -164,6 +180,13 @@ class _Search:
                 return None
             target, last = best.target, best.law.left
         return None
+
+    def _finalists(self, matching: Matching, dictionary: Dictionary) -> list[Match]:
+        """The best matches, and plainer ones that leave hardly more."""
+        options = self._options
+        tried = matching.best(dictionary, options.atoms)[: options.finalists]
+        plainer = [matching.plainer(m, dictionary) for m in tried[: options.plainer]]
+        return list({m.atoms: m for m in [*plainer, *tried]}.values())
 
     def _converged(self, match: Match, target: np.ndarray) -> _State | None:
         """The match with coefficients and constants as far as corrections lead; None where its
@@ -218,6 +241,39 @@ class _Search:
             names = polynomial_terms(self._dim, 1).variables
             family = joined(family, Terms(self._dim, names, tuple(dict.fromkeys(rows))))
         return joined(family, given_terms(self._dim, texts)) if texts else family
+
+    def shortest(self) -> _State | None:
+        """The law that says most in the fewest atoms of what is noise for the rest."""
+        options, dictionary, best = self._options, self._dictionary(False), None
+        said = options.certain / (np.log(2) * self._middle.size)
+        target, last = self._target, np.inf
+        for _ in range(options.rounds):
+            matching = self._matching(target, said)
+            tried = self._finalists(matching, dictionary)
+            states = []
+            for match in tried:
+                state = self._settled(match, target)
+                if state is not None:
+                    left = Match(state.match.atoms, state.law.left)
+                    states.append((matching.cost(left), len(states), state))
+            if not states:
+                return best
+            value, _, state = min(states)
+            if not value < last - said:
+                return best
+            best, last, target = state, value, state.target
+        return best
+
+    def _settled(self, match: Match, target: np.ndarray) -> _State | None:
+        """The match after so many corrections that what is left of their error is noise."""
+        state = None
+        for _ in range(self._options.settled):
+            law, target = self._corrected(match, target)
+            if law is None:
+                return None
+            state = _State(match, law, target)
+            match = self._matching(target).refined(match.atoms)
+        return state
 
     # Simpler ways to say the same
 
