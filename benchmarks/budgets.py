@@ -30,8 +30,10 @@ from harness import HERE, SEED, TABLES, Numbers, between_markers, main, markdown
 from harness import results as results_of
 
 # isort: split
-import as_a_user
 import numpy as np
+from users.case import box
+from users.known import drawn
+from users.systems import fput, henon_heiles
 
 import gfnn_jax as gfnn
 from gfnn_jax.evaluate import report
@@ -74,7 +76,7 @@ def kepler(z):
 
 def near(centre: Sequence[float], half: Sequence[float]) -> Callable[[int, int], np.ndarray]:
     """(number, seed) -> states (number, 2d), uniform in a box around the centre."""
-    draw = as_a_user.box(half)
+    draw = box(half)
     return lambda num, seed: np.asarray(centre) + draw(num, seed)
 
 
@@ -93,17 +95,17 @@ def orbits(num: int, seed: int) -> np.ndarray:
 
 
 SYSTEMS: dict[str, Callable[[], tuple[gfnn.Pairs, gfnn.Pairs]]] = {
-    "toda-32": lambda: as_a_user.drawn(toda, as_a_user.box([0.5] * 64), 0.05, 2_000),
-    "fput-8": lambda: as_a_user.drawn(as_a_user.fput, as_a_user.box([0.5] * 16), 0.1, 2_000),
-    "elastic-pendulum": lambda: as_a_user.drawn(
+    "toda-32": lambda: drawn(toda, box([0.5] * 64), 0.05, 2_000),
+    "fput-8": lambda: drawn(fput, box([0.5] * 16), 0.1, 2_000),
+    "elastic-pendulum": lambda: drawn(
         elastic_pendulum, near([0.0, -1.1, 0.0, 0.0], [0.3, 0.2, 0.3, 0.3]), 0.2, 2_000
     ),
-    "heavy-top": lambda: as_a_user.drawn(
+    "heavy-top": lambda: drawn(
         heavy_top, near([0.0, 1.2, 0.0, 0.5, 0.0, 1.0], [1.0, 0.3, 1.0, 0.2, 0.3, 0.2]), 0.1, 2_000
     ),
-    "kepler": lambda: as_a_user.drawn(kepler, orbits, 0.1, 1_800),
-    "million-pairs": lambda: as_a_user.drawn(
-        as_a_user.henon_heiles, as_a_user.box([0.3] * 4), 0.3, 1_000_000
+    "kepler": lambda: drawn(kepler, orbits, 0.1, 1_800),
+    "million-pairs": lambda: drawn(
+        henon_heiles, box([0.3] * 4), 0.3, 1_000_000
     ),
 }  # fmt: skip
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from gfnn_jax.families import from_function
     from gfnn_jax.generating.charts import CHARTS, Chart
     from gfnn_jax.learn.fit import Fit, fit
+    from gfnn_jax.learn.options import FitOptions
     from gfnn_jax.maps.saved import load, register
     from gfnn_jax.maps.stroboscopic import stroboscopic
     from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -49,6 +50,7 @@ _HOMES = {
     "Chart": "generating.charts",
     "Fit": "learn.fit",
     "FitError": "errors",
+    "FitOptions": "learn.options",
     "FitWarning": "errors",
     "Fitted": "models.model",
     "InputError": "errors",
@@ -77,6 +79,7 @@ __all__ = [
     "Chart",
     "Fit",
     "FitError",
+    "FitOptions",
     "FitWarning",
     "Fitted",
     "InputError",

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import json
 import math
 import os
-import re
 import signal
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -25,16 +25,11 @@ from gfnn_jax.compiling import enable_compile_cache
 from gfnn_jax.data.kinds import are_recordings
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
+from gfnn_jax.learn.options import COUNT, DEVICES, OPTIONS, POSITIVE, SEED, FitOptions, Kind
 from gfnn_jax.storage.outputs import ensure_new
 from gfnn_jax.storage.partial import unfinished_note
 
-# Copies of the choices in `learn.check` and `exports.export`, whose import would load JAX; a test
-# compares them.
-CHARTS = ("auto", "type1", "type2", "type3", "midpoint")
-FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
-LEARN = ("auto", "map", "hamiltonian", "lagrangian")
-STRUCTURES = ("ring", "chain", "bodies:N", "ring:FIELDS", "chain:FIELDS", "bodies:N:SPECIES")
-EXPORTS = ("c", "stablehlo")
+EXPORTS = ("c", "stablehlo")  # those of `exports.export`, whose import would load JAX
 _FEW_TERMS = 15  # of a law with noise that is shown as H
 
 EXIT_STATUS = """\
@@ -143,7 +138,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/SCENE)")
     command.add_argument("--quick", action="store_true", help="fewer pairs and rollouts")
     command.add_argument("--dt", type=_positive, metavar="H", help="another time step")
-    _add_fit_options(command, "the scene's own, close to the best attainable")
+    _add_fit_options(command, tolerance="the scene's own, close to the best attainable")
 
     command = commands.add_parser(
         "look", help="what a recording holds, before anything is learned",
@@ -178,30 +173,16 @@ def _parser() -> argparse.ArgumentParser:
         "--scene", metavar="NAME",
         help="scene whose coordinates and features are used; features assume the scene's units",
     )  # fmt: skip
-    _add_fit_options(command, "1e-6")
+    _add_fit_options(command)
     add_column_options(command)
     command.add_argument(
-        "--friction", default="auto", metavar="KIND",
-        help="of a recording: auto, none, linear, quadratic, dry, or some joined by + "
-        "(default %(default)s)",
-    )  # fmt: skip
-    command.add_argument(
-        "--input-hold", choices=("auto", "hold", "linear", "band"), default="auto",
-        help="of a recording: how inputs go on between samples (default %(default)s)",
-    )  # fmt: skip
-    command.add_argument(
-        "--devices", type=_devices, metavar="all|N",
-        help="number of devices that share the rows, and the networks of an ensemble; on a CPU "
-        "these are its cores",
+        "--despite", type=_kinds, metavar="KIND", default=(),
+        help="of a recording: a mistake that gfnn look names and that is none, by its kind",
     )  # fmt: skip
     command.add_argument(
         "--distributed", action="store_true",
         help="this is one of several processes that srun or another launcher has started: each "
         "reads its own rows of DATA, or its own files",
-    )  # fmt: skip
-    command.add_argument(
-        "--absolute-tolerance", type=_positive, metavar="E",
-        help="instead of --tolerance: bound on the RMS per component, in the data's units",
     )  # fmt: skip
 
     command = commands.add_parser(
@@ -216,7 +197,9 @@ def _parser() -> argparse.ArgumentParser:
         help="initial states, or a trajectory file: its sequences continue from their last states; "
         "of a map of positions a recording, whose runs continue from their last two",
     )  # fmt: skip
-    command.add_argument("--num-steps", type=_count, metavar="N")
+    command.add_argument(
+        "--num-steps", type=_steps, metavar="N", help="steps to predict, backwards where N < 0"
+    )
     command.add_argument(
         "--estimate-from", type=_count, metavar="K",
         help="of a recording: samples that the state at its end is estimated from",
@@ -298,54 +281,22 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
+def _add_fit_options(command: argparse.ArgumentParser, **defaults: str) -> None:
+    """Add the options of `FitOptions` that the command has. defaults: words for some of them."""
+    for field in dataclasses.fields(FitOptions):
+        name, about = field.name, OPTIONS[field.name]
+        if command.prog not in about.commands:
+            continue
+        default = defaults.get(name, "" if field.default in (None, ()) else str(field.default))
+        shown = about.help.replace("%", "%%")
+        shown += f" (default {default})" if default and "default" not in shown else ""
+        given: dict[str, Any] = {"dest": name, "default": argparse.SUPPRESS}
+        given |= {"choices": about.kind.choices} if about.kind.choices else {}
+        given |= {"type": _reader(about.kind), "metavar": about.metavar} if about.metavar else {}
+        command.add_argument(f"--{name.replace('_', '-')}", help=shown, **given)
     command.add_argument(
-        "--tolerance", type=_positive, metavar="E",
-        help="bound on the one-step error, RMS over coordinates of error divided by spread "
-        f"(default {tolerance})",
-    )  # fmt: skip
-    command.add_argument(
-        "--learn", choices=LEARN, default="auto", help="what is learned (default %(default)s)"
-    )
-    command.add_argument(
-        "--terms", type=_texts, default=(), metavar="TEXT",
-        help='known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"',
-    )  # fmt: skip
-    command.add_argument(
-        "--base", metavar="TEXT",
-        help='known part of H: "p1**2/2 - cos(q1)"; its flow is factored out, and S learns the '
-        "remainder",
-    )  # fmt: skip
-    command.add_argument(
-        "--structure", type=_structure, metavar="|".join(STRUCTURES),
-        help="structure of many degrees of freedom: H is a sum over equal sites, with --terms in "
-        "q1, p1 of a site and q2, p2, … of the next ones (ring:2 has two q at every site, side by "
-        "side); or over bodies and pairs of bodies (bodies:4:abbb: the last three are alike)",
-    )  # fmt: skip
-    command.add_argument("--chart", choices=CHARTS, default="auto", help="default %(default)s")
-    command.add_argument(
-        "--family", choices=FAMILIES, default="auto",
-        help="family of the generating function (default %(default)s)",
-    )  # fmt: skip
-    command.add_argument(
-        "--scalar", dest="family", choices=FAMILIES, default=argparse.SUPPRESS,
-        help=argparse.SUPPRESS,  # the old name of --family
-    )  # fmt: skip
-    command.add_argument(
-        "--ensemble", type=_count, default=1, metavar="N",
-        help="with --family mlp: number of networks trained together; their mean is the map, their "
-        "spread its bands",
-    )  # fmt: skip
-    command.add_argument("--seed", type=_seed, default=0, metavar="N")
-    command.add_argument(
-        "--max-seconds", type=_positive, default=None, metavar="S",
-        help="time for the fit, after which the best map so far is kept (default 120, or none with "
-        "--max-operations)",
-    )  # fmt: skip
-    command.add_argument(
-        "--max-operations", type=_count, default=None, metavar="N",
-        help="counted operations for the fit: the value of fit.max_operations in a report gives "
-        "the same model again, also where time had ended that fit",
+        "--scalar", dest="family", choices=OPTIONS["family"].kind.choices,
+        default=argparse.SUPPRESS, help=argparse.SUPPRESS,  # the old name of --family
     )  # fmt: skip
     command.add_argument(
         "--strict", action="store_true", help="exit status 1 where the tolerance is not met"
@@ -353,41 +304,37 @@ def _add_fit_options(command: argparse.ArgumentParser, tolerance: str) -> None:
     _add_output_options(command)
 
 
+def _fit_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Options of `FitOptions` that were given, by name."""
+    named = [name for name, about in OPTIONS.items() if about.commands]
+    return {name: getattr(arguments, name) for name in named if hasattr(arguments, name)}
+
+
 def _add_output_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--overwrite", action="store_true", help="replace an existing output")
     command.add_argument("--resume", action="store_true", help="continue an unfinished output")
 
 
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"expected a finite number > 0, got {text}")
-    return value
+def _reader(kind: Kind) -> Callable[[str], Any]:
+    """Make the reader of an option of this kind."""
+
+    def read(text: str) -> Any:
+        with contextlib.suppress(ValueError):
+            if kind.holds(value := kind.read(text)):
+                return value
+        raise argparse.ArgumentTypeError(f"expected {kind.words}, got {text}")
+
+    return read
 
 
-def _whole(text: str, low: int, high: int, what: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = low - 1
-    if not low <= value < high:
-        raise argparse.ArgumentTypeError(f"expected a whole number {what}, got {text}")
-    return value
+_positive, _count, _seed, _devices = (_reader(kind) for kind in (POSITIVE, COUNT, SEED, DEVICES))
+_steps = _reader(
+    Kind("a whole number from 1 to 2**53 - 1, or its negative", lambda v: COUNT.holds(abs(v)), int)
+)
 
 
-def _count(text: str) -> int:
-    return _whole(text, 1, 2**53, "from 1 to 2**53 - 1")
-
-
-def _devices(text: str) -> int | str:
-    return text if text == "all" else _whole(text, 1, 2**31, "from 1 to 2**31 - 1, or all")
-
-
-def _seed(text: str) -> int:
-    return _whole(text, 0, 2**32, "from 0 to 2**32 - 1")
+def _kinds(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(","))
 
 
 def _check_exists(path: Path) -> None:
@@ -401,18 +348,6 @@ def _check_exists(path: Path) -> None:
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(","))
-
-
-def _structure(text: str) -> str:
-    bodies = re.fullmatch(r"bodies:([0-9]+)(:[A-Za-z]+)?", text)
-    sites = re.fullmatch(r"(ring|chain)(:[1-9][0-9]?)?", text)
-    if sites or (bodies and int(bodies[1]) > 1):
-        return text
-    raise argparse.ArgumentTypeError(f"expected {', '.join(STRUCTURES)}; got '{text}'")
-
-
-def _texts(text: str) -> tuple[str, ...]:
-    return tuple(part.strip() for part in text.split(";") if part.strip())
 
 
 # The commands. The heavy imports are here, after the checks that need none of them.
@@ -444,13 +379,9 @@ def _run(arguments: argparse.Namespace) -> None:
 
     with progress.on_stderr() as shown:
         ran = run(
-            arguments.scene, out=out, quick=arguments.quick, seed=arguments.seed, dt=arguments.dt,
-            tolerance=arguments.tolerance,
-            max_seconds=arguments.max_seconds or "auto", max_operations=arguments.max_operations,
-            chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
-            base=arguments.base, structure=arguments.structure,
-            family=arguments.family, ensemble=arguments.ensemble, overwrite=arguments.overwrite,
-            resume=arguments.resume, progress=shown,
+            arguments.scene, out=out, quick=arguments.quick, dt=arguments.dt,
+            overwrite=arguments.overwrite, resume=arguments.resume, progress=shown,
+            **_fit_options(arguments),
         )  # fmt: skip
     _summarise(ran, out)
     _hold_to(arguments.strict, out / "model")
@@ -481,7 +412,8 @@ def _look(arguments: argparse.Namespace) -> None:
 
 
 def _fit(arguments: argparse.Namespace) -> None:
-    if arguments.tolerance is not None and arguments.absolute_tolerance is not None:
+    options = _fit_options(arguments)
+    if {"tolerance", "absolute_tolerance"} <= set(options):
         raise InputError("expected --tolerance or --absolute-tolerance, not both")
     if not arguments.resume:
         ensure_new(arguments.out, arguments.overwrite, folder=True)
@@ -492,32 +424,33 @@ def _fit(arguments: argparse.Namespace) -> None:
     if are_recordings(arguments.data, with_roles=with_roles):
         if arguments.dt is not None:
             columns["dt"] = arguments.dt
-        if arguments.learn == "map":
-            return _fit_positions(arguments, columns)
-        return _fit_law(arguments, columns)
-    if arguments.learn == "lagrangian":
+        if options.get("learn") == "map":
+            return _fit_positions(arguments, columns, options)
+        return _fit_law(arguments, columns, options)
+    if options.get("learn") == "lagrangian":
         raise InputError("--learn lagrangian: expected a recording, got states q, p")
-    arguments.angles = _as_indices(columns)
+    options["angles"] = _as_indices(columns)
     with contextlib.ExitStack() as stack:
         group = None
         if arguments.distributed:
             stack.enter_context(processes.watched(f"gfnn: {processes.LOST}"))
-        _set_up_jax(arguments.devices)
+        _set_up_jax(options.get("devices"))
         if arguments.distributed:
             group = processes.Group(processes.join())
-        _fit_and_tell(arguments, group)
+        _fit_and_tell(arguments, options, group)
 
 
-def _fit_law(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
+def _fit_law(
+    arguments: argparse.Namespace, columns: dict[str, Any], options: dict[str, Any]
+) -> None:
     """The law of a recording."""
     _set_up_jax()
     from gfnn_jax.jobs.fit_recording import fit_recording
 
     with progress.on_stderr() as shown:
         learned = fit_recording(
-            arguments.data, out=arguments.out, columns=columns, learn=arguments.learn,
-            friction=arguments.friction, input_hold=arguments.input_hold,
-            mass=masses(arguments), seed=arguments.seed, progress=shown,
+            arguments.data, out=arguments.out, columns=columns, mass=masses(arguments),
+            despite=arguments.despite, progress=shown, **options,
         )  # fmt: skip
     print(learned.fit.table)
     print(f"written to {arguments.out}")
@@ -525,18 +458,17 @@ def _fit_law(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
           "--out forecast.csv")  # fmt: skip
 
 
-def _fit_positions(arguments: argparse.Namespace, columns: dict[str, Any]) -> None:
+def _fit_positions(
+    arguments: argparse.Namespace, columns: dict[str, Any], options: dict[str, Any]
+) -> None:
     """Learn the map of a recording of positions."""
     _set_up_jax()
     from gfnn_jax.jobs.fit_positions import fit_positions
 
     with progress.on_stderr() as shown:
         ran = fit_positions(
-            arguments.data, out=arguments.out, columns=columns, seed=arguments.seed,
-            tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
-            absolute_tolerance=arguments.absolute_tolerance, structure=arguments.structure,
-            max_seconds=arguments.max_seconds or "auto", max_operations=arguments.max_operations,
-            progress=shown,
+            arguments.data, out=arguments.out, columns=columns, despite=arguments.despite,
+            progress=shown, **options,
         )  # fmt: skip
     _summarise(ran, arguments.out)
     print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
@@ -544,20 +476,16 @@ def _fit_positions(arguments: argparse.Namespace, columns: dict[str, Any]) -> No
     _hold_to(arguments.strict, arguments.out)
 
 
-def _fit_and_tell(arguments: argparse.Namespace, group: processes.Group | None) -> None:
+def _fit_and_tell(
+    arguments: argparse.Namespace, options: dict[str, Any], group: processes.Group | None
+) -> None:
     from gfnn_jax.jobs.fit import fit
 
     with progress.on_stderr() as shown:
         ran = fit(
-            arguments.data, out=arguments.out, dt=arguments.dt,
-            tolerance=1e-6 if arguments.tolerance is None else arguments.tolerance,
-            absolute_tolerance=arguments.absolute_tolerance,
-            max_seconds=arguments.max_seconds or "auto", max_operations=arguments.max_operations,
-            chart=arguments.chart, learn=arguments.learn, terms=arguments.terms,
-            base=arguments.base, structure=arguments.structure,
-            family=arguments.family, ensemble=arguments.ensemble, scene_name=arguments.scene,
-            angles=arguments.angles, seed=arguments.seed, overwrite=arguments.overwrite,
-            resume=arguments.resume, devices=arguments.devices, group=group, progress=shown,
+            arguments.data, out=arguments.out, dt=arguments.dt, scene_name=arguments.scene,
+            overwrite=arguments.overwrite, resume=arguments.resume, group=group, progress=shown,
+            **options,
         )  # fmt: skip
     if group is not None:
         processes.wait_for_all()
@@ -627,7 +555,7 @@ def _forecast(arguments: argparse.Namespace) -> None:
         inputs=arguments.inputs, compare=arguments.compare, overwrite=arguments.overwrite,
     )  # fmt: skip
     times = [f.times[-1] for f in found.values()]
-    print(f"{arguments.out}: forecasts of {len(found)} runs, up to {max(times):g} s")
+    print(f"{arguments.out}: forecasts of {len(found)} runs, up to t = {max(times):g}")
     if judged is not None:
         for name, (rms, median, within) in judged.columns.items():
             print(f"{name}: error {rms:.4g} rms, {median:.4g} median; {within:.0%} of "
@@ -650,7 +578,8 @@ def _predict_and_tell(arguments: argparse.Namespace, share: processes.Share | No
         print(f"process {share.index} of {share.count}: {num_lanes} trajectories, "
               f"{predicted.seconds:.1f} s")  # fmt: skip
         return
-    print(f"{arguments.out}: {num_lanes} trajectories of {arguments.num_steps} steps, "
+    back = " backwards" if arguments.num_steps < 0 else ""
+    print(f"{arguments.out}: {num_lanes} trajectories of {abs(arguments.num_steps)} steps{back}, "
           f"{predicted.seconds:.1f} s")  # fmt: skip
     _print_status(predicted.status, predicted.left_at)
     if predicted.horizon is not None:

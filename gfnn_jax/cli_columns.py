@@ -31,14 +31,27 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument("--time-unit", choices=tuple(SECONDS), help="of the times (default s)")
     group.add_argument(
-        "--std", type=_numbers, action="append", metavar="NAME=σ", help="noise of a column, known"
-    )
+        "--std", type=_sigmas, action="append", metavar="NAME=σ",
+        help="noise of a column, known: a number, or the column that holds it for each value",
+    )  # fmt: skip
     group.add_argument(
         "--mass", type=_numbers, action="append", metavar="NAME=m",
         help="known mass, or moment of inertia, of a position",
     )  # fmt: skip
     group.add_argument("--offset", type=_names, metavar="A,B", help="columns with unknown offsets")
     group.add_argument("--scale", type=_names, metavar="A,B", help="columns of unknown scale")
+    group.add_argument(
+        "--observe", type=_formula, action="append", metavar="COLUMN=TEXT",
+        help="what a sensor shows, as 'px = x0 + R*sin(theta + tilt)': its parameters are fitted",
+    )  # fmt: skip
+    group.add_argument(
+        "--guess", type=_guesses, action="append", metavar="NAME=X",
+        help="where parameters of --observe start",
+    )  # fmt: skip
+    group.add_argument(
+        "--coordinates", type=_names, metavar="A,B",
+        help="what moves, where --observe says how columns show it",
+    )  # fmt: skip
     group.add_argument(
         "--from", dest="start", type=_finite, metavar="T", help="rows from time T on"
     )
@@ -49,9 +62,10 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
 def column_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """The options that were given, as keywords of `gfnn_jax.read`; ``mass`` is none of them."""
     names = (*ROLES, "angles", "degrees", "columns", "time_unit", "offset", "scale", "start",
-             "stop", "every")  # fmt: skip
+             "stop", "every", "coordinates")  # fmt: skip
     given = {name: getattr(arguments, name) for name in names}
-    given["std"] = dict(pair for pairs in arguments.std or () for pair in pairs)
+    for name in ("std", "observe", "guess"):
+        given[name] = dict(pair for pairs in getattr(arguments, name) or () for pair in pairs)
     return {name: value for name, value in given.items() if value not in (None, {})}
 
 
@@ -62,7 +76,7 @@ def masses(arguments: argparse.Namespace) -> dict[str, float]:
 
 def names_roles(options: dict[str, Any]) -> bool:
     """Whether keywords of `column_options` say what columns are, which makes a file a recording."""
-    return bool({*ROLES, "columns"} & set(options))
+    return bool({*ROLES, "columns", "coordinates", "observe"} & set(options))
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -92,6 +106,31 @@ def _numbers(text: str) -> list[tuple[str, float]]:
             raise argparse.ArgumentTypeError(f"expected NAME=NUMBER above 0, got '{part}'")
         pairs.append((name.strip(), value))
     return pairs
+
+
+def _sigmas(text: str) -> list[tuple[str, float | str]]:
+    """Numbers, or names of columns."""
+    named = [part.partition("=") for part in text.split(",")]
+    return [
+        (name.strip(), column.strip())
+        if name.strip() and math.isnan(_float(column)) and column.strip()
+        else _numbers(f"{name}{equals}{column}")[0]
+        for name, equals, column in named
+    ]
+
+
+def _guesses(text: str) -> list[tuple[str, float]]:
+    pairs = [part.partition("=") for part in text.split(",")]
+    if not all(name.strip() and math.isfinite(_float(number)) for name, _, number in pairs):
+        raise argparse.ArgumentTypeError(f"expected NAME=NUMBER, got '{text}'")
+    return [(name.strip(), float(number)) for name, _, number in pairs]
+
+
+def _formula(text: str) -> list[tuple[str, str]]:
+    column, _, formula = text.partition("=")
+    if not (column.strip() and formula.strip()):
+        raise argparse.ArgumentTypeError(f"expected COLUMN=FORMULA, got '{text}'")
+    return [(column.strip(), formula.strip())]
 
 
 def _finite(text: str) -> float:

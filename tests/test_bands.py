@@ -149,6 +149,21 @@ def test_every_sample_is_a_symplectic_map_and_rolls_out_as_it(noisy):
     np.testing.assert_array_equal(again, np.asarray(samples.params))
 
 
+def test_samples_roll_back_to_where_they_began(noisy):
+    _, fit = noisy
+    samples = fit.map.sample(jax.random.key(1), 3)
+    z = np.array([[0.1, 0.2, -0.1, 0.05]])
+    ahead, _ = samples.rollout(z, 20)
+    ends = np.asarray(ahead)[:, :, -1]
+    back, _ = samples.rollout(ends, -20)
+    np.testing.assert_allclose(back, ahead[:, :, ::-1], rtol=0, atol=1e-13)
+    shared, _ = fit.map.sharded(1).rollout(ends[0], -20)
+    alone, _ = fit.map.rollout(ends[0], -20)
+    np.testing.assert_allclose(shared, alone, rtol=0, atol=1e-14)
+    with pytest.raises(ValueError, match="no inputs of a rollout backwards"):
+        samples.rollout(z, -2, inputs=np.ones((2, 1)))
+
+
 def test_a_map_without_posterior_says_so(noisy):
     bare = jax.tree.map(lambda leaf: leaf, noisy[1].map)
     with pytest.raises(ValueError, match="no posterior to draw from"):

@@ -22,16 +22,18 @@ from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.errors import FitWarning
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
-from gfnn_jax.generating.charts import MIDPOINT
+from gfnn_jax.generating.charts import CHARTS, MIDPOINT
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.jobs import fit as jobs_fit
 from gfnn_jax.jobs import predict as predict_job
 from gfnn_jax.jobs import progress, search
-from gfnn_jax.learn import check, structures
+from gfnn_jax.learn import check
 from gfnn_jax.learn import fit as learn_fit
 from gfnn_jax.learn.candidates import Candidate, Tolerance
+from gfnn_jax.learn.options import OPTIONS
 from gfnn_jax.maps import saved as models
 from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.inputs import HOLDS
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.storage import checkpoints
@@ -111,10 +113,10 @@ def files(folder):
 
 
 def test_choices_are_those_of_the_fit():
-    assert cli.CHARTS == check.CHART_NAMES
-    assert cli.FAMILIES == check.FAMILIES
-    assert set(cli.LEARN) == {*check.LEARNS, "lagrangian"}  # of a recording
-    assert cli.STRUCTURES == structures.NAMES
+    chosen = {name: about.kind.choices for name, about in OPTIONS.items()}
+    assert chosen["chart"] == ("auto", *CHARTS)
+    assert set(chosen["learn"]) == {*check.LEARNS, "lagrangian"}  # of a recording
+    assert chosen["input_hold"] == ("auto", *HOLDS)
 
 
 def test_scenes(capsys):
@@ -157,6 +159,7 @@ def test_a_line_of_progress_says_where_its_error_comes_from():
 
 
 WHOLE = "expected a whole number from 1 to 2**53 - 1, got "
+STEPS = WHOLE.replace(", got", ", or its negative, got")
 BAD_USAGE = [
     ((), "expected a command, got none"),
     (("rum",), "invalid choice: 'rum'"),
@@ -210,9 +213,9 @@ BAD_USAGE = [
     (("predict", "{folder}", "{to}"), "holds no model.json"),
     (("predict", "{model}", "{to}", "--initial", "{tmp}/none.npy"), "no such file"),
     (("predict", "{model}", "{to}", "--initial", "{wide}"), "expected states of 2 columns"),
-    (("predict", "{model}", "{to}", "--num-steps", "0"), WHOLE + "0"),
-    (("predict", "{model}", "{to}", "--num-steps", "1e3"), WHOLE + "1e3"),
-    (("predict", "{model}", "{to}", "--num-steps", "1" + 20 * "0"), WHOLE + "1000"),
+    (("predict", "{model}", "{to}", "--num-steps", "0"), STEPS + "0"),
+    (("predict", "{model}", "{to}", "--num-steps", "1e3"), STEPS + "1e3"),
+    (("predict", "{model}", "{to}", "--num-steps", "1" + 20 * "0"), STEPS + "1000"),
     (("predict", "{model}", "{to}", "--save-every", "-1"), WHOLE + "-1"),
     (("predict", "{model}", "{to}", "--save-every", "99"), "--save-every of at most --num-steps"),
     (("predict", "{model}", "{to}", "--outside", "maybe"), "invalid choice: 'maybe'"),
@@ -571,8 +574,8 @@ def test_strict(fitted, tmp_path, capsys, monkeypatch):
 def test_the_former_name_of_an_option(fitted, tmp_path, monkeypatch):
     asked = []
 
-    def remember(*args, family, **kwargs):
-        asked.append(family)
+    def remember(*args, options, **kwargs):
+        asked.append(options.family)
         return fitted
 
     monkeypatch.setattr(search, "fit", remember)
@@ -659,6 +662,23 @@ def stopped_after(num_chunks, stop):
 
 def interrupt():
     raise KeyboardInterrupt
+
+
+def test_a_prediction_backwards_comes_back(model, tmp_path, capsys):
+    assert predict(model, tmp_path / "there.npz", num_steps=40) == 0
+    with np.load(tmp_path / "there.npz") as there:
+        ahead = there["trajectories"][:2]
+    np.save(tmp_path / "end.npy", ahead[:, -1])
+    with stopped_after(3, interrupt):
+        back = ("predict", model, "--initial", tmp_path / "end.npy", "--num-steps", -40,
+                "--save-every", 2, "--out", tmp_path / "back.npz")  # fmt: skip
+        assert gfnn(*back) == 130
+    assert gfnn(*back, "--resume") == 0
+    assert "2 trajectories of 40 steps backwards" in capsys.readouterr().out
+    with np.load(tmp_path / "back.npz") as found:
+        np.testing.assert_array_equal(found["steps"], np.arange(0, -41, -2))
+        assert found["dt"] == DT
+        np.testing.assert_allclose(found["trajectories"], ahead[:, ::-2], rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize(

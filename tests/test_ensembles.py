@@ -18,6 +18,7 @@ from gfnn_jax.jobs.predict import predict
 from gfnn_jax.jobs.progress import Progress
 from gfnn_jax.jobs.search import search
 from gfnn_jax.learn import network_sweep
+from gfnn_jax.learn.options import FitOptions
 
 DT = 0.5
 
@@ -142,7 +143,9 @@ def test_a_saved_ensemble_keeps_its_members_and_predicts_bands(fit, tmp_path):
 
 @pytest.mark.filterwarnings("ignore::gfnn_jax.FitWarning")
 def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path, monkeypatch):
-    options = {"family": "mlp", "chart": "midpoint", "max_iterations": 6, "ensemble": 4}
+    options = FitOptions(
+        family="mlp", chart="midpoint", max_iterations=6, ensemble=4, max_seconds=None
+    )
 
     class Stopping(Progress):
         def __init__(self, at):
@@ -156,8 +159,7 @@ def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path, monkeypat
             pass
 
     def run(folder, at):
-        return search(pairs_of(150, 0), None, progress=Stopping(at), kept_in=folder, job={},
-                      max_seconds=None, **options)  # fmt: skip
+        return search(pairs_of(150, 0), None, options, progress=Stopping(at), kept_in=folder)
 
     monkeypatch.setattr(network_sweep, "_CHECKPOINT_SECONDS", 0.0)
     whole = run(tmp_path / "whole", 99)
@@ -174,7 +176,7 @@ def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"ensemble": 0}, "whole number of 1 or more as ensemble, got 0"),
+        ({"ensemble": 0}, "whole number from 1 to .* as ensemble, got 0"),
         ({"ensemble": 3}, "expected family='mlp'"),
         ({"ensemble": 3, "family": "mlp", "learn": "hamiltonian"}, "an ensemble is of networks S"),
     ],

@@ -15,7 +15,7 @@ from recordings.generated import MISTAKES, sheet
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
-from gfnn_jax.data.recording_summary import summarise
+from gfnn_jax.data.recording_summary import refuse_mistakes, summarise
 from gfnn_jax.errors import InputError
 
 
@@ -152,6 +152,20 @@ def test_strict_look_fails_where_something_is_wrong(tmp_path, capsys):
     assert main(["look", str(tmp_path / "none.csv")]) == 2
     assert main(["look", str(path), "--positions", "phi"]) == 2
     assert "no column phi" in capsys.readouterr().err
+
+
+def test_fit_refuses_what_look_calls_wrong(tmp_path, capsys):
+    path = a_swing(tmp_path / "r.csv", omega=lambda t, x: np.cos(17 * t))
+    model = str(tmp_path / "model")
+    for learn in ("auto", "map"):
+        assert main(["fit", str(path), "--out", model, "--learn", learn]) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert "omega is not the derivative of theta" in line
+        assert "--positions theta" in line
+        assert "--despite 'no derivative'" in line
+    assert not (tmp_path / "model").exists()
+    refuse_mistakes(gfnn.read(path), ["no derivative"])
+    refuse_mistakes(gfnn.read(path, positions="theta"))
 
 
 def test_look_at_states(tmp_path, capsys):

@@ -67,10 +67,10 @@ def test_few_pairs_are_cross_validated(pairs):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"model": object()}, "has no name, sizes, fit"),
+        ({"model": object()}, "a model with a name, sizes"),
         ({"model": own_module.Kicks(), "learn": "map"}, "a model of one's own is all"),
         ({"family": lambda inputs: [inputs]}, "Inputs has no name"),
-        ({"family": 3}, "expected family to be one of auto"),
+        ({"family": 3}, "expected one of auto, .* as family"),
     ],
 )
 def test_what_is_none(options, message, pairs):

@@ -14,7 +14,7 @@ from gfnn_jax.models.arguments import arguments_of
 from gfnn_jax.models.atoms import Factor, atom_text, dictionary_of, gradient_of, powers_of
 from gfnn_jax.models.matching import Matching, orthonormal
 from gfnn_jax.models.shapes import constants_for, has_constant, kinds_for, values
-from gfnn_jax.models.textbook import textbook_law
+from gfnn_jax.models.textbook import Textbook
 from gfnn_jax.phase_space import apply_j, sizes
 
 
@@ -70,7 +70,8 @@ def outside_pairs(count):
 
 def searched(pairs, **options):
     problem = Problem(pairs.z0, pairs.z1, pairs.dt, sizes(pairs.z0))
-    return textbook_law(problem, np.arange(len(pairs.z0)), **options)
+    search = Textbook(problem, np.arange(len(pairs.z0)), **options)
+    return search.law(products=False) or (None if search.noisy else search.law(products=True))
 
 
 def read(law):

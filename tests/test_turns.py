@@ -81,7 +81,7 @@ def test_a_law_of_few_terms_is_found_beyond_half_a_turn_and_that_is_said(dt):
     z1 = images(family, np.ones(1), z0, dt, Steps(10, 40)).states
     fit = gfnn.fit(gfnn.Pairs(z0, z1, dt), tolerance=1e-11, learn="hamiltonian")
     assert fit.met
-    assert fit.formula == "0.5 q1² + 0.5 p1² + 0.1 q1³"
+    assert fit.formula == "0.5*q1**2 + 0.5*p1**2 + 0.1*q1**3"
     assert "beyond π" in " ".join(fit.messages)
 
 

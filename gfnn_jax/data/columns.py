@@ -72,6 +72,9 @@ def angles_of(
     known = (*roles["positions"], *roles["velocities"])
     check_known(source, "angles", given, roles["positions"])
     check_known(source, "degrees", degrees, known)
+    told = [n for n in degrees if _unit(units, n).startswith("rad")]
+    if told:
+        raise InputError(f"{source}: degrees: {told[0]} is in {units[told[0]]} by its header")
     in_degrees = set(degrees) | {n for n in known if _unit(units, n).startswith(("deg", "°"))}
     angles = set(given) | {n for n in roles["positions"] if n in in_degrees}
     if by_names:

@@ -43,7 +43,7 @@ def job_of(
     job = {
         **identity,
         "format": _FORMAT,
-        "shape": [shape[0], 1 + num_steps // save_every, shape[1]],
+        "shape": [shape[0], 1 + abs(num_steps) // save_every, shape[1]],
         **({"bands": True} if bands else {}),
         "num_steps": num_steps,
         "save_every": save_every,
@@ -74,7 +74,8 @@ class PredictionWriter:
 
     out:       the ``.npz`` to write; ``OUT.partial`` holds the chunks until `finish`.
     shape:     (B, 2d).
-    num_steps, save_every: N and K; saved are the S = 1 + N // K states of steps 0, K, 2K, ...
+    num_steps, save_every: N and K; saved are the S = 1 + |N| // K states of steps 0, ±K, ±2K, ...,
+               backwards where N < 0.
     dt:        the time step of the map.
     params:    the names (k,) and values (B, k) of its parameters.
     drive:     the time t0 (B,) of the drive at the initial states, and its period.
@@ -110,7 +111,8 @@ class PredictionWriter:
     ):
         self.out = Path(out)
         self.partial = self.out.with_name(self.out.name + ".partial")
-        self.steps = range(0, num_steps + 1, save_every)
+        sign = 1 if num_steps > 0 else -1
+        self.steps = range(0, num_steps + sign, sign * save_every)
         self.dt = float(dt)
         self.params, self.drive = params, drive
         self.lanes, self._state = shape

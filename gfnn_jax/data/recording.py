@@ -11,7 +11,6 @@ needs JAX.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,6 +29,7 @@ from gfnn_jax.data.columns import (
 )
 from gfnn_jax.data.roles import ROLES, is_run, is_time
 from gfnn_jax.data.runs import restarts, runs_of
+from gfnn_jax.data.sigmas import check_sigmas, typical, with_sigmas
 from gfnn_jax.data.tables import Table, from_arrays, from_memory
 from gfnn_jax.data.text_files import from_text
 from gfnn_jax.errors import InputError
@@ -48,12 +48,17 @@ class Recording:
     positions, velocities, momenta, inputs, parameters: names of columns. The i-th velocity and the
                 i-th momentum belong to the i-th position.
     angles:     positions of period 2π, in radians, wrapped or not.
-    std:        name -> standard deviation σ of the column's noise, or None where it was not given;
-                in radians where the column is.
+    std:        name -> standard deviation σ of the column's noise, the median where it was given
+                for each value (`sigma`), or None where it was not; in radians where the column is.
     units:      name -> unit, as the file gives it.
     factors:    name -> value here ÷ number in the file: π/180 of a column in degrees, else 1.
     time_unit:  of the file; `times` are in seconds.
+    coordinates: what moves, the positions unless other names were given.
+    observe:    column -> what its sensor shows: text in coordinates, velocities and parameters that
+                are fitted, or a function of these (`maps.observation`).
+    guess:      name -> where a parameter of ``observe`` starts.
     offsets, scales: columns that a sensor shows with an unknown offset, or scale, to be fitted.
+    sensors:    columns that only ``observe`` explains.
     ignored:    columns without a role.
     angles_given: whether the angles were told, not read off names and units.
     notes:      what reading had to decide, a line each.
@@ -66,11 +71,15 @@ class Recording:
     momenta: tuple[str, ...]
     inputs: tuple[str, ...]
     parameters: tuple[str, ...]
+    sensors: tuple[str, ...]
+    coordinates: tuple[str, ...]
     angles: tuple[str, ...]
     std: dict[str, float | None]
     units: dict[str, str]
     factors: dict[str, float]
     time_unit: str
+    observe: dict[str, Any]
+    guess: dict[str, float]
     offsets: tuple[str, ...]
     scales: tuple[str, ...]
     ignored: tuple[str, ...]
@@ -79,13 +88,16 @@ class Recording:
     source: str
     _times: dict[str, np.ndarray]
     _values: dict[str, dict[str, np.ndarray]]  # run -> name -> (n,)
+    _sigmas: dict[str, str]  # name -> the column of σ of its values
 
     def __init__(
         self, table: Any, *, positions: Names = None, velocities: Names = None,
         momenta: Names = None, inputs: Names = None, parameters: Names = None,
         angles: Names = None, degrees: Names = None, time_unit: str | None = None,
-        std: Mapping[str, float] | None = None, columns: Names = None, dt: float | None = None,
-        offset: Names = None, scale: Names = None,
+        std: Mapping[str, Any] | None = None, columns: Names = None, dt: float | None = None,
+        offset: Names = None, scale: Names = None, sensors: Names = None,
+        coordinates: Names = None, observe: Mapping[str, Any] | None = None,
+        guess: Mapping[str, float] | None = None,
     ):  # fmt: skip
         """The recording of a table in memory; of files: `read`.
 
@@ -97,36 +109,60 @@ class Recording:
         angles:  positions of period 2π; without it those whose name or unit says so.
         degrees: columns in degrees, or degrees per second; a position among them is an angle.
         time_unit: s (the default), ms, us, ns, min or h; a header's own unit serves too.
-        std:     σ of columns, in their own unit.
+        std:     σ of columns, in their own unit: a number, one for each value (T,) of a table, or
+                 the name of a column that holds them; of column x also a column x_std.
         columns: those to take beside times and runs; all others are as if they were not there.
         dt:      seconds between rows, in place of a column of times.
         offset, scale: columns that a sensor shows shifted, or scaled, by an unknown amount.
+        coordinates: what moves, where it is not the positions: ``observe`` then says how columns
+                 show it.
+        observe: column -> text such as "x0 + R*sin(theta + tilt)", or a function of arguments with
+                 these names: coordinates, velocities, and parameters to be fitted.
+        guess:   where parameters of ``observe`` start.
         Raises InputError where names, times or values do not fit.
         """
         given = {
             "positions": listed(positions), "velocities": listed(velocities),
             "momenta": listed(momenta), "inputs": listed(inputs),
-            "parameters": listed(parameters),
+            "parameters": listed(parameters), "sensors": listed(sensors),
         }  # fmt: skip
         tables = [from_memory(t) for t in (table if isinstance(table, (list, tuple)) else [table])]
         if not tables:
             raise InputError("expected at least one table, got none")
         tables = [_selected(t, listed(columns)) for t in tables]
+        tables, sigmas = with_sigmas(tables, std or {})
         source = ", ".join(dict.fromkeys(t.source for t in tables))
         names = list(dict.fromkeys(name for t in tables for name in t.columns))
         units = {name: unit for t in reversed(tables) for name, unit in t.units.items()}
-        numbers = [name for name in names if not is_run(name) and not is_time(name)]
+        columned = [name for name in names if not is_run(name) and not is_time(name)]
+        numbers = [name for name in columned if name not in sigmas.values()]
         unit = time_unit_of(source, names, units, time_unit)
-        runs = runs_of(tables, numbers, SECONDS[unit], dt)
+        runs = runs_of(tables, columned, SECONDS[unit], dt)
+        seen = listed(coordinates)
+        check_known(source, "observe", observe or {}, numbers)
+        if seen and not given["positions"]:
+            given["positions"] = tuple(name for name in seen if name in numbers)
+        if seen and not any(given.values()):
+            given["sensors"] = tuple(observe or {})
         roles, decided = roles_of(source, numbers, given, runs)
+        others = [name for of_role in roles.values() for name in of_role]
+        more = (name for name in observe or {} if name not in others)
+        roles = {**roles, "sensors": (*roles["sensors"], *more)}
+        seen = seen or roles["positions"]
         with_role = [name for role in ROLES for name in roles[role]]
         empty = [n for n in with_role if not any(np.isfinite(v[n]).any() for _, v in runs.values())]
         if empty:
             raise InputError(f"{source}: no value in column {', '.join(empty)}")
         angular, in_degrees = angles_of(
-            source, roles, listed(angles), listed(degrees), angles is None, units
+            source,
+            {**roles, "positions": seen},
+            listed(angles),
+            listed(degrees),
+            angles is None,
+            units,
         )
         factors = factors_of(numbers, in_degrees)
+        factors |= {of: factors[name] for name, of in sigmas.items()}
         values = {
             run: {name: column * factors[name] for name, column in of_run.items()}
             for run, (_, of_run) in runs.items()
@@ -137,11 +173,16 @@ class Recording:
             ("scale", listed(scale)),
         ):
             check_known(source, what, wanted, with_role)
+        sigmas = {name: of for name, of in sigmas.items() if name in with_role}
+        check_sigmas(source, sigmas, values)
         fields = {
             **roles,
             "runs": tuple(runs),
             "angles": angular,
-            "std": _std(std or {}, with_role, factors),
+            "std": typical(std or {}, sigmas, with_role, factors, values),
+            "coordinates": seen,
+            "observe": dict(observe or {}),
+            "guess": {name: float(value) for name, value in (guess or {}).items()},
             "units": {n: u for n, u in units.items() if n in numbers},
             "factors": factors,
             "time_unit": unit,
@@ -154,6 +195,7 @@ class Recording:
             "source": source,
             "_times": {run: times for run, (times, _) in runs.items()},
             "_values": values,
+            "_sigmas": sigmas,
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -172,12 +214,17 @@ class Recording:
     @property
     def dim(self) -> int:
         """Degrees of freedom: the number of positions, or of velocities where there are none."""
-        return len(self.positions) or len(self.velocities) or len(self.momenta)
+        return len(self.coordinates) or len(self.velocities) or len(self.momenta)
 
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns that have a role, role by role."""
         return tuple(name for role in ROLES for name in getattr(self, role))
+
+    @property
+    def explained(self) -> frozenset[str]:
+        """Columns whose sensor is told by ``observe``, an offset or a scale."""
+        return frozenset({*self.observe, *self.offsets, *self.scales})
 
     def times(self, run: str | float) -> np.ndarray:
         """Times (n,) of a run in seconds, rising."""
@@ -189,6 +236,14 @@ class Recording:
         if name not in found:
             raise InputError(f"{self.source}: no column {name}, found {', '.join(found)}")
         return found[name]
+
+    def sigma(self, name: str, run: str | float) -> np.ndarray | None:
+        """σ (n,) of the values of a column in a run, None where it was not given."""
+        self.values(name, run)  # raises where there is no such column
+        if name in self._sigmas:
+            return self._values[self._named(run)][self._sigmas[name]]
+        known = self.std.get(name)
+        return None if known is None else np.full(len(self.times(run)), known)
 
     def unwrapped(self, name: str, run: str | float) -> np.ndarray:
         """A column (n,) in a run, an angle lifted so that it moves by less than half a turn between
@@ -267,7 +322,7 @@ def read(
               none.
     start, stop, every: rows to keep: between these times (in the file's unit), every so many.
     options:  positions, velocities, momenta, inputs, parameters, angles, degrees, time_unit, std,
-              dt, offset, scale: as of `Recording`.
+              dt, offset, scale, sensors, coordinates, observe, guess: as of `Recording`.
     Raises InputError, one line with the file and the line, where a file cannot be used.
     """
     several = [paths] if isinstance(paths, (str, Path)) else list(paths)
@@ -309,13 +364,3 @@ def _selected(table: Table, columns: tuple[str, ...]) -> Table:
         )
     kept = {n: x for n, x in table.columns.items() if n in columns or is_time(n) or is_run(n)}
     return dataclasses.replace(table, columns=kept)
-
-
-def _std(
-    given: Mapping[str, float], names: Sequence[str], factors: Mapping[str, float]
-) -> dict[str, float | None]:
-    """σ of each column, inside. Raises InputError where one is no size."""
-    bad = {name: s for name, s in given.items() if not (math.isfinite(s) and s >= 0)}
-    if bad:
-        raise InputError(f"expected a finite σ, 0 or above, got std = {bad}")
-    return {name: given[name] * factors[name] if name in given else None for name in names}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from gfnn_jax.data.faults import Fault, faults
 from gfnn_jax.data.roles import ROLES
 from gfnn_jax.data.traits import Traits, traits
+from gfnn_jax.errors import InputError
 from gfnn_jax.signals import energy
 from gfnn_jax.signals.spectra import dominant_frequencies
 from gfnn_jax.signals.steps import gaps
@@ -160,6 +161,16 @@ def summarise(recording: Recording, options: Mapping[str, Any] | None = None) ->
     )  # fmt: skip
 
 
+def refuse_mistakes(recording: Recording, despite: Sequence[str] = ()) -> None:
+    """Raises InputError, a line with what mends it, where the samples show a mistake that makes a
+    fit meaningless; kinds of `Fault` in ``despite`` are let pass."""
+    wrong = [f for f in faults(traits(recording)) if f.wrong and f.kind not in despite]
+    if wrong:
+        more = f"; {len(wrong) - 1} more: gfnn look" if len(wrong) > 1 else ""
+        kind = shlex.quote(wrong[0].kind)
+        raise InputError(f"{recording.source}: {wrong[0]} (or --despite {kind}){more}")
+
+
 def _motion(known: Traits) -> tuple[float | None, energy.Loss | None]:
     """(period in s, loss of energy) of the positions."""
     recording, local = known.recording, known.local
@@ -239,13 +250,20 @@ def _command(recording: Recording, found: tuple[Fault, ...], options: Mapping[st
     return f"gfnn fit {files}{as_typed(typed)} --out model"
 
 
+def _short(value: Any) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
 def as_typed(options: Mapping[str, Any]) -> str:
     """Keywords of `gfnn_jax.read` as options of the command line, with a blank before each."""
     words = {"start": "from", "stop": "to", "time_unit": "time-unit"}
     said = []
     for option, value in options.items():
+        if option == "observe":
+            said += [f" --observe {shlex.quote(f'{c} = {f}')}" for c, f in value.items()]
+            continue
         if isinstance(value, Mapping):
-            value = ",".join(f"{name}={number:g}" for name, number in value.items())
+            value = ",".join(f"{name}={_short(number)}" for name, number in value.items())
         elif isinstance(value, (tuple, list)):
             value = ",".join(map(str, value))
         said.append(f" --{words.get(option, option)} {shlex.quote(str(value))}")

@@ -6,7 +6,7 @@ import re
 import unicodedata
 from collections.abc import Iterable
 
-ROLES = ("positions", "velocities", "momenta", "inputs", "parameters")
+ROLES = ("positions", "velocities", "momenta", "inputs", "parameters", "sensors")
 TIMES = (
     "t", "time", "times", "timestamp", "timestamps", "date", "datetime", "elapsed", "clock", "sec",
     "seconds", "zeit", "temps", "tiempo", "tempo",

@@ -8,7 +8,7 @@ forty to a period of the fastest motion, each with the state (q, v) that local c
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -29,17 +29,21 @@ _SHORTEST_ARC = 5
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Stretch:
-    """Samples without a gap of ``run``: times t (n,), positions y (n, d), inputs u (n, k)."""
+    """Samples without a gap of ``run``: times t (n,), channels y (n, k), NaN where one was not
+    seen, inputs u (n, inputs), the coordinates q (n, d) that the channels show, and the ``noise``
+    (n, k) of each value in units of its channel's."""
 
     run: str
     t: np.ndarray
     y: np.ndarray
     u: np.ndarray
+    q: np.ndarray
+    noise: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Nodes:
-    """Samples ``at`` (m,) of a stretch, with their times t (m,), positions y (m, d) and states x
+    """Samples ``at`` (m,) of a stretch, with their times t (m,), channels y (m, k) and states x
     (m, 2d)."""
 
     stretch: Stretch
@@ -51,8 +55,9 @@ class Nodes:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scales:
-    """What the samples say about themselves: noise σ (d,), rms speeds (d,), the fastest frequency
-    ω (1/s), the median step dt, and the window of the local cubics (samples to either side)."""
+    """What the samples say about themselves: noise σ (k,) of the channels, rms speeds (d,), the
+    fastest frequency ω (1/s), the median step dt, and the window of the local cubics (samples to
+    either side)."""
 
     sigma: np.ndarray
     speed: np.ndarray
@@ -82,30 +87,45 @@ class Scales:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Arcs:
-    """Arcs of one length L: times (A, L), y (A, L, d), states x (A, L, 2d), and where they come
-    from: (stretch, first node, node after the last). A shorter arc repeats its last node, unseen
-    (NaN)."""
+    """Arcs of one length L: times (A, L), y (A, L, k), states x (A, L, 2d), relative noise (A, L,
+    k), and where they come from: (stretch, first node, node after the last). A shorter arc repeats
+    its last node, unseen (NaN)."""
 
     t: np.ndarray
     y: np.ndarray
     x: np.ndarray
+    noise: np.ndarray
     home: tuple[tuple[int, int, int], ...]
 
     def take(self, keep: np.ndarray) -> Arcs:
         chosen = np.arange(len(self.home))[keep]
         home = tuple(self.home[i] for i in chosen)
-        return Arcs(self.t[keep], self.y[keep], self.x[keep], home)
+        return Arcs(self.t[keep], self.y[keep], self.x[keep], self.noise[keep], home)
 
 
-def stretches(recording: Recording) -> list[Stretch]:
-    """The stretches of all runs. Raises FitError where none is long enough."""
+def stretches(
+    recording: Recording, channels: Sequence[str] | None = None,
+    coordinates_of: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> list[Stretch]:  # fmt: skip
+    """The stretches of all runs.
+
+    channels: columns that are seen, the positions unless given. coordinates_of: (n, k) channels ->
+    (n, d) coordinates, NaN where they are not told; None: the channels are the coordinates.
+    Raises FitError where no stretch is long enough.
+    """
+    names = recording.positions if channels is None else channels
     found = []
     for run in recording.runs:
-        t = recording.times(run)
-        y = np.stack([recording.unwrapped(n, run) for n in recording.positions], axis=1)
-        u = recording.array("inputs", run)
-        seen = np.isfinite(y).all(1) & np.isfinite(u).all(1)
-        found += pieces(run, t[seen], y[seen], u[seen])
+        t, u = recording.times(run), recording.array("inputs", run)
+        y, noise = channels_of(recording, names, run)
+        q = y if coordinates_of is None else coordinates_of(y)
+        turns = [i for i, n in enumerate(recording.coordinates) if n in recording.angles]
+        seen = np.isfinite(q).all(1) & np.isfinite(u).all(1)
+        t, y, u, q, noise = t[seen], y[seen], u[seen], q[seen], noise[seen]
+        if coordinates_of is not None and len(q):
+            q = q.copy()
+            q[:, turns] = np.unwrap(q[:, turns], axis=0)
+        found += pieces(run, t, y, u, q, noise)
     found = [s for s in found if len(s.t) >= _SHORTEST]
     if not found:
         raise FitError(
@@ -114,29 +134,62 @@ def stretches(recording: Recording) -> list[Stretch]:
     return found
 
 
+def channels_of(
+    recording: Recording, names: Sequence[str], run: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n, k) values of columns in a run, angles lifted, and their noise ÷ that of their column: 1
+    where σ was not given for each value."""
+    y = np.stack([recording.unwrapped(name, run) for name in names], axis=1)
+    noise = np.ones(y.shape)
+    for k, name in enumerate(names):
+        sigma, usual = recording.sigma(name, run), recording.std[name]
+        if sigma is not None and usual:
+            noise[:, k] = np.where(np.isfinite(sigma), sigma / usual, 1.0)
+    return y, noise
+
+
 def pieces(
-    run: str, t: np.ndarray, y: np.ndarray, u: np.ndarray, gap: float = GAP
-) -> list[Stretch]:
+    run: str, t: np.ndarray, y: np.ndarray, u: np.ndarray, q: np.ndarray, noise: np.ndarray,
+    gap: float = GAP,
+) -> list[Stretch]:  # fmt: skip
     """A run cut at its gaps."""
     steps = np.diff(t)
     cuts = np.flatnonzero(steps > gap * np.median(steps)) + 1 if len(steps) else []
-    parts = (np.split(a, cuts) for a in (t, y, u))
+    parts = (np.split(a, cuts) for a in (t, y, u, q, noise))
     return [Stretch(run, *part) for part in zip(*parts, strict=True)]
 
 
 def measure(found: Sequence[Stretch]) -> Scales:
     """Noise, speeds and the fastest frequency, from local cubics at some two thousand samples."""
-    half, sigma = choose_half([(s.t, s.y) for s in found])
+    half, sigma = choose_half([(s.t, s.q) for s in found])
     every = max(1, sum(len(s.t) for s in found) // 2_000)
-    smooths = [smooth(s.t, s.y, half, np.arange(0, len(s.t), every))[0] for s in found]
+    smooths = [smooth(s.t, s.q, half, np.arange(0, len(s.t), every))[0] for s in found]
     speed = np.sqrt(np.mean(np.concatenate([s.v for s in smooths]) ** 2, axis=0))
     acceleration = np.sqrt(np.mean(np.concatenate([s.a for s in smooths]) ** 2, axis=0))
     if not np.all(speed > 0):
         raise InputError("expected positions that move: a column is constant")
     dt = float(np.median(np.concatenate([np.diff(s.t) for s in found])))
-    resolution = np.median(np.abs(np.concatenate([np.diff(s.y, axis=0) for s in found])), axis=0)
-    sigma = np.maximum(sigma, 1e-9 * np.maximum(resolution, speed * dt))  # clean data have none
+    if any(s.y is not s.q for s in found):
+        sigma = _noise_of_channels(found)
+    steps = np.concatenate([np.diff(s.y, axis=0) for s in found])
+    resolution = np.nanmedian(np.abs(steps), axis=0)
+    size = np.sqrt(np.nanmean(steps**2, axis=0))
+    sigma = np.maximum(sigma, 1e-9 * np.maximum(resolution, size))  # clean data have none
     return Scales(sigma, speed, float(np.max(acceleration / speed)), dt, half)
+
+
+def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:
+    """σ (k,) of channels, each where it was seen."""
+    sigma = []
+    for k in range(found[0].y.shape[1]):
+        known = [
+            (s.t[have], s.y[have, k : k + 1]) for s in found for have in [~np.isnan(s.y[:, k])]
+        ]
+        known = [pair for pair in known if len(pair[0]) >= _SHORTEST]
+        if not known:
+            raise FitError(f"expected channels with {_SHORTEST} samples in a row, got fewer")
+        sigma.append(float(choose_half(known)[1][0]))
+    return np.array(sigma)
 
 
 def nodes_of(found: Sequence[Stretch], scales: Scales) -> list[Nodes]:
@@ -152,7 +205,7 @@ def nodes_of(found: Sequence[Stretch], scales: Scales) -> list[Nodes]:
             count += 1
             if len(block) < _SHORTEST_ARC or (count - 1) % keep:
                 continue
-            q, v, _ = smooth(s.t, s.y, scales.half, block)[0]
+            q, v, _ = smooth(s.t, s.q, scales.half, block)[0]
             x = np.concatenate([q, v], axis=1)
             nodes.append(Nodes(s, block, s.t[block], s.y[block], x))
     return nodes
@@ -166,14 +219,15 @@ def arcs_of(nodes: Sequence[Nodes], length: int) -> Arcs:
         edges = np.linspace(0, len(node.t), count + 1).round().astype(int)
         home += [(i, int(a), int(b)) for a, b in pairwise(edges) if b - a >= _SHORTEST_ARC]
     longest = max(b - a for _, a, b in home)
-    t, y, x = [], [], []
+    t, y, x, noise = [], [], [], []
     for i, a, b in home:
         index = np.minimum(np.arange(a, a + longest), b - 1)
         t.append(nodes[i].t[index])
         x.append(nodes[i].x[index])
+        noise.append(nodes[i].stretch.noise[nodes[i].at[index]])
         seen = np.arange(a, a + longest) < b
         y.append(np.where(seen[:, None], nodes[i].y[index], np.nan))
-    return Arcs(np.array(t), np.array(y), np.array(x), tuple(home))
+    return Arcs(np.array(t), np.array(y), np.array(x), np.array(noise), tuple(home))
 
 
 def with_states(nodes: Sequence[Nodes], arcs: Arcs, x: np.ndarray) -> list[Nodes]:

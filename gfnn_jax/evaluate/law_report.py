@@ -58,6 +58,8 @@ def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:
             },
         },
         "zeros": {name: {"zero": z, "std": s} for name, (z, s) in fit.zeros.items()},
+        "observe": fit.observe,
+        "sensors": {name: {"value": c, "std": s} for name, (c, s) in fit.sensors.items()},
         "noise": {n: {"sigma": s, "residual": fit.residual[n]} for n, s in fit.noise.items()},
         "gauge": fit.gauge,
         "energy": fit.energy,

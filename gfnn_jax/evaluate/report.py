@@ -127,7 +127,6 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
     law = fit.hamiltonian
     return {
         "formula": fit.formula,
-        "text": law.text,
         "terms": [term._asdict() for term in law.terms],
         "friction": [term._asdict() for term in law.friction],
         "dropped": law.dropped._asdict() if law.dropped is not None else None,

@@ -12,7 +12,7 @@ import dataclasses
 import keyword
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache, cached_property
 from typing import Any
 
@@ -188,15 +188,37 @@ def parse(text: str, dim: int, parameters: tuple[str, ...] = ()) -> Expression:
     Raises InputError, in one line, for anything but numbers, + - * / **, the coordinates, the
     parameters and the functions of `FUNCTIONS`.
     """
-    if len(text) > _LONGEST_TEXT:
-        raise InputError(f"expected a term of at most {_LONGEST_TEXT} characters, got {len(text)}")
     names = {name: coordinate(i) for i, name in enumerate(coordinate_names(dim))}
     if dim == 1:
         names.update(q=coordinate(0), p=coordinate(1))
     names.update({name: parameter(i) for i, name in enumerate(parameters)})
+    return _read(text, lambda tree: _parsed(tree, names, text, 0))
+
+
+def parse_named(text: str, names: Sequence[str]) -> Expression:
+    """Parse an expression in variables of any names, which become coordinates in their order.
+
+    Raises InputError as `parse` does.
+    """
+    known = {name: coordinate(i) for i, name in enumerate(names)}
+    return _read(text, lambda tree: _parsed(tree, known, text, 0))
+
+
+def names_in(text: str) -> tuple[str, ...]:
+    """The names of variables in an expression, in the order in which they appear."""
+    nodes = _read(text, lambda tree: list(ast.walk(tree)))
+    called = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
+    found = [n for n in nodes if isinstance(n, ast.Name) and id(n) not in called]
+    found.sort(key=lambda node: node.col_offset)
+    return tuple(dict.fromkeys(node.id for node in found if node.id not in _CONSTANTS))
+
+
+def _read(text: str, use: Callable[[ast.expr], Any]) -> Any:
+    """What ``use`` makes of the syntax tree of a text. Raises InputError where there is none."""
+    if len(text) > _LONGEST_TEXT:
+        raise InputError(f"expected a term of at most {_LONGEST_TEXT} characters, got {len(text)}")
     try:
-        tree = ast.parse(plain(text.strip()), mode="eval").body
-        return _parsed(tree, names, text, 0)
+        return use(ast.parse(plain(text.strip()), mode="eval").body)
     except (SyntaxError, ValueError, RecursionError, MemoryError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
@@ -262,6 +284,11 @@ _SUM, _PRODUCT, _POWER, _ATOM = range(4)
 def to_text(tree: Expression, dim: int, parameters: tuple[str, ...] = ()) -> str:
     """Write the tree as text that `parse` reads back, every number to its last digit."""
     return _text(tree, (*coordinate_names(dim), *parameters), 2 * dim)[0]
+
+
+def to_named_text(tree: Expression, names: Sequence[str]) -> str:
+    """Write a tree of coordinates of these names as text that `parse_named` reads back."""
+    return _text(tree, tuple(names), len(names))[0]
 
 
 def _text(tree: Expression, names, width: int) -> tuple[str, int]:

@@ -20,11 +20,6 @@ _NEEDED = (
 )  # fmt: skip
 
 
-def is_own(given: Any) -> bool:
-    """Return whether this is a user's family, or a function that gives such families."""
-    return not isinstance(given, str) and (isinstance(given, LinearFamily) or callable(given))
-
-
 def own_families(given: Any, inputs: Inputs) -> Iterator[Any]:
     """Iterate over the families, by rising number of terms.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
 
@@ -15,9 +15,10 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import report
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.jobs.progress import SILENT, Progress
-from gfnn_jax.jobs.search import BEST, failures_of_arithmetic, scene_named, search
+from gfnn_jax.jobs.search import BEST, failures_of_arithmetic, refusals, scene_named, search
 from gfnn_jax.jobs.written import Ran, already_done, publish, write
 from gfnn_jax.learn.check import FEWEST
+from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.learn.refit import can_be_refitted, help_refit, not_refitted, refit
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.phase_space import Pairs
@@ -35,42 +36,31 @@ def fit(
     *,
     out: Path,
     dt: float | None = None,
-    tolerance: float = 1e-6,
-    absolute_tolerance: float | None = None,
-    max_seconds: float | Literal["auto"] | None = "auto",
-    max_operations: int | None = None,
-    chart: str = "auto",
-    learn: str = "auto",
-    terms: tuple[str, ...] = (),
-    base: str | None = None,
-    structure: str | None = None,
-    family: str = "auto",
-    ensemble: int = 1,
     scene_name: str | None = None,
-    angles: tuple[int, ...] = (),
-    seed: int = 0,
     overwrite: bool = False,
     resume: bool = False,
-    devices: int | str | None = None,
     group: Group | None = None,
     progress: Progress = SILENT,
+    **options: Any,
 ) -> Ran | None:
     """Learn the map of trajectory files, and write it with its report into the model folder out.
 
     scene_name: the scene whose coordinates and features are used. resume: returns None where
-    ``out`` holds the result of this same job. devices: those of each process, as ``gfnn.fit`` takes
-    them; a job may be resumed on others. group: the processes that do this job, each with its own
-    rows or files; all but the first return None. The other options are those of ``gfnn.fit``.
+    ``out`` holds the result of this same job. group: the processes that do this job, each with its
+    own rows or files; all but the first return None. options: `FitOptions`; devices are those of
+    each process, and a job may be resumed on others.
     """
+    with refusals():
+        asked = FitOptions(**options)
     try:
-        own = () if devices is None else local_devices(devices)
+        own = () if asked.devices is None else local_devices(asked.devices)
     except ValueError as error:
         raise InputError(f"--devices: {error}") from error
     scene = scene_named(scene_name) if scene_name is not None else None
     data = [data] if isinstance(data, Path) else list(data)
     processes, group = group, group or Group()
     pairs = _Pairs(data, dt, group.share)
-    structured = structure is not None or (scene is not None and scene.structure is not None)
+    structured = asked.structure is not None or (scene is not None and scene.structure is not None)
     fewest = FEWEST if structured else None
     size = sum(path.stat().st_size for path in data if path.is_file())
     large = processes is not None or len(data) > 1 or size > _LARGE_BYTES
@@ -88,15 +78,10 @@ def fit(
         return None
     for line in summary(trajectories):
         progress.tell(line)
-    options = {
-        "tolerance": tolerance, "absolute_tolerance": absolute_tolerance, "chart": chart,
-        "learn": learn, "terms": list(terms), "base": base, "structure": structure,
-        "family": family, "seed": seed, **({} if ensemble == 1 else {"ensemble": ensemble}),
-    }  # fmt: skip
     job = {
         "command": "fit", "data": trajectories.digest,
         "dt": None if np.ndim(trajectories.dt) else trajectories.dt, "scene": scene_name,
-        "angles": list(angles), **options,
+        **asked.deciding,
     }  # fmt: skip
     if already_done(out, job, resume):
         group.told({})
@@ -104,9 +89,7 @@ def fit(
     with unfinished(out, job, what="fit", overwrite=overwrite, resume=resume) as kept_in:
         try:
             fitted = search(
-                trajectories.pairs(), scene, angles=angles, max_seconds=max_seconds,
-                max_operations=max_operations, progress=progress, kept_in=kept_in, job=job,
-                devices=devices, **options,
+                trajectories.pairs(), scene, asked, progress=progress, kept_in=kept_in, job=job
             )  # fmt: skip
             if large and can_be_refitted(fitted.map):
                 progress.say("all pairs, for the chosen candidate")
@@ -121,7 +104,7 @@ def fit(
             progress.say("the report: the posterior, and the derivative of a step")
             fitted = fitted.settled()
             result = report.assemble(
-                fitted, scene=scene_name, dt=float(np.asarray(fitted.map.dt)), seed=seed,
+                fitted, scene=scene_name, dt=float(np.asarray(fitted.map.dt)), seed=asked.seed,
                 rollout=None,
                 data={
                     "source": trajectories.source,

@@ -7,10 +7,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gfnn_jax.data.recording import read
+from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.evaluate import law_report, report
 from gfnn_jax.jobs.progress import SILENT, Progress
+from gfnn_jax.jobs.search import refusals
 from gfnn_jax.jobs.written import REPORT
 from gfnn_jax.learn.fit import fit as learn_fit
+from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps import saved
 from gfnn_jax.models.learned_law import LearnedLaw
 from gfnn_jax.storage.outputs import atomic_folder
@@ -25,22 +28,26 @@ class Learned(NamedTuple):
 
 
 def fit_recording(
-    data: Sequence[Path], *, out: Path, columns: dict[str, Any], learn: str = "auto",
-    friction: str = "auto", input_hold: str = "auto", mass: dict[str, float] | None = None,
-    seed: int = 0, progress: Progress = SILENT,
+    data: Sequence[Path], *, out: Path, columns: dict[str, Any], despite: Sequence[str] = (),
+    progress: Progress = SILENT, **options: Any,
 ) -> Learned:  # fmt: skip
     """Learn the law of recordings (files), and write it with its report into the folder ``out``.
 
-    columns: keywords of `gfnn_jax.read`. The other options are those of ``gfnn.fit``.
+    columns: keywords of `gfnn_jax.read`. despite: kinds of mistakes that the files may show.
+    options: `FitOptions`. Raises InputError where `gfnn look` finds a mistake.
     """
+    with refusals():
+        asked = FitOptions(**options)
     recording = read(list(data), **columns)
-    fitted = learn_fit(
-        recording, learn=learn, friction=friction, input_hold=input_hold, mass=mass, seed=seed,
-        on_progress=progress.tell,
-    )  # fmt: skip
-    result = law_report.assemble(fitted, source=recording.source, seed=seed)
+    refuse_mistakes(recording, despite)
+    fitted = learn_fit(recording, options=asked, on_progress=progress.tell)
+    result = law_report.assemble(fitted, source=recording.source, seed=asked.seed)
     kept = ("seed", "device", "data", "fit", "map", "lagrangian", "friction", "gauge")
-    job = {"command": "fit", "data": recording.source, "friction": friction}
+    job = {
+        "command": "fit", "data": recording.source, **asked.deciding,
+        "degrees": [name for name, factor in recording.factors.items() if factor != 1],
+        "time_unit": recording.time_unit,
+    }  # fmt: skip
     record = {"job": job, **report.finite({key: result[key] for key in kept})}
     with atomic_folder(out) as folder:
         saved.save(fitted.map, folder, record=record)

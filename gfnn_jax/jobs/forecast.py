@@ -1,27 +1,31 @@
 """What ``gfnn predict MODEL --initial RECORDING`` does: forecasts from the end of each run.
 
 The file written has times (R, n), values and std (R, n, d) by runs and columns; with .csv at its
-end, columns run, t, each position and std_ of each. Angles are in radians.
+end, columns run, t, each position and std_ of each. Times and values are in the units of the
+recording that the law was learned from.
 """
 
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.data.recording import Recording, read
+from gfnn_jax.data.recording import SECONDS, Recording, read
 from gfnn_jax.errors import InputError
 from gfnn_jax.maps.estimates import Forecast, forecast
-from gfnn_jax.maps.saved import load
+from gfnn_jax.maps.saved import load, record
+from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.storage.outputs import atomic_write, ensure_new
 
 
 class Judged(NamedTuple):
     """A forecast against what was measured: column -> (root mean square error, its median size,
-    share of samples within two standard deviations), and the number of samples."""
+    both in the column's unit, share of samples within two standard deviations), and the number of
+    samples."""
 
     columns: dict[str, tuple[float, float, float]]
     num_samples: int
@@ -40,16 +44,18 @@ def forecast_recording(
     `gfnn_jax.read` beside the roles, which the model knows.
     """
     ensure_new(out, overwrite)
+    if num_steps is not None and num_steps < 0:
+        raise InputError("expected --num-steps above 0: a forecast begins where a recording ends")
     map_ = load(model)
     if map_.sensors is None:
         raise InputError(f"{model}: was not learned from a recording: --initial needs states q, p")
     sensors = map_.sensors
-    roles = {"positions": sensors.positions, "inputs": sensors.inputs, "angles": sensors.angles}
-    roles = {**(columns or {}), **{k: v for k, v in roles.items() if v or k == "angles"}}
-    if set(sensors.positions) & set(roles.get("degrees", ())):
-        del roles["angles"]
+    job = record(model).get("job", {})
+    roles = _roles(sensors, job) | (columns or {})
     recording = read(initial, **roles)
-    ahead = None if inputs is None else read(inputs, **{**roles, "positions": None})
+    only_inputs = {**roles, "positions": None, "sensors": None, "coordinates": None, "angles": None,
+                   "degrees": None}  # fmt: skip
+    ahead = None if inputs is None else read(inputs, **only_inputs)
     measured = None if compare is None else read(compare, **roles)
     if num_steps is None and measured is None:
         raise InputError("expected --num-steps, or --compare, whose times the forecast is for")
@@ -70,8 +76,32 @@ def forecast_recording(
             steps = np.arange(save_every, num_steps + 1, save_every)
             times = last + float(np.asarray(map_.dt)) * steps
         found[run] = forecast(map_, part, times, ahead)
-    _write(out, sensors.positions, found)
+    second = SECONDS[recording.time_unit]
+    found = {run: _in_units(one, recording.factors, second) for run, one in found.items()}
+    _write(out, tuple(next(iter(found.values())).values), found)
     return found, None if measured is None else _judged(sensors, found, measured)
+
+
+def _roles(sensors: Sensors, job: dict[str, Any]) -> dict[str, Any]:
+    """Keywords of `read` for a recording with the columns that the law was learned from."""
+    channels = sensors.seen.channels
+    roles: dict[str, Any] = {
+        "positions": tuple(n for n in channels if n in sensors.positions),
+        "sensors": tuple(n for n in channels if n not in sensors.positions),
+        "inputs": sensors.inputs, "coordinates": sensors.positions, "angles": sensors.angles,
+    }  # fmt: skip
+    degrees = [n for n in job.get("degrees", ()) if n in channels]
+    unit = job.get("time_unit", "s")
+    return {**roles, "degrees": degrees or None, "time_unit": None if unit == "s" else unit}
+
+
+def _in_units(one: Forecast, factors: Mapping[str, float], second: float) -> Forecast:
+    """In the units of the file."""
+    values, std = (
+        {name: array / factors.get(name, 1.0) for name, array in of.items()}
+        for of in (one.values, one.std)
+    )
+    return Forecast(one.times / second, values, std)
 
 
 def _last_samples(recording: Recording, run: str, count: int | None) -> Recording:
@@ -81,16 +111,20 @@ def _last_samples(recording: Recording, run: str, count: int | None) -> Recordin
     return recording.slice(start=float(np.sort(times)[-min(count, len(times)) :].min()))
 
 
-def _judged(sensors: Any, found: dict[str, Forecast], measured: Recording) -> Judged:
+def _judged(sensors: Sensors, found: dict[str, Forecast], measured: Recording) -> Judged:
     columns, count = {}, 0
-    for name in sensors.positions:
+    for name in sensors.seen.channels:
         errors, stds = [], []
         for run, one in found.items():
             own = run if len(measured.runs) > 1 else next(iter(measured.runs))
-            at = np.searchsorted(measured.times(own), one.times)
-            error = one.values[name][0] - measured.values(name, own)[at]
+            factor = measured.factors[name]
+            seconds = one.times * SECONDS[measured.time_unit]
+            times = measured.times(own)
+            at = np.searchsorted(times, seconds - 0.5 * np.min(np.diff(times)))
+            error = one.values[name][0] - measured.values(name, own)[at] / factor
             if name in sensors.angles:
-                error = (error + np.pi) % (2 * np.pi) - np.pi
+                half = np.pi / factor
+                error = (error + half) % (2 * half) - half
             seen = np.isfinite(error)
             errors.append(error[seen])
             stds.append(one.std[name][0][seen])

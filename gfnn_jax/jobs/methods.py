@@ -19,6 +19,7 @@ from gfnn_jax.jobs.rollouts import Rollouts, map_rollouts, step_rollouts
 from gfnn_jax.jobs.run import QUICK_PAIRS, QUICK_TOLERANCE
 from gfnn_jax.jobs.search import search
 from gfnn_jax.jobs.shared_data import SharedData
+from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, sizes, symplecticity_defect
 from gfnn_jax.solve.status import NOT_CONVERGED
@@ -131,8 +132,8 @@ def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollout
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FitWarning)  # kept in fit.messages
         fit = search(
-            Pairs(z[:, 0], z[:, 1], scene.dt), scene, tolerance=tolerance, learn="map",
-            seed=data.seed, progress=progress,
+            Pairs(z[:, 0], z[:, 1], scene.dt), scene,
+            FitOptions(tolerance=tolerance, learn="map", seed=data.seed), progress=progress,
         )  # fmt: skip
     chosen = fit.chosen
     part = {

@@ -32,7 +32,7 @@ _CHUNK_BYTES, _CHUNK_LANE_STEPS = 32 * 2**20, 400_000
 
 
 class Predicted(NamedTuple):
-    """Result of a prediction: status and left_at (B,), the map's dt, seconds of computing.
+    """Result of a prediction: status and left_at (B,), size of the map's dt, seconds of computing.
 
     horizon: (B,) where one was asked for. Among several processes the first has all lanes, the
     others have their own.
@@ -90,6 +90,7 @@ def predict(
 ) -> Predicted:
     """Predict from the initial states in a file, in chunks along the steps, into ``out``.
 
+    num_steps: backwards, by the inverse map, where it is negative, as the saved ``steps`` then are.
     dt: time step, where it is not that of the data; for a map that can step any dt. samples: number
     of maps drawn from the model's posterior, whose spread becomes ``std`` and ``quantiles``. Where
     the file of initial states has their noise ``z0_std``, the spread includes it, and ``band`` says
@@ -104,9 +105,9 @@ def predict(
     than that, for any ``num_steps``. With ``resume`` a killed job continues where its last chunk
     ended, to the same bits as an uninterrupted one. Raises InputError for bad input.
     """
-    if save_every > num_steps:
+    if save_every > abs(num_steps):
         raise InputError(
-            f"expected --save-every of at most --num-steps = {num_steps}, got {save_every}"
+            f"expected --save-every of at most --num-steps = {abs(num_steps)}, got {save_every}"
         )
     if horizon_size is not None and samples is None:
         raise InputError("--horizon needs --samples: the band is the spread of samples")
@@ -116,12 +117,13 @@ def predict(
             map_ = map_.over(dt)
         except ValueError as error:
             raise InputError(f"--dt: {error}") from error
-    dt = float(map_.dt)
+    dt = abs(float(map_.dt))
     names = () if map_.parameters is None else map_.parameters.names
     if starts_from_positions(map_) and are_recordings(initial):
         z0, params = _last_states(map_, model, initial), None
     else:
         z0, params = read_initial(initial, map_.dim, names)
+    map_ = map_ if num_steps > 0 else map_.reversed()
     digest = hashlib.sha256(np.ascontiguousarray(z0).data)
     if params is not None:
         digest.update(np.ascontiguousarray(params).data)
@@ -199,7 +201,7 @@ def _written(
 ) -> Predicted:
     """Predict these lanes into one file."""
     map_ = request.map
-    dt, parameters = float(map_.dt), map_.parameters
+    dt, parameters = abs(float(map_.dt)), map_.parameters
     own, drive = None, None
     if parameters is not None and params is not None:
         names = parameters.names
@@ -230,8 +232,8 @@ def _written(
         if not writer.finished:
             done = max(0, writer.saved - 1) * request.save_every
             stop.add_note(
-                f"{writer.partial} keeps {done} of {request.num_steps} steps: --resume goes on "
-                "with it"
+                f"{writer.partial} keeps {done} of {abs(request.num_steps)} steps: --resume goes "
+                "on with it"
             )
         raise
     return Predicted(status, left_at, dt, time.perf_counter() - started, passed)
@@ -283,14 +285,14 @@ def _go_on(
     started, begun = time.perf_counter(), writer.saved
     while writer.saved < writer.total:
         progress.say(
-            f"step {(writer.saved - 1) * save_every} of {request.num_steps}"
+            f"step {(writer.saved - 1) * save_every} of {abs(request.num_steps)}"
             + _time_left(time.perf_counter() - started, writer.saved - begun, writer)
         )
         count = min(chunk, writer.total - writer.saved)
         lanes, states = map_.advance(lanes, count, **options)
         if drawn is not None and of_samples is not None:
             of_samples, others = drawn.samples.advance(of_samples, count, **options)
-            steps = writer.steps[writer.saved : writer.saved + count]
+            steps = np.abs(writer.steps[writer.saved : writer.saved + count])
             states, passed = _with_bands(drawn, states, others, steps, passed)
         writer.append(states, _carry(lanes, of_samples, passed))
     return lanes

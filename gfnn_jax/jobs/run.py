@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
@@ -14,10 +14,11 @@ from gfnn_jax.evaluate import figures, figures_of_many, metrics, report
 from gfnn_jax.jobs.measure import Measured, measure, plane_of
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.rollouts import NUM_STEPS, NUM_TRAJECTORIES, map_rollouts
-from gfnn_jax.jobs.search import scene_named, search
+from gfnn_jax.jobs.search import refusals, scene_named, search
 from gfnn_jax.jobs.written import MODEL, Ran, already_done, pairs_digest, write
 from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.fit import Fit
+from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.learn.structures import Bodies, structure_of
 from gfnn_jax.maps.bands import bands
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -33,8 +34,9 @@ from gfnn_jax.scenes.trajectories import (
 from gfnn_jax.storage.outputs import atomic_folder
 from gfnn_jax.storage.partial import unfinished
 
-# (pairs, tolerance, iterations) of a network, and those with --quick.
-_NETWORK, _NETWORK_QUICK = (6_000, 1e-6, 250), (3_000, 1e-5, 60)
+# Pairs and options of a network, and those with --quick.
+_NETWORK = 6_000, {"tolerance": 1e-6, "max_iterations": 250}
+_NETWORK_QUICK = 3_000, {"tolerance": 1e-5, "max_iterations": 60}
 # Trajectories and samples of the band in the figure of errors: twice the work of all rollouts.
 _BAND_TRAJECTORIES, _BAND_SAMPLES = 10, 20
 QUICK_PAIRS, QUICK_TRAJECTORIES, QUICK_TOLERANCE = 4_000, 25, 1e-7
@@ -45,56 +47,43 @@ def run(
     *,
     out: Path,
     quick: bool = False,
-    seed: int = 0,
     dt: float | None = None,
-    tolerance: float | None = None,
-    max_seconds: float | Literal["auto"] | None = "auto",
-    max_operations: int | None = None,
-    chart: str = "auto",
-    learn: str = "auto",
-    terms: tuple[str, ...] = (),
-    base: str | None = None,
-    structure: str | None = None,
-    family: str = "auto",
-    ensemble: int = 1,
     overwrite: bool = False,
     resume: bool = False,
     progress: Progress = SILENT,
+    **options: Any,
 ) -> Ran | None:
     """Run a scene: reference data, fit, rollouts, metrics, figures, report, into the folder out.
 
-    tolerance: relative; with None the scene's own, close to the best attainable. quick: fewer pairs
-    and rollouts, a tolerance of 1e-7 or larger, no band in the figure of errors. resume: returns
-    None where ``out`` holds the result of this same job.
+    quick: fewer pairs and rollouts, a tolerance of 1e-7 or larger, no band in the figure of errors.
+    resume: returns None where ``out`` holds the result of this same job. options: `FitOptions`;
+    without a tolerance the scene's own, close to the best attainable.
     """
     scene = scene_named(name, dt)
-    if family == "features" and scene.features is None:
+    num_pairs, usual = scene.num_pairs, {"tolerance": scene.tolerance}
+    if options.get("family") == "mlp":
+        num_pairs, usual = _NETWORK_QUICK if quick else _NETWORK
+    elif quick:
+        num_pairs = min(num_pairs, QUICK_PAIRS)
+        usual = {"tolerance": max(scene.tolerance, QUICK_TOLERANCE)}
+    with refusals():
+        asked = FitOptions(**{**usual, **options})
+    if asked.family == "features" and scene.features is None:
         raise InputError(
             f"family 'features' needs features, and the scene {name} declares none: choose another "
             "family"
         )
-    num_pairs, default = scene.num_pairs, scene.tolerance
-    more = {}
-    if family == "mlp":
-        num_pairs, default, more["max_iterations"] = _NETWORK_QUICK if quick else _NETWORK
-    elif quick:
-        num_pairs, default = min(num_pairs, QUICK_PAIRS), max(default, QUICK_TOLERANCE)
-    options = {
-        "tolerance": default if tolerance is None else tolerance, "chart": chart, "learn": learn,
-        "terms": list(terms), "base": base, "structure": structure, "family": family, "seed": seed,
-        **({} if ensemble == 1 else {"ensemble": ensemble}),
-    }  # fmt: skip
     num_trajectories = QUICK_TRAJECTORIES if quick else NUM_TRAJECTORIES
     job = {
         "command": "run", "scene": name, "dt": scene.dt, "num_pairs": num_pairs, "quick": quick,
-        **options,
+        **asked.deciding,
     }  # fmt: skip
     if already_done(out / MODEL, job, resume):
         return None
 
     with unfinished(out, job, what="run", overwrite=overwrite, resume=resume) as kept_in:
         progress.say(f"reference data: {num_pairs} pairs, {num_trajectories} trajectories")
-        key_pairs, key_test = _keys(seed)
+        key_pairs, key_test = _keys(asked.seed)
         pairs = _finite(sample_pairs(scene, num_pairs, key_pairs))
         z0 = np.asarray(sample_test_states(scene, num_trajectories, key_test))
         given: dict[str, Any] = {
@@ -102,8 +91,7 @@ def run(
             "t0": sample_t0(scene, num_trajectories, key_test),
         }
         fitted = search(
-            pairs, scene, max_seconds=max_seconds, max_operations=max_operations,
-            progress=progress, kept_in=kept_in, job=job, **options, **more,
+            pairs, scene, asked, progress=progress, kept_in=kept_in, job=job
         ).settled()  # fmt: skip
         progress.say(f"reference trajectories of {NUM_STEPS} steps")
         reference = np.asarray(reference_trajectories(scene, z0, NUM_STEPS, **given))
@@ -111,7 +99,7 @@ def run(
         rollouts = map_rollouts(fitted.map, z0, **given)
         measured = measure(rollouts, scene, reference, given["params"])
         result = report.assemble(
-            fitted, scene=name, dt=scene.dt, seed=seed, rollout=measured.report,
+            fitted, scene=name, dt=scene.dt, seed=asked.seed, rollout=measured.report,
             data={"source": "reference data of the scene", "digest": pairs_digest(pairs)},
         )  # fmt: skip
         progress.say("figures")

@@ -16,6 +16,7 @@ from gfnn_jax.errors import FitError, InputError, WorkError
 from gfnn_jax.jobs.progress import Progress
 from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.fit import Fit, fit
+from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
@@ -29,13 +30,13 @@ BEST = "best"
 def search(
     pairs: Pairs,
     scene: Scene | None,
+    options: FitOptions,
     *,
     progress: Progress,
     kept_in: Path | None = None,
     job: dict[str, Any] | None = None,
-    **options: Any,
 ) -> Fit:
-    """Fit these pairs, with the options of ``gfnn.fit``.
+    """Fit these pairs.
 
     kept_in: folder for checkpoints of a training, factors, and the best map so far. job: the job
     that they belong to. Raises InputError for data or a request that cannot give a map, WorkError
@@ -45,15 +46,12 @@ def search(
     if kept_in is not None:
         checkpoints, factors = TrainingCheckpoints(kept_in, job or {}), KeptFactors(kept_in)
         on_better = partial(_keep, kept_in / BEST, scene, job)
-    try:
-        with failures_of_arithmetic():
-            return fit(
-                pairs, scene, checkpoints=checkpoints, factors=factors, on_progress=progress.say,
-                on_candidate=lambda candidate: progress.tell(line(candidate)),
-                on_better=on_better, **options,
-            )  # fmt: skip
-    except FitError as error:
-        raise InputError(str(error)) from error
+    with refusals(), failures_of_arithmetic():
+        return fit(
+            pairs, scene, options=options, checkpoints=checkpoints, factors=factors,
+            on_progress=progress.say,
+            on_candidate=lambda candidate: progress.tell(line(candidate)), on_better=on_better,
+        )  # fmt: skip
 
 
 def _keep(
@@ -88,6 +86,15 @@ def line(candidate: Candidate) -> str:
         f"{candidate.validation_relative:.2e} of the spread, "
         f"{candidate.num_parameters} parameters"
     )
+
+
+@contextlib.contextmanager
+def refusals() -> Iterator[None]:
+    """Turn a FitError, of options or data that can give no map, into an InputError."""
+    try:
+        yield
+    except FitError as error:
+        raise InputError(str(error)) from error
 
 
 @contextlib.contextmanager

@@ -17,6 +17,7 @@ from gfnn_jax.dataset.split import split_rows
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.generating.generated import Generated
+from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.phase_space import Pairs, sizes
 
@@ -36,6 +37,13 @@ class Tolerance:
 
     bound: float
     relative: bool = True
+
+    @classmethod
+    def of(cls, options: FitOptions) -> Tolerance:
+        """Tolerance that the options ask for."""
+        if options.absolute_tolerance is None:
+            return cls(options.tolerance)
+        return cls(options.absolute_tolerance, relative=False)
 
 
 @dataclasses.dataclass(frozen=True)

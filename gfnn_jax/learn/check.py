@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import numbers
-from collections.abc import Sequence
 
 import jax
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.own import is_own
 from gfnn_jax.families.sums import site_terms
 from gfnn_jax.families.terms import given_terms
-from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.learn.candidates import Tolerance
+from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.learn.structures import fields_of
 from gfnn_jax.learn.varied import check_varied
 from gfnn_jax.phase_space import Pairs, sizes, split
 from gfnn_jax.scenes.scene import AroundOrbit, Scene
 from gfnn_jax.scenes.trajectories import sample_states
 
-FAMILIES = ("auto", "polynomial", "features", "sines", "mlp")
-LEARNS = ("auto", "map", "hamiltonian")
-CHART_NAMES = ("auto", *CHARTS)
+LEARNS = ("auto", "map", "hamiltonian")  # of pairs
 
 _OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; those in other units do
 _COMPARED = 100
@@ -34,66 +30,29 @@ _STILL = 1e-15  # of the spread: no move
 
 
 def check_request(
-    pairs: Pairs,
-    scene: Scene | None,
-    *,
-    tolerance,
-    chart,
-    learn,
-    family,
-    angles,
-    model=None,
-    terms=(),
-    base=None,
-    structure=None,
-    ensemble=1,
-    seed=0,
-    max_seconds: float | None = None,
-    max_operations: int | None = None,
+    pairs: Pairs, scene: Scene | None, options: FitOptions, structure: str | None
 ) -> None:
-    """Raises FitError where the request or the pairs cannot give a map."""
-    for name, value, known in (
-        ("chart", chart, CHART_NAMES), ("family", family, FAMILIES), ("learn", learn, LEARNS)
-    ):  # fmt: skip
-        if name == "family" and is_own(value):
-            continue
-        if not isinstance(value, str) or value not in known:
-            raise FitError(f"expected {name} to be one of {', '.join(known)}; got {value!r}")
+    """Raises FitError where the pairs cannot give what is asked for.
+
+    structure: of the options, or the scene's.
+    """
+    angles = options.angles
     if not isinstance(pairs, Pairs):
         raise FitError(f"expected gfnn.Pairs(z0, z1, dt), got {type(pairs).__name__}")
     if scene is not None and not isinstance(scene, Scene):
         raise FitError(f"expected a scene, as gfnn.scenes.make('two-body'), got {scene!r}")
-    budget = isinstance(max_seconds, numbers.Real) and max_seconds > 0
-    if max_seconds is not None and not budget:
-        raise FitError(f"expected max_seconds above 0, or None for no limit; got {max_seconds!r}")
-    counted = isinstance(max_operations, numbers.Integral) and max_operations >= 0
-    if max_operations is not None and not counted:
+    if options.learn not in LEARNS:
         raise FitError(
-            "expected a whole number of operations as max_operations, or None for no limit; got "
-            f"{max_operations!r}"
+            f"expected one of {', '.join(LEARNS)} as learn of pairs, got {options.learn!r}"
         )
-    if not (isinstance(seed, numbers.Integral) and 0 <= seed < 2**32):
-        raise FitError(f"expected a whole number from 0 to 2**32 - 1 as seed, got {seed!r}")
-    if not (isinstance(ensemble, numbers.Integral) and ensemble >= 1):
-        raise FitError(f"expected a whole number of 1 or more as ensemble, got {ensemble!r}")
-    if model is not None:
-        _check_model(model, learn, terms, base, structure, family, chart)
-    if ensemble > 1 and (family != "mlp" or learn == "hamiltonian"):
-        raise FitError("an ensemble is of networks S: expected family='mlp', and S to be learned")
     own_dt = bool(np.ndim(pairs.dt))
-    one = () if own_dt else (("time step", pairs.dt),)
-    for name, value in (("tolerance", tolerance), *one):
-        if not isinstance(value, numbers.Real) and np.shape(value) != ():
-            raise FitError(f"expected a number as {name}, got {value!r}")
-        if isinstance(value, str) or value is None:
-            raise FitError(f"expected a number as {name}, got {value!r}")
-    if not tolerance > 0:
-        raise FitError(f"expected a tolerance > 0, got {tolerance}")
+    if not own_dt and not isinstance(pairs.dt, numbers.Real) and (
+        pairs.dt is None or isinstance(pairs.dt, str) or np.shape(pairs.dt) != ()
+    ):  # fmt: skip
+        raise FitError(f"expected a number as time step, got {pairs.dt!r}")
     for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):
         if np.dtype(z.dtype).kind not in "fiu":
             raise FitError(f"expected {name} of real numbers, got {z.dtype}")
-    if not isinstance(angles, (tuple, list)) or any(not isinstance(a, int) for a in angles):
-        raise FitError(f"expected angles as a tuple of indices, got {angles!r}")
     if scene is not None and scene.dim != pairs.dim:
         raise FitError(f"scene {scene.name} has dim {scene.dim}, the pairs have {pairs.dim}")
     if scene is not None and angles:
@@ -105,44 +64,22 @@ def check_request(
         )
     if own_dt or pairs.args or pairs.period is not None:
         check_varied(pairs)
-    if pairs.period is not None and chart == "type1":
+    if pairs.period is not None and options.chart == "type1":
         raise FitError("expected another chart than type1, which a driven map has not")
     if not own_dt and not 0 < float(pairs.dt) < np.inf:
         raise FitError(
             f"expected a time step that is finite and above 0, got {pairs.dt}"
             + (float(pairs.dt) < 0) * ": of steps back, z1 are the states and z0 their images"
         )
-    if isinstance(terms, str):
-        raise FitError(f"expected a sequence of terms, got the text '{terms}'")
-    if not isinstance(terms, Sequence):
-        raise FitError(f"expected a sequence of terms, () for none; got {terms!r}")
-    if any(not (isinstance(term, str) or callable(term)) for term in terms):
-        raise FitError(f"expected terms as texts or functions of z, got {terms!r}")
     if structure is not None:
-        _check_structured(structure, scene, learn, terms, base, family, chart, angles, pairs)
+        _check_structured(structure, scene, options, pairs)
+    known = () if options.base is None else (options.base,)
     try:
-        given_terms(pairs.dim, () if structure else terms, tuple(pairs.args or ()))
+        given_terms(pairs.dim, () if structure else options.terms, tuple(pairs.args or ()))
+        given_terms(pairs.dim, known)
     except (InputError, jax.errors.ConcretizationTypeError) as error:
         raise FitError(str(error)) from error
-    if terms and (learn == "map" or (family, chart) != ("auto", "auto")):
-        raise FitError(
-            "terms are those of H: expected learn='auto' or 'hamiltonian', and no family or chart"
-        )
-    if base is not None:
-        if not (isinstance(base, str) or callable(base)):
-            raise FitError(f"expected a base Hamiltonian as text or a function of z, got {base!r}")
-        if learn == "hamiltonian" or terms:
-            raise FitError("a base Hamiltonian is factored out of the map: it goes with S alone")
-        try:
-            given_terms(pairs.dim, (base,))
-        except (InputError, jax.errors.ConcretizationTypeError) as error:
-            raise FitError(str(error)) from error
-    if learn == "hamiltonian" and (family not in ("auto", "mlp") or chart != "auto"):
-        raise FitError(
-            "family and chart are those of S: learn='hamiltonian' has no chart, and no family but "
-            "'mlp'"
-        )
-    if family == "features" and (scene is None or scene.features is None):
+    if options.family == "features" and (scene is None or scene.features is None):
         raise FitError("family 'features' needs a scene that declares features")
     for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):
         finite = np.isfinite(np.asarray(z)).all(axis=1)
@@ -155,21 +92,6 @@ def check_request(
         check_number(pairs)
     elif len(pairs) < FEWEST:
         raise FitError(f"expected at least {FEWEST} pairs, got {len(pairs)}")
-
-
-def _check_model(model, learn, terms, base, structure, family, chart) -> None:
-    """Raises FitError for what is no model, or does not go with one."""
-    missing = [name for name in ("name", "sizes", "fit") if not hasattr(model, name)]
-    if missing:
-        raise FitError(
-            f"expected a model with a name, sizes(data) and fit(data, size); {model!r} has no "
-            f"{', '.join(missing)}"
-        )
-    if (learn, family, chart, base) != ("auto", "auto", "auto", None) or terms or structure:
-        raise FitError(
-            "a model of one's own is all that is learned: expected no learn, terms, base, "
-            "structure, family or chart beside it"
-        )
 
 
 def check_moves(pairs: Pairs) -> None:
@@ -193,14 +115,15 @@ def check_number(pairs: Pairs) -> None:
 
 
 def _check_structured(
-    structure, scene, learn, terms, base, family, chart, angles, pairs: Pairs
+    structure: str, scene: Scene | None, options: FitOptions, pairs: Pairs
 ) -> None:
     """Raises FitError for what does not go with a structure."""
-    if (family, base) != ("auto", None):
+    learn, terms, chart, angles = options.learn, options.terms, options.chart, options.angles
+    if (options.family, options.base) != ("auto", None):
         raise FitError("a structure has its own terms: expected no family or base")
     if chart == "type1":
         raise FitError("expected another chart than type1, which has no structure")
-    bodies = str(structure).startswith("bodies")
+    bodies = structure.startswith("bodies")
     if bodies and (learn == "map" or chart != "auto"):
         raise FitError("a structure of bodies is that of H: expected no learn='map' or chart")
     coordinates = scene.coordinates if scene is not None else CARTESIAN
@@ -227,7 +150,7 @@ def _check_structured(
                 "next ones"
             )
         try:
-            site_terms(pairs.dim, "ring", 0, 0, (term,), max(1, fields_of(str(structure))))
+            site_terms(pairs.dim, "ring", 0, 0, (term,), max(1, fields_of(structure)))
         except InputError as error:
             raise FitError(str(error)) from error
 

@@ -41,12 +41,14 @@ def law_of(
     terms: Sequence[str | Callable],
     budget: Budget,
     say: Callable[[str], Any],
+    dearest: float = np.inf,
 ) -> LearnedHamiltonian | None:
     """The Hamiltonian of these pairs, or None where "auto" finds none, or the budget ends before
     the first.
 
-    prepared: without a base map. Raises FitError where a Hamiltonian is asked for and there is none
-    to learn.
+    prepared: without a base map. dearest: operations of a step of H that is chosen beside a map
+    that meets the tolerance; of use where H is not asked for. Raises FitError where a Hamiltonian
+    is asked for and there is none to learn.
     """
     unfit = unfit_for_law(prepared, scene)
     if unfit is not None:
@@ -65,8 +67,9 @@ def law_of(
     try:
         with np.errstate(all="ignore"):  # starts that run away are part of the search
             return learn_hamiltonian(
-                prepared, judges, scene, terms=terms, budget=budget, say=say, options=options
-            )
+                prepared, judges, scene, terms=terms, budget=budget, say=say, options=options,
+                dearest=np.inf if foremost else dearest,
+            )  # fmt: skip
     except OutOfTime:
         budget.leave_out("H", "no library of terms was fitted within the budget")
     except (FitError, np.linalg.LinAlgError) as error:

@@ -23,7 +23,7 @@ MAX_SECONDS = 120.0  # of a fit that is told of no budget
 # matched to gradients, iterations of a network. What is compiled is counted in seconds.
 ROWS, SOLVE, FLOW, NETWORK, COMPILE = "rows", "solve", "flow", "network", "compile"
 MATCHING = "matching"
-_RATES = {ROWS: 1e10, SOLVE: 2e10, FLOW: 5e8, MATCHING: 1e9, NETWORK: 5e9, COMPILE: 1.0}
+_RATES = {ROWS: 1e10, SOLVE: 2e10, FLOW: 5e8, MATCHING: 1e8, NETWORK: 5e9, COMPILE: 1.0}
 # Seconds, at these rates, of a unit that tells its kind's own: of shorter ones most is overhead.
 _TELLING = 0.1
 # Seconds that compiling a step takes, by 2d: small eliminations are unrolled, and larger ones call

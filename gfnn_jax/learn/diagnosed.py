@@ -42,15 +42,15 @@ def diagnose_request(request: Request, plain: Prepared, judges: Judges) -> Diagn
     """
     if plain.varied or plain.structure is not None:  # H or a sum of terms is looked for first
         return Diagnosis(plain, plain, Charts([], None, {}, []), float("nan"), [])
-    prepared = plain
-    if request.base is not None:
-        known = given_terms(plain.dim, (request.base,))
+    prepared, options = plain, request.options
+    if options.base is not None:
+        known = given_terms(plain.dim, (options.base,))
         flow = flow_of(known, np.ones(known.num_parameters), plain)
-        _, prepared = factored_out([flow], plain, request.seed)
+        _, prepared = factored_out([flow], plain, options.seed)
     # A law of the user's keeps areas, and so does what H of an autonomous system generates.
-    may_lose = request.base is None and request.learn != "hamiltonian" and not plain.after
+    may_lose = options.base is None and options.learn != "hamiltonian" and not plain.after
     return diagnosed(
-        prepared, request.chart, request.reversor, request.seed, judges if may_lose else None
+        prepared, options.chart, request.reversor, options.seed, judges if may_lose else None
     )
 
 

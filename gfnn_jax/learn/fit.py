@@ -11,9 +11,9 @@ import dataclasses
 import io
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
@@ -27,7 +27,7 @@ from gfnn_jax.learn.assemble import block_of
 from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance
 from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.clean import clean
-from gfnn_jax.learn.clock import COMPILE, MAX_SECONDS, ROWS, Budget, seconds_allowed
+from gfnn_jax.learn.clock import COMPILE, MAX_SECONDS, ROWS, Budget
 from gfnn_jax.learn.conclude import conclude
 from gfnn_jax.learn.damping import LearnedDamping
 from gfnn_jax.learn.diagnose import ChartJudgement, looked_for_errors
@@ -36,6 +36,7 @@ from gfnn_jax.learn.draw import NUM_PAIRS, drawn
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.noisy_sweeps import without_bias
+from gfnn_jax.learn.options import FitOptions, with_options
 from gfnn_jax.learn.positions import OfPositions, learn_positions
 from gfnn_jax.learn.posterior import with_posterior, work_of_posterior
 from gfnn_jax.learn.recordings import fit_recording
@@ -45,7 +46,6 @@ from gfnn_jax.learn.stated import stated
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.model import Model
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
 
@@ -209,7 +209,8 @@ class Fit:
 
     @property
     def formula(self) -> str | None:
-        """H as text, where one was found that meets the tolerance or was chosen."""
+        """H as text that ``terms`` and sympy read, where one was found that meets the tolerance or
+        was chosen; ``print(fit.hamiltonian)`` shows it as people read it."""
         law = self.hamiltonian
         if law is None or not (self.chosen.learns == "hamiltonian" or self._met_by(law.candidate)):
             return None
@@ -250,35 +251,19 @@ class Fit:
         return text.getvalue()
 
 
+@with_options
 def fit(
     pairs: Pairs | Recording,
     scene: Scene | None = None,
     *,
-    tolerance: float = 1e-6,
-    absolute_tolerance: float | None = None,
-    learn: str = "auto",
-    terms: Sequence[str | Callable] = (),
-    base: str | Callable | None = None,
-    structure: str | None = None,
-    family: Any = "auto",
-    model: Model | None = None,
-    chart: str = "auto",
-    ensemble: int = 1,
-    angles: tuple[int, ...] = (),
-    seed: int = 0,
-    max_seconds: float | Literal["auto"] | None = "auto",
-    max_operations: int | None = None,
+    options: FitOptions | None = None,
     clock: Callable[[], float] = time.perf_counter,
-    max_iterations: int = 250,
-    friction: str = "auto",
-    input_hold: str = "auto",
-    mass: Mapping[str, float] | None = None,
-    devices: int | str | None = None,
     checkpoints: Any = None,
     factors: Any = None,
     on_progress: Callable[[str], Any] = lambda message: None,
     on_candidate: Callable[[Candidate], Any] = lambda candidate: None,
     on_better: Callable[[SymplecticMap, Candidate], Any] | None = None,
+    **changes: Any,
 ) -> Any:
     """Learn the map of these pairs: the cheapest candidate within the tolerance, else the best.
 
@@ -293,39 +278,8 @@ def fit(
                (args) H is learned, or an S of state and parameters, which family="polynomial" or
                learn="map" ask for.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
-    tolerance: bound on the RMS over coordinates of the one-step error ÷ that coordinate's spread,
-               at its upper 95 % bound; a pure number.
-    absolute_tolerance: in its stead, on the RMS per component in the user's units.
-    learn:     "map": S, whose step is an implicit equation; "hamiltonian": H, whose flow is the
-               map; "auto": both, and H is taken where it meets the tolerance at no more than four
-               times the cost of a step, because it holds outside the data and at any time step.
-    terms:     of H that the user knows: text such as "1/sqrt(q1**2 + q2**2)", or functions of z.
-    base:      a Hamiltonian that the user knows a part of the map by, as such text or a function:
-               its flow is factored out, and S learns what it leaves over.
-    structure: "ring" or "chain" of equal sites, whose ``terms`` are text in a site's q1, p1 and the
-               next ones' q2, p2, …; "bodies:N", q body by body: H is a sum over sites, or over
-               bodies and pairs, of which "bodies:4:abbb" says that the last three are of one
-               species; of sites, S where learn is "map" or no H meets the tolerance.
-               None: the scene's own.
-    family:    "auto", "polynomial" (Fourier in angles), "features" (the scene's), "sines", "mlp";
-               with learn="hamiltonian" H is a sum of terms, or a network with "mlp". Or a family
-               of one's own that is linear in its parameters, or a function of `Inputs` that gives
-               such families by rising number of terms (`families.own`).
-    model:     a model of one's own (`models.model.Model`), which is then all that is learned.
-    chart:     "auto" or one of type1, type2, type3, midpoint.
-    ensemble:  so many networks trained together, of which the map is the mean and their spread the
-               posterior; with family="mlp".
-    angles:    without a scene, the indices of z that have period 2π.
-    max_seconds: for all of it; the search ends with the best map so far while there is time to
-               compile its step. None: no budget, and the same map on a busy machine and an idle
-               one. "auto": 120, or None where max_operations is given.
-    max_operations: of the search, as counted: what a fit reports as ``operations`` gives its map
-               again, whatever the clock has ended. None: no bound.
+    options:   a `FitOptions`, which the keywords below change; None: its defaults.
     clock:     gives the seconds that max_seconds is held against.
-    max_iterations: of the training of "mlp".
-    devices:   of this process, among which the rows of the least-squares and Gauss–Newton problems,
-               the steps of held-out pairs and the networks of an ensemble are shared out: "all" or
-               the first so many. The same bits on any number; None: the arithmetic of one batch.
     checkpoints, factors: a ``TrainingCheckpoints`` and a ``KeptFactors``, which an interrupted fit
                has saved to and the same fit goes on from.
     on_progress, on_candidate: called with what is being done, and with every candidate.
@@ -337,27 +291,16 @@ def fit(
     meets the tolerance, where a chart is close to singular, where pairs contradict their neighbours
     (a few are left out), and where the pairs do not look symplectic.
     """
+    options = dataclasses.replace(options or FitOptions(), **changes)
     if isinstance(pairs, Recording):
-        if learn not in ("auto", "lagrangian", "map"):
-            raise InputError(
-                f"expected learn auto, lagrangian or map of a recording, got {learn!r}"
-            )
-        if scene is not None or terms or base is not None:
-            raise InputError("expected no scene, terms or base of a recording")
-        if learn == "map":
-            return fit_positions(
-                pairs, tolerance=tolerance, absolute_tolerance=absolute_tolerance,
-                structure=structure, seed=seed, max_seconds=max_seconds,
-                max_operations=max_operations, clock=clock, on_progress=on_progress,
-                on_candidate=on_candidate,
-            )  # fmt: skip
-        if structure is not None:
-            raise InputError("expected no structure of a recording whose law is learned")
+        _check_of_recording(scene, options)
+        if options.learn == "map":
+            return fit_positions(pairs, options, clock, on_progress, on_candidate)
         return fit_recording(
-            pairs, friction=friction, input_hold=input_hold, mass=mass, on_progress=on_progress
-        )
-    dim = pairs.dim if isinstance(pairs, Pairs) else None
-    budget = Budget(seconds_allowed(max_seconds, max_operations), max_operations, clock, dim)
+            pairs, friction=options.friction, input_hold=options.input_hold, mass=options.mass,
+            on_progress=on_progress,
+        )  # fmt: skip
+    budget = options.budget(clock, pairs.dim if isinstance(pairs, Pairs) else None)
     require_x64("a fit")
     messages: list[str] = []
 
@@ -367,14 +310,12 @@ def fit(
             warnings.warn(message, FitWarning, stacklevel=3)
 
     request = checked(
-        pairs, scene, tolerance=tolerance, absolute_tolerance=absolute_tolerance, learn=learn,
-        terms=terms, base=base, structure=structure, family=family, model=model, chart=chart,
-        ensemble=ensemble, angles=angles, seed=seed, budget=budget, max_iterations=max_iterations,
-        checkpoints=checkpoints, factors=factors, say=on_progress, tell=on_candidate,
+        pairs, scene, options, budget=budget, checkpoints=checkpoints, factors=factors,
+        say=on_progress, tell=on_candidate,
     )  # fmt: skip
     warn(request.messages)
     on_progress("looking at the map's local Jacobians")
-    with row_blocks.on_devices(_devices(devices)):
+    with row_blocks.on_devices(_devices(options.devices)):
         pairs, plain, row, about_pairs = clean(
             *identified(request.pairs), request.coordinates, request.structure
         )
@@ -385,7 +326,7 @@ def fit(
                 f"a look for gross errors at all but {looked_at:,} of {len(request.pairs):,} pairs",
                 "those that the map misses by far are found in the end",
             )
-        judges = Judges.of(pairs, seed, request.tolerance)
+        judges = Judges.of(pairs, options.seed, request.tolerance)
         seen = diagnose_request(request, plain, judges)
         warn(seen.messages)
         if seen.damping is not None:
@@ -431,19 +372,28 @@ def fit(
     )
 
 
+def _check_of_recording(scene: Scene | None, options: FitOptions) -> None:
+    """Raises InputError for options of pairs alone."""
+    if options.learn not in ("auto", "lagrangian", "map"):
+        raise InputError(
+            f"expected learn auto, lagrangian or map of a recording, got {options.learn!r}"
+        )
+    if scene is not None or options.terms or options.base is not None:
+        raise InputError("expected no scene, terms or base of a recording")
+    if options.learn != "map" and options.structure is not None:
+        raise InputError("expected no structure of a recording whose law is learned")
+
+
 def fit_positions(
-    recording: Recording, *, tolerance: float = 1e-6, absolute_tolerance: float | None = None,
-    structure: str | None = None, seed: int = 0,
-    max_seconds: float | Literal["auto"] | None = "auto",
-    max_operations: int | None = None, clock: Callable[[], float] = time.perf_counter,
-    on_progress: Callable[[str], Any] = lambda message: None,
-    on_candidate: Callable[[Candidate], Any] = lambda candidate: None,
+    recording: Recording, options: FitOptions, clock: Callable[[], float],
+    on_progress: Callable[[str], Any], on_candidate: Callable[[Candidate], Any],
 ) -> Fit:  # fmt: skip
     """Learn the map behind positions alone, at even times or by turns: S(q, Q) of chart type 1.
 
     recording: its positions, of one run or many; an angle's values that range over more than one
-    turn are a lift and trusted, others known modulo 2π. structure: "ring" or "chain" of equal
-    sites. The rest as of `fit`; errors are those of the next position.
+    turn are a lift and trusted, others known modulo 2π. options: of which the tolerance, a
+    structure of sites, the seed and the budget apply. The rest as of `fit`; errors are those of the
+    next position.
 
     The map acts on z = (q, p), p = −h ∂S/∂q: ``map.from_positions`` and
     ``map.rollout(positions=(q, Q), …)`` start it. Positions of one place tell p but for a factor
@@ -452,12 +402,11 @@ def fit_positions(
     Raises FitError where the recording has no positions at even times, or too few.
     """
     require_x64("a fit")
-    relative = absolute_tolerance is None
-    asked = Tolerance(tolerance if absolute_tolerance is None else absolute_tolerance, relative)
-    seconds = seconds_allowed(max_seconds, max_operations)
-    budget = Budget(seconds, max_operations, clock, len(recording.positions) or None)
+    asked = Tolerance.of(options)
+    budget = options.budget(clock, len(recording.positions) or None)
     found = learn_positions(
-        recording, tolerance=asked, structure=structure, seed=seed, budget=budget,
+        recording, tolerance=asked, structure=options.structure, seed=options.seed,
+        budget=budget,
         say=on_progress, tell=on_candidate,
     )  # fmt: skip
     for message in found.messages:

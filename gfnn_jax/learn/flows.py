@@ -43,6 +43,7 @@ from gfnn_jax.learn.law_libraries import (
 from gfnn_jax.learn.law_options import OPTIONS, Options
 from gfnn_jax.learn.law_starts import starts
 from gfnn_jax.learn.law_work import LawWork
+from gfnn_jax.learn.law_worth import too_dear
 from gfnn_jax.learn.learned_law import (
     Dropped,
     FittedLaw,
@@ -76,10 +77,12 @@ def learn_hamiltonian(
     budget: Budget | None = None,
     say: Callable[[str], Any] = lambda message: None,
     options: Options = OPTIONS,
+    dearest: float = np.inf,
 ) -> LearnedHamiltonian:
     """The Hamiltonian of these pairs: the smallest library that meets the tolerance, else the best.
 
     prepared: without a base map. scene: lends its features and reversor. terms: a user's own.
+    dearest: as of `LawWork`.
 
     Raises FitError where no library can be tried, OutOfTime where the budget ends before the first.
     """
@@ -102,7 +105,7 @@ def learn_hamiltonian(
         prepared.y0, prepared.y1, prepared.each_dt, prepared.scale, args=prepared.args
     )
     most = options.max_operations if basis is None else options.mode_operations
-    work = LawWork(problem, budget, most)
+    work = LawWork(problem, budget, most, dearest)
     everywhere, free = judges, (*prepared.coordinates.cyclic, *prepared.whole)
     if prepared.structure is None:
         outer = outermost(prepared.y0[judges.training], free)
@@ -140,7 +143,9 @@ def learn_hamiltonian(
         there = dataclasses.replace(everywhere, held_out=everywhere.training[outer])
         if outer.any():
             outside = held_out_error(best.family, best.fit, prepared, there).relative
-        if best.error.relative > _ROUNDOFF and len(best.fit.used) < len(everywhere.training):
+        misses = best.error.bound > judges.tolerance.bound and np.isfinite(dearest)
+        few = len(best.fit.used) < len(everywhere.training)
+        if best.error.relative > _ROUNDOFF and few and not misses:
             what = "the fit of H to all pairs"
             with work.again(what, best.family, len(everywhere.training)):
                 best = _refitted(problem, best, everywhere.training, prepared, judges)
@@ -220,6 +225,9 @@ def _searched(
             del libraries[0]
     try:
         for family in libraries:
+            if tried and too_dear(problem, family, tried[-1], prepared, judges, work.dearest):
+                say(f"H: {family.num_parameters} terms would cost more than the map at hand")
+                continue
             say(f"H: {family.num_parameters} terms")
             found = _fitted(
                 problem, work, family, prepared, judges, tried[-1] if tried else None, options, say

@@ -67,7 +67,7 @@ def without_gross_errors(
         pairs, plain = found.judges.pairs, found.plain
         pairs, plain = pairs.take(others), plain.take(others)
         request.say(f"without {gone + len(rows)} of {count} pairs that are gross errors")
-        judges = Judges.of(pairs, request.seed, request.tolerance)
+        judges = Judges.of(pairs, request.options.seed, request.tolerance)
         diagnosis = diagnose_request(request, plain, judges)
         again = searched(request, plain, diagnosis, judges, None)
         left = _residuals(again)

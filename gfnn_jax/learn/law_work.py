@@ -21,10 +21,16 @@ class LawWork:
     A library takes as many times the operations of one evaluation as the library before it did. The
     search has a cap of its own, on the operations that it makes: without a budget that is what ends
     it, at the same library on any machine.
+
+    dearest: operations of a step above which H is not taken, for a map at hand meets the tolerance
+    with fewer; infinite where none does.
     """
 
-    def __init__(self, problem: Problem, budget: Budget, most: float):
+    def __init__(
+        self, problem: Problem, budget: Budget, most: float, dearest: float = float("inf")
+    ):
         self._problem, self.budget, self._cap = problem, budget, Counted(most)
+        self.dearest = dearest
         self._evaluations = float(_EVALUATIONS)
         problem.check, problem.spend = budget.check, self._cap.spend
 

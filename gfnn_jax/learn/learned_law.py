@@ -56,9 +56,9 @@ class LearnedHamiltonian:
     """H as learned, in the inner coordinates.
 
     candidate: as the others of a fit, its error measured by steps in NumPy. flow: the piece.
-    terms, formula: what H is; () and None of a network. truncation: largest error of the flow's
-    own steps on the held-out states, ÷ scale. omega_h: the fastest oscillation of the linearised
-    flow, times dt, in the median over the data; beyond π pairs of one dt may not tell H.
+    terms, shown: what H is, as people read it; () and None of a network. truncation: largest error
+    of the flow's own steps on the held-out states, ÷ scale. omega_h: the fastest oscillation of the
+    linearised flow, times dt, in the median over the data; beyond π pairs of one dt may not tell H.
     contraction: the fixed point's factor where it is largest. condition: of the terms' columns.
     null_terms: that the data do not tell from the others. left_out: pairs that the flow does not
     resolve. stalled: whether larger libraries were no more accurate. covariance: makes ``root``;
@@ -71,7 +71,7 @@ class LearnedHamiltonian:
     candidate: Candidate
     flow: Flow
     terms: tuple[Term, ...]
-    formula: str | None
+    shown: str | None
     truncation: float
     omega_h: float
     contraction: float
@@ -95,25 +95,35 @@ class LearnedHamiltonian:
         return None if self.covariance is None else self.covariance()
 
     @property
-    def text(self) -> str | None:
-        """The formula as code, which sympy reads: "0.5*p1**2 - cos(q1)". None of a network, and of
-        a sum over sites or bodies, whose formula is that of a general one."""
-        whole = self.formula is not None and isinstance(self.flow.family, Terms)
-        return plain(self.formula) if whole and self.formula else None
-
-    def sympy(self) -> Any:
-        """H as a sympy expression. Raises ValueError where it has no ``text``."""
-        return as_sympy(self._code)
-
-    def latex(self) -> str:
-        """H in LaTeX's notation. Raises ValueError where it has no ``text``."""
-        return as_latex(self._code)
+    def formula(self) -> str | None:
+        """H as ``terms`` and sympy read it: "0.5*p1**2 - cos(q1)". None of a network; of a sum over
+        sites or bodies, and of a Lagrangian, which are no expression in q and p, as it is shown."""
+        return plain(self.shown) if self.shown and self._is_expression else self.shown
 
     @property
-    def _code(self) -> str:
-        if self.text is None:
-            raise ValueError("expected an H of terms, got a network, or a sum over sites or bodies")
-        return self.text
+    def _is_expression(self) -> bool:
+        return isinstance(without_forces(self.flow.family), Terms)
+
+    def __str__(self) -> str:
+        """H as people read it: "0.5 p1² - cos(q1)"."""
+        return self.shown or "a network"
+
+    def sympy(self) -> Any:
+        """H as a sympy expression. Raises ValueError of a network, a sum over sites or bodies."""
+        return as_sympy(self._expression)
+
+    def latex(self) -> str:
+        """H in LaTeX's notation. Raises ValueError as ``sympy`` does."""
+        return as_latex(self._expression)
+
+    @property
+    def _expression(self) -> str:
+        if not self._is_expression or self.formula is None:
+            raise ValueError(
+                "expected an H that is an expression in q and p, got a network, a sum over sites "
+                "or bodies, or a Lagrangian"
+            )
+        return self.formula
 
     @property
     def fast(self) -> bool:

@@ -8,17 +8,19 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from gfnn_jax.data.recording import Recording
-from gfnn_jax.dataset.stretches import Scales, measure, nodes_of, stretches
+from gfnn_jax.dataset.stretches import Scales, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.maps.estimates import law_in_use
 from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import map_of_law
+from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.arc_inputs import ArcInputs
 from gfnn_jax.models.calibration import calibrated
@@ -27,6 +29,7 @@ from gfnn_jax.models.law_search import FRICTIONS, SearchOptions, search
 from gfnn_jax.models.law_text import Expression, friction_of, speed_names, terms_of
 from gfnn_jax.models.learned_law import LearnedLaw, hamiltonian_of, in_columns, scaled
 
+_IMITATED = 1e-4  # of what a sensor's parameter changes, that no coefficient of the law does
 _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apart
 
 
@@ -52,38 +55,51 @@ def fit_recording(
         steps.append(line)
         on_progress(line)
 
-    found = stretches(recording)
+    seen, angles = _observation(recording)
+    found = _stretches(recording, seen, angles)
+    far = [i for i in seen.shifts() if i not in angles]
+    if far and not recording.guess:
+        middle = np.mean(np.concatenate([s.q for s in found]), axis=0)
+        seen = seen.shifted(np.where(np.isin(range(seen.dim), far), middle, 0.0))
+        found = _stretches(recording, seen, angles)
     scales = measure(found)
+    given = np.array([recording.std[name] or np.nan for name in seen.channels])
+    scales = dataclasses.replace(scales, sigma=np.where(given > 0, given, scales.sigma))
     nodes = nodes_of(found, scales)
-    angles = tuple(i for i, n in enumerate(recording.positions) if n in recording.angles)
     if not recording.inputs:
         holds: tuple[str, ...] = ("hold",)
     else:
         holds = HOLDS if input_hold == "auto" else (input_hold,)
     inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
-    fit, hold, nodes = search(nodes, scales, angles, len(recording.inputs), inputs, told, options)
+    fit, hold, nodes = search(
+        nodes, scales, angles, len(recording.inputs), inputs, seen, told, options
+    )
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
         raise FitError("no law of the library follows this recording: its arcs could not be closed")
+    first = fit.form.count + len(fit.structure.zeros)
+    fitted = dataclasses.replace(seen, values=fit.p[first:])
+    _check_told(fit, fitted)
     law, covariance = in_columns(fit)
-    gauge = f"the mean of M11 over the data is 1 ({recording.positions[0]})"
+    names = recording.coordinates
+    gauge = f"the mean of M11 over the data is 1 ({names[0]})"
     if mass:
-        (name, value), i = next(iter(mass.items())), recording.positions.index(next(iter(mass)))
+        (name, value), i = next(iter(mass.items())), names.index(next(iter(mass)))
         masses = law.masses(np.concatenate([n.x[:, : fit.form.dim] for n in nodes]))
         law, covariance = scaled(law, covariance, value / float(np.mean(masses[:, i, i])))
         gauge = f"the mean mass of {name} over the data is {value:g}"
     x = np.concatenate([n.x for n in nodes])
     d = fit.form.dim
     zeros = np.zeros(d)
-    zeros[list(fit.structure.zeros)] = fit.p[fit.form.count :]
+    zeros[list(fit.structure.zeros)] = fit.p[fit.form.count : first]
     q, v = x[:, :d] + zeros, x[:, d:]
     root = _root(covariance)
+    noise = np.where(given > 0, given, np.minimum(scales.sigma, fit.rms()))
     sensors = Sensors(
-        recording.positions, recording.inputs, recording.angles,
-        np.minimum(scales.sigma, fit.rms()), scales.omega,
-        scales.period, hold, 0.0, np.array([scales.period]), np.zeros((1, d)),
+        names, recording.inputs, recording.angles, noise, scales.omega, scales.period, hold, 0.0,
+        np.array([scales.period]), np.zeros((1, len(noise))), None if seen.is_plain else fitted,
     )  # fmt: skip
     told("bands: forecasts from windows of the record")
-    spread = np.std(np.concatenate([s.y for s in found]), axis=0)
+    spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
     used, horizons = calibrated(law_in_use(law, root, sensors), found, scales, spread)
     z = np.concatenate([q, law.momentum(q, v)], axis=1)
     u = np.concatenate([n.stretch.u[n.at] for n in nodes])
@@ -109,17 +125,61 @@ def _options(friction: str) -> SearchOptions:
 
 
 def _check(recording: Recording, input_hold: str, mass: Mapping[str, float] | None) -> None:
-    if not recording.positions:
+    if not recording.coordinates:
         raise InputError(f"{recording.source}: expected positions, found none (--positions)")
     if input_hold not in ("auto", *HOLDS):
         raise InputError(f"expected input_hold auto, {', '.join(HOLDS)}, got {input_hold!r}")
     for name, value in (mass or {}).items():
-        if name not in recording.positions:
-            raise InputError(f"mass: no position {name} among {', '.join(recording.positions)}")
+        if name not in recording.coordinates:
+            raise InputError(f"mass: no position {name} among {', '.join(recording.coordinates)}")
         if not (np.isfinite(value) and value > 0):
             raise InputError(f"mass: expected {name} above 0, got {value}")
     if len(mass or {}) > 1:
         raise InputError("mass: one known mass fixes the scale of L; got several")
+
+
+def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
+    """How the columns show the coordinates, and which of these are angles.
+
+    Raises InputError where a sensor's parameter is one that every law has.
+    """
+    names = recording.coordinates
+    angles = tuple(i for i, name in enumerate(names) if name in recording.angles)
+    seen = observed(
+        recording.observe, names, speed_names(names, recording.velocities), recording.guess,
+        offsets=recording.offsets, scales=recording.scales, columns=recording.columns,
+    )  # fmt: skip
+    lengths = [i for i in range(len(names)) if i not in angles]
+    open_ = seen.undetermined(lengths)
+    if open_:
+        shown = ", ".join(names[i] for i in lengths)
+        raise InputError(
+            f"{', '.join(open_)}: every scale of {shown} has a law of the same terms: leave it "
+            "out, or observe a velocity of known scale beside"
+        )
+    return seen, angles
+
+
+def _stretches(recording: Recording, seen: Observation, angles: tuple[int, ...]) -> list[Stretch]:
+    """The stretches of a recording, as the parameters of ``seen`` show its coordinates."""
+    if seen.is_plain:
+        return stretches(recording)
+    return stretches(recording, seen.channels, partial(seen.coordinates_of, angles=angles))
+
+
+def _check_told(fit: LawFit, seen: Observation) -> None:
+    """Raises FitError where the record does not tell a sensor's parameters from the law."""
+    count = len(seen.parameters)
+    R = fit.fitted.triangle
+    size = np.linalg.norm(R, axis=0)
+    for name, k in zip(seen.parameters, range(len(fit.p) - count, len(fit.p)), strict=True):
+        others = np.delete(R, k, axis=1)
+        left = R[:, k] - others @ np.linalg.lstsq(others, R[:, k], rcond=None)[0]
+        if not np.linalg.norm(left) > _IMITATED * size[k]:
+            raise FitError(
+                f"{name}: the record does not tell it from the coefficients of the law: leave it "
+                "out, or give it as a number"
+            )
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
@@ -139,8 +199,10 @@ def _described(
     times: list[np.ndarray], seconds: float,
 ) -> LearnedLaw:  # fmt: skip
     """The law in the words of the recording."""
-    names = recording.positions
+    names = recording.coordinates
     speeds = speed_names(names, recording.velocities)
+    channels = map_.sensors.seen.channels
+    factors = np.array([recording.factors[name] for name in channels])
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     count, lost = law.terms.count, law.friction.count
     lagrangian = terms_of(law.terms, law.coefficients, std[:count], names, speeds)
@@ -151,6 +213,16 @@ def _described(
         for j, u in enumerate(recording.inputs)
     }
     zero_std = np.sqrt(np.diag(fit.covariance()))[fit.form.count :]
+    sensors = {
+        name: (float(value), float(error))
+        for (_, name), value, error in zip(
+            fit.structure.keys()[fit.form.count + len(fit.structure.zeros) :],
+            fit.p[fit.form.count + len(fit.structure.zeros) :],
+            zero_std[len(fit.structure.zeros) :],
+            strict=True,
+        )
+    }
+    formulas = dict(zip(channels, map_.sensors.seen.formulas, strict=True))
     zeros = {
         names[i]: (float(fit.p[fit.form.count + k]), float(zero_std[k]))
         for k, i in enumerate(fit.structure.zeros)
@@ -161,8 +233,9 @@ def _described(
     return LearnedLaw(
         map=map_, lagrangian=lagrangian, friction=friction, gains=gains,
         hamiltonian=hamiltonian_of(law.terms, lagrangian, names), zeros=zeros,
-        noise=dict(zip(names, map(float, map_.sensors.sigma), strict=True)),
-        residual=dict(zip(names, map(float, fit.rms()), strict=True)), gauge=gauge,
+        noise=dict(zip(channels, map(float, map_.sensors.sigma / factors), strict=True)),
+        residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)), gauge=gauge,
+        observe={n: f for n, f in formulas.items() if n != f}, sensors=sensors,
         alike=_alike(fit, lagrangian, friction), horizon=tuple(horizons),
         energy=_energy(law, friction, recording.inputs, states, times),
         messages=tuple(messages), steps=steps, num_samples=len(recording), seconds=seconds,

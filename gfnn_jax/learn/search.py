@@ -166,6 +166,12 @@ class Search:
         return self._entries[place]
 
     @property
+    def cheapest(self) -> float:
+        """Operations of a step of the cheapest size that meets the tolerance; infinite where none
+        does."""
+        return self._cheapest
+
+    @property
     def _ratios(self) -> list[float]:
         return [_known(r) for r in self._ratio]
 

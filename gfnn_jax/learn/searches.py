@@ -65,25 +65,26 @@ def searched(
 ) -> Searched:  # fmt: skip
     """Every candidate. Raises FitError where there is none."""
     bound, budget, say, tell = request.tolerance, request.budget, request.say, request.tell
+    options = request.options
     scene, prepared, charts = request.scene, seen.prepared, seen.charts
     better = _Better(on_better) if on_better is not None else None
     given = bound.bound, budget, say, tell, better
     # Small sizes first: a map is then there, however long the search for H.
-    early = not prepared.of_terms or request.model is not None
+    early = not prepared.of_terms or options.model is not None
     climb = Search(_sweeps(request, plain, seen, judges) if early else [], *given)
     climb.climb(most=_SMALL)
-    law = _law(request, plain, judges, better)
+    law = _law(request, plain, judges, better, DEARER * climb.cheapest)
     of_terms, failed = None, None
     met_by_law = law is not None and judges.met_by(law.candidate)
-    wanted = not early and request.learn != "hamiltonian" and not met_by_law
-    if wanted and request.family == "auto":
+    wanted = not early and options.learn != "hamiltonian" and not met_by_law
+    if wanted and options.family == "auto":
         try:
-            of_terms = map_of(prepared, judges, scene, request.chart, law, budget, say)
+            of_terms = map_of(prepared, judges, scene, options.chart, law, budget, say)
         except FitError as error:
             failed = error
     if wanted and plain.args is not None and not _met(of_terms, judges):
         try:
-            seen = diagnosed(plain, request.chart, request.reversor, request.seed)
+            seen = diagnosed(plain, options.chart, request.reversor, options.seed)
         except FitError as error:
             failed = failed or error
         prepared, charts = seen.prepared, seen.charts
@@ -104,7 +105,7 @@ def searched(
         say("drawing pairs from the flow of H")
         drawn = search_of_law(
             law, judges.pairs, judges, scene, request.coordinates, dearest, budget, say, tell,
-            request.seed,
+            options.seed,
         )  # fmt: skip
         if drawn is not None:
             found, charts = drawn
@@ -113,7 +114,7 @@ def searched(
         and law_explains_most(law, found, bound, budget)
     ):  # fmt: skip
         say(f"learning what the flow of {law.candidate.label} leaves over")
-        around = search_around(law, plain, judges, scene, budget, say, tell, better, request.seed)
+        around = search_around(law, plain, judges, scene, budget, say, tell, better, options.seed)
         if around is not None and better_than(around.found, found, law):
             found, charts = around
     known = [f.candidate for f in (law, of_terms, *found.ranking[:1]) if f is not None]
@@ -139,20 +140,23 @@ def _met(found: LearnedMap | None, judges: Judges) -> bool:
 
 
 def _law(
-    request: Request, plain: Prepared, judges: Judges, better: _Better | None
+    request: Request, plain: Prepared, judges: Judges, better: _Better | None, dearest: float
 ) -> LearnedHamiltonian | None:
-    """H, where one is looked for and found."""
+    """H, where one is looked for and found. dearest: operations of a step of a law that is chosen
+    beside the maps at hand."""
+    options = request.options
     if not request.seeks_law:
         return None
     if request.of_network:
         law = learn_network(
-            plain, judges, request.scene, seed=request.seed, budget=request.budget, say=request.say,
-            max_iterations=request.max_iterations,
+            plain, judges, request.scene, seed=options.seed, budget=request.budget,
+            say=request.say, max_iterations=options.max_iterations,
         )  # fmt: skip
     else:
         law = law_of(
-            plain, judges, request.scene, request.learn, request.terms, request.budget, request.say
-        )
+            plain, judges, request.scene, options.learn, options.terms, request.budget, request.say,
+            dearest,
+        )  # fmt: skip
     if law is not None:
         if better is not None:
             better.offer(law.candidate, lambda: composed(law.flow, plain, judges))
@@ -163,21 +167,22 @@ def _law(
 def _sweeps(request: Request, plain: Prepared, seen: Diagnosis, judges: Judges) -> list[Any]:
     """The sweeps of S over the charts that cover the data; none where H alone is learned, or the
     pairs are driven, or differ in dt and in parameters too."""
-    if request.model is not None:
-        return [ModelSweep(request.model, plain, judges)]
+    options = request.options
+    if options.model is not None:
+        return [ModelSweep(options.model, plain, judges)]
     charts, prepared = seen.charts.charts, seen.prepared
-    if request.learn == "hamiltonian" or prepared.period is not None:
+    if options.learn == "hamiltonian" or prepared.period is not None:
         return []
     if prepared.own_dt is not None:
         alone = prepared.structure is None and prepared.args is None
         return [sweep_of_dt(prepared, request.scene, judges, request.factors)] if alone else []
-    if request.family == "mlp":
-        given = (prepared, charts[0], judges, request.max_iterations, request.seed,
+    if options.family == "mlp":
+        given = (prepared, charts[0], judges, options.max_iterations, options.seed,
                  request.checkpoints)  # fmt: skip
-        count = request.ensemble
+        count = options.ensemble
         return [NetworkSweep(*given) if count == 1 else EnsembleSweep(*given, count=count)]
     return list(
-        sweeps_for(request.family, charts, prepared, request.scene, judges, request.factors)
+        sweeps_for(options.family, charts, prepared, request.scene, judges, request.factors)
     )
 
 

@@ -23,10 +23,10 @@ from gfnn_jax.families.sums import (
     site_terms,
 )
 from gfnn_jax.families.terms import Terms
+from gfnn_jax.learn.options import STRUCTURE
 from gfnn_jax.maps.domain import Ranges, ranges_of
 from gfnn_jax.phase_space import sizes
 
-NAMES = ("ring", "chain", "bodies:N", "ring:FIELDS", "chain:FIELDS", "bodies:N:SPECIES")
 _ENDS = {"ring": ("ring",), "chain": ("free", "fixed")}
 # (reach, degree, whether functions are tried too) of the libraries, by rising size.
 _LIBRARIES = (
@@ -176,7 +176,7 @@ def structure_of(
         return Bodies(count, dim // count, species)
     kind, fields = str(text).partition(":")[0], fields_of(str(text))
     if fields == 0:
-        raise FitError(f"expected a structure among {', '.join(NAMES)}; got {text!r}")
+        raise FitError(f"expected {STRUCTURE.words}, got {text!r}")
     if dim % fields:
         raise FitError(f"expected {fields} q of every site; got {dim} degrees of freedom")
     if dim // fields < _FEWEST_SITES:

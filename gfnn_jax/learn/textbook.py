@@ -19,11 +19,11 @@ from gfnn_jax.learn.clock import MATCHING
 from gfnn_jax.learn.law_work import LawWork
 from gfnn_jax.learn.learned_law import FittedLaw, held_out_error
 from gfnn_jax.learn.prepare import Prepared
-from gfnn_jax.models.textbook import OPTIONS, Law, textbook_law
+from gfnn_jax.models.textbook import OPTIONS, Law, Textbook
 
-# Operations of a search, by degrees of freedom from 1: of the laws of benchmarks/textbook.py the
-# longest.
-_OPERATIONS = (2e9, 4e9, 8e9, 1e10)
+# Operations of a search by degrees of freedom from 1, without products and with them: about the
+# longest of the laws of benchmarks/textbook.py.
+_OPERATIONS = {False: (1e8, 1.5e8, 3e8, 5e8), True: (2e8, 3e8, 4e8, 5e8)}
 _FEWEST = 60  # pairs
 _NOTHING = 1e-9  # of the largest term: a term so small is roundoff
 _EXACT = 1e-9  # of the spread: the error of a law that is no approximation
@@ -40,16 +40,20 @@ def law_of_physics(
     rows, coordinates = judges.training, prepared.coordinates
     own = copy.copy(problem)  # its flows are no part of what libraries may take
     own.spend = lambda operations: None
-    name = "laws of physics"
-    try:
-        with work.budget.unit(name, MATCHING, _OPERATIONS[prepared.dim - 1]):
-            law = textbook_law(
-                own, rows, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
-                cyclic=coordinates.cyclic, say=say,
-            )  # fmt: skip
-    except OutOfTime:
-        work.budget.leave_out(name, work.ended)
-        return None
+    search = Textbook(
+        own, rows, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+        cyclic=coordinates.cyclic, say=say,
+    )  # fmt: skip
+    law = None
+    for products, name in ((False, "laws of physics"), (True, "laws of physics with products")):
+        if law is not None or search.noisy:
+            break
+        try:
+            with work.budget.unit(name, MATCHING, _OPERATIONS[products][prepared.dim - 1]):
+                law = search.law(products=products)
+        except OutOfTime:
+            work.budget.leave_out(name, work.ended)
+            return None
     if law is None:
         return None
     family, start = _without_nothing(law, prepared.y0[rows], prepared.scale)
@@ -58,11 +62,11 @@ def law_of_physics(
             fit = problem.fit(family, start, rows, rounds=False)
             error = held_out_error(family, fit, prepared, judges)
     except OutOfTime:
-        work.budget.leave_out(name, work.ended)
+        work.budget.leave_out("the law of physics that was found", work.ended)
         return None
     if not (error.bound <= judges.tolerance.bound and error.relative <= _EXACT):
         return None
-    return FittedLaw(family, fit, rows, error, ())
+    return FittedLaw(family, fit, rows, error, search.null, search.null)
 
 
 def _without_nothing(law: Law, z: np.ndarray, scale: np.ndarray):

@@ -16,6 +16,7 @@ import numpy as np
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.local_cubics import smooth
+from gfnn_jax.dataset.stretches import channels_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.flows.motion import Form
@@ -30,7 +31,8 @@ _FINE = 0.16  # radians of the fastest motion in a step
 
 
 class Forecast(NamedTuple):
-    """Positions ahead: column name -> (runs, n), and their standard deviations."""
+    """What sensors will show, and coordinates that no column is named for: name -> (runs, n), and
+    their standard deviations."""
 
     times: np.ndarray
     values: dict[str, np.ndarray]
@@ -38,12 +40,14 @@ class Forecast(NamedTuple):
 
 
 class Window(NamedTuple):
-    """Samples of one run before a time: t (n,), positions y (n, d), and that run's inputs."""
+    """Samples of one run before a time: t (n,), channels y (n, k), that run's inputs, and the noise
+    (n, k) of each value in units of its channel's, None where it is the same of all."""
 
     t: np.ndarray
     y: np.ndarray
     inputs_t: np.ndarray
     inputs: np.ndarray
+    noise: np.ndarray | None = None
 
 
 class Law(NamedTuple):
@@ -121,40 +125,40 @@ def forecast(
     x, covariance = estimate_states(law, windows)
     ahead = np.broadcast_to(times, (len(windows), len(times)))
     orbits = propagate(law, windows, x, covariance, last, ahead)
-    names = sensors.positions
-    return Forecast(
-        times,
-        {n: orbits.values[..., i] for i, n in enumerate(names)},
-        {n: orbits.std[..., i] for i, n in enumerate(names)},
-    )
+    names = sensors.seen.channels
+    values = {n: orbits.values[..., k] for k, n in enumerate(names)}
+    std = {n: orbits.std[..., k] for k, n in enumerate(names)}
+    for i, n in enumerate(sensors.positions):
+        if n not in values:
+            values[n] = orbits.states[..., i]
+            std[n] = np.sqrt(orbits.covariances[..., i, i])
+    return Forecast(times, values, std)
 
 
 def windows_of(sensors: Sensors, recording: Recording) -> list[Window]:
     """The last samples of each run. Raises InputError where a column is missing or they are few."""
-    missing = [n for n in (*sensors.positions, *sensors.inputs) if n not in recording.columns]
+    channels = sensors.seen.channels
+    missing = [n for n in (*channels, *sensors.inputs) if n not in recording.columns]
     if missing:
         raise InputError(f"{recording.source}: expected columns {', '.join(missing)}")
     windows = []
     for run in recording.runs:
         t = recording.times(run)
-        columns = [
-            recording.unwrapped(n, run) if n in recording.angles else recording.values(n, run)
-            for n in sensors.positions
-        ]
-        y = np.stack(columns, axis=1)
+        y, noise = channels_of(recording, channels, run)
         u = [recording.values(n, run) for n in sensors.inputs]
         u = np.stack(u, axis=1) if u else np.zeros((len(t), 0))
         known = np.isfinite(u).all(axis=1)
-        seen = np.isfinite(y).all(axis=1)
+        seen = np.isfinite(sensors.coordinates_of(y)).all(axis=1)
         if np.sum(seen) < FEWEST:
             raise InputError(
                 f"{recording.source}: run {run}: expected at least {FEWEST} samples to estimate "
                 f"the state from, got {np.sum(seen)}"
             )
-        times, places = t[seen], y[seen]
+        times, places, noise = t[seen], y[seen], noise[seen]
         recent = times >= times[-FEWEST:].min()
         recent |= times >= times.max() - sensors.window
-        windows.append(thinned(Window(times[recent], places[recent], t[known], u[known])))
+        window = Window(times[recent], places[recent], t[known], u[known], noise[recent])
+        windows.append(thinned(window))
     return windows
 
 
@@ -162,7 +166,8 @@ def thinned(window: Window) -> Window:
     """The window with every so many of its samples, counted from the last one: more tell no
     more."""
     every = -(-len(window.t) // _MOST)
-    return window._replace(t=window.t[::-every][::-1], y=window.y[::-every][::-1])
+    noise = None if window.noise is None else window.noise[::-every][::-1]
+    return window._replace(t=window.t[::-every][::-1], y=window.y[::-every][::-1], noise=noise)
 
 
 def _with_inputs(window: Window, inputs: Recording, sensors: Sensors, run: str) -> Window:
@@ -197,30 +202,33 @@ class _Windows:
         )
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
-        d = self.law.form.dim
-        by_state = np.zeros((*x.shape[:2], d, 2 * d))
-        by_state[..., range(d), range(d)] = 1.0
-        return Observed(x[..., :d], by_state, np.zeros((*x.shape[:2], d, 0)))
+        seen = self.law.sensors.seen(x)
+        return seen._replace(by_coefficients=seen.by_coefficients[..., :0])
 
 
 def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np.ndarray]:
     """(q, v) (B, 2d) at the last sample of each window, and its covariance (B, 2d, 2d) in the
     law."""
-    d, sensors = law.form.dim, law.sensors
+    sensors = law.sensors
     length = max(len(w.t) for w in windows)
-    t, y, x = [], [], []
+    count = windows[0].y.shape[1]
+    t, y, x, noise = [], [], [], []
     for w in windows:
         pad = length - len(w.t)  # before the window: steps of no time, nothing seen
-        start = smooth(w.t, w.y, min(len(w.t), _near(sensors, w.t)))[0]
+        own = sensors.coordinates_of(w.y)
+        start = smooth(w.t, own, min(len(w.t), _near(sensors, w.t)))[0]
         own = np.concatenate([start.q, start.v], axis=1)
         t.append(np.concatenate([np.full(pad, w.t[0]), w.t]))
-        y.append(np.concatenate([np.full((pad, d), np.nan), w.y]))
+        y.append(np.concatenate([np.full((pad, count), np.nan), w.y]))
+        own_noise = np.ones(w.y.shape) if w.noise is None else w.noise
+        noise.append(np.concatenate([np.ones((pad, count)), own_noise]))
         x.append(np.concatenate([np.repeat(own[:1], pad, axis=0), own]))
     t, y, x = np.array(t), np.array(y), np.array(x)
     u, _ = _inputs(law, windows, t, substeps_of(sensors, np.max(np.diff(t, axis=1), initial=0.0)))
     arcs = _Windows(law, np.diff(t, axis=1), u)
-    scale = np.concatenate([sensors.sigma, sensors.sigma * sensors.omega])
-    found = fit_arcs(arcs, np.zeros(0), x, y, sensors.sigma, scale)
+    sigma = sensors.seen.state_sigma(x[:, -1], sensors.sigma)
+    scale = np.concatenate([sigma, sigma * sensors.omega])
+    found = fit_arcs(arcs, np.zeros(0), x, y, sensors.sigma * np.array(noise), scale)
     return found.x[:, -1], found.last_covariance()
 
 
@@ -231,12 +239,13 @@ def _near(sensors: Sensors, t: np.ndarray) -> int:
 
 
 class Orbits(NamedTuple):
-    """Positions (B, n, d) at the times asked, their standard deviations, and the states (B, n,
-    2d)."""
+    """Channels (B, n, k) at the times asked, their standard deviations, the states (B, n, 2d), and
+    these states' covariances in the law (B, n, 2d, 2d)."""
 
     values: np.ndarray
     std: np.ndarray
     states: np.ndarray
+    covariances: np.ndarray
 
 
 def propagate(
@@ -249,7 +258,7 @@ def propagate(
     steps = np.diff(np.concatenate([last[:, None], times], axis=1), axis=1)
     root = np.linalg.cholesky(covariance + 1e-300 * np.eye(2 * d)) if len(x) else covariance
     spread = np.concatenate([root, np.zeros((len(x), 2 * d, law.root.shape[0]))], axis=2)
-    values, deviations, states, now = [], [], [], last
+    states, covariances, now = [], [], last
     for k in range(times.shape[1]):
         parts = substeps_of(sensors, np.max(steps[:, k], initial=0.0))
         both = np.stack([now, times[:, k]], axis=1)
@@ -258,12 +267,13 @@ def propagate(
         x, now = step.states, times[:, k]
         spread = step.by_state @ spread
         spread[..., 2 * d :] += step.by_coefficients[..., :count] @ law.root.T
-        own = np.sum(spread[:, :d] ** 2, axis=2) + sensors.sigma**2
-        own = own + sensors.misfit_at(now - last) ** 2
-        values.append(x[:, :d])
-        deviations.append(np.sqrt(own))
         states.append(x)
-    return Orbits(*(np.stack(a, axis=1) for a in (values, deviations, states)))
+        covariances.append(spread @ spread.swapaxes(1, 2))
+    orbit, of_states = np.stack(states, axis=1), np.stack(covariances, axis=1)
+    seen = sensors.seen(orbit)
+    own = np.einsum("bnki,bnij,bnkj->bnk", seen.by_state, of_states, seen.by_state)
+    own = own + sensors.sigma**2 + sensors.misfit_at(times - last[:, None]) ** 2
+    return Orbits(seen.values, np.sqrt(own), orbit, of_states)
 
 
 def substeps_of(sensors: Sensors, h: float) -> int:

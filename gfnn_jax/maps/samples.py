@@ -21,6 +21,7 @@ from gfnn_jax.maps.symplectic_map import (
     advanced,
     begun,
     predicted,
+    require_no_inputs_backwards,
 )
 
 # Fewest lanes that are stepped together. More samples at once gain nothing on a CPU: a batched
@@ -72,6 +73,11 @@ class Samples:
         together = self._together(lanes.y)
         return _advance(self, lanes, args, num_saved, save_every, stop_outside, together)
 
+    def reversed(self) -> Samples:
+        """Make the inverse maps."""
+        piece = len(self.map.pieces) - 1 - self.piece
+        return Samples(self.map.reversed(), self.params, piece)
+
     def rollout(
         self,
         z0,
@@ -83,13 +89,19 @@ class Samples:
         save_every: int = 1,
         stop_outside: bool = False,
     ) -> tuple[Any, RolloutInfo]:
-        """Predict with every map.
+        """Predict with every map, back by its inverse where ``num_steps`` is negative.
 
         z0: (B, 2d), or (n, B, 2d) where each sample has its own. inputs: argument of
-        `SymplecticMap.rollout`. Returns the states (n, B, 1 + num_steps // save_every, 2d), and a
+        `SymplecticMap.rollout`. Returns the states (n, B, 1 + |num_steps| // save_every, 2d), and a
         RolloutInfo of leaves (n, B). Other samples of the same kind use the same compiled program.
-        Raises ValueError where a shape is wrong.
+        Raises ValueError where a shape is wrong, or inputs are given backwards.
         """
+        if num_steps < 0:
+            require_no_inputs_backwards(inputs)
+            return self.reversed().rollout(
+                z0, -num_steps, params=params, t0=t0, save_every=save_every,
+                stop_outside=stop_outside,
+            )  # fmt: skip
         z0, _ = self._given(z0, params, t0)
         args = self.map._schedule(params, self.map._states(z0[0]), t0, inputs, num_steps)
         return _rollout(

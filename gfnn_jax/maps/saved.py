@@ -42,6 +42,7 @@ from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping
 from gfnn_jax.maps.domain import Domain, Ranges
 from gfnn_jax.maps.inputs import Signals
+from gfnn_jax.maps.observation import Observation
 from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.sensors import Sensors
@@ -58,7 +59,7 @@ _TYPES: dict[str, type] = {
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
         Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
         Windows, Groups, Ranges, OfTimeStep, Ensemble, Uniform, Forced, Legendre, Friction, Signals,
-        Sensors, Damping, OfDisplacement,
+        Sensors, Observation, Damping, OfDisplacement,
     )
 } | {"LagrangianTerms": lagrangian.Terms}  # fmt: skip
 _NAMES = {kind: name for name, kind in _TYPES.items()}

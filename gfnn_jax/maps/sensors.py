@@ -7,16 +7,19 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.maps.observation import Observation
+
 
 @dataclasses.dataclass(frozen=True)
 class Sensors:
     """What was measured, and how well.
 
-    positions, inputs, angles: names of columns. sigma: (d,) noise of the positions. omega: the
-    fastest frequency, 1/s. window: seconds before a time from which a state is estimated best.
-    hold, delay: inputs between samples, and the time by which they act later, in seconds. leads,
-    misfit: (n,) times ahead, and (n, d) the standard deviation there of forecasts of the data that
-    neither the noise nor the errors of state and coefficients explain: the law's own.
+    positions, inputs, angles: names of coordinates and columns. sigma: (k,) noise of the channels
+    that are seen. omega: the fastest frequency, 1/s. window: seconds before a time from which a
+    state is estimated best. hold, delay: inputs between samples, and the time by which they act
+    later, in seconds. leads, misfit: (n,) times ahead, and (n, k) the standard deviation there of
+    forecasts of the data that neither the noise nor the errors of state and coefficients explain:
+    the law's own. observation: how channels show a state; None where they are the positions.
     """
 
     positions: tuple[str, ...]
@@ -29,9 +32,30 @@ class Sensors:
     delay: float
     leads: Any
     misfit: Any
+    observation: Observation | None = None
+
+    @property
+    def seen(self) -> Observation:
+        """How channels show a state."""
+        return self.observation or Observation.plain(self.positions)
+
+    @property
+    def turning(self) -> tuple[int, ...]:
+        """Indices of the coordinates that are angles."""
+        return tuple(i for i, name in enumerate(self.positions) if name in self.angles)
+
+    def coordinates_of(self, y: np.ndarray) -> np.ndarray:
+        """The coordinates (n, d) that channels y (n, k) of samples in a row show, angles lifted."""
+        if self.observation is None:
+            return y
+        q = self.seen.coordinates_of(y, self.turning)
+        known = np.isfinite(q).all(axis=1)
+        for i in self.turning:
+            q[known, i] = np.unwrap(q[known, i])
+        return q
 
     def misfit_at(self, ahead: np.ndarray) -> np.ndarray:
-        """The law's own error (..., d) at times ``ahead`` (...); beyond the last lead it grows on
+        """The law's own error (..., k) at times ``ahead`` (...); beyond the last lead it grows on
         as it did on the mean until there."""
         columns = [np.interp(ahead, self.leads, column) for column in self.misfit.T]
         beyond = np.maximum(1.0, ahead / self.leads[-1])

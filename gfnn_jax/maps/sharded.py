@@ -81,10 +81,10 @@ class Sharded:
         self, z0, num_steps: int, *, params=None, t0=None, save_every: int = 1,
         stop_outside: bool = False,
     ) -> tuple[Any, RolloutInfo]:  # fmt: skip
-        """Predict ``num_steps`` steps from z0 (B, 2d).
+        """Predict ``num_steps`` steps from z0 (B, 2d), back where the number is negative.
 
-        Returns the states (B, 1 + num_steps // save_every, 2d) and a RolloutInfo. Raises ValueError
-        as the map's rollout does.
+        Returns the states (B, 1 + |num_steps| // save_every, 2d) and a RolloutInfo. Raises
+        ValueError as the map's rollout does.
         """
         options = {"save_every": save_every, "stop_outside": stop_outside}
 

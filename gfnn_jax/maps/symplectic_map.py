@@ -407,8 +407,9 @@ class SymplecticMap:
         Returns the states (B, 1 + |num_steps| // save_every, 2d), the initial ones first, and a
         RolloutInfo. With samples its ``bands`` have their std about the states, and quantiles. A
         lane is NaN from where its step fails, or from where it leaves the domain with
-        ``stop_outside``. Raises ValueError where a number of steps or a shape is wrong, and where
-        samples are asked for without a key or from a map without a posterior.
+        ``stop_outside``. Raises ValueError where a number of steps or a shape is wrong, inputs are
+        given backwards, and where samples are asked for without a key or from a map without a
+        posterior.
         """
         for name, number in (("num_steps", num_steps), ("save_every", save_every)):
             if not isinstance(number, Integral):
@@ -421,6 +422,7 @@ class SymplecticMap:
             z0 = self.from_positions(*positions)
         z0 = self._states(z0)
         if num_steps < 0:
+            require_no_inputs_backwards(inputs)
             map_ = self if dt is None else self.over(dt, np.shape(z0)[:-1])
             return map_.reversed().rollout(
                 z0, -num_steps, params=params, t0=t0, save_every=save_every,
@@ -680,6 +682,12 @@ def _judge(status, inside, stop_outside: bool):
     """Update the status by the domain; only lanes that have not ended can change."""
     outside = STOPPED_AT_EDGE if stop_outside else LEFT_DOMAIN
     return jnp.where((status <= LEFT_DOMAIN) & ~inside, outside, status)
+
+
+def require_no_inputs_backwards(inputs) -> None:
+    """Raise ValueError for inputs of a rollout backwards, where nothing says which come first."""
+    if inputs is not None:
+        raise ValueError("expected no inputs of a rollout backwards (num_steps below 0)")
 
 
 def begun(map_, z, args, stop_outside) -> Lanes:

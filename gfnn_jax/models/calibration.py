@@ -37,7 +37,7 @@ def calibrated(
     law: Law, found: Sequence[Stretch], scales: Scales, spread: np.ndarray
 ) -> tuple[Law, list[Horizon]]:
     """The law with the best window for its estimates and the misfit of its forecasts, and its
-    horizons. ``spread`` (d,) of the positions."""
+    horizons. ``spread`` (k,) of the channels."""
     starts = _starts(found, scales)
     if not starts:
         return law, []
@@ -81,6 +81,10 @@ def calibrated(
     return law._replace(sensors=sensors), horizons
 
 
+def _window(s: Stretch, begin: int, end: int) -> Window:
+    return Window(s.t[begin:end], s.y[begin:end], s.t, s.u, s.noise[begin:end])
+
+
 def _passed(error: np.ndarray, leads: np.ndarray, fraction: float) -> float:
     above = np.flatnonzero(error > fraction)
     return float(leads[above[0]]) if len(above) else float("inf")
@@ -98,13 +102,13 @@ def _forecasts(
     law: Law, found: Sequence[Stretch], starts: Sequence[tuple[int, int]], window: float,
     leads: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Errors (B, n, d) of forecasts, NaN where the record ends before, and their standard
+    """Errors (B, n, k) of forecasts, NaN where the record ends before, and their standard
     deviations without a misfit; times are those of the samples nearest to the leads."""
     windows, times, measured = [], [], []
     for i, k in starts:
         s = found[i]
         first = min(int(np.searchsorted(s.t, s.t[k] - window)), max(0, k - _SHORT + 1))
-        windows.append(thinned(Window(s.t[first : k + 1], s.y[first : k + 1], s.t, s.u)))
+        windows.append(thinned(_window(s, first, k + 1)))
         at = np.minimum(np.searchsorted(s.t, s.t[k] + leads), len(s.t) - 1)
         inside = s.t[k] + leads <= s.t[-1]
         times.append(np.where(inside, s.t[at], s.t[at[inside][-1]] if inside.any() else s.t[k]))

@@ -7,16 +7,19 @@ import dataclasses
 import numpy as np
 
 from gfnn_jax.flows.motion import Form
+from gfnn_jax.maps.observation import Observation
 from gfnn_jax.solve.latent_arcs import Observed, Steps
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LawOnArcs:
-    """Steps h (A, L − 1) of a law with inputs u (A, L − 1, substeps, 6, k). What is seen is the
-    position plus the angle's ``zeros``, the last coefficients. Coefficients that are not ``free``
-    (indices) stay as in ``given``."""
+    """Steps h (A, L − 1) of a law with inputs u (A, L − 1, substeps, 6, k). What is seen are the
+    channels of ``seen`` plus the ``zeros`` of angles; their coefficients come last, first the
+    zeros', then the parameters of ``seen``. Coefficients that are not ``free`` (indices) stay as in
+    ``given``."""
 
     form: Form
+    seen: Observation
     zeros: tuple[int, ...]
     h: np.ndarray
     u: np.ndarray
@@ -49,12 +52,13 @@ class LawOnArcs:
         )
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
-        d, whole = self.form.dim, self.full(p)
-        values = x[..., :d].copy()
-        by_state = np.zeros((*values.shape, 2 * d))
-        by_state[..., range(d), range(d)] = 1.0
-        by = np.zeros((*values.shape, len(whole)))
-        for k, i in enumerate(self.zeros, self.form.count):
-            values[..., i] += whole[k]
-            by[..., i, k] = 1.0
-        return Observed(values, by_state, by[..., self.free])
+        whole, first = self.full(p), self.form.count
+        last = first + len(self.zeros)
+        seen = self.seen(x, whole[last:])
+        values, by = seen.values, np.zeros((*seen.values.shape, len(whole)))
+        by[..., last:] = seen.by_coefficients
+        for k, i in enumerate(self.zeros, first):
+            channel = self.seen.direct[i]
+            values[..., channel] += whole[k]
+            by[..., channel, k] = 1.0
+        return Observed(values, seen.by_state, by[..., self.free])

@@ -10,6 +10,7 @@ import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs, Nodes, arcs_of, with_states
 from gfnn_jax.flows.motion import Form
+from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.law_arcs import LawOnArcs
 from gfnn_jax.models.structure import Key, Structure
 from gfnn_jax.solve.latent_arcs import Fitted, fit_arcs, loss, sensitivities
@@ -20,8 +21,8 @@ FOLDS = 3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LawFit:
-    """A structure fitted to arcs, in the gauge of ``form``; σ (d,) is the scale of the residuals, τ
-    their correlation time in nodes."""
+    """A structure fitted to arcs, in the gauge of ``form``; σ (k,) is the scale of the residuals of
+    each channel, τ their correlation time in nodes."""
 
     structure: Structure
     form: Form
@@ -43,22 +44,35 @@ class LawFit:
         return self.fitted.covariance() * self.correlation
 
     def rms(self) -> np.ndarray:
-        """Root mean square residual (d,), in units of the positions."""
-        return np.sqrt(np.nanmean(self.fitted.residuals**2, axis=(0, 1))) * self.sigma
+        """Root mean square residual (k,), in units of the channels."""
+        left = self.fitted.residuals * self.arcs.noise
+        return np.sqrt(np.nanmean(left**2, axis=(0, 1))) * self.sigma
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Workbench:
-    """What all fits of one recording share: positions of the gauge, the inputs of arcs, scales."""
+    """What all fits of one recording share: positions of the gauge, the inputs of arcs, the fastest
+    frequency ω, and how states are seen."""
 
     gauge: np.ndarray
     inputs: Callable[[Arcs], np.ndarray]
-    state_scale: np.ndarray  # (2d,) per unit of σ: 1 and ω
+    omega: float
+    seen: Observation
 
     def model(self, structure: Structure, arcs: Arcs, given: np.ndarray, free: np.ndarray):
         form = structure.form(self.gauge)
         u = self.inputs(arcs)
-        return LawOnArcs(form, structure.zeros, np.diff(arcs.t, axis=1), u, given, free)
+        h = np.diff(arcs.t, axis=1)
+        return LawOnArcs(form, self.seen, structure.zeros, h, u, given, free)
+
+    def state_scale(self, sigma: np.ndarray) -> np.ndarray:
+        """The defect (2d,) that counts as one standard deviation of the channels."""
+        own = self.seen.state_sigma(self._states, sigma)
+        return np.concatenate([own, own * self.omega])
+
+    @property
+    def _states(self) -> np.ndarray:
+        return np.concatenate([self.gauge, 0 * self.gauge], axis=1)
 
     def fit(
         self,
@@ -73,8 +87,8 @@ class Workbench:
         x = arcs.x
         model = self.model(structure, arcs, p, np.arange(len(p)))
         for _ in range(3 if rescale else 1):
-            scale = np.concatenate([sigma, sigma]) * self.state_scale
-            found = fit_arcs(model, p, x, arcs.y, sigma, scale, tolerance=1e-4 if rescale else 1e-3)
+            noise, scale = sigma * arcs.noise, self.state_scale(sigma)
+            found = fit_arcs(model, p, x, arcs.y, noise, scale, tolerance=1e-4 if rescale else 1e-3)
             p, x = found.p, found.x
             change = np.nanmedian(np.abs(found.residuals), axis=(0, 1)) / 0.6745
             change = np.maximum(change, 1e-3)
@@ -86,8 +100,8 @@ class Workbench:
     def held_out(self, fit: LawFit, arcs: Arcs) -> np.ndarray:
         """The cost (A,) of arcs that the fit has not seen, with their own states."""
         model = self.model(fit.structure, arcs, fit.p, np.arange(0))
-        scale = np.concatenate([fit.sigma, fit.sigma]) * self.state_scale
-        found = fit_arcs(model, np.zeros(0), arcs.x, arcs.y, fit.sigma, scale, 15, 1e-3)
+        noise, scale = fit.sigma * arcs.noise, self.state_scale(fit.sigma)
+        found = fit_arcs(model, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, 1e-3)
         if not np.isfinite(found.cost):
             return np.full(len(arcs.home), np.inf)
         return np.nansum(loss(found.residuals), axis=(1, 2))
@@ -117,7 +131,8 @@ class Workbench:
         keys = larger.keys()
         p = larger.start(known)
         model = self.model(larger, fit.arcs, p, np.arange(len(p)))
-        R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, fit.sigma)
+        noise = fit.sigma * fit.arcs.noise
+        R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise)
         old = [keys.index(k) for k in known]
         own = [keys.index(k) for k in new]
         Q = np.linalg.qr(R[:, old])[0] if old else np.zeros((len(R), 0))

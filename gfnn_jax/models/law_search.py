@@ -17,6 +17,7 @@ import numpy as np
 from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of, with_states
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models import libraries
 from gfnn_jax.models.law_fit import LawFit, Workbench
 from gfnn_jax.models.structure import Key, Loss, Structure
@@ -50,15 +51,19 @@ def search(
     angles: tuple[int, ...],
     num_inputs: int,
     inputs: Mapping[str, Callable],
+    seen: Observation,
     told: Callable[[str], object] = lambda line: None,
     options: SearchOptions = SearchOptions(),
 ) -> tuple[LawFit, str, list[Nodes]]:
     """The law of these nodes: its fit to the longest arcs; of the rules between samples of the
-    ``inputs`` (hold -> inputs of arcs) the best; and the nodes with the states found."""
-    d = nodes[0].y.shape[1]
+    ``inputs`` (hold -> inputs of arcs) the best; and the nodes with the states found. ``seen`` says
+    how states are observed."""
+    d = seen.dim
     gauge = np.concatenate([n.x[:, :d] for n in nodes])
-    state_scale = np.repeat([1.0, scales.omega], d)
-    benches = {hold: Workbench(gauge, u, state_scale) for hold, u in inputs.items()}
+    benches = {hold: Workbench(gauge, u, scales.omega, seen) for hold, u in inputs.items()}
+    sensors = tuple(zip(seen.parameters, map(float, seen.values), strict=True))
+    shifted = seen.shifts()
+    turned = tuple(i for i in angles if i in seen.direct and i not in shifted)  # with a zero
 
     def length(periods: float) -> int:
         return max(6, round(periods * scales.per_period))
@@ -71,14 +76,15 @@ def search(
         plain.append(libraries.relative(d, angles))
     plain_terms = []
     for rows in (*plain, libraries.first(d, angles)):
-        library = Structure(d, tuple(rows), tuple(linear), (), num_inputs)
+        terms = libraries.without_forces(rows, shifted)
+        library = Structure(d, terms, tuple(linear), (), num_inputs, sensors)
         try:
             structure, known = weak_start(library, nodes, scales)
         except FitError:
             continue
         if rows in plain:
             plain_terms.append(structure.terms)
-        zeros = tuple(i for i in angles if any(row[2][i] for row in structure.terms))
+        zeros = tuple(i for i in turned if any(row[2][i] for row in structure.terms))
         structure = structure.plus(
             [("loss", row) for row in linear[:d]] + [("zero", i) for i in zeros]
         )
@@ -104,8 +110,10 @@ def search(
     simple = [k for k in simple if misfit[k] <= options.plain_is_enough * misfit[best]]
     fit = starts[min(simple, key=lambda k: misfit[k]) if simple else best]
     every = Structure(
-        d, (*libraries.first(d, angles), *libraries.more(d, angles)),
-        _with_opposites(libraries.losses(d, libraries.KINDS, width)), angles, num_inputs,
+        d, libraries.without_forces(
+            (*libraries.first(d, angles), *libraries.more(d, angles)), shifted
+        ),
+        _with_opposites(libraries.losses(d, libraries.KINDS, width)), turned, num_inputs, sensors,
     )  # fmt: skip
     allowed = tuple(libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions)
     every = dataclasses.replace(
@@ -148,8 +156,8 @@ def prune(
     costs = None
     while True:
         z = significance(fit)
-        gains_of_inputs = {k for k in z if k[0] == "gain"}  # always there
-        fixed = protected(fit.structure) | refused | gains_of_inputs
+        always = {k for k in z if k[0] in ("gain", "sensor")}
+        fixed = protected(fit.structure) | refused | always
         z = {k: size for k, size in z.items() if k not in fixed and size < options.significant}
         if not z:
             return fit

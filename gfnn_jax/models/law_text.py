@@ -40,7 +40,7 @@ class Expression:
 
     def __str__(self) -> str:
         """As a person writes it: the last digits' standard errors in brackets."""
-        return _sum(f"{_measured(c, s)} {_pretty(t)}" for t, c, s in self.terms) or "0"
+        return _sum(f"{measured(c, s)} {_pretty(t)}" for t, c, s in self.terms) or "0"
 
     def sympy(self) -> Any:
         """As a sympy expression."""
@@ -131,7 +131,7 @@ def _digits(value: float, std: float) -> str:
     return f"{value:.{int(np.clip(np.ceil(np.log10(abs(value) / std)) + 2, 2, 15))}g}"
 
 
-def _measured(value: float, std: float) -> str:
+def measured(value: float, std: float) -> str:
     """0.4073(3): the standard error in units of the last digit."""
     if std <= 0 or not np.isfinite(std):
         return f"{value:.6g}"

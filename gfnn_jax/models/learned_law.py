@@ -12,7 +12,7 @@ from gfnn_jax.families.lagrangian import Lagrangian, Terms
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.calibration import Horizon
 from gfnn_jax.models.law_fit import LawFit
-from gfnn_jax.models.law_text import Expression, Term, terms_of
+from gfnn_jax.models.law_text import Expression, Term, measured, terms_of
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -22,10 +22,12 @@ class LearnedLaw:
     map: its flow, which estimates and forecasts. lagrangian: L, and friction: Rayleigh's R, by the
     names of columns, with standard errors. gains: input -> force on each position, with its
     standard error. hamiltonian: H in words, its terms as of L. zeros: angle -> (where it is zero,
-    standard error), already inside the formula. noise: column -> σ of its samples; residual: of
-    the fit's arcs. gauge: what fixes the scale of L. alike: coefficients that the record cannot
-    tell apart. horizon: for how long a forecast can be trusted. energy: stored, lost, supplied per
-    second, means over the record. messages: warnings. steps: what the search did, line by line.
+    standard error), already inside the formula. observe: column -> what its sensor shows, where
+    that is not the coordinate; sensors: the parameters in it, fitted, with standard errors. noise:
+    column -> σ of its samples; residual: of the fit's arcs, both in the file's unit. gauge: what
+    fixes the scale of L. alike: coefficients that the record cannot tell apart. horizon: for how
+    long a forecast can be trusted. energy: stored, lost, supplied per second, means over the
+    record. messages: warnings. steps: what the search did, line by line.
     num_samples, seconds (of the processor). ended: why the search ended.
     """
 
@@ -35,6 +37,8 @@ class LearnedLaw:
     gains: dict[str, dict[str, tuple[float, float]]]
     hamiltonian: Hamiltonian
     zeros: dict[str, tuple[float, float]]
+    observe: dict[str, str]
+    sensors: dict[str, tuple[float, float]]
     noise: dict[str, float]
     residual: dict[str, float]
     gauge: str
@@ -59,6 +63,8 @@ class LearnedLaw:
         lines += [
             f"{name}: zero at {zero:.5f}({std:.5f})" for name, (zero, std) in self.zeros.items()
         ]
+        lines += [f"{column} shows {formula}" for column, formula in self.observe.items()]
+        lines += [f"{name} = {measured(value, std)}" for name, (value, std) in self.sensors.items()]
         for name, forces in self.gains.items():
             told = ", ".join(f"{q} {g:.6g} ± {s:.2g}" for q, (g, s) in forces.items())
             lines.append(f"force of {name}: {told}")
@@ -66,9 +72,9 @@ class LearnedLaw:
             lines.append(
                 f"{name}: noise {sigma:.3g}, residual of the law {self.residual[name]:.3g}"
             )
-        for fraction, measured, predicted in self.horizon:
+        for fraction, seconds, predicted in self.horizon:
             lines.append(
-                f"forecasts within {fraction:.0%} of the spread for {measured:.3g} s (by the bands "
+                f"forecasts within {fraction:.0%} of the spread for {seconds:.3g} s (by the bands "
                 f"{predicted:.3g} s)"
             )
         return "\n".join(lines)
@@ -133,7 +139,7 @@ def in_columns(fit: LawFit) -> tuple[Lagrangian, np.ndarray]:
     form, structure = fit.form, fit.structure
     law = form.lagrangian(fit.p[: form.count])
     zeros = np.zeros(form.dim)
-    zeros[list(structure.zeros)] = fit.p[form.count :]
+    zeros[list(structure.zeros)] = fit.p[form.count : form.count + len(structure.zeros)]
     terms = law.terms
     moved = dataclasses.replace(terms, phases=terms.phases - terms.modes @ zeros)
     rest = form.count - form.basis.shape[1]

@@ -9,6 +9,7 @@ asks for.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations, combinations_with_replacement
 
 import numpy as np
@@ -104,6 +105,13 @@ def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
         for m in modes(dim, angles, 1):
             rows += [(none, unit(dim, i), m, 0.0), (none, unit(dim, i), m, SINE)]
     return rows
+
+
+def without_forces(rows: Sequence[Row], axes: Sequence[int]) -> tuple[Row, ...]:
+    """The rows without constant forces along these axes, whose zero is where the force is none."""
+    dim = len(rows[0][0])
+    forces = [((0,) * dim, unit(dim, i), (0,) * dim, 0.0) for i in axes]
+    return tuple(row for row in rows if row not in forces)
 
 
 def modes(dim: int, angles: tuple[int, ...], order: int) -> list[tuple[int, ...]]:

@@ -176,12 +176,9 @@ class Matching:
         residual, basis, _ = self._residual(match.atoms)
         if not np.isfinite(residual).all():
             return []
-        own = basis[:, self.base.shape[1] :]  # the dictionary is without the base already
-        columns = dictionary.columns
-        size = np.sqrt(np.maximum(1 - np.sum((own.T @ columns) ** 2, axis=0), 0.0))
-        independent = size > _INDEPENDENT
-        part = np.where(independent, residual @ columns / np.where(independent, size, 1.0), 0.0)
-        gain = part**2
+        own, columns = basis[:, self.base.shape[1] :], dictionary.columns
+        part, size = self._parts(residual, own, columns)
+        independent, gain = size > _INDEPENDENT, part**2
         singles = _apart(np.argsort(-gain), dictionary.atoms, _BRANCHES)
         found: list[tuple[Atom, ...]] = [(dictionary.atoms[i],) for i in singles]
         if len(match.atoms) + 2 > most:
@@ -207,6 +204,20 @@ class Matching:
             if len(seen) == _BRANCHES:
                 break
         return found
+
+    def gains(self, match: Match, dictionary: Dictionary) -> np.ndarray:
+        """(atoms,): the part of the square of what a match leaves over that each atom explains."""
+        residual, basis, _ = self._residual(match.atoms)
+        part, _ = self._parts(residual, basis[:, self.base.shape[1] :], dictionary.columns)
+        return part**2 / max(float(residual @ residual), 1e-300)
+
+    @staticmethod
+    def _parts(residual, own: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(what of the residual lies along each column without what ``own`` spans of it, 0 where
+        little of it is left; the length of that). Columns are without the base already."""
+        size = np.sqrt(np.maximum(1 - np.sum((own.T @ columns) ** 2, axis=0), 0.0))
+        told = size > _INDEPENDENT
+        return np.where(told, residual @ columns / np.where(told, size, 1.0), 0.0), size
 
     def _flat(self, gradient: np.ndarray) -> np.ndarray:
         return (gradient * self.weight).ravel()

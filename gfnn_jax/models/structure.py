@@ -1,4 +1,5 @@
-"""The structure of a law: which terms, frictions, gains and zeros of angles it has, and its gauge.
+"""The structure of a law: which terms, frictions, gains and zeros of angles it has, how it is seen,
+and its gauge.
 
 L → c L + const moves nothing, so one coefficient has to be given: the mean of M₁₁ over the data is
 1. (To set the coefficient of ½v₁² alone would admit M₁₁ = 1 − 1.3 cos q + 0.3 cos 2q, which is
@@ -25,14 +26,15 @@ Key = tuple[Any, ...]
 @dataclasses.dataclass(frozen=True)
 class Structure:
     """Terms of L (the first is ½v₁²·2, whose coefficient the gauge gives), friction, the
-    coordinates whose zero is unknown, and the number of inputs, each with a gain for each
-    coordinate."""
+    coordinates whose zero is unknown, the number of inputs, each with a gain for each coordinate,
+    and the names of the sensors' parameters with where they start."""
 
     dim: int
     terms: tuple[Row, ...]
     friction: tuple[Loss, ...] = ()
     zeros: tuple[int, ...] = ()
     num_inputs: int = 0
+    sensors: tuple[tuple[str, float], ...] = ()
 
     def keys(self) -> list[Key]:
         """A name of each free coefficient, in their order."""
@@ -42,10 +44,12 @@ class Structure:
             *(("loss", row) for row in self.friction),
             *gains,
             *(("zero", i) for i in self.zeros),
+            *(("sensor", name) for name, _ in self.sensors),
         ]
 
     def start(self, known: Mapping[Key, float]) -> np.ndarray:
-        """The coefficients that are known, and 0 for the others."""
+        """The coefficients that are known, for sensors those they start from, 0 for the others."""
+        known = {**{("sensor", name): value for name, value in self.sensors}, **known}
         return np.array([known.get(key, 0.0) for key in self.keys()])
 
     def form(self, q: np.ndarray) -> Form:

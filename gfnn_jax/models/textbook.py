@@ -18,7 +18,7 @@ import numpy as np
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
-from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.fitting.gauss_newton import Problem, null_terms
 from gfnn_jax.flows.collocation import Steps, of_lanes
 from gfnn_jax.models.arguments import arguments_of
 from gfnn_jax.models.atoms import (
@@ -30,7 +30,7 @@ from gfnn_jax.models.atoms import (
     powers_of,
     weight_of,
 )
-from gfnn_jax.models.matching import SAID, Match, Matching, orthonormal
+from gfnn_jax.models.matching import Match, Matching, orthonormal
 from gfnn_jax.phase_space import apply_j
 
 _STEPS = Steps(6, 1)
@@ -49,7 +49,9 @@ class Options:
     go through their flow; plainer: of them, that are tried in plainer shapes too. corrections: of
     gradients, at most; contracted: by which each must lower what is left over. roundoff: of the
     coordinates' sizes; a law that leaves no more is exact. lost: part of the pairs whose flow may
-    fail. most_dim: degrees of freedom beyond which the dictionary is too large.
+    fail. most_dim: degrees of freedom beyond which the dictionary is too large. rows_per_term: that
+    all products of coordinates need together. certain: twice the logarithm of the odds that what an
+    atom explains is no chance.
     """
 
     rows: int = 260
@@ -64,9 +66,8 @@ class Options:
     roundoff: float = 1e-11
     lost: float = 0.1
     most_dim: int = 4
-    noisy_rows: int = 1_000
-    settled: int = 4
-    certain: float = 8.0
+    rows_per_term: float = 1.6
+    certain: float = 10.0
 
 
 OPTIONS = Options()
@@ -88,58 +89,47 @@ class _State(NamedTuple):
     target: np.ndarray
 
 
-def textbook_law(
-    problem: Problem, rows: np.ndarray, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
-    options: Options = OPTIONS, say: Callable[[str], Any] = lambda message: None,
-) -> Law | None:  # fmt: skip
-    """The simplest law whose flow takes z₀ to z₁, or None where none is found.
+class Textbook:
+    """The search for the law of these rows of a problem's pairs, which have no args.
 
-    rows: of the problem's pairs, which have no args. angles, cyclic: indices of z.
+    angles, cyclic: indices of z. check: called between attempts; it may raise to stop.
+    noisy: whether what the last search left over looks like noise, so that none need follow.
+    null: the coordinates and products of two that the states do not tell from those before.
+    Raises ValueError for more degrees of freedom than ``options.most_dim``.
     """
-    if problem.z0.shape[1] > 2 * options.most_dim:
-        return None
-    search = _Search(problem, rows, tuple(angles), tuple(cyclic), options, say)
-    with np.errstate(all="ignore"):
-        for products in (False, True):
-            found = search.found(products)
-            if found is not None:
-                return search.simplified(found).law
-    return None
 
-
-def noisy_law(
-    problem: Problem, rows: np.ndarray, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
-    options: Options = OPTIONS, say: Callable[[str], Any] = lambda message: None,
-) -> Law | None:  # fmt: skip
-    """The law of shortest description of pairs with noise: as `textbook_law`, without a claim that
-    it is exact. None where its flow fails."""
-    if problem.z0.shape[1] > 2 * options.most_dim:
-        return None
-    options = dataclasses.replace(options, rows=options.noisy_rows)
-    search = _Search(problem, rows, tuple(angles), tuple(cyclic), options, say)
-    with np.errstate(all="ignore"):
-        found = search.shortest()
-    return None if found is None else found.law
-
-
-class _Search:
-    def __init__(self, problem, rows, angles, cyclic, options: Options, say):
-        self._problem, self._options, self._say = problem, options, say
+    def __init__(
+        self, problem: Problem, rows: np.ndarray, *, angles: Sequence[int] = (),
+        cyclic: Sequence[int] = (), options: Options = OPTIONS,
+        say: Callable[[str], Any] = lambda message: None,
+    ):  # fmt: skip
+        dim = problem.z0.shape[1] // 2
+        if dim > options.most_dim:
+            raise ValueError(f"expected at most {options.most_dim} degrees of freedom, got {dim}")
+        self._problem, self._options, self._say, self._dim = problem, options, say, dim
         rows = np.asarray(rows[: options.rows])
         moved = np.linalg.norm((problem.z1 - problem.z0)[rows] / problem.scale, axis=1)
         self._rows = np.sort(rows[np.argsort(moved)[: int(np.ceil(options.quiet * len(rows)))]])
         z0, z1 = problem.z0[self._rows], problem.z1[self._rows]
         dt = of_lanes(problem.dt, self._rows)
         self._h = dt[:, None] if np.ndim(dt) else dt
-        self._dim = z0.shape[1] // 2
-        self._z0, self._z1, self._middle = z0, z1, 0.5 * (z0 + z1)
-        self._weight = 1.0 / np.roll(problem.scale, self._dim)
-        self._arguments = arguments_of(self._middle, angles, cyclic)
-        self._base = polynomial_terms(self._dim, 2, cyclic=(*angles, *cyclic))
+        self._z1, self._middle = z1, 0.5 * (z0 + z1)
+        self._weight = 1.0 / np.roll(problem.scale, dim)
+        self._arguments = arguments_of(self._middle, tuple(angles), tuple(cyclic))
+        every = polynomial_terms(dim, 2, cyclic=(*angles, *cyclic))
+        kept, null = null_terms(every, self._middle)
+        self._base, self.null = every.take(kept), tuple(every.term_names[j] for j in null)
         columns = self._base.term_gradients(self._middle) * self._weight[:, None]
-        self._columns = columns.reshape(-1, columns.shape[-1])
-        self._spanned = orthonormal(self._columns)
+        self._spanned = orthonormal(columns.reshape(-1, columns.shape[-1]))
         self._target = -apply_j(z1 - z0) / self._h
+        self.noisy = False
+
+    def law(self, *, products: bool) -> Law | None:
+        """The plainest law whose flow takes z₀ to z₁, of a dictionary without products of shapes or
+        with them; None where none is found."""
+        with np.errstate(all="ignore"):
+            found = self._found(products)
+            return None if found is None else self._simplified(found).law
 
     @property
     def _degree(self) -> int:
@@ -151,18 +141,19 @@ class _Search:
             self._arguments, self._weight, self._spanned, degree=self._degree, products=products
         )
 
-    def _matching(self, target: np.ndarray, said: float = SAID) -> Matching:
+    def _matching(self, target: np.ndarray) -> Matching:
         flat = (target * self._weight).ravel()
-        return Matching(self._spanned, flat, self._weight, self._arguments, said)
+        return Matching(self._spanned, flat, self._weight, self._arguments)
 
-    def found(self, products: bool) -> _State | None:
+    def _found(self, products: bool) -> _State | None:
         """The simplest law that is exact, of a dictionary with products or without."""
         options = self._options
         dictionary = self._dictionary(products)
         self._say(f"H: {len(dictionary.atoms)} atoms of laws of physics")
         blocks = [] if products else blocks_of(self._arguments, self._degree)
         rows = self._middle.size
-        blocks = [b for b in blocks if 1.6 * (len(b) + self._columns.shape[1]) < rows]
+        most = rows / options.rows_per_term - self._base.num_parameters
+        blocks = [b for b in blocks if len(b) < most]
         target, last = self._target, np.inf
         for _ in range(options.rounds):
             matching = self._matching(target)
@@ -177,9 +168,16 @@ class _Search:
                 return None
             best = min(states, key=lambda s: s.law.left)
             if not best.law.left < options.contracted * last:
+                self.noisy = self._explains_nothing(best, dictionary)
                 return None
             target, last = best.target, best.law.left
         return None
+
+    def _explains_nothing(self, state: _State, dictionary: Dictionary) -> bool:
+        """Whether no atom explains more of what is left over than it would of noise."""
+        gain = self._matching(state.target).gains(state.match, dictionary).max(initial=0.0)
+        chance = 2 * np.log(len(dictionary.atoms)) + self._options.certain
+        return bool(-self._middle.size * np.log1p(-min(gain, 1 - 1e-12)) < chance)
 
     def _finalists(self, matching: Matching, dictionary: Dictionary) -> list[Match]:
         """The best matches, and plainer ones that leave hardly more."""
@@ -242,42 +240,9 @@ class _Search:
             family = joined(family, Terms(self._dim, names, tuple(dict.fromkeys(rows))))
         return joined(family, given_terms(self._dim, texts)) if texts else family
 
-    def shortest(self) -> _State | None:
-        """The law that says most in the fewest atoms of what is noise for the rest."""
-        options, dictionary, best = self._options, self._dictionary(False), None
-        said = options.certain / (np.log(2) * self._middle.size)
-        target, last = self._target, np.inf
-        for _ in range(options.rounds):
-            matching = self._matching(target, said)
-            tried = self._finalists(matching, dictionary)
-            states = []
-            for match in tried:
-                state = self._settled(match, target)
-                if state is not None:
-                    left = Match(state.match.atoms, state.law.left)
-                    states.append((matching.cost(left), len(states), state))
-            if not states:
-                return best
-            value, _, state = min(states)
-            if not value < last - said:
-                return best
-            best, last, target = state, value, state.target
-        return best
-
-    def _settled(self, match: Match, target: np.ndarray) -> _State | None:
-        """The match after so many corrections that what is left of their error is noise."""
-        state = None
-        for _ in range(self._options.settled):
-            law, target = self._corrected(match, target)
-            if law is None:
-                return None
-            state = _State(match, law, target)
-            match = self._matching(target).refined(match.atoms)
-        return state
-
     # Simpler ways to say the same
 
-    def simplified(self, state: _State) -> _State:
+    def _simplified(self, state: _State) -> _State:
         """The simplest law that is as exact: other atoms that match the corrected gradients, fewer
         of them, constants of fewer digits."""
         dictionary = self._dictionary(False)

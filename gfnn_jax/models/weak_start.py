@@ -69,7 +69,7 @@ def weak_start(
 
 def _solve(X: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Least squares X c = Y: c, residuals in the shape of Y, and R⁻¹ of the factor."""
-    flat = X.reshape(-1, X.shape[-1])
+    flat = X.reshape(X.shape[0] * X.shape[1], X.shape[2])
     scale = np.linalg.norm(flat, axis=0)
     Q, R = np.linalg.qr(flat / scale)
     inverse = np.linalg.pinv(R, rcond=1e-12)

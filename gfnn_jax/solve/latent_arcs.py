@@ -94,10 +94,10 @@ def fit_arcs(
 ) -> Fitted:
     """Fit p (n,) and the states x (A, L, m), from what they start at, to y (A, L, k).
 
-    Entries of y that are NaN were not seen. ``sigma`` (k,) is the noise of y, ``state_scale`` (m,)
-    the defect that counts as one standard deviation. While defects matter, an iteration has to
-    close them; then it has to lower the cost. Ends where it lowers it by less than ``tolerance``
-    of itself. The cost is infinite where the defects could not be closed.
+    Entries of y that are NaN were not seen. ``sigma`` (k,) or (A, L, k) is the noise of y,
+    ``state_scale`` (m,) the defect that counts as one standard deviation. While defects matter, an
+    iteration has to close them; then it has to lower the cost. Ends where it lowers it by less than
+    ``tolerance`` of itself. The cost is infinite where the defects could not be closed.
     """
     seen = np.isfinite(y)
     known = np.where(seen, y, 0.0)
@@ -210,7 +210,7 @@ def _reduced(at: _Iterate, sigma: np.ndarray) -> _Rows:
         S[:, i + 1, :, -1] += at.defects[:, i]
     J = observed.by_state @ S
     J[..., m : m + n] += observed.by_coefficients
-    J /= sigma[:, None]
+    J /= sigma[..., None]
     J[..., -1] = residuals - J[..., -1]
     weight = (1 + (residuals / ROBUST) ** 2) ** -0.25  # the square root of ρ'(r)/2r
     weight = np.where(at.seen, weight, 0.0)

@@ -46,8 +46,8 @@ def _steps(traits: Traits, name: str) -> np.ndarray:
 def units(traits: Traits) -> Iterator[Fault]:
     """Angles whose jumps, or whose swings, are too wide for radians."""
     recording = traits.recording
-    for name in recording.angles:
-        if recording.factors[name] != 1:
+    for name in _angles(traits):
+        if recording.factors[name] != 1 or name in recording.explained:
             continue
         option = {"degrees": (name,)}
         jump, swing = jumps(traits, name), _swing(_raw(traits, name))
@@ -58,6 +58,12 @@ def units(traits: Traits) -> Iterator[Fault]:
             found = f"{name} swings by {swing:.3g}: degrees, or {swing / TURN:.0f} turns"
             remedy = f"--degrees {name}, or --angles {name} if it is in radians"
             yield Fault("degrees", found, remedy, option)
+
+
+def _angles(traits: Traits) -> list[str]:
+    """Positions that are angles; a coordinate that no column shows directly is none of them."""
+    recording = traits.recording
+    return [name for name in recording.positions if name in recording.angles]
 
 
 def _settled(traits: Traits, name: str) -> bool:
@@ -93,7 +99,7 @@ def wraps(traits: Traits) -> Iterator[Fault]:
 
 def interpolated_jumps(traits: Traits) -> Iterator[Fault]:
     """Wrapped angles that were interpolated across their jump: a few steps make a whole turn."""
-    for name in traits.recording.angles:
+    for name in _angles(traits):
         count = sum(_cuts(x) for x in _raw(traits, name))
         if count:
             yield Fault(
@@ -125,7 +131,7 @@ def _cuts(x: np.ndarray) -> int:
 
 def coarse(traits: Traits) -> Iterator[Fault]:
     """Angles whose steps are so wide that their lift is a guess."""
-    for name in traits.recording.angles:
+    for name in _angles(traits):
         steps = _steps(traits, name)
         wide = int(np.sum(np.abs(np.angle(np.exp(1j * steps))) > _WIDE))
         is_lift = np.ptp(_all(traits, name)) > 1.02 * TURN

@@ -28,7 +28,8 @@ def related(traits: Traits) -> Iterator[Fault]:
     still = {
         n for n in recording.columns if np.nanmin(traits.columns[n]) == np.nanmax(traits.columns[n])
     }
-    declared = [p for p in declared if not still & set(p) and not _jumps(traits, p[0])]
+    told = still | recording.explained  # what a sensor shows is fitted with the law
+    declared = [p for p in declared if not told & set(p) and not _jumps(traits, p[0])]
     relations = {pair: traits.relation(*pair) for pair in declared}
     known = {pair: relation for pair, relation in relations.items() if relation is not None}
     if not known or len(known) < len(declared):

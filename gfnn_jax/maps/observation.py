@@ -1,0 +1,308 @@
+"""What sensors show of a state: channels g(q, v; c) with unknown parameters c.
+
+    theta  =  theta + zero              an angle whose zero is unknown
+    omega  =  k*omega                   a gyroscope of unknown scale
+    px     =  x0 + R*sin(theta + tilt)  a camera with its pivot and its tilt
+
+A channel is text in the names of the coordinates, their velocities and parameters, or a function
+whose arguments have these names. Both become the same tree, which is saved as text.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.errors import InputError
+from gfnn_jax.families.expressions import (
+    Expression,
+    depends_on,
+    names_in,
+    parse_named,
+    to_named_text,
+)
+from gfnn_jax.families.jets import jets
+from gfnn_jax.families.traced import traced
+from gfnn_jax.solve.latent_arcs import Observed
+
+_SAME = 1e-6  # sine of the angle between changes that are the same
+_TRIED = 12  # places of an angle from which a state is looked for
+_ITERATIONS = 30
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Observation:
+    """Channels of a state, the columns of a recording.
+
+    channels: names of columns. formulas: of each, in the names of ``coordinates``, ``speeds`` and
+    ``parameters``. values: (m,) of the parameters, those to start from or those that were fitted.
+    """
+
+    channels: tuple[str, ...]
+    formulas: tuple[str, ...]
+    coordinates: tuple[str, ...]
+    speeds: tuple[str, ...]
+    parameters: tuple[str, ...]
+    values: Any
+
+    @staticmethod
+    def plain(names: Sequence[str], speeds: Sequence[str] | None = None) -> Observation:
+        """Coordinates that are seen as they are."""
+        names = tuple(names)
+        speeds = tuple(f"{name}_dot" for name in names) if speeds is None else tuple(speeds)
+        return Observation(names, names, names, speeds, (), np.zeros(0))
+
+    @property
+    def dim(self) -> int:
+        return len(self.coordinates)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether every channel is the coordinate of its name, and none is missing."""
+        return self.channels == self.formulas == self.coordinates
+
+    @cached_property
+    def _trees(self) -> tuple[Expression | None, ...]:
+        """Of each channel; None where it is the coordinate of its name."""
+        names = (*self.coordinates, *self.speeds, *self.parameters)
+        same = zip(self.channels, self.formulas, strict=True)
+        return tuple(
+            None if c == f and c in self.coordinates else parse_named(f, names) for c, f in same
+        )
+
+    @property
+    def direct(self) -> dict[int, int]:
+        """Coordinate -> the channel that shows it as it is, where no other channel shows it."""
+        found = {}
+        for k, tree in enumerate(self._trees):
+            i = self.coordinates.index(self.channels[k]) if tree is None else -1
+            others = (depends_on(t) for t in self._trees if t is not None)
+            if tree is None and not any(i in seen for seen in others):
+                found[i] = k
+        return found
+
+    def __call__(self, x: np.ndarray, values: np.ndarray | None = None) -> Observed:
+        """g (..., k) at states x (..., 2d), and its derivatives in x and the parameters."""
+        c = self.values if values is None else values
+        d, m, count = self.dim, len(self.parameters), len(self.channels)
+        shape = x.shape[:-1]
+        g, by = np.zeros((*shape, count)), np.zeros((*shape, count, 2 * d + m))
+        w = x if not m else np.concatenate([x, np.broadcast_to(c, (*shape, m))], axis=-1)
+        for k, tree in enumerate(self._trees):
+            if tree is None:
+                i = self.coordinates.index(self.channels[k])
+                g[..., k], by[..., k, i] = x[..., i], 1.0
+                continue
+            (jet,) = jets([tree], w, 1)
+            g[..., k] = jet.value
+            for i, slope in jet.slope.items():
+                by[..., k, i] = slope
+        return Observed(g, by[..., : 2 * d], by[..., 2 * d :])
+
+    def coordinates_of(self, y: np.ndarray, angles: Sequence[int]) -> np.ndarray:
+        """The coordinates (n, d) that channels y (n, k) show at ``values``, each sample for itself;
+        ``angles`` that no column shows directly in (−π, π].
+
+        Raises InputError where the channels leave a coordinate open.
+        """
+        if len(self.direct) == self.dim:
+            return y[:, [self.direct[i] for i in range(self.dim)]]
+        d = self.dim
+        still = [
+            k for k, tree in enumerate(self._trees)
+            if tree is None or not depends_on(tree) & set(range(d, 2 * d))
+        ]  # fmt: skip
+        q, best = np.zeros((len(y), d)), np.full(len(y), np.inf)
+        scale = np.nanstd(y[:, still], axis=0) + 1e-300
+        turns = np.arange(_TRIED) * 2 * np.pi / _TRIED
+        own = [self.channels.index(n) if n in self.channels else None for n in self.coordinates]
+        choices = [
+            turns if i in angles and own[i] is None else np.zeros(1) for i in range(d)
+        ]  # fmt: skip
+        for choice in product(*choices):
+            x = np.zeros((len(y), 2 * d))
+            for i, value in enumerate(choice):
+                x[:, i] = value if own[i] is None else y[:, own[i]]
+            x, left = self._followed(x, y, still, scale)
+            better = left < best
+            q[better], best[better] = x[better, :d], left[better]
+        if not np.isfinite(best).all():
+            raise InputError(
+                f"observe: {', '.join(self.channels)} do not tell {', '.join(self.coordinates)}: "
+                "each needs a channel that shows it"
+            )
+        for i in angles:
+            if own[i] is None:
+                q[:, i] = np.pi - (np.pi - q[:, i]) % (2 * np.pi)
+        return q
+
+    def _followed(
+        self, x: np.ndarray, y: np.ndarray, still: list[int], scale: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Gauss–Newton of each sample from x (n, 2d): states, and what they leave of y, squared;
+        infinite where a coordinate moves no channel."""
+        d, sizes = self.dim, np.full(len(x), np.inf)
+        for _ in range(_ITERATIONS):
+            seen = self(x)
+            r = (y[:, still] - seen.values[:, still]) / scale
+            J = seen.by_state[:, still, :d] / scale[:, None]
+            sizes = np.sum(np.nan_to_num(r) ** 2, axis=1)
+            J = np.where(np.isfinite(r)[..., None], J, 0.0)
+            step = (np.linalg.pinv(J, rcond=1e-8) @ np.nan_to_num(r)[..., None])[..., 0]
+            x = np.concatenate([x[:, :d] + np.clip(step, -1e3, 1e3), x[:, d:]], axis=1)
+            if np.max(np.abs(step), initial=0.0) < 1e-10:
+                break
+        rank = np.linalg.matrix_rank(J, tol=1e-8)
+        return x, np.where((rank == d) & np.isfinite(sizes), sizes, np.inf)
+
+    def state_sigma(self, x: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+        """σ (d,) of the coordinates, of that of the channels (k,), at states x (n, 2d)."""
+        J = self(x).by_state[..., : self.dim] / sigma[:, None]
+        return 1 / np.sqrt(np.mean(np.sum(J**2, axis=1), axis=0))
+
+    def shifts(self) -> tuple[int, ...]:
+        """Coordinates that the parameters can shift: their zero is then where the law has it."""
+        by_state, by_values = self._anywhere()
+        return tuple(i for i in range(self.dim) if _spans(by_values, by_state[:, [i]]))
+
+    def shifted(self, by: np.ndarray) -> Observation:
+        """With parameters that show coordinates which are lower by these amounts (d,) as before,
+        where they can: g(q, v; c) = g(q − by, v; c′), to first order."""
+        by_state, by_values = self._anywhere()
+        change = np.linalg.lstsq(by_values, by_state @ by, rcond=None)[0]
+        return dataclasses.replace(self, values=self.values + change)
+
+    def undetermined(self, lengths: Sequence[int]) -> tuple[str, ...]:
+        """Parameters that scale ``lengths``, which a law of other coefficients does as well."""
+        if not len(self.parameters) or not len(lengths):
+            return ()
+        by_state, by_values = self._anywhere(scaled=True)
+        stretch = by_state[:, list(lengths)]
+        u, v = (np.linalg.svd(a, full_matrices=False) for a in (by_values, stretch))
+        both = u[0][:, u[1] > _SAME].T @ v[0][:, v[1] > _SAME]
+        left, overlap, _ = np.linalg.svd(both)
+        if not len(overlap) or overlap[0] < 1 - _SAME:
+            return ()
+        along = u[2][u[1] > _SAME].T @ (left[:, 0] / u[1][u[1] > _SAME])
+        return tuple(n for n, a in zip(self.parameters, along, strict=True) if abs(a) > _SAME)
+
+    def _anywhere(self, scaled: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of all channels at some states, in what shifts each coordinate (or scales it
+        with its velocity) and in the parameters: (n, d) and (n, m)."""
+        d = self.dim
+        x = np.random.default_rng(0).normal(size=(40, 2 * d))
+        seen = self(x)
+        by = seen.by_state[..., :d]
+        if scaled:
+            by = by * x[:, None, :d] + seen.by_state[..., d:] * x[:, None, d:]
+        rows = by.shape[0] * by.shape[1]
+        return by.reshape(rows, d), seen.by_coefficients.reshape(rows, len(self.parameters))
+
+
+def observed(
+    observe: Mapping[str, Any], coordinates: Sequence[str], speeds: Sequence[str],
+    guess: Mapping[str, float], *, offsets: Sequence[str] = (), scales: Sequence[str] = (),
+    columns: Sequence[str],
+) -> Observation:  # fmt: skip
+    """The observation of a recording with these columns.
+
+    observe: column -> text, or a function whose arguments are coordinates, speeds and parameters by
+    name, the parameters' defaults where they start. offsets, scales: columns that are shown with an
+    offset, or a scale, of their own. guess: where other parameters start; without it those of a
+    channel that shows a coordinate start where it shows it as it is.
+    Raises InputError, one line, for what cannot be read or has no start.
+    """
+    state = (*coordinates, *speeds)
+    starts = dict(guess)
+    formulas: dict[str, str] = {name: name for name in coordinates if name in columns}
+    for name in dict.fromkeys((*offsets, *scales)):
+        if name in observe:
+            raise InputError(f"observe: {name} has a formula already: write its offset there")
+        if name not in state:
+            raise InputError(
+                f"expected an offset or a scale of {', '.join(state)}, got one of {name}"
+            )
+        scale = f"scale_{name}*" if name in scales else ""
+        formulas[name] = f"{scale}{name}" + (f" + offset_{name}" if name in offsets else "")
+    for name, given in observe.items():
+        if name not in columns:
+            raise InputError(f"observe: no column {name} among {', '.join(columns)}")
+        formulas[name] = given if isinstance(given, str) else _text_of(given, starts)
+    parameters = [n for f in formulas.values() for n in names_in(f) if n not in state]
+    parameters = list(dict.fromkeys(parameters))
+    unknown = [name for name in guess if name not in parameters]
+    if unknown:
+        raise InputError(
+            f"guess: no parameter {', '.join(unknown)} among {', '.join(parameters) or 'none'}"
+        )
+    values = np.array([starts.get(name, np.nan) for name in parameters])
+    found = Observation(
+        tuple(formulas), tuple(formulas.values()), tuple(coordinates), tuple(speeds),
+        tuple(parameters), values,
+    )  # fmt: skip
+    return dataclasses.replace(found, values=_started(found))
+
+
+def _text_of(function: Callable, starts: dict[str, float]) -> str:
+    """The formula of a function of named arguments, whose defaults become ``starts``."""
+    try:
+        arguments = inspect.signature(function).parameters
+        for name, argument in arguments.items():
+            if argument.default is not argument.empty:
+                starts.setdefault(name, float(argument.default))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"observe: expected text or a function of named arguments ({error})"
+        ) from None
+    names, size = tuple(arguments), len(arguments)
+    try:
+        trees = traced(lambda z: function(*(z[i] for i in range(size))), -(-size // 2))
+    except TypeError as error:
+        raise InputError(
+            f"observe: expected a function of JAX's operations, as jnp.sin ({str(error)[:60]})"
+        ) from None
+    if len(trees) != 1:
+        raise InputError(f"observe: expected a function with one value, got {len(trees)}")
+    return to_named_text(trees[0], names)
+
+
+def _started(g: Observation) -> np.ndarray:
+    """The values of the parameters; where none were given, those with which a channel shows the
+    coordinate or velocity of its name as nearly as it can."""
+    values, state = g.values.copy(), (*g.coordinates, *g.speeds)
+    open_ = np.flatnonzero(np.isnan(values))
+    own = [(k, state.index(name)) for k, name in enumerate(g.channels) if name in state]
+    x = np.random.default_rng(0).normal(size=(40, 2 * g.dim))
+    values[open_] = 1.0
+    told = np.zeros(len(values), bool)
+    for _ in range(_ITERATIONS if len(open_) else 0):
+        seen = g(x, values)
+        rows = [seen.by_coefficients[:, k][:, open_] for k, _ in own]
+        left = [x[:, i] - seen.values[:, k] for k, i in own]
+        if not rows:
+            break
+        J = np.concatenate(rows)
+        told[open_] = np.any(J, axis=0)
+        values[open_] += np.linalg.pinv(J, rcond=1e-8) @ np.concatenate(left)
+    missing = [g.parameters[i] for i in open_ if not told[i] or not np.isfinite(values[i])]
+    if missing:
+        raise InputError(
+            f"observe: {', '.join(missing)}: where do they start? guess={{{missing[0]!r}: …}} "
+            f"(--guess {missing[0]}=…)"
+        )
+    return np.where(np.abs(values) < 1e-12, 0.0, values)
+
+
+def _spans(table: np.ndarray, column: np.ndarray) -> bool:
+    """Whether a column is a combination of those of a table."""
+    size = np.linalg.norm(column)
+    if not table.shape[1] or size == 0:
+        return False
+    left = column - table @ np.linalg.lstsq(table, column, rcond=None)[0]
+    return bool(np.linalg.norm(left) < _SAME * size)

@@ -1,0 +1,55 @@
+"""Options of a fit have one home, from which Python, the command line and jobs take them."""
+
+import dataclasses
+import inspect
+import json
+
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax import cli
+from gfnn_jax.learn.options import OPTIONS
+
+FIELDS = {field.name: field.default for field in dataclasses.fields(gfnn.FitOptions)}
+
+
+def test_each_is_a_keyword_of_the_fit_with_its_default():
+    shown = inspect.signature(gfnn.fit).parameters
+    assert {n: shown[n].default for n in FIELDS} == FIELDS
+    assert all(f"{name}: {about.help}" in str(gfnn.fit.__doc__) for name, about in OPTIONS.items())
+
+
+def test_the_command_line_reads_what_python_takes():
+    given = ["--tolerance", "1e-3", "--terms", "p1**2; cos(q1)", "--seed", "7", "--devices", "all",
+             "--max-seconds", "5", "--max-operations", "9", "--structure", "ring:2"]  # fmt: skip
+    arguments = cli._parser().parse_args(["fit", "data.npz", "--out", "model", *given])
+    assert gfnn.FitOptions(**cli._fit_options(arguments)) == gfnn.FitOptions(
+        tolerance=1e-3, terms=("p1**2", "cos(q1)"), seed=7, devices="all", max_seconds=5.0,
+        max_operations=9, structure="ring:2",
+    )  # fmt: skip
+    of_run = cli._parser().parse_args(["run", "two-body", "--family", "mlp"])
+    assert cli._fit_options(of_run) == {"family": "mlp"}
+
+
+def test_a_job_is_identified_by_what_decides_its_model():
+    options = gfnn.FitOptions(terms=("p1**2",), angles=(0,), max_seconds=3.0, devices=2)
+    assert json.loads(json.dumps(options.deciding)) == options.deciding
+    assert set(FIELDS) - set(options.deciding) == {"max_seconds", "max_operations", "devices"}
+
+
+def test_given_whole_or_by_name():
+    z = np.random.default_rng(0).normal(size=(40, 2))
+    c, s = np.cos(0.3), np.sin(0.3)
+    pairs = gfnn.Pairs(z, z @ np.array([[c, -s], [s, c]]), 0.3)
+    asked = gfnn.FitOptions(learn="map", chart="midpoint", tolerance=1e-3)
+    whole = gfnn.fit(pairs, options=asked)
+    changed = gfnn.fit(pairs, options=dataclasses.replace(asked, tolerance=1.0), tolerance=1e-3)
+    assert whole.tolerance == changed.tolerance == 1e-3
+    np.testing.assert_array_equal(whole.map.step(z)[0], changed.map.step(z)[0])
+
+
+@pytest.mark.parametrize("name", ["tolerence", "scalar"])
+def test_a_name_that_is_none(name):
+    with pytest.raises(TypeError, match=f"unexpected keyword argument '{name}'"):
+        gfnn.FitOptions(**{name: 1})
