@@ -127,7 +127,7 @@ def _ring(dim: int, text: str, coefficient: float) -> dict[str, float]:
     return {text.format(i=i + 1, j=(i + 1) % dim + 1): coefficient for i in range(dim)}
 
 
-_R, _R2 = "sqrt(q1**2 + q2**2)", "(q1**2 + q2**2)"
+_R = "sqrt(q1**2 + q2**2)"
 _RING = {_R: (0.6, 2.0)}
 _UP = (1.0, 0.8)
 
@@ -237,7 +237,7 @@ LAWS: dict[str, Law] = {
         (0.7, -1.2, -0.5, -0.7), (1.6, 1.2, 0.5, 0.7), 0.1, MASSES, angles=(1,),
     ),
     "elastic-pendulum": Law(
-        {**_kinetic(2), _R2: 4.0, _R: -8.0, "q2": 1.0}, *_box(1.6, 1.6, 0.7, 0.7), 0.1, CONSTANTS,
+        {**_kinetic(2), "q1**2": 4.0, "q2**2": 4.0, _R: -8.0, "q2": 1.0}, *_box(1.6, 1.6, 0.7, 0.7), 0.1, CONSTANTS,
         {_R: (0.6, 1.7)},
     ),
     "spherical-pendulum": Law(
@@ -250,7 +250,7 @@ LAWS: dict[str, Law] = {
         {"sqrt((q1 + 0.2)**2 + q2**2)": (0.5, 3.0), "sqrt((q1 - 0.8)**2 + q2**2)": (0.4, 3.0)},
     ),
     "josephson-dimer": Law(
-        {"p1**2": 1.2, "sqrt(1 - p1**2)*cos(q1)": -1.0}, *_box(3.0, 0.85), 0.1, CONSTANTS,
+        {"p1**2": 1.2, "sqrt(1 - p1**2)*cos(q1)": -1.0}, *_box(3.0, 0.8), 0.1, CONSTANTS,
         angles=(0,),
     ),
     "lotka-volterra": Law(

@@ -39,6 +39,7 @@ from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.options import FitOptions, with_options
 from gfnn_jax.learn.positions import OfPositions, learn_positions
 from gfnn_jax.learn.posterior import with_posterior, work_of_posterior
+from gfnn_jax.learn.propose import structures_to_try
 from gfnn_jax.learn.recordings import fit_recording
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
@@ -327,11 +328,15 @@ def fit(
                 "those that the map misses by far are found in the end",
             )
         judges = Judges.of(pairs, options.seed, request.tolerance)
-        seen = diagnose_request(request, plain, judges)
+        for asked, prepared in structures_to_try(request, pairs, plain):
+            request, plain = asked, prepared
+            seen = diagnose_request(request, plain, judges)
+            if seen.damping is not None:
+                on_progress(str(seen.damping))
+            found = searched(request, plain, seen, judges, on_better)
+            if found.met_by_law:
+                break
         warn(seen.messages)
-        if seen.damping is not None:
-            on_progress(str(seen.damping))
-        found = searched(request, plain, seen, judges, on_better)
         seen, found, about_pairs = without_gross_errors(request, seen, found, row)
         warn(about_pairs)
         found = without_bias(found, request)
