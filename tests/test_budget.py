@@ -326,7 +326,7 @@ def test_a_fit_leaves_some_map_whatever_its_budget():
 @QUIETLY
 def test_the_words_of_a_search_that_was_cut_off():
     fit = gfnn.fit(kepler(), learn="hamiltonian", tolerance=1e-9, max_seconds=None,
-                   max_operations=4 * 10**8)  # fmt: skip
+                   max_operations=16 * 10**7)  # fmt: skip
     said = " ".join([*fit.messages, fit.ended])
     assert "promised" not in said
     assert "operations is spent after unit" in said

@@ -175,8 +175,8 @@ def test_a_law_that_misses_the_tolerance_is_the_best_there_is():
     found = {term.term: term.coefficient for term in fit.hamiltonian.terms}
     assert list(found) == ["q1²", "p1²", "q1⁴", "q1⁶", "q1⁸"]
     series = [0.6, 0.5, -(1 / 24 + 0.05 + 0.005), 1 / 720 + 0.1 / 24 + 0.0025 + 1 / 6000]
-    np.testing.assert_allclose(list(found.values())[:4], series, rtol=2e-2)
-    assert fit.chosen.validation_relative < 1e-6
+    np.testing.assert_allclose(list(found.values())[:4], series, rtol=3e-2)
+    assert fit.chosen.validation_relative < 5e-6
     assert repr(fit).startswith("Fit(flow H, 5 terms, 5 parameters: one-step error ")
     assert "not met" in repr(fit)
     assert repr(fit.map) == "SymplecticMap(Flow; cartesian, d = 1, dt = 0.2)"

@@ -46,7 +46,7 @@ def law_of_physics(
     )  # fmt: skip
     law = None
     for products, name in ((False, "laws of physics"), (True, "laws of physics with products")):
-        if law is not None or search.noisy:
+        if law is not None:
             break
         try:
             with work.budget.unit(name, MATCHING, _OPERATIONS[products][prepared.dim - 1]):

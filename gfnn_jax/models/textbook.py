@@ -48,10 +48,12 @@ class Options:
     a law, beside the coordinates and products of two. rounds: of matching. finalists: matches that
     go through their flow; plainer: of them, that are tried in plainer shapes too. corrections: of
     gradients, at most; contracted: by which each must lower what is left over. roundoff: of the
-    coordinates' sizes; a law that leaves no more is exact. lost: part of the pairs whose flow may
-    fail. most_dim: degrees of freedom beyond which the dictionary is too large. rows_per_term: that
-    all products of coordinates need together. certain: twice the logarithm of the odds that what an
-    atom explains is no chance.
+    coordinates' sizes; a law that leaves no more is exact. digits, digits_a_number: and so is one
+    that leaves no more than 10 to the minus so many, and so many for every coefficient and constant
+    of its atoms: sums of atoms that are near the law gain about one digit each. lost: part of the
+    pairs whose flow may fail. most_dim: degrees of freedom, beyond which the dictionary is too
+    large. rows_per_term: that all products of coordinates need together. certain: twice the logarithm of
+    the odds that what an atom explains is no chance.
     """
 
     rows: int = 260
@@ -63,7 +65,9 @@ class Options:
     plainer: int = 2
     corrections: int = 30
     contracted: float = 0.6
-    roundoff: float = 1e-11
+    roundoff: float = 1e-13
+    digits: float = 6.0
+    digits_a_number: float = 1.5
     lost: float = 0.1
     most_dim: int = 4
     rows_per_term: float = 1.6
@@ -92,8 +96,7 @@ class _State(NamedTuple):
 class Textbook:
     """The search for the law of these rows of a problem's pairs, which have no args.
 
-    angles, cyclic: indices of z. check: called between attempts; it may raise to stop.
-    noisy: whether what the last search left over looks like noise, so that none need follow.
+    angles, cyclic: indices of z.
     null: the coordinates and products of two that the states do not tell from those before.
     Raises ValueError for more degrees of freedom than ``options.most_dim``.
     """
@@ -122,7 +125,7 @@ class Textbook:
         columns = self._base.term_gradients(self._middle) * self._weight[:, None]
         self._spanned = orthonormal(columns.reshape(-1, columns.shape[-1]))
         self._target = -apply_j(z1 - z0) / self._h
-        self.noisy = False
+        self._closest: _State | None = None  # of the laws that were not exact
 
     def law(self, *, products: bool) -> Law | None:
         """The plainest law whose flow takes z₀ to z₁, of a dictionary without products of shapes or
@@ -149,6 +152,8 @@ class Textbook:
         """The simplest law that is exact, of a dictionary with products or without."""
         options = self._options
         dictionary = self._dictionary(products)
+        if self._closest is not None and self._explains_nothing(self._closest, dictionary):
+            return None  # what is left over is noise
         self._say(f"H: {len(dictionary.atoms)} atoms of laws of physics")
         blocks = [] if products else blocks_of(self._arguments, self._degree)
         rows = self._middle.size
@@ -161,17 +166,22 @@ class Textbook:
             whole = sorted((matching.refined(b) for b in blocks), key=lambda m: m.left)
             tried += [m for m in whole if m.left < 10 * tried[0].left][:2]
             states = [s for m in tried for s in [self._converged(m, target)] if s is not None]
-            exact = [s for s in states if s.law.left <= self._options.roundoff]
+            exact = [s for s in states if self._is_exact(s)]
             if exact:
                 return min(exact, key=lambda s: weight_of(s.match.atoms))
             if not states:
                 return None
             best = min(states, key=lambda s: s.law.left)
             if not best.law.left < options.contracted * last:
-                self.noisy = self._explains_nothing(best, dictionary)
-                return None
-            target, last = best.target, best.law.left
+                break
+            target, last, self._closest = best.target, best.law.left, best
         return None
+
+    def _is_exact(self, state: _State) -> bool:
+        """Whether the law is as exact as no approximation of so many numbers would be."""
+        numbers = sum(1 + sum(f.theta is not None for f in atom) for atom in state.match.atoms)
+        digits = self._options.digits + self._options.digits_a_number * numbers
+        return state.law.left <= max(10.0**-digits, self._options.roundoff)
 
     def _explains_nothing(self, state: _State, dictionary: Dictionary) -> bool:
         """Whether no atom explains more of what is left over than it would of noise."""
@@ -247,7 +257,7 @@ class Textbook:
         of them, constants of fewer digits."""
         dictionary = self._dictionary(False)
         matching = self._matching(state.target)
-        bound = max(self._options.roundoff, 3 * state.law.left)
+        bound = 3 * max(state.law.left, self._options.roundoff)
         options = [
             m for m in matching.best(dictionary, min(3, len(state.match.atoms)))
             if m.left <= _AS_WELL * max(state.match.left, _MATCHED)
