@@ -26,6 +26,27 @@ def as_row(array: Any, like: Any) -> Any:
     return array.reshape((1,) * (like.ndim - array.ndim) + array.shape)
 
 
+def beside(first: Any, last: Any) -> Any:
+    """Concatenate (..., k) and (..., K) to (..., k + K); their other axes are broadcast."""
+    xp = namespace(first, last)
+    axes = np.broadcast_shapes(first.shape[:-1], last.shape[:-1])
+    both = (xp.broadcast_to(a, (*axes, a.shape[-1])) for a in (first, last))
+    return xp.concatenate(list(both), axis=-1)
+
+
+def as_numbers(values: Any, dtype: Any, what: str) -> Any:
+    """Convert a user's values to an array of this dtype; JAX's arrays stay JAX's.
+
+    Raises ValueError, in one line that names ``what`` they are, for values that are no numbers.
+    """
+    if hasattr(values, "dtype") and namespace(values) is not np:
+        return values if values.dtype == dtype else values.astype(dtype)
+    try:
+        return np.asarray(values, dtype)
+    except (TypeError, ValueError):
+        raise ValueError(f"expected numbers as {what}, got {values!r}") from None
+
+
 def matmul(a: Any, b: Any) -> Any:
     """Matrix product a @ b, by JAX at ``precision="highest"``.
 

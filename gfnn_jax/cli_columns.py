@@ -75,7 +75,8 @@ def masses(arguments: argparse.Namespace) -> dict[str, float]:
 
 
 def names_roles(options: dict[str, Any]) -> bool:
-    """Whether keywords of `column_options` say what columns are, which makes a file a recording."""
+    """Return whether keywords of `column_options` say what columns are, which makes a file a
+    recording."""
     return bool({*ROLES, "columns", "coordinates", "observe"} & set(options))
 
 

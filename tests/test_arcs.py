@@ -7,6 +7,7 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.terms import given_terms
@@ -14,9 +15,7 @@ from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.learn import choose_law, flows
 from gfnn_jax.learn.arcs import arcs_of
-from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.clock import Counted
-from gfnn_jax.learn.prepare import prepare
 
 LAW, TRUE = given_terms(1, ["p**2", "q**2", "q**4"]), np.array([0.5, 0.5, 0.25])
 QUIETLY = pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")
@@ -34,8 +33,8 @@ def sequences(dt, noise=1e-3, count=20, length=60, seed=0):
 
 
 def arcs(pairs, coordinates=CARTESIAN):
-    judges = Judges.of(identified(pairs).pairs, 0, Tolerance(1e-6))
-    return arcs_of(prepare(pairs, coordinates), judges), judges
+    data = Dataset.of(identified(pairs).pairs, coordinates).divided(0)
+    return arcs_of(data), data
 
 
 @pytest.mark.parametrize(
@@ -55,17 +54,17 @@ def test_an_arc_is_as_long_as_the_noise_asks(dt, noise, lengths):
 
 def test_arcs_are_chains_within_their_sequences_and_their_set():
     pairs = sequences(0.02)
-    found, judges = arcs(pairs)
-    k, of = found.length, found.judges.pairs
-    assert found.prepared.dt == of.dt == k * 0.02
+    found, data = arcs(pairs)
+    k, of = found.length, found.data.pairs
+    assert found.data.dt == of.dt == k * 0.02
     every = {row.tobytes(): i for i, row in enumerate(np.column_stack([pairs.z0, pairs.z1]))}
     place = {row.tobytes(): i for i, row in enumerate(pairs.z0)}
     first = np.array([place[row.tobytes()] for row in of.z0])
     assert len(every) == len(pairs)
     np.testing.assert_array_equal(pairs.z1[first + k - 1], of.z1)
     assert (first // 59 == (first + k - 1) // 59).all()  # 59 pairs of a sequence
-    for rows, own in ((found.judges.training, judges.training),
-                      (found.judges.held_out, judges.held_out)):  # fmt: skip
+    for rows, own in ((found.data.training, data.training),
+                      (found.data.validation, data.validation)):  # fmt: skip
         assert np.isin(first[rows][:, None] + np.arange(k), own).all()
     goes_on = np.all(of.z1[:-1] == of.z0[1:], axis=1)
     assert goes_on.mean() > 0.3  # the noise that neighbours share is known
@@ -77,7 +76,7 @@ def test_angles_go_on_over_their_turns():
     states[..., 1] += 1e-2 * np.random.default_rng(0).normal(size=(20, 60))
     pairs = gfnn.Pairs(states[:, :-1].reshape(-1, 2), states[:, 1:].reshape(-1, 2), 0.02)
     found, _ = arcs(pairs, Coordinates("cartesian", angles=(0,)))
-    moved = found.prepared.y1[:, 0] - found.prepared.y0[:, 0]
+    moved = found.data.y1[:, 0] - found.data.y0[:, 0]
     turned = np.repeat(p[:, 0], 60 - found.length) * 0.02 * found.length
     np.testing.assert_allclose(moved, turned, atol=1e-12)
 

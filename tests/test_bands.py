@@ -7,13 +7,13 @@ import pytest
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.data.files import read_initial_noise
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import InputError
 from gfnn_jax.fitting import shared_noise, uncertainty
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.jobs.predict import predict
-from gfnn_jax.learn.candidates import Judges, Tolerance
-from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.sweeps import LinearSweep
 from gfnn_jax.maps.bands import bands, horizon
 from gfnn_jax.scenes import henon_heiles
@@ -183,10 +183,9 @@ def test_the_posterior_of_s_covers_the_held_out_misfit():
 
 def test_residual_of_s_moves_with_the_states_as_its_derivatives_say():
     pairs = gfnn.sample_pairs(henon_heiles(), 100, jax.random.key(0))
-    prepared = prepare(pairs, CARTESIAN)
+    data = Dataset.of(pairs, CARTESIAN).trained_on(np.arange(80)).validated_on(np.arange(80, 100))
     for chart in (MIDPOINT, TYPE2):
-        judges = Judges(pairs, np.arange(80), np.arange(80, 100), Tolerance(1e-6))
-        sweep = LinearSweep(prepared, chart, judges, "polynomial", None, None)
+        sweep = LinearSweep(data, Tolerance(1e-6), chart, "polynomial", None, None)
         family = sweep.sizes[0].family
         drawn = np.random.default_rng(0).normal(size=family.num_parameters)
         params = family.unflatten(drawn)
@@ -195,7 +194,7 @@ def test_residual_of_s_moves_with_the_states_as_its_derivatives_say():
             gradient = family.gradient(params, chart.evaluation_point(y0, y1))
             return sweep._weight * (gradient - chart.target_gradient(y0, y1, pairs.dt))
 
-        y0, y1, scale = prepared.y0[:5], prepared.y1[:5], prepared.scale
+        y0, y1, scale = data.y0[:5], data.y1[:5], data.scale
         found = sweep.by_states(family, params, chart.evaluation_point(y0, y1))
         off = 1e-5 * np.diag(scale)
         for j in range(4):

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance, measured_error, one_step_error
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.learn import sweeps
-from gfnn_jax.learn.candidates import Judges, Tolerance, one_step_error
 from gfnn_jax.learn.clock import Budget
-from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.search import search
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.storage.factors import KeptFactors
@@ -54,9 +54,13 @@ def test_errors_of_angles_are_to_the_nearest_image():
     z0 = np.random.default_rng(2).uniform(-3, 3, (20, 2))
     pairs = Pairs(z0, z0 + np.array([2 * np.pi, 0.0]), 1.0)
     rows = np.arange(20)
-    judges = Judges(pairs, rows, rows, Tolerance(1.0))
-    assert judges.error_of(z0, Coordinates("angle", angles=(0,))).rms < 1e-15
-    assert judges.error_of(z0, Coordinates("plain")).rms > 4
+
+    def rms(coordinates):
+        data = Dataset.of(pairs, coordinates).validated_on(rows)
+        return measured_error(data, Tolerance(1.0), z0).rms
+
+    assert rms(Coordinates("angle", angles=(0,))) < 1e-15
+    assert rms(Coordinates("plain")) > 4
 
 
 # Sizes.
@@ -88,9 +92,8 @@ def kicked(num=2_000):
 def of_kicks(num=2_000, factors=None):
     """The sweep of polynomials in type 2, without any compilation."""
     pairs = kicked(num)
-    prepared = prepare(pairs, Coordinates("plain"))
-    judges = Judges.of(identified(pairs).pairs, 0, Tolerance(1e-11))
-    return sweeps.LinearSweep(prepared, TYPE2, judges, "polynomial", None, None, factors)
+    data = Dataset.of(identified(pairs).pairs, Coordinates("plain")).divided(0)
+    return sweeps.LinearSweep(data, Tolerance(1e-11), TYPE2, "polynomial", None, None, factors)
 
 
 def quiet(_):
@@ -160,10 +163,9 @@ def test_an_even_generating_function_is_known_by_its_pairs(odd, even, monkeypatc
     q, p = z[:, :3], z[:, 3:]
     p = p - 0.1 * (q + q**3 / 2 + odd * q**2)
     pairs = Pairs(z, np.concatenate([q + 0.1 * p, p], axis=1), 0.1)
-    prepared = prepare(pairs, Coordinates("cartesian"))
-    judges = Judges.of(identified(pairs).pairs, 0, Tolerance(1e-6))
-    assert sweeps.is_even(prepared, judges) == even
-    (found,) = sweeps.sweeps_for("polynomial", [MIDPOINT], prepared, None, judges)
+    data = Dataset.of(identified(pairs).pairs, Coordinates("cartesian")).divided(0)
+    assert sweeps.is_even(data) == even
+    (found,) = sweeps.sweeps_for("polynomial", [MIDPOINT], data, Tolerance(1e-6), None)
     assert [size.family.degree for size in found.sizes] == ([2, 4] if even else [2, 3, 4])
     if even:
         judged = found.judge(found.sizes[-1], Budget(), lambda message: None)

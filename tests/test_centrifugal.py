@@ -7,10 +7,10 @@ from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import polynomial_terms
 from gfnn_jax.learn.centrifugal import centrifugal_terms
-from gfnn_jax.learn.prepare import prepare
 
 
 def spherical_pendulum_pairs(count, latitude=False):
@@ -48,7 +48,7 @@ def test_a_spherical_pendulum_told_nothing(latitude, expected):
 
 def test_centrifugal_terms_only_where_pairs_ask_for_them():
     def asked(pairs, family):
-        return centrifugal_terms(prepare(pairs, CARTESIAN), np.arange(len(pairs)), family)
+        return centrifugal_terms(Dataset.of(pairs, CARTESIAN), np.arange(len(pairs)), family)
 
     sphere, cubic = spherical_pendulum_pairs(400), polynomial_terms(2, 3)
     found = ("p2**2/sin(q1)**2", "cos(q1)", "sin(q1)")

@@ -19,6 +19,7 @@ import pytest
 
 from gfnn_jax import cli, scenes
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitWarning
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
@@ -29,7 +30,7 @@ from gfnn_jax.jobs import predict as predict_job
 from gfnn_jax.jobs import progress, search
 from gfnn_jax.learn import check
 from gfnn_jax.learn import fit as learn_fit
-from gfnn_jax.learn.candidates import Candidate, Tolerance
+from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.options import OPTIONS
 from gfnn_jax.maps import saved as models
 from gfnn_jax.maps.domain import covering

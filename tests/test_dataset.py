@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
+from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.data.files import read_trajectories
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.dataset.bounds import bound_of_mean
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.runs import identified, next_of, steps_between
 from gfnn_jax.dataset.split import correlation_time, split_rows
+from gfnn_jax.maps.affine import Affine
 from gfnn_jax.processes import Group
 
 # Runs
@@ -252,3 +255,56 @@ def test_noise_that_was_given_is_told_from_what_a_map_cannot_represent():
         said[std] = " ".join(fit.messages)
     assert "what is left over is the noise that was given" in said[1e-3]
     assert "std is too small" in said[1e-4]
+
+
+# The data set
+
+
+def dataset_of(pairs, coordinates=CARTESIAN):
+    found, row = identified(pairs)
+    return Dataset.of(found, coordinates, row=row).divided(0)
+
+
+def test_rows_keep_their_identity_and_their_part():
+    states = walks(*[20] * 12)
+    order = np.random.default_rng(2).permutation(240)
+    pairs = in_rows(states, run=np.repeat(np.arange(12), 20)).take(order)
+    whole = dataset_of(pairs, Coordinates("rotor", angles=(0,)))
+    rows = np.random.default_rng(3).choice(240, 150, replace=False)
+    few = whole.take(rows)
+    assert len(few) == 150
+    np.testing.assert_array_equal(few.pairs.z1, np.asarray(pairs.z1)[few.row])
+    np.testing.assert_array_equal(few.run, np.asarray(pairs.run)[few.row])
+    np.testing.assert_array_equal(few.y0, whole.y0[rows])
+    np.testing.assert_array_equal(few.scale, few.y0.std(axis=0))
+    for part in ("training", "validation", "test"):
+        kept = [r for r in whole.row[getattr(whole, part)] if r in set(few.row)]
+        assert few.row[getattr(few, part)].tolist() == kept  # in their order
+
+
+def test_what_is_factored_out_is_put_back():
+    data = dataset_of(in_rows(walks(40)))
+    turn = Affine(np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([0.1, 0.2]), np.zeros(2))
+    rest = data.without(turn, turn)
+    np.testing.assert_array_equal(rest.y0, turn.image(data.y0))
+    np.testing.assert_allclose(rest.whole_image(rest.y1), data.y1, rtol=0, atol=1e-14)
+    assert rest.pairs is data.pairs
+    assert rest.split is data.split
+
+
+def test_other_pairs_train_and_the_validation_rows_choose():
+    data = dataset_of(in_rows(walks(*[5] * 40)))
+    others = gfnn.Pairs(np.ones((7, 2)), np.ones((7, 2)), 0.4)
+    both = data.validating(others)
+    np.testing.assert_array_equal(both.pairs.z0[both.training], others.z0)
+    np.testing.assert_array_equal(both.pairs.z1[both.validation], data.pairs.z1[data.validation])
+    assert not len(both.test)
+
+
+def test_each_row_has_its_dt_and_parameters():
+    dt, length = np.array([0.1, 0.3, 0.2]), np.array([1.0, 2.0, 3.0])
+    data = Dataset.of(gfnn.Pairs(np.eye(3, 2), np.eye(3, 2), dt, {"l": length}), CARTESIAN)
+    assert (data.dt, data.parameters, data.varied) == (0.2, ("l",), True)
+    few = data.take(np.array([2, 0]))
+    np.testing.assert_array_equal(few.given(np.array([1]))[0], [0.1])
+    np.testing.assert_array_equal(few.args, [[3.0], [1.0]])

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.learn import choose
 from gfnn_jax.learn.diagnose import local_jacobians, look_symplectic
-from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.scenes import DrawnFrom, Scene, henon_heiles
 from gfnn_jax.scenes.two_body import angular_momentum
 
@@ -137,9 +137,9 @@ def test_what_is_not_symplectic_is_noticed_at_short_steps(wrong):
         z0, z1 = pairs.z0, pairs.z1 * np.exp([0, 0, -0.2 * 0.02, -0.2 * 0.02])[None, :]
 
     def told(z0, z1):
-        prepared = prepare(gfnn.Pairs(z0, z1, 0.02), scene.coordinates)
-        jacobians, error = local_jacobians(prepared.y0, prepared.y1, prepared.scale)
-        return not look_symplectic(jacobians, error, prepared.scale)
+        data = Dataset.of(gfnn.Pairs(z0, z1, 0.02), scene.coordinates)
+        jacobians, error = local_jacobians(data.y0, data.y1, data.scale)
+        return not look_symplectic(jacobians, error, data.scale)
 
     assert told(z0, z1)
     assert not told(pairs.z0, pairs.z1)
@@ -314,12 +314,12 @@ def test_what_is_found_on_the_way_is_handed_on(pendulum_fit):
 
 def test_a_map_without_all_images_is_still_given(monkeypatch):
     """The most accurate there is, with a warning, even where no step could be judged."""
-    from gfnn_jax.learn import candidates
+    from gfnn_jax.dataset import measured_error
 
     def failing(error, spread, tolerance, block=None):
-        return candidates.OneStepError(np.inf, np.inf, np.inf, np.full(2, np.inf))
+        return measured_error.OneStepError(np.inf, np.inf, np.inf, np.full(2, np.inf))
 
-    monkeypatch.setattr(candidates, "one_step_error", failing)
+    monkeypatch.setattr(measured_error, "one_step_error", failing)
     with pytest.warns(gfnn.FitWarning, match="leaves held-out states without an image"):
         fit = gfnn.fit(pendulum_pairs(60), chart="midpoint", family="polynomial")
     assert not fit.met

@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.families.terms import Terms, given_terms, polynomial_terms
 from gfnn_jax.fitting.gauss_newton import Problem, log_start, midpoint_start, null_terms
 from gfnn_jax.flows.collocation import Steps, images, truncation
-from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.flows import learn_hamiltonian
 from gfnn_jax.learn.formula import Term, formula
 from gfnn_jax.learn.learned_law import assembled
-from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.phase_space import Pairs
 
 HENON_HEILES = Terms(
@@ -30,9 +30,8 @@ def henon_heiles(count, dt, seed=0, size=0.3):
 
 
 def learned(pairs, *, tolerance=1e-12, terms=(), coordinates=CARTESIAN):
-    prepared = prepare(pairs, coordinates)
-    judges = Judges.of(identified(pairs).pairs, 0, Tolerance(tolerance))
-    return learn_hamiltonian(prepared, judges, terms=terms), prepared, judges
+    data, asked = Dataset.of(identified(pairs).pairs, coordinates).divided(0), Tolerance(tolerance)
+    return learn_hamiltonian(data, asked, terms=terms), data, asked
 
 
 def problem_of(pairs):
@@ -143,12 +142,12 @@ def test_a_pendulum_of_any_angle():
     family = given_terms(1, ["p**2", "cos(q)"])
     z0 = np.random.default_rng(0).uniform([-3.1, -1.5], [3.1, 1.5], (120, 2))
     z1 = images(family, np.array([0.5, -1.0]), z0, 0.3, Steps(10, 1)).states
-    found, prepared, judges = learned(
+    found, data, asked = learned(
         Pairs(z0, z1, 0.3), coordinates=Coordinates("pendulum", angles=(0,))
     )
     assert found.formula == "-cos(q1) + 0.5*p1**2"
     assert found.candidate.validation_relative < 1e-14
-    final = assembled(found, prepared, judges, Budget()).candidate
+    final = assembled(found, data, asked, Budget()).candidate
     assert final.validation_relative < 1e-14
     # The learned law holds outside the data and at any dt.
     states, _ = final.map.rollout(jnp.array([[0.1, 2.5]]), 200)

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.modes import Mode, Modes
@@ -13,9 +15,7 @@ from gfnn_jax.families.terms import Terms, given_terms, multiplied
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.growth import grow
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.flows import learn_hamiltonian
-from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.phase_space import Pairs
 
 BASIS = Modes(2, (0, 1), ("p1", "p2"))
@@ -32,8 +32,8 @@ def pairs_of(terms, coefficients, count, dt, seed=0):
 
 def learned(pairs, tolerance, terms=(), angles=(0,)):
     coordinates = Coordinates("angles", angles=angles) if angles else CARTESIAN
-    judges = Judges.of(identified(pairs).pairs, 0, Tolerance(tolerance))
-    return learn_hamiltonian(prepare(pairs, coordinates), judges, terms=terms)
+    data = Dataset.of(identified(pairs).pairs, coordinates).divided(0)
+    return learn_hamiltonian(data, Tolerance(tolerance), terms=terms)
 
 
 def test_growth_follows_the_difference_of_two_angles():

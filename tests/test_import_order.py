@@ -15,9 +15,9 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 # A module imports only from rooms before its own; the modules of a room share its place.
 ORDER = (
     "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes",
-    "storage", "signals", "data", "records", "dataset", "scenes", "families", "solve", "generating",
-    "flows", "maps", "exports", "fitting", "models", "learn", "baselines", "evaluate", "jobs",
-    "cli_columns", "cli", "__main__",
+    "storage", "signals", "data", "records", "scenes", "families", "solve", "generating", "flows",
+    "maps", "dataset", "exports", "fitting", "models", "learn", "baselines", "evaluate", "jobs",
+    "cli_columns", "cli_parser", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {

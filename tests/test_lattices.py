@@ -11,6 +11,7 @@ import pytest
 import gfnn_jax as gfnn
 from gfnn_jax import cli, scenes
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.evaluate import figures, figures_of_many
 from gfnn_jax.families.sums import ENDS, Part, Sums, Windows, body_terms, matrix_free, site_terms
 from gfnn_jax.families.terms import Terms, given_terms
@@ -19,7 +20,6 @@ from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.propose import proposed
 from gfnn_jax.phase_space import apply_j, defect_of_pairs
 from gfnn_jax.solve import krylov
@@ -471,7 +471,7 @@ def test_the_command_line_takes_a_structure(tmp_path):
 def test_a_structure_is_proposed_and_not_used():
     def best_of(family, params, dt=0.1):
         pairs = drawn(6, 60, family, params, dt)
-        return " ".join(proposed(prepare(pairs, CARTESIAN)))
+        return " ".join(proposed(Dataset.of(pairs, CARTESIAN)))
 
     assert "--structure ring explains" in best_of(*springs(6))
     assert "--structure chain explains" in best_of(*springs(6, "free"))

@@ -9,12 +9,12 @@ from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
-from gfnn_jax.dataset.local_cubics import choose_half, smooth
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, Friction, Lagrangian, Terms
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import interpolate
 from gfnn_jax.models.law_text import speed_names, terms_of
+from gfnn_jax.signals.local_cubics import choose_half, smooth
 from gfnn_jax.solve.latent_arcs import Observed, Steps, fit_arcs
 
 
@@ -142,6 +142,12 @@ def test_text_of_a_law():
     assert found.latex().startswith(r"0.5 \omega_{1}^{2} + 0.25 \omega_{1} \, \omega_{2}")
 
 
+def test_names_of_functions_are_columns_all_the_same():
+    terms = Terms.of([((2, 0), (0, 0), (0, 0), 0.0), ((0, 0), (0, 0), (1, 0), 0.0)], 2)
+    found = terms_of(terms, np.ones(2), np.zeros(2), ("beta", "E"), ("gamma", "I"))
+    assert str(found.sympy()) == "gamma**2 + cos(beta)"
+
+
 @pytest.fixture(scope="module")
 def swing():
     t, theta = pendulum()
@@ -243,6 +249,9 @@ def test_the_command_line_learns_and_forecasts(tmp_path, capsys):
     assert report["lagrangian"]["terms"][0]["term"] == "omega**2"
     assert set(report) >= {"hamiltonian", "friction", "inputs", "noise", "gauge", "energy"}
     assert report["rollout"] is None
+    assert report["whiteness"]["theta"]["white"]
+    assert report["whiteness"]["theta"]["fit_percent"] > 99.5
+    assert (tmp_path / "model" / "law.png").stat().st_size > 10_000
     everything = str(tmp_path / "all.csv")
     out = tmp_path / "forecast.csv"
     arguments = ["predict", model, "--initial", past, "--out", str(out)]

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.families.terms import given_terms, polynomial_terms
 from gfnn_jax.fitting.gauss_newton import Problem, midpoint_start
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.law_worth import too_dear
-from gfnn_jax.learn.learned_law import FittedLaw, held_out_error
-from gfnn_jax.learn.prepare import prepare
+from gfnn_jax.learn.learned_law import FittedLaw, validation_error
 from gfnn_jax.phase_space import Pairs
 
 
@@ -28,16 +28,15 @@ def test_a_few_terms_of_many_are_told_from_many(terms, coefficients, dear):
     law, z0 = given_terms(2, terms), np.random.default_rng(0).uniform(-0.5, 0.5, (400, 4))
     z1 = images(law, np.array(coefficients, float), z0, 0.1, Steps(12, 1)).states
     pairs = Pairs(z0, z1, 0.1)
-    prepared = prepare(pairs, CARTESIAN)
-    judges = Judges.of(identified(pairs).pairs, 0, Tolerance(1e-5))
-    problem = Problem(prepared.y0, prepared.y1, 0.1, prepared.scale)
-    cubic, rows = polynomial_terms(2, 3), judges.training[:150]
-    start = midpoint_start(cubic, z0[rows], z1[rows], 0.1, prepared.scale)
+    data, asked = Dataset.of(identified(pairs).pairs, CARTESIAN).divided(0), Tolerance(1e-5)
+    problem = Problem(data.y0, data.y1, 0.1, data.scale)
+    cubic, rows = polynomial_terms(2, 3), data.training[:150]
+    start = midpoint_start(cubic, z0[rows], z1[rows], 0.1, data.scale)
     fit = problem.fit(cubic, start, rows)
-    last = FittedLaw(cubic, fit, rows, held_out_error(cubic, fit, prepared, judges), ())
+    last = FittedLaw(cubic, fit, rows, validation_error(cubic, fit, data, asked), ())
 
     def told(dearest):
-        return too_dear(problem, polynomial_terms(2, 4), last, prepared, judges, dearest)
+        return too_dear(problem, polynomial_terms(2, 4), last, data, asked, dearest)
 
     assert told(5e3) == dear
     assert not told(np.inf)

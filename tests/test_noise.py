@@ -9,14 +9,13 @@ from analytic import exact_oscillator, generated, map_of, oscillator, rotated
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.noise import of_differences, of_residuals, robust
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import MIDPOINT
-from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.noise import noise_of_sites, state_noise
-from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.white import leaves_white
 from gfnn_jax.scenes import froeschle
 
@@ -109,5 +108,5 @@ def test_a_law_is_right_where_it_leaves_white_noise_over(frequency, white, num_s
     """Noise of 1e-3 on turns by 0.2; a law of another frequency leaves a rotation over."""
     pairs = noisy_turns(0.2, np.array([1e-3, 1e-3]), num_steps)[1]
     flow = Flow(given_terms(1, ["q1**2", "p1**2"]), 0.5 * frequency * np.ones(2), 0.2, np.ones(2))
-    prepared, judges = prepare(pairs, CARTESIAN), Judges.of(pairs, 0, Tolerance(1e-6))
-    assert leaves_white(SimpleNamespace(flow=flow), prepared, judges) == white
+    data = Dataset.of(pairs, CARTESIAN).divided(0)
+    assert leaves_white(SimpleNamespace(flow=flow), data) == white

@@ -9,6 +9,8 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import least_squares, uncertainty
@@ -17,10 +19,8 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn import noisy_sweeps
-from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.noisy_sweeps import NoisySweep, best_size
-from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.sweeps import LinearSweep, Size
 from gfnn_jax.maps.affine import Affine
 
@@ -113,8 +113,8 @@ def sweep_of(chart, sigma, num=3_000):
     z0, z1, family, params = generated_pairs(chart, num)
     rng = np.random.default_rng(2)
     pairs = gfnn.Pairs(*(z + sigma * rng.normal(size=z.shape) for z in (z0, z1)), DT)
-    judges = Judges(pairs, np.arange(300, num), np.arange(300), Tolerance(1e-6))
-    plain = LinearSweep(prepare(pairs, CARTESIAN), chart, judges, "polynomial", None, None)
+    data = Dataset.of(pairs, CARTESIAN).trained_on(np.arange(300, num)).validated_on(np.arange(300))
+    plain = LinearSweep(data, Tolerance(1e-6), chart, "polynomial", None, None)
     return plain, family, params, pairs
 
 
@@ -123,7 +123,7 @@ def test_the_size_of_smallest_expected_error_is_that_of_the_true_s():
     free = (Budget(), lambda message: None)
     most = next(s for s in plain.sizes if s.family.degree == 6)
     size = best_size(plain, plain.sizes[0], most, *free).size
-    deviations = plain.state_deviations(size) * plain.prepared.scale
+    deviations = plain.state_deviations(size) * plain.data.scale
     np.testing.assert_allclose(deviations, SIGMA, rtol=0.1)
     sweep = NoisySweep(plain, plain, size, plain.state_deviations(size))
     found = best_size(sweep, size, most, *free)
@@ -153,11 +153,11 @@ def test_derivatives_in_the_states_count_a_base_map():
     plain, *_ = sweep_of(MIDPOINT, 0.0, 400)
     turn = np.array([[0.8, 0.6], [-0.6, 0.8]])
     half = Affine(turn, np.zeros(2), np.zeros(2))
-    prepared = plain.prepared.without(None, half)
-    moved = LinearSweep(prepared, MIDPOINT, plain.judges, "polynomial", None, None)
+    data = plain.data.without(None, half)
+    moved = LinearSweep(data, plain.tolerance, MIDPOINT, "polynomial", None, None)
     of_point, of_target = moved.of_states
-    z0, z1 = plain.prepared.y0[:5], plain.prepared.y1[:5]
-    states = np.concatenate([z0, z1], axis=1) / np.tile(prepared.scale, 2)
+    z0, z1 = plain.data.y0[:5], plain.data.y1[:5]
+    states = np.concatenate([z0, z1], axis=1) / np.tile(data.scale, 2)
     y1 = half.inverse().image(z1)
     np.testing.assert_allclose(states @ of_point.T, MIDPOINT.evaluation_point(z0, y1), atol=1e-12)
     np.testing.assert_allclose(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax import cli
+from gfnn_jax import cli_parser
 from gfnn_jax.learn.options import OPTIONS
 
 FIELDS = {field.name: field.default for field in dataclasses.fields(gfnn.FitOptions)}
@@ -23,13 +23,13 @@ def test_each_is_a_keyword_of_the_fit_with_its_default():
 def test_the_command_line_reads_what_python_takes():
     given = ["--tolerance", "1e-3", "--terms", "p1**2; cos(q1)", "--seed", "7", "--devices", "all",
              "--max-seconds", "5", "--max-operations", "9", "--structure", "ring:2"]  # fmt: skip
-    arguments = cli._parser().parse_args(["fit", "data.npz", "--out", "model", *given])
-    assert gfnn.FitOptions(**cli._fit_options(arguments)) == gfnn.FitOptions(
+    arguments = cli_parser.parser().parse_args(["fit", "data.npz", "--out", "model", *given])
+    assert gfnn.FitOptions(**cli_parser.fit_options(arguments)) == gfnn.FitOptions(
         tolerance=1e-3, terms=("p1**2", "cos(q1)"), seed=7, devices="all", max_seconds=5.0,
         max_operations=9, structure="ring:2",
     )  # fmt: skip
-    of_run = cli._parser().parse_args(["run", "two-body", "--family", "mlp"])
-    assert cli._fit_options(of_run) == {"family": "mlp"}
+    of_run = cli_parser.parser().parse_args(["run", "two-body", "--family", "mlp"])
+    assert cli_parser.fit_options(of_run) == {"family": "mlp"}
 
 
 def test_a_job_is_identified_by_what_decides_its_model():

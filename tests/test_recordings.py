@@ -10,6 +10,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.cli_columns import add_column_options, column_options, masses, names_roles
 from gfnn_jax.data.kinds import are_recordings
 from gfnn_jax.data.recording_summary import as_typed
+from gfnn_jax.data.roles import symbols
 from gfnn_jax.errors import InputError
 
 T = np.array([0.0, 0.1, 0.25, 0.3, 1.0])
@@ -63,6 +64,13 @@ TEXTS = {
     + rows(T, THETA, OMEGA, separator=";").replace("\n", ";\n"),
     "decimal commas in quotes": '"t","theta","omega"\n'
     + '"' + rows(T, THETA, OMEGA, separator='","', decimal=",")[:-1].replace("\n", '"\n"') + '"\n',
+    "a title": "mass A\nt\ttheta\tomega\n" + rows(T, THETA, OMEGA, separator="\t"),
+    "a title as wide": "mass A\t\t\t\nt\ttheta\tomega\t\n" + rows(T, THETA, OMEGA, separator="\t"),
+    "names with a run": "Time (s) Run #1,theta (rad) Run #1,omega (rad/s) Run #1\n"
+    + rows(T, THETA, OMEGA),
+    "the latest run": "Latest: Time (s),Latest: theta (rad),Latest: omega\n"
+    + rows(T, THETA, OMEGA),
+    "milliseconds by name": "millis,theta,omega\n" + rows(1e3 * T, THETA, OMEGA),
     "another order": "omega,t,theta\n" + rows(OMEGA, T, THETA),
 }  # fmt: skip
 
@@ -192,7 +200,20 @@ def test_a_recording_is_frozen():
         recording.values("x", 0)[0] = 1
 
 
+def test_units_stand_in_names_too(tmp_path):
+    text = "time_ms,angle_deg\n" + rows(1e3 * T, np.degrees(THETA))
+    recording = gfnn.read(write(tmp_path / "r.csv", text))
+    assert (recording.positions, recording.angles) == (("angle_deg",), ("angle_deg",))
+    np.testing.assert_allclose(recording.values("angle_deg", 0), THETA, rtol=1e-12)
+
+
+def test_names_as_they_can_stand_in_a_formula():
+    names = ("θ₁", "Angle 1", "lambda", "x", "2nd", "a b", "a_b")
+    assert symbols(names) == ("theta1", "Angle_1", "lambda_", "x", "q_2nd", "a_b", "a_b_7")
+
+
 REFUSED = {
+    "Time (s) Run #1,x Run #1,Time (s) Run #2,x Run #2\n0,1,0,1\n1,2,1,2\n": "Run #1, Run #2",
     "a,x\n1,2\n2,3\n": "expected a column t or time",
     "t,a,b\n1,2,3\n2,3,4\n": "do not tell what was measured",
     "t,x\n0,1\n0,2\n": "line 3: t = 0 is the same as 0",

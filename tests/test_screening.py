@@ -7,13 +7,12 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.runs import identified, steps_between
-from gfnn_jax.dataset.split import split_rows
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting.shooting import arcs_of
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.learn.clean import clean
-from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.learn.screening import gross_errors
 
 NOISE, DT = 1e-3, 0.5
@@ -70,9 +69,9 @@ def pairs_of(states, dt=DT):
 
 def named(pairs, angles=()):
     """Rows that are named, with nothing left out before."""
-    prepared = prepare(pairs, Coordinates("cartesian", angles=angles))
+    data = Dataset.of(pairs, Coordinates("cartesian", angles=angles))
     return gross_errors(
-        prepared, steps_between(identified(pairs).pairs) > 0, np.zeros(len(prepared.y0), bool)
+        data, steps_between(identified(pairs).pairs) > 0, np.zeros(len(data), bool)
     )  # fmt: skip
 
 
@@ -151,10 +150,9 @@ def test_what_was_left_out_is_bridged():
 
 def test_sequences_are_held_out_whole_where_pairs_were_left_out():
     states, _ = spoilt(henon_heiles(50), 0.05, "box")
-    taken = clean(*identified(pairs_of(states)), Coordinates("cartesian"))
-    assert len(taken.pairs) < 1_850
-    split = split_rows(taken.pairs, 0)
-    runs = [set(np.asarray(taken.pairs.run)[rows]) for rows in split[:3]]
+    data = clean(identified(pairs_of(states)), Coordinates("cartesian"))[0].divided(0)
+    assert len(data) < 1_850
+    runs = [set(data.run[rows]) for rows in data.split[:3]]
     assert not any(one & other for one, other in itertools.combinations(runs, 2))
 
 

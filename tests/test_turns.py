@@ -7,11 +7,11 @@ from scipy.linalg import expm
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting.turns import backwards, forward_logarithm, tangent, turns
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.learn.choose_law import long_step
-from gfnn_jax.learn.prepare import prepare
 from gfnn_jax.phase_space import symplectic_form
 
 
@@ -64,12 +64,12 @@ def test_the_tangent_is_that_of_a_cubic_map():
 @pytest.mark.parametrize(("dt", "said"), [(0.5, False), (1.0, False), (2.0, False), (4.0, True)])
 def test_a_step_that_is_too_long_is_named(dt, said):
     """Hénon–Heiles oscillates at about 1 rad per unit of time."""
-    prepared = prepare(henon_heiles_pairs(400, dt=dt), CARTESIAN)
-    messages = long_step(prepared, None)
+    data = Dataset.of(henon_heiles_pairs(400, dt=dt), CARTESIAN)
+    messages = long_step(data, None)
     assert bool(messages) is said
     if said:
         assert "(ωh > π)" in messages[0]
-    assert not long_step(prepared, gfnn.scenes.make("standard-map-regular"))
+    assert not long_step(data, gfnn.scenes.make("standard-map-regular"))
 
 
 @pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")

@@ -146,8 +146,8 @@ def column(index: int, dim: int) -> str:
 
 @contextlib.contextmanager
 def damage(path, name: str, *more: type[Exception]) -> Iterator[None]:
-    """What a damaged file makes its readers raise, in one line; a mistake of ours goes through.
-    more: what only this reader raises."""
+    """Turn what a damaged file makes its readers raise into one line; a mistake of ours goes
+    through. more: what only this reader raises."""
     try:
         yield
     except InputError:

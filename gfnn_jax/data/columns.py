@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.data.roles import ROLES, by_name, is_angle, is_time, plain
+from gfnn_jax.data.roles import ROLES, by_name, is_angle, is_time, plain, unit_in
 from gfnn_jax.data.roles_by_data import parameters, positions_and_velocities
 from gfnn_jax.errors import InputError
 
@@ -87,12 +87,12 @@ def angles_of(
 
 
 def factors_of(names: Sequence[str], in_degrees: set[str]) -> dict[str, float]:
-    """By name what a number in the file is multiplied by: π/180 for degrees, else 1."""
+    """Factors of the numbers in the file, by column: π/180 for degrees, else 1."""
     return {name: math.pi / 180 if name in in_degrees else 1.0 for name in names}
 
 
 def _unit(units: Mapping[str, str], name: str) -> str:
-    return units.get(name, "").strip().lower()
+    return units.get(name, unit_in(name)).strip().lower()
 
 
 def check_known(source: str, what: str, wanted: Any, known: Sequence[str]) -> None:
@@ -114,6 +114,7 @@ def time_unit_of(source: str, names: list[str], units: Mapping[str, str], given:
     for name in names:
         if is_time(name):
             end = plain(name).rpartition("_")[2]
+            end = {"millis": "ms", "micros": "us"}.get(end, end)
             for unit in (_unit(units, name), end):
                 unit = unit.removesuffix("ec") if unit in ("sec", "msec", "usec") else unit
                 if unit in SECONDS:

@@ -225,8 +225,9 @@ def _csv_dt(path, names: list[str], table: np.ndarray, lines: np.ndarray) -> flo
 
 
 def _only_rounded(time: np.ndarray, sequence: np.ndarray, dt: float) -> bool:
-    """Whether the steps differ because the times were printed with few decimals, the last of them
-    less than a thousandth of dt: every sequence is then within that unit of a straight line."""
+    """Return whether the steps differ because the times were printed with few decimals, the last of
+    them less than a thousandth of dt: every sequence is then within that unit of a straight line.
+    """
     if np.isnan(time[0]):  # nothing stands before the first row of a file
         time, sequence = time[1:], sequence[1:]
     for decimals in range(max(0, int(np.ceil(3 - np.log10(dt)))), 13):
@@ -259,8 +260,8 @@ def _check_times_rise(path, time: np.ndarray, sequence: np.ndarray, lines: np.nd
 
 
 def _even(time: np.ndarray, sequence: np.ndarray, dt: float) -> bool:
-    """Whether every step within a sequence is dt, but for the rounding of printed times. ``time``
-    and ``sequence`` start one row before."""
+    """Return whether every step within a sequence is dt, but for the rounding of printed times.
+    ``time`` and ``sequence`` start one row before."""
     if np.isnan(dt):
         return False
     slack = TIME_TOLERANCE * dt + 4 * np.finfo(np.float64).eps * np.abs(time[1:])

@@ -1,4 +1,4 @@
-"""Whether the runs of a recording are motions of one system.
+"""Test of whether the runs of a recording are motions of one system.
 
 Accelerations by local polynomials are fitted with functions that small mechanical systems have:
 once for all runs together, and for each run by itself, where one half of its windows is fitted and

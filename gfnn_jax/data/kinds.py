@@ -1,4 +1,4 @@
-"""Whether a file holds canonical states, (q, p) at known steps, or a recording."""
+"""Kinds of files: canonical states, (q, p) at known steps, or a recording."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from gfnn_jax.errors import InputError
 
 
 def are_recordings(paths: str | Path | Sequence[str | Path], *, with_roles: bool = False) -> bool:
-    """Whether files are to be read by `gfnn_jax.read` (True) or as canonical trajectories (False).
+    """Return whether files are to be read by `gfnn_jax.read` (True) or as canonical trajectories
+    (False).
 
     Canonical are an ``.npz`` with ``z0`` or ``trajectories``, a plain ``.npy``, and a ``.csv`` with
     columns q1 … and p1 … between commas. All else is a recording; so is every file but these two
@@ -48,7 +49,7 @@ def _is_recording(path: Path, with_roles: bool) -> bool:
 
 
 def _names_q_and_p(path: Path) -> bool:
-    """Whether the header of a text file names columns q1 … and p1 … between commas."""
+    """Return whether the header of a text file names columns q1 … and p1 … between commas."""
     with damage(path, "the header"), open(path, encoding="utf-8-sig") as stream:
         for line in stream:
             names = [cell.strip().strip('"').lower() for cell in line.lstrip("#").split(",")]

@@ -192,7 +192,7 @@ def _begin_of(path: Path, info: zipfile.ZipInfo) -> int | None:
 
 
 def _rows_of(array: _StoredArray) -> int:
-    """Its rows."""
+    """Rows of this sequence."""
     return array.shape[0] if array.shape else 0
 
 
@@ -234,7 +234,7 @@ def _read_params(path, names: list[str], member) -> tuple[tuple[str, ...], np.nd
 
 
 def _own_columns(path, times, params, count: int, what: str, repeat: int):
-    """What rows have beside their states (rows, 1 + k), or None: times of all rows, and params of
+    """Columns of rows beside their states (rows, 1 + k), or None: times of all rows, and params of
     each of ``count`` sequences of ``repeat`` rows."""
     if times is None and params is None:
         return None

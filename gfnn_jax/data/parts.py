@@ -33,8 +33,8 @@ def part_of(out: Path, share: Share) -> Path:
 
 
 def number_of_parts(out: Path, share: Share, *, resume: bool) -> int:
-    """In how many parts the prediction is: one of each process, or as many as an interrupted job
-    has begun, whatever its number of processes.
+    """Number of parts that the prediction is in: one of each process, or as many as an interrupted
+    job has begun, whatever its number of processes.
 
     Raises InputError where parts of another number are there and are not to be gone on with.
     """

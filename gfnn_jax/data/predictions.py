@@ -39,7 +39,8 @@ def job_of(
     identity: dict[str, Any], shape: tuple[int, int], *, num_steps: int, save_every: int = 1,
     dt: float, bands: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
-    """What was asked for, as a file can hold it; the arguments are those of `PredictionWriter`."""
+    """Request of a prediction, as a file can hold it; the arguments are those of
+    `PredictionWriter`."""
     job = {
         **identity,
         "format": _FORMAT,
@@ -53,12 +54,12 @@ def job_of(
 
 
 def digest_of(job: dict[str, Any]) -> str:
-    """By which a finished prediction tells its job."""
+    """Digest by which a finished prediction is known as that of its job."""
     return hashlib.sha256(json.dumps(job, sort_keys=True).encode()).hexdigest()
 
 
 def is_done(out: Path, job: dict[str, Any]) -> bool:
-    """Whether ``out`` is the finished prediction of this job."""
+    """Return whether ``out`` is the finished prediction of this job."""
     try:
         with np.load(out, allow_pickle=False) as file:
             return str(file["job"]) == digest_of(job)

@@ -289,7 +289,7 @@ class Recording:
         return part
 
     def summary(self) -> RecordingSummary:
-        """What the samples tell before anything is fitted: noise, frequencies, friction, mistakes.
+        """Summary of the samples before anything is fitted: noise, frequencies, friction, mistakes.
 
         Prints as one screen; `RecordingSummary.as_json` gives plain data.
         """

@@ -53,7 +53,7 @@ class Column:
 
 @dataclasses.dataclass(frozen=True)
 class RecordingSummary:
-    """What a recording holds. Prints as one screen, in a notebook too.
+    """Contents of a recording. Prints as one screen, in a notebook too.
 
     runs: name -> (number of samples, begin, end in s). steps: (shortest, median, longest without
     gaps) in s. gaps: (run, begin, end in s). period: of the motion, in s. coarsest: step in s that

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import keyword
 import re
 import unicodedata
 from collections.abc import Iterable
@@ -9,7 +10,7 @@ from collections.abc import Iterable
 ROLES = ("positions", "velocities", "momenta", "inputs", "parameters", "sensors")
 TIMES = (
     "t", "time", "times", "timestamp", "timestamps", "date", "datetime", "elapsed", "clock", "sec",
-    "seconds", "zeit", "temps", "tiempo", "tempo",
+    "seconds", "millis", "micros", "zeit", "temps", "tiempo", "tempo",
 )  # fmt: skip
 RUNS = ("run", "trial", "sequence", "seq", "episode", "experiment", "trajectory")
 
@@ -17,7 +18,19 @@ _GREEK = {
     "α": "alpha", "β": "beta", "γ": "gamma", "θ": "theta", "φ": "phi", "ϕ": "phi", "ψ": "psi",
     "ϑ": "theta", "ω": "omega", "τ": "tau",
 }  # fmt: skip
-_ANGLES = ("theta", "phi", "psi", "alpha", "beta", "gamma", "angle", "yaw", "pitch", "roll")
+_ANGLES = (
+    "theta",
+    "phi",
+    "psi",
+    "alpha",
+    "beta",
+    "gamma",
+    "angle",
+    "winkel",
+    "yaw",
+    "pitch",
+    "roll",
+)
 _WORDS = {
     "positions": (*_ANGLES, "q", "x", "y", "z", "r", "position", "pos", "displacement"),
     "velocities": ("v", "omega", "velocity", "vel", "speed", "qdot", "qd", "gyro", "dq"),
@@ -29,6 +42,7 @@ _WORDS = {
 _ROLE_OF = {word: role for role, words in _WORDS.items() for word in words}
 # A word, perhaps an index (a number or the letter of an axis) after it.
 _INDEXED = re.compile(r"([a-z]+?)_?(\d+|[xyz])?")
+_UNIT = re.compile(r"_(deg|rad)$")
 # A derivative of another column: theta_dot, thetadot, dtheta, dtheta_dt, dtheta/dt, d_theta, θ̇.
 _DERIVATIVES = (
     re.compile(r"(?P<of>.+?)_?(dot|prime|')(?P<index>_?\d*)"),
@@ -46,20 +60,44 @@ def plain(name: str) -> str:
     return re.sub(r"[\s.-]+", "_", text.translate(str.maketrans("₀₁₂₃₄₅₆₇₈₉", "0123456789")))
 
 
+def symbols(names: Iterable[str]) -> tuple[str, ...]:
+    """Names as they can stand in a formula: θ₁ as theta1, Angle 1 as Angle_1."""
+    found: list[str] = []
+    for name in names:
+        code = name
+        if not (name.isidentifier() and name == unicodedata.normalize("NFKC", name)):
+            code = re.sub(r"\W", "_", plain(name) if not name.isascii() else name)
+            code = code if code[:1].isalpha() else f"q_{code}"
+        code = f"{code}_" if keyword.iskeyword(code) else code
+        found.append(f"{code}_{len(found) + 1}" if code in found else code)
+    return tuple(found)
+
+
 def is_time(name: str) -> bool:
-    """Whether this is the name of a column of times."""
+    """Return whether this is the name of a column of times."""
     return re.sub(r"_?(s|ms|us|µs|ns)$", "", plain(name)) in TIMES or plain(name) in TIMES
 
 
 def is_run(name: str) -> bool:
-    """Whether this is the name of a column that tells runs apart."""
+    """Return whether this is the name of a column that tells runs apart."""
     return re.sub(r"_?(id|no|nr|number|index)$", "", plain(name)) in RUNS
 
 
 def is_angle(name: str) -> bool:
-    """Whether this is the usual name of an angle."""
-    found = _INDEXED.fullmatch(plain(name))
+    """Return whether this is the usual name of an angle."""
+    found = _INDEXED.fullmatch(_bare(name))
     return bool(found) and found[1] in _ANGLES
+
+
+def unit_in(name: str) -> str:
+    """The unit of an angle that its name ends with: deg of theta_deg; "" of none."""
+    found = _UNIT.search(plain(name))
+    return found[1] if found else ""
+
+
+def _bare(name: str) -> str:
+    """The plain name without a unit at its end."""
+    return _UNIT.sub("", plain(name))
 
 
 def derivative_of(name: str) -> str | None:
@@ -74,7 +112,7 @@ def derivative_of(name: str) -> str | None:
 
 def role_of(name: str) -> str | None:
     """The role that a column of this name usually has; None where names do not tell."""
-    found = _INDEXED.fullmatch(plain(name))
+    found = _INDEXED.fullmatch(_bare(name))
     role = _ROLE_OF.get(found[1]) if found else None
     if role is None and (of := derivative_of(name)) is not None and role_of(of) == "positions":
         return "velocities"
@@ -122,5 +160,5 @@ def _mate(positions: list[str], name: str) -> str | None:
 
 
 def _index(name: str) -> str:
-    found = _INDEXED.fullmatch(plain(name))
+    found = _INDEXED.fullmatch(_bare(name))
     return (found[2] or "") if found else ""

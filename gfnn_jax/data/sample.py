@@ -31,7 +31,7 @@ def read_sample(
     paths, *, dt: float | None = None, num_pairs: int = 200_000, seed: int = 0,
     group: Group | None = None,
 ) -> TrajectoryData:  # fmt: skip
-    """As `read_trajectories`, of data larger than memory: a random sample of their pairs.
+    """Read a random sample of the pairs of data larger than memory, as `read_trajectories` would.
 
     paths: a file, or several. group: the processes that each read their own pairs of them, as
     `iterate_pairs` shares them out; the sample, the same for any number, is the first one's, and

@@ -1,4 +1,4 @@
-"""What a trajectory file holds, in a few lines to read before a fit."""
+"""Summary of a trajectory file, in a few lines to read before a fit."""
 
 from __future__ import annotations
 

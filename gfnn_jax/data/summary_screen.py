@@ -19,7 +19,7 @@ _NOTEBOOK = '<pre style="line-height:normal;white-space:pre">{code}</pre>'
 
 
 def screen(summary: RecordingSummary) -> Group:
-    """What `gfnn look` prints."""
+    """Screen that `gfnn look` prints."""
     lines = [Text(line) for line in (_first(summary), _times(summary), _motion(summary)) if line]
     found = [_fault(fault) for fault in summary.faults[:_MOST]]
     more = len(summary.faults) - _MOST

@@ -23,12 +23,16 @@ _SNIFFED = 1 << 16  # characters of the file's begin that tell its format
 _COMMENTS = "#%!"
 _MISSING = ("", "nan", "na", "n/a", "null", "none", "-", "--", "?")
 _BEYOND = "\0beyond"  # a column after the last, which is empty
+_OF_RUN = re.compile(
+    r"\s*((?P<before>latest|run\s*#?\d+)\s*:)?\s*(?P<name>.*?)\s*(?P<behind>run\s*#\s*\d+)?\s*",
+    re.IGNORECASE,
+)
 _BRACKETS = re.compile(r"^\s*([^\[(]*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))?\s*$")
 
 
 @dataclasses.dataclass(frozen=True)
 class _Format:
-    """How a text file is written: what its first lines tell."""
+    """Dialect of a text file, from its first lines."""
 
     separator: str  # or r"\s+"
     decimal: str
@@ -232,9 +236,12 @@ def _sniffed(path: Path, columns: Sequence[str]) -> _Format:
         width -= 1  # a separator ends every line
         above = [cells[:width] for cells in above]
     notes: tuple[str, ...] = ()
+    above = [cells[:width] if not any(cells[width:]) else cells for cells in above]
     named = [cells for cells in above if len(cells) == width]
+    while len(named) > 1 and all(named[1]) and not all(named[0]):
+        named.pop(0)  # a title
     if named:
-        names, units = _named(named[0])
+        names, units = _named(_undecorated(path, named[0]))
         for cells in named[1:2]:
             units |= {n: _bare(c) for n, c in zip(names, cells, strict=True) if _bare(c)}
             notes = (f"the line below the names holds units: {', '.join(filter(None, cells))}",)
@@ -290,6 +297,22 @@ def _separator(path: Path, lines: list[str]) -> tuple[str, str]:
             "semicolons between columns, or decimal points"
         )
     return separator, decimal
+
+
+def _undecorated(path: Path, cells: list[str]) -> list[str]:
+    """Names without what programs write around them: "Latest: Time", "Angle (rad) Run #1".
+
+    Raises InputError where the columns of several runs stand side by side."""
+    parts = [_OF_RUN.fullmatch(cell) for cell in cells]
+    assert all(part is not None for part in parts)
+    runs = {part["before"] or part["behind"] for part in parts if part}
+    if len(runs - {None}) > 1:
+        found = ", ".join(sorted(run for run in runs if run))
+        raise InputError(
+            f"{path}: has columns of several runs side by side ({found}): export one run a file, "
+            "and give all files"
+        )
+    return [part["name"] for part in parts if part]
 
 
 def _named(cells: list[str]) -> tuple[list[str], dict[str, str]]:

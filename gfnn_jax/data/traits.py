@@ -20,7 +20,7 @@ _NARROWEST = 7  # samples of a window for derivatives
 
 @dataclasses.dataclass(frozen=True)
 class Traits:
-    """What the samples of a recording tell column by column.
+    """Traits of a recording's columns, from their samples.
 
     times: (n_r,) of each run. columns: name -> (T,), the runs one after another, angles lifted.
     noise, resolution: by name. local: local polynomials of the columns named in ``moving``.

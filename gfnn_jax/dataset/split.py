@@ -1,4 +1,4 @@
-"""Which pairs a fit is trained on, which ones choose, and which ones state the error.
+"""Split of the pairs: those that train a fit, those that choose, those that state the error.
 
 Training rows determine coefficients. Validation rows choose: size, chart, terms. Test rows are
 looked at once, when all is chosen, and state the error. Runs are kept whole, or cut into
@@ -32,6 +32,20 @@ class Split(NamedTuple):
     validation: np.ndarray
     test: np.ndarray
     stretch: np.ndarray
+
+    @classmethod
+    def of_training(cls, rows: np.ndarray, count: int) -> Split:
+        """These of ``count`` rows train, and nothing is kept apart; each errs independently."""
+        return cls(rows, np.zeros(0, int), np.zeros(0, int), np.arange(count))
+
+    def take(self, rows: np.ndarray) -> Split:
+        """The split of these rows alone, (n,) of the N rows, each in its part."""
+        place = np.full(len(self.stretch), -1)
+        place[rows] = np.arange(len(rows))
+        training, validation, test = (
+            kept[kept >= 0] for kept in (place[part] for part in self[:3])
+        )
+        return Split(training, validation, test, self.stretch[rows])
 
 
 def split_rows(pairs: Pairs, seed: int) -> Split:
@@ -103,7 +117,7 @@ def correlation_time(pairs: Pairs, goes_on: np.ndarray) -> int:
 
 
 def outermost(y: np.ndarray, free: tuple[int, ...] = ()) -> np.ndarray:
-    """Which of the states y (N, 2d) are of the outermost twentieth, (N,) bool, by Mahalanobis'
+    """Mark the outermost twentieth of the states y (N, 2d), (N,) bool, by Mahalanobis'
     distance. free: coordinates that do not count, as angles that cover their circle."""
     seen = y[:, [i for i in range(y.shape[1]) if i not in free]]
     centred = seen - seen.mean(axis=0)

@@ -13,9 +13,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from gfnn_jax.data.channels import channels_of
 from gfnn_jax.data.recording import Recording
-from gfnn_jax.dataset.local_cubics import choose_half, smooth
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.signals.local_cubics import choose_half, smooth
 
 GAP = 3.5  # median steps: a longer one ends a stretch
 PER_PERIOD = 40  # nodes
@@ -55,7 +56,7 @@ class Nodes:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scales:
-    """What the samples say about themselves: noise σ (k,) of the channels, rms speeds (d,), the
+    """Scales of the samples, from the samples: noise σ (k,) of the channels, rms speeds (d,), the
     fastest frequency ω (1/s), the median step dt, and the window of the local cubics (samples to
     either side)."""
 
@@ -132,20 +133,6 @@ def stretches(
             f"{recording.source}: expected stretches of at least {_SHORTEST} samples without a gap"
         )
     return found
-
-
-def channels_of(
-    recording: Recording, names: Sequence[str], run: str
-) -> tuple[np.ndarray, np.ndarray]:
-    """(n, k) values of columns in a run, angles lifted, and their noise ÷ that of their column: 1
-    where σ was not given for each value."""
-    y = np.stack([recording.unwrapped(name, run) for name in names], axis=1)
-    noise = np.ones(y.shape)
-    for k, name in enumerate(names):
-        sigma, usual = recording.sigma(name, run), recording.std[name]
-        if sigma is not None and usual:
-            noise[:, k] = np.where(np.isfinite(sigma), sigma / usual, 1.0)
-    return y, noise
 
 
 def pieces(

@@ -61,6 +61,17 @@ def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:
         "observe": fit.observe,
         "sensors": {name: {"value": c, "std": s} for name, (c, s) in fit.sensors.items()},
         "noise": {n: {"sigma": s, "residual": fit.residual[n]} for n, s in fit.noise.items()},
+        "whiteness": {
+            name: {
+                "white": of.white,
+                "lags": of.lags.tolist(),
+                "autocorrelation": of.autocorrelation.tolist(),
+                "bound": of.bound,
+                "inputs": {u: one._asdict() for u, one in of.inputs.items()},
+                "fit_percent": of.fit_percent,
+            }
+            for name, of in fit.whiteness.items()
+        },
         "gauge": fit.gauge,
         "energy": fit.energy,
         "horizon": [h._asdict() for h in fit.horizon],

@@ -25,7 +25,7 @@ from gfnn_jax.solve.linear import COFACTORS_UP_TO, by_cofactors
 
 
 def why_not_piece(piece: Any) -> str | None:
-    """Why a piece cannot be written in C; None where it can."""
+    """Reason why a piece cannot be written in C; None where it can."""
     if isinstance(piece, (Affine, Damping)):
         return None
     if not isinstance(piece, (Generated, Flow)):

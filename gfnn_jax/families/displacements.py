@@ -45,7 +45,7 @@ class OfDisplacement:
 
     @property
     def label(self) -> str:
-        """As candidates tables show it: what, and how large."""
+        """Label in a table of candidates: name and size."""
         return f"{self.family.label} of q and Q − q"
 
     @property
@@ -61,7 +61,7 @@ class OfDisplacement:
 
     @property
     def matrix_free(self) -> bool:
-        """Whether solvers are to use products with the Hessian instead of the Hessian."""
+        """Return whether solvers are to use products with the Hessian instead of the Hessian."""
         return matrix_free(self.family)
 
     def unflatten(self, coefficients):
@@ -93,14 +93,14 @@ class OfDisplacement:
         return self._mean(gradients), self._mean(hessians)
 
     def term_gradients(self, w, args=None):
-        """∇ of every term at w (..., 2d): (..., 2d, N). NumPy."""
+        """Gradient of every term at w (..., 2d): (..., 2d, N). NumPy."""
         return self._mean([
             self._turned(self._outer(self.family.term_gradients(self._inner(v)), -2), k, -2)
             for k, v in enumerate(self._ways(w))
         ])  # fmt: skip
 
     def curvatures(self, params, w, args=None) -> list:
-        """What ``hessian_product`` takes: those of F, one way or both."""
+        """Curvatures that ``hessian_product`` takes: those of F, one way or both."""
         return [self.family.curvatures(params, self._inner(v), args) for v in self._ways(w)]
 
     def hessian_product(self, curvatures, v):

@@ -214,7 +214,7 @@ def names_in(text: str) -> tuple[str, ...]:
 
 
 def _read(text: str, use: Callable[[ast.expr], Any]) -> Any:
-    """What ``use`` makes of the syntax tree of a text. Raises InputError where there is none."""
+    """Apply ``use`` to the syntax tree of a text. Raises InputError where there is none."""
     if len(text) > _LONGEST_TEXT:
         raise InputError(f"expected a term of at most {_LONGEST_TEXT} characters, got {len(text)}")
     try:

@@ -65,7 +65,8 @@ class Terms:
 
     @staticmethod
     def of(rows: Sequence[Sequence[Any]], dim: int) -> Terms:
-        """Of rows (k, n, m, φ). Raises ValueError for more than two factors v, or a power > 8."""
+        """Make it of rows (k, n, m, φ). Raises ValueError for more than two factors v, or a power >
+        8."""
         k, n, m = (np.array([r[i] for r in rows], dtype=int).reshape(-1, dim) for i in range(3))
         if (k.sum(1) > 2).any() or k.min(initial=0) < 0:
             raise ValueError("a term of a Lagrangian has at most two factors v")
@@ -94,7 +95,7 @@ class Terms:
         return Terms(self.speeds[keep], self.powers[keep], self.modes[keep], self.phases[keep])
 
     def padded(self, count: int) -> Terms:
-        """With constants behind, which move nothing, ``count`` terms in all."""
+        """Pad with constants, which move nothing, to ``count`` terms in all."""
         more = count - self.count
         k, n, m = (np.pad(a, ((0, more), (0, 0))) for a in (self.speeds, self.powers, self.modes))
         return Terms(k, n, m, np.pad(self.phases, (0, more)))
@@ -172,7 +173,7 @@ class Friction:
 
     @staticmethod
     def of(rows: Sequence[Sequence[Any]], dim: int) -> Friction:
-        """Of rows (c, kind, ε)."""
+        """Make it of rows (c, kind, ε)."""
         return Friction(
             np.array([r[0] for r in rows], dtype=int).reshape(-1, dim),
             np.array([r[1] for r in rows], dtype=int),
@@ -199,7 +200,7 @@ class Friction:
         return Friction(self.directions[keep], self.kinds[keep], self.widths[keep])
 
     def padded(self, count: int) -> Friction:
-        """With terms along no direction behind, ``count`` in all."""
+        """Pad with terms along no direction to ``count`` in all."""
         more = count - self.count
         return Friction(
             np.pad(self.directions, ((0, more), (0, 0))),

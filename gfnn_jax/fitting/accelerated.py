@@ -19,7 +19,7 @@ from gfnn_jax.families.sines import Sines
 
 
 def takes(family: Any) -> bool:
-    """Whether the gradients of its terms can be traced by JAX."""
+    """Return whether the gradients of its terms can be traced by JAX."""
     return isinstance(family, (Products, Sines))
 
 

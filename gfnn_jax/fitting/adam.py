@@ -35,7 +35,7 @@ Rows = Float[Array | np.ndarray, "_ _"]
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """How to train.
+    """Recipe of a training.
 
     batch_size:     pairs per iteration (all of them where there are fewer).
     epochs:         parts of the training; each ends with a validation.

@@ -405,14 +405,14 @@ class Problem:
         return rows[order[np.isfinite(size[order])]]
 
     def _resolved(self, family, c, steps: Steps, rows):
-        """Those of these rows that the steps resolve: whose own error is not what is left over of
-        them. One unresolved passage would outweigh all pairs that tell the coefficients."""
+        """Keep the rows that the steps resolve: whose own error is not most of their residual. One
+        unresolved passage would outweigh all pairs that tell the coefficients."""
         known, off, limit = self.resolution(family, c, steps, rows)
         return rows[known & (off <= limit)]
 
     def resolution(self, family, c, steps: Steps, rows) -> tuple[np.ndarray, np.ndarray, float]:
-        """Of these rows whether the flow is known (n,), the steps' own error (n,) ÷ scale, and the
-        error up to which a row counts as resolved among them."""
+        """Resolution of these rows: whether the flow is known (n,), the steps' own error (n,) ÷
+        scale, and the error up to which a row counts as resolved among them."""
         size = np.abs(self.residuals(family, c, steps, rows)).max(axis=1, initial=0.0)
 
         def own_error(block) -> np.ndarray:
@@ -447,15 +447,15 @@ class Problem:
         return Steps(self.options.coarse_stages, substeps, newton=False)
 
     def substeps_for(self, family, c, rows) -> int:
-        """As the function of this name, of these rows."""
+        """Substeps that these rows need, by the function of this name."""
         dt, args = self.given(rows)
         return substeps_for(family, c, self.z0[rows], dt, self.options.reach, args=args)
 
     def fine_steps(
         self, family, c, rows, tolerances: Sequence[float | None] = (None,)
     ) -> tuple[Steps, ...]:
-        """For each tolerance the cheapest steps whose own error, ÷ scale, is within it at nearly
-        all of these rows; None: at roundoff."""
+        """Find for each tolerance the cheapest steps whose own error, ÷ scale, is within it at
+        nearly all of these rows; None: at roundoff."""
         options = self.options
         judged = options.judged_free if matrix_free(family) else options.judged
         sample = rows[:: -(-len(rows) // judged)]
@@ -475,7 +475,7 @@ class Problem:
         )
 
     def _descend(self, family, c, steps: Steps, rows, most: int):
-        """As the function `descended`, over these rows."""
+        """Descend over these rows, by the function `descended`."""
         return descended(lambda c: self.linearised(family, c, steps, rows), c, most, self.options)
 
 

@@ -1,4 +1,5 @@
-"""Which modes an H has: Gauss–Newton through the flow, over a library that grows where it gains.
+"""Growth of an H mode by mode: Gauss–Newton through the flow, over a library that grows where it
+gains.
 
 Each round solves for the modes that are there and looks at the candidates around those that
 matter. Of a candidate's derivative, what the present modes explain is taken away first; then its
@@ -131,8 +132,8 @@ def grow(
 
 
 def _out_of_reach(pace: list[tuple[int, float]], goal: float, most: int) -> bool:
-    """Whether the modes that are left, each gaining as much as those of the last four rounds did,
-    would miss the goal."""
+    """Return whether the modes that are left, each gaining as much as those of the last four rounds
+    did, would miss the goal."""
     if len(pace) < 4:
         return False
     (count, rms), added = pace[-1], pace[-1][0] - pace[0][0]
@@ -198,8 +199,8 @@ class _Look:
         return {self.modes[j]: float(v) for j, v in zip(kept, c, strict=True)}, rest, span
 
     def candidates(self, tried: list[Mode], rest, span, room: int, options: Options) -> list[Mode]:
-        """Of the modes that are tried, those that the residual asks for: the heaviest, then the one
-        that is heaviest beside it, and so on. rest, span: as `solved` gives them."""
+        """Select among the modes that are tried those that the residual asks for: the heaviest,
+        then the one that is heaviest beside it, and so on. rest, span: as `solved` gives them."""
         freedom = np.sqrt(max(len(rest) - span.shape[1], 0))
         columns, heaviest = np.zeros((len(rest), 0)), np.zeros(0, dtype=int)
         for first in range(0, len(tried), options.block):

@@ -138,7 +138,7 @@ def _blocks(rows, num_parameters: int, least: int = 0) -> Iterator[tuple[np.ndar
 
 
 def _pairs_of(num_parameters: int, width: int, least: int) -> int:
-    """How many pairs of states (2d,) of this width a block holds."""
+    """Number of pairs of states (2d,) of this width in a block."""
     return max(1, max(_FEWEST_ROWS, _BLOCK_BYTES // (8 * (num_parameters + 1)), least) // width)
 
 

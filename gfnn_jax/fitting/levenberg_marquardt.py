@@ -259,7 +259,7 @@ def _compiled_on_devices(family, rows, theta, layout):
 
 
 class _Options(NamedTuple):
-    """When a training stops, and who is told of its states."""
+    """Limits of a training, and the callbacks that see its states."""
 
     max_iterations: int
     block: Callable[[int], AbstractContextManager]

@@ -80,7 +80,8 @@ class Triangle:
         return Triangle(factor, self.rows + (len(rows) if count is None else count))
 
     def stacked(self, rows: np.ndarray) -> Triangle:
-        """As `append`, by NumPy's QR of R on top of the rows: a third slower, other rounding."""
+        """Append rows by NumPy's QR of R on top of them: a third slower than `append`, other
+        rounding."""
         stack = np.concatenate([self.factor[: self.rows], rows])
         return dataclasses.replace(Triangle.of(stack), rows=self.rows + len(rows))
 
@@ -92,7 +93,7 @@ class Triangle:
         return Triangle(factor, self.rows + other.rows)
 
     def spoilt(self) -> Triangle:
-        """These rows and one that no coefficients explain: ρ is infinite."""
+        """Add a row that no coefficients explain: ρ is infinite."""
         factor = self.factor.copy()
         factor[-1, -1] = np.inf
         return Triangle(factor, self.rows)

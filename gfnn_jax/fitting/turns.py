@@ -1,4 +1,4 @@
-"""How far a step turns the states around their centre, and which way; a quadratic H of such turns.
+"""Turns of the states around their centre in a step, with their sense; a quadratic H of such turns.
 
 A step tells a turn only up to whole ones: 4 radians forwards are 2π − 4 = 2.28 backwards. The sense
 is that of the eigenvector v, the sign of i v*Jv (Krein's): an H with a minimum turns forwards, as a

@@ -1,4 +1,4 @@
-"""How well least-squares coefficients are known, whatever the residuals are made of.
+"""Uncertainty of least-squares coefficients, whatever the residuals are made of.
 
 The coefficients of min ‖A c − b‖ move by (AᵀA)⁻¹ Aᵀ r when b moves by r. With r independent row by
 row their covariance is (AᵀA)⁻¹ (Aᵀ diag(r²) A) (AᵀA)⁻¹: each row counts with its own residual

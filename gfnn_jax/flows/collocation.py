@@ -32,8 +32,9 @@ _DERIVATIVE = 1e-6
 
 @dataclasses.dataclass(frozen=True)
 class Steps:
-    """How a flow over dt is computed: ``substeps`` of collocation with ``stages`` stages each, and
-    whether lanes in which the fixed point does not contract are given to Newton's method."""
+    """Steps by which a flow over dt is computed: ``substeps`` of collocation with ``stages`` stages
+    each, and whether lanes in which the fixed point does not contract are given to Newton's method.
+    """
 
     stages: int
     substeps: int
@@ -51,7 +52,7 @@ class Images(NamedTuple):
 
 
 def of_lanes(value, lanes):
-    """Of these lanes, what differs between lanes; a number, or None, is that of all of them."""
+    """Take these lanes of what differs between lanes; a number, or None, is that of all of them."""
     return value[lanes] if np.ndim(value) else value
 
 
@@ -238,7 +239,7 @@ def truncation(
     family, params, z, dt, steps: Steps, *, args=None,
     on_substep: Callable[[], Any] = lambda: None,
 ) -> np.ndarray:  # fmt: skip
-    """How far images of the states z (B, 2d) are from those of twice the substeps, (B, 2d): not
+    """Differences of the images of states z (B, 2d) from those of twice the substeps, (B, 2d): not
     finite where one of them fails."""
     finer = dataclasses.replace(steps, substeps=2 * steps.substeps)
     one, other = (

@@ -327,7 +327,8 @@ def _fixed_point(stages: int, shared, z, args):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _stages(stages: int, shared, z, args):
-    """As ``_fixed_point``, with derivatives in everything by the implicit function theorem."""
+    """Solve as ``_fixed_point`` does, with derivatives in everything by the implicit function
+    theorem."""
     return _fixed_point(stages, shared, z, args)
 
 

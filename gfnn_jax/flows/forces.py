@@ -19,10 +19,42 @@ from typing import Any
 import jax
 import numpy as np
 
-from gfnn_jax.arrays import as_row, matmul, namespace
+from gfnn_jax.arrays import as_row, beside, matmul, namespace
 from gfnn_jax.families.family import at_time, parameter_gradients
 from gfnn_jax.families.lagrangian import LINEAR, Friction
 from gfnn_jax.phase_space import split
+
+
+class WithForces:
+    """Family of H of which forces change the field: what stays H's own, ``family``'s."""
+
+    family: Any
+    name = "terms with friction"
+
+    @property
+    def dim(self) -> int:
+        return self.family.dim
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the args that are no inputs."""
+        return getattr(self.family, "parameters", ())
+
+    def unflatten(self, coefficients):
+        """Return the coefficients: they are the parameters."""
+        return coefficients
+
+    def __call__(self, params, w, args=None):
+        return self.value(params, w, args)
+
+    def value(self, params, w, args=None):
+        """H, shape (...), the energy that friction loses and inputs supply."""
+        own = params[: self.family.num_parameters]
+        return self.family.value(own, w, self._inner(args))
+
+    def _inner(self, args):
+        """Args of H."""
+        return args
 
 
 @partial(
@@ -31,7 +63,7 @@ from gfnn_jax.phase_space import split
     meta_fields=("num_inputs", "degree"),
 )
 @dataclasses.dataclass(frozen=True, eq=False)
-class Forced:
+class Forced(WithForces):
     """H of ``family`` with friction and inputs; params are those of H, then ρ (F,), then G (d, k)
     row by row.
 
@@ -47,21 +79,10 @@ class Forced:
     num_inputs: int = 0
     degree: int = 0
 
-    name = "terms with friction"
-
     @property
     def label(self) -> str:
         losses, inputs = self.friction.count, self.num_inputs
         return f"{self.family.label}, {losses} of friction, {inputs} inputs"
-
-    @property
-    def dim(self) -> int:
-        return self.family.dim
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """The names of the args that are no inputs."""
-        return getattr(self.family, "parameters", ())
 
     @property
     def num_parameters(self) -> int:
@@ -69,25 +90,21 @@ class Forced:
 
     @property
     def term_names(self) -> tuple[str, ...]:
-        """Those of H, of R, and of G."""
+        """Names of the terms of H, of R, and of G."""
         gains = [f"u{j + 1} on q{i + 1}" for i in range(self.dim) for j in range(self.num_inputs)]
         return (*self.family.term_names, *self.friction.names, *gains)
 
     @property
     def quadratic(self) -> bool:
-        """Whether the field is affine."""
+        """Return whether the field is affine."""
         return self.family.quadratic and not np.any(self.friction.kinds != LINEAR)
 
     @property
     def operations(self) -> tuple[int, int]:
-        """Those of H, with the Hessian that friction's derivative takes."""
+        """Operations of H, with the Hessian that friction's derivative takes."""
         gradient, with_hessian = self.family.operations
         more = 8 * self.friction.count * self.dim + 2 * self.dim * self.num_inputs
         return gradient + more, with_hessian + more + 4 * self.dim**3
-
-    def unflatten(self, coefficients):
-        """The parameters are the coefficients themselves."""
-        return coefficients
 
     def take(self, rows) -> Any:
         """The family of these terms of H and R alone, all gains with them; the one of H where no
@@ -110,7 +127,7 @@ class Forced:
         )
 
     def multiplier(self, params, dt) -> None:
-        """None: no multiple of the symplectic form is kept."""
+        """Return None: no multiple of the symplectic form is kept."""
         return None
 
     def at_time(self, args, after):
@@ -131,17 +148,7 @@ class Forced:
         later = xp.concatenate(xp.broadcast_arrays(*shifted), axis=-1)
         if args.shape[-1] == count:
             return later
-        others = at_time(self.family, args[..., :-count], after)
-        others = xp.broadcast_to(others, (*later.shape[:-1], others.shape[-1]))
-        return xp.concatenate([others, later], axis=-1)
-
-    def __call__(self, params, w, args=None):
-        return self.value(params, w, args)
-
-    def value(self, params, w, args=None):
-        """H, shape (...)."""
-        own, _, _ = self.parts(params)
-        return self.family.value(own, w, self._inner(args))
+        return beside(at_time(self.family, args[..., :-count], after), later)
 
     def gradient(self, params, w, args=None):
         """(∂H/∂q + ∂R/∂v − G u, ∂H/∂p), shape (..., 2d)."""
@@ -151,7 +158,7 @@ class Forced:
         return self._field(gradient, slope, losses, gains, args)
 
     def gradient_and_hessian(self, params, w, args=None):
-        """That field, and its derivative (..., 2d, 2d), which is not symmetric."""
+        """Field and its derivative (..., 2d, 2d), which is not symmetric."""
         own, losses, gains = self.parts(params)
         gradient, hessian = self.family.gradient_and_hessian(own, w, self._inner(args))
         _, slope, curvature = self.friction.tables(split(gradient)[1])
@@ -193,7 +200,7 @@ class Forced:
         return params[:own], params[own : own + count], gains
 
     def _inner(self, args):
-        """The args of H."""
+        """Args of H."""
         if args is None:
             return None
         others = args.shape[-1] - (self.degree + 1) * self.num_inputs

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gfnn_jax.arrays import as_row, namespace
+from gfnn_jax.arrays import as_row, beside, namespace
 from gfnn_jax.families.family import at_time, parameter_gradients
-from gfnn_jax.flows.forces import Forced
+from gfnn_jax.flows.forces import Forced, WithForces
 from gfnn_jax.phase_space import split
 
 FRICTION = "friction"  # the name of γ among the terms
@@ -28,7 +28,7 @@ FRICTION = "friction"  # the name of γ among the terms
 
 @partial(jax.tree_util.register_dataclass, data_fields=("family",), meta_fields=())
 @dataclasses.dataclass(frozen=True)
-class Uniform:
+class Uniform(WithForces):
     """H of ``family`` with uniform friction; params (m + 1,) are those of H and γ behind them.
 
     In place of ∇H stands the field (∂H/∂q + γp, ∂H/∂p), which J turns into the velocity, and in
@@ -37,20 +37,9 @@ class Uniform:
 
     family: Any
 
-    name = "terms with friction"
-
     @property
     def label(self) -> str:
         return f"{self.family.label}, friction"
-
-    @property
-    def dim(self) -> int:
-        return self.family.dim
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """The names of the args."""
-        return getattr(self.family, "parameters", ())
 
     @property
     def num_parameters(self) -> int:
@@ -58,22 +47,18 @@ class Uniform:
 
     @property
     def term_names(self) -> tuple[str, ...]:
-        """Those of H, and that of γ."""
+        """Names of the terms of H, and γ."""
         return (*self.family.term_names, FRICTION)
 
     @property
     def quadratic(self) -> bool:
-        """Whether the field is affine."""
+        """Return whether the field is affine."""
         return self.family.quadratic
 
     @property
     def operations(self) -> tuple[int, int]:
-        """Those of H; friction adds a few."""
+        """Operations of H; friction adds a few."""
         return self.family.operations
-
-    def unflatten(self, coefficients):
-        """The parameters are the coefficients (m + 1,) themselves."""
-        return coefficients
 
     def take(self, rows) -> Any:
         """The family of these terms alone; without γ the one without friction."""
@@ -91,19 +76,12 @@ class Uniform:
             return None
         return namespace(params, dt).exp(-params[-1] * dt)
 
-    def __call__(self, params, w, args=None):
-        return self.value(params, w, args)
-
-    def value(self, params, w, args=None):
-        """H, shape (...)."""
-        return self.family.value(params[:-1], w, args)
-
     def gradient(self, params, w, args=None):
         """(∂H/∂q + γp, ∂H/∂p), shape (..., 2d)."""
         return self.family.gradient(params[:-1], w, args) + params[-1] * _momenta(w)
 
     def gradient_and_hessian(self, params, w, args=None):
-        """That field, and its derivative (..., 2d, 2d), which is not symmetric."""
+        """Field and its derivative (..., 2d, 2d), which is not symmetric."""
         gradient, hessian = self.family.gradient_and_hessian(params[:-1], w, args)
         more = np.eye(2 * self.dim, k=self.dim, dtype=hessian.dtype)  # of (p, 0) in (q, p)
         field = gradient + params[-1] * _momenta(w)
@@ -163,7 +141,7 @@ class Power(NamedTuple):
 
 
 def power(family, params, w, args=None) -> Power:
-    """What forces do at states w (..., 2d), where ``family`` holds any. NumPy or JAX."""
+    """Power of the forces at states w (..., 2d), where ``family`` holds any. NumPy or JAX."""
     if isinstance(family, Uniform):
         lost, supplied = power(family.family, params[:-1], w, args)
         v = split(family.family.gradient(params[:-1], w, args))[1]
@@ -195,9 +173,7 @@ class CaldirolaKanai:
         since = (since + after)[..., None]
         if args.shape[-1] == 1:
             return since
-        others = at_time(self.family, args[..., :-1], after)
-        others = xp.broadcast_to(others, (*since.shape[:-1], others.shape[-1]))
-        return xp.concatenate([others, since], axis=-1)
+        return beside(at_time(self.family, args[..., :-1], after), since)
 
     def gradient(self, params, w, args):
         """∂H̃/∂(q, p̃) = (g ∂H/∂q, ∂H/∂p), g = e^(γτ)."""

@@ -1,4 +1,4 @@
-"""What ``gfnn fit RECORDING`` does: a recording in, a model folder with its report out."""
+"""Job of ``gfnn fit RECORDING``: a recording in, a model folder with its report out."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from gfnn_jax.data.recording import read
 from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.evaluate import law_report, report
+from gfnn_jax.evaluate.figures_of_laws import law_figure
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.search import refusals
 from gfnn_jax.jobs.written import REPORT
@@ -17,6 +18,8 @@ from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps import saved
 from gfnn_jax.models.learned_law import LearnedLaw
 from gfnn_jax.storage.outputs import atomic_folder
+
+FIGURE = "law.png"
 
 
 class Learned(NamedTuple):
@@ -51,5 +54,6 @@ def fit_recording(
     record = {"job": job, **report.finite({key: result[key] for key in kept})}
     with atomic_folder(out) as folder:
         saved.save(fitted.map, folder, record=record)
+        law_figure(fitted, recording, folder / FIGURE)
         (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
     return Learned(fitted, out, result)

@@ -1,4 +1,4 @@
-"""What ``gfnn predict MODEL --initial RECORDING`` does: forecasts from the end of each run.
+"""Job of ``gfnn predict MODEL --initial RECORDING``: forecasts from the end of each run.
 
 The file written has times (R, n), values and std (R, n, d) by runs and columns; with .csv at its
 end, columns run, t, each position and std_ of each. Times and values are in the units of the
@@ -96,7 +96,7 @@ def _roles(sensors: Sensors, job: dict[str, Any]) -> dict[str, Any]:
 
 
 def _in_units(one: Forecast, factors: Mapping[str, float], second: float) -> Forecast:
-    """In the units of the file."""
+    """Convert to the units of the file."""
     values, std = (
         {name: array / factors.get(name, 1.0) for name, array in of.items()}
         for of in (one.values, one.std)

@@ -1,4 +1,4 @@
-"""What `gfnn look` does: a recording read, summed up, drawn."""
+"""Job of ``gfnn look``: a recording read, summed up, drawn."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def look(
 
 
 def _hold_states(paths: Sequence[Path]) -> bool:
-    """Whether the files are arrays of canonical states (q, p)."""
+    """Return whether the files are arrays of canonical states (q, p)."""
     is_array = all(path.suffix.lower() in (".npz", ".npy") for path in paths)
     return is_array and not are_recordings(paths)
 

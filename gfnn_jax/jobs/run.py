@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.dataset.structures import Bodies, structure_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import figures, figures_of_many, metrics, report
 from gfnn_jax.jobs.measure import Measured, measure, plane_of
@@ -19,7 +20,6 @@ from gfnn_jax.jobs.written import MODEL, Ran, already_done, pairs_digest, write
 from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.fit import Fit
 from gfnn_jax.learn.options import FitOptions
-from gfnn_jax.learn.structures import Bodies, structure_of
 from gfnn_jax.maps.bands import bands
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.noise import of_differences
 from gfnn_jax.dataset.runs import steps_between
-from gfnn_jax.learn.candidates import Judges
-from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.dataset.split import Split
 from gfnn_jax.phase_space import Pairs
 
 
@@ -42,24 +42,23 @@ OPTIONS = Options()
 
 
 class Arcs(NamedTuple):
-    """The arcs as pairs, in chains whose images are the states of the next, and k."""
+    """The arcs as a data set, in chains whose images are the states of the next, and k."""
 
-    prepared: Prepared
-    judges: Judges
+    data: Dataset
     length: int
 
 
-def arcs_of(prepared: Prepared, judges: Judges, options: Options = OPTIONS) -> Arcs | None:
+def arcs_of(data: Dataset, options: Options = OPTIONS) -> Arcs | None:
     """The arcs that H is to be learned from; None where the pairs themselves serve: where no
     sequences are, where a step is long against its noise, and for pairs of many dt or parameters,
     or of a structure."""
-    if prepared.varied or prepared.structure is not None:
+    if data.varied or data.structure is not None:
         return None
-    starts, lengths = _runs(judges.pairs)
+    starts, lengths = _runs(data.pairs)
     usual = int(np.median(np.repeat(lengths, lengths)))  # that a pair stands in
     if usual <= options.order:
         return None
-    moved = (prepared.y1 - prepared.y0) / prepared.scale
+    moved = (data.y1 - data.y0) / data.scale
     displacement = float(np.sqrt(np.mean(moved**2)))
     runs = [moved[first : first + count] for first, count in zip(starts, lengths, strict=True)]
     noise = of_differences(runs, options.order, options.alike)
@@ -69,7 +68,7 @@ def arcs_of(prepared: Prepared, judges: Judges, options: Options = OPTIONS) -> A
     length = min(wanted, int(options.part * usual))
     if length < 2:
         return None
-    return _strided(prepared, judges, starts, lengths, length, options)
+    return _strided(data, starts, lengths, length, options)
 
 
 def _runs(pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
@@ -78,35 +77,32 @@ def _runs(pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
     return starts, np.diff(np.append(starts, len(pairs)))
 
 
-def _strided(
-    prepared: Prepared, judges: Judges, starts, lengths, length: int, options: Options
-) -> Arcs | None:
+def _strided(data: Dataset, starts, lengths, length: int, options: Options) -> Arcs | None:
     """The arcs of so many steps that are wholly in the training pairs, or in those held out."""
     first = np.concatenate([
         np.arange(begin + offset, begin + count - length + 1, length)
         for begin, count in zip(starts, lengths, strict=True) for offset in range(length)
     ])  # fmt: skip
     along = first[:, None] + np.arange(length)
-    pairs, moved = judges.pairs, prepared.y1 - prepared.y0
+    pairs, moved = data.pairs, data.y1 - data.y0
     last = first + length - 1
     # In chains of arcs that follow one another, one for each offset in a run.
     begin = np.repeat(starts, lengths)[first]
     strided = Pairs(
-        np.asarray(pairs.z0)[first], np.asarray(pairs.z1)[last], length * prepared.dt,
+        np.asarray(pairs.z0)[first], np.asarray(pairs.z1)[last], length * data.dt,
         run=begin + (first - begin) % length, place=(first - begin) // length,
     )  # fmt: skip
-    angles = np.isin(np.arange(moved.shape[1]), prepared.coordinates.angles)
+    angles = np.isin(np.arange(moved.shape[1]), data.coordinates.angles)
     # Angles go on over turns; what is no angle is as measured, without a sum's rounding.
-    y0 = prepared.y0[first]
-    y1 = np.where(angles, y0 + moved[along].sum(axis=1), prepared.y1[last])
+    y0 = data.y0[first]
+    y1 = np.where(angles, y0 + moved[along].sum(axis=1), data.y1[last])
     rows = []
-    for own in (judges.training, judges.held_out):
+    for own in (data.training, data.validation):
         inside = np.zeros(len(moved), bool)
         inside[own] = True
         rows.append(np.random.default_rng(0).permutation(np.flatnonzero(inside[along].all(axis=1))))
     if min(map(len, rows)) < options.fewest:
         return None
-    return Arcs(
-        dataclasses.replace(prepared, y0=y0, y1=y1, dt=length * prepared.dt),
-        Judges(strided, rows[0], rows[1], judges.tolerance), length,
-    )  # fmt: skip
+    split = Split(rows[0], rows[1], np.zeros(0, int), np.arange(len(first)))
+    arcs = dataclasses.replace(data, pairs=strided, row=data.row[first], y0=y0, y1=y1, split=split)
+    return Arcs(arcs, length)

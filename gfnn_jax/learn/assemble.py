@@ -9,17 +9,17 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance, measured_error
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
-from gfnn_jax.learn.candidates import Candidate, Judges, refined_images, with_error
+from gfnn_jax.learn.candidates import Candidate, refined_images, with_error
 from gfnn_jax.learn.clock import COMPILE, Budget
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.maps.parameters import Parameters, sampled
 from gfnn_jax.maps.symplectic_map import Piece, SymplecticMap
-from gfnn_jax.phase_space import sizes
 from gfnn_jax.solve.status import LEFT_DOMAIN
 
 _TIMING = "the time of a step, and the error of compiled ones"
@@ -40,19 +40,18 @@ class Assembled(NamedTuple):
 
 
 def measured(
-    candidate: Candidate, map_: SymplecticMap, prepared: Prepared, judges: Judges, budget: Budget
+    candidate: Candidate, map_: SymplecticMap, data: Dataset, tolerance: Tolerance, budget: Budget
 ) -> Assembled:
     """The candidate with this map, its error and its time per step measured by the steps that users
     run, as long as compiling them fits into the budget."""
-    held, compiling = judges.pairs.take(judges.held_out), budget.compiling
+    held, compiling = data.pairs.take(data.validation), budget.compiling
     try:
         with budget.last(_TIMING, COMPILE, compiling, decides=True):
             steps = stepped(map_, np.asarray(held.z0), held.dt, held.args)
     except OutOfTime:
         return Assembled(dataclasses.replace(candidate, map=map_), 0.0, compiled=False)
-    error = judges.error_of(
-        np.where(steps.failed[:, None], np.nan, steps.images), prepared.coordinates
-    )
+    images = np.where(steps.failed[:, None], np.nan, steps.images)
+    error = measured_error(data, tolerance, images)
     candidate = dataclasses.replace(
         with_error(candidate, error), map=map_,
         newton_iterations_max=int(steps.iterations.max()),
@@ -61,54 +60,52 @@ def measured(
     return Assembled(candidate, steps.compile_seconds)
 
 
-def with_predictor(generated: Generated, prepared: Prepared, rows) -> Generated:
+def with_predictor(generated: Generated, data: Dataset, rows) -> Generated:
     """The piece with predictors fitted to its own images of the data's states: where S is coarse,
     the data are no closer to its roots than S is to the data."""
     rows = rows[:_PREDICTOR_PAIRS]
-    images, solved = refined_images(
-        prepared, generated.chart, generated.family, generated.params, rows
-    )
+    images, solved = refined_images(data, generated.chart, generated.family, generated.params, rows)
     if solved.sum() < 2:  # nothing to learn from: the data's own images
-        images, solved = prepared.y1[rows], np.ones(len(rows), bool)
-    coordinates, args = prepared.coordinates, prepared.given(rows[solved])[1]
+        images, solved = data.y1[rows], np.ones(len(rows), bool)
+    coordinates, args = data.coordinates, data.given(rows[solved])[1]
     features = getattr(getattr(generated.family, "inputs", None), "features", None)
     fitted = fit_predictors(
-        generated.chart, prepared.y0[rows][solved], images[solved],
-        of_lanes(prepared.given(rows)[0], solved),
+        generated.chart, data.y0[rows][solved], images[solved],
+        of_lanes(data.given(rows)[0], solved),
         angles=coordinates.angles, cyclic=coordinates.cyclic, features=features, args=args,
     )  # fmt: skip
     chosen = affordable(fitted, generated.family)
     return dataclasses.replace(generated, predictor=chosen.predictor)
 
 
-def composed(piece: Piece, prepared: Prepared, judges: Judges) -> SymplecticMap:
+def composed(piece: Piece, data: Dataset) -> SymplecticMap:
     """The piece between those that were factored out, in the scene's coordinates: leaves of JAX."""
     map_ = SymplecticMap(
-        pieces=(*prepared.before, piece, *prepared.after),
-        coordinates=prepared.coordinates,
-        domain=prepared.domain,
-        scale=sizes(judges.pairs.z0),
-        angle_centre=prepared.angle_centre,
-        dt=prepared.dt,
-        parameters=_sampled(prepared),
-        dt_range=_dt_range(piece, prepared),
+        pieces=(*data.before, piece, *data.after),
+        coordinates=data.coordinates,
+        domain=data.domain,
+        scale=data.spread,
+        angle_centre=data.angle_centre,
+        dt=data.dt,
+        parameters=_sampled(data),
+        dt_range=_dt_range(piece, data),
     )
     # Not jnp.asarray, which compiles a copy for every new shape.
     return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_)
 
 
-def _sampled(prepared: Prepared) -> Parameters | None:
+def _sampled(data: Dataset) -> Parameters | None:
     """What the map depends on beside the state, and where it was sampled."""
-    if prepared.args is None:
+    if data.args is None:
         return None
-    return sampled(prepared.parameters, prepared.args, prepared.each_dt, prepared.period)
+    return sampled(data.parameters, data.args, data.each_dt, data.period)
 
 
-def _dt_range(piece: Piece, prepared: Prepared) -> np.ndarray | None:
+def _dt_range(piece: Piece, data: Dataset) -> np.ndarray | None:
     """Where dt was sampled, of an S that was learned with it."""
-    if prepared.own_dt is None or not isinstance(piece, Generated):
+    if data.own_dt is None or not isinstance(piece, Generated):
         return None
-    return np.array([prepared.own_dt.min(), prepared.own_dt.max()])
+    return np.array([data.own_dt.min(), data.own_dt.max()])
 
 
 def in_block(z: np.ndarray) -> np.ndarray:

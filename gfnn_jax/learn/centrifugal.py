@@ -12,42 +12,40 @@ from itertools import permutations
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
 from gfnn_jax.fitting.gauss_newton import fitted_gradients
 from gfnn_jax.generating.charts import MIDPOINT
-from gfnn_jax.learn.prepare import Prepared
 
 _MOST_DIM = 3  # beyond it they are too many
 _ROWS_PER_TERM = 4  # numbers for each coefficient, and half as many again to judge by
 _GAINED = 0.2  # of what the library leaves over, that may be left with them
 
 
-def centrifugal_terms(
-    prepared: Prepared, rows: np.ndarray, family: Terms | Sums
-) -> tuple[str, ...]:
+def centrifugal_terms(data: Dataset, rows: np.ndarray, family: Terms | Sums) -> tuple[str, ...]:
     """Centrifugal terms, and the cosine and sine of their angles, which with the quadratic terms
     leave a fifth or less of what ``family`` leaves over; none where they do not.
 
     rows: of pairs in plain coordinates, without args or a structure. At states beyond a pole, and
     where one lies between states, a term is not tried."""
-    dim = prepared.dim
+    dim = data.dim
     if dim > _MOST_DIM:
         return ()
     texts = [
         f"p{j + 1}**2/{f}(q{i + 1})**2"
         for f, pole in (("sin", 0.0), ("cos", np.pi / 2))
         for i, j in permutations(range(dim), 2)
-        if i not in prepared.coordinates.cyclic and _between_poles(prepared.y0[rows, i], pole)
+        if i not in data.coordinates.cyclic and _between_poles(data.y0[rows, i], pole)
     ]
     if not texts:
         return ()
     angles = [i for i in range(dim) if any(f"(q{i + 1})" in text for text in texts)]
     texts += [f"{f}(q{i + 1})" for i in angles for f in ("cos", "sin")]
     with_them = joined(given_terms(dim, texts), polynomial_terms(dim, 2))
-    left = _left_over(with_them, prepared, rows)
-    return tuple(texts) if left <= _GAINED * _left_over(family, prepared, rows) else ()
+    left = _left_over(with_them, data, rows)
+    return tuple(texts) if left <= _GAINED * _left_over(family, data, rows) else ()
 
 
 def _between_poles(q: np.ndarray, pole: float) -> bool:
@@ -55,21 +53,21 @@ def _between_poles(q: np.ndarray, pole: float) -> bool:
     return bool(np.ptp(np.floor((q - pole) / np.pi)) == 0)
 
 
-def _left_over(family: Terms | Sums, prepared: Prepared, rows: np.ndarray) -> float:
+def _left_over(family: Terms | Sums, data: Dataset, rows: np.ndarray) -> float:
     """RMS of the held-out target gradients, in units of the coordinates' sizes, that least squares
     leave over; infinite where they fail."""
-    count = -(-_ROWS_PER_TERM * family.num_parameters // (2 * prepared.dim))
-    rows, scale = rows[: count + count // 2], prepared.scale
+    count = -(-_ROWS_PER_TERM * family.num_parameters // (2 * data.dim))
+    rows, scale = rows[: count + count // 2], data.scale
     if len(rows) <= count:
         return np.inf
-    y0, y1 = prepared.y0[rows], prepared.y1[rows]
+    y0, y1 = data.y0[rows], data.y1[rows]
     w = MIDPOINT.evaluation_point(y0, y1)
-    dt = np.reshape(prepared.given(rows)[0], (-1, 1))
+    dt = np.reshape(data.given(rows)[0], (-1, 1))
     target = MIDPOINT.target_gradient(y0, y1, dt)
     try:
         c = fitted_gradients(family, w[:count], target[:count], scale)
     except (FitError, np.linalg.LinAlgError):  # terms that overflow at these states
         return np.inf
-    off = (family.gradient(c, w[count:]) - target[count:]) / np.roll(scale, prepared.dim)
+    off = (family.gradient(c, w[count:]) - target[count:]) / np.roll(scale, data.dim)
     rms = float(np.sqrt(np.mean(off**2)))
     return rms if np.isfinite(rms) else np.inf

@@ -8,12 +8,12 @@ import jax
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
+from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.dataset.structures import fields_of
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.sums import site_terms
 from gfnn_jax.families.terms import given_terms
-from gfnn_jax.learn.candidates import Tolerance
 from gfnn_jax.learn.options import FitOptions
-from gfnn_jax.learn.structures import fields_of
 from gfnn_jax.learn.varied import check_varied
 from gfnn_jax.phase_space import Pairs, sizes, split
 from gfnn_jax.scenes.scene import AroundOrbit, Scene

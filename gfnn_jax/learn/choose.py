@@ -6,14 +6,14 @@ import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.learn.assemble import composed, measured
-from gfnn_jax.learn.candidates import Candidate, Judges
+from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.choose_law import preferred
 from gfnn_jax.learn.clock import ROWS, Budget
 from gfnn_jax.learn.learned_law import assembled as flow_assembled
 from gfnn_jax.learn.map_of_terms import assembled as map_assembled
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import Entry
 from gfnn_jax.learn.searches import Searched
@@ -22,35 +22,34 @@ _BORNE_OUT = 1.1  # of the error that the search measured
 
 
 class Chosen(NamedTuple):
-    """The candidate with its map; the pairs as they were prepared for it, and which of them judged
-    it; the seconds that compiling took; the entry that it comes from, None for H and for an S with
-    parameters."""
+    """The candidate with its map; the data set that it was fitted to and judged by; the seconds
+    that compiling took; the entry that it comes from, None for H and for an S with parameters."""
 
     candidate: Candidate
-    prepared: Prepared
-    judges: Judges
+    data: Dataset
     compile_seconds: float
     entry: Entry | None = None
 
 
 def choose(searched: Searched, request: Request) -> Chosen:
     """The candidate that is taken, its error and its time measured by the steps that users run."""
-    law, judges, budget = searched.law, searched.judges, request.budget
+    law, data = searched.law, searched.data
+    given = data, request.tolerance, request.budget
     if searched.linear is not None:
-        return Chosen(searched.linear, searched.plain, judges, 0.0)
+        return Chosen(searched.linear, data, 0.0)
     if searched.of_terms is not None:
-        candidate, seconds, _ = map_assembled(searched.of_terms, searched.plain, judges, budget)
-        return Chosen(candidate, searched.plain, judges, seconds)
-    ranking, bound = searched.found.ranking, judges.tolerance.bound
+        candidate, seconds, _ = map_assembled(searched.of_terms, *given)
+        return Chosen(candidate, data, seconds)
+    ranking, bound = searched.found.ranking, request.tolerance.bound
     best = ranking[0].candidate if ranking else None
     if law is None or not (best is None or preferred(law.candidate, best, bound)):
         return _of_ranking(ranking, request)
     request.say(f"compiling the flow of {law.candidate.label}")
-    candidate, seconds, _ = flow_assembled(law, searched.plain, judges, budget)
+    candidate, seconds, _ = flow_assembled(law, *given)
     expected = max(bound, _BORNE_OUT * law.candidate.validation_bound)
     if best is not None and not candidate.validation_bound <= expected:
         return _of_ranking(ranking, request)
-    return Chosen(candidate, searched.plain, judges, seconds)
+    return Chosen(candidate, data, seconds)
 
 
 def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
@@ -66,8 +65,8 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     for entry in itertools.chain([first], larger, ranking[1:]):
         say(f"compiling the step of {entry.candidate.chart} {entry.candidate.label}")
         sweep = entry.sweep
-        map_ = composed(sweep.piece(entry.size), sweep.prepared, sweep.judges)
-        assembled = measured(entry.candidate, map_, sweep.prepared, sweep.judges, budget)
+        map_ = composed(sweep.piece(entry.size), sweep.data)
+        assembled = measured(entry.candidate, map_, sweep.data, request.tolerance, budget)
         compile_seconds += assembled.compile_seconds
         tried.append((assembled.candidate, entry))
         expected = max(bound, _BORNE_OUT * entry.candidate.validation_bound)
@@ -76,7 +75,7 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     candidate, entry = min(
         tried, key=lambda t: (t[0].validation_bound > bound, t[0].validation_bound)
     )
-    return Chosen(candidate, entry.sweep.prepared, entry.sweep.judges, compile_seconds, entry)
+    return Chosen(candidate, entry.sweep.data, compile_seconds, entry)
 
 
 def _larger(entry: Entry, budget: Budget, say) -> Iterator[Entry]:

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import FitError
 from gfnn_jax.fitting.base_map import fit_half_map
 from gfnn_jax.generating.charts import CHARTS, TYPE1, AnyChart
 from gfnn_jax.learn.diagnose import SAFE, ChartJudgement, judge_chart
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.maps.affine import Affine
 
 # Where the best chart's determinant falls below this, the map is far from the identity.
@@ -27,15 +27,15 @@ class Charts(NamedTuple):
     messages: list[str]
 
 
-def choose_charts(request: str, prepared: Prepared, reversor, jacobians) -> Charts:
+def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
     """The charts for these data: the one asked for, or with "auto" those that are valid.
 
     A base map is factored out where no chart is valid without it; with "auto" also where the map
     is far from the identity and the base map brings it nearer: S is smoother then. Raises FitError
     where no chart covers the data, or the one asked for is singular over them.
     """
-    judgements = {name: judge_chart(c, jacobians, prepared.scale) for name, c in CHARTS.items()}
-    angular = bool(prepared.coordinates.angles)
+    judgements = {name: judge_chart(c, jacobians, data.scale) for name, c in CHARTS.items()}
+    angular = bool(data.coordinates.angles)
     near_identity = {n: c for n, c in CHARTS.items() if n != "type1"}
     valid = [n for n in near_identity if judgements[n].valid and judgements[n].sign > 0]
     if request == "type1" and angular:
@@ -51,14 +51,14 @@ def choose_charts(request: str, prepared: Prepared, reversor, jacobians) -> Char
         if valid:
             raise FitError(_about(request, judgement, "is singular over the data", valid))
     half = fit_half_map(
-        prepared.y0, prepared.y1, prepared.scale,
-        angles=prepared.coordinates.angles, reversor=reversor,
+        data.y0, data.y1, data.scale,
+        angles=data.coordinates.angles, reversor=reversor,
     )  # fmt: skip
     closest = max((judgements[n].low for n in valid), default=0.0)
     if half is not None and closest < _FAR:
         back = np.asarray(half.inverse().matrix)
         inner = back @ jacobians @ back
-        with_base = {n: judge_chart(c, inner, prepared.scale) for n, c in CHARTS.items()}
+        with_base = {n: judge_chart(c, inner, data.scale) for n, c in CHARTS.items()}
         tried = ("midpoint", "type2", "type3") if request == "auto" else (request,)
         good = [n for n in tried if with_base[n].valid and with_base[n].sign > 0]
         if good and with_base[good[0]].low > closest:

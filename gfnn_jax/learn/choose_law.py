@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError
 from gfnn_jax.fitting.turns import backwards, tangent, turns
-from gfnn_jax.learn.candidates import Candidate, Judges
+from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.clock import Budget, OutOfTime
 from gfnn_jax.learn.flows import learn_hamiltonian
 from gfnn_jax.learn.law_options import OPTIONS
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.scenes.scene import Scene
 
 # Beside a map only a law of few terms is looked for: a larger one is no shorter to say than S. Its
@@ -34,8 +35,8 @@ _TURNED = 0.2  # radians backwards that are worth a word
 
 
 def law_of(
-    prepared: Prepared,
-    judges: Judges,
+    data: Dataset,
+    tolerance: Tolerance,
     scene: Scene | None,
     learn: str,
     terms: Sequence[str | Callable],
@@ -46,19 +47,19 @@ def law_of(
     """The Hamiltonian of these pairs, or None where "auto" finds none, or the budget ends before
     the first.
 
-    prepared: without a base map. dearest: operations of a step of H that is chosen beside a map
-    that meets the tolerance; of use where H is not asked for. Raises FitError where a Hamiltonian
-    is asked for and there is none to learn.
+    data: without a base map. dearest: operations of a step of H that is chosen beside a map that
+    meets the tolerance; of use where H is not asked for. Raises FitError where a Hamiltonian is
+    asked for and there is none to learn.
     """
-    unfit = unfit_for_law(prepared, scene)
+    unfit = unfit_for_law(data, scene)
     if unfit is not None:
         if learn == "hamiltonian":
             raise FitError(f"expected data of an autonomous flow to learn H from: {unfit}")
         return None
     # S of a driven system, or of one with parameters or several dt, needs more terms than H: no map
     # to wait for.
-    structured = prepared.structure is not None
-    foremost = learn == "hamiltonian" or terms or prepared.varied or structured
+    structured = data.structure is not None
+    foremost = learn == "hamiltonian" or terms or data.varied or structured
     options = OPTIONS if foremost else _BESIDE
     if learn == "hamiltonian":  # no map stands in for a law that misses the tolerance
         options = dataclasses.replace(options, only_within=False, gained=_GAINED_ALONE)
@@ -67,7 +68,7 @@ def law_of(
     try:
         with np.errstate(all="ignore"):  # starts that run away are part of the search
             return learn_hamiltonian(
-                prepared, judges, scene, terms=terms, budget=budget, say=say, options=options,
+                data, tolerance, scene, terms=terms, budget=budget, say=say, options=options,
                 dearest=np.inf if foremost else dearest,
             )  # fmt: skip
     except OutOfTime:
@@ -80,31 +81,31 @@ def law_of(
     return None
 
 
-def long_step(prepared: Prepared, scene: Scene | None) -> list[str]:
+def long_step(data: Dataset, scene: Scene | None) -> list[str]:
     """A warning where no H was found and the states turn backwards around their centre.
 
-    prepared: without a base map.
+    data: without a base map.
     """
-    if prepared.varied or prepared.coordinates.angles or unfit_for_law(prepared, scene) is not None:
+    if data.varied or data.coordinates.angles or unfit_for_law(data, scene) is not None:
         return []
-    _, _, jacobian = tangent(prepared.y0, prepared.y1, prepared.scale)
-    angle = backwards(turns(jacobian, prepared.scale)[0])
+    _, _, jacobian = tangent(data.y0, data.y1, data.scale)
+    angle = backwards(turns(jacobian, data.scale)[0])
     if angle < _TURNED:
         return []
     return [
-        f"around their centre a step of {prepared.dt:g} turns the states by {angle:.2g} radians "
+        f"around their centre a step of {data.dt:g} turns the states by {angle:.2g} radians "
         f"backwards, or by {2 * np.pi - angle:.2g} forwards (ωh > π): pairs of one dt may then not "
         "determine H; sample with a smaller dt, or with several"
     ]
 
 
-def unfit_for_law(prepared: Prepared, scene: Scene | None) -> str | None:
+def unfit_for_law(data: Dataset, scene: Scene | None) -> str | None:
     """Why the pairs are not those of an autonomous flow, where that is known."""
     if scene is not None and scene.timeless:
         return f"the scene {scene.name} is a map without time"
-    if scene is not None and scene.period is not None and prepared.period is None:
+    if scene is not None and scene.period is not None and data.period is None:
         return f"the Hamiltonian of the scene {scene.name} depends on time"
-    if any(a >= prepared.dim for a in prepared.coordinates.angles):
+    if any(a >= data.dim for a in data.coordinates.angles):
         return "a momentum is an angle"
     return None
 

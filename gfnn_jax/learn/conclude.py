@@ -7,9 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.learn.assemble import stepped
-from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance
+from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.check import not_radians, wrapped
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.choose_law import long_step
@@ -48,7 +50,7 @@ class Conclusion(NamedTuple):
 def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion:
     """What is to be said of the chosen map."""
     candidate, law, found = chosen.candidate, searched.law, searched.found
-    met = searched.judges.met_by(candidate)
+    met = searched.tolerance.met_by(candidate)
     ended, noise, messages, unmet, reason = found.ended, None, [], "", ""
     if not searched.swept:
         cut = request.budget.ended or (law.ended if law is not None else "")
@@ -67,7 +69,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         messages += law.messages if said else ()
         unmet = law.unmet if said else ""
     if met:
-        return Conclusion(ended, searched.judges.pairs.std, [*messages, *request.budget.left_out])
+        return Conclusion(ended, searched.data.noise, [*messages, *request.budget.left_out])
     diagnosis: list[str] = []
     jumps = wrapped(request.pairs, request.coordinates)
     structured = request.structure is not None  # too few pairs to look at their neighbours
@@ -87,10 +89,10 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         elif reason:
             ended = f"{ended}; {reason}"
     if request.seeks_law and not structured and not searched.met_by_law:
-        diagnosis += long_step(searched.plain, request.scene)
-    messages += not_radians(chosen.judges.pairs, request.coordinates)
+        diagnosis += long_step(searched.data, request.scene)
+    messages += not_radians(chosen.data.pairs, request.coordinates)
     if not structured:
-        diagnosis += proposed(searched.plain)
+        diagnosis += proposed(searched.data)
     if unmet and noise is None and not reason:  # else it is known why
         messages = [unmet, *messages]
     unmet = not_met(candidate, request.tolerance, ended)
@@ -113,8 +115,8 @@ def _work(entry: Entry | None) -> float:
     half of the rows, steps in NumPy, and compiled ones for the derivative of a step."""
     if entry is None:
         return 0.0
-    width, count = 2 * entry.sweep.prepared.dim, entry.candidate.num_parameters
-    rows = len(entry.sweep.judges.training) * width
+    width, count = 2 * entry.sweep.data.dim, entry.candidate.num_parameters
+    rows = len(entry.sweep.data.training) * width
     steps = OF_STEPS * (_RESIDUAL_PAIRS + _NOISE_PAIRS * width / 10)
     return 2 * OF_SOLVE * count**3 + 2 * rows * count**2 + steps * entry.size.operations
 
@@ -159,12 +161,12 @@ def _residuals_of_sample(
     candidate: Candidate, entry: Entry | None, searched: Searched
 ) -> _Sample:  # fmt: skip
     """The residuals of the entry's map, or of the candidate's where there is none."""
-    judges = searched.judges if entry is None else entry.sweep.judges
-    rows = np.sort(judges.training)[:_RESIDUAL_PAIRS]
-    y0, residual, solved = _residuals(candidate, entry, judges, rows)
+    data = searched.data if entry is None else entry.sweep.data
+    rows = np.sort(data.training)[:_RESIDUAL_PAIRS]
+    y0, residual, solved = _residuals(candidate, entry, data, rows)
     rows, y0, residual = rows[solved], y0[solved], residual[solved]
-    sequence = np.asarray(judges.pairs.run)[rows]
-    scale = judges.spread if entry is None else entry.sweep.prepared.scale
+    sequence = data.run[rows]
+    scale = data.spread if entry is None else data.scale
     return _Sample(rows, y0, residual, scale, sequence)
 
 
@@ -205,26 +207,26 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
 
     The residuals are those of the chosen map, or of the best generated one where H was chosen.
     """
-    candidate, judges = chosen.candidate, searched.judges
+    candidate, data = chosen.candidate, searched.data
     entry = chosen.entry or next(iter(searched.found.ranking), None)
     if entry is not None:
-        judges = entry.sweep.judges
+        data = entry.sweep.data
     sample = _residuals_of_sample(candidate, entry, searched)
     known = _no_noise(sample, stalled)
     if known is not None:
         return known
     rows, sequence = sample.rows, sample.sequence
     law = searched.law
-    taken = candidate.num_parameters / (judges.training.size * 2 * judges.pairs.dim)
-    noise = state_noise(candidate.map, judges.pairs.take(rows[:_NOISE_PAIRS]), taken)
+    taken = candidate.num_parameters / (data.training.size * 2 * data.dim)
+    noise = state_noise(candidate.map, data.pairs.take(rows[:_NOISE_PAIRS]), taken)
     if law is not None and law.noise is not None and candidate.learns == "hamiltonian":
         # Along an arc what the law misses adds up, and looks like noise.
         noise = np.minimum(law.noise, noise)
-    if judges.pairs.std is not None:
-        return _beside_known(noise, judges.pairs.std)
+    if data.noise is not None:
+        return _beside_known(noise, data.noise)
     own, sizes_of_noise = "", ", ".join(f"{sigma:.1e}" for sigma in noise)
     if candidate.learns == "map" and entry is not None and isinstance(entry.sweep, LinearSweep):
-        part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / judges.spread) ** 2))
+        part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / data.spread) ** 2))
         own = f" (the map's own error is then about {part:.1g} of it)"
     hidden = ""
     if len(np.unique(sequence)) == len(sequence):
@@ -233,7 +235,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
             "single pairs do not tell from noise, "
         )
     of_law = law if candidate.learns == "hamiltonian" and not hidden else None
-    if of_law is not None and leaves_white(of_law, searched.plain, judges):
+    if of_law is not None and leaves_white(of_law, searched.data):
         message = (
             "H is right, as far as these pairs tell: what it leaves over is white, noise of about "
             f"{sizes_of_noise} on the coordinates in their order"
@@ -265,10 +267,10 @@ def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOv
     """Noise, where other libraries of the structure leave as much."""
     if not stalled:
         return _LeftOver(None, [])
-    judges = chosen.judges
-    few = max(1, _NOISE_NUMBERS // (2 * judges.pairs.dim))
-    rows = np.sort(judges.training)[:few]
-    noise = noise_of_sites(chosen.candidate.map, judges.pairs.take(rows))
+    data = chosen.data
+    few = max(1, _NOISE_NUMBERS // (2 * data.dim))
+    rows = np.sort(data.training)[:few]
+    noise = noise_of_sites(chosen.candidate.map, data.pairs.take(rows))
     message = (
         "other libraries of the structure are no more accurate: the pairs seem to carry noise of "
         f"about {noise[0]:.1e} on positions and {noise[-1]:.1e} on momenta, or to have terms that "
@@ -278,15 +280,14 @@ def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOv
 
 
 def _residuals(
-    chosen: Candidate, entry: Entry | None, judges: Judges, rows
+    chosen: Candidate, entry: Entry | None, data: Dataset, rows
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States and residuals (N, 2d) of these pairs, and which of them were predicted (N,): as
-    prepared where S was learned, in the user's coordinates where only a law was."""
+    inner ones where S was learned, in the user's coordinates where only a law was."""
     if entry is not None:
-        prepared = entry.sweep.prepared
         images, solved = entry.sweep.images(entry.size, rows)
-        return prepared.y0[rows], prepared.y1[rows] - images, solved
-    pairs, coordinates = judges.pairs.take(rows), chosen.map.coordinates
+        return data.y0[rows], data.y1[rows] - images, solved
+    pairs, coordinates = data.pairs.take(rows), chosen.map.coordinates
     angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
     z0 = np.asarray(pairs.z0)
     steps = stepped(chosen.map, z0, pairs.dt, pairs.args, timed=False)

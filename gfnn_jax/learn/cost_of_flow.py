@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting.gauss_newton import rates
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.gauss import gauss
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.phase_space import symplectic_form
 
 CONTRACTING = 0.8  # a fixed point's factor up to which it is preferred to Newton's method
@@ -35,19 +35,19 @@ def operations_of(family, width: int, fastest, dt: float, steps: Steps) -> float
     return float(steps.substeps * iterations * s * (gradient + 2 * width * s))
 
 
-def flow_operations(flow: Flow, prepared: Prepared) -> float:
+def flow_operations(flow: Flow, data: Dataset) -> float:
     """Floating-point operations per step of the flow."""
-    fastest = rates(flow.family, flow.params, prepared.y0[:FREQUENCY_STATES])
+    fastest = rates(flow.family, flow.params, data.y0[:FREQUENCY_STATES])
     steps = Steps(flow.stages, flow.substeps)
-    return operations_of(flow.family, len(prepared.scale), fastest, float(flow.dt), steps)
+    return operations_of(flow.family, len(data.scale), fastest, float(flow.dt), steps)
 
 
-def omega_h_of(family, coefficients, prepared: Prepared, fastest) -> float:
+def omega_h_of(family, coefficients, data: Dataset, fastest) -> float:
     """The fastest oscillation of the linearised flow, radians per step, its median over states."""
     if not matrix_free(family):
         some = slice(FREQUENCY_STATES)
-        z, args = prepared.y0[some], prepared.given(some)[1]
+        z, args = data.y0[some], data.given(some)[1]
         _, hessian = family.gradient_and_hessian(coefficients, z, args)
-        turned = symplectic_form(prepared.dim) @ hessian
+        turned = symplectic_form(data.dim) @ hessian
         fastest = np.abs(np.linalg.eigvals(turned).imag).max(axis=-1)
-    return float(prepared.dt * np.median(fastest))
+    return float(data.dt * np.median(fastest))

@@ -18,14 +18,13 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import AnyChart
-from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.choose_charts import choose_charts
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.rows import rows_of
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping
@@ -83,26 +82,25 @@ def area_factors(jacobians, scale) -> np.ndarray:
 
 
 def learn_damping(
-    prepared: Prepared, judges: Judges, jacobians, error: float, chart: str, reversor
+    data: Dataset, jacobians, error: float, chart: str, reversor
 ) -> LearnedDamping | None:
     """The D_b behind these pairs; None where areas are kept, or no D_b explains what is lost.
 
-    prepared: the judges' pairs, without a base map. jacobians: (n, 2d, 2d) local ones, known to
+    data: without a base map. jacobians: (n, 2d, 2d) local ones, known to
     the error.
     """
-    factors, dim = area_factors(jacobians, prepared.scale), prepared.dim
+    factors, dim = area_factors(jacobians, data.scale), data.dim
     b = float(np.median(factors))
     deviation = 1.5 * float(np.median(np.abs(factors - b))) / np.sqrt(len(factors))
     if not b > 0 or not abs(b - 1) > max(3 * error, _CERTAIN * deviation):
         return None
     start = LearnedDamping(np.asarray(b), np.asarray(np.inf), np.zeros(dim))
-    undamped = prepared.without(None, start.piece)
+    undamped = data.without(None, start.piece)
     try:
         charts = choose_charts(chart, undamped, reversor, start.undone(jacobians))
     except FitError:  # no chart covers the rest
         return None
-    rows = judges.training, judges.held_out
-    problems = [_Problem(prepared, each, charts.half, *rows) for each in charts.charts]
+    problems = [_Problem(data, each, charts.half) for each in charts.charts]
 
     def best(spread: np.ndarray) -> tuple[_Fitted, _Problem]:
         found = [(problem.best(spread, np.full(len(spread), b)), problem) for problem in problems]
@@ -155,11 +153,9 @@ class _Problem:
     """The pairs, chart and half base map of the symplectic part, and the rows that train and
     judge."""
 
-    prepared: Prepared
+    data: Dataset
     chart: AnyChart
     half: Affine | None
-    training: np.ndarray
-    held_out: np.ndarray
 
     def best(self, spread: np.ndarray, factor: np.ndarray) -> _Fitted:
         """Of the degrees of S, that which leaves least of the held-out rows.
@@ -180,7 +176,7 @@ class _Problem:
     def _families(self, spread, factor) -> Iterator[Products]:
         """By rising degree, those that the training rows determine in reasonable time."""
         undamped = self._undamped(_momenta(spread, factor), self._drift(0.0))
-        w = rows_of(undamped, self.chart, self.training)[0][0]
+        w = rows_of(undamped, self.chart, self.data.training)[0][0]
         inputs = box_inputs(w, angles=tuple(self._angles), cyclic=undamped.coordinates.cyclic)
         for degree in _DEGREES:
             family = Products(inputs, degree)
@@ -197,7 +193,7 @@ class _Problem:
         for _ in range(_UPDATES):
             b, c = _momenta(spread, factor), self._drift(shift)
             undamped = self._undamped(b, c)
-            terms, target = self._design(family, undamped, self.training)
+            terms, target = self._design(family, undamped, self.data.training)
             solved = _solved(terms, target)
             columns = self._columns(family, solved, undamped, spread, b, c)
             change, std = _last_unknowns(np.column_stack([terms, columns, target]), terms.shape[1])
@@ -206,22 +202,22 @@ class _Problem:
             factor, shift = factor + change[:k], shift + change[k:]
             if not (factor > 0).all():
                 return _Fitted(factor, np.full(k, np.inf), c, np.inf)
-        held, wanted = self._design(family, undamped, self.held_out)
+        held, wanted = self._design(family, undamped, self.data.validation)
         rms = float(np.sqrt(np.mean((held @ solved - wanted) ** 2)))
         return _Fitted(factor, std[:k], c, rms, family)
 
-    def _design(self, family: Products, undamped: Prepared, rows) -> tuple[np.ndarray, np.ndarray]:
+    def _design(self, family: Products, undamped: Dataset, rows) -> tuple[np.ndarray, np.ndarray]:
         """The terms' gradients (n, m) and what they must add up to (n,), each row without unit."""
         (w, target), weight = rows_of(undamped, self.chart, rows)
         terms = family.term_gradients(w) * weight[:, None]
         return terms.reshape(-1, terms.shape[-1]), (target * weight).ravel()
 
-    def _columns(self, family: Products, solved, undamped: Prepared, spread, b, c) -> np.ndarray:
+    def _columns(self, family: Products, solved, undamped: Dataset, spread, b, c) -> np.ndarray:
         """(n, k + a): the derivatives of the residuals of ∇S in b and c, which move the momenta of
         D_b⁻¹Z = (Q, (P − c)/b)."""
-        dim, chart, dt = self.prepared.dim, self.chart, undamped.dt
-        (w, _), weight = rows_of(undamped, chart, self.training)
-        p = (split(self.prepared.y1[self.training])[1] - c) / b
+        dim, chart, dt = self.data.dim, self.chart, undamped.dt
+        (w, _), weight = rows_of(undamped, chart, self.data.training)
+        p = (split(self.data.y1[self.data.training])[1] - c) / b
         by_factor = -(p / b)[:, None, :] * spread
         by_shift = np.broadcast_to(-np.eye(dim)[self._angles] / b, (len(p), len(self._angles), dim))
         moved = np.concatenate([by_factor, by_shift], axis=1)
@@ -237,17 +233,17 @@ class _Problem:
     @property
     def _angles(self) -> list[int]:
         """The angles that S is periodic in: their momenta may drift."""
-        coordinates, dim = self.prepared.coordinates, self.prepared.dim
+        coordinates, dim = self.data.coordinates, self.data.dim
         return [a for a in coordinates.angles if a < dim and a not in coordinates.cyclic]
 
     def _drift(self, shift) -> np.ndarray:
-        drift = np.zeros(self.prepared.dim)
+        drift = np.zeros(self.data.dim)
         drift[self._angles] = shift
         return drift
 
-    def _undamped(self, b, c) -> Prepared:
+    def _undamped(self, b, c) -> Dataset:
         """The pairs of the symplectic part, without its base map."""
-        found = self.prepared.without(None, Damping(b, c))
+        found = self.data.without(None, Damping(b, c))
         return found if self.half is None else found.without(self.half, self.half)
 
 

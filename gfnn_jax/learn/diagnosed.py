@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.families.terms import given_terms
-from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.choose_charts import Charts, choose_charts
 from gfnn_jax.learn.damping import LearnedDamping, learn_damping, where_areas_differ
 from gfnn_jax.learn.diagnose import (
@@ -18,58 +18,53 @@ from gfnn_jax.learn.diagnose import (
     sampled_dimension,
 )
 from gfnn_jax.learn.factor_out import factored_out, flow_of
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.varied import given_by
 
 
 class Diagnosis(NamedTuple):
-    """prepared: without what was factored out. plain: without base map and law, yet without a
+    """data: without what was factored out. plain: without base map and law, yet without a
     ``damping`` of areas, where one was found."""
 
-    prepared: Prepared
-    plain: Prepared
+    data: Dataset
+    plain: Dataset
     charts: Charts
     data_defect: float
     messages: list[str]
     damping: LearnedDamping | None = None
 
 
-def diagnose_request(request: Request, plain: Prepared, judges: Judges) -> Diagnosis:
+def diagnose_request(request: Request, plain: Dataset) -> Diagnosis:
     """The diagnosis of the pairs that a fit takes; a law that the user knows is factored out.
 
-    plain: the judges' pairs as prepared. Raises FitError where no chart covers the data.
+    plain: as taken. Raises FitError where no chart covers the data.
     """
     if plain.varied or plain.structure is not None:  # H or a sum of terms is looked for first
         return Diagnosis(plain, plain, Charts([], None, {}, []), float("nan"), [])
-    prepared, options = plain, request.options
+    data, options = plain, request.options
     if options.base is not None:
         known = given_terms(plain.dim, (options.base,))
         flow = flow_of(known, np.ones(known.num_parameters), plain)
-        _, prepared = factored_out([flow], plain, options.seed)
+        _, data = factored_out([flow], plain, options.seed)
     # A law of the user's keeps areas, and so does what H of an autonomous system generates.
     may_lose = options.base is None and options.learn != "hamiltonian" and not plain.after
-    return diagnosed(
-        prepared, options.chart, request.reversor, options.seed, judges if may_lose else None
-    )
+    return diagnosed(data, options.chart, request.reversor, options.seed, may_lose=may_lose)
 
 
-def diagnosed(
-    prepared: Prepared, chart: str, reversor, seed: int, damped: Judges | None = None
-) -> Diagnosis:
+def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = False) -> Diagnosis:
     """What the local Jacobians say: whether the pairs look symplectic, and which charts cover
     them; the base map is factored out where one is needed.
 
-    damped: of these pairs, where a map that loses area is looked for: its D_b is factored out too.
+    may_lose: whether a map that loses area is looked for: its D_b is factored out too.
     """
-    plain = prepared
+    plain = data
     jacobians, error = local_jacobians(plain.y0, plain.y1, plain.scale, given_by(plain), seed=seed)
     defect, messages, damping = data_defect(jacobians, plain.scale), _thin(plain), None
-    if damped is not None:
-        damping = learn_damping(plain, damped, jacobians, error, chart, reversor)
+    if may_lose:
+        damping = learn_damping(plain, jacobians, error, chart, reversor)
     if damping is not None:
         jacobians = damping.undone(jacobians)
-        prepared = plain = plain.without(None, damping.piece)
+        data = plain = plain.without(None, damping.piece)
     elif not look_symplectic(jacobians, error, plain.scale):
         differing = where_areas_differ(jacobians, centres(plain.y0, jacobians, seed), plain.scale)
         messages.append(
@@ -77,17 +72,17 @@ def diagnosed(
             f"{error:.1g} (0 for a symplectic map): are q and p in order, p momenta and not "
             f"velocities, and no friction?{differing}"
         )
-    charts = choose_charts(chart, prepared, reversor, jacobians)
+    charts = choose_charts(chart, data, reversor, jacobians)
     if charts.half is not None:
-        prepared = prepared.without(charts.half, charts.half)
-    return Diagnosis(prepared, plain, charts, defect, [*messages, *charts.messages], damping)
+        data = data.without(charts.half, charts.half)
+    return Diagnosis(data, plain, charts, defect, [*messages, *charts.messages], damping)
 
 
-def _thin(prepared: Prepared) -> list[str]:
+def _thin(data: Dataset) -> list[str]:
     """A warning where the states lie on a curve, or on the torus of an orbit."""
-    seen = [i for i in range(2 * prepared.dim) if i not in prepared.coordinates.cyclic]
-    dimension = sampled_dimension(prepared.y0[:, seen], prepared.scale[seen])
-    if dimension > min(prepared.dim, len(seen) - 1):
+    seen = [i for i in range(2 * data.dim) if i not in data.coordinates.cyclic]
+    dimension = sampled_dimension(data.y0[:, seen], data.scale[seen])
+    if dimension > min(data.dim, len(seen) - 1):
         return []
     where = "a curve" if dimension == 1 else f"a surface of dimension {dimension}"
     return [

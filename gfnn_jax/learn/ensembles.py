@@ -72,13 +72,13 @@ class EnsembleSweep(NetworkSweep):
         Where the held-out residuals of ∇S are larger than the members' spread, that part of them is
         noise which polynomials leave too; the spread has it already. All else is misfit.
         """
-        (w, target), weight = rows_of(self.prepared, self.chart, self.judges.held_out)
+        (w, target), weight = rows_of(self.data, self.chart, self.data.validation)
         each = np.stack([size.family.gradient(only, w) for only in np.eye(len(self._params))])
         spread = weight * each.std(axis=0, ddof=1)
         left = weight * (each.mean(axis=0) - target)
         ratio, noise = float(np.mean((left / spread) ** 2)), 0.0
         if ratio > 1:
-            noise = min(1.0, trial_residual(self.prepared) ** 2 / float(np.mean(left**2)))
+            noise = min(1.0, trial_residual(self.data) ** 2 / float(np.mean(left**2)))
         factor = np.sqrt(noise + (1 - noise) * _ALIKE * ratio)
         count = len(self._params)
         return factor / np.sqrt(count - 1) * (np.eye(count) - 1 / count)

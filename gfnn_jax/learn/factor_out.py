@@ -7,36 +7,36 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import Problem, rates
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.learn.cost_of_flow import CONTRACTING, FREQUENCY_STATES, contraction_of
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.sweeps import trial_residual
 
 TRIAL_PAIRS = 1_000  # by which it is found out where a flow is to be factored out
 
 
-def factored_out(flows: Sequence[Flow], plain: Prepared, seed: int) -> tuple[Flow, Prepared]:
+def factored_out(flows: Sequence[Flow], data: Dataset, seed: int) -> tuple[Flow, Dataset]:
     """The pairs without one of these flows: before, after, or half on either side of what is
     learned, whichever leaves the map that a small S comes closest to."""
 
-    def left_over(prepared: Prepared) -> float:
-        rows = np.random.default_rng(seed).permutation(len(prepared.y0))[:TRIAL_PAIRS]
-        return trial_residual(prepared.take(rows))
+    def left_over(rest: Dataset) -> float:
+        rows = np.random.default_rng(seed).permutation(len(rest))[:TRIAL_PAIRS]
+        return trial_residual(rest.take(rows))
 
-    tried = [(flow, plain.without(*pieces)) for flow in flows for pieces in around(flow)]
-    errors = [left_over(prepared) for _, prepared in tried]
+    tried = [(flow, data.without(*pieces)) for flow in flows for pieces in around(flow)]
+    errors = [left_over(rest) for _, rest in tried]
     return tried[0] if errors[0] <= 2 * min(errors) else tried[int(np.argmin(errors))]
 
 
-def flow_of(family: Terms, params, prepared: Prepared) -> Flow:
+def flow_of(family: Terms, params, data: Dataset) -> Flow:
     """The flow of a law over dt, to roundoff: to be factored out.
 
-    prepared: without a base map. Raises FitError where it has no image of some of the states.
+    data: without a base map. Raises FitError where it has no image of some of the states.
     """
-    y0, y1, dt, scale = prepared.y0, prepared.y1, prepared.dt, prepared.scale
+    y0, y1, dt, scale = data.y0, data.y1, data.dt, data.scale
     problem = Problem(y0, y1, dt, scale)
     (steps,) = problem.fine_steps(family, params, np.arange(len(y0)))
     fastest = rates(family, params, y0[:FREQUENCY_STATES])

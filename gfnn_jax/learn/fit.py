@@ -19,12 +19,13 @@ import jax
 import numpy as np
 
 from gfnn_jax.data.recording import Recording
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.errors import FitError, FitWarning, InputError, OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.assemble import block_of
-from gfnn_jax.learn.candidates import Candidate, Judges, Tolerance
+from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.clean import clean
 from gfnn_jax.learn.clock import COMPILE, MAX_SECONDS, ROWS, Budget
@@ -317,9 +318,7 @@ def fit(
     warn(request.messages)
     on_progress("looking at the map's local Jacobians")
     with row_blocks.on_devices(_devices(options.devices)):
-        pairs, plain, row, about_pairs = clean(
-            *identified(request.pairs), request.coordinates, request.structure
-        )
+        data, about_pairs = clean(identified(request.pairs), request.coordinates, request.structure)
         warn(about_pairs)
         looked_at = len(looked_for_errors(len(request.pairs)))
         if looked_at < len(request.pairs):
@@ -327,51 +326,51 @@ def fit(
                 f"a look for gross errors at all but {looked_at:,} of {len(request.pairs):,} pairs",
                 "those that the map misses by far are found in the end",
             )
-        judges = Judges.of(pairs, options.seed, request.tolerance)
-        for asked, prepared in structures_to_try(request, pairs, plain):
-            request, plain = asked, prepared
-            seen = diagnose_request(request, plain, judges)
+        data = data.divided(options.seed)
+        for asked, same in structures_to_try(request, data):
+            request, data = asked, same
+            seen = diagnose_request(request, data)
             if seen.damping is not None:
                 on_progress(str(seen.damping))
-            found = searched(request, plain, seen, judges, on_better)
+            found = searched(request, data, seen, on_better)
             if found.met_by_law:
                 break
         warn(seen.messages)
-        seen, found, about_pairs = without_gross_errors(request, seen, found, row)
+        seen, found, about_pairs = without_gross_errors(request, seen, found)
         warn(about_pairs)
         found = without_bias(found, request)
-        pairs = found.judges.pairs
+        data = found.data
         chosen = with_posterior(choose(found, request), found)
         on_progress("the test pairs: the error that is stated")
         error = stated(chosen, found)
         chosen = chosen._replace(candidate=error.candidate)
         conclusion = conclude(chosen, found, request)
         warn(conclusion.messages)
-    judged = min(_JUDGED, block_of(2 * pairs.dim))
-    test = chosen.judges.pairs.take(chosen.judges.held_out[:judged])
+    judged = min(_JUDGED, block_of(2 * data.dim))
+    some = chosen.data.pairs.take(chosen.data.validation[:judged])
     return Fit(
         map=chosen.candidate.map,
         candidates=_all_candidates(chosen, found),
         asked=request.tolerance,
-        num_pairs=len(pairs),
-        validation_pairs=pairs.take(found.judges.held_out),
+        num_pairs=len(data),
+        validation_pairs=data.pairs.take(data.validation),
         judgements=found.charts.judgements,
         data_defect=seen.data_defect,
-        base_map=bool(chosen.prepared.before or chosen.prepared.after),
+        base_map=bool(chosen.data.before or chosen.data.after),
         hamiltonian=found.law,
         noise=conclusion.noise,
         messages=tuple(messages),
         ended=conclusion.ended,
         seconds=budget.seconds,
         compile_seconds=chosen.compile_seconds,
-        test_states=np.asarray(test.z0),
-        test_args=test.args,
+        test_states=np.asarray(some.z0),
+        test_args=some.args,
         model_determinant_min=_smallest_determinant(chosen),
-        pairs=pairs,
+        pairs=data.pairs,
         scene=scene,
         damping=seen.damping if chosen.candidate.learns == "map" else None,
         stated_by=error.words,
-        test_pairs=pairs.take(found.judges.test) if len(found.judges.test) else None,
+        test_pairs=data.pairs.take(data.test) if len(data.test) else None,
         operations=budget.operations,
         budget=budget,
     )
@@ -454,15 +453,15 @@ def _all_candidates(chosen: Chosen, found: Searched) -> tuple[Candidate, ...]:
 def _smallest_determinant(chosen: Chosen) -> float:
     """The chart's determinant over some held-out pairs, where it is closest to 0. NaN where no
     piece has a chart. NumPy."""
-    map_, prepared = chosen.candidate.map, chosen.prepared
+    map_, data = chosen.candidate.map, chosen.data
     piece = next((p for p in map_.pieces if isinstance(p, Generated)), None)
     if piece is None:
         return float("nan")
     piece = jax.tree.map(np.asarray, piece)
-    rows = chosen.judges.held_out[:_JUDGED]
-    dt, args = prepared.given(rows)
-    piece = dataclasses.replace(piece, dt=dt) if prepared.own_dt is not None else piece
-    determinant = piece.determinant(prepared.y0[rows], prepared.y1[rows], args)
+    rows = data.validation[:_JUDGED]
+    dt, args = data.given(rows)
+    piece = dataclasses.replace(piece, dt=dt) if data.own_dt is not None else piece
+    determinant = piece.determinant(data.y0[rows], data.y1[rows], args)
     return float(determinant[np.argmin(np.abs(determinant))])
 
 

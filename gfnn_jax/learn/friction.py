@@ -15,18 +15,18 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.lagrangian import LINEAR, Friction
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.uniform import Uniform, without_forces
-from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.lagrangians import lagrangian_of
 from gfnn_jax.learn.law_libraries import libraries_of, modes_of
 from gfnn_jax.learn.law_options import OPTIONS, Options
 from gfnn_jax.learn.law_work import LawWork
 from gfnn_jax.learn.learned_law import FittedLaw
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.phase_space import split
 
 _CERTAIN = 5.0  # standard errors of a coefficient of friction
@@ -46,13 +46,13 @@ def linear_in_velocities(family) -> Forced:
 
 
 def beside_friction(
-    problem: Problem, work: LawWork, before: Searched, prepared: Prepared, judges: Judges,
+    problem: Problem, work: LawWork, before: Searched, data: Dataset, tolerance: Tolerance,
     search: Callable[[Forces], Searched],
 ) -> Searched:  # fmt: skip
     """The best that ``search`` finds with friction, where H alone, ``before``, misses the tolerance
     and friction is certain and worth it; else ``before``."""
-    best, bound, rows = before, judges.tolerance.bound, judges.training[:_LOOKED_AT]
-    simple = prepared.args is None and prepared.structure is None
+    best, bound, rows = before, tolerance.bound, data.training[:_LOOKED_AT]
+    simple = data.args is None and data.structure is None
     if not simple or best[0].error.bound <= bound:
         return before
     work.capped(before[1].max_operations)
@@ -63,7 +63,7 @@ def beside_friction(
     except OutOfTime:
         work.budget.leave_out("H with friction", work.ended)
         return before
-    for forces in (Uniform, linear_in_velocities)[: 1 if prepared.dim == 1 else 2]:
+    for forces in (Uniform, linear_in_velocities)[: 1 if data.dim == 1 else 2]:
         try:
             found = search(forces)
         except OutOfTime:
@@ -84,12 +84,12 @@ def beside_friction(
 
 
 def mechanical(
-    problem: Problem, work: LawWork, prepared: Prepared, judges: Judges
+    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance
 ) -> FittedLaw | None:
     """The law of a Lagrangian, without friction or with it, as `beside_friction` would have it;
     None where the pairs are of no such system."""
     try:
-        alone = lagrangian_of(problem, work, prepared, judges)
+        alone = lagrangian_of(problem, work, data, tolerance)
     except OutOfTime:
         work.budget.leave_out("the Lagrangian", work.ended)
         return None
@@ -99,22 +99,20 @@ def mechanical(
         return None
 
     def search(forces: Forces) -> Searched:
-        found = lagrangian_of(problem, work, prepared, judges, forces)
+        found = lagrangian_of(problem, work, data, tolerance, forces)
         assert found is not None
         return found, OPTIONS
 
-    return beside_friction(problem, work, (alone, OPTIONS), prepared, judges, search)[0]
+    return beside_friction(problem, work, (alone, OPTIONS), data, tolerance, search)[0]
 
 
-def libraries_with(
-    forces: Forces, prepared: Prepared, judges: Judges, scene, terms, options: Options
-) -> Iterator[Any]:
+def libraries_with(forces: Forces, data: Dataset, scene, terms, options: Options) -> Iterator[Any]:
     """The families of H by rising size, each with these forces; of angles their shortest modes."""
-    basis = modes_of(prepared, scene, terms)
+    basis = modes_of(data, scene, terms)
     if basis is None:
-        yield from map(forces, libraries_of(prepared, judges, scene, terms, options))
+        yield from map(forces, libraries_of(data, scene, terms, options))
         return
-    most = len(judges.training) * 2 * prepared.dim / options.rows_per_term
+    most = len(data.training) * 2 * data.dim / options.rows_per_term
     for size in _BOXES:
         family = basis.terms(basis.box(*size))
         if family.num_parameters < most:

@@ -13,9 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
-from gfnn_jax.learn.candidates import Judges
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.learn.diagnosed import Diagnosis, diagnose_request
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.learn.sweeps import LinearSweep
@@ -45,38 +44,34 @@ class Cleaned(NamedTuple):
     messages: list[str]
 
 
-def without_gross_errors(
-    request: Request, seen: Diagnosis, found: Searched, row: np.ndarray
-) -> Cleaned:
+def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> Cleaned:
     """Searched again without gross errors, as long as that lowers what is left over of the others;
-    as it is, where the tolerance is met, there are none, or too many. row: (N,) the user's row of
-    each pair."""
-    count, gone = len(found.judges.pairs), 0
-    kept = np.arange(count)
+    as it is, where the tolerance is met, there are none, or too many."""
+    everyone, gone = found.data, 0
+    count = len(everyone)
     request = dataclasses.replace(request, factors=None, checkpoints=None)
     for _ in range(_ROUNDS):
         size = _residuals(found)
         if size is None:
             break
-        rows = _standing_alone(found.plain, size)
+        rows = _standing_alone(found.data, size)
         if not len(rows) or gone + len(rows) > _MOST * count or request.budget.over:
             break
         others = np.setdiff1d(np.arange(len(size)), rows)
         if not _rms(size) > _SPOILT * _rms(size[others]):
             break
-        pairs, plain = found.judges.pairs, found.plain
-        pairs, plain = pairs.take(others), plain.take(others)
         request.say(f"without {gone + len(rows)} of {count} pairs that are gross errors")
-        judges = Judges.of(pairs, request.options.seed, request.tolerance)
-        diagnosis = diagnose_request(request, plain, judges)
-        again = searched(request, plain, diagnosis, judges, None)
+        data = found.data.take(others)
+        diagnosis = diagnose_request(request, data)
+        again = searched(request, data, diagnosis, None)
         left = _residuals(again)
         if left is not None and not _rms(left) <= _RISE * _rms(size[others]):
             break
-        seen, found, gone, kept = diagnosis, again, gone + len(rows), kept[others]
+        seen, found, gone = diagnosis, again, gone + len(rows)
     if not gone:
         return Cleaned(seen, found, [])
-    rows = ", ".join(map(str, row[np.setdiff1d(np.arange(count), kept)[:5]]))
+    left_out = everyone.row[~np.isin(everyone.row, found.data.row)]
+    rows = ", ".join(map(str, left_out[:5]))
     rows += ", …" if gone > 5 else ""
     return Cleaned(seen, found, [
         f"{gone} of {count} pairs (rows {rows}) are gross errors beside the map of the others: "
@@ -91,19 +86,19 @@ def _rms(size) -> float:
 def _residuals(found: Searched) -> np.ndarray | None:
     """(N,) what the best map leaves of every pair; of a law by its steps ÷ scale, of S in its
     gradient, which has the same unit. None where it meets the tolerance, or is neither."""
-    law, judges, plain = found.law, found.judges, found.plain
+    law, data, tolerance = found.law, found.data, found.tolerance
     entry = next(iter(found.found.ranking), None)
     best = min(
         (c for c in (law and law.candidate, entry and entry.candidate) if c is not None),
         key=lambda c: c.validation_relative, default=None,
     )  # fmt: skip
-    if best is None or judges.met_by(best) or best.validation_relative <= _ROUNDOFF:
+    if best is None or tolerance.met_by(best) or best.validation_relative <= _ROUNDOFF:
         return None
-    if plain.structure is not None or plain.varied:
+    if data.structure is not None or data.varied:
         return None
     if law is not None and best is law.candidate:
-        left = (law.flow.image(plain.y0) - plain.y1) / plain.scale
-    elif entry is not None and isinstance(entry.sweep, LinearSweep) and _same(entry.sweep, judges):
+        left = (law.flow.image(data.y0) - data.y1) / data.scale
+    elif entry is not None and isinstance(entry.sweep, LinearSweep) and _same(entry.sweep, data):
         left = entry.sweep.left_over(entry.size)
     else:
         return None
@@ -111,11 +106,11 @@ def _residuals(found: Searched) -> np.ndarray | None:
     return np.where(np.isfinite(size), size, np.inf)
 
 
-def _same(sweep: LinearSweep, judges: Judges) -> bool:
-    return sweep.judges.pairs is judges.pairs
+def _same(sweep: LinearSweep, data: Dataset) -> bool:
+    return sweep.data.pairs is data.pairs
 
 
-def _standing_alone(plain: Prepared, size) -> np.ndarray:
+def _standing_alone(data: Dataset, size) -> np.ndarray:
     """The rows whose residual is far beyond those of all but a few of the neighbours, of the state
     or of the image: a state that is a gross error has no neighbours but its like."""
     if len(size) <= _NEIGHBOURS:
@@ -125,7 +120,7 @@ def _standing_alone(plain: Prepared, size) -> np.ndarray:
     if not len(rows) or not middle > 0:
         return rows[:0]
     around = np.full(len(rows), np.inf)
-    for y in (plain.y0 / plain.scale, plain.y1 / plain.scale):
+    for y in (data.y0 / data.scale, data.y1 / data.scale):
         near = cKDTree(y).query(y[rows], k=_NEIGHBOURS + 1)[1][:, 1:]
         around = np.minimum(around, np.sort(size[near], axis=1)[:, -1 - _BUT])
     alone = rows[(size[rows] > _BEYOND * around) & (around < _ORDINARY * middle)]

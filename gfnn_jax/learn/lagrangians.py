@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.legendre import Legendre
-from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.law_work import LawWork
-from gfnn_jax.learn.learned_law import FittedLaw, held_out_error
-from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.learn.learned_law import FittedLaw, validation_error
 from gfnn_jax.phase_space import split
 
 _SHORTEST = 2  # Σ|m_i| of the modes of angles; degree of the powers of lengths in a mass
@@ -33,17 +33,17 @@ _NULL = 1e-8  # of the largest singular value of the linear start
 
 
 def lagrangian_of(
-    problem: Problem, work: LawWork, prepared: Prepared, judges: Judges,
+    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance,
     forces: Callable[[Any], Any] | None = None,
 ) -> FittedLaw | None:  # fmt: skip
     """The law of all terms, with these forces, fitted to the training pairs; None where there are
     not several degrees of freedom with an angle among them, or the pairs are too few."""
-    coordinates, dim = prepared.coordinates, prepared.dim
+    coordinates, dim = data.coordinates, data.dim
     angles = tuple(a for a in coordinates.angles if a < dim)
     mechanical = coordinates.forward is CARTESIAN.forward and len(angles) == len(coordinates.angles)
-    if not (angles and dim > 1 and mechanical) or coordinates.cyclic or prepared.varied:
+    if not (angles and dim > 1 and mechanical) or coordinates.cyclic or data.varied:
         return None
-    family, rows = Legendre(library(dim, angles)), judges.training
+    family, rows = Legendre(library(dim, angles)), data.training
     if _ROWS_PER_TERM * family.num_parameters > len(rows) * dim:
         return None
     start = _start(family, problem, rows)
@@ -52,7 +52,7 @@ def lagrangian_of(
         start = np.concatenate([start, np.zeros(family.num_parameters - len(start))])
     with work.library(family.label, family, len(rows)), np.errstate(all="ignore"):
         fit = problem.fit(family, start, rows)
-    return FittedLaw(family, fit, rows, held_out_error(family, fit, prepared, judges), ())
+    return FittedLaw(family, fit, rows, validation_error(family, fit, data, tolerance), ())
 
 
 def library(dim: int, angles: tuple[int, ...]) -> Terms:

@@ -6,18 +6,18 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.families.terms import Terms, given_terms, joined, multiplied, polynomial_terms
 from gfnn_jax.learn.law_options import Options
-from gfnn_jax.learn.prepare import Prepared
 
 
-def angles_and_others(prepared: Prepared) -> tuple[tuple[int, ...], tuple[str, ...]]:
+def angles_and_others(data: Dataset) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """The angles that enter H by themselves, and the names of the coordinates that are none."""
-    dim, coordinates = prepared.dim, prepared.coordinates
+    dim, coordinates = data.dim, data.coordinates
     angles = tuple(i for i in coordinates.angles if i < dim and i not in coordinates.cyclic)
     plain = tuple(
         name
@@ -27,12 +27,12 @@ def angles_and_others(prepared: Prepared) -> tuple[tuple[int, ...], tuple[str, .
     return angles, plain
 
 
-def modes_of(prepared: Prepared, scene, terms) -> Modes | None:
+def modes_of(data: Dataset, scene, terms) -> Modes | None:
     """The basis that grows, where an angle enters H by itself; else None."""
-    if prepared.args is not None or (scene is not None and scene.features is not None):
+    if data.args is not None or (scene is not None and scene.features is not None):
         return None
-    dim = prepared.dim
-    angles, plain = angles_and_others(prepared)
+    dim = data.dim
+    angles, plain = angles_and_others(data)
     if not angles:
         return None
     own = given_terms(dim, terms).variables if terms else ()
@@ -40,14 +40,14 @@ def modes_of(prepared: Prepared, scene, terms) -> Modes | None:
     return Modes(dim, angles, (*plain, *own), len(own))
 
 
-def own_terms(prepared: Prepared, terms) -> Terms:
-    return given_terms(prepared.dim, terms, prepared.parameters)
+def own_terms(data: Dataset, terms) -> Terms:
+    return given_terms(data.dim, terms, data.parameters)
 
 
-def check_finite(given: Terms, prepared: Prepared, rows) -> None:
+def check_finite(given: Terms, data: Dataset, rows) -> None:
     """Raises FitError for a user's term that has no value or no slope at some of the states."""
-    z = prepared.y0[rows]
-    slopes = given.term_gradients(z, prepared.given(rows)[1])
+    z = data.y0[rows]
+    slopes = given.term_gradients(z, data.given(rows)[1])
     for j, name in enumerate(given.term_names):
         bad = ~np.isfinite(slopes[:, :, j]).all(axis=1)
         if bad.any():
@@ -57,19 +57,19 @@ def check_finite(given: Terms, prepared: Prepared, rows) -> None:
             )
 
 
-def libraries_of(prepared, judges, scene, terms, options: Options) -> Iterator[Terms | Sums]:
+def libraries_of(data: Dataset, scene, terms, options: Options) -> Iterator[Terms | Sums]:
     """Families by rising size, of as many terms as the training rows tell apart."""
-    dim, coordinates = prepared.dim, prepared.coordinates
-    if prepared.structure is not None:
-        libraries = prepared.structure.libraries(dim, terms)
-        most = len(judges.training) * 2 * dim / options.rows_per_term
+    dim, coordinates = data.dim, data.coordinates
+    if data.structure is not None:
+        libraries = data.structure.libraries(dim, terms)
+        most = len(data.training) * 2 * dim / options.rows_per_term
         yield from (library for library in libraries if library.num_parameters <= most)
         return
     reversor = scene.reversor if scene is not None else None
     features = scene.features if scene is not None else None
-    most = len(judges.training) * 2 * dim / options.rows_per_term
+    most = len(data.training) * 2 * dim / options.rows_per_term
     most = min(most, options.most_terms)
-    own = own_terms(prepared, terms) if terms else None
+    own = own_terms(data, terms) if terms else None
     if own is not None:
         degrees = options.given_degrees
     else:

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre
-from gfnn_jax.learn.candidates import Judges, Tolerance
 from gfnn_jax.learn.choose_charts import Charts
 from gfnn_jax.learn.clock import FLOW, Budget
 from gfnn_jax.learn.cost_of_flow import flow_operations
@@ -21,10 +21,8 @@ from gfnn_jax.learn.diagnosed import diagnosed
 from gfnn_jax.learn.draw import NUM_PAIRS, drawn
 from gfnn_jax.learn.factor_out import TRIAL_PAIRS, factored_out, flow_of
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
-from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.search import Entry, Found, search
 from gfnn_jax.learn.sweeps import sweeps_for
-from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
 
 _FITTED, _MOST_STRONG = 200, 4  # pairs and terms of the simplest laws
@@ -48,32 +46,26 @@ def more_pairs_would_help(sweeps, found: Found, bound: Tolerance, dearest: float
 
 
 def search_of_law(
-    law: LearnedHamiltonian, pairs: Pairs, judges: Judges, scene: Scene | None,
-    coordinates: Coordinates, dearest: float, budget: Budget, say, tell, seed: int,
+    law: LearnedHamiltonian, data: Dataset, tolerance: Tolerance, scene: Scene | None,
+    dearest: float, budget: Budget, say, tell, seed: int,
 ) -> LawMaps | None:  # fmt: skip
-    """Maps fitted to pairs that are drawn from the law's flow, and judged by the user's held-out
-    pairs; None where none of them meets the tolerance, or no chart covers the drawn pairs."""
+    """Maps fitted to pairs that are drawn from the law's flow, and judged by the user's validation
+    rows; None where none of them meets the tolerance, or no chart covers the drawn pairs."""
     try:
         with budget.unit("pairs drawn from the flow of H", FLOW, _work(law, NUM_PAIRS)):
-            more = drawn(law.flow, coordinates, pairs.z0, float(pairs.dt), seed=seed)
+            more = drawn(law.flow, data.coordinates, data.pairs.z0, data.dt, seed=seed)
     except OutOfTime:
         return None
-    held = pairs.take(judges.held_out)
-    both = Pairs(
-        np.concatenate([more.z0, held.z0]), np.concatenate([more.z1, held.z1]), float(pairs.dt)
-    )
-    rows = np.arange(len(both))
-    judges = Judges(both, rows[: len(more)], rows[len(more) :], judges.tolerance)
     reversor = scene.reversor if scene else None
     try:
-        seen = diagnosed(prepare(both, coordinates), "auto", reversor, seed)
+        seen = diagnosed(data.validating(more), "auto", reversor, seed)
     except FitError:  # drawn ones go further than the user's; the law itself is left
         return None
-    sweeps = list(sweeps_for("auto", seen.charts.charts, seen.prepared, scene, judges))
-    found = search(sweeps, judges.tolerance.bound, budget, say, tell, None, dearest)
+    sweeps = list(sweeps_for("auto", seen.charts.charts, seen.data, tolerance, scene))
+    found = search(sweeps, tolerance.bound, budget, say, tell, None, dearest)
     if not found.ranking:
         return None
-    if found.ranking[0].candidate.validation_bound > judges.tolerance.bound:
+    if found.ranking[0].candidate.validation_bound > tolerance.bound:
         return None
     found = found._replace(ended="the tolerance is met, by a map of pairs drawn from H's flow")
     return LawMaps(found, seen.charts)
@@ -92,33 +84,33 @@ def law_explains_most(
 
 
 def search_around(
-    law: LearnedHamiltonian, plain: Prepared, judges: Judges, scene: Scene | None, budget: Budget,
-    say, tell, better, seed: int,
+    law: LearnedHamiltonian, data: Dataset, tolerance: Tolerance, scene: Scene | None,
+    budget: Budget, say, tell, better, seed: int,
 ) -> LawMaps | None:  # fmt: skip
     """Maps of a law's flow Φ and of S, which learns what Φ leaves over: of the whole law, then of
     its strongest terms, which leave more over but smoother. None where Φ has no image of some of
     the states, or no chart covers what is left."""
     best: LawMaps | None = None
-    for laws in ([(law.flow.family, np.asarray(law.flow.params))], strongest(law, plain, judges)):
+    for laws in ([(law.flow.family, np.asarray(law.flow.params))], strongest(law, data)):
         if not laws:
             break
         try:
-            with budget.unit("what the flow of H leaves over", FLOW, _work(law, len(plain.y0))):
-                flows = [flow_of(family, c, plain) for family, c in laws]
-                flow, prepared = factored_out(flows, plain, seed)
-                seen = diagnosed(prepared, "auto", scene.reversor if scene else None, seed)
+            with budget.unit("what the flow of H leaves over", FLOW, _work(law, len(data))):
+                flows = [flow_of(family, c, data) for family, c in laws]
+                flow, rest = factored_out(flows, data, seed)
+                seen = diagnosed(rest, "auto", scene.reversor if scene else None, seed)
         except OutOfTime:
             break
         except FitError:
             continue
-        found = _around(flow, seen, plain, judges, scene, budget, say, tell, better)
+        found = _around(flow, seen, data, tolerance, scene, budget, say, tell, better)
         if found.found.ranking and (
             best is None
             or found.found.ranking[0].candidate.validation_bound
             < best.found.ranking[0].candidate.validation_bound
         ):
             best = found
-        if best and best.found.ranking[0].candidate.validation_bound <= judges.tolerance.bound:
+        if best and best.found.ranking[0].candidate.validation_bound <= tolerance.bound:
             break
     return best
 
@@ -129,13 +121,13 @@ def _work(law: LearnedHamiltonian, states: int) -> float:
 
 
 def _around(
-    flow: Flow, seen, plain: Prepared, judges: Judges, scene: Scene | None, budget: Budget, say,
+    flow: Flow, seen, data: Dataset, tolerance: Tolerance, scene: Scene | None, budget: Budget, say,
     tell, better,
 ) -> LawMaps:  # fmt: skip
     """The search for S around one flow, whose operations are added to every candidate's."""
-    more = flow_operations(flow, plain)
-    sweeps = list(sweeps_for("auto", seen.charts.charts, seen.prepared, scene, judges))
-    found = search(sweeps, judges.tolerance.bound, budget, say, tell, better)
+    more = flow_operations(flow, data)
+    sweeps = list(sweeps_for("auto", seen.charts.charts, seen.data, tolerance, scene))
+    found = search(sweeps, tolerance.bound, budget, say, tell, better)
 
     def dearer(entry: Entry) -> Entry:
         candidate = dataclasses.replace(
@@ -148,19 +140,17 @@ def _around(
     return LawMaps(found._replace(entries=entries, ranking=ranking), seen.charts)
 
 
-def strongest(
-    law: LearnedHamiltonian, plain: Prepared, judges: Judges
-) -> list[tuple[Terms, np.ndarray]]:
+def strongest(law: LearnedHamiltonian, data: Dataset) -> list[tuple[Terms, np.ndarray]]:
     """The law's one, two … strongest terms, with coefficients fitted anew, as far as their flow
     explains most of the motion."""
     family, c = law.flow.family, np.asarray(law.flow.params)
     if isinstance(family, Legendre):  # its terms are those of L
         return []
-    rows = judges.training[:TRIAL_PAIRS]
-    slopes = family.term_gradients(plain.y0[rows]) * plain.scale[:, None]
+    rows = data.training[:TRIAL_PAIRS]
+    slopes = family.term_gradients(data.y0[rows]) * data.scale[:, None]
     strength = np.abs(c) * np.sqrt(np.mean(np.sum(slopes**2, axis=1), axis=0))
     order = np.argsort(-strength)
-    problem = Problem(plain.y0, plain.y1, plain.dt, plain.scale)
+    problem = Problem(data.y0, data.y1, data.dt, data.scale)
     laws = []
     for count in range(1, min(len(c), _MOST_STRONG + 1)):
         kept = np.sort(order[:count])

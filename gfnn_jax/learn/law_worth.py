@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.fitting.gauss_newton import Problem, rates, significant
-from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.cost_of_flow import FREQUENCY_STATES, operations_of
 from gfnn_jax.learn.learned_law import FittedLaw, bound_of
-from gfnn_jax.learn.prepare import Prepared
 
 
 def too_dear(
-    problem: Problem, family, last: FittedLaw, prepared: Prepared, judges: Judges, dearest: float
+    problem: Problem,
+    family,
+    last: FittedLaw,
+    data: Dataset,
+    tolerance: Tolerance,
+    dearest: float,
 ) -> bool:
     """Whether a step of no law of this library costs up to ``dearest`` operations.
 
@@ -23,7 +28,7 @@ def too_dear(
     if not np.isfinite(dearest):
         return False
     fit = last.fit
-    fastest = rates(last.family, fit.coefficients, prepared.y0[:FREQUENCY_STATES])
+    fastest = rates(last.family, fit.coefficients, data.y0[:FREQUENCY_STATES])
 
     def cost(family) -> float:
         return operations_of(family, 2 * family.dim, fastest, problem.dt, fit.steps)
@@ -32,10 +37,10 @@ def too_dear(
         return False
     known = dict(zip(last.family.term_names, fit.coefficients, strict=True))
     start = np.array([known.get(name, 0.0) for name in family.term_names])
-    rows = judges.training[: max(len(last.rows), 2 * family.num_parameters)]
+    rows = data.training[: max(len(last.rows), 2 * family.num_parameters)]
     found = problem.linearised(family, start, fit.steps, rows)
     if not np.isfinite(found.norm) or found.rows <= family.num_parameters:
         return False
-    allowed = max(bound_of(judges, problem.scale), last.error.relative**2)
+    allowed = max(bound_of(tolerance, problem.scale), last.error.relative**2)
     kept, _ = significant(found, start, np.sqrt(found.rows), allowed)
     return not kept.size or cost(family.take(tuple(kept.tolist()))) > dearest

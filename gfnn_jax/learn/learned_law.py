@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.exports.symbolic import as_latex, as_sympy
 from gfnn_jax.families.expressions import plain
@@ -29,7 +31,7 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.learn.assemble import Assembled, composed, measured
-from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
+from gfnn_jax.learn.candidates import Candidate, with_error
 from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.cost_of_flow import (
     CONTRACTING,
@@ -40,9 +42,8 @@ from gfnn_jax.learn.cost_of_flow import (
 )
 from gfnn_jax.learn.formula import Term, formula
 from gfnn_jax.learn.law_options import OPTIONS, Options
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.whole_sequences import Whole
-from gfnn_jax.phase_space import Pairs, apply_j, symplectic_form
+from gfnn_jax.phase_space import apply_j, symplectic_form
 
 FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
 _NEAR_ROUNDOFF = 3e-15  # of the spread
@@ -163,33 +164,33 @@ class FittedLaw(NamedTuple):
 
 
 def learned_from(
-    found: FittedLaw, problem, prepared: Prepared, judges: Judges, seconds: float, options: Options,
-    of_arcs: Callable[[], np.ndarray] | None,
+    found: FittedLaw, problem, data: Dataset, tolerance: Tolerance, seconds: float,
+    options: Options, of_arcs: Callable[[], np.ndarray] | None,
 ) -> LearnedHamiltonian:  # fmt: skip
     """of_arcs: makes the root, where the fit was not to these pairs but to arcs of them."""
     family, fit, whole = found.family, found.fit, found.whole
-    rows = judges.held_out
-    z, args = prepared.y0[rows], prepared.given(rows)[1]
+    rows = data.validation
+    z, args = data.y0[rows], data.given(rows)[1]
     some = slice(FREQUENCY_STATES)
-    fastest = rates(family, fit.coefficients, prepared.y0[some], prepared.given(some)[1])
-    if prepared.own_dt is not None:  # the map's own dt, from which others follow
-        problem = Problem(prepared.y0, prepared.y1, prepared.dt, prepared.scale, args=prepared.args)
-    steps = _cheapest(problem, family, fit, fastest, judges, options)
-    steps = _resolving(family, fit.coefficients, steps, prepared, judges)
-    contraction = contraction_of(fastest, prepared.dt, steps)
+    fastest = rates(family, fit.coefficients, data.y0[some], data.given(some)[1])
+    if data.own_dt is not None:  # the map's own dt, from which others follow
+        problem = Problem(data.y0, data.y1, data.dt, data.scale, args=data.args)
+    steps = _cheapest(problem, family, fit, fastest, data, tolerance, options)
+    steps = _resolving(family, fit.coefficients, steps, data, tolerance)
+    contraction = contraction_of(fastest, data.dt, steps)
     by_newton = contraction > CONTRACTING and not matrix_free(family)
-    off = truncation(family, fit.coefficients, z, prepared.dt, steps, args=args) / prepared.scale
+    off = truncation(family, fit.coefficients, z, data.dt, steps, args=args) / data.scale
     flow = Flow(
-        family, fit.coefficients, prepared.dt, prepared.scale, steps.stages, steps.substeps,
+        family, fit.coefficients, data.dt, data.scale, steps.stages, steps.substeps,
         by_newton,
     )  # fmt: skip
-    longest = flow.over(np.max(prepared.each_dt)).substeps
+    longest = flow.over(np.max(data.each_dt)).substeps
     of_all = dataclasses.replace(steps, substeps=longest)
-    error = error_of_steps(family, fit.coefficients, of_all, prepared, judges)
+    error = error_of_steps(family, fit.coefficients, of_all, data, tolerance)
     candidate = Candidate(
         label=_label(family), family=family.name, chart="flow",
         num_parameters=family.num_parameters,
-        operations=operations_of(family, 2 * family.dim, fastest, prepared.dt, steps),
+        operations=operations_of(family, 2 * family.dim, fastest, data.dt, steps),
         validation_rms=error.rms, validation_relative=error.relative,
         validation_bound=error.bound, deviations=error.deviations, train_rms=fit.rms,
         fit_seconds=seconds, condition=fit.condition, rank=family.num_parameters,
@@ -203,10 +204,10 @@ def learned_from(
     )
     of_h = without_forces(family).num_parameters
     terms, friction = terms[:of_h], terms[of_h:]
-    omega_h = omega_h_of(family, fit.coefficients, prepared, fastest)
+    omega_h = omega_h_of(family, fit.coefficients, data, fastest)
     left_out = len(np.setdiff1d(found.rows, fit.used))
-    resolved = np.abs(off).max(axis=1) <= bound_of(judges, prepared.scale)
-    covariance = of_arcs or partial(covariance_root, found, problem, prepared, steps, judges.pairs)
+    resolved = np.abs(off).max(axis=1) <= bound_of(tolerance, data.scale)
+    covariance = of_arcs or partial(covariance_root, found, problem, data, steps)
     if whole is not None:
         covariance = partial(np.asarray, whole.root)
     return LearnedHamiltonian(
@@ -214,11 +215,11 @@ def learned_from(
         getattr(without_forces(family), "prefix", "") + formula(terms),
         float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
-        tuple(_messages(error, omega_h, prepared, judges, found, left_out, int((~resolved).sum()))),
+        tuple(_messages(error, omega_h, data, tolerance, found, left_out, int((~resolved).sum()))),
         stalled=found.stalled,
         covariance=covariance, noise=None if whole is None else whole.noise,
         arcs=0 if whole is None else whole.arcs,
-        dropped=found.dropped, unmet=_unmet(error, omega_h, prepared, judges, found),
+        dropped=found.dropped, unmet=_unmet(error, omega_h, data, tolerance, found),
         friction=friction,
     )  # fmt: skip
 
@@ -229,69 +230,68 @@ def _label(family) -> str:
     return f"{what}, {of_h.num_parameters} terms" + (", friction" if of_h is not family else "")
 
 
-def held_out_error(family, fit: FlowFit, prepared, judges: Judges) -> OneStepError:
+def validation_error(family, fit: FlowFit, data: Dataset, tolerance: Tolerance) -> OneStepError:
     """By steps that resolve the held-out pairs: an unresolved passage says nothing of the law."""
-    steps = _resolving(family, fit.coefficients, fit.steps, prepared, judges)
-    return error_of_steps(family, fit.coefficients, steps, prepared, judges)
+    steps = _resolving(family, fit.coefficients, fit.steps, data, tolerance)
+    return error_of_steps(family, fit.coefficients, steps, data, tolerance)
 
 
-def error_of_steps(family, coefficients, steps: Steps, prepared, judges: Judges) -> OneStepError:
-    states, (dt, args) = prepared.y0[judges.held_out], prepared.given(judges.held_out)
+def error_of_steps(
+    family, coefficients, steps: Steps, data: Dataset, tolerance: Tolerance
+) -> OneStepError:
+    states, (dt, args) = data.y0[data.validation], data.given(data.validation)
     found = images(family, coefficients, states, dt, steps, args=args).states
-    return judges.error_of(to_user(prepared.coordinates, found), prepared.coordinates)
+    return measured_error(data, tolerance, to_user(data.coordinates, found))
 
 
-def bound_of(judges: Judges, scale) -> float:
+def bound_of(tolerance: Tolerance, scale) -> float:
     """The tolerance as a part of the coordinates' scale."""
-    bound = judges.tolerance.bound
-    return bound if judges.tolerance.relative else bound / float(scale.max())
+    bound = tolerance.bound
+    return bound if tolerance.relative else bound / float(scale.max())
 
 
-def _resolving(family, coefficients, steps: Steps, prepared, judges: Judges) -> Steps:
+def _resolving(family, coefficients, steps: Steps, data: Dataset, tolerance: Tolerance) -> Steps:
     """These steps, or, where the law misses the tolerance by them, finer ones: halved until they
     resolve the held-out pairs, or there are as many as a flow may have."""
-    bound, states = bound_of(judges, prepared.scale), prepared.y0[judges.held_out]
-    if (
-        error_of_steps(family, coefficients, steps, prepared, judges).bound
-        <= judges.tolerance.bound
-    ):
+    bound, states = bound_of(tolerance, data.scale), data.y0[data.validation]
+    if error_of_steps(family, coefficients, steps, data, tolerance).bound <= tolerance.bound:
         return steps
-    dt, args = prepared.given(judges.held_out)
+    dt, args = data.given(data.validation)
     while 2 * steps.substeps <= MOST_SUBSTEPS:
-        off = truncation(family, coefficients, states, dt, steps, args=args) / prepared.scale
+        off = truncation(family, coefficients, states, dt, steps, args=args) / data.scale
         if np.sqrt(np.mean(off**2)) <= OPTIONS.truncation * bound:
             break
         steps = dataclasses.replace(steps, substeps=2 * steps.substeps)
     return steps
 
 
-def _cheapest(problem, family, fit: FlowFit, fastest, judges: Judges, options: Options) -> Steps:
+def _cheapest(
+    problem, family, fit: FlowFit, fastest, data: Dataset, tolerance: Tolerance, options: Options
+) -> Steps:
     """Steps whose own error is a tenth of the tolerance; near roundoff, or at it, where that is not
     twice as dear."""
 
     def cost(steps: Steps) -> float:
         return operations_of(family, 2 * family.dim, fastest, problem.dt, steps)
 
-    bound = max(options.truncation * bound_of(judges, problem.scale), 0.3 * fit.rms)
+    bound = max(options.truncation * bound_of(tolerance, problem.scale), 0.3 * fit.rms)
     tolerances = (bound, min(bound, _NEAR_ROUNDOFF), None)
-    found = problem.fine_steps(family, fit.coefficients, judges.training, tolerances)
+    found = problem.fine_steps(family, fit.coefficients, data.training, tolerances)
     return next(s for s in reversed(found) if s == found[0] or cost(s) < 2 * cost(found[0]))
 
 
-def covariance_root(
-    found: FittedLaw, problem: Problem, prepared: Prepared, steps: Steps, pairs: Pairs
-) -> np.ndarray:
+def covariance_root(found: FittedLaw, problem: Problem, data: Dataset, steps: Steps) -> np.ndarray:
     """(m, m): rootᵀ root is the covariance of the coefficients. What is noise, a generator of
     polynomials tells, which does not explain it; what it explains is misfit, of these steps too."""
     fit, count = found.fit, found.family.num_parameters
-    most = max(_FEWEST_SAMPLED, OPTIONS.sampled_rows * count // prepared.y0.shape[1])
-    structure = prepared.structure
+    most = max(_FEWEST_SAMPLED, OPTIONS.sampled_rows * count // data.y0.shape[1])
+    structure = data.structure
     if structure is not None:
-        most = structure.fewest(prepared.y0.shape[1])
-    places, goes_on = looked_at(pairs, fit.used, most)
+        most = structure.fewest(data.y0.shape[1])
+    places, goes_on = looked_at(data.pairs, fit.used, most)
     rows, scale = fit.used[places], problem.scale
     images = problem.images(found.family, fit.coefficients, rows, steps, derivatives=True)
-    residual = images.states - prepared.y1[rows]
+    residual = images.states - data.y1[rows]
     if not np.isfinite(residual).all():  # of a flow that runs away from some of the states
         return np.full((count, count), np.nan)
     slopes = images.by_coefficient / scale[:, None]
@@ -306,7 +306,7 @@ def covariance_root(
             )
             states = first, second, goes_on
         degree = int(np.max(np.sum(family.powers, axis=1)))
-        noise = unexplained(prepared, rows, residual, count, degree, states)
+        noise = unexplained(data, rows, residual, count, degree, states)
     return uncertainty.root(
         fit.triangle, count, slopes.reshape(-1, count), np.hypot(left, _NEAR_ROUNDOFF).ravel(),
         noise=noise, scores=scores,
@@ -314,7 +314,7 @@ def covariance_root(
 
 
 def unexplained(
-    prepared: Prepared, rows, residual, taken: int, degree: int, states
+    data: Dataset, rows, residual, taken: int, degree: int, states
 ) -> float | None:  # fmt: skip
     """Of the mean square of what a law leaves over (n, 2d) on these rows, the part that no
     generator K explains, residual = J∇K at the images: K of as high a degree as the rows tell.
@@ -324,9 +324,9 @@ def unexplained(
 
     1 where K explains no more than it would of noise, by ``explained`` standard errors: an F test.
     """
-    z, coordinates, width = prepared.y1[rows], prepared.coordinates, residual.shape[1]
+    z, coordinates, width = data.y1[rows], data.coordinates, residual.shape[1]
     inputs = box_inputs(
-        z, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+        z, angles=tuple(a for a in coordinates.angles if a < data.dim),
         cyclic=coordinates.cyclic,
     )  # fmt: skip
     degrees = sorted({*OPTIONS.generators, degree + OPTIONS.beyond})
@@ -335,12 +335,12 @@ def unexplained(
     known = [family for family in sizes if family.num_parameters <= most]
     if not known:
         return None
-    family, weight = known[-1], 1.0 / np.roll(prepared.scale, prepared.dim)
+    family, weight = known[-1], 1.0 / np.roll(data.scale, data.dim)
     target = -apply_j(residual)
     reduced = least_squares.reduce(family, [(z, target)], weight)
     count, freedom = family.num_parameters, None
     if states is not None:
-        to_target = -weight[:, None] * symplectic_form(prepared.dim)
+        to_target = -weight[:, None] * symplectic_form(data.dim)
         slopes, (first, second, goes_on) = family.term_gradients(z) * weight[:, None], states
         scores = shared_noise.scores(
             slopes, weight * target, to_target @ first, to_target @ second, goes_on
@@ -354,22 +354,22 @@ def unexplained(
     return part if part < 1 - by_chance else 1.0
 
 
-def _unmet(error: OneStepError, omega_h: float, prepared, judges, found: FittedLaw) -> str:
-    if error.bound <= judges.tolerance.bound:
+def _unmet(error: OneStepError, omega_h: float, data, tolerance, found: FittedLaw) -> str:
+    if error.bound <= tolerance.bound:
         return ""
     return (
         f"no H of the terms tried meets the tolerance (best {error.relative:.2e} of the spread, "
         f"its fastest oscillation {omega_h:.2g} in a step): the pairs carry noise, other terms are "
-        f"needed, the map has no flow, or ωh > π at dt = {prepared.dt:g}, and then only a shorter "
+        f"needed, the map has no flow, or ωh > π at dt = {data.dt:g}, and then only a shorter "
         "dt tells H" + (f"; modes were added until {found.ended}" if found.ended else "")
     )
 
 
 def _messages(
-    error: OneStepError, omega_h: float, prepared, judges, found: FittedLaw, left_out: int,
+    error: OneStepError, omega_h: float, data, tolerance, found: FittedLaw, left_out: int,
     unresolved: int,
 ) -> Iterator[str]:  # fmt: skip
-    if error.bound <= judges.tolerance.bound and omega_h > FAST:
+    if error.bound <= tolerance.bound and omega_h > FAST:
         yield (
             f"H oscillates by {omega_h:.2g} radians in a step (ωh, its median over the states"
             f"{', beyond π' if omega_h > np.pi else ''}): an H whose frequencies differ by 2π per "
@@ -396,26 +396,26 @@ def _messages(
         )
     if unresolved:
         yield (
-            f"{unresolved} of {len(judges.held_out)} held-out pairs are not resolved to the "
+            f"{unresolved} of {len(data.validation)} held-out pairs are not resolved to the "
             "tolerance by the flow's own steps: there the map is in error, and not the law"
         )
 
 
 def assembled(
-    learned: LearnedHamiltonian, prepared: Prepared, judges: Judges, budget: Budget
+    learned: LearnedHamiltonian, data: Dataset, tolerance: Tolerance, budget: Budget
 ) -> Assembled:
     """The candidate's map, measured."""
-    prepared = _in_relative_domain(learned.flow, prepared)
-    map_ = composed(learned.flow, prepared, judges)
-    return measured(learned.candidate, map_, prepared, judges, budget)
+    data = _in_relative_domain(learned.flow, data)
+    map_ = composed(learned.flow, data)
+    return measured(learned.candidate, map_, data, tolerance, budget)
 
 
-def _in_relative_domain(flow: Flow, prepared: Prepared) -> Prepared:
+def _in_relative_domain(flow: Flow, data: Dataset) -> Dataset:
     """With a domain that leaves out where the whole is, if no force depends on that."""
-    if prepared.structure is None:
-        return prepared
-    force = flow.family.gradient(flow.params, prepared.y0)[:, : prepared.dim]
+    if data.structure is None:
+        return data
+    force = flow.family.gradient(flow.params, data.y0)[:, : data.dim]
     moves = np.abs(force.sum(axis=1)).max() > _NO_FORCE * np.abs(force).sum(axis=1).max()
     return dataclasses.replace(
-        prepared, domain=prepared.structure.domain(prepared.y0, uses_positions=bool(moves))
+        data, domain=data.structure.domain(data.y0, uses_positions=bool(moves))
     )

@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.family import at_time
@@ -27,11 +29,10 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import CHARTS, AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.assemble import Assembled, composed, measured
-from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
+from gfnn_jax.learn.candidates import Candidate, with_error
 from gfnn_jax.learn.clock import ROWS, Budget
 from gfnn_jax.learn.diagnose import SINGULAR
 from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
-from gfnn_jax.learn.prepare import Prepared
 
 _CHARTS = ("type2", "midpoint", "type3")  # that are tried, in this order
 _MOST_TERMS, _ROWS_PER_TERM = 500, 3
@@ -63,7 +64,7 @@ class _Tried(NamedTuple):
 
 
 def learn_map(
-    prepared: Prepared, judges: Judges, scene: Any = None, *, chart: str = "auto",
+    data: Dataset, tolerance: Tolerance, scene: Any = None, *, chart: str = "auto",
     budget: Budget | None = None, say: Callable[[str], Any] = lambda message: None,
     needed: bool = True,
 ) -> LearnedMap:  # fmt: skip
@@ -78,13 +79,13 @@ def learn_map(
     tried: list[_Tried] = []
     try:
         for name in _CHARTS if chart == "auto" else (chart,):
-            attempts = _Attempts(CHARTS[name], prepared, judges, budget, say, needed)
+            attempts = _Attempts(CHARTS[name], data, tolerance, budget, say, needed)
             for found in _of_chart(attempts, scene):
                 tried.append(found)
                 needed = False
                 if best is None or found.error.bound < best.error.bound:
                     best = found
-            if best is not None and best.error.bound <= judges.tolerance.bound:
+            if best is not None and best.error.bound <= tolerance.bound:
                 break
     except OutOfTime:
         if best is None:
@@ -92,18 +93,18 @@ def learn_map(
     if best is None or not np.isfinite(best.error.bound):
         raise FitError(
             "expected pairs that tell an S of such terms: they are too few, or no chart covers "
-            f"them{' for all values of the parameters' if prepared.args is not None else ''}"
+            f"them{' for all values of the parameters' if data.args is not None else ''}"
         )
     rivals = [
         f for f in tried
         if f.piece.chart is best.piece.chart and f.error.relative <= _FLAT * best.error.relative
     ]  # fmt: skip
-    stalled = len(rivals) > 1 and best.error.bound > judges.tolerance.bound
-    if prepared.structure is not None:
-        judges = _fewer(prepared, judges)
+    stalled = len(rivals) > 1 and best.error.bound > tolerance.bound
+    if data.structure is not None:
+        data = _fewer(data)
     try:
-        with budget.unit(_FEWER_TERMS, ROWS, len(_THRESHOLDS) * _work(best.piece.family, judges)):
-            best = _sparse(best, prepared, judges)
+        with budget.unit(_FEWER_TERMS, ROWS, len(_THRESHOLDS) * _work(best.piece.family, data)):
+            best = _sparse(best, data, tolerance)
     except OutOfTime:
         budget.leave_out(_FEWER_TERMS, budget.ended)
     piece = best.piece
@@ -116,27 +117,25 @@ def learn_map(
         deviations=best.error.deviations, train_rms=best.train_rms,
         fit_seconds=time.perf_counter() - started,
     )  # fmt: skip
-    covariance = partial(
-        _root, piece, prepared, _fewer(prepared, judges) if prepared.structure else judges
-    )
+    covariance = partial(_root, piece, data)
     return LearnedMap(with_error(candidate, best.error), piece, covariance, stalled)
 
 
 def map_of(
-    prepared: Prepared, judges: Judges, scene: Any, chart: str, law: Any, budget: Budget,
+    data: Dataset, tolerance: Tolerance, scene: Any, chart: str, law: Any, budget: Budget,
     say: Callable[[str], Any],
 ) -> LearnedMap | None:  # fmt: skip
     """As `learn_map`; None where it finds none, or none that is better than the law that was."""
     try:
         with np.errstate(all="ignore"):
             found = learn_map(
-                prepared, judges, scene, chart=chart, budget=budget, say=say, needed=law is None
+                data, tolerance, scene, chart=chart, budget=budget, say=say, needed=law is None
             )
     except (FitError, OutOfTime):
         if law is None:
             raise
         return None
-    better = 1.0 if prepared.structure is None else _BETTER
+    better = 1.0 if data.structure is None else _BETTER
     error = found.candidate.validation_bound
     if law is not None and not error < better * law.candidate.validation_bound:
         return None
@@ -144,11 +143,11 @@ def map_of(
 
 
 def assembled(
-    learned: LearnedMap, prepared: Prepared, judges: Judges, budget: Budget
+    learned: LearnedMap, data: Dataset, tolerance: Tolerance, budget: Budget
 ) -> Assembled:  # fmt: skip
     """The candidate's map, measured."""
-    map_ = composed(learned.piece, prepared, judges)
-    return measured(learned.candidate, map_, prepared, judges, budget)
+    map_ = composed(learned.piece, data)
+    return measured(learned.candidate, map_, data, tolerance, budget)
 
 
 @dataclasses.dataclass
@@ -157,39 +156,39 @@ class _Attempts:
     it is ``needed``."""
 
     chart: AnyChart
-    prepared: Prepared
-    judges: Judges
+    data: Dataset
+    tolerance: Tolerance
     budget: Budget
     say: Callable[[str], Any]
     needed: bool
 
     def __post_init__(self) -> None:
-        if self.prepared.structure is not None:
-            self.judges = _fewer(self.prepared, self.judges)
+        if self.data.structure is not None:
+            self.data = _fewer(self.data)
 
     def __call__(self, family: Any) -> _Tried:
         name = f"S in {self.chart.name}: {family.num_parameters} terms"
-        work = _work(family, self.judges)
+        work = _work(family, self.data)
         self.say(name)
         first, self.needed = self.needed, False
         unit = self.budget.free(ROWS, work) if first else self.budget.unit(name, ROWS, work)
         with unit:
-            return _fitted(self.chart, family, self.prepared, self.judges)
+            return _fitted(self.chart, family, self.data, self.tolerance)
 
 
-def _work(family: Any, judges: Judges) -> float:
+def _work(family: Any, data: Dataset) -> float:
     """Operations of a least-squares fit of the family's terms."""
-    rows = len(judges.training) * judges.spread.size
+    rows = len(data.training) * data.spread.size
     return 2.0 * rows * family.num_parameters**2
 
 
 def _of_chart(attempt: _Attempts, scene) -> Iterator[_Tried]:
     """What is tried in a chart, in turn."""
-    prepared, judges = attempt.prepared, attempt.judges
-    if prepared.structure is not None:
-        yield from _of_sites(prepared, judges, attempt)
+    data, tolerance = attempt.data, attempt.tolerance
+    if data.structure is not None:
+        yield from _of_sites(data, tolerance, attempt)
         return
-    coordinates, dim = prepared.coordinates, prepared.dim
+    coordinates, dim = data.coordinates, data.dim
     angles = tuple(i for i in coordinates.angles if i < dim and i not in coordinates.cyclic)
     plain = tuple(
         name
@@ -197,90 +196,88 @@ def _of_chart(attempt: _Attempts, scene) -> Iterator[_Tried]:
         if i not in angles and i not in coordinates.cyclic
     )
     states = state_libraries(
-        dim, prepared.parameters, angles=angles, cyclic=coordinates.cyclic, plain=plain,
+        dim, data.parameters, angles=angles, cyclic=coordinates.cyclic, plain=plain,
         features=scene.features if scene is not None else None, reversor=None, own=None,
     )  # fmt: skip
-    _, args = prepared.given(judges.training)
-    functions = functions_of_parameters(
-        dim, prepared.parameters, args, own=False, period=prepared.period
-    )
+    _, args = data.given(data.training)
+    functions = functions_of_parameters(dim, data.parameters, args, own=False, period=data.period)
 
     yield from walked(
         states, functions, attempt, lambda tried: tried.error.bound,
-        bound=judges.tolerance.bound,
-        most=min(len(judges.training) * 2 * dim / _ROWS_PER_TERM, _MOST_TERMS),
+        bound=tolerance.bound,
+        most=min(len(data.training) * 2 * dim / _ROWS_PER_TERM, _MOST_TERMS),
     )  # fmt: skip
 
 
-def _fewer(prepared: Prepared, judges: Judges) -> Judges:
+def _fewer(data: Dataset) -> Dataset:
     """With as many training pairs as the terms of a site need."""
-    most = max(1, _STRUCTURED_ROWS // prepared.y0.shape[1])
-    return dataclasses.replace(judges, training=judges.training[:most])
+    most = max(1, _STRUCTURED_ROWS // data.y0.shape[1])
+    return data.trained_on(data.training[:most])
 
 
-def _of_sites(prepared: Prepared, judges: Judges, attempt) -> Iterator[_Tried]:
+def _of_sites(data: Dataset, tolerance: Tolerance, attempt) -> Iterator[_Tried]:
     """The libraries of a structure by rising size, until one meets the tolerance."""
-    assert prepared.structure is not None
-    width = prepared.y0.shape[1]
-    rows = judges.training[: max(1, _NULL_ROWS // width)]
-    most = min(len(judges.training) * width / _ROWS_PER_TERM, _MOST_TERMS)
-    for library in prepared.structure.libraries(prepared.dim):
-        family = library.take(null_terms(library, prepared.y0[rows])[0])
+    assert data.structure is not None
+    width = data.y0.shape[1]
+    rows = data.training[: max(1, _NULL_ROWS // width)]
+    most = min(len(data.training) * width / _ROWS_PER_TERM, _MOST_TERMS)
+    for library in data.structure.libraries(data.dim):
+        family = library.take(null_terms(library, data.y0[rows])[0])
         if family.num_parameters <= most:
             tried = attempt(family)
             yield tried
-            if tried.error.bound <= judges.tolerance.bound:
+            if tried.error.bound <= tolerance.bound:
                 return
 
 
-def _data(chart: AnyChart, family: Terms | Sums, prepared: Prepared, rows):
+def _data(chart: AnyChart, family: Terms | Sums, data: Dataset, rows):
     """(w, target gradient, args in the middle of the step) of these rows."""
-    y0, y1 = prepared.y0[rows], prepared.y1[rows]
-    w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, prepared.dt)
-    return w, target, at_time(family, prepared.given(rows)[1], 0.5 * prepared.dt)
+    y0, y1 = data.y0[rows], data.y1[rows]
+    w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, data.dt)
+    return w, target, at_time(family, data.given(rows)[1], 0.5 * data.dt)
 
 
-def _fitted(chart: AnyChart, family: Terms | Sums, prepared: Prepared, judges: Judges) -> _Tried:
+def _fitted(chart: AnyChart, family: Terms | Sums, data: Dataset, tolerance: Tolerance) -> _Tried:
     """The library's S by least squares, and the error of its steps on the held-out pairs."""
-    w, target, args = _data(chart, family, prepared, judges.training)
-    c = fitted_gradients(family, w, target, prepared.scale, args)
-    return _judged(Generated(family, c, chart, prepared.dt, prepared.scale), prepared, judges)
+    w, target, args = _data(chart, family, data, data.training)
+    c = fitted_gradients(family, w, target, data.scale, args)
+    return _judged(Generated(family, c, chart, data.dt, data.scale), data, tolerance)
 
 
-def _judged(piece: Generated, prepared: Prepared, judges: Judges) -> _Tried:
+def _judged(piece: Generated, data: Dataset, tolerance: Tolerance) -> _Tried:
     """With the errors of its steps; infinite where the chart folds over the held-out pairs."""
-    rows, family, params = judges.held_out, piece.family, piece.params
-    w = piece.chart.evaluation_point(prepared.y0[rows], prepared.y1[rows])
-    args = prepared.given(rows)[1]
-    images, off = piece.refined_step(prepared.y0[rows], w, args)
+    rows, family, params = data.validation, piece.family, piece.params
+    w = piece.chart.evaluation_point(data.y0[rows], data.y1[rows])
+    args = data.given(rows)[1]
+    images, off = piece.refined_step(data.y0[rows], w, args)
     folds = False  # a fixed point that contracts is none
     if not matrix_free(family):
-        determinant = piece.determinant(prepared.y0[rows], prepared.y1[rows], args)
+        determinant = piece.determinant(data.y0[rows], data.y1[rows], args)
         folds = not (determinant > SINGULAR).all() and not (determinant < -SINGULAR).all()
     bad = ~(off < _SOLVED) | folds
     images = np.where(bad[:, None], np.nan, images)
-    error = judges.error_of(to_user(prepared.coordinates, images), prepared.coordinates)
-    w, target, args = _data(piece.chart, family, prepared, judges.training)
-    left = (family.gradient(params, w, args) - target) * _weight(prepared)
+    error = measured_error(data, tolerance, to_user(data.coordinates, images))
+    w, target, args = _data(piece.chart, family, data, data.training)
+    left = (family.gradient(params, w, args) - target) * _weight(data)
     return _Tried(piece, error, float(np.sqrt(np.mean(left**2))))
 
 
-def _weight(prepared: Prepared) -> np.ndarray:
+def _weight(data: Dataset) -> np.ndarray:
     """h over the scale of what each entry of ∇S changes (2d,)."""
-    return prepared.dt / np.roll(prepared.scale, prepared.dim)
+    return data.dt / np.roll(data.scale, data.dim)
 
 
-def _root(piece: Generated, prepared: Prepared, judges: Judges) -> np.ndarray:
+def _root(piece: Generated, data: Dataset) -> np.ndarray:
     """What of the residual is noise, the next library tells, which leaves that too; without a
     structure all of it may be misfit."""
     family, count = piece.family, piece.family.num_parameters
-    w, target, args = _data(piece.chart, family, prepared, judges.training)
-    weight = _weight(prepared)
+    w, target, args = _data(piece.chart, family, data, data.training)
+    weight = _weight(data)
     aim = (target * weight).ravel()
     slopes = (family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
     residual, noise = slopes @ np.asarray(piece.params) - aim, None
-    if prepared.structure is not None:
-        larger = (f for f in prepared.structure.libraries(prepared.dim) if f.num_parameters > count)
+    if data.structure is not None:
+        larger = (f for f in data.structure.libraries(data.dim) if f.num_parameters > count)
         found = next(larger, None)
         if found is not None and _ROWS_PER_TERM * found.num_parameters <= target.size:
             known = found.take(null_terms(found, w[: max(1, _NULL_ROWS // w.shape[1])])[0])
@@ -292,11 +289,11 @@ def _root(piece: Generated, prepared: Prepared, judges: Judges) -> np.ndarray:
     return uncertainty.root(train, count, slopes, residual, noise=noise)
 
 
-def _sparse(full: _Tried, prepared: Prepared, judges: Judges) -> _Tried:
+def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance) -> _Tried:
     """Without the terms that the pairs do not ask for, as far as the held-out error allows."""
     piece = full.piece
-    w, target, args = _data(piece.chart, piece.family, prepared, judges.training)
-    weight = _weight(prepared)
+    w, target, args = _data(piece.chart, piece.family, data, data.training)
+    weight = _weight(data)
     terms = (piece.family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
     residual = terms @ piece.params - (target * weight).ravel()
     triangle = Triangle.of(np.column_stack([terms, residual]))
@@ -306,7 +303,7 @@ def _sparse(full: _Tried, prepared: Prepared, judges: Judges) -> _Tried:
         if not 0 < len(kept) < piece.family.num_parameters or len(kept) in tried:
             continue
         tried.add(len(kept))
-        found = _fitted(piece.chart, piece.family.take(kept.tolist()), prepared, judges)
+        found = _fitted(piece.chart, piece.family.take(kept.tolist()), data, tolerance)
         if found.error.relative <= max(_RISE * full.error.relative, _ROUNDING):
             return found
     return full

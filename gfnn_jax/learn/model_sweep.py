@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance, measured_error
 from gfnn_jax.learn.assemble import composed, stepped
-from gfnn_jax.learn.candidates import Candidate, Judges
+from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.clock import Budget
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.models.model import Fitted, Model, TrainingData
 
 
@@ -38,9 +39,9 @@ class ModelSweep:
 
     short_of_pairs = False
 
-    def __init__(self, model: Model, prepared: Prepared, judges: Judges):
-        self.model, self.prepared, self.judges = model, prepared, judges
-        self._data = training_data(prepared, judges, judges.training)
+    def __init__(self, model: Model, data: Dataset, tolerance: Tolerance):
+        self.model, self.data, self.tolerance = model, data, tolerance
+        self._data = training_data(data, data.training)
         self.sizes = [ModelSize(own, n) for n, own in enumerate(model.sizes(self._data), 1)]
         self._fitted: dict[int, Fitted] = {}
 
@@ -57,13 +58,13 @@ class ModelSweep:
         return 0.0
 
     def judge(self, size: ModelSize, budget: Budget, say: Callable[[str], Any]) -> Candidate:
-        """The size fitted, and its error measured by steps on the held-out pairs."""
+        """The size fitted, and its error measured by steps on the validation rows."""
         started = time.perf_counter()
         say(self.named(size))
         fitted = self._fitted[size.number] = self.model.fit(self._data, size.own)
         seconds = time.perf_counter() - started
-        images = self._images_of_users(fitted, self.judges.held_out)
-        error = self.judges.error_of(images, self.prepared.coordinates)
+        images = self._images_of_users(fitted, self.data.validation)
+        error = measured_error(self.data, self.tolerance, images)
         return Candidate(
             label=fitted.label, family=self.model.name, chart="model",
             num_parameters=fitted.num_parameters, operations=float(fitted.operations),
@@ -86,32 +87,32 @@ class ModelSweep:
 
     def predicted(self, size: ModelSize, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Images (n, 2d) of these rows, in the user's coordinates, by a fit to other rows."""
-        fitted = self.model.fit(training_data(self.prepared, self.judges, others), size.own)
+        fitted = self.model.fit(training_data(self.data, others), size.own)
         return self._images_of_users(fitted, rows)
 
     def images(self, size: ModelSize, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Images of these rows (n, 2d), as prepared, and which steps were solved (n,)."""
+        """Images of these rows (n, 2d), in inner coordinates, and which steps were solved (n,)."""
         plain = dataclasses.replace(
-            self.prepared, coordinates=CARTESIAN, angle_centre=np.zeros(0), whole=()
+            self.data, coordinates=CARTESIAN, angle_centre=np.zeros(0), whole=()
         )
-        map_ = composed(self.piece(size), plain, self.judges)
-        dt, args = self.judges.pairs.take(rows).dt, self.judges.pairs.take(rows).args
-        steps = stepped(map_, self.prepared.y0[rows], dt, args, timed=False)
+        map_ = composed(self.piece(size), plain)
+        dt, args = self.data.pairs.take(rows).dt, self.data.pairs.take(rows).args
+        steps = stepped(map_, self.data.y0[rows], dt, args, timed=False)
         return steps.images, ~steps.failed
 
     def _images_of_users(self, fitted: Fitted, rows: np.ndarray) -> np.ndarray:
         """Images (n, 2d) in the user's coordinates, NaN where a step fails."""
-        map_, pairs = composed(fitted.piece, self.prepared, self.judges), self.judges.pairs
+        map_, pairs = composed(fitted.piece, self.data), self.data.pairs
         pairs = pairs.take(rows)
         steps = stepped(map_, np.asarray(pairs.z0), pairs.dt, pairs.args, timed=False)
         return np.where(steps.failed[:, None], np.nan, steps.images)
 
 
-def training_data(prepared: Prepared, judges: Judges, rows: np.ndarray) -> TrainingData:
+def training_data(data: Dataset, rows: np.ndarray) -> TrainingData:
     """What a model is given of these rows."""
-    dt, args = prepared.given(rows)
-    coordinates, pairs = prepared.coordinates, judges.pairs.take(rows)
+    dt, args = data.given(rows)
+    coordinates, pairs = data.coordinates, data.pairs.take(rows)
     return TrainingData(
-        prepared.y0[rows], prepared.y1[rows], dt, args, prepared.parameters, prepared.scale,
+        data.y0[rows], data.y1[rows], dt, args, data.parameters, data.scale,
         coordinates.angles, coordinates.cyclic, pairs.run, pairs.place, pairs.std,
     )  # fmt: skip

@@ -9,10 +9,12 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.fitting.levenberg_marquardt import LMResult, LMState, levenberg_marquardt
-from gfnn_jax.learn.candidates import Candidate, Judges, validated
+from gfnn_jax.learn.candidates import Candidate, validated
 from gfnn_jax.learn.clock import NETWORK, Budget
 from gfnn_jax.learn.rows import rows_of
 from gfnn_jax.learn.sweeps import OF_STEPS, Generates, Size
@@ -28,13 +30,15 @@ class NetworkSweep(Generates):
     kind = "mlp"
     short_of_pairs = False  # its one size is trained on any number of pairs
 
-    def __init__(self, prepared, chart, judges: Judges, max_iterations, seed, checkpoints):
-        self.prepared, self.chart, self.judges = prepared, chart, judges
+    def __init__(
+        self, data: Dataset, tolerance: Tolerance, chart, max_iterations, seed, checkpoints
+    ):
+        self.data, self.tolerance, self.chart = data, tolerance, chart
         self._max_iterations, self._seed, self._checkpoints = max_iterations, seed, checkpoints
-        (w, target), self._weight = rows_of(prepared, chart, judges.training[:_MLP_PAIRS])
-        coordinates = prepared.coordinates
+        (w, target), self._weight = rows_of(data, chart, data.training[:_MLP_PAIRS])
+        coordinates = data.coordinates
         inputs = box_inputs(
-            w, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+            w, angles=tuple(a for a in coordinates.angles if a < data.dim),
             cyclic=coordinates.cyclic,
         )  # fmt: skip
         family = Mlp(inputs, _MLP_HIDDEN, _MLP_ACTIVATION, amplitude_of(w, target))
@@ -51,7 +55,7 @@ class NetworkSweep(Generates):
 
     def work_of_steps(self, size: Size) -> float:
         """Operations that validating the judged size takes."""
-        return OF_STEPS * len(self.judges.held_out) * size.operations
+        return OF_STEPS * len(self.data.validation) * size.operations
 
     @property
     def _work_of_iteration(self) -> float:
@@ -62,7 +66,7 @@ class NetworkSweep(Generates):
     def judge(self, size: Size, budget: Budget, say: Callable[[str], Any]) -> Candidate:
         """Train the network."""
         family = size.family
-        held, _ = rows_of(self.prepared, self.chart, self.judges.held_out)
+        held, _ = rows_of(self.data, self.chart, self.data.validation)
 
         def report(state: LMState) -> None:
             say(
@@ -76,11 +80,11 @@ class NetworkSweep(Generates):
             block=lambda count: budget.unit(
                 f"{count} iterations of {family.label}", NETWORK, count * self._work_of_iteration
             ),
-            target_rms=0.5 * self.judges.tolerance.bound,
+            target_rms=0.5 * self.tolerance.bound,
             on_progress=report, checkpoint=_every_few_seconds(self._checkpoints),
             resume=resume[1] if resume else None,
         )  # fmt: skip
-        error = self.judges.estimate(result.validation_rms)
+        error = estimated_error(self.data, self.tolerance, result.validation_rms)
         return Candidate(
             label=family.label, family=self.kind, chart=self.chart.name,
             num_parameters=family.num_parameters, operations=size.operations,
@@ -104,7 +108,7 @@ class NetworkSweep(Generates):
 
     def validate(self, size: Size, judged: Candidate, budget: Budget, say) -> Candidate:
         """The trained network with its error measured by steps."""
-        return validated(judged, self.prepared, self.chart, size.family, self._params, self.judges)
+        return validated(judged, self.data, self.tolerance, self.chart, size.family, self._params)
 
     def solve(self, size: Size, budget: Budget, say) -> tuple[Any, Any]:
         """The params of the trained network."""

@@ -18,6 +18,8 @@ import jax
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
@@ -26,12 +28,11 @@ from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import MIDPOINT
-from gfnn_jax.learn.candidates import Candidate, Judges, OneStepError, with_error
+from gfnn_jax.learn.candidates import Candidate, with_error
 from gfnn_jax.learn.choose_law import unfit_for_law
 from gfnn_jax.learn.clock import NETWORK, Budget
 from gfnn_jax.learn.cost_of_flow import contraction_of, omega_h_of, operations_of
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.rows import residual_weight
 from gfnn_jax.scenes.scene import Scene
 
@@ -63,27 +64,27 @@ _RESOLVED = 0.1  # of the tolerance: what rounds may leave over of the gradient
 
 
 def learn_network(
-    prepared: Prepared, judges: Judges, scene: Scene | None, *, seed: int, max_iterations: int,
+    data: Dataset, tolerance: Tolerance, scene: Scene | None, *, seed: int, max_iterations: int,
     budget: Budget, say: Callable[[str], Any] = lambda message: None, options: Options = OPTIONS,
 ) -> LearnedHamiltonian:  # fmt: skip
     """The network H whose flow is nearest to these pairs. It has no formula and no posterior.
 
-    prepared: without a base map. max_iterations: of all rounds. Raises FitError where the pairs are
+    data: without a base map. max_iterations: of all rounds. Raises FitError where the pairs are
     not of one autonomous flow.
     """
-    unfit = unfit_for_law(prepared, scene)
-    if prepared.varied:
+    unfit = unfit_for_law(data, scene)
+    if data.varied:
         unfit = "they differ in dt or in parameters"
     if unfit is not None:
         raise FitError(f"expected pairs of one autonomous flow to learn a network H from: {unfit}")
     started = time.perf_counter()
-    count = len(judges.training[: options.pairs])
-    rows = np.concatenate([judges.training[:count], judges.held_out])
-    y0, y1, dt, scale = prepared.y0[rows], prepared.y1[rows], prepared.dt, prepared.scale
+    count = len(data.training[: options.pairs])
+    rows = np.concatenate([data.training[:count], data.validation])
+    y0, y1, dt, scale = data.y0[rows], data.y1[rows], data.dt, data.scale
     w, wanted = MIDPOINT.evaluation_point(y0, y1), MIDPOINT.target_gradient(y0, y1, dt)
-    coordinates = prepared.coordinates
+    coordinates = data.coordinates
     inputs = box_inputs(
-        w, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+        w, angles=tuple(a for a in coordinates.angles if a < data.dim),
         cyclic=coordinates.cyclic,
     )  # fmt: skip
     family = Mlp(inputs, options.hidden, options.activation, amplitude_of(w, wanted))
@@ -97,24 +98,24 @@ def learn_network(
             family, params, w[:count], target[:count], validation=(w[count:], target[count:]),
             weight=weight, max_iterations=options.iterations[done > 0],
             block=lambda n: budget.unit(f"{n} iterations of {label}", NETWORK, n * work),
-            target_rms=_RESOLVED * judges.tolerance.bound,
+            target_rms=_RESOLVED * tolerance.bound,
         )  # fmt: skip
         params, done = jax.tree.map(np.asarray, result.params), done + max(result.iterations, 1)
         substeps = substeps_for(family, params, y0[:_STATES], dt, options.reach)
         flow = Flow(family, params, dt, scale, options.stages, substeps)
         images = np.asarray(_images(flow, y0))
-        error = judges.error_of(to_user(coordinates, images[count:]), coordinates)
+        error = measured_error(data, tolerance, to_user(coordinates, images[count:]), coordinates)
         say(f"{label}: {done} iterations, error {error.relative:.2e}")
         better = best is None or error.relative < (1 - options.gained) * best.error.relative
         idle = 0 if better else idle + 1
         if best is None or error.relative < best.error.relative:
             best = _Round(flow, images[count:], error, result.train_rms)
-        if error.bound <= judges.tolerance.bound or not np.isfinite(images).all():
+        if error.bound <= tolerance.bound or not np.isfinite(images).all():
             break
         target = family.gradient(params, w) + wanted - MIDPOINT.target_gradient(y0, images, dt)
     if best is None:
         raise FitError("expected time and iterations to train a network with, got none")
-    return _learned(best, label, prepared, judges, y0, time.perf_counter() - started)
+    return _learned(best, label, data, tolerance, y0, time.perf_counter() - started)
 
 
 class _Round(NamedTuple):
@@ -127,9 +128,9 @@ class _Round(NamedTuple):
 
 
 def _learned(
-    best: _Round, label: str, prepared: Prepared, judges: Judges, y0, seconds: float
+    best: _Round, label: str, data: Dataset, tolerance: Tolerance, y0, seconds: float
 ) -> LearnedHamiltonian:
-    flow, error, dt = best.flow, best.error, prepared.dt
+    flow, error, dt = best.flow, best.error, data.dt
     family = flow.family
     finer = _images(dataclasses.replace(flow, substeps=2 * flow.substeps), y0)
     fastest = rates(family, flow.params, y0[:_STATES])
@@ -142,10 +143,10 @@ def _learned(
         learns="hamiltonian",
     )  # fmt: skip
     off = best.images - np.asarray(finer)[-len(best.images) :]
-    truncation = float(np.abs(off / prepared.scale).max())
-    omega_h = omega_h_of(family, flow.params, prepared, fastest)
+    truncation = float(np.abs(off / data.scale).max())
+    omega_h = omega_h_of(family, flow.params, data, fastest)
     messages = ()
-    if error.bound > judges.tolerance.bound and omega_h > _SHORT:
+    if error.bound > tolerance.bound and omega_h > _SHORT:
         messages = (
             f"a network H learns little from steps that turn by {omega_h:.2g} radians (ωh): sample "
             "with a smaller dt, or learn H as terms",

@@ -44,7 +44,7 @@ def without_bias(found: Searched, request: Request) -> Searched:
     if not ranking or request.structure is not None or found.of_terms is not None:
         return found
     best = ranking[0]
-    met = found.judges.met_by(best.candidate)
+    met = found.tolerance.met_by(best.candidate)
     if met or (law is not None and preferred(law.candidate, best.candidate, np.inf)):
         return found
     rivals = _as_far(found)
@@ -88,7 +88,7 @@ def _can_be_corrected(entry: Entry) -> bool:
     plain = isinstance(entry.sweep, LinearSweep) and isinstance(entry.size.family, Products)
     if not plain:
         return False
-    return not entry.sweep.prepared.varied and entry.sweep.moved_by_states
+    return not entry.sweep.data.varied and entry.sweep.moved_by_states
 
 
 class Expected(NamedTuple):
@@ -181,13 +181,13 @@ class NoisySweep(LinearSweep):
         of_point, of_target = (of * of_noise for of in plain.of_states)
 
         def rows(which):
-            (w, target), _ = rows_of(self.prepared, self.chart, which)
+            (w, target), _ = rows_of(self.data, self.chart, which)
             found = nearest(
                 lambda w: family.gradient_and_hessian(params, w), w, target, of_point, of_target
             )
             return found.points, found.target, found.whitening
 
-        self._train, self._held = (rows(r) for r in (self.judges.training, self.judges.held_out))
+        self._train, self._held = (rows(r) for r in (self.data.training, self.data.validation))
         self._weight = np.ones(len(deviations))
 
     def in_rows(self, family: Any) -> Any:
@@ -203,7 +203,7 @@ class NoisySweep(LinearSweep):
         plain = self.plain.validate(size, judged, budget, say)
         solved, params = self.solve(size, budget, say)
         candidate = dataclasses.replace(plain, condition=solved.condition, rank=solved.rank)
-        return validated(candidate, self.prepared, self.chart, size.family, params, self.judges)
+        return validated(candidate, self.data, self.tolerance, self.chart, size.family, params)
 
     def own_error(self, size: Size) -> float:
         """That of the measured points."""

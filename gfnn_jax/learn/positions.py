@@ -16,8 +16,10 @@ import numpy as np
 
 from gfnn_jax.coordinates import Coordinates, circle_centre, nearest_image, whole_turns
 from gfnn_jax.data.recording import Recording
+from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, one_step_error
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.dataset.split import Split, split_rows
+from gfnn_jax.dataset.structures import Sites, structure_of
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs, variable_signs
@@ -27,10 +29,9 @@ from gfnn_jax.generating.charts import TYPE1
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
 from gfnn_jax.learn.assemble import stepped
-from gfnn_jax.learn.candidates import Candidate, OneStepError, Tolerance, one_step_error
+from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.clock import ROWS, Budget
 from gfnn_jax.learn.search import MET
-from gfnn_jax.learn.structures import Sites, structure_of
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.discrete_lagrangian import left_over, solve

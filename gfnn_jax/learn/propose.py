@@ -8,14 +8,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.structures import structure_of
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.fitting.gauss_newton import fitted_gradients
 from gfnn_jax.generating.charts import CHARTS
-from gfnn_jax.learn.prepare import Prepared, prepare
 from gfnn_jax.learn.request import Request
-from gfnn_jax.learn.structures import structure_of
-from gfnn_jax.phase_space import Pairs
 
 _FEWEST_DIM = 6  # below it a fit needs no structure
 _CHARTS = ("midpoint", "type2")  # of flows, to O(h²), and of kicked maps
@@ -26,10 +25,10 @@ _EXPLAINED = 0.1  # of the forces or of the velocities, that the midpoint's erro
 _TRIED = 0.02  # of them: so little that a law of the structure is looked for before anything else
 
 
-def proposed(prepared: Prepared) -> list[str]:
+def proposed(data: Dataset) -> list[str]:
     """One line that names the structure which explains a sample of the pairs best, to O(h²); none
-    where none does. prepared: without a base map or a structure."""
-    best, left = _best(prepared)
+    where none does. data: without a base map or a structure."""
+    best, left = _best(data)
     if not left < _EXPLAINED:
         return []
     return [
@@ -38,32 +37,30 @@ def proposed(prepared: Prepared) -> list[str]:
     ]
 
 
-def structures_to_try(
-    request: Request, pairs: Pairs, plain: Prepared
-) -> Iterator[tuple[Request, Prepared]]:
-    """The request and these pairs as prepared: with the structure that explains nearly all of a
-    sample, where a law is looked for and nothing is told of it; then as they are."""
-    options = request.options
-    told = options.terms or request.scene is not None or plain.structure is not None
+def structures_to_try(request: Request, data: Dataset) -> Iterator[tuple[Request, Dataset]]:
+    """The request and its data: with the structure that explains nearly all of a sample, where a
+    law is looked for and nothing is told of it; then as they are."""
+    told = request.options.terms or request.scene is not None or data.structure is not None
     if request.seeks_law and not (told or request.of_network):
-        best, left = _best(plain)
+        best, left = _best(data)
         if left < _TRIED:
-            structure = structure_of(best, plain.dim, plain.coordinates)
+            structure = structure_of(best, data.dim, data.coordinates)
             request.say(
                 f"a {best} explains all but {left:.1g} of forces and velocities: tried first"
             )
+            same = Dataset.of(data.pairs, data.coordinates, structure, data.row)
             yield (
                 dataclasses.replace(request, structure=structure),
-                prepare(pairs, plain.coordinates, structure),
+                dataclasses.replace(same, split=data.split),
             )
-    yield request, plain
+    yield request, data
 
 
-def _best(prepared: Prepared) -> tuple[str, float]:
+def _best(data: Dataset) -> tuple[str, float]:
     """The structure that leaves least of a sample's forces and velocities over, and that part."""
-    if prepared.dim < _FEWEST_DIM or prepared.varied or prepared.coordinates.angles:
+    if data.dim < _FEWEST_DIM or data.varied or data.coordinates.angles:
         return "", np.inf
-    left = {text: _left_over(text, prepared) for text in _possible(prepared.dim)}
+    left = {text: _left_over(text, data) for text in _possible(data.dim)}
     best = min(left, key=lambda text: left[text])
     return best, left[best]
 
@@ -74,22 +71,22 @@ def _possible(dim: int) -> Iterator[str]:
     yield from (f"bodies:{dim // k}" for k in (3, 2, 1) if dim % k == 0 and dim // k > 1)
 
 
-def _left_over(text: str, prepared: Prepared) -> float:
+def _left_over(text: str, data: Dataset) -> float:
     """The least part of the held-out target gradients that a library of the structure leaves."""
-    structure = structure_of(text, prepared.dim)
+    structure = structure_of(text, data.dim)
     assert structure is not None
-    libraries = list(structure.libraries(prepared.dim))
+    libraries = list(structure.libraries(data.dim))
     small = [family for family in libraries if family.num_parameters <= _MOST_TERMS]
-    return min((_of_library(f, prepared) for f in small), default=np.inf)
+    return min((_of_library(f, data) for f in small), default=np.inf)
 
 
-def _of_library(family: Sums, prepared: Prepared) -> float:
-    y0, y1 = _quiet(prepared)
+def _of_library(family: Sums, data: Dataset) -> float:
+    y0, y1 = _quiet(data)
     half, found = len(y0) // 2, []
     for chart in (CHARTS[name] for name in _CHARTS):
-        w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, prepared.dt)
+        w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, data.dt)
         try:
-            c = fitted_gradients(family, w[:half], target[:half], prepared.scale)
+            c = fitted_gradients(family, w[:half], target[:half], data.scale)
         except (FitError, np.linalg.LinAlgError):  # functions that overflow at these states
             continue
         off = family.gradient(c, w[half:]) - target[half:]
@@ -97,10 +94,10 @@ def _of_library(family: Sums, prepared: Prepared) -> float:
     return min(found, default=np.inf)
 
 
-def _quiet(prepared: Prepared) -> tuple[np.ndarray, np.ndarray]:
+def _quiet(data: Dataset) -> tuple[np.ndarray, np.ndarray]:
     """A sample of the pairs without those that move most, as close passages do."""
-    y0, y1 = prepared.y0[: 2 * _SAMPLE], prepared.y1[: 2 * _SAMPLE]
-    moved = np.abs((y1 - y0) / prepared.scale).max(axis=1)
+    y0, y1 = data.y0[: 2 * _SAMPLE], data.y1[: 2 * _SAMPLE]
+    moved = np.abs((y1 - y0) / data.scale).max(axis=1)
     quiet = moved <= np.quantile(moved, _QUIET)
     return y0[quiet], y1[quiet]
 

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.data.recording import Recording
-from gfnn_jax.dataset.stretches import Scales, Stretch, measure, nodes_of, stretches
+from gfnn_jax.data.roles import symbols
+from gfnn_jax.dataset.stretches import Nodes, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.maps.estimates import law_in_use
 from gfnn_jax.maps.inputs import HOLDS, Signals
@@ -28,6 +29,7 @@ from gfnn_jax.models.law_fit import LawFit
 from gfnn_jax.models.law_search import FRICTIONS, SearchOptions, search
 from gfnn_jax.models.law_text import Expression, friction_of, speed_names, terms_of
 from gfnn_jax.models.learned_law import LearnedLaw, hamiltonian_of, in_columns, scaled
+from gfnn_jax.models.residuals import Trace, whiteness
 
 _IMITATED = 1e-4  # of what a sensor's parameter changes, that no coefficient of the law does
 _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apart
@@ -108,7 +110,8 @@ def fit_recording(
         law, z, scales.dt, angles=angles, signals=signals, inputs=u if signals else None, root=root
     )
     map_ = _with_sensors(map_, used.sensors)
-    return _described(recording, fit, map_, law, covariance, horizons, gauge, tuple(steps), scales,
+    traces = _traces(recording, seen.channels, fit, law, nodes, zeros)
+    return _described(recording, fit, map_, law, covariance, horizons, gauge, tuple(steps), traces,
                       (q, v, u), [n.t for n in nodes], time.process_time() - started)  # fmt: skip
 
 
@@ -195,18 +198,20 @@ def _with_sensors(map_: Any, sensors: Sensors) -> Any:
 
 def _described(
     recording: Recording, fit: LawFit, map_: Any, law: Any, covariance: np.ndarray,
-    horizons: Any, gauge: str, steps: tuple[str, ...], scales: Scales, states: Any,
+    horizons: Any, gauge: str, steps: tuple[str, ...], traces: tuple[Trace, ...], states: Any,
     times: list[np.ndarray], seconds: float,
 ) -> LearnedLaw:  # fmt: skip
     """The law in the words of the recording."""
     names = recording.coordinates
     speeds = speed_names(names, recording.velocities)
+    in_formulas = symbols((*names, *speeds))
+    codes, of_speeds = in_formulas[: len(names)], in_formulas[len(names) :]
     channels = map_.sensors.seen.channels
     factors = np.array([recording.factors[name] for name in channels])
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     count, lost = law.terms.count, law.friction.count
-    lagrangian = terms_of(law.terms, law.coefficients, std[:count], names, speeds)
-    friction = friction_of(law.friction, law.losses, std[count : count + lost], speeds)
+    lagrangian = terms_of(law.terms, law.coefficients, std[:count], codes, of_speeds)
+    friction = friction_of(law.friction, law.losses, std[count : count + lost], of_speeds)
     of_gains = std[count + lost :].reshape(law.gains.shape)
     gains = {
         u: {q: (float(law.gains[i, j]), float(of_gains[i, j])) for i, q in enumerate(names)}
@@ -232,15 +237,41 @@ def _described(
         messages.append("friction with a negative coefficient: the record shows energy gained")
     return LearnedLaw(
         map=map_, lagrangian=lagrangian, friction=friction, gains=gains,
-        hamiltonian=hamiltonian_of(law.terms, lagrangian, names), zeros=zeros,
+        hamiltonian=hamiltonian_of(law.terms, lagrangian, codes), zeros=zeros,
         noise=dict(zip(channels, map(float, map_.sensors.sigma / factors), strict=True)),
         residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)), gauge=gauge,
+        whiteness=whiteness(traces, channels, recording.inputs), traces=traces,
         observe={n: f for n, f in formulas.items() if n != f}, sensors=sensors,
         alike=_alike(fit, lagrangian, friction), horizon=tuple(horizons),
         energy=_energy(law, friction, recording.inputs, states, times),
         messages=tuple(messages), steps=steps, num_samples=len(recording), seconds=seconds,
         ended="every length of arcs was fitted",
     )  # fmt: skip
+
+
+def _traces(
+    recording: Recording,
+    channels: tuple[str, ...],
+    fit: LawFit,
+    law: Any,
+    nodes: list[Nodes],
+    zeros: np.ndarray,
+) -> tuple[Trace, ...]:
+    """The arcs of a fit, channels in the file's units."""
+    arcs, found, d = fit.arcs, [], fit.form.dim
+    factors = np.array([recording.factors[name] for name in channels])
+    left = fit.fitted.residuals * fit.sigma * arcs.noise
+    for k, (i, a, b) in enumerate(arcs.home):
+        n, stretch = b - a, nodes[i].stretch
+        y, x = arcs.y[k, :n], fit.fitted.x[k, :n]
+        energy = law.energy(x[:, :d] + zeros, x[:, d:])
+        found.append(
+            Trace(
+                stretch.run, arcs.t[k, :n], y / factors, (y - left[k, :n]) / factors,
+                fit.fitted.residuals[k, :n], energy, stretch.u[nodes[i].at[a:b]],
+            )
+        )  # fmt: skip
+    return tuple(found)
 
 
 def _alike(fit: LawFit, lagrangian: Expression, friction: Expression) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_inner, whole_turns
+from gfnn_jax.dataset.measured_error import Tolerance, one_step_error
 from gfnn_jax.errors import FitWarning
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.time_step import OfTimeStep
@@ -27,7 +28,7 @@ from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.assemble import stepped
-from gfnn_jax.learn.candidates import Candidate, Tolerance, one_step_error, with_error
+from gfnn_jax.learn.candidates import Candidate, with_error
 from gfnn_jax.learn.conclude import not_met
 from gfnn_jax.learn.fit import Fit
 from gfnn_jax.learn.formula import Term, formula

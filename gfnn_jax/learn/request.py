@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.coordinates import Coordinates
-from gfnn_jax.learn.candidates import Candidate, Tolerance
+from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.dataset.structures import Structure, structure_of
+from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.check import (
     check_moves,
     check_request,
@@ -19,7 +21,6 @@ from gfnn_jax.learn.check import (
 )
 from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.options import FitOptions
-from gfnn_jax.learn.structures import Structure, structure_of
 from gfnn_jax.learn.varied import as_varied
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene

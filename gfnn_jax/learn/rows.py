@@ -1,4 +1,4 @@
-"""The rows of the least-squares problem of S, from prepared pairs."""
+"""The rows of the least-squares problem of S, from the rows of a data set."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.generating.charts import AnyChart
-from gfnn_jax.learn.prepare import Prepared
 
 
-def rows_of(prepared: Prepared, chart: AnyChart, rows) -> tuple[Any, np.ndarray]:
+def rows_of(data: Dataset, chart: AnyChart, rows) -> tuple[Any, np.ndarray]:
     """(w, target_gradient) of these rows, with their args where there are some, and the weight that
     makes a row of ∇S unit-free. Where each pair has its own dt: (w, h times that, dt), as `_Moves`
     has its terms."""
-    (y0, y1), (_, args) = (prepared.y0[rows], prepared.y1[rows]), prepared.given(rows)
-    dt = prepared.dt
-    if prepared.own_dt is not None:
-        dt, args = 1.0, prepared.own_dt[rows, None]
-    data = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, dt)
-    data = data if args is None else (*data, args)
-    return data, residual_weight(chart, prepared.scale, dt)
+    (y0, y1), (_, args) = (data.y0[rows], data.y1[rows]), data.given(rows)
+    dt = data.dt
+    if data.own_dt is not None:
+        dt, args = 1.0, data.own_dt[rows, None]
+    found = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, dt)
+    found = found if args is None else (*found, args)
+    return found, residual_weight(chart, data.scale, dt)
 
 
 def of_rows(family: Any) -> Any:

@@ -23,9 +23,9 @@ import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.coordinates import nearest_image
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.noise import robust
 from gfnn_jax.learn.diagnose import looked_for_errors
-from gfnn_jax.learn.prepare import Prepared
 
 # Times the median residual: beyond the second, a pair is a gross error. Those between the two are
 # fewer than this part of them. Of normal noise and d = 1 one pair of 100,000 is beyond the first.
@@ -47,21 +47,21 @@ _ABSOLUTE, _BIWEIGHT, _TUKEY = 8, 7, 6.0  # rounds of either loss, and where the
 _SPANNED = 1e-12  # of the largest: a smaller eigenvalue of a Gram matrix is roundoff
 
 
-def gross_errors(prepared: Prepared, goes_on: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+def gross_errors(data: Dataset, goes_on: np.ndarray, left_out: np.ndarray) -> np.ndarray:
     """Rows of the pairs that are gross errors; none where it is not certain which they are.
 
     goes_on: (N − 1,) whether the image of a pair is the state of the next. left_out: (N,) bool,
     pairs that are known to be wrong, and are not named again.
     """
     none = np.zeros(0, int)
-    if prepared.varied or prepared.structure is not None:
+    if data.varied or data.structure is not None:
         return none
-    rows = looked_for_errors(len(prepared.y0))
-    if len(rows) < len(prepared.y0):
+    rows = looked_for_errors(len(data.y0))
+    if len(rows) < len(data.y0):
         within = goes_on[rows[:-1]] & (np.diff(rows) == 1)
-        return rows[gross_errors(prepared.take(rows), within, left_out[rows])]
+        return rows[gross_errors(data.take(rows), within, left_out[rows])]
     best = None
-    for model in _models(prepared, ~left_out):
+    for model in _models(data, ~left_out):
         if best is not None and not model.left < _GAINED * best.left:
             continue
         best = model
@@ -76,7 +76,7 @@ def gross_errors(prepared: Prepared, goes_on: np.ndarray, left_out: np.ndarray) 
         return none
     if goes_on.any():
         return _borne_out(best, far, goes_on, left_out)
-    alone = far[_ordinary_around(prepared, best.unit, size, far)]
+    alone = far[_ordinary_around(data, best.unit, size, far)]
     return alone if len(alone) >= _ALONE * len(far) else none
 
 
@@ -87,14 +87,14 @@ class _Model:
     regressor. left: the larger median, in units of the moves'. unit: (2d,) robust deviations.
     """
 
-    def __init__(self, prepared: Prepared, known: np.ndarray, degree: int):
-        self._angles, self._degree = prepared.coordinates.angles, degree
-        self._free = tuple(i for i in prepared.coordinates.cyclic if i not in self._angles)
-        self.y0, self.y1 = prepared.y0, prepared.y1
+    def __init__(self, data: Dataset, known: np.ndarray, degree: int):
+        self._angles, self._degree = data.coordinates.angles, degree
+        self._free = tuple(i for i in data.coordinates.cyclic if i not in self._angles)
+        self.y0, self.y1 = data.y0, data.y1
         both = np.concatenate([self.y0, self.y1])
         self._centre = np.median(both, axis=0)
         unit = robust(both - self._centre, axis=0)
-        self.unit = np.where(unit > 0, unit, prepared.scale)
+        self.unit = np.where(unit > 0, unit, data.scale)
         move = nearest_image(self.y1 - self.y0, self._angles) / self.unit
         self._ahead, ahead, left = self._fitted(self.y0, move, known)
         _, back, left_back = self._fitted(self.y1, -move, known)
@@ -145,14 +145,14 @@ class _Model:
         return np.stack(list(products.values()), axis=1)
 
 
-def _models(prepared: Prepared, known: np.ndarray) -> Iterator[_Model]:
+def _models(data: Dataset, known: np.ndarray) -> Iterator[_Model]:
     """By rising degree, as far as the pairs tell their terms."""
-    coordinates, width = prepared.coordinates, prepared.y0.shape[1]
+    coordinates, width = data.coordinates, data.y0.shape[1]
     width += len(coordinates.angles) - len(set(coordinates.cyclic) - set(coordinates.angles))
     most = min(_MOST_TERMS, int(known.sum()) // _PAIRS_PER_TERM)
     degree = 1
     while math.comb(width + degree, degree) <= most:
-        yield _Model(prepared, known, degree)
+        yield _Model(data, known, degree)
         degree += 1
 
 
@@ -179,11 +179,11 @@ def _resistant(design, move) -> tuple[np.ndarray, float]:
     return turn @ coefficients, median
 
 
-def _ordinary_around(prepared: Prepared, unit, size, rows) -> np.ndarray:
+def _ordinary_around(data: Dataset, unit, size, rows) -> np.ndarray:
     """Which of the rows have ordinary neighbours, of the state or of the image: a state that is a
     gross error has no neighbours but its like."""
     near_one = np.zeros(len(rows), bool)
-    for y in (prepared.y0 / unit, prepared.y1 / unit):
+    for y in (data.y0 / unit, data.y1 / unit):
         near = cKDTree(y).query(y[rows], k=_NEIGHBOURS + 1)[1][:, 1:]
         near_one |= np.sort(size[near], axis=1)[:, -1 - _BUT] < _ORDINARY
     return near_one

@@ -7,9 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.dataset.structures import Sites
 from gfnn_jax.errors import FitError
 from gfnn_jax.learn.assemble import composed
-from gfnn_jax.learn.candidates import Candidate, Judges
+from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.choose_charts import Charts
 from gfnn_jax.learn.choose_law import DEARER, law_of
 from gfnn_jax.learn.clock import Budget
@@ -28,7 +31,6 @@ from gfnn_jax.learn.map_of_terms import LearnedMap, map_of
 from gfnn_jax.learn.model_sweep import ModelSweep
 from gfnn_jax.learn.network_sweep import NetworkSweep
 from gfnn_jax.learn.networks import learn_network
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import Entry, Found, Search
 from gfnn_jax.learn.sweeps import sweep_of_dt, sweeps_for
@@ -42,105 +44,108 @@ OnBetter = Callable[[SymplecticMap, Candidate], Any]
 class Searched(NamedTuple):
     """law: H, or None. of_terms: S with parameters or of a structure, or None. linear: the linear
     map, where the budget has left nothing that is as accurate. found: the generated maps. swept:
-    whether any were looked for. charts: theirs. plain: the pairs as prepared, without a base map or
-    law factored out. judges: of the user's pairs."""
+    whether any were looked for. charts: theirs. data: the user's, nothing of it factored out.
+    tolerance: that was asked for."""
 
     law: LearnedHamiltonian | None
     of_terms: LearnedMap | None
     found: Found
     swept: bool
     charts: Charts
-    plain: Prepared
-    judges: Judges
+    data: Dataset
+    tolerance: Tolerance
     linear: Candidate | None = None
 
     @property
     def met_by_law(self) -> bool:
-        return self.law is not None and self.judges.met_by(self.law.candidate)
+        return self.law is not None and self.tolerance.met_by(self.law.candidate)
 
 
 def searched(
-    request: Request, plain: Prepared, seen: Diagnosis, judges: Judges,
-    on_better: OnBetter | None,
-) -> Searched:  # fmt: skip
+    request: Request, data: Dataset, seen: Diagnosis, on_better: OnBetter | None
+) -> Searched:
     """Every candidate. Raises FitError where there is none."""
-    bound, budget, say, tell = request.tolerance, request.budget, request.say, request.tell
-    options = request.options
-    scene, prepared, charts = request.scene, seen.prepared, seen.charts
+    tolerance, budget, say, tell = request.tolerance, request.budget, request.say, request.tell
+    options, scene, charts = request.options, request.scene, seen.charts
     better = _Better(on_better) if on_better is not None else None
-    given = bound.bound, budget, say, tell, better
+    given = tolerance.bound, budget, say, tell, better
     # Small sizes first: a map is then there, however long the search for H.
-    early = not prepared.of_terms or options.model is not None
-    climb = Search(_sweeps(request, plain, seen, judges) if early else [], *given)
+    early = not _of_terms(data) or options.model is not None
+    climb = Search(_sweeps(request, data, seen) if early else [], *given)
     climb.climb(most=_SMALL)
-    law = _law(request, plain, judges, better, DEARER * climb.cheapest)
+    law = _law(request, data, better, DEARER * climb.cheapest)
     of_terms, failed = None, None
-    met_by_law = law is not None and judges.met_by(law.candidate)
+    met_by_law = law is not None and tolerance.met_by(law.candidate)
     wanted = not early and options.learn != "hamiltonian" and not met_by_law
     if wanted and options.family == "auto":
         try:
-            of_terms = map_of(prepared, judges, scene, options.chart, law, budget, say)
+            of_terms = map_of(seen.data, tolerance, scene, options.chart, law, budget, say)
         except FitError as error:
             failed = error
-    if wanted and plain.args is not None and not _met(of_terms, judges):
+    if wanted and data.args is not None and not _met(of_terms, tolerance):
         try:
-            seen = diagnosed(plain, options.chart, request.reversor, options.seed)
+            seen = diagnosed(data, options.chart, request.reversor, options.seed)
         except FitError as error:
             failed = failed or error
-        prepared, charts = seen.prepared, seen.charts
+        charts = seen.charts
     if not early:
-        climb = Search(_sweeps(request, plain, seen, judges), *given)
+        climb = Search(_sweeps(request, data, seen), *given)
     dearest = law.candidate.operations if law is not None and met_by_law else np.inf
     climb.climb(dearest)
     found = climb.found()
     dearest /= DEARER  # of maps that would be chosen
     lossy = seen.damping is not None or (law is not None and bool(law.friction))
-    if plain.varied or lossy:  # pairs of H's flow are drawn, and factored out, at one dt
+    if data.varied or lossy:  # pairs of H's flow are drawn, and factored out, at one dt
         pass
     elif (
         law is not None
         and met_by_law
-        and more_pairs_would_help(climb.sweeps, found, bound, dearest)
+        and more_pairs_would_help(climb.sweeps, found, tolerance, dearest)
     ):
         say("drawing pairs from the flow of H")
         drawn = search_of_law(
-            law, judges.pairs, judges, scene, request.coordinates, dearest, budget, say, tell,
-            options.seed,
+            law, data, tolerance, scene, dearest, budget, say, tell, options.seed
         )  # fmt: skip
         if drawn is not None:
             found, charts = drawn
     elif (
-        law is not None and not met_by_law and plain.args is None
-        and law_explains_most(law, found, bound, budget)
+        law is not None and not met_by_law and data.args is None
+        and law_explains_most(law, found, tolerance, budget)
     ):  # fmt: skip
         say(f"learning what the flow of {law.candidate.label} leaves over")
-        around = search_around(law, plain, judges, scene, budget, say, tell, better, options.seed)
+        around = search_around(law, data, tolerance, scene, budget, say, tell, better, options.seed)
         if around is not None and better_than(around.found, found, law):
             found, charts = around
     known = [f.candidate for f in (law, of_terms, *found.ranking[:1]) if f is not None]
     best = min((c.validation_bound for c in known), default=np.inf)
     linear = None
-    if budget.over and best > bound.bound:
-        linear = linear_map(seen.plain, judges)
+    if budget.over and best > tolerance.bound:
+        linear = linear_map(seen.plain, tolerance)
         if linear is not None and linear.validation_bound < best:
             tell(linear)
         elif known:
             linear = None
     if not known and linear is None:
-        raise failed or FitError(_nothing_found(len(judges.pairs), budget))
-    if of_terms is not None and found.ranking and not _met(of_terms, judges):
+        raise failed or FitError(_nothing_found(len(data), budget))
+    if of_terms is not None and found.ranking and not _met(of_terms, tolerance):
         best = found.ranking[0].candidate
         if best.validation_bound < of_terms.candidate.validation_bound:
             of_terms = None
-    return Searched(law, of_terms, found, bool(climb.sweeps), charts, plain, judges, linear)
+    return Searched(law, of_terms, found, bool(climb.sweeps), charts, data, tolerance, linear)
 
 
-def _met(found: LearnedMap | None, judges: Judges) -> bool:
-    return found is not None and judges.met_by(found.candidate)
+def _met(found: LearnedMap | None, tolerance: Tolerance) -> bool:
+    return found is not None and tolerance.met_by(found.candidate)
+
+
+def _of_terms(data: Dataset) -> bool:
+    """Whether S, where it is learned, is a sum of terms: with parameters, or over sites."""
+    sites = isinstance(data.structure, Sites) and data.own_dt is None
+    return sites or data.args is not None
 
 
 def _law(
-    request: Request, plain: Prepared, judges: Judges, better: _Better | None, dearest: float
+    request: Request, data: Dataset, better: _Better | None, dearest: float
 ) -> LearnedHamiltonian | None:
     """H, where one is looked for and found. dearest: operations of a step of a law that is chosen
     beside the maps at hand."""
@@ -149,41 +154,39 @@ def _law(
         return None
     if request.of_network:
         law = learn_network(
-            plain, judges, request.scene, seed=options.seed, budget=request.budget,
+            data, request.tolerance, request.scene, seed=options.seed, budget=request.budget,
             say=request.say, max_iterations=options.max_iterations,
         )  # fmt: skip
     else:
         law = law_of(
-            plain, judges, request.scene, options.learn, options.terms, request.budget, request.say,
-            dearest,
+            data, request.tolerance, request.scene, options.learn, options.terms, request.budget,
+            request.say, dearest,
         )  # fmt: skip
     if law is not None:
         if better is not None:
-            better.offer(law.candidate, lambda: composed(law.flow, plain, judges))
+            better.offer(law.candidate, lambda: composed(law.flow, data))
         request.tell(law.candidate)
     return law
 
 
-def _sweeps(request: Request, plain: Prepared, seen: Diagnosis, judges: Judges) -> list[Any]:
+def _sweeps(request: Request, taken: Dataset, seen: Diagnosis) -> list[Any]:
     """The sweeps of S over the charts that cover the data; none where H alone is learned, or the
     pairs are driven, or differ in dt and in parameters too."""
+    charts, data, tolerance = seen.charts.charts, seen.data, request.tolerance
     options = request.options
     if options.model is not None:
-        return [ModelSweep(options.model, plain, judges)]
-    charts, prepared = seen.charts.charts, seen.prepared
-    if options.learn == "hamiltonian" or prepared.period is not None:
+        return [ModelSweep(options.model, taken, tolerance)]
+    if options.learn == "hamiltonian" or data.period is not None:
         return []
-    if prepared.own_dt is not None:
-        alone = prepared.structure is None and prepared.args is None
-        return [sweep_of_dt(prepared, request.scene, judges, request.factors)] if alone else []
+    if data.own_dt is not None:
+        alone = data.structure is None and data.args is None
+        return [sweep_of_dt(data, tolerance, request.scene, request.factors)] if alone else []
     if options.family == "mlp":
-        given = (prepared, charts[0], judges, options.max_iterations, options.seed,
+        given = (data, tolerance, charts[0], options.max_iterations, options.seed,
                  request.checkpoints)  # fmt: skip
         count = options.ensemble
         return [NetworkSweep(*given) if count == 1 else EnsembleSweep(*given, count=count)]
-    return list(
-        sweeps_for(options.family, charts, prepared, request.scene, judges, request.factors)
-    )
+    return list(sweeps_for(options.family, charts, data, tolerance, request.scene, request.factors))
 
 
 def _nothing_found(num_pairs: int, budget: Budget) -> str:
@@ -211,4 +214,4 @@ class _Better:
 
 def _map_of(entry: Entry) -> SymplecticMap:
     sweep = entry.sweep
-    return composed(sweep.piece(entry.size), sweep.prepared, sweep.judges)
+    return composed(sweep.piece(entry.size), sweep.data)

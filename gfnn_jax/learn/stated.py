@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.measured_error import measured_error
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.learn.assemble import stepped
@@ -54,22 +55,21 @@ class Stated(NamedTuple):
 
 def stated(chosen: Chosen, found: Searched) -> Stated:
     """The chosen candidate with its error on the test pairs, or by cross-validation."""
-    judges, candidate = found.judges, chosen.candidate
-    block = np.arange(len(judges.pairs)) if judges.stretch is None else judges.stretch
-    if len(judges.test):
-        rows, by = judges.test, "test"
+    data, candidate = found.data, chosen.candidate
+    block = data.split.stretch
+    if len(data.test):
+        rows, by = data.test, "test"
         images = _images_of(chosen, found, rows)
     else:
         by, predicts = "cross-validation", _predictor(chosen, found)
-        rows = np.concatenate([judges.training, judges.held_out])
+        rows = np.concatenate([data.training, data.validation])
         if predicts is None:
-            return Stated(
-                candidate, "validation", len(judges.held_out), _count(block, judges.held_out)
-            )
+            held = data.validation
+            return Stated(candidate, "validation", len(held), _count(block, held))
         folds = np.array_split(np.unique(block[rows]), min(_FOLDS, _count(block, rows)))
         out = [rows[np.isin(block[rows], fold)] for fold in folds]
         rows, images = np.concatenate(out), np.concatenate([predicts(part) for part in out])
-    error = judges.error_of(images, candidate.map.coordinates, rows)
+    error = measured_error(data, found.tolerance, images, rows)
     return Stated(with_error(candidate, error), by, len(rows), _count(block, rows))
 
 
@@ -79,17 +79,19 @@ def _count(block: np.ndarray, rows: np.ndarray) -> int:
 
 def _images_of(chosen: Chosen, found: Searched, rows: np.ndarray) -> np.ndarray:
     """By the steps that users run; in NumPy where the budget had no room for compiling them."""
-    candidate, prepared, entry = chosen.candidate, chosen.prepared, chosen.entry
-    pairs = found.judges.pairs.take(rows)
+    candidate, data, entry = chosen.candidate, chosen.data, chosen.entry
+    pairs = found.data.pairs.take(rows)
     if candidate.microseconds_per_step is None and found.linear is not None:
-        linear = jax.tree.map(np.asarray, candidate.map.pieces[0])
-        return to_user(prepared.coordinates, linear.image(prepared.y0[rows]))
+        images = data.y0[rows]
+        for piece in jax.tree.map(np.asarray, candidate.map.pieces):
+            images = piece.image(images)
+        return to_user(data.coordinates, images)
     sweep = None if entry is None else entry.sweep
-    own = sweep is not None and sweep.judges.pairs is found.judges.pairs
+    own = sweep is not None and sweep.data.pairs is found.data.pairs
     if candidate.microseconds_per_step is None and entry is not None and own:
         images, solved = entry.sweep.images(entry.size, rows)
-        images = prepared.whole_image(np.where(solved[:, None], images, np.nan))
-        return to_user(prepared.coordinates, images)
+        images = data.whole_image(np.where(solved[:, None], images, np.nan))
+        return to_user(data.coordinates, images)
     steps = stepped(candidate.map, np.asarray(pairs.z0), pairs.dt, pairs.args, timed=False)
     return np.where(steps.failed[:, None], np.nan, steps.images)
 
@@ -99,7 +101,7 @@ def _predictor(chosen: Chosen, found: Searched) -> Predicts | None:
     known how."""
     entry, law = chosen.entry, found.law
     if entry is not None:
-        return _of_entry(entry) if entry.sweep.judges.pairs is found.judges.pairs else None
+        return _of_entry(entry) if entry.sweep.data.pairs is found.data.pairs else None
     flow = law is not None and chosen.candidate.learns == "hamiltonian" and law.terms
     return _of_law(found) if flow else None
 
@@ -108,24 +110,22 @@ def _of_entry(entry: Entry) -> Predicts | None:
     sweep = entry.sweep
     if isinstance(sweep, NetworkSweep):  # each would be trained as long as the first
         return None
-    everyone = np.concatenate([sweep.judges.training, sweep.judges.held_out])
+    everyone = np.concatenate([sweep.data.training, sweep.data.validation])
     return lambda rows: sweep.predicted(entry.size, np.setdiff1d(everyone, rows), rows)
 
 
 def _of_law(found: Searched) -> Predicts:
-    prepared, law = found.plain, found.law
+    data, law = found.data, found.law
     assert law is not None
     flow = law.flow
-    problem = Problem(
-        prepared.y0, prepared.y1, prepared.each_dt, prepared.scale, args=prepared.args
-    )
-    steps = Steps(flow.stages, flow.over(np.max(prepared.each_dt)).substeps)
+    problem = Problem(data.y0, data.y1, data.each_dt, data.scale, args=data.args)
+    steps = Steps(flow.stages, flow.over(np.max(data.each_dt)).substeps)
     coefficients = np.asarray(flow.params)
 
     def predicts(rows: np.ndarray) -> np.ndarray:
-        others = np.setdiff1d(np.arange(len(prepared.y0)), rows)
+        others = np.setdiff1d(np.arange(len(data)), rows)
         fit = problem.fit(flow.family, coefficients, others, rounds=False, steps=steps)
         images = problem.images(flow.family, fit.coefficients, rows, steps)
-        return to_user(prepared.coordinates, images.states)
+        return to_user(data.coordinates, images.states)
 
     return predicts

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
 from gfnn_jax.dataset.noise import of_pairs
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.dataset.split import outermost
@@ -25,9 +27,8 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.assemble import with_predictor
-from gfnn_jax.learn.candidates import Candidate, Judges, refined_images, validated
+from gfnn_jax.learn.candidates import Candidate, refined_images, validated
 from gfnn_jax.learn.clock import Budget
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.learn.rows import of_rows, rows_of
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping
@@ -76,7 +77,12 @@ class Size:
 
 
 def sweeps_for(
-    request: Any, charts: Sequence[AnyChart], prepared, scene, judges, factors=None
+    request: Any,
+    charts: Sequence[AnyChart],
+    data: Dataset,
+    tolerance: Tolerance,
+    scene,
+    factors=None,
 ) -> Iterator:
     """The sweeps of the families that apply, chart by chart.
 
@@ -87,29 +93,29 @@ def sweeps_for(
     if not isinstance(request, str):
         for chart in charts:
             yield LinearSweep(
-                prepared, chart, judges, "own", None, None, own=lambda i: own_families(request, i)
+                data, tolerance, chart, "own", None, None, own=lambda i: own_families(request, i)
             )  # fmt: skip
         return
     features = scene.features if scene is not None else None
     polynomials = request in ("auto", "polynomial")
-    even = polynomials and (scene is None or scene.reversor is None) and is_even(prepared, judges)
+    even = polynomials and (scene is None or scene.reversor is None) and is_even(data)
     for chart in charts:
         # Only the midpoint S inherits the parity.
         reversor = scene.reversor if scene is not None and chart == MIDPOINT else None
         if polynomials:
             yield LinearSweep(
-                prepared, chart, judges, "polynomial", None, reversor, factors, even
+                data, tolerance, chart, "polynomial", None, reversor, factors, even
             )  # fmt: skip
         if request in ("auto", "features") and features is not None:
-            yield LinearSweep(prepared, chart, judges, "features", features, reversor, factors)
-        if request == "sines" or (request == "auto" and prepared.dim > 2):
-            yield LinearSweep(prepared, chart, judges, "sines", None, None, factors)
+            yield LinearSweep(data, tolerance, chart, "features", features, reversor, factors)
+        if request == "sines" or (request == "auto" and data.dim > 2):
+            yield LinearSweep(data, tolerance, chart, "sines", None, None, factors)
 
 
-def sweep_of_dt(prepared, scene, judges, factors=None) -> LinearSweep:
+def sweep_of_dt(data: Dataset, tolerance: Tolerance, scene, factors=None) -> LinearSweep:
     """The sweep of S(w; dt²), where each pair has its own dt."""
     reversor = scene.reversor if scene is not None else None
-    return LinearSweep(prepared, MIDPOINT, judges, "polynomial", None, reversor, factors)
+    return LinearSweep(data, tolerance, MIDPOINT, "polynomial", None, reversor, factors)
 
 
 class _Factors(NamedTuple):
@@ -130,9 +136,9 @@ class _Factors(NamedTuple):
 class Generates:
     """What sweeps of S have in common: a solved size makes a piece."""
 
-    prepared: Prepared
+    data: Dataset
     chart: AnyChart
-    judges: Judges
+    tolerance: Tolerance
 
     def solve(self, size: Size, budget: Budget, say) -> tuple[Any, Any]:
         """What is known of the solution, and the params of the size's family."""
@@ -140,14 +146,14 @@ class Generates:
 
     def piece(self, size: Size) -> Generated:
         """The piece that the size's S generates, with its predictor."""
-        prepared, params = self.prepared, self._params_of(size)
-        piece = Generated(size.family, params, self.chart, prepared.dt, prepared.scale)
-        return with_predictor(piece, prepared, self.judges.training)
+        data, params = self.data, self._params_of(size)
+        piece = Generated(size.family, params, self.chart, data.dt, data.scale)
+        return with_predictor(piece, data, data.training)
 
     def images(self, size: Size, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Images of these rows (n, 2d), as prepared, and which steps were solved (n,)."""
+        """Images of these rows (n, 2d), inner ones, and which steps were solved (n,)."""
         params = self._params_of(size)
-        return refined_images(self.prepared, self.chart, size.family, params, rows)
+        return refined_images(self.data, self.chart, size.family, params, rows)
 
     def _params_of(self, size: Size) -> Any:
         return self.solve(size, Budget(), lambda message: None)[1]
@@ -162,22 +168,22 @@ class LinearSweep(Generates):
     """
 
     def __init__(
-        self, prepared: Prepared, chart: AnyChart, judges: Judges, kind: str, features, reversor,
+        self, data: Dataset, tolerance: Tolerance, chart: AnyChart, kind: str, features, reversor,
         factors=None, even=False, own: Callable[[Inputs], Iterable[Any]] | None = None,
     ):  # fmt: skip
-        reversor = (-1,) * 2 * prepared.dim if even else reversor
+        reversor = (-1,) * 2 * data.dim if even else reversor
         self._kept, self._prefix = factors, "even " if even else ""
-        self.prepared, self.chart, self.judges, self.kind = prepared, chart, judges, kind
-        self._train, self._weight = rows_of(prepared, chart, judges.training)
-        self._held, _ = rows_of(prepared, chart, judges.held_out)
-        free = (*prepared.coordinates.cyclic, *prepared.whole)
-        self._outermost = outermost(prepared.y0[judges.training], free)
-        coordinates = prepared.coordinates
-        w, of, args = self._train[0], Products, prepared.given(judges.training)[1]
-        if prepared.own_dt is not None:
-            of, args = _of_time_step, prepared.own_dt[judges.training, None] ** 2
+        self.data, self.tolerance, self.chart, self.kind = data, tolerance, chart, kind
+        self._train, self._weight = rows_of(data, chart, data.training)
+        self._held, _ = rows_of(data, chart, data.validation)
+        free = (*data.coordinates.cyclic, *data.whole)
+        self._outermost = outermost(data.y0[data.training], free)
+        coordinates = data.coordinates
+        w, of, args = self._train[0], Products, data.given(data.training)[1]
+        if data.own_dt is not None:
+            of, args = _of_time_step, data.own_dt[data.training, None] ** 2
         inputs = box_inputs(
-            w, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+            w, angles=tuple(a for a in coordinates.angles if a < data.dim),
             cyclic=coordinates.cyclic, features=features, reversor=reversor,
             args=args,
         )  # fmt: skip
@@ -221,7 +227,7 @@ class LinearSweep(Generates):
     def work_of_steps(self, size: Size) -> float:
         """Operations that validating the judged size takes, those of the steps as those that the
         solution makes in their time."""
-        steps = len(self.judges.held_out) * size.operations
+        steps = len(self.data.validation) * size.operations
         return OF_SOLVE * size.family.num_parameters**3 + OF_STEPS * steps
 
     def judge(self, size: Size, budget: Budget, say: Callable[[str], Any]) -> Candidate:
@@ -248,9 +254,7 @@ class LinearSweep(Generates):
             judged, train_rms=solved.train_rms, condition=solved.condition, rank=solved.rank,
             outside=outside,
         )  # fmt: skip
-        candidate = validated(
-            candidate, self.prepared, self.chart, size.family, params, self.judges
-        )
+        candidate = validated(candidate, self.data, self.tolerance, self.chart, size.family, params)
         seconds = judged.fit_seconds + time.perf_counter() - started
         return dataclasses.replace(candidate, fit_seconds=seconds)
 
@@ -264,7 +268,7 @@ class LinearSweep(Generates):
             label = f"{self._prefix}{family.name} {degree}"
             terms = family.terms_of(degree)
         rows = self._train[0].shape
-        share = rows[0] / (rows[0] + len(self.judges.held_out))
+        share = rows[0] / (rows[0] + len(self.data.validation))
         pairs = int(np.ceil(_ROWS_PER_TERM * terms / rows[1] / share))
         most = f", more than the {_MOST_TERMS:,} that are tried" if terms > _MOST_TERMS else ""
         return f"{label} ({terms:,} terms{most}; about {pairs:,} pairs)"
@@ -281,30 +285,28 @@ class LinearSweep(Generates):
     def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Images (n, 2d) of these rows, in the user's coordinates, by a fit to other rows; NaN
         where a step is not solved."""
-        prepared, family = self.prepared, self.in_rows(size.family)
-        train = least_squares.reduce(
-            family, [rows_of(prepared, self.chart, others)[0]], self._weight
-        )
+        data, family = self.data, self.in_rows(size.family)
+        train = least_squares.reduce(family, [rows_of(data, self.chart, others)[0]], self._weight)
         held = least_squares.reduce(family, [self._held], self._weight)
         solved = least_squares.solve(train, held, size.family.num_parameters)
         params = size.family.unflatten(solved.coefficients)
-        images, known = refined_images(prepared, self.chart, size.family, params, rows)
-        images = prepared.whole_image(np.where(known[:, None], images, np.nan))
-        return to_user(prepared.coordinates, images)
+        images, known = refined_images(data, self.chart, size.family, params, rows)
+        images = data.whole_image(np.where(known[:, None], images, np.nan))
+        return to_user(data.coordinates, images)
 
     def left_over(self, size: Size) -> np.ndarray:
         """(N, 2d): what the size leaves of ∇S of every pair, unit-free as train_rms."""
         _, params = self.solve(size, Budget(), lambda message: None)
-        (w, target, *args), weight = rows_of(self.prepared, self.chart, slice(None))
+        (w, target, *args), weight = rows_of(self.data, self.chart, slice(None))
         gradient = np.asarray(size.family.gradient(params, w, *args))
-        if self.prepared.own_dt is not None:
+        if self.data.own_dt is not None:
             gradient = args[0] * gradient
         return weight * (gradient - target)
 
     def own_error(self, size: Size) -> float:
         """What noise leaves wrong in the size's ∇S, in the measure of train_rms: half of the
         difference between the fits to either half of the training pairs, blocks in time."""
-        half = self.judges.training // _HALVES_BLOCK % 2
+        half = self.data.training // _HALVES_BLOCK % 2
         train, held = self.factors(size.group, Budget(), lambda message: None)[:2]
         count = size.family.num_parameters
         one, other = (
@@ -353,7 +355,7 @@ class LinearSweep(Generates):
     def by_states(self, family, params, w, *args) -> tuple[np.ndarray, np.ndarray]:
         """The residual's derivatives in z₀ and z₁ (n, 2d, 2d), those ÷ their scale."""
         hessian = family.gradient_and_hessian(params, w, *args)[1]
-        if self.prepared.own_dt is not None:
+        if self.data.own_dt is not None:
             hessian = args[0][..., None] * hessian
         of_point, of_target = self.of_states
         by = self._weight[:, None] * (hessian @ of_point - of_target)
@@ -363,25 +365,23 @@ class LinearSweep(Generates):
     def of_states(self) -> tuple[np.ndarray, np.ndarray]:
         """(2d, 4d) each: what the numbers of z₀ and z₁, ÷ their scale, add to w and to the target.
         An affine base map is counted, the flow of a law is not."""
-        prepared, chart = self.prepared, self.chart
-        dt = 1.0 if prepared.own_dt is not None else prepared.dt
-        eye = np.eye(2 * prepared.dim)
+        data, chart = self.data, self.chart
+        dt = 1.0 if data.own_dt is not None else data.dt
+        eye = np.eye(2 * data.dim)
         first, second, none = eye, eye, np.zeros_like(eye)
-        for piece in prepared.before:
+        for piece in data.before:
             first = getattr(piece, "matrix", eye) @ first
-        for piece in prepared.after:
+        for piece in data.after:
             second = getattr(piece, "matrix", eye) @ second
         ends = ((first.T, none), (none, np.linalg.inv(second).T))
-        of_point = [chart.evaluation_point(*of).T * prepared.scale for of in ends]
-        of_target = [chart.target_gradient(*of, dt).T * prepared.scale for of in ends]
+        of_point = [chart.evaluation_point(*of).T * data.scale for of in ends]
+        of_target = [chart.target_gradient(*of, dt).T * data.scale for of in ends]
         return np.concatenate(of_point, axis=1), np.concatenate(of_target, axis=1)
 
     @property
     def moved_by_states(self) -> bool:
         """Whether ``of_states`` is all that states' noise does: not behind the flow of a law."""
-        return all(
-            isinstance(p, (Affine, Damping)) for p in (*self.prepared.before, *self.prepared.after)
-        )
+        return all(isinstance(p, (Affine, Damping)) for p in (*self.data.before, *self.data.after))
 
     @property
     def largest_known(self) -> Size:
@@ -430,7 +430,7 @@ class LinearSweep(Generates):
 
     def _sample(self, pairs: int) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
         """Rows of about so many training pairs, and which of them go on with the next."""
-        places, goes_on = looked_at(self.judges.pairs, self.judges.training, pairs)
+        places, goes_on = looked_at(self.data.pairs, self.data.training, pairs)
         return tuple(a[places] for a in self._train), goes_on
 
     def _noise(self, size: Size, larger: Size, data, states) -> float:
@@ -513,7 +513,7 @@ class LinearSweep(Generates):
         return f"{self.chart.name} {self.kind} {group.num_parameters}"
 
     def _candidate(self, size: Size, train_rms, held_rms, seconds) -> Candidate:
-        error = self.judges.estimate(held_rms)
+        error = estimated_error(self.data, self.tolerance, held_rms)
         return Candidate(
             label=f"{self._prefix}{size.family.label}", family=self.kind, chart=self.chart.name,
             num_parameters=size.family.num_parameters, operations=size.operations,
@@ -542,20 +542,20 @@ class _WithOdd:
         return np.concatenate([self._even.term_gradients(w), odd], axis=-1)
 
 
-def is_even(prepared: Prepared, judges: Judges) -> bool:
+def is_even(data: Dataset) -> bool:
     """Whether S(−w) = S(w) as far as any size of a sweep could tell: odd terms beside the even ones
     of the highest degree that a sweep has do not make the held-out residual smaller.
 
     False where terms are not scarce, where angles or args are, or where the test would take too
     much.
     """
-    dim = prepared.dim
-    if dim < _SCARCE_FROM_DIM or prepared.coordinates.angles or prepared.args is not None:
+    dim = data.dim
+    if dim < _SCARCE_FROM_DIM or data.coordinates.angles or data.args is not None:
         return False
-    (w, target), weight = rows_of(prepared, MIDPOINT, judges.training)
-    held, _ = rows_of(prepared, MIDPOINT, judges.held_out)
+    (w, target), weight = rows_of(data, MIDPOINT, data.training)
+    held, _ = rows_of(data, MIDPOINT, data.validation)
     flip = (-1,) * 2 * dim
-    inputs = box_inputs(w, cyclic=prepared.coordinates.cyclic, reversor=flip)
+    inputs = box_inputs(w, cyclic=data.coordinates.cyclic, reversor=flip)
     signs = variable_signs(inputs, flip, w)
     most = min(_MOST_TERMS, w.size // _ROWS_PER_TERM)
     degrees = [
@@ -581,16 +581,16 @@ def is_even(prepared: Prepared, judges: Judges) -> bool:
     return with_odd >= _NO_GAIN * without
 
 
-def trial_residual(prepared: Prepared) -> float:
+def trial_residual(data: Dataset) -> float:
     """The held-out residual of ∇S, ÷ scale, of polynomials of a low degree in the midpoint chart:
     how near these pairs are to a map that a small S generates. Infinite where some are missing."""
-    half = len(prepared.y0) // 2
-    (w, target), weight = rows_of(prepared, MIDPOINT, slice(None))
+    half = len(data.y0) // 2
+    (w, target), weight = rows_of(data, MIDPOINT, slice(None))
     if not np.isfinite(w + target).all():
         return float("inf")
-    coordinates = prepared.coordinates
+    coordinates = data.coordinates
     inputs = box_inputs(
-        w, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+        w, angles=tuple(a for a in coordinates.angles if a < data.dim),
         cyclic=coordinates.cyclic,
     )  # fmt: skip
     groups = list(_determined(([Products(inputs, degree)] for degree in _TRIAL), w.size // 2))

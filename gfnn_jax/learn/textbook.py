@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.fitting.gauss_newton import Problem
-from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.clock import MATCHING
 from gfnn_jax.learn.law_work import LawWork
-from gfnn_jax.learn.learned_law import FittedLaw, held_out_error
-from gfnn_jax.learn.prepare import Prepared
+from gfnn_jax.learn.learned_law import FittedLaw, validation_error
 from gfnn_jax.models.textbook import OPTIONS, Law, Textbook
 
 # Operations of a search by degrees of freedom from 1, without products and with them: about the
@@ -30,18 +30,18 @@ _EXACT = 1e-9  # of the spread: the error of a law that is no approximation
 
 
 def law_of_physics(
-    problem: Problem, work: LawWork, prepared: Prepared, judges: Judges, say: Callable[[str], Any]
+    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance, say: Callable[[str], Any]
 ) -> FittedLaw | None:
     """The law, or None where none is found, or the pairs are of no autonomous flow of a few degrees
     of freedom in plain coordinates and angles."""
-    simple = prepared.args is None and prepared.structure is None
-    if not simple or prepared.dim > OPTIONS.most_dim or len(judges.training) < _FEWEST:
+    simple = data.args is None and data.structure is None
+    if not simple or data.dim > OPTIONS.most_dim or len(data.training) < _FEWEST:
         return None
-    rows, coordinates = judges.training, prepared.coordinates
+    rows, coordinates = data.training, data.coordinates
     own = copy.copy(problem)  # its flows are no part of what libraries may take
     own.spend = lambda operations: None
     search = Textbook(
-        own, rows, angles=tuple(a for a in coordinates.angles if a < prepared.dim),
+        own, rows, angles=tuple(a for a in coordinates.angles if a < data.dim),
         cyclic=coordinates.cyclic, say=say,
     )  # fmt: skip
     law = None
@@ -49,22 +49,24 @@ def law_of_physics(
         if law is not None:
             break
         try:
-            with work.budget.unit(name, MATCHING, _OPERATIONS[products][prepared.dim - 1]):
+            with work.budget.unit(name, MATCHING, _OPERATIONS[products][data.dim - 1]):
                 law = search.law(products=products)
         except OutOfTime:
             work.budget.leave_out(name, work.ended)
             return None
+        except np.linalg.LinAlgError:
+            return None
     if law is None:
         return None
-    family, start = _without_nothing(law, prepared.y0[rows], prepared.scale)
+    family, start = _without_nothing(law, data.y0[rows], data.scale)
     try:
         with work.library(f"H of {family.num_parameters} terms", family, len(rows)):
             fit = problem.fit(family, start, rows, rounds=False)
-            error = held_out_error(family, fit, prepared, judges)
+            error = validation_error(family, fit, data, tolerance)
     except OutOfTime:
         work.budget.leave_out("the law of physics that was found", work.ended)
         return None
-    if not (error.bound <= judges.tolerance.bound and error.relative <= _EXACT):
+    if not (error.bound <= tolerance.bound and error.relative <= _EXACT):
         return None
     return FittedLaw(family, fit, rows, error, search.null, search.null)
 

@@ -11,9 +11,9 @@ import dataclasses
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.expressions import check_names
-from gfnn_jax.learn.prepare import Prepared
 from gfnn_jax.phase_space import TIME, Pairs, sizes
 
 _SAME = 1e-9  # of its size: a parameter, or a dt, that varies by less does not
@@ -138,11 +138,11 @@ def _one_phase(t0: float, dt: float, period: float) -> str:
     return f"{told}; dt = {dt:g} is no whole number of periods: a second step is at another time"
 
 
-def given_by(prepared: Prepared) -> np.ndarray | None:
+def given_by(data: Dataset) -> np.ndarray | None:
     """What a pair's move depends on beside its state, (N, k) of unit sizes; None for nothing."""
-    if not prepared.varied:
+    if not data.varied:
         return None
-    columns = [] if prepared.own_dt is None else [prepared.own_dt]
-    columns += [] if prepared.args is None else list(prepared.args.T)
+    columns = [] if data.own_dt is None else [data.own_dt]
+    columns += [] if data.args is None else list(data.args.T)
     given = np.column_stack(columns)
     return given / sizes(given)

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.learn.candidates import Judges
 from gfnn_jax.learn.learned_law import LearnedHamiltonian, unexplained
-from gfnn_jax.learn.prepare import Prepared
 
 _PAIRS = 2_000  # whose residuals are looked at
 
 
-def leaves_white(law: LearnedHamiltonian, prepared: Prepared, judges: Judges) -> bool:
+def leaves_white(law: LearnedHamiltonian, data: Dataset) -> bool:
     """Whether no polynomial generator explains more than chance of what the law leaves over, by an
     F test (`learned_law.unexplained`). False where the pairs are too few to tell, and of a law with
     parameters or over sites."""
     family = law.flow.family
-    if not isinstance(family, Terms) or prepared.varied or prepared.structure is not None:
+    if not isinstance(family, Terms) or data.varied or data.structure is not None:
         return False
-    rows = np.sort(judges.training)[:_PAIRS]
-    residual = prepared.y1[rows] - law.flow.image(prepared.y0[rows])
+    rows = np.sort(data.training)[:_PAIRS]
+    residual = data.y1[rows] - law.flow.image(data.y0[rows])
     resolved = np.isfinite(residual).all(axis=1)
     degree = int(np.max(np.sum(family.powers, axis=1), initial=0))
     taken = family.num_parameters
-    return unexplained(prepared, rows[resolved], residual[resolved], taken, degree, None) == 1.0
+    return unexplained(data, rows[resolved], residual[resolved], taken, degree, None) == 1.0

@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.noise import robust
 from gfnn_jax.dataset.runs import steps_between
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem, significant
 from gfnn_jax.fitting.shooting import OPTIONS, Shooting, Shot, arcs_of, longest_arc
-from gfnn_jax.learn.candidates import Judges
-from gfnn_jax.learn.prepare import Prepared
 
 _SHORTEST = 3  # steps of an arc that says more than its pairs do
 _CERTAIN = 4.0  # standard errors below which a term is noise
@@ -39,39 +38,39 @@ class Whole(NamedTuple):
 
 
 def fitted_to_sequences(
-    problem: Problem, family, fit: FlowFit, prepared: Prepared, judges: Judges,
+    problem: Problem, family, fit: FlowFit, data: Dataset,
     check: Callable[[], Any],
 ) -> Whole | None:  # fmt: skip
     """The law of these pairs' fit, fitted to their sequences. None where they are none of one dt in
     plain coordinates, where noise soon grows beyond the linear, or where held-out sequences do not
     bear the law out."""
-    coordinates = prepared.coordinates
-    plain = coordinates.forward is CARTESIAN.forward and prepared.structure is None
-    if not plain or prepared.varied:
+    coordinates = data.coordinates
+    plain = coordinates.forward is CARTESIAN.forward and data.structure is None
+    if not plain or data.varied:
         return None
     c = fit.coefficients
-    some = judges.training[:_STATES]
+    some = data.training[:_STATES]
     rms = float(robust(problem.residuals(family, c, fit.steps, some)))
     if not 0 < rms < np.inf:
         return None
     resolved = _STEP_ERROR * rms
-    steps = problem.fine_steps(family, c, judges.training, (resolved,))[0]
-    between = steps_between(judges.pairs)
-    longest = longest_arc(family, c, prepared.y0[some], prepared.dt, steps, rms)
+    steps = problem.fine_steps(family, c, data.training, (resolved,))[0]
+    between = steps_between(data.pairs)
+    longest = longest_arc(family, c, data.y0[some], data.dt, steps, rms)
 
     def along(rows) -> Shooting | None:
-        rows, pairs = np.sort(rows), judges.pairs
+        rows, pairs = np.sort(rows), data.pairs
         # What was left out is bridged, what is held out is not.
         onward = np.where(np.diff(rows) == 1, between[rows[:-1]], 0)
         arcs = arcs_of(np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows], longest, onward)
         if arcs is None or np.median(arcs.measured.sum(axis=1)) <= _SHORTEST:
             return None
         return Shooting(
-            arcs, prepared.dt, steps, problem.scale, coordinates.angles, resolved=resolved,
+            arcs, data.dt, steps, problem.scale, coordinates.angles, resolved=resolved,
             check=check,
         )  # fmt: skip
 
-    train, held = along(judges.training), along(judges.held_out)
+    train, held = along(data.training), along(data.validation)
     if train is None or held is None:
         return None
 
@@ -91,7 +90,7 @@ def fitted_to_sequences(
         if again is not None and left(fewer, again.coefficients) <= _RISE * before:
             kept, found, family = tuple(few.tolist()), again, fewer
     if _ROWS_PER_TERM * len(kept) <= found.triangle.rows:
-        everyone = along(np.arange(len(prepared.y0)))
+        everyone = along(np.arange(len(data.y0)))
         again = everyone.fit(family, found.coefficients) if everyone is not None else None
         if everyone is not None and again is not None:
             train, found = everyone, again

@@ -19,7 +19,7 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 
 class Ledger(NamedTuple):
-    """Where the energy of rollouts went, per unit of time: stored (B,), lost (B, F) by each
+    """Energy ledger of rollouts, per unit of time: stored (B,), lost (B, F) by each
     friction, supplied (B, k) by each input; closure (B,) is what these leave unexplained."""
 
     stored: Any

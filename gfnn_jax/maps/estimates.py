@@ -14,15 +14,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.data.channels import channels_of
 from gfnn_jax.data.recording import Recording
-from gfnn_jax.dataset.local_cubics import smooth
-from gfnn_jax.dataset.stretches import channels_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import interpolate, stage_times
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.sensors import Sensors
+from gfnn_jax.signals.local_cubics import smooth
 from gfnn_jax.solve.latent_arcs import Observed, Steps, fit_arcs
 
 FEWEST = 5  # samples from which a state is estimated

@@ -12,19 +12,18 @@ import dataclasses
 from functools import cache
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
-from gfnn_jax.arrays import as_row, namespace
+from gfnn_jax.arrays import as_numbers, as_row, beside, namespace
+from gfnn_jax.flows.schedules import HOLDS
 
-HOLDS = ("hold", "linear", "band")
 _DEGREE = {"hold": 0, "linear": 1, "band": 9}
 # Samples to either side of a band-limited value, and the shape of their window (Kaiser's β).
 _TAPS, _BETA = 32, 8.0
 
 
 class Scheduled(NamedTuple):
-    """What rollouts take as args: the values of parameters, or None, and the inputs' coefficients
+    """Args of rollouts: the values of parameters, or None, and the inputs' coefficients
     of every step (N, K) or (B, N, K)."""
 
     params: Any
@@ -35,7 +34,7 @@ class Scheduled(NamedTuple):
         xp, found = namespace(steps, self.coefficients), self.coefficients
         n = xp.clip(steps, 0, found.shape[-2] - 1)
         own = found[n] if found.ndim == 2 else found[np.arange(len(found)), n]
-        return own if params is None else _behind(params, own)
+        return own if params is None else beside(params, own)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,20 +54,20 @@ class Signals:
 
     @property
     def degree(self) -> int:
-        """Of the polynomials."""
+        """Degree of the polynomials."""
         return _DEGREE[self.hold]
 
     def constant(self, args, inputs, shape: tuple, dtype):
         """The args of a step of states of this shape during which the inputs, (k,) or (B, k), do
         not change; None: none acts. Raises ValueError for another shape."""
         count = len(self.names)
-        u = np.zeros(count, dtype) if inputs is None else _numbers(inputs, dtype)
+        u = np.zeros(count, dtype) if inputs is None else as_numbers(inputs, dtype, "inputs")
         if u.shape not in ((count,), (*shape[:-1], count)):
             raise ValueError(f"expected inputs {self._named} of shape ({count},), got {u.shape}")
         u = u if u.ndim == 2 else u[None]
         rest = np.zeros((*u.shape[:-1], self.degree * count), dtype)
         own = namespace(u).concatenate([u, rest], axis=-1)
-        return own if args is None else _behind(args, own)
+        return own if args is None else beside(args, own)
 
     def scheduled(self, args, inputs, shape: tuple, dtype, dt, num_steps: int | None) -> Scheduled:
         """The args of rollouts from states of this shape.
@@ -77,7 +76,7 @@ class Signals:
         last. None: none acts. Raises ValueError for another shape.
         """
         count = len(self.names)
-        u = np.zeros((1, count), dtype) if inputs is None else _numbers(inputs, dtype)
+        u = np.zeros((1, count), dtype) if inputs is None else as_numbers(inputs, dtype, "inputs")
         lanes = u.shape[:-2] in ((), shape[:-1])
         long = (
             num_steps is None
@@ -93,7 +92,7 @@ class Signals:
         return Scheduled(args, self.coefficients(u, dt))
 
     def coefficients(self, u, dt):
-        """Of samples u (..., N, k) a time dt apart the coefficients (..., N, K) of the polynomials
+        """Coefficients (..., N, K), from samples u (..., N, k) a time dt apart, of the polynomials
         in each step; beyond the ends the samples are those at the ends. NumPy or JAX."""
         xp, (first, weights) = namespace(u, dt), _stencil(self.hold)
         count = u.shape[-2]
@@ -124,20 +123,3 @@ def _stencil(hold: str) -> tuple[int, np.ndarray]:
     values = np.sinc(distance) * window
     values /= values.sum(axis=1, keepdims=True)
     return first, np.linalg.solve(np.vander(at, increasing=True), values)
-
-
-def _behind(params, own):
-    """Values of parameters (..., k) before those of inputs (B, K)."""
-    xp = namespace(params, own)
-    axes = np.broadcast_shapes(params.shape[:-1], own.shape[:-1])
-    both = (xp.broadcast_to(a, (*axes, a.shape[-1])) for a in (params, own))
-    return xp.concatenate(list(both), axis=-1)
-
-
-def _numbers(values: Any, dtype) -> Any:
-    if isinstance(values, jax.Array):
-        return values if values.dtype == dtype else values.astype(dtype)
-    try:
-        return np.asarray(values, dtype)
-    except (TypeError, ValueError):
-        raise ValueError(f"expected numbers as inputs, got {type(values).__name__}") from None

@@ -1,4 +1,4 @@
-"""What sensors show of a state: channels g(q, v; c) with unknown parameters c.
+"""Observation of a state by sensors: channels g(q, v; c) with unknown parameters c.
 
     theta  =  theta + zero              an angle whose zero is unknown
     omega  =  k*omega                   a gyroscope of unknown scale
@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.data.roles import symbols
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.expressions import (
     Expression,
@@ -40,8 +41,9 @@ _ITERATIONS = 30
 class Observation:
     """Channels of a state, the columns of a recording.
 
-    channels: names of columns. formulas: of each, in the names of ``coordinates``, ``speeds`` and
-    ``parameters``. values: (m,) of the parameters, those to start from or those that were fitted.
+    channels: names of columns. formulas: of each, in the `symbols` of ``coordinates`` and
+    ``speeds`` and in ``parameters``. values: (m,) of the parameters, those to start from
+    or those that were fitted.
     """
 
     channels: tuple[str, ...]
@@ -64,13 +66,13 @@ class Observation:
 
     @property
     def is_plain(self) -> bool:
-        """Whether every channel is the coordinate of its name, and none is missing."""
+        """Return whether every channel is the coordinate of its name, and none is missing."""
         return self.channels == self.formulas == self.coordinates
 
     @cached_property
     def _trees(self) -> tuple[Expression | None, ...]:
-        """Of each channel; None where it is the coordinate of its name."""
-        names = (*self.coordinates, *self.speeds, *self.parameters)
+        """Syntax trees of the channels; None where one is the coordinate of its name."""
+        names = (*symbols((*self.coordinates, *self.speeds)), *self.parameters)
         same = zip(self.channels, self.formulas, strict=True)
         return tuple(
             None if c == f and c in self.coordinates else parse_named(f, names) for c, f in same
@@ -172,8 +174,8 @@ class Observation:
         return tuple(i for i in range(self.dim) if _spans(by_values, by_state[:, [i]]))
 
     def shifted(self, by: np.ndarray) -> Observation:
-        """With parameters that show coordinates which are lower by these amounts (d,) as before,
-        where they can: g(q, v; c) = g(q − by, v; c′), to first order."""
+        """Change the parameters so that coordinates which are lower by these amounts (d,) show as
+        before, where they can: g(q, v; c) = g(q − by, v; c′), to first order."""
         by_state, by_values = self._anywhere()
         change = np.linalg.lstsq(by_values, by_state @ by, rcond=None)[0]
         return dataclasses.replace(self, values=self.values + change)
@@ -219,6 +221,7 @@ def observed(
     Raises InputError, one line, for what cannot be read or has no start.
     """
     state = (*coordinates, *speeds)
+    code = dict(zip(state, symbols(state), strict=True))
     starts = dict(guess)
     formulas: dict[str, str] = {name: name for name in coordinates if name in columns}
     for name in dict.fromkeys((*offsets, *scales)):
@@ -228,13 +231,17 @@ def observed(
             raise InputError(
                 f"expected an offset or a scale of {', '.join(state)}, got one of {name}"
             )
-        scale = f"scale_{name}*" if name in scales else ""
-        formulas[name] = f"{scale}{name}" + (f" + offset_{name}" if name in offsets else "")
+        own = code[name]
+        scale = f"scale_{own}*" if name in scales else ""
+        formulas[name] = f"{scale}{own}" + (f" + offset_{own}" if name in offsets else "")
     for name, given in observe.items():
         if name not in columns:
             raise InputError(f"observe: no column {name} among {', '.join(columns)}")
         formulas[name] = given if isinstance(given, str) else _text_of(given, starts)
-    parameters = [n for f in formulas.values() for n in names_in(f) if n not in state]
+    parameters = [
+        n for column, f in formulas.items() if f != column or column not in coordinates
+        for n in names_in(f) if n not in code.values()
+    ]  # fmt: skip
     parameters = list(dict.fromkeys(parameters))
     unknown = [name for name in guess if name not in parameters]
     if unknown:
@@ -300,7 +307,7 @@ def _started(g: Observation) -> np.ndarray:
 
 
 def _spans(table: np.ndarray, column: np.ndarray) -> bool:
-    """Whether a column is a combination of those of a table."""
+    """Return whether a column is a combination of those of a table."""
     size = np.linalg.norm(column)
     if not table.shape[1] or size == 0:
         return False

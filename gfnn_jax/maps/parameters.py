@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from gfnn_jax.arrays import as_row, namespace
+from gfnn_jax.arrays import as_numbers, as_row, namespace
 from gfnn_jax.phase_space import TIME
 
 _EDGE = 1e-9  # tolerance at the ends of a range, relative to it, for printed numbers
@@ -134,11 +134,11 @@ def as_args(parameters: Parameters | None, given: Any, shape: tuple, dtype, t0: 
     if isinstance(given, Mapping):
         if set(given) != set(names):
             raise ValueError(f"expected params {wanted}; got {', '.join(map(str, given)) or '{}'}")
-        values: Any = [_numbers(given[name], dtype) for name in names]
+        values: Any = [as_numbers(given[name], dtype, "params") for name in names]
         xp = namespace(*values)
         args = xp.stack(xp.broadcast_arrays(*values), axis=-1)
     else:
-        args = _numbers(given, dtype)
+        args = as_numbers(given, dtype, "params")
         if len(names) == 1 and (args.ndim == 0 or args.shape == shape[:-1] != (1,)):
             args = args[..., None]
     if args.shape not in ((len(names),), (*shape[:-1], len(names))):
@@ -164,12 +164,3 @@ def _with_time(parameters: Parameters | None, given: Any, t0: Any) -> dict[str, 
             )
         given = {name: given[..., i] for i, name in enumerate(others)}
     return {**given, TIME: t0}
-
-
-def _numbers(values: Any, dtype) -> Any:
-    if isinstance(values, jax.Array):
-        return values if values.dtype == dtype else values.astype(dtype)
-    try:
-        return np.asarray(values, dtype)
-    except (TypeError, ValueError):
-        raise ValueError(f"expected numbers as params, got {values!r}") from None

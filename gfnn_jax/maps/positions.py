@@ -12,14 +12,14 @@ from gfnn_jax.generating.charts import TYPE1
 
 
 def starts_from_positions(map_: Any) -> bool:
-    """Whether a map was learned from positions alone: its S is one of q and Q."""
+    """Return whether a map was learned from positions alone: its S is one of q and Q."""
     piece = map_.pieces[0]
     ours = isinstance(getattr(piece, "family", None), OfDisplacement)
     return ours and len(map_.pieces) == 1 and piece.chart == TYPE1
 
 
 def state_at(map_: Any, q, other):
-    """See `SymplecticMap.from_positions`."""
+    """State at q, as `SymplecticMap.from_positions` gives it."""
     if not starts_from_positions(map_):
         raise ValueError(
             "expected a map that was learned from positions alone, whose S is one of (q, Q)"

@@ -1,4 +1,4 @@
-"""What a map knows of the sensors that its data came from."""
+"""Sensors that the data of a map came from."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gfnn_jax.maps.observation import Observation
 
 @dataclasses.dataclass(frozen=True)
 class Sensors:
-    """What was measured, and how well.
+    """Columns that were measured, and their noise.
 
     positions, inputs, angles: names of coordinates and columns. sigma: (k,) noise of the channels
     that are seen. omega: the fastest frequency, 1/s. window: seconds before a time from which a
@@ -36,7 +36,7 @@ class Sensors:
 
     @property
     def seen(self) -> Observation:
-        """How channels show a state."""
+        """Observation of a state by the channels."""
         return self.observation or Observation.plain(self.positions)
 
     @property

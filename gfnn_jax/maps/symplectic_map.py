@@ -455,7 +455,7 @@ class SymplecticMap:
         return self.coordinates.angles if self.coordinates.forward is CARTESIAN.forward else ()
 
     def _args(self, given, z, t0=None, inputs=None):
-        """What a step of the states z takes."""
+        """Args of a step of the states z."""
         dtype = np.dtype(self.scale.dtype)
         args = as_args(self.parameters, given, z.shape, dtype, t0)
         if self.signals is not None:
@@ -465,7 +465,7 @@ class SymplecticMap:
         return args
 
     def _schedule(self, given, z, t0=None, inputs=None, num_steps: int | None = None):
-        """What rollouts from the states z take: as one step, or of each of ``num_steps``."""
+        """Args of rollouts from the states z: of one step for all, or of each of ``num_steps``."""
         if self.signals is None:
             return self._args(given, z, t0, inputs)
         dtype = np.dtype(self.scale.dtype)

@@ -1,4 +1,4 @@
-"""How well a law forecasts the data that it was learned from: bands and the horizon.
+"""Calibration of a law's forecasts by the data that it was learned from: bands and the horizon.
 
 From many samples of the record the state is estimated and the orbit followed. What the forecasts
 miss, beyond what noise and the errors of state and coefficients explain, is the law's own misfit,

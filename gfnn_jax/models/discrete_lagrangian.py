@@ -39,8 +39,8 @@ class Solved(NamedTuple):
 
 
 def equations(family: Any, triples: Triples, size: np.ndarray) -> np.ndarray:
-    """What each term adds to the Euler–Lagrange equations, h² ÷ the coordinates' sizes (d,) times:
-    (N, d, m)."""
+    """Contribution of each term to the Euler–Lagrange equations, h² ÷ the coordinates' sizes (d,)
+    times: (N, d, m)."""
     count, dim = len(triples), triples.dim
     gradients = family.term_gradients(triples.ends)
     left = gradients[:count, dim:] + gradients[count:, :dim]
@@ -77,7 +77,7 @@ def left_over(family: Any, params: Any, triples: Triples) -> np.ndarray:
 
 
 def _mixed_terms(family: Any, triples: Triples) -> np.ndarray:
-    """Of every term of S, the mean of −h² ∂²/∂q_i∂Q_i, weighed as above: (m,)."""
+    """Mean of −h² ∂²/∂q_i∂Q_i of every term of S, weighed as above: (m,)."""
     dim, w, size = triples.dim, _sample(triples), displacement(triples)
     total = np.zeros(family.num_parameters)
     for i, step in enumerate(_DIFFERENCE * size):
@@ -98,7 +98,7 @@ def _free_motion(family: Any, triples: Triples) -> np.ndarray:
 
 
 def _sample(triples: Triples) -> np.ndarray:
-    """Some of the points w = (q, Q)."""
+    """Sample of the points w = (q, Q)."""
     return triples.ends[:: max(1, 2 * len(triples) * triples.dim // _SAMPLED)]
 
 

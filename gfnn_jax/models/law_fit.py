@@ -40,7 +40,7 @@ class LawFit:
         return dict(zip(self.structure.keys(), map(float, self.p), strict=True))
 
     def covariance(self) -> np.ndarray:
-        """Of p: that of white residuals, times their correlation time."""
+        """Covariance of p: that of white residuals, times their correlation time."""
         return self.fitted.covariance() * self.correlation
 
     def rms(self) -> np.ndarray:
@@ -51,8 +51,8 @@ class LawFit:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Workbench:
-    """What all fits of one recording share: positions of the gauge, the inputs of arcs, the fastest
-    frequency ω, and how states are seen."""
+    """Basis that all fits of one recording share: positions of the gauge, the inputs of arcs, the
+    fastest frequency ω, and how states are seen."""
 
     gauge: np.ndarray
     inputs: Callable[[Arcs], np.ndarray]
@@ -123,8 +123,8 @@ class Workbench:
         return costs
 
     def scores(self, fit: LawFit, candidates: Structure) -> dict[Key, float]:
-        """How many standard errors each coefficient of ``candidates`` that the fit lacks would be
-        from zero, were it alone added; 0 for those that the others imitate."""
+        """Distance from zero, in standard errors, of each coefficient of ``candidates`` that the
+        fit lacks, were it alone added; 0 for those that the others imitate."""
         known = fit.values
         new = [k for k in candidates.keys() if k not in known]  # noqa: SIM118
         larger = fit.structure.plus(new)

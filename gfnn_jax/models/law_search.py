@@ -185,7 +185,8 @@ def significance(fit: LawFit) -> dict[Key, float]:
 
 
 def gains(costs: np.ndarray, others: np.ndarray, share: float) -> bool:
-    """Whether ``others`` are lower in all than these held-out costs (A,), by this share of them."""
+    """Return whether ``others`` are lower in all than these held-out costs (A,), by this share of
+    them."""
     return bool(np.sum(others) < np.sum(costs) * (1 - share))
 
 

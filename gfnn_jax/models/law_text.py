@@ -35,15 +35,15 @@ class Expression:
 
     @property
     def formula(self) -> str:
-        """As Python writes it, which ``--terms`` and sympy read."""
+        """Formula as Python writes it, which ``--terms`` and sympy read."""
         return _sum(f"{_digits(c, s)}*{t}" for t, c, s in self.terms) or "0"
 
     def __str__(self) -> str:
-        """As a person writes it: the last digits' standard errors in brackets."""
+        """Formula as a person writes it: the last digits' standard errors in brackets."""
         return _sum(f"{measured(c, s)} {_pretty(t)}" for t, c, s in self.terms) or "0"
 
     def sympy(self) -> Any:
-        """As a sympy expression."""
+        """Formula as a sympy expression."""
         return as_sympy(self.formula)
 
     def latex(self) -> str:
@@ -54,7 +54,7 @@ def terms_of(
     terms: Terms, coefficients: np.ndarray, std: np.ndarray, names: Sequence[str],
     speeds: Sequence[str],
 ) -> Expression:  # fmt: skip
-    """Of Σ θ_j ℓ_j; a phase other than that of a cosine or a sine stays in the argument."""
+    """Terms of Σ θ_j ℓ_j; a phase other than that of a cosine or a sine stays in the argument."""
     listed = []
     for (k, n, m, phase), c, s in zip(terms.rows(), coefficients, std, strict=True):
         factors = [_power(v, e) for v, e in zip(speeds, k, strict=True) if e]

@@ -1,4 +1,4 @@
-"""What was learned from a recording: the law in words and numbers, and its map."""
+"""Law that was learned from a recording: the law in words and numbers, and its map."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.calibration import Horizon
 from gfnn_jax.models.law_fit import LawFit
 from gfnn_jax.models.law_text import Expression, Term, measured, terms_of
+from gfnn_jax.models.residuals import Trace, Whiteness
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -24,10 +25,11 @@ class LearnedLaw:
     standard error. hamiltonian: H in words, its terms as of L. zeros: angle -> (where it is zero,
     standard error), already inside the formula. observe: column -> what its sensor shows, where
     that is not the coordinate; sensors: the parameters in it, fitted, with standard errors. noise:
-    column -> σ of its samples; residual: of the fit's arcs, both in the file's unit. gauge: what
-    fixes the scale of L. alike: coefficients that the record cannot tell apart. horizon: for how
-    long a forecast can be trusted. energy: stored, lost, supplied per second, means over the
-    record. messages: warnings. steps: what the search did, line by line.
+    column -> σ of its samples; residual: of the fit's arcs, both in the file's unit. whiteness: of
+    the residuals, column by column; traces: the arcs that were fitted. gauge: what fixes the scale
+    of L. alike: coefficients that the record cannot tell apart. horizon: for how long a forecast
+    can be trusted. energy: stored, lost, supplied per second, means over the record. messages:
+    warnings. steps: what the search did, line by line.
     num_samples, seconds (of the processor). ended: why the search ended.
     """
 
@@ -41,6 +43,8 @@ class LearnedLaw:
     sensors: dict[str, tuple[float, float]]
     noise: dict[str, float]
     residual: dict[str, float]
+    whiteness: dict[str, Whiteness]
+    traces: tuple[Trace, ...]
     gauge: str
     alike: tuple[str, ...]
     horizon: tuple[Horizon, ...]
@@ -70,7 +74,8 @@ class LearnedLaw:
             lines.append(f"force of {name}: {told}")
         for name, sigma in self.noise.items():
             lines.append(
-                f"{name}: noise {sigma:.3g}, residual of the law {self.residual[name]:.3g}"
+                f"{name}: noise {sigma:.3g}, residual of the law {self.residual[name]:.3g}, "
+                f"{self.whiteness[name].text}"
             )
         for fraction, seconds, predicted in self.horizon:
             lines.append(

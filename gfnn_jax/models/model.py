@@ -55,7 +55,7 @@ class Fitted(NamedTuple):
 
 @runtime_checkable
 class Model(Protocol):
-    """What `gfnn.fit` needs of a model. name: one word, as in the table of candidates."""
+    """Model that `gfnn.fit` can learn. name: one word, as in the table of candidates."""
 
     name: str
 

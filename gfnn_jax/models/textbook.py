@@ -52,8 +52,8 @@ class Options:
     that leaves no more than 10 to the minus so many, and so many for every coefficient and constant
     of its atoms: sums of atoms that are near the law gain about one digit each. lost: part of the
     pairs whose flow may fail. most_dim: degrees of freedom, beyond which the dictionary is too
-    large. rows_per_term: that all products of coordinates need together. certain: twice the logarithm of
-    the odds that what an atom explains is no chance.
+    large. rows_per_term: that all products of coordinates need together. certain: twice the
+    logarithm of the odds that what an atom explains is no chance.
     """
 
     rows: int = 260

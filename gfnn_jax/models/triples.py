@@ -42,7 +42,7 @@ class Triples:
         return self.middle.shape[1]
 
     def take(self, rows) -> Triples:
-        """Those of these rows."""
+        """Triples of these rows."""
         names = ("before", "middle", "after", "run", "place")
         return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in names})
 
@@ -99,7 +99,7 @@ def triples_of(recording: Recording, *, sites: bool = False) -> Triples:
 
 
 def _lifted(triples: Triples, sites: bool) -> Triples:
-    """With moves that are continuous over the data: those to the middle within a turn, those from
+    """Make moves continuous over the data: those to the middle within a turn, those from
     it as the states (q, Q − q) around them move."""
     dim, q = triples.dim, triples.middle
     angles = (*triples.angles, *(dim + i for i in triples.angles))

@@ -1,4 +1,4 @@
-"""Where the fit of a law starts: linear least squares of the weak form, with terms eliminated."""
+"""Start of the fit of a law: linear least squares of the weak form, with terms eliminated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a column is the derivative of another: with which factor, and how late.
+"""Derivatives among columns: whether one is that of another, with which factor, and how late.
 
 In windows of consecutive samples a polynomial of degree p + 1 through x gives ẋ at the centre, one
 of degree p through v the value of v there: exact for the same motions, at uneven times too. Then
@@ -53,7 +53,8 @@ class Derivatives:
     sigmas: Sequence[float | None]
 
     def relation(self, of: int, column: int) -> Relation | None:
-        """Of ``column`` to the derivative of column ``of``; None where too few windows tell."""
+        """Relation of ``column`` to the derivative of column ``of``; None where too few windows
+        tell."""
         v = self.values.values[column]
         rate, bend = self.slopes.slopes[of], self.slopes.curvatures[of]
         known = np.isfinite(v) & np.isfinite(rate)

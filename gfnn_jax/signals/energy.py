@@ -40,7 +40,8 @@ class Loss:
 
     @property
     def seen(self) -> bool:
-        """Whether there is a loss, or a gain: more than three standard errors, and than 1e-4."""
+        """Return whether there is a loss, or a gain: more than three standard errors, and than
+        1e-4."""
         return abs(self.per_period) > max(3 * self.error, 1e-4)
 
 

@@ -123,7 +123,8 @@ def _widest(variances: np.ndarray) -> int | None:
 
 
 def _correlation(fit: LocalFits, column: int) -> float:
-    """Of the noise of neighbours: that of the residuals, less what fitting makes of white noise.
+    """Correlation of the noise of neighbours: that of the residuals, less what fitting makes of
+    white noise.
 
     With P the projection on what polynomials leave, white noise of unit size gives residuals of
     covariance P."""

@@ -67,7 +67,7 @@ def _angles(traits: Traits) -> list[str]:
 
 
 def _settled(traits: Traits, name: str) -> bool:
-    """Whether a velocity, or the file's unit, has told the unit of this angle already."""
+    """Return whether a velocity, or the file's unit, has told the unit of this angle already."""
     recording = traits.recording
     place = recording.positions.index(name)
     unit = recording.units.get(name, "")

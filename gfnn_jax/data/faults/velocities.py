@@ -56,7 +56,8 @@ def related(traits: Traits) -> Iterator[Fault]:
 
 
 def _jumps(traits: Traits, x: str) -> bool:
-    """Whether a column that jumps by turns has not been lifted, so that it has no derivative."""
+    """Return whether a column that jumps by turns has not been lifted, so that it has no
+    derivative."""
     found = angles.jumps(traits, x)
     return found is not None and not (x in traits.recording.angles and found[0] < 10)
 

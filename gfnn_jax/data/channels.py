@@ -1,0 +1,23 @@
+"""Columns of a recording side by side, with their noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gfnn_jax.data.recording import Recording
+
+
+def channels_of(
+    recording: Recording, names: Sequence[str], run: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n, k) values of columns in a run, angles lifted, and their noise ÷ that of their column: 1
+    where σ was not given for each value."""
+    y = np.stack([recording.unwrapped(name, run) for name in names], axis=1)
+    noise = np.ones(y.shape)
+    for k, name in enumerate(names):
+        sigma, usual = recording.sigma(name, run), recording.std[name]
+        if sigma is not None and usual:
+            noise[:, k] = np.where(np.isfinite(sigma), sigma / usual, 1.0)
+    return y, noise

@@ -1,0 +1,239 @@
+"""The one data set that a fit sees: the pairs as measured, the same rows in the coordinates where
+a model is learned, and which of them train, choose and state the error.
+
+It is made once and frozen. Taking rows, factoring a known map out and training on fewer rows give
+another, whose rows keep their run, their place and the row that the user knows them by.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.coordinates import CARTESIAN, Coordinates, lift, lift_sites, to_inner
+from gfnn_jax.dataset.split import Split, split_rows
+from gfnn_jax.dataset.structures import Structure
+from gfnn_jax.errors import FitError
+from gfnn_jax.flows.collocation import of_lanes
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.damping import Damping
+from gfnn_jax.maps.domain import Domain, Ranges, covering
+from gfnn_jax.phase_space import Pairs, sizes
+
+Factored = Affine | Damping | Flow  # pieces that can be factored out of pairs
+
+
+@dataclasses.dataclass(frozen=True)
+class Dataset:
+    """N pairs of states, all that is known of them, and the part that each has in a fit. NumPy.
+
+    pairs: as measured, in the user's coordinates, with run, place, dt, args and std. row: (N,) the
+    user's row of each. y0, y1: (N, 2d) the same in the inner coordinates, where a model is learned:
+    angles lifted, what is known factored out. split: rows of each part.
+    scale: (2d,) sizes of the inner coordinates. domain: where states were. coordinates: the change
+    between the two views. angle_centre: (a,) of each angle's interval. whole: angles that cover
+    their circle. before, after: pieces that were factored out, in the order in which they are
+    applied around what is learned: R^½ on both sides for an affine base map R, the flow of a law,
+    D_b behind a map that loses area. structure: of many degrees of freedom, whose sizes and domain
+    are then those of its parts.
+    """
+
+    pairs: Pairs
+    row: np.ndarray
+    y0: np.ndarray
+    y1: np.ndarray
+    split: Split
+    scale: np.ndarray
+    domain: Domain | Ranges
+    coordinates: Coordinates
+    angle_centre: np.ndarray
+    whole: tuple[int, ...]
+    before: tuple[Factored, ...] = ()
+    after: tuple[Factored, ...] = ()
+    structure: Structure | None = None
+
+    @classmethod
+    def of(
+        cls, pairs: Pairs, coordinates: Coordinates, structure: Structure | None = None,
+        row: np.ndarray | None = None,
+    ) -> Dataset:  # fmt: skip
+        """The pairs in both coordinates, all of them for training.
+
+        row: (N,) the user's row of each; None: their order. Raises FitError where states have no
+        inner coordinates.
+        """
+        before, after = (to_inner(coordinates, z) for z in (pairs.z0, pairs.z1))
+        known = np.isfinite(before + after).all(axis=1)
+        if not known.all():
+            raise FitError(
+                f"expected states that have {coordinates.name} coordinates, got "
+                f"{int((~known).sum())} pairs without, the first is row {int(np.argmin(known))}"
+            )
+        lifted = lift if structure is None or not structure.angles else lift_sites
+        y0, y1, centres, covered = lifted(before, after, coordinates)
+        whole = tuple(i for i, c in zip(coordinates.angles, covered, strict=True) if c)
+        nowhere = covering(y0[:0], ignore=tuple(range(y0.shape[1])))
+        row = np.arange(len(pairs)) if row is None else row
+        return cls(
+            pairs, row, y0, y1, Split.of_training(np.arange(len(pairs)), len(pairs)),
+            np.ones(y0.shape[1]), nowhere, coordinates, centres, whole, structure=structure,
+        )._measured()  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.y0)
+
+    @property
+    def dim(self) -> int:
+        """Degrees of freedom d."""
+        return self.y0.shape[1] // 2
+
+    @property
+    def training(self) -> np.ndarray:
+        """Rows that determine coefficients, shuffled."""
+        return self.split.training
+
+    @property
+    def validation(self) -> np.ndarray:
+        """Rows that choose between models, shuffled."""
+        return self.split.validation
+
+    @property
+    def test(self) -> np.ndarray:
+        """Rows that state the error, once everything is chosen; none where the pairs are few."""
+        return self.split.test
+
+    @property
+    def run(self) -> np.ndarray:
+        """(N,) the run of each row."""
+        return np.asarray(self.pairs.run)
+
+    @property
+    def noise(self) -> np.ndarray | None:
+        """Standard deviation of the noise on the user's coordinates, (2d,) or of each value
+        (N, 2d); None where it is to be estimated."""
+        return self.pairs.std
+
+    @cached_property
+    def spread(self) -> np.ndarray:
+        """(2d,) sizes of the user's coordinates."""
+        return sizes(self.pairs.z0)
+
+    @cached_property
+    def own_dt(self) -> np.ndarray | None:
+        """(N,) the dt of each row, where they differ."""
+        return np.asarray(self.pairs.dt, np.float64) if np.ndim(self.pairs.dt) else None
+
+    @cached_property
+    def dt(self) -> float:
+        """The dt of all rows, or in the middle of those that differ."""
+        return float(self.pairs.dt if self.own_dt is None else np.median(self.own_dt))
+
+    @property
+    def each_dt(self) -> Any:
+        """A number, or (N,) where the rows differ."""
+        return self.dt if self.own_dt is None else self.own_dt
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the args, the time of a drive last."""
+        return tuple(self.pairs.args or ())
+
+    @cached_property
+    def args(self) -> np.ndarray | None:
+        """(N, k) values of the ``parameters``; None where there are none."""
+        given = self.pairs.args
+        return np.stack([given[name] for name in given], axis=-1) if given else None
+
+    @property
+    def period(self) -> float | None:
+        """That of a drive."""
+        return self.pairs.period
+
+    @property
+    def varied(self) -> bool:
+        """Whether rows differ in their dt or in parameters."""
+        return self.own_dt is not None or self.args is not None
+
+    @property
+    def user_angles(self) -> tuple[int, ...]:
+        """The angles among the user's coordinates."""
+        plain = self.coordinates.forward is CARTESIAN.forward
+        return self.coordinates.angles if plain else ()
+
+    def given(self, rows) -> tuple[Any, Any]:
+        """(dt, args) of these rows."""
+        return of_lanes(self.each_dt, rows), of_lanes(self.args, rows)
+
+    def divided(self, seed: int) -> Dataset:
+        """With rows for training, validation and test, drawn by the seed (`dataset.split`)."""
+        return dataclasses.replace(self, split=split_rows(self.pairs, seed))
+
+    def trained_on(self, rows: np.ndarray) -> Dataset:
+        """With these rows for training; validation and test as they are."""
+        return dataclasses.replace(self, split=self.split._replace(training=rows))
+
+    def validated_on(self, rows: np.ndarray) -> Dataset:
+        """With these rows for validation; training and test as they are."""
+        return dataclasses.replace(self, split=self.split._replace(validation=rows))
+
+    def validating(self, others: Pairs) -> Dataset:
+        """Other pairs for training, as of a law's flow, and this one's validation rows to choose
+        by; none state an error.
+
+        Raises FitError where states of the others have no inner coordinates.
+        """
+        held, count = self.pairs.take(self.validation), len(others)
+        z0, z1 = (
+            np.concatenate([one, other])
+            for one, other in ((others.z0, held.z0), (others.z1, held.z1))
+        )
+        rows = np.arange(len(z0))
+        split = Split(rows[:count], rows[count:], rows[:0], rows)
+        both = Dataset.of(Pairs(z0, z1, self.dt), self.coordinates, self.structure)
+        return dataclasses.replace(both, split=split)
+
+    def take(self, rows: np.ndarray) -> Dataset:
+        """These rows alone, each in its part; sizes and domain are theirs."""
+        return dataclasses.replace(
+            self, pairs=self.pairs.take(rows), row=self.row[rows], y0=self.y0[rows],
+            y1=self.y1[rows], split=self.split.take(rows),
+        )._measured()  # fmt: skip
+
+    def lifted_anew(self, rows: np.ndarray) -> Dataset:
+        """These rows alone, their angles lifted among themselves, nothing factored out and all of
+        them for training."""
+        return Dataset.of(self.pairs.take(rows), self.coordinates, self.structure, self.row[rows])
+
+    def without(self, before: Factored | None, after: Factored | None) -> Dataset:
+        """These pieces factored out: before(z) -> after⁻¹(Z). The domain stays that of the
+        states."""
+        found = self
+        if before is not None:
+            found = dataclasses.replace(
+                found, y0=before.image(found.y0), before=(*found.before, before)
+            )
+        if after is not None:
+            found = dataclasses.replace(
+                found, y1=after.inverse().image(found.y1), after=(after, *found.after)
+            )
+        return found
+
+    def whole_image(self, y: np.ndarray) -> np.ndarray:
+        """The images of what is learned, y (N, 2d), as those of the map."""
+        for piece in self.after:
+            y = piece.image(y)
+        return y
+
+    def _measured(self) -> Dataset:
+        """With sizes and domain of these rows."""
+        structure = self.structure
+        if structure is not None:
+            scale, domain = structure.sizes(self.y0), structure.domain(self.y0)
+        else:
+            ignore = (*self.coordinates.cyclic, *self.whole)
+            scale, domain = sizes(self.y0), covering(self.y0, ignore=ignore)
+        return dataclasses.replace(self, scale=scale, domain=domain)

@@ -1,0 +1,91 @@
+"""The one-step error of a model on rows of a data set, and the error that is asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.coordinates import nearest_image
+from gfnn_jax.dataset.bounds import bound_of_mean
+from gfnn_jax.dataset.dataset import Dataset
+
+
+@dataclasses.dataclass(frozen=True)
+class Tolerance:
+    """The error that is asked for.
+
+    bound:    on the one-step error's upper 95 % bound.
+    relative: whether errors are divided by each coordinate's spread first; else they are in the
+              user's units, RMS per component.
+    """
+
+    bound: float
+    relative: bool = True
+
+    @classmethod
+    def of(cls, options: Any) -> Tolerance:
+        """Tolerance that the options of a fit ask for, which have one of either kind."""
+        if options.absolute_tolerance is None:
+            return cls(options.tolerance)
+        return cls(options.absolute_tolerance, relative=False)
+
+    def met_by(self, candidate: Any) -> bool:
+        """Whether the candidate's error is within it, at 95 %."""
+        return candidate.validation_bound <= self.bound
+
+
+class OneStepError(NamedTuple):
+    """Z_predicted − Z on some rows, in the user's coordinates, angles to the nearest image.
+
+    rms: RMS per component. relative: the RMS over coordinates of error ÷ spread. deviations: (2d,)
+    the RMS in each coordinate. bound: the upper 95 % bound in the tolerance's measure
+    (`dataset.bounds`). All infinite where a step fails.
+    """
+
+    rms: float
+    relative: float
+    bound: float
+    deviations: np.ndarray
+
+
+def measured_error(data: Dataset, tolerance: Tolerance, images, rows=None) -> OneStepError:
+    """The error of the validation rows' images (N, 2d) in the user's coordinates, or of these
+    rows'.
+
+    The bound by the validation rows is the one that the test rows are likely to state: as far above
+    their error again as that is above the validation rows'.
+    """
+    own = data.validation if rows is None else rows
+    error = nearest_image(images - np.asarray(data.pairs.z1)[own], data.user_angles)
+    found = one_step_error(error, data.spread, tolerance, data.split.stretch[own])
+    size = found.relative if tolerance.relative else found.rms
+    if rows is not None or not len(data.test) or not 0 < size < np.inf:
+        return found
+    return found._replace(bound=found.bound**2 / size)
+
+
+def one_step_error(error, spread, tolerance: Tolerance, block=None) -> OneStepError:
+    """The statistics of errors (N, 2d) of states whose coordinates have this spread (2d,). block:
+    (N,) which of them depend on each other; None: none do."""
+    if not np.isfinite(error).all():
+        width = error.shape[1]
+        return OneStepError(np.inf, np.inf, np.inf, np.full(width, np.inf))
+    squares = error**2
+    deviations = np.sqrt(squares.mean(axis=0))
+    measured = np.mean(squares / spread**2 if tolerance.relative else squares, axis=1)
+    bound = bound_of_mean(measured, np.arange(len(measured)) if block is None else block)
+    return OneStepError(
+        float(np.sqrt(squares.mean())),
+        float(np.sqrt(np.mean(squares / spread**2))),
+        float(np.sqrt(bound)),
+        deviations,
+    )
+
+
+def estimated_error(data: Dataset, tolerance: Tolerance, relative: float) -> OneStepError:
+    """The error of a step that a relative residual of the gradient lets expect."""
+    rms = relative * float(np.sqrt(np.mean(data.spread**2)))
+    bound = relative if tolerance.relative else rms
+    return OneStepError(rms, relative, bound, relative * data.spread)

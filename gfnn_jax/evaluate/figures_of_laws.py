@@ -1,0 +1,95 @@
+"""The figure of a law: what was measured against a forecast with its band, what the law leaves, its
+energy, and whether the residuals are white."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.errors import InputError
+from gfnn_jax.models.learned_law import LearnedLaw
+
+_AHEAD = 2 / 3  # of the longest run that a forecast is shown for
+_MOST_TIMES = 600
+_MOST_CHANNELS = 6
+
+
+def law_figure(fit: LearnedLaw, recording: Recording, path: Path) -> Path:
+    """Write the figure of a law and the recording that it was learned from, in the file's units."""
+    channels = list(fit.whiteness)[:_MOST_CHANNELS]
+    figure, axes = plt.subplots(
+        len(channels) + 1, 3, figsize=(14, 2.6 * (len(channels) + 1)), squeeze=False,
+        layout="constrained",
+    )  # fmt: skip
+    run = max(recording.runs, key=lambda name: np.ptp(recording.times(name)))
+    for row, name in zip(axes, channels, strict=False):
+        _forecast(row[0], fit, recording, run, name)
+        _residuals(row[1], fit, name)
+        _whiteness(row[2], fit, name)
+    axes[0, 0].set_title(f"forecast from one state, run {run}", fontsize=9)
+    axes[0, 1].set_title("residuals of the fitted arcs", fontsize=9)
+    axes[0, 2].set_title("correlation of residuals, and what chance allows", fontsize=9)
+    _energy(axes[-1, 0], fit)
+    for empty in axes[-1, 1:]:
+        empty.axis("off")
+    axes[-1, 1].text(0, 1, f"L = {fit.lagrangian}\nR = {fit.friction}", va="top", wrap=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return path
+
+
+def _forecast(axes, fit: LearnedLaw, recording: Recording, run: str, name: str) -> None:
+    t = recording.times(run)
+    begin = t[0] + (1 - _AHEAD) * np.ptp(t)
+    ahead = t[t > begin][:: max(1, int(np.sum(t > begin)) // _MOST_TIMES)]
+    factor, angle = recording.factors[name], name in recording.angles
+    seen = recording.unwrapped(name, run) if angle else recording.values(name, run)
+    axes.plot(t, seen / factor, ".", ms=2, color="0.6", label="measured")
+    own = recording.slice(run=run)
+    try:
+        found = fit.map.forecast(own.slice(stop=begin), ahead, own if recording.inputs else None)
+    except InputError:  # too few samples before
+        return
+    value, std = found.values[name][0], found.std[name][0]
+    if angle:  # the turn that the lift of the measured angle has there
+        begins = np.interp(begin, t[np.isfinite(seen)], seen[np.isfinite(seen)])
+        value = value + 2 * np.pi * np.round((begins - value[0]) / (2 * np.pi))
+    axes.plot(ahead, value / factor, lw=1, color="C0", label="forecast")
+    axes.fill_between(ahead, (value - 2 * std) / factor, (value + 2 * std) / factor, alpha=0.25)
+    low, high = np.nanmin(seen) / factor, np.nanmax(seen) / factor
+    axes.set_ylim(low - 0.3 * (high - low), high + 0.3 * (high - low))
+    unit = recording.units.get(name) or ("rad" if angle else "")
+    axes.set_ylabel(f"{name} [{unit}]" if unit else name)
+    axes.set_xlabel("t [s]")
+
+
+def _residuals(axes, fit: LearnedLaw, name: str) -> None:
+    k = list(fit.whiteness).index(name)
+    for trace in fit.traces:
+        axes.plot(trace.t, trace.measured[:, k] - trace.fitted[:, k], ".", ms=2, color="C0")
+    axes.axhline(0, color="0.5", lw=0.5)
+    for sign in (-2, 2):
+        axes.axhline(sign * fit.noise[name], color="0.5", lw=0.7, ls="--")
+    axes.set_ylabel(f"measured − law, {name}")
+    axes.set_xlabel("t [s]")
+
+
+def _whiteness(axes, fit: LearnedLaw, name: str) -> None:
+    of = fit.whiteness[name]
+    axes.axhspan(-of.bound, of.bound, color="0.85")
+    axes.stem(of.lags[1:], of.autocorrelation[1:], basefmt=" ")
+    for u, one in of.inputs.items():
+        axes.plot(one.lag, one.correlation, "o", mfc="none", label=f"with {u}")
+    if of.inputs:
+        axes.legend(fontsize=8)
+    axes.set_xlabel("lag [s]")
+
+
+def _energy(axes, fit: LearnedLaw) -> None:
+    for trace in fit.traces:
+        axes.plot(trace.t, trace.energy, lw=0.8, color="C2")
+    axes.set_ylabel("energy of the law")
+    axes.set_xlabel("t [s]")

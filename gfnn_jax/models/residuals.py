@@ -1,0 +1,119 @@
+"""What a law leaves of its record: residuals along arcs, whether they are white, and whether inputs
+are in them.
+
+Of N white residuals the correlation with any other series, and that with themselves some samples
+later, has a standard deviation of 1/√N. What exceeds that was not noise: a force that the law lacks
+(correlation with itself), or the timing or gain of an input (correlation with it).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+_LAGS = 20  # nodes, up to which residuals are correlated
+_BEYOND = 3.0  # standard deviations of a correlation that is no accident, of the largest of many
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Trace:
+    """One arc: its run, times t (n,) in s, channels as measured and as the law has them (n, k),
+    residuals (n, k) in units of their scale, NaN where nothing was seen, energy (n,) of the law,
+    inputs (n, m)."""
+
+    run: str
+    t: np.ndarray
+    measured: np.ndarray
+    fitted: np.ndarray
+    residuals: np.ndarray
+    energy: np.ndarray
+    inputs: np.ndarray
+
+
+class OfInput(NamedTuple):
+    """The largest correlation of residuals with an input, the time by which the residual is later
+    (s), and whether it is beyond chance."""
+
+    correlation: float
+    lag: float
+    seen: bool
+
+
+class Whiteness(NamedTuple):
+    """Of the residuals of one channel: lags (s) and the autocorrelation there, the size (three
+    standard deviations) that white residuals stay below, whether these do, correlations with inputs
+    by name, and the share of the channel's variation about its mean that the arcs follow, in %."""
+
+    lags: np.ndarray
+    autocorrelation: np.ndarray
+    bound: float
+    white: bool
+    inputs: dict[str, OfInput]
+    fit_percent: float
+
+    @property
+    def text(self) -> str:
+        """A line for people."""
+        seen = np.flatnonzero(self.autocorrelation[1:] > self.bound)
+        found = "white" if self.white else (
+            f"not white (ρ = {self.autocorrelation[1:][np.argmax(self.autocorrelation[1:])]:.2f}"
+            + (f", up to {self.lags[1 + seen[-1]]:.3g} s)" if len(seen) else ")")
+        )  # fmt: skip
+        told = "".join(
+            f"; {'with' if one.seen else 'none with'} {name} (ρ = {one.correlation:+.2f} at "
+            f"{one.lag:.3g} s)"
+            for name, one in self.inputs.items()
+        )
+        return f"{found}{told}; fit {self.fit_percent:.2f} %"
+
+
+def whiteness(
+    traces: Sequence[Trace], channels: Sequence[str], inputs: Sequence[str]
+) -> dict[str, Whiteness]:
+    """Of each channel."""
+    steps = np.concatenate([np.diff(trace.t) for trace in traces])
+    step = float(np.median(steps[steps > 0]))
+    found = {}
+    for k, name in enumerate(channels):
+        r = [np.clip(trace.residuals[:, k], -5, 5) for trace in traces]  # outliers count as five σ
+        count = sum(int(np.isfinite(one).sum()) for one in r)
+        rho = np.array([_correlation(r, r, lag) for lag in range(_LAGS + 1)])
+        bound = _BEYOND / np.sqrt(max(count, 1))
+        colour = 1 + 2 * float(np.sum(rho[1:].clip(min=0)))
+        of_inputs = {}
+        for j, u in enumerate(inputs):
+            mean = np.mean(np.concatenate([trace.inputs[:, j] for trace in traces]))
+            series = [trace.inputs[:, j] - mean for trace in traces]
+            both = {lag: _correlation(series, r, lag) for lag in range(-_LAGS // 4, _LAGS + 1)}
+            best = max(both, key=lambda lag: abs(both[lag]))
+            seen = bool(abs(both[best]) > bound * np.sqrt(colour))
+            of_inputs[u] = OfInput(both[best], best * step, seen)
+        measured = np.concatenate([trace.measured[:, k] for trace in traces])
+        left = measured - np.concatenate([trace.fitted[:, k] for trace in traces])
+        percent = 100 * (1 - np.sqrt(np.nanmean(left**2)) / max(np.nanstd(measured), 1e-300))
+        white = bool(np.all(np.abs(rho[1:]) < bound))
+        found[name] = Whiteness(
+            step * np.arange(_LAGS + 1), rho, bound, white, of_inputs, float(percent)
+        )
+    return found
+
+
+def _correlation(a: Sequence[np.ndarray], b: Sequence[np.ndarray], lag: int) -> float:
+    """Of a with b ``lag`` samples later, within arcs, in units of all of both, so that few pairs of
+    a long lag count for as little; NaN counts as nothing."""
+    early, late = [], []
+    for one, other in zip(a, b, strict=True):
+        n = len(one)
+        if n <= abs(lag):
+            continue
+        early.append(one[max(0, -lag) : n - max(0, lag)])
+        late.append(other[max(0, lag) : n - max(0, -lag)])
+    if not early:
+        return 0.0
+    x, y = np.concatenate(early), np.concatenate(late)
+    known = np.isfinite(x) & np.isfinite(y)
+    size = np.sqrt(np.prod([np.nansum(np.concatenate(every) ** 2) for every in (a, b)]))
+    return float(np.sum(x[known] * y[known]) / size) if size > 0 else 0.0
