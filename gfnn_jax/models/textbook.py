@@ -48,9 +48,10 @@ class Options:
     a law, beside the coordinates and products of two. rounds: of matching. finalists: matches that
     go through their flow; plainer: of them, that are tried in plainer shapes too. corrections: of
     gradients, at most; contracted: by which each must lower what is left over. roundoff: of the
-    coordinates' sizes; a law that leaves no more is exact. digits, digits_a_number: and so is one
-    that leaves no more than 10 to the minus so many, and so many for every coefficient and constant
-    of its atoms: sums of atoms that are near the law gain about one digit each. lost: part of the
+    coordinates' sizes; a polynomial that leaves no more is exact. digits, digits_a_number: so is
+    another law that leaves no more than 10 to the minus so many, and so many more for every
+    coefficient and constant of its atoms, because sums of atoms that are not those of the law come
+    nearer to it by about one digit each. lost: part of the
     pairs whose flow may fail. most_dim: degrees of freedom, beyond which the dictionary is too
     large. rows_per_term: that all products of coordinates need together. certain: twice the
     logarithm of the odds that what an atom explains is no chance.
@@ -67,7 +68,7 @@ class Options:
     contracted: float = 0.6
     roundoff: float = 1e-13
     digits: float = 6.0
-    digits_a_number: float = 1.5
+    digits_a_number: float = 1.25
     lost: float = 0.1
     most_dim: int = 4
     rows_per_term: float = 1.6
@@ -179,9 +180,14 @@ class Textbook:
 
     def _is_exact(self, state: _State) -> bool:
         """Whether the law is as exact as no approximation of so many numbers would be."""
-        numbers = sum(1 + sum(f.theta is not None for f in atom) for atom in state.match.atoms)
-        digits = self._options.digits + self._options.digits_a_number * numbers
-        return state.law.left <= max(10.0**-digits, self._options.roundoff)
+        options, width = self._options, 2 * self._dim
+        others = [
+            a for a in state.match.atoms if powers_of(a, self._arguments, width) is None
+        ]  # fmt: skip
+        if not others:
+            return state.law.left <= options.roundoff
+        numbers = len(state.match.atoms) + sum(f.theta is not None for a in others for f in a)
+        return state.law.left <= 10.0 ** -(options.digits + options.digits_a_number * numbers)
 
     def _explains_nothing(self, state: _State, dictionary: Dictionary) -> bool:
         """Whether no atom explains more of what is left over than it would of noise."""
