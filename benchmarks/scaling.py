@@ -60,8 +60,8 @@ from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.terms import polynomial_terms
-from gfnn_jax.fitting import gauss_newton, least_squares, row_blocks
-from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt_together
+from gfnn_jax.fitting import gauss_newton, least_squares, linear_starts, row_blocks
+from gfnn_jax.fitting.together import levenberg_marquardt_together
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.learn.refit import help_refit, refit
@@ -136,7 +136,7 @@ def problem(task: str, quick: bool) -> Callable[[], Any]:
     if task == "gauss-newton":
         terms = polynomial_terms(2, size)
         own = gauss_newton.Problem(z0, z1, dt, np.ones(4))
-        c = gauss_newton.midpoint_start(terms, z0, z1, dt, np.ones(4))
+        c = linear_starts.midpoint_start(terms, z0, z1, dt, np.ones(4))
         return lambda: own.linearised(terms, c, Steps(5, 1), np.arange(len(z0))).factor
     network = Mlp(box_inputs(w), (16, 16, 16), "gelu", amplitude_of(w, target))
     starts = [network.init(key, np.float64) for key in jax.random.split(jax.random.key(1), size)]

@@ -131,8 +131,8 @@ class Pairs:
     run: the run (trajectory, sequence) of each pair, (N,) numbers or text. place: the number of z0
     along its run, (N,) integers. A fit sorts pairs that have a run by run and place. Where places
     are missing, it finds them by the images that are states of other pairs.
-    std: standard deviation of the noise on each measured coordinate, (2d,), in the user's units.
-    With None it is estimated.
+    std: standard deviation of the noise on each measured coordinate, (2d,), or on each value of
+    both states of a pair, (N, 2d), in the user's units. With None it is estimated.
 
     Raises FitError where the arrays do not have these shapes.
     """
@@ -172,10 +172,11 @@ class Pairs:
         self._set_identities()
         if self.std is not None and not isinstance(self.std, jax.Array):
             self._set("std", np.asarray(self.std, np.float64))
-            if self.std.shape != (self.z0.shape[1],):
+            width = self.z0.shape[1]
+            if self.std.shape not in ((width,), (len(self), width)):
                 raise FitError(
-                    f"expected std of shape ({self.z0.shape[1]},), one of each coordinate, got "
-                    f"{self.std.shape}"
+                    f"expected std of shape ({width},), one of each coordinate, or "
+                    f"({len(self)}, {width}), one of each value, got {self.std.shape}"
                 )
             if not (np.isfinite(self.std) & (self.std > 0)).all():
                 raise FitError("expected every std finite and above 0; leave std out if unknown")
@@ -246,9 +247,10 @@ class Pairs:
         dt = self.dt[rows] if np.ndim(self.dt) else self.dt
         args = self.args and {name: values[rows] for name, values in self.args.items()}
         run, place = (None if of is None else of[rows] for of in (self.run, self.place))
+        std = self.std[rows] if np.ndim(self.std) == 2 else self.std
         return Pairs(
             self.z0[rows], self.z1[rows], dt, args, period=self.period, run=run, place=place,
-            std=self.std,
+            std=std,
         )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """Budgets: decisions that count operations, and a clock that only says how many fit."""
 
+import contextlib
 import itertools
 import time
 from functools import partial
@@ -13,7 +14,8 @@ import gfnn_jax as gfnn
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.learn.clock import COMPILE, ROWS, Budget
+from gfnn_jax.learn import searches
+from gfnn_jax.learn.clock import COMPILE, FLOW, ROWS, Budget
 
 QUIETLY = pytest.mark.filterwarnings("ignore::gfnn_jax.FitWarning")
 LARGE = 10**10  # operations whose time tells the rate of their kind: a second, by default
@@ -304,6 +306,7 @@ def test_a_faster_clock_ends_at_an_earlier_unit_which_operations_reproduce(learn
         same_bits(fit, again)
         assert again.operations == fit.operations
         assert ("the clock ended it" in fit.ended) == (tick > 1)
+        assert fit.budget.ended in fit.ended
     operations = [fit.operations for fit in found]
     assert operations == sorted(operations, reverse=True)
     assert len(set(operations)) == len(operations)
@@ -324,6 +327,22 @@ def test_a_fit_leaves_some_map_whatever_its_budget():
 
 
 @QUIETLY
+@QUIETLY
+def test_ended_names_the_clock_where_the_maps_ended_by_themselves(monkeypatch):
+    """Every size of S that so few pairs determine is judged before the clock ends the search for
+    H."""
+
+    def cut_off(request, *_):
+        with contextlib.suppress(OutOfTime), request.budget.unit("H of 60 terms", FLOW, 1e30):
+            pass
+
+    monkeypatch.setattr(searches, "_law", cut_off)
+    fit = gfnn.fit(kepler(60), tolerance=1e-12, max_seconds=1e6)
+    assert "the clock ended it" in fit.ended
+    assert "H of 60 terms" in fit.ended
+    assert fit.ended in " ".join(fit.messages)
+
+
 def test_the_words_of_a_search_that_was_cut_off():
     fit = gfnn.fit(kepler(), learn="hamiltonian", tolerance=1e-9, max_seconds=None,
                    max_operations=16 * 10**7)  # fmt: skip

@@ -9,11 +9,9 @@ import pytest
 import gfnn_jax as gfnn
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp
-from gfnn_jax.fitting.levenberg_marquardt import (
-    LMState,
-    levenberg_marquardt,
-    levenberg_marquardt_together,
-)
+from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
+from gfnn_jax.fitting.together import levenberg_marquardt_together
+from gfnn_jax.fitting.training import LMState
 from gfnn_jax.jobs.predict import predict
 from gfnn_jax.jobs.progress import Progress
 from gfnn_jax.jobs.search import search

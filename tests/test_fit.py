@@ -316,7 +316,7 @@ def test_a_map_without_all_images_is_still_given(monkeypatch):
     """The most accurate there is, with a warning, even where no step could be judged."""
     from gfnn_jax.dataset import measured_error
 
-    def failing(error, spread, tolerance, block=None):
+    def failing(error, spread, tolerance, block=None, worst=2):
         return measured_error.OneStepError(np.inf, np.inf, np.inf, np.full(2, np.inf))
 
     monkeypatch.setattr(measured_error, "one_step_error", failing)

@@ -15,9 +15,9 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.evaluate import figures, figures_of_many
 from gfnn_jax.families.sums import ENDS, Part, Sums, Windows, body_terms, matrix_free, site_terms
 from gfnn_jax.families.terms import Terms, given_terms
-from gfnn_jax.fitting.gauss_newton import rates
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.rates import rates
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.propose import proposed

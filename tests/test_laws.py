@@ -307,7 +307,7 @@ def test_pairs_are_drawn_in_the_region_that_is_named(law):
 def test_a_map_that_is_far_cheaper_than_the_law_is_fitted_to_pairs_of_the_law(pairs, monkeypatch):
     few = pairs.take(np.arange(60))
     for module in (searches, choose_law):  # as if the law's step were ten times as dear
-        monkeypatch.setattr(module, "DEARER", 0.4)
+        monkeypatch.setattr(module, "MAX_COST_RATIO", 0.4)
     found = gfnn.fit(few, tolerance=1e-5)
     assert found.chosen.learns == "map"
     assert found.chosen.num_parameters * 3 > 60 * 4  # more than the pairs alone determine

@@ -14,7 +14,8 @@ from jax.flatten_util import ravel_pytree
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.family import DifferentiatedByJax, from_function
 from gfnn_jax.fitting import levenberg_marquardt as lm
-from gfnn_jax.fitting.levenberg_marquardt import BLOCK, levenberg_marquardt
+from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
+from gfnn_jax.fitting.training import BLOCK
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("amplitude",), meta_fields=())
@@ -189,13 +190,13 @@ def test_a_step_into_non_finite_values_is_rejected():
 
 
 def test_memory_is_bounded_by_the_chunk_and_not_by_the_pairs():
-    theta, layout = lm._flattened(network_params(0, 50))
+    theta, layout = lm.flattened(network_params(0, 50))
     w, target = (np.tile(a, (10, 1)) for a in TRAINING)
     chunk, num_parameters = 100, theta.size
-    given = (NETWORK, lm._chunked(w, target, np.ones(2), chunk), theta)
+    given = (NETWORK, lm.chunked(w, target, np.ones(2), chunk), theta)
     square = np.zeros((theta.size, theta.size))
-    linearize = lm._linearize.lower(*given, layout=layout)
-    attempt = lm._attempt.lower(*given, square, theta, 1.0, layout=layout)
+    linearize = lm.linearize.lower(*given, layout=layout)
+    attempt = lm.attempt.lower(*given, square, theta, 1.0, layout=layout)
     jacobian, matrix = 2 * chunk * num_parameters, num_parameters**2
     assert len(w) * 2 * num_parameters > 4 * (jacobian + matrix)  # whole, it would not fit below
 

@@ -14,7 +14,7 @@ from gfnn_jax.data.recording import Recording
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
-from gfnn_jax.models.discrete_lagrangian import left_over, solve
+from gfnn_jax.models.discrete_lagrangian import residuals, solve
 from gfnn_jax.models.triples import Triples, triples_of
 
 K = 0.6
@@ -186,7 +186,7 @@ def test_s_is_fixed_by_its_mixed_term_and_nearest_to_free_motion():
     family = OfDisplacement(Products(inputs, 2), 0.5)
     solved = solve(family, triples)
     params = family.unflatten(solved.coefficients)
-    assert np.abs(left_over(family, params, triples)).max() < 1e-13
+    assert np.abs(residuals(family, params, triples)).max() < 1e-13
     assert solved.rank < family.num_parameters - 4
     hessian = family.gradient_and_hessian(params, triples.ends[:1])[1][0]
     mixed = -(dt**2) * hessian[:2, 2:]

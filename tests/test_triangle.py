@@ -79,8 +79,8 @@ def test_a_ridge_damps_columns_scaled_to_one():
     both = spectrum.solution(np.stack([spectrum.inverse, spectrum.ridged(ridge)]))
     np.testing.assert_allclose(both.T, [lstsq(A, B), c], rtol=1e-10)
     hat = damped[:90] @ np.linalg.inv(damped.T @ damped) @ damped[:90].T
-    assert spectrum.freedom(ridge) == pytest.approx(np.trace(hat), rel=1e-12)
-    assert spectrum.freedom() == pytest.approx(7)
+    assert spectrum.degrees_of_freedom(ridge) == pytest.approx(np.trace(hat), rel=1e-12)
+    assert spectrum.degrees_of_freedom() == pytest.approx(7)
     root = spectrum.root(ridge) * column[:, None]
     np.testing.assert_allclose(root @ root.T, np.linalg.inv(damped.T @ damped), atol=1e-14)
 

@@ -117,6 +117,13 @@ class Dataset:
         (N, 2d); None where it is to be estimated."""
         return self.pairs.std
 
+    @property
+    def noise_of_channels(self) -> np.ndarray | None:
+        """(2d,): of noise of each value the root of the mean square."""
+        if self.noise is None or self.noise.ndim == 1:
+            return self.noise
+        return np.sqrt(np.mean(self.noise**2, axis=0))
+
     @cached_property
     def spread(self) -> np.ndarray:
         """(2d,) sizes of the user's coordinates."""
@@ -150,12 +157,12 @@ class Dataset:
 
     @property
     def period(self) -> float | None:
-        """That of a drive."""
+        """Period of a drive."""
         return self.pairs.period
 
     @property
     def varied(self) -> bool:
-        """Whether rows differ in their dt or in parameters."""
+        """Return whether rows differ in their dt or in parameters."""
         return self.own_dt is not None or self.args is not None
 
     @property
@@ -169,15 +176,15 @@ class Dataset:
         return of_lanes(self.each_dt, rows), of_lanes(self.args, rows)
 
     def divided(self, seed: int) -> Dataset:
-        """With rows for training, validation and test, drawn by the seed (`dataset.split`)."""
+        """Draw rows for training, validation and test by the seed (`dataset.split`)."""
         return dataclasses.replace(self, split=split_rows(self.pairs, seed))
 
     def trained_on(self, rows: np.ndarray) -> Dataset:
-        """With these rows for training; validation and test as they are."""
+        """Take these rows for training; validation and test as they are."""
         return dataclasses.replace(self, split=self.split._replace(training=rows))
 
     def validated_on(self, rows: np.ndarray) -> Dataset:
-        """With these rows for validation; training and test as they are."""
+        """Take these rows for validation; training and test as they are."""
         return dataclasses.replace(self, split=self.split._replace(validation=rows))
 
     def validating(self, others: Pairs) -> Dataset:
@@ -197,19 +204,19 @@ class Dataset:
         return dataclasses.replace(both, split=split)
 
     def take(self, rows: np.ndarray) -> Dataset:
-        """These rows alone, each in its part; sizes and domain are theirs."""
+        """Take these rows alone, each in its part; sizes and domain are theirs."""
         return dataclasses.replace(
             self, pairs=self.pairs.take(rows), row=self.row[rows], y0=self.y0[rows],
             y1=self.y1[rows], split=self.split.take(rows),
         )._measured()  # fmt: skip
 
     def lifted_anew(self, rows: np.ndarray) -> Dataset:
-        """These rows alone, their angles lifted among themselves, nothing factored out and all of
-        them for training."""
+        """Take these rows alone, their angles lifted among themselves, nothing factored out and all
+        of them for training."""
         return Dataset.of(self.pairs.take(rows), self.coordinates, self.structure, self.row[rows])
 
     def without(self, before: Factored | None, after: Factored | None) -> Dataset:
-        """These pieces factored out: before(z) -> after⁻¹(Z). The domain stays that of the
+        """Factor these pieces out: before(z) -> after⁻¹(Z). The domain stays that of the
         states."""
         found = self
         if before is not None:
@@ -229,7 +236,7 @@ class Dataset:
         return y
 
     def _measured(self) -> Dataset:
-        """With sizes and domain of these rows."""
+        """Measure sizes and domain of these rows."""
         structure = self.structure
         if structure is not None:
             scale, domain = structure.sizes(self.y0), structure.domain(self.y0)

@@ -11,6 +11,11 @@ from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.dataset.bounds import bound_of_mean
 from gfnn_jax.dataset.dataset import Dataset
 
+# Runs from which on their errors tell how much they differ; of fewer, stretches are told apart.
+FEWEST_RUNS = 5
+# Times that the worst of the rows counts, of those that choose and of those that state an error.
+_CHOOSING, _STATING = 2, 3
+
 
 @dataclasses.dataclass(frozen=True)
 class Tolerance:
@@ -32,7 +37,7 @@ class Tolerance:
         return cls(options.absolute_tolerance, relative=False)
 
     def met_by(self, candidate: Any) -> bool:
-        """Whether the candidate's error is within it, at 95 %."""
+        """Return whether the candidate's error is within it, at 95 %."""
         return candidate.validation_bound <= self.bound
 
 
@@ -55,27 +60,44 @@ def measured_error(data: Dataset, tolerance: Tolerance, images, rows=None) -> On
     rows'.
 
     The bound by the validation rows is the one that the test rows are likely to state: as far above
-    their error again as that is above the validation rows'.
+    their error again as that is above the validation rows'. Their stretches err independently; of
+    the rows that state an error runs do, as many as there are.
     """
     own = data.validation if rows is None else rows
     error = nearest_image(images - np.asarray(data.pairs.z1)[own], data.user_angles)
-    found = one_step_error(error, data.spread, tolerance, data.split.stretch[own])
+    cluster = data.split.stretch[own] if rows is None else clusters(data, rows)[0]
+    worst = _CHOOSING if rows is None else _STATING
+    found = one_step_error(error, data.spread, tolerance, cluster, worst)
     size = found.relative if tolerance.relative else found.rms
     if rows is not None or not len(data.test) or not 0 < size < np.inf:
         return found
     return found._replace(bound=found.bound**2 / size)
 
 
-def one_step_error(error, spread, tolerance: Tolerance, block=None) -> OneStepError:
+def clusters(data: Dataset, rows: np.ndarray) -> tuple[np.ndarray, bool]:
+    """(n,) the cluster of each of these rows, of which each errs in its own way, and whether these
+    are runs: where there are at least five, else they are stretches of a run."""
+    by_run = count_of_runs(data, rows) >= FEWEST_RUNS
+    return (data.run if by_run else data.split.stretch)[rows], by_run
+
+
+def count_of_runs(data: Dataset, rows: np.ndarray) -> int:
+    """Runs that these rows are of; a single pair is a run of its own."""
+    return len(np.unique(data.run[rows]))
+
+
+def one_step_error(
+    error, spread, tolerance: Tolerance, block=None, worst: int = _CHOOSING
+) -> OneStepError:
     """The statistics of errors (N, 2d) of states whose coordinates have this spread (2d,). block:
-    (N,) which of them depend on each other; None: none do."""
+    (N,) which of them depend on each other; None: none do. worst: as of `bounds.bound_of_mean`."""
     if not np.isfinite(error).all():
         width = error.shape[1]
         return OneStepError(np.inf, np.inf, np.inf, np.full(width, np.inf))
     squares = error**2
     deviations = np.sqrt(squares.mean(axis=0))
     measured = np.mean(squares / spread**2 if tolerance.relative else squares, axis=1)
-    bound = bound_of_mean(measured, np.arange(len(measured)) if block is None else block)
+    bound = bound_of_mean(measured, np.arange(len(measured)) if block is None else block, worst)
     return OneStepError(
         float(np.sqrt(squares.mean())),
         float(np.sqrt(np.mean(squares / spread**2))),

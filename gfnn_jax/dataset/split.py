@@ -35,7 +35,8 @@ class Split(NamedTuple):
 
     @classmethod
     def of_training(cls, rows: np.ndarray, count: int) -> Split:
-        """These of ``count`` rows train, and nothing is kept apart; each errs independently."""
+        """Split in which these of ``count`` rows train, and nothing is kept apart; each errs
+        independently."""
         return cls(rows, np.zeros(0, int), np.zeros(0, int), np.arange(count))
 
     def take(self, rows: np.ndarray) -> Split:

@@ -120,7 +120,8 @@ def stretches(
         t, u = recording.times(run), recording.array("inputs", run)
         y, noise = channels_of(recording, names, run)
         q = y if coordinates_of is None else coordinates_of(y)
-        turns = [i for i, n in enumerate(recording.coordinates) if n in recording.angles]
+        lifted = {*recording.angles} - {*names}  # angles that no column shows: columns are lifted
+        turns = [i for i, n in enumerate(recording.coordinates) if n in lifted]
         seen = np.isfinite(q).all(1) & np.isfinite(u).all(1)
         t, y, u, q, noise = t[seen], y[seen], u[seen], q[seen], noise[seen]
         if coordinates_of is not None and len(q):
@@ -156,7 +157,7 @@ def measure(found: Sequence[Stretch]) -> Scales:
     if not np.all(speed > 0):
         raise InputError("expected positions that move: a column is constant")
     dt = float(np.median(np.concatenate([np.diff(s.t) for s in found])))
-    if any(s.y is not s.q for s in found):
+    if not all(np.array_equal(s.y, s.q) for s in found):
         sigma = _noise_of_channels(found)
     steps = np.concatenate([np.diff(s.y, axis=0) for s in found])
     resolution = np.nanmedian(np.abs(steps), axis=0)

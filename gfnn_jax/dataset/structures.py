@@ -1,4 +1,5 @@
-"""What a user says of many degrees of freedom: equal sites in a ring or a chain, or bodies.
+"""Structures of many degrees of freedom, as a user names them: equal sites in a ring or a chain, or
+bodies.
 
 A structure tells which libraries of terms are tried, and by what the domain of the data is known.
 """
@@ -13,6 +14,7 @@ from math import comb
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
+from gfnn_jax.dataset.structure_names import EXPECTED
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.sums import (
     Part,
@@ -23,7 +25,6 @@ from gfnn_jax.families.sums import (
     site_terms,
 )
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.learn.options import STRUCTURE
 from gfnn_jax.maps.domain import Ranges, ranges_of
 from gfnn_jax.phase_space import sizes
 
@@ -94,7 +95,7 @@ class Sites:
         return np.repeat(size[:, None], both.shape[2], axis=1).ravel()
 
     def domain(self, z: np.ndarray, uses_positions: bool = True) -> Ranges:
-        """Where the states z (N, 2d) were: p and the differences of neighbours, and q unless only
+        """Domain of the states z (N, 2d): p and the differences of neighbours, and q unless only
         its differences are used."""
         dim = z.shape[1] // 2
         ends = "ring" if self.kind == "ring" else "free"
@@ -142,7 +143,7 @@ class Bodies:
         return sizes(z)
 
     def domain(self, z: np.ndarray, uses_positions: bool = True) -> Ranges:
-        """Where the states z (N, 2d) were: each body's |p|² and each pair's distance."""
+        """Domain of the states z (N, 2d): each body's |p|² and each pair's distance."""
         return ranges_of(body_terms(self.count, self.space, (1,), alike=False), z)
 
 
@@ -176,7 +177,7 @@ def structure_of(
         return Bodies(count, dim // count, species)
     kind, fields = str(text).partition(":")[0], fields_of(str(text))
     if fields == 0:
-        raise FitError(f"expected {STRUCTURE.words}, got {text!r}")
+        raise FitError(f"expected {EXPECTED}, got {text!r}")
     if dim % fields:
         raise FitError(f"expected {fields} q of every site; got {dim} degrees of freedom")
     if dim // fields < _FEWEST_SITES:

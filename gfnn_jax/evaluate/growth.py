@@ -118,13 +118,13 @@ def _slope(x, lanes, steps, transform):
     if num_lanes > 1:  # delete-one jackknife; for a linear transform, the scatter of the slopes
         replicates = transform((lanes.sum(axis=0) - lanes) / (num_lanes - 1)) @ weights
         variance = (num_lanes - 1) * np.var(replicates)
-        freedom = num_lanes - 1
+        degrees = num_lanes - 1
     else:
         residual = curve - curve.mean() - value * centred
         variance = residual @ residual / (num_points - 2) * (weights @ weights)
-        freedom = num_points - 2
+        degrees = num_points - 2
     error = float(np.sqrt(variance))
-    half = float(stdtrit(freedom, 0.975)) * error
+    half = float(stdtrit(degrees, 0.975)) * error
     value = float(value)
     return Estimate(
         value, error, (value - half, value + half), float(steps[0]), float(steps[-1]), num_lanes

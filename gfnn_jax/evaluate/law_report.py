@@ -45,6 +45,7 @@ def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:
             "messages": list(fit.messages),
             "steps": list(fit.steps),
             "alike": list(fit.alike),
+            "next_motions": [motion._asdict() for motion in fit.next_motions],
         },
         "hamiltonian": _law(fit.hamiltonian),
         "lagrangian": {**_law(fit.lagrangian), "text": str(fit.lagrangian)},
@@ -61,6 +62,7 @@ def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:
         "observe": fit.observe,
         "sensors": {name: {"value": c, "std": s} for name, (c, s) in fit.sensors.items()},
         "noise": {n: {"sigma": s, "residual": fit.residual[n]} for n, s in fit.noise.items()},
+        "velocities": {name: one._asdict() for name, one in fit.velocities.items()},
         "whiteness": {
             name: {
                 "white": of.white,

@@ -18,16 +18,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg
 
-from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting import row_blocks
-from gfnn_jax.fitting.base_map import field_for
-from gfnn_jax.fitting.triangle import Spectrum, Triangle
-from gfnn_jax.fitting.turns import backwards, forward_logarithm, tangent, turns
+from gfnn_jax.fitting.descent import ROUNDOFF, descended, step
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps, images, of_lanes, operations, truncation
-from gfnn_jax.phase_space import apply_j, symplectic_form
+from gfnn_jax.flows.rates import MOST_SUBSTEPS, substeps_for
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,14 +34,10 @@ class Options:
     fractions: of the pairs, those that the present H explains best, in the rounds of a fit.
     early, most: Gauss–Newton steps of the early rounds and of the last.
     rows_per_term: rows that a round has for each term, at least.
-    dampings: tried in turn, in units of the largest singular value.
-    gained: a step that lowers the residual by less has converged. promised: a step that was to
-    lower it by no more than this, and does not, has met the floor of rounding or truncation.
     foretold: how well the linearised problem must tell the next residual for a start to be close.
-    null: of a term's size; one that is closer to the span of those before it is not known apart.
     block_bytes: of the arrays that a block of pairs takes. part_bytes: of a block that one of
     several devices takes; part_rows: rows of its part per term, at least.
-    reach: h‖H''‖ of one substep. coarse_stages: of the early rounds.
+    coarse_stages: of the early rounds.
     early_rows: rows per term that the early rounds look at; fewest: pairs at least.
     judged: pairs at which a step's own error is measured; judged_free: of a family that does
     without matrices, every pair of which has many coordinates.
@@ -56,15 +49,10 @@ class Options:
     early: int = 3
     most: int = 40
     rows_per_term: float = 1.5
-    dampings: tuple[float, ...] = (0.0, 1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
-    gained: float = 1e-2
-    promised: float = 0.1
     foretold: float = 0.1
-    null: float = 1e-10
     block_bytes: int = 32 * 2**20
     part_bytes: int = 4 * 2**20
     part_rows: float = 4.0
-    reach: float = 1.0
     coarse_stages: int = 4
     early_rows: float = 6.0
     fewest: int = 60
@@ -76,11 +64,8 @@ class Options:
 
 
 OPTIONS = Options()
-_ROUNDOFF = 2e-16  # of the coordinates' sizes: the residual's floor
-_FINE, _ROUNDED = (
-    5e-16,
-    1e-13,
-)  # of them: a step's own error that is roundoff, at dt of long arcs too
+# A step's own error, of the coordinates' sizes, that is roundoff; at dt of long arcs too.
+_FINE, _ROUNDED = 5e-16, 1e-13
 
 
 class FlowFit(NamedTuple):
@@ -100,129 +85,6 @@ class FlowFit(NamedTuple):
     used: np.ndarray
     iterations: int
     steps: Steps
-
-
-# Where a fit starts.
-
-
-def null_terms(
-    family, z, tolerance: float = OPTIONS.null, *, args=None
-) -> tuple[list[int], list[int]]:
-    """(kept, null): the terms that states z (N, 2d) with these args (N, k) tell apart, and those
-    whose gradient is a combination of those before them."""
-    gradients = family.term_gradients(z, args)
-    columns = gradients.reshape(-1, gradients.shape[-1])
-    size = np.linalg.norm(columns, axis=0)
-    scaled = columns / np.where(size > 0, size, 1.0)
-    kept: list[int] = []
-    basis = np.zeros((len(scaled), 0))
-    for j in range(scaled.shape[1]):
-        rest = scaled[:, j]
-        for _ in range(2):  # the second time makes it orthogonal to roundoff
-            rest = rest - basis @ (basis.T @ rest)
-        distance = np.linalg.norm(rest)
-        if np.isfinite(distance) and distance > tolerance and basis.shape[1] < len(scaled):
-            kept.append(j)
-            basis = np.column_stack([basis, rest / distance])
-    return kept, sorted(set(range(scaled.shape[1])) - set(kept))
-
-
-def midpoint_start(family, z0, z1, dt, scale, args=None) -> np.ndarray:
-    """The linear problem (z₁ − z₀)/h = J∇H(½(z₀ + z₁), t + ½h): exact to O(h²). dt: a number or
-    (N,)."""
-    h = dt[:, None] if np.ndim(dt) else dt
-    args = at_time(family, args, 0.5 * dt)
-    return fitted_gradients(family, 0.5 * (z0 + z1), -apply_j(z1 - z0) / h, scale, args)
-
-
-def log_start(family, z0, z1, dt: float, scale) -> np.ndarray | None:
-    """The quadratic H whose flow is the pairs' affine regression: its logarithm over h. None where
-    it has no real one."""
-    width = z0.shape[1]
-    centre = z0.mean(axis=0)
-    design = np.column_stack([np.ones(len(z0)), (z0 - centre) / scale])
-    solution = np.linalg.lstsq(design, (z1 - z0) / scale, rcond=None)[0]
-    augmented = np.eye(width + 1)
-    augmented[:width, :width] += solution[1:].T
-    augmented[:width, width] = solution[0]
-    logarithm = scipy.linalg.logm(augmented)
-    if not np.abs(np.imag(logarithm)).max() <= 1e-6 * (1 + np.abs(logarithm).max()):
-        return None
-    generator = np.real(logarithm) / dt
-    unit = scale[:, None] / scale[None, :]
-    matrix = -symplectic_form(width // 2) @ (generator[:width, :width] * unit)
-    offset = -apply_j(scale * generator[:width, width])
-    gradient = (z0 - centre) @ (0.5 * (matrix + matrix.T)) + offset
-    return fitted_gradients(family, z0, gradient, scale)
-
-
-def forward_start(family, z0, z1, dt: float, scale) -> tuple[float, np.ndarray] | None:
-    """(angle, the quadratic H) where a plane around the centre turns backwards by this angle: the H
-    that turns it forwards instead, by more than π in a step. None where none does."""
-    centre, image, jacobian = tangent(z0, z1, scale)
-    angle = backwards(turns(jacobian, scale)[0])
-    logarithm = forward_logarithm(jacobian, scale) if angle > 0 else None
-    if logarithm is None:
-        return None
-    form = symplectic_form(z0.shape[1] // 2)
-    matrix = -form @ logarithm
-    generator = form @ (0.5 * (matrix + matrix.T))
-    velocity = ((z0 - centre) @ generator.T + field_for(generator, image - centre)) / dt
-    return angle, fitted_gradients(family, z0, -apply_j(velocity), scale)
-
-
-def fitted_gradients(family, z, gradient, scale, args=None) -> np.ndarray:
-    """Coefficients whose ∇H is closest to gradients (N, 2d) at states z with these args, each in
-    the unit of what it changes."""
-    dim = z.shape[1] // 2
-    weight = 1.0 / np.roll(scale, dim)
-    terms = family.term_gradients(z, args) * weight[:, None]
-    rows = terms.reshape(-1, terms.shape[-1])
-    size = np.linalg.norm(rows, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    return np.linalg.lstsq(rows / size, (gradient * weight).ravel(), rcond=1e-12)[0] / size
-
-
-# States and iterations by which the fastest rate of a large system is estimated.
-_RATED, _POWERS = 4, 30
-
-
-# A flow that needs more is dearer than any map, and its linear start is seldom right.
-MOST_SUBSTEPS = 64
-
-
-def substeps_for(family, coefficients, z, dt, reach: float = OPTIONS.reach, *, args=None) -> int:
-    """Substeps so that h‖H''‖ is within reach for nearly all of the states z (N, 2d), at the
-    longest dt."""
-    found = rates(family, coefficients, z, args)
-    finite = found[np.isfinite(found)]
-    if not len(finite):
-        return 1
-    return int(np.clip(np.ceil(np.max(dt) * np.quantile(finite, 0.95) / reach), 1, MOST_SUBSTEPS))
-
-
-def rates(family, coefficients, z, args=None) -> np.ndarray:
-    """The largest |eigenvalue| of JH'' (N,) at states z (N, 2d): the fastest rate of the linearised
-    flow; not finite where H'' is not. Without matrices its estimate by power iteration, from below.
-    """
-    if not matrix_free(family):
-        _, hessian = family.gradient_and_hessian(coefficients, z, args)
-        finite = np.isfinite(hessian).all(axis=(1, 2))
-        turned = symplectic_form(z.shape[1] // 2) @ hessian[finite]
-        found = np.full(len(z), np.nan)
-        found[finite] = np.abs(np.linalg.eigvals(turned)).max(axis=-1, initial=0.0)
-        return found
-    z = z[:: -(-len(z) // _RATED)]
-    bends = family.curvatures(coefficients, z, args)
-    v = np.random.default_rng(0).normal(size=z.shape)
-    for _ in range(_POWERS):  # twice at a time: eigenvalues come in pairs ±λ
-        v = v / np.linalg.norm(v, axis=1, keepdims=True)
-        for _ in range(2):
-            v = apply_j(family.hessian_product(bends, v))
-    return np.sqrt(np.linalg.norm(v, axis=1))
-
-
-# The fit.
 
 
 class Problem:
@@ -393,7 +255,7 @@ class Problem:
         if not np.isfinite(here.norm) or here.rows < family.num_parameters:
             return None
         spectrum = here.spectrum()
-        tried = c - _step(spectrum, 0.0)
+        tried = c - step(spectrum, 0.0)
         size = self.residuals(family, tried, coarse, rows)
         off = abs(float(np.linalg.norm(size)) - spectrum.residual_norm)
         return tried if off <= self.options.foretold * here.norm else None
@@ -449,7 +311,7 @@ class Problem:
     def substeps_for(self, family, c, rows) -> int:
         """Substeps that these rows need, by the function of this name."""
         dt, args = self.given(rows)
-        return substeps_for(family, c, self.z0[rows], dt, self.options.reach, args=args)
+        return substeps_for(family, c, self.z0[rows], dt, args=args)
 
     def fine_steps(
         self, family, c, rows, tolerances: Sequence[float | None] = (None,)
@@ -476,44 +338,7 @@ class Problem:
 
     def _descend(self, family, c, steps: Steps, rows, most: int):
         """Descend over these rows, by the function `descended`."""
-        return descended(lambda c: self.linearised(family, c, steps, rows), c, most, self.options)
-
-
-def descended(
-    linearised: Callable[[np.ndarray], Triangle], c, most: int, options: Options = OPTIONS
-) -> tuple[np.ndarray, Triangle, int]:
-    """Gauss–Newton steps from c until nothing is gained, at most so many: (coefficients, their
-    triangle, steps taken). ``linearised(c)``: the problem at c, of rows wherever they are."""
-    here = linearised(c)
-    floor = _ROUNDOFF * np.sqrt(here.rows)
-    first_damping, made = 0, 0
-    while made < most and floor < here.norm < np.inf:
-        found, spectrum = None, here.spectrum()
-        promised = 1 - spectrum.residual_norm / here.norm
-        for n in range(first_damping, len(options.dampings)):
-            tried = c - _step(spectrum, options.dampings[n])
-            there = linearised(tried)
-            if there.norm < here.norm:
-                found = n
-                break
-            if promised < options.promised and there.norm < 2 * here.norm:
-                break
-        if found is None:
-            break
-        made += 1
-        gained = 1 - there.norm / here.norm
-        c, here = tried, there
-        first_damping = max(0, found - 2)
-        if gained < options.gained:
-            break
-    return c, here, made
-
-
-def _step(spectrum: Spectrum, damping: float) -> np.ndarray:
-    """δ that minimises ‖R δ − r‖² + (damping s₀)² ‖D δ‖² among the directions that are known."""
-    s = np.where(spectrum.known, spectrum.s, 0.0)
-    square = np.where(spectrum.known, s**2 + (damping * spectrum.s[0]) ** 2, 1.0)
-    return spectrum.solution(s / square)
+        return descended(lambda c: self.linearised(family, c, steps, rows), c, most)
 
 
 def _cheapest(error: Callable[[Steps], float], substeps: int, tolerance: float) -> Steps:
@@ -544,41 +369,6 @@ def summarised(c, triangle: Triangle, used, iterations: int, steps: Steps) -> Fl
     """The fit that ends at c, with the triangle that was found there."""
     spectrum, rows = triangle.spectrum(), triangle.rows
     rms = triangle.norm / np.sqrt(max(rows, 1))
-    noise = max(triangle.norm / np.sqrt(max(rows - len(c), 1)), _ROUNDOFF)
+    noise = max(triangle.norm / np.sqrt(max(rows - len(c), 1)), ROUNDOFF)
     errors = noise * spectrum.deviations()
     return FlowFit(c, rms, errors, triangle, spectrum.condition, used, iterations, steps)
-
-
-# Fewer terms.
-
-
-def significant_terms(fit: FlowFit, threshold: float) -> np.ndarray:
-    """The terms that are left when those below ``threshold`` standard errors go, the others solved
-    for again (in the linearised problem), until none is below."""
-    return significant(fit.triangle, fit.coefficients, threshold, fit.rms)[0]
-
-
-def significant(
-    triangle: Triangle, coefficients, threshold: float, rms: float | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """(kept, their coefficients) of the linearised problem of [∂r/∂c, r], as `significant_terms`.
-
-    rms: of what the terms do not explain; None: of what all of them leave over.
-    """
-    count, rows = len(coefficients), triangle.rows
-    kept = np.arange(count)
-    unexplained = triangle.residual_norm(count) / np.sqrt(rows) if rms is None else rms
-    noise = max(unexplained, _ROUNDOFF) * np.sqrt(rows / max(rows - count, 1))
-    problem, c = triangle.rebased(coefficients), coefficients
-    while kept.size:
-        spectrum = problem.pruned(kept).spectrum()
-        c = spectrum.solution(spectrum.inverse)
-        ratio = np.abs(c) / (noise * spectrum.deviations())
-        weak = ratio < threshold
-        if not weak.any():
-            break
-        # Half of the weak ones at a time, the weakest first: they lend each other their weight.
-        order = np.argsort(ratio)
-        gone = order[: max(1, (weak.sum() + 1) // 2)]
-        kept, c = np.delete(kept, gone), np.delete(c, gone)
-    return kept, c

@@ -17,7 +17,9 @@ import numpy as np
 
 from gfnn_jax.families.modes import Mode, Modes
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.fitting.gauss_newton import Problem, midpoint_start, null_terms, significant
+from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.fitting.linear_starts import midpoint_start
+from gfnn_jax.fitting.significance import null_terms, significant
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps
 
@@ -201,7 +203,7 @@ class _Look:
     def candidates(self, tried: list[Mode], rest, span, room: int, options: Options) -> list[Mode]:
         """Select among the modes that are tried those that the residual asks for: the heaviest,
         then the one that is heaviest beside it, and so on. rest, span: as `solved` gives them."""
-        freedom = np.sqrt(max(len(rest) - span.shape[1], 0))
+        degrees = np.sqrt(max(len(rest) - span.shape[1], 0))
         columns, heaviest = np.zeros((len(rest), 0)), np.zeros(0, dtype=int)
         for first in range(0, len(tried), options.block):
             part = np.arange(first, min(first + options.block, len(tried)))
@@ -215,7 +217,7 @@ class _Look:
             left = np.linalg.norm(columns, axis=0)
             new = left > options.null * size
             weights = np.abs(rest @ columns) / np.where(new, left, np.inf)
-            weights *= freedom / np.linalg.norm(rest)
+            weights *= degrees / np.linalg.norm(rest)
             j = int(np.argmax(weights))
             least = least or max(options.significant, options.weighty * weights[j])
             if not weights[j] >= least:

@@ -33,7 +33,7 @@ def scores(
     return each.reshape(-1, slopes.shape[-1])
 
 
-def freedom(slopes: np.ndarray, residual: np.ndarray, scores: np.ndarray) -> float:
+def degrees_of_freedom(slopes: np.ndarray, residual: np.ndarray, scores: np.ndarray) -> float:
     """Degrees of freedom that the noise of these scores (k, m) takes of the residual (n, 2d) in a
     fit of A = slopes (n, 2d, m): as many as there are terms, were the rows independent."""
     rows = np.concatenate([slopes, residual[..., None]], axis=-1)

@@ -30,14 +30,14 @@ ALIKE = 2.0
 _FEWEST_TERMS, _TINY = 3, 1e-280
 
 
-def variance(triangle: Triangle, size: int, freedom: float | None = None) -> float:
+def variance(triangle: Triangle, size: int, taken: float | None = None) -> float:
     """Mean square per degree of freedom that the leading ``size`` terms leave of these rows.
 
-    freedom: degrees that noise takes of them, `shared_noise.freedom`; None: it is independent from
-    row to row, and takes ``size``.
+    taken: degrees of freedom that noise takes of them (`shared_noise.degrees_of_freedom`); None:
+    noise is independent from row to row, and takes ``size``.
     """
     left = triangle.residual_norm(size) ** 2
-    return left / max(triangle.rows - (size if freedom is None else freedom), 1.0)
+    return left / max(triangle.rows - (size if taken is None else taken), 1.0)
 
 
 def misfit(explained: float, terms: int, variance: float) -> float:
@@ -73,7 +73,7 @@ def root(
     columns scaled to one, are 0, as in the solution.
     """
     spectrum = train.spectrum(size)
-    along, told = spectrum.root(ridge), max(spectrum.freedom(ridge), 1.0)
+    along, told = spectrum.root(ridge), max(spectrum.degrees_of_freedom(ridge), 1.0)
     leverage = np.minimum(np.sum((sample @ along) ** 2, axis=1), _MOST_LEVERAGE)
     rows = np.linalg.qr((residual / (1 - leverage))[:, None] * sample, mode="r")
     share = 0.0 if noise is None else min(noise, 1.0)

@@ -53,8 +53,8 @@ def forecast_recording(
     job = record(model).get("job", {})
     roles = _roles(sensors, job) | (columns or {})
     recording = read(initial, **roles)
-    only_inputs = {**roles, "positions": None, "sensors": None, "coordinates": None, "angles": None,
-                   "degrees": None}  # fmt: skip
+    bare = ("positions", "velocities", "sensors", "coordinates", "angles", "degrees")
+    only_inputs = {**roles, **dict.fromkeys(bare)}
     ahead = None if inputs is None else read(inputs, **only_inputs)
     measured = None if compare is None else read(compare, **roles)
     if num_steps is None and measured is None:
@@ -84,10 +84,11 @@ def forecast_recording(
 
 def _roles(sensors: Sensors, job: dict[str, Any]) -> dict[str, Any]:
     """Keywords of `read` for a recording with the columns that the law was learned from."""
-    channels = sensors.seen.channels
+    channels, speeds = sensors.seen.channels, sensors.seen.speeds
     roles: dict[str, Any] = {
         "positions": tuple(n for n in channels if n in sensors.positions),
-        "sensors": tuple(n for n in channels if n not in sensors.positions),
+        "velocities": tuple(n for n in channels if n in speeds),
+        "sensors": tuple(n for n in channels if n not in (*sensors.positions, *speeds)),
         "inputs": sensors.inputs, "coordinates": sensors.positions, "angles": sensors.angles,
     }  # fmt: skip
     degrees = [n for n in job.get("degrees", ()) if n in channels]

@@ -95,14 +95,14 @@ def composed(piece: Piece, data: Dataset) -> SymplecticMap:
 
 
 def _sampled(data: Dataset) -> Parameters | None:
-    """What the map depends on beside the state, and where it was sampled."""
+    """Args that the map depends on beside the state, and where they were sampled."""
     if data.args is None:
         return None
     return sampled(data.parameters, data.args, data.each_dt, data.period)
 
 
 def _dt_range(piece: Piece, data: Dataset) -> np.ndarray | None:
-    """Where dt was sampled, of an S that was learned with it."""
+    """Range in which dt was sampled, of an S that was learned with it."""
     if data.own_dt is None or not isinstance(piece, Generated):
         return None
     return np.array([data.own_dt.min(), data.own_dt.max()])

@@ -16,7 +16,7 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
-from gfnn_jax.fitting.gauss_newton import fitted_gradients
+from gfnn_jax.fitting.linear_starts import fitted_gradients
 from gfnn_jax.generating.charts import MIDPOINT
 
 _MOST_DIM = 3  # beyond it they are too many
@@ -49,7 +49,8 @@ def centrifugal_terms(data: Dataset, rows: np.ndarray, family: Terms | Sums) -> 
 
 
 def _between_poles(q: np.ndarray, pole: float) -> bool:
-    """Whether the values lie between two neighbouring poles, at ``pole`` and every π from it."""
+    """Return whether the values lie between two neighbouring poles, at ``pole`` and every π from
+    it."""
     return bool(np.ptp(np.floor((q - pole) / np.pi)) == 0)
 
 

@@ -1,4 +1,4 @@
-"""What a fit refuses before any work, each in one line: what was expected and what came."""
+"""Refusals of a fit before any work, each in one line: what was expected and what came."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.search import Entry
 from gfnn_jax.learn.searches import Searched
 
-_BORNE_OUT = 1.1  # of the error that the search measured
+_CONFIRMED = 1.1  # of the error that the search measured
 
 
 class Chosen(NamedTuple):
@@ -46,7 +46,7 @@ def choose(searched: Searched, request: Request) -> Chosen:
         return _of_ranking(ranking, request)
     request.say(f"compiling the flow of {law.candidate.label}")
     candidate, seconds, _ = flow_assembled(law, *given)
-    expected = max(bound, _BORNE_OUT * law.candidate.validation_bound)
+    expected = max(bound, _CONFIRMED * law.candidate.validation_bound)
     if best is not None and not candidate.validation_bound <= expected:
         return _of_ranking(ranking, request)
     return Chosen(candidate, data, seconds)
@@ -69,7 +69,7 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
         assembled = measured(entry.candidate, map_, sweep.data, request.tolerance, budget)
         compile_seconds += assembled.compile_seconds
         tried.append((assembled.candidate, entry))
-        expected = max(bound, _BORNE_OUT * entry.candidate.validation_bound)
+        expected = max(bound, _CONFIRMED * entry.candidate.validation_bound)
         if assembled.candidate.validation_bound <= expected or not assembled.compiled:
             break
     candidate, entry = min(

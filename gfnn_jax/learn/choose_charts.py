@@ -1,4 +1,4 @@
-"""Which charts cover the data, and whether a base map must be factored out first."""
+"""Charts that cover the data, and whether a base map must be factored out first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a Hamiltonian is learned beside the map, and when it is preferred to it."""
+"""Choice between H and a map: whether H is learned beside the map, and when it is preferred."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _BESIDE = dataclasses.replace(
     OPTIONS, most_terms=60, most_modes=150, max_operations=1e10, mode_operations=2e10
 )
 # A law holds outside the data and at any time step: so much dearer a step it may be.
-DEARER = 4.0
+MAX_COST_RATIO = 4.0
 # Where none meets the tolerance, errors that the noise of held-out pairs does not tell apart.
 _AS_GOOD = 1.01
 # Of the error that a library must leave to have helped, where noise hides what it brings.
@@ -100,7 +100,7 @@ def long_step(data: Dataset, scene: Scene | None) -> list[str]:
 
 
 def unfit_for_law(data: Dataset, scene: Scene | None) -> str | None:
-    """Why the pairs are not those of an autonomous flow, where that is known."""
+    """Reason why the pairs are not those of an autonomous flow, where that is known."""
     if scene is not None and scene.timeless:
         return f"the scene {scene.name} is a map without time"
     if scene is not None and scene.period is not None and data.period is None:
@@ -111,10 +111,13 @@ def unfit_for_law(data: Dataset, scene: Scene | None) -> str | None:
 
 
 def preferred(law: Candidate, chosen: Candidate, bound: float) -> bool:
-    """Whether the law is taken instead of the map that was chosen: where it alone meets the
+    """Return whether the law is taken instead of the map that was chosen: where it alone meets the
     tolerance, or meets it and is not four times dearer, or none meets it and it is as good."""
     if law.validation_bound <= bound:
-        return not chosen.validation_bound <= bound or law.operations <= DEARER * chosen.operations
+        return (
+            not chosen.validation_bound <= bound
+            or law.operations <= MAX_COST_RATIO * chosen.operations
+        )
     if chosen.validation_bound <= bound or not np.isfinite(law.validation_relative):
         return False
     return law.validation_relative <= _AS_GOOD * chosen.validation_relative

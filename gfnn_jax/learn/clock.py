@@ -1,4 +1,4 @@
-"""What a fit may take: operations, counted in units of work. A clock only says how many fit.
+"""Budget of a fit: operations, counted in units of work. A clock only says how many fit.
 
 A unit is a size of a sweep, a library of H, a block of a network's iterations. Its operations are
 predicted before it starts, its time from those of its kind that this process has done. The first
@@ -88,7 +88,7 @@ class Budget:
 
     @property
     def over(self) -> bool:
-        """Whether a unit did not fit, so that no further one is begun."""
+        """Return whether a unit did not fit, so that no further one is begun."""
         return bool(self.ended)
 
     @contextlib.contextmanager
@@ -150,8 +150,8 @@ class Budget:
         self.left_out.append(f"left out: {what}: {why}")
 
     def check(self) -> None:
-        """Between the parts of a unit: raises OutOfTime where it takes longer than foretold and the
-        time is over. The unit is then as though it had never begun."""
+        """Check between the parts of a unit: raises OutOfTime where it takes longer than foretold
+        and the time is over. The unit is then as though it had never begun."""
         if self.over:
             raise OutOfTime
         if self.max_seconds is not None and self.seconds + self._set_apart > self.max_seconds:

@@ -1,4 +1,4 @@
-"""What a fit says in the end: why the search ended, and what is left over where nothing is met."""
+"""Conclusion of a fit: why the search ended, and the residuals where nothing is met."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.check import not_radians, wrapped
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.choose_law import long_step
-from gfnn_jax.learn.clock import SOLVE
+from gfnn_jax.learn.clock import SOLVE, Budget
 from gfnn_jax.learn.diagnose import differs_between_sequences, volume_change
 from gfnn_jax.learn.noise import noise_of_sites, state_noise
 from gfnn_jax.learn.propose import proposed
@@ -40,7 +40,8 @@ _NOISE_NUMBERS = 8_192  # the same of many sites: numbers of so many pairs
 
 
 class Conclusion(NamedTuple):
-    """Why the search ended; the noise (2d,) that the residuals suggest, or None; warnings."""
+    """Reason why the search ended; the noise (2d,) that the residuals suggest, or None;
+    warnings."""
 
     ended: str
     noise: np.ndarray | None
@@ -48,7 +49,7 @@ class Conclusion(NamedTuple):
 
 
 def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion:
-    """What is to be said of the chosen map."""
+    """Conclude on the chosen map."""
     candidate, law, found = chosen.candidate, searched.law, searched.found
     met = searched.tolerance.met_by(candidate)
     ended, noise, messages, unmet, reason = found.ended, None, [], "", ""
@@ -62,14 +63,17 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
             else "the steps of a map that was to meet it do not converge from some of the states"
         )
     if met and not ended.startswith(MET):  # by the pairs that state the error
-        ended = f"{MET}; {request.budget.ended}" if request.budget.over else MET
+        ended = MET
     if law is not None and searched.of_terms is None and searched.linear is None:
         on_law = chosen.entry is None or searched.met_by_law
         said = on_law or (law.fast and not met)
         messages += law.messages if said else ()
         unmet = law.unmet if said else ""
     if met:
-        return Conclusion(ended, searched.data.noise, [*messages, *request.budget.left_out])
+        ended = _with_clock(ended, request.budget)
+        return Conclusion(
+            ended, searched.data.noise_of_channels, [*messages, *request.budget.left_out]
+        )
     diagnosis: list[str] = []
     jumps = wrapped(request.pairs, request.coordinates)
     structured = request.structure is not None  # too few pairs to look at their neighbours
@@ -88,6 +92,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
             ended = f"larger models are no more accurate: {reason}"
         elif reason:
             ended = f"{ended}; {reason}"
+    ended = _with_clock(ended, request.budget)
     if request.seeks_law and not structured and not searched.met_by_law:
         diagnosis += long_step(searched.data, request.scene)
     messages += not_radians(chosen.data.pairs, request.coordinates)
@@ -103,8 +108,16 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     return Conclusion(ended, noise, messages)
 
 
+def _with_clock(ended: str, budget: Budget) -> str:
+    """Why the search ended, and that a budget did, wherever a unit of it was left out."""
+    clock = budget.ended
+    if not clock or clock in ended:
+        return ended
+    return f"{ended}; {clock}" if ended.startswith(MET) else f"{clock}; {ended}"
+
+
 def only_noise(entry: Entry, searched: Searched) -> bool:
-    """Whether what this entry leaves over is noise, as far as its residuals tell."""
+    """Return whether what this entry leaves over is noise, as far as its residuals tell."""
     if not _stalled(entry.candidate, entry, searched):
         return False
     return _no_noise(_residuals_of_sample(entry.candidate, entry, searched), True) is None
@@ -122,8 +135,8 @@ def _work(entry: Entry | None) -> float:
 
 
 def _stalled(candidate: Candidate, entry: Entry | None, searched: Searched) -> bool:
-    """Whether larger models stopped helping: in the chosen sweep, in another that has come as far,
-    or, where no S was found, among the libraries of H."""
+    """Return whether larger models stopped helping: in the chosen sweep, in another that has come
+    as far, or, where no S was found, among the libraries of H."""
     found = searched.found
     if searched.of_terms is not None and candidate.learns == "map":
         return searched.of_terms.stalled
@@ -138,7 +151,7 @@ def _stalled(candidate: Candidate, entry: Entry | None, searched: Searched) -> b
 
 
 class _LeftOver(NamedTuple):
-    """What the residuals suggest: the noise (2d,), what is said of them, and the reason why no
+    """Findings in the residuals: the noise (2d,), messages, and the reason why no
     larger model would help where that is known."""
 
     noise: np.ndarray | None
@@ -171,7 +184,7 @@ def _residuals_of_sample(
 
 
 def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
-    """What these residuals are, where they are something else than noise."""
+    """Describe these residuals, where they are something else than noise."""
     _, y0, residual, scale, sequence = sample
     if differs_between_sequences(y0 / scale, residual / scale, sequence):
         message = (
@@ -222,8 +235,9 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     if law is not None and law.noise is not None and candidate.learns == "hamiltonian":
         # Along an arc what the law misses adds up, and looks like noise.
         noise = np.minimum(law.noise, noise)
-    if data.noise is not None:
-        return _beside_known(noise, data.noise)
+    known_noise = data.noise_of_channels
+    if known_noise is not None:
+        return _beside_known(noise, known_noise)
     own, sizes_of_noise = "", ", ".join(f"{sigma:.1e}" for sigma in noise)
     if candidate.learns == "map" and entry is not None and isinstance(entry.sweep, LinearSweep):
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / data.spread) ** 2))

@@ -1,4 +1,4 @@
-"""What a step of a flow costs: how fast its stages converge, in counted operations."""
+"""Cost of a step of a flow, in counted operations: how fast its stages converge."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import numpy as np
 
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.families.sums import matrix_free
-from gfnn_jax.fitting.gauss_newton import rates
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.gauss import gauss
+from gfnn_jax.flows.rates import rates
 from gfnn_jax.phase_space import symplectic_form
 
 CONTRACTING = 0.8  # a fixed point's factor up to which it is preferred to Newton's method

@@ -62,7 +62,7 @@ class LearnedDamping:
         return np.swapaxes(linear.image(np.swapaxes(jacobians, 1, 2)), 1, 2)
 
     def __str__(self) -> str:
-        """What was learned, in a line."""
+        """Line about what was learned."""
         told = [f"{b:.12g} ± {s:.1g}" for b, s in np.c_[self.factor.ravel(), self.std.ravel()]]
         if not self.factor.ndim:
             return f"every step multiplies areas by {told[0]}, the same everywhere"
@@ -158,7 +158,7 @@ class _Problem:
     half: Affine | None
 
     def best(self, spread: np.ndarray, factor: np.ndarray) -> _Fitted:
-        """Of the degrees of S, that which leaves least of the held-out rows.
+        """Degree of S which leaves least of the held-out rows.
 
         spread: (k, d), which of the k factors multiplies each momentum; none: they are kept.
         factor: (k,), the first guess.
@@ -174,7 +174,7 @@ class _Problem:
         return best
 
     def _families(self, spread, factor) -> Iterator[Products]:
-        """By rising degree, those that the training rows determine in reasonable time."""
+        """Families by rising degree, those that the training rows determine in reasonable time."""
         undamped = self._undamped(_momenta(spread, factor), self._drift(0.0))
         w = rows_of(undamped, self.chart, self.data.training)[0][0]
         inputs = box_inputs(w, angles=tuple(self._angles), cyclic=undamped.coordinates.cyclic)
@@ -255,8 +255,8 @@ def _solved(design: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _last_unknowns(rows: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of the least-squares problem [A b], (n, m + 1), the unknowns from ``first`` on and their
-    standard errors, those of independent residuals."""
+    """Solve the least-squares problem [A b], (n, m + 1), for the unknowns from ``first`` on and
+    their standard errors, those of independent residuals."""
     triangle = np.asarray(np.linalg.qr(rows, mode="r"))
     inverse = np.linalg.pinv(triangle[first:-1, first:-1])
     deviation = abs(triangle[-1, -1]) / np.sqrt(max(1, len(rows) - len(triangle) + 1))

@@ -1,4 +1,4 @@
-"""What the pairs say about the map by themselves: local Jacobians, from neighbouring pairs. NumPy.
+"""Diagnosis of the map from the pairs by themselves: local Jacobians, of neighbours. NumPy.
 
 The Jacobians give the determinant of each chart over the data, and how symplectic the data are.
 Neighbours also tell which pairs are outliers, and the residuals of a fit whether there is friction.
@@ -76,7 +76,7 @@ class ChartJudgement(NamedTuple):
 
     @property
     def valid(self) -> bool:
-        """Whether w determines z over the data."""
+        """Return whether w determines z over the data."""
         return self.low > SINGULAR
 
 
@@ -217,7 +217,8 @@ def _pseudo_inverse(design):
 
 
 def _full_rank(design):
-    """Whether the neighbours of each local design (n, neighbours, terms) tell all terms apart."""
+    """Return whether the neighbours of each local design (n, neighbours, terms) tell all terms
+    apart."""
     terms = design.shape[-1]
     if terms <= _MANY_TERMS:
         return np.linalg.matrix_rank(design, rtol=_SPANNED) == terms
@@ -246,7 +247,8 @@ def data_defect(jacobians, scale) -> float:
 
 
 def look_symplectic(jacobians, error: float, scale) -> bool:
-    """Whether the pairs may be those of a symplectic map, as far as their local Jacobians tell.
+    """Return whether the pairs may be those of a symplectic map, as far as their local Jacobians
+    tell.
 
     Every map of a short step is close to the identity and so to a symplectic one: the defect is
     held against M − 1, and against the Jacobians' own error. Columns in another order miss by a
@@ -337,8 +339,8 @@ def sampled_dimension(y, scale) -> int:
 
 
 def differs_between_sequences(z, residual, sequence) -> bool:
-    """Whether what a fit left over agrees within a sequence and differs between sequences: then
-    something that the states do not hold, a parameter, differs between them.
+    """Return whether what a fit left over agrees within a sequence and differs between sequences:
+    then something that the states do not hold, a parameter, differs between them.
 
     z, residual: (N, 2d), in units of the coordinates' sizes; sequence: (N,). Within, every other
     pair of a sequence is predicted by an affine fit to the rest of it; between, a pair by its

@@ -1,4 +1,5 @@
-"""What the local Jacobians of the pairs say: are they symplectic, and which charts cover them."""
+"""Diagnosis by the pairs' local Jacobians: whether they are symplectic, and which charts cover
+them."""
 
 from __future__ import annotations
 
@@ -52,7 +53,7 @@ def diagnose_request(request: Request, plain: Dataset) -> Diagnosis:
 
 
 def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = False) -> Diagnosis:
-    """What the local Jacobians say: whether the pairs look symplectic, and which charts cover
+    """Diagnose by the local Jacobians whether the pairs look symplectic, and which charts cover
     them; the base map is factored out where one is needed.
 
     may_lose: whether a map that loses area is looked for: its D_b is factored out too.

@@ -76,8 +76,8 @@ def checked_region(region, dim: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _near(y: np.ndarray, coordinates: Coordinates) -> Callable[[np.ndarray], np.ndarray]:
-    """Which states (N, 2d) are in the box of the data, or not far beyond it: orbits that escape
-    would be most of what is drawn."""
+    """Mark the states (N, 2d) that are in the box of the data, or not far beyond it: orbits that
+    escape would be most of what is drawn."""
     low, high = np.nanmin(y, axis=0), np.nanmax(y, axis=0)
     beyond = _BEYOND * (high - low)
     free = [*coordinates.angles, *coordinates.cyclic]

@@ -14,11 +14,8 @@ import jax
 import numpy as np
 
 from gfnn_jax.families.ensemble import Ensemble
-from gfnn_jax.fitting.levenberg_marquardt import (
-    LMResult,
-    LMState,
-    levenberg_marquardt_together,
-)
+from gfnn_jax.fitting.together import levenberg_marquardt_together
+from gfnn_jax.fitting.training import LMResult, LMState
 from gfnn_jax.learn.network_sweep import NetworkSweep
 from gfnn_jax.learn.rows import rows_of
 from gfnn_jax.learn.sweeps import Size, trial_residual

@@ -1,4 +1,5 @@
-"""Where the errors of a size sweep lead: what its larger sizes promise, and which one would do."""
+"""Extrapolation of the errors of a size sweep: what larger sizes promise, and which one would
+do."""
 
 from __future__ import annotations
 

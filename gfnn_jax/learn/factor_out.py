@@ -10,8 +10,9 @@ import numpy as np
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.fitting.gauss_newton import Problem, rates
+from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.rates import rates
 from gfnn_jax.learn.cost_of_flow import CONTRACTING, FREQUENCY_STATES, contraction_of
 from gfnn_jax.learn.sweeps import trial_residual
 
@@ -22,12 +23,12 @@ def factored_out(flows: Sequence[Flow], data: Dataset, seed: int) -> tuple[Flow,
     """The pairs without one of these flows: before, after, or half on either side of what is
     learned, whichever leaves the map that a small S comes closest to."""
 
-    def left_over(rest: Dataset) -> float:
+    def misfit(rest: Dataset) -> float:
         rows = np.random.default_rng(seed).permutation(len(rest))[:TRIAL_PAIRS]
         return trial_residual(rest.take(rows))
 
     tried = [(flow, data.without(*pieces)) for flow in flows for pieces in around(flow)]
-    errors = [left_over(rest) for _, rest in tried]
+    errors = [misfit(rest) for _, rest in tried]
     return tried[0] if errors[0] <= 2 * min(errors) else tried[int(np.argmin(errors))]
 
 
@@ -52,7 +53,7 @@ def flow_of(family: Terms, params, data: Dataset) -> Flow:
 
 
 def around(flow: Flow) -> list[tuple[Flow | None, Flow | None]]:
-    """(before, after) what is learned: half of the flow on either side, which keeps the symmetry in
-    time, or all of it on one, which suits a kick."""
+    """Pieces (before, after) around what is learned: half of the flow on either side, which
+    keeps the symmetry in time, or all of it on one, which suits a kick."""
     half = dataclasses.replace(flow, dt=0.5 * flow.dt)
     return [(half, half), (flow, None), (None, flow)]

@@ -154,8 +154,8 @@ class Fit:
         )  # fmt: skip
 
     def settled(self) -> Fit:
-        """With what a report and a saved model hold beside the map, as far as the budget goes: the
-        posterior, which is left out of the map where it does not fit, and the defect of a step.
+        """Compute what a report and a saved model hold beside the map, as far as the budget goes:
+        the posterior, which is left out of the map where it does not fit, and the defect of a step.
         Warns (FitWarning) of what is left out."""
         told, map_, tells = len(self.budget.left_out), self.map, True
         if map_.posterior is not None and not map_.posterior.known:
@@ -229,7 +229,8 @@ class Fit:
 
     @property
     def met(self) -> bool:
-        """Whether the chosen candidate's validation error is within the tolerance, at 95 %."""
+        """Return whether the chosen candidate's validation error is within the tolerance, at 95
+        %."""
         return self._met_by(self.chosen)
 
     def _met_by(self, candidate: Candidate) -> bool:
@@ -300,7 +301,7 @@ def fit(
             return fit_positions(pairs, options, clock, on_progress, on_candidate)
         return fit_recording(
             pairs, friction=options.friction, input_hold=options.input_hold, mass=options.mass,
-            on_progress=on_progress,
+            terms=tuple(options.terms), on_progress=on_progress,
         )  # fmt: skip
     budget = options.budget(clock, pairs.dim if isinstance(pairs, Pairs) else None)
     require_x64("a fit")
@@ -341,8 +342,8 @@ def fit(
         found = without_bias(found, request)
         data = found.data
         chosen = with_posterior(choose(found, request), found)
-        on_progress("the test pairs: the error that is stated")
-        error = stated(chosen, found)
+        on_progress("the error that is stated, of pairs that chose nothing")
+        error = stated(chosen, found, budget)
         chosen = chosen._replace(candidate=error.candidate)
         conclusion = conclude(chosen, found, request)
         warn(conclusion.messages)
@@ -382,8 +383,8 @@ def _check_of_recording(scene: Scene | None, options: FitOptions) -> None:
         raise InputError(
             f"expected learn auto, lagrangian or map of a recording, got {options.learn!r}"
         )
-    if scene is not None or options.terms or options.base is not None:
-        raise InputError("expected no scene, terms or base of a recording")
+    if scene is not None or options.base is not None:
+        raise InputError("expected no scene or base of a recording")
     if options.learn != "map" and options.structure is not None:
         raise InputError("expected no structure of a recording whose law is learned")
 

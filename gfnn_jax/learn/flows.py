@@ -22,14 +22,10 @@ from gfnn_jax.dataset.split import outermost
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.fitting.gauss_newton import (
-    MOST_SUBSTEPS,
-    Problem,
-    null_terms,
-    significant,
-    significant_terms,
-)
+from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.growth import grow
+from gfnn_jax.fitting.significance import null_terms, significant, significant_terms
+from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.learn.arcs import arcs_of
 from gfnn_jax.learn.centrifugal import centrifugal_terms
 from gfnn_jax.learn.clock import Budget
@@ -364,8 +360,8 @@ def affine_error(data: Dataset, tolerance: Tolerance) -> OneStepError:
 
 
 def _out_of_reach(errors: list[float], left: int, bound: float) -> bool:
-    """Whether the libraries that are left, each gaining as much as the best of the last two gains,
-    would still miss the bound."""
+    """Return whether the libraries that are left, each gaining as much as the best of the last two
+    gains, would still miss the bound."""
     if len(errors) < 3 or not np.isfinite(errors[-3:]).all():
         return False
     gain = min(errors[-1] / errors[-2], errors[-2] / errors[-3], 1.0)
@@ -458,7 +454,7 @@ def _significant(problem, full: FittedLaw, rows, options: Options) -> FittedLaw 
 
 
 def _sparse(problem, full: FittedLaw, data, tolerance, options: Options, say) -> FittedLaw:
-    """Without the terms that the pairs do not ask for, as far as the held-out error allows."""
+    """Drop the terms that the pairs do not ask for, as far as the held-out error allows."""
     seen: set[tuple[int, ...]] = set()
     for threshold in options.thresholds:
         kept = tuple(significant_terms(full.fit, threshold).tolist())

@@ -36,7 +36,7 @@ def formula(terms: Sequence[Term]) -> str:
 
 
 def _is_sum(term: str) -> bool:
-    """Whether a user's term is a sum, which a coefficient before it would not multiply."""
+    """Return whether a user's term is a sum, which a coefficient before it would not multiply."""
     term = re.sub(r"\|[^|]*\|", "r", term)  # a distance holds its own difference
     depth = np.cumsum([(c in "(") - (c in ")") for c in term])
     return any(depth[i] == 0 and term[i : i + 3] in (" + ", " - ") for i in range(len(term)))

@@ -120,14 +120,14 @@ def libraries_with(forces: Forces, data: Dataset, scene, terms, options: Options
 
 
 def _certain(law: FittedLaw) -> bool:
-    """Whether there is friction, all of it certain and above 0."""
+    """Return whether there is friction, all of it certain and above 0."""
     of_h = without_forces(law.family).num_parameters
     rates, errors = law.fit.coefficients[of_h:], law.fit.standard_errors[of_h:]
     return bool(len(rates) and (rates > _CERTAIN * errors).all())
 
 
 def _explains(problem: Problem, alone: FittedLaw, rows) -> bool:
-    """Whether γ, in the problem linearised about H alone, is certain to be above 0."""
+    """Return whether γ, in the problem linearised about H alone, is certain to be above 0."""
     family = Uniform(alone.family)
     c = np.append(alone.fit.coefficients, 0.0)
     found = problem.linearised(family, c, alone.fit.steps, rows)
@@ -140,7 +140,8 @@ def _explains(problem: Problem, alone: FittedLaw, rows) -> bool:
 
 
 def _alike(problem: Problem, law: FittedLaw, rows) -> bool:
-    """Whether rates of their own for the degrees of freedom would explain no more than γ does."""
+    """Return whether rates of their own for the degrees of freedom would explain no more than γ
+    does."""
     if not isinstance(law.family, Uniform) or law.family.dim == 1:
         return True
     c, steps = law.fit.coefficients, law.fit.steps

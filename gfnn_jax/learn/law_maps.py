@@ -38,8 +38,8 @@ class LawMaps(NamedTuple):
 
 
 def more_pairs_would_help(sweeps, found: Found, bound: Tolerance, dearest: float) -> bool:
-    """Whether none of the sizes that the pairs determine meets the tolerance, and larger ones would
-    still be cheap enough."""
+    """Return whether none of the sizes that the pairs determine meets the tolerance, and larger
+    ones would still be cheap enough."""
     if found.ranking and found.ranking[0].candidate.validation_bound <= bound.bound:
         return False
     return any(s.short_of_pairs and s.sizes and s.sizes[-1].operations < dearest for s in sweeps)
@@ -74,8 +74,8 @@ def search_of_law(
 def law_explains_most(
     law: LearnedHamiltonian, found: Found, bound: Tolerance, budget: Budget
 ) -> bool:
-    """Whether nothing meets the tolerance, but S might with most of the motion factored out. What
-    stalls in noise would stall without it too."""
+    """Return whether nothing meets the tolerance, but S might with most of the motion factored out.
+    What stalls in noise would stall without it too."""
     if budget.over or not found.ranking or found.stalled:
         return False
     best = found.ranking[0].candidate
@@ -162,7 +162,8 @@ def strongest(law: LearnedHamiltonian, data: Dataset) -> list[tuple[Terms, np.nd
 
 
 def better_than(around: Found, found: Found, law: LearnedHamiltonian) -> bool:
-    """Whether the maps around the law have a better one than the others and the law itself."""
+    """Return whether the maps around the law have a better one than the others and the law
+    itself."""
     if not around.ranking:
         return False
     others = [found.ranking[0].candidate, law.candidate]

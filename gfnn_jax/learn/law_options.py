@@ -1,4 +1,4 @@
-"""What a search for H may try: sizes of libraries, limits and thresholds."""
+"""Options of a search for H: sizes of libraries, limits and thresholds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the descent to H starts: the start whose flow is nearest to the pairs."""
+"""Start of the descent to H: the start whose flow is nearest to the pairs."""
 
 from __future__ import annotations
 
@@ -7,11 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gfnn_jax.families.sums import matrix_free
-from gfnn_jax.fitting.gauss_newton import (
-    forward_start,
-    log_start,
-    midpoint_start,
-)
+from gfnn_jax.fitting.linear_starts import forward_start, log_start, midpoint_start
 from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.learn.learned_law import FAST, FittedLaw
 

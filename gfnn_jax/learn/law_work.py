@@ -16,7 +16,7 @@ _STEPS = Steps(6, 1)
 
 
 class LawWork:
-    """What a search for H may still do.
+    """Work that a search for H may still do.
 
     A library takes as many times the operations of one evaluation as the library before it did. The
     search has a cap of its own, on the operations that it makes: without a budget that is what ends
@@ -36,7 +36,7 @@ class LawWork:
 
     @property
     def ended(self) -> str:
-        """What cut the search short; "" where nothing has."""
+        """Reason that cut the search short; "" where nothing has."""
         capped = f"a search for H may take {self._cap.most:.2g} operations, and has taken them"
         return self.budget.ended or (capped if self._cap.spent > self._cap.most else "")
 
@@ -46,11 +46,11 @@ class LawWork:
         return self._cap.spent
 
     def capped(self, most: float) -> None:
-        """From now on with this cap, beside what the search has made."""
+        """Cap the search anew, beside what it has made."""
         self._cap.most = self._cap.spent + most
 
     def uncapped(self) -> None:
-        """What follows a search is soon done."""
+        """Lift the cap: what follows a search is soon done."""
         self._cap.most = float("inf")
 
     @contextlib.contextmanager
@@ -82,3 +82,8 @@ class LawWork:
     def _one(self, family, rows: int) -> float:
         """Operations of an evaluation."""
         return rows * operations(family, self._problem.z0.shape[1], _STEPS, family)
+
+
+def work_of_refit(family, rows: int, dim: int, steps: Steps) -> float:
+    """Operations of a fit of terms that are close to their optimum to so many pairs."""
+    return _CLOSE * rows * operations(family, 2 * dim, steps, family)

@@ -6,7 +6,9 @@ import numpy as np
 
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
-from gfnn_jax.fitting.gauss_newton import Problem, rates, significant
+from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.fitting.significance import significant
+from gfnn_jax.flows.rates import rates
 from gfnn_jax.learn.cost_of_flow import FREQUENCY_STATES, operations_of
 from gfnn_jax.learn.learned_law import FittedLaw, bound_of
 
@@ -19,7 +21,7 @@ def too_dear(
     tolerance: Tolerance,
     dearest: float,
 ) -> bool:
-    """Whether a step of no law of this library costs up to ``dearest`` operations.
+    """Return whether a step of no law of this library costs up to ``dearest`` operations.
 
     One Gauss–Newton problem at the last law tells which terms the tolerance asks for: those whose
     absence would double the mean square that it allows. What the linear problem leaves unknown is

@@ -20,15 +20,11 @@ from gfnn_jax.families.products import Products
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
-from gfnn_jax.fitting.gauss_newton import (
-    MOST_SUBSTEPS,
-    FlowFit,
-    Problem,
-    rates,
-)
+from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre
+from gfnn_jax.flows.rates import MOST_SUBSTEPS, rates
 from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.learn.assemble import Assembled, composed, measured
 from gfnn_jax.learn.candidates import Candidate, with_error
@@ -128,7 +124,7 @@ class LearnedHamiltonian:
 
     @property
     def fast(self) -> bool:
-        """Whether H oscillates so fast that other laws are not far from the same pairs."""
+        """Return whether H oscillates so fast that other laws are not far from the same pairs."""
         return self.omega_h > FAST
 
 
@@ -231,7 +227,8 @@ def _label(family) -> str:
 
 
 def validation_error(family, fit: FlowFit, data: Dataset, tolerance: Tolerance) -> OneStepError:
-    """By steps that resolve the held-out pairs: an unresolved passage says nothing of the law."""
+    """Error by steps that resolve the held-out pairs: an unresolved passage says nothing of the
+    law."""
     steps = _resolving(family, fit.coefficients, fit.steps, data, tolerance)
     return error_of_steps(family, fit.coefficients, steps, data, tolerance)
 
@@ -251,8 +248,8 @@ def bound_of(tolerance: Tolerance, scale) -> float:
 
 
 def _resolving(family, coefficients, steps: Steps, data: Dataset, tolerance: Tolerance) -> Steps:
-    """These steps, or, where the law misses the tolerance by them, finer ones: halved until they
-    resolve the held-out pairs, or there are as many as a flow may have."""
+    """Keep these steps, or, where the law misses the tolerance by them, take finer ones: halved
+    until they resolve the held-out pairs, or there are as many as a flow may have."""
     bound, states = bound_of(tolerance, data.scale), data.y0[data.validation]
     if error_of_steps(family, coefficients, steps, data, tolerance).bound <= tolerance.bound:
         return steps
@@ -316,8 +313,8 @@ def covariance_root(found: FittedLaw, problem: Problem, data: Dataset, steps: St
 def unexplained(
     data: Dataset, rows, residual, taken: int, degree: int, states
 ) -> float | None:  # fmt: skip
-    """Of the mean square of what a law leaves over (n, 2d) on these rows, the part that no
-    generator K explains, residual = J∇K at the images: K of as high a degree as the rows tell.
+    """Part of the mean square of a law's residuals (n, 2d) on these rows that no generator K
+    explains, residual = J∇K at the images: K of as high a degree as the rows tell.
     taken: coefficients that the law itself was given, degree: its own. states: the residual's
     derivatives and which pairs go on, as `shared_noise.scores` takes them, or None. None where the
     rows are too few.
@@ -345,7 +342,7 @@ def unexplained(
         scores = shared_noise.scores(
             slopes, weight * target, to_target @ first, to_target @ second, goes_on
         )
-        freedom = shared_noise.freedom(slopes, weight * target, scores)
+        freedom = shared_noise.degrees_of_freedom(slopes, weight * target, scores)
     left = reduced.norm**2 / max(reduced.rows - taken, 1)
     if left == 0:
         return 1.0
@@ -411,7 +408,7 @@ def assembled(
 
 
 def _in_relative_domain(flow: Flow, data: Dataset) -> Dataset:
-    """With a domain that leaves out where the whole is, if no force depends on that."""
+    """Take a domain that leaves out where the whole is, if no force depends on that."""
     if data.structure is None:
         return data
     force = flow.family.gradient(flow.params, data.y0)[:, : data.dim]

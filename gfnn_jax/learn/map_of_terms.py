@@ -24,7 +24,8 @@ from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting import least_squares, uncertainty
-from gfnn_jax.fitting.gauss_newton import fitted_gradients, null_terms, significant
+from gfnn_jax.fitting.linear_starts import fitted_gradients
+from gfnn_jax.fitting.significance import null_terms, significant
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import CHARTS, AnyChart
 from gfnn_jax.generating.generated import Generated
@@ -125,7 +126,8 @@ def map_of(
     data: Dataset, tolerance: Tolerance, scene: Any, chart: str, law: Any, budget: Budget,
     say: Callable[[str], Any],
 ) -> LearnedMap | None:  # fmt: skip
-    """As `learn_map`; None where it finds none, or none that is better than the law that was."""
+    """Learn by `learn_map`; None where it finds none, or none that is better than the law that
+    was."""
     try:
         with np.errstate(all="ignore"):
             found = learn_map(
@@ -183,7 +185,7 @@ def _work(family: Any, data: Dataset) -> float:
 
 
 def _of_chart(attempt: _Attempts, scene) -> Iterator[_Tried]:
-    """What is tried in a chart, in turn."""
+    """Iterate over what is tried in a chart."""
     data, tolerance = attempt.data, attempt.tolerance
     if data.structure is not None:
         yield from _of_sites(data, tolerance, attempt)
@@ -210,7 +212,7 @@ def _of_chart(attempt: _Attempts, scene) -> Iterator[_Tried]:
 
 
 def _fewer(data: Dataset) -> Dataset:
-    """With as many training pairs as the terms of a site need."""
+    """Take as many training pairs as the terms of a site need."""
     most = max(1, _STRUCTURED_ROWS // data.y0.shape[1])
     return data.trained_on(data.training[:most])
 
@@ -245,7 +247,7 @@ def _fitted(chart: AnyChart, family: Terms | Sums, data: Dataset, tolerance: Tol
 
 
 def _judged(piece: Generated, data: Dataset, tolerance: Tolerance) -> _Tried:
-    """With the errors of its steps; infinite where the chart folds over the held-out pairs."""
+    """Measure the errors of its steps; infinite where the chart folds over the held-out pairs."""
     rows, family, params = data.validation, piece.family, piece.params
     w = piece.chart.evaluation_point(data.y0[rows], data.y1[rows])
     args = data.given(rows)[1]
@@ -268,8 +270,8 @@ def _weight(data: Dataset) -> np.ndarray:
 
 
 def _root(piece: Generated, data: Dataset) -> np.ndarray:
-    """What of the residual is noise, the next library tells, which leaves that too; without a
-    structure all of it may be misfit."""
+    """Root of the covariance. The next library tells the noise in the residual, which it leaves;
+    without a structure all of it may be misfit."""
     family, count = piece.family, piece.family.num_parameters
     w, target, args = _data(piece.chart, family, data, data.training)
     weight = _weight(data)
@@ -290,7 +292,7 @@ def _root(piece: Generated, data: Dataset) -> np.ndarray:
 
 
 def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance) -> _Tried:
-    """Without the terms that the pairs do not ask for, as far as the held-out error allows."""
+    """Drop the terms that the pairs do not ask for, as far as the held-out error allows."""
     piece = full.piece
     w, target, args = _data(piece.chart, piece.family, data, data.training)
     weight = _weight(data)

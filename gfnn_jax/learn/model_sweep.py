@@ -46,7 +46,7 @@ class ModelSweep:
         self._fitted: dict[int, Fitted] = {}
 
     def named(self, size: ModelSize) -> str:
-        """What is done to judge the size."""
+        """Name of the unit that judges the size."""
         return f"{self.model.name} {size.own}"
 
     def work(self, size: ModelSize) -> float:
@@ -56,6 +56,10 @@ class ModelSweep:
     def work_of_steps(self, size: ModelSize) -> float:
         """The steps are made when the size is judged."""
         return 0.0
+
+    def work_of_refit(self, size: ModelSize) -> float:
+        """A fit to other rows counts one operation, too."""
+        return 1.0
 
     def judge(self, size: ModelSize, budget: Budget, say: Callable[[str], Any]) -> Candidate:
         """The size fitted, and its error measured by steps on the validation rows."""
@@ -78,7 +82,7 @@ class ModelSweep:
         return judged
 
     def at(self, extent: float) -> str:
-        """What the size of this number is called."""
+        """Name of the size of this number."""
         return f"size {round(extent)} of {self.model.name}"
 
     def piece(self, size: ModelSize) -> Any:
@@ -109,7 +113,7 @@ class ModelSweep:
 
 
 def training_data(data: Dataset, rows: np.ndarray) -> TrainingData:
-    """What a model is given of these rows."""
+    """Data of these rows that a model is given."""
     dt, args = data.given(rows)
     coordinates, pairs = data.coordinates, data.pairs.take(rows)
     return TrainingData(

@@ -13,7 +13,8 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
-from gfnn_jax.fitting.levenberg_marquardt import LMResult, LMState, levenberg_marquardt
+from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
+from gfnn_jax.fitting.training import LMResult, LMState
 from gfnn_jax.learn.candidates import Candidate, validated
 from gfnn_jax.learn.clock import NETWORK, Budget
 from gfnn_jax.learn.rows import rows_of
@@ -46,7 +47,7 @@ class NetworkSweep(Generates):
         self._params: Any = None
 
     def named(self, size: Size) -> str:
-        """What is done to judge the size."""
+        """Name of the unit that judges the size."""
         return f"{self.chart.name} {size.family.label}"
 
     def work(self, size: Size) -> float:

@@ -23,10 +23,10 @@ from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_er
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
-from gfnn_jax.fitting.gauss_newton import rates, substeps_for
 from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.rates import rates, substeps_for
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.learn.candidates import Candidate, with_error
 from gfnn_jax.learn.choose_law import unfit_for_law

@@ -187,6 +187,7 @@ class NoisySweep(LinearSweep):
             )
             return found.points, found.target, found.whitening
 
+        self._rows = rows
         self._train, self._held = (rows(r) for r in (self.data.training, self.data.validation))
         self._weight = np.ones(len(deviations))
 
@@ -195,7 +196,7 @@ class NoisySweep(LinearSweep):
         return Whitened(family)
 
     def judge(self, size: Size, budget: Budget, say) -> Candidate:
-        """As the sweep that was corrected judges it, by the measured points."""
+        """Judge as the sweep that was corrected does, by the measured points."""
         return self.plain.judge(size, budget, say)
 
     def validate(self, size: Size, judged: Candidate, budget: Budget, say) -> Candidate:
@@ -205,8 +206,12 @@ class NoisySweep(LinearSweep):
         candidate = dataclasses.replace(plain, condition=solved.condition, rank=solved.rank)
         return validated(candidate, self.data, self.tolerance, self.chart, size.family, params)
 
+    def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """By a fit to the states that other rows most likely had."""
+        return self._predicted(size, self._rows(others), rows)
+
     def own_error(self, size: Size) -> float:
-        """That of the measured points."""
+        """Own error of the measured points."""
         return self.plain.own_error(size)
 
     def by_states(self, family, params, w, whitening) -> tuple[np.ndarray, np.ndarray]:

@@ -9,18 +9,16 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field
 from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple
 
+from gfnn_jax.dataset.structure_names import EXPECTED, STRUCTURES, names_structure
 from gfnn_jax.errors import FitError
 from gfnn_jax.learn.clock import Budget, seconds_allowed
 
 RUN, FIT = ("gfnn run", "gfnn fit"), ("gfnn fit",)
-STRUCTURES = ("ring", "chain", "bodies:N", "ring:FIELDS", "chain:FIELDS", "bodies:N:SPECIES")
-_SITES, _BODIES = r"(ring|chain)(:[1-9][0-9]?)?", r"bodies:0*([2-9]|[1-9][0-9]+)(:[A-Za-z]+)?"
 
 
 class Kind(NamedTuple):
@@ -76,10 +74,7 @@ DEVICES = Kind(
     lambda v: v == "all" or _whole(1, 31).holds(v),
     lambda text: "all" if text == "all" else int(text),
 )  # fmt: skip
-STRUCTURE = Kind(
-    f"a structure among {', '.join(STRUCTURES)}",
-    lambda v: isinstance(v, str) and bool(re.fullmatch(f"{_SITES}|{_BODIES}", v)),
-)
+STRUCTURE = Kind(EXPECTED, names_structure)
 _SECONDS = Kind(
     "a finite number > 0, or None for no limit", lambda v: v in ("auto", None) or _is_positive(v),
     float,
@@ -150,7 +145,8 @@ class FitOptions:
     ))  # fmt: skip
     terms: Sequence[str | Callable] = field(default=(), metadata=_about(
         _TERMS,
-        'known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"; in Python also functions of z', "TEXT",
+        'known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"; in Python also functions of z; of a '
+        'recording those of its law: "omega**2; V: cos(theta); R: omega**2"', "TEXT",
     ))  # fmt: skip
     base: str | Callable | None = field(default=None, metadata=_about(
         _LAW,

@@ -159,9 +159,9 @@ def walked(
     most: float,
     options: Options = OPTIONS,
 ) -> Iterator[Any]:
-    """What ``attempt`` finds for products of a library of the state and one of the parameters, as
-    they are tried: of each row of functions, both grow, whichever lowers the error, until it is
-    within the bound or neither does. most: terms at most."""
+    """Iterate over what ``attempt`` finds for products of a library of the state and one of the
+    parameters, as they are tried: of each row of functions, both grow, whichever lowers the error,
+    until it is within the bound or neither does. most: terms at most."""
     at, best = 0, np.inf
     for row in functions:
         level, here = 0, np.inf

@@ -34,7 +34,7 @@ from gfnn_jax.learn.clock import ROWS, Budget
 from gfnn_jax.learn.search import MET
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.discrete_lagrangian import left_over, solve
+from gfnn_jax.models.discrete_lagrangian import residuals, solve
 from gfnn_jax.models.triples import Triples, triples_of
 from gfnn_jax.phase_space import Pairs, sizes
 
@@ -50,7 +50,7 @@ _TURNS = 1e-8  # radians, to which momenta must turn with the moves to be angles
 
 @dataclasses.dataclass(frozen=True)
 class OfPositions:
-    """What an S of positions alone is like.
+    """Traits of an S of positions alone.
 
     symmetric: whether S(q, Q) = S(Q, q). rank: how many combinations of its terms the data tell;
     the others, the factor of S among them, are those of free motion. condition: of those told.
@@ -63,7 +63,7 @@ class OfPositions:
     num_triples: int
 
     def __str__(self) -> str:
-        """What was learned, in a line."""
+        """Line about what was learned."""
         left = self.num_parameters - self.rank
         kind = "symmetric, as of a reversible map" if self.symmetric else "of no symmetry"
         return (
@@ -178,7 +178,7 @@ class _Sweep:
         return found
 
     def _families(self, symmetric: bool) -> Iterator[OfDisplacement]:
-        """By rising size, as many as the training triples determine."""
+        """Families by rising size, as many as the training triples determine."""
         triples, rows = self.triples, len(self.split.training) * self.triples.dim
         # An angle stays as it is: the middle of two would be known by half a turn only.
         part, moves = 0.0 if triples.angles else 0.5, _centres_of_moves(triples)
@@ -218,7 +218,7 @@ class _Sweep:
         params = family.unflatten(solved.coefficients)
         states = _states(family, params, triples)
         piece = Generated(family, params, TYPE1, triples.dt, sizes(states[0]))
-        left = left_over(family, params, training) / self.spread
+        left = residuals(family, params, training) / self.spread
         error = self.error_of(_images(piece, held), self.split.validation)
         gradient, with_hessian = family.operations
         candidate = Candidate(
@@ -238,7 +238,7 @@ class _Sweep:
         return _Found(piece, candidate, about)
 
     def error_of(self, positions: np.ndarray, rows: np.ndarray) -> OneStepError:
-        """Of the last positions (n, d) of these rows, as predicted."""
+        """Error of the last positions (n, d) of these rows, as predicted."""
         error = nearest_image(positions - self.triples.after[rows], self.triples.angles)
         return one_step_error(error, self.spread, self.tolerance, self.split.stretch[rows])
 
@@ -276,7 +276,7 @@ class _Sweep:
 
 
 def _split(triples: Triples, seed: int) -> Split:
-    """By runs, or of few runs by blocks of time, as pairs of states (q, Q − q) are split."""
+    """Split by runs, or of few runs by blocks of time, as pairs of states (q, Q − q) are split."""
     coming, going = np.split(triples.moves, 2)
     z0 = np.concatenate([triples.middle, coming], axis=1)
     z1 = np.concatenate([triples.after, going], axis=1)
@@ -285,7 +285,7 @@ def _split(triples: Triples, seed: int) -> Split:
 
 
 def _centres_of_moves(triples: Triples) -> np.ndarray | None:
-    """As `OfDisplacement` has them."""
+    """Centres as `OfDisplacement` has them."""
     if not triples.wrapped:
         return None
     centres = np.full(triples.dim, np.nan)

@@ -1,5 +1,5 @@
-"""The structure of many degrees of freedom that pairs tell of: tried first where a sample of them
-bears it out, proposed where a fit met nothing."""
+"""Structure of many degrees of freedom that pairs tell of: tried first where a sample bears it out,
+proposed where a fit met nothing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.structures import structure_of
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.sums import Sums
-from gfnn_jax.fitting.gauss_newton import fitted_gradients
+from gfnn_jax.fitting.linear_starts import fitted_gradients
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.learn.request import Request
 
@@ -60,7 +60,7 @@ def _best(data: Dataset) -> tuple[str, float]:
     """The structure that leaves least of a sample's forces and velocities over, and that part."""
     if data.dim < _FEWEST_DIM or data.varied or data.coordinates.angles:
         return "", np.inf
-    left = {text: _left_over(text, data) for text in _possible(data.dim)}
+    left = {text: _misfit(text, data) for text in _possible(data.dim)}
     best = min(left, key=lambda text: left[text])
     return best, left[best]
 
@@ -71,7 +71,7 @@ def _possible(dim: int) -> Iterator[str]:
     yield from (f"bodies:{dim // k}" for k in (3, 2, 1) if dim % k == 0 and dim // k > 1)
 
 
-def _left_over(text: str, data: Dataset) -> float:
+def _misfit(text: str, data: Dataset) -> float:
     """The least part of the held-out target gradients that a library of the structure leaves."""
     structure = structure_of(text, data.dim)
     assert structure is not None

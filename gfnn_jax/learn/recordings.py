@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -18,6 +18,7 @@ from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.dataset.stretches import Nodes, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.lagrangian import Friction, Terms
 from gfnn_jax.maps.estimates import law_in_use
 from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import map_of_law
@@ -25,11 +26,15 @@ from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.arc_inputs import ArcInputs
 from gfnn_jax.models.calibration import calibrated
-from gfnn_jax.models.law_fit import LawFit
+from gfnn_jax.models.given_law import fit_given
+from gfnn_jax.models.given_terms import Given, given_terms
+from gfnn_jax.models.law_fit import LawFit, Workbench
 from gfnn_jax.models.law_search import FRICTIONS, SearchOptions, search
 from gfnn_jax.models.law_text import Expression, friction_of, speed_names, terms_of
-from gfnn_jax.models.learned_law import LearnedLaw, hamiltonian_of, in_columns, scaled
+from gfnn_jax.models.learned_law import LearnedLaw, NextMotion, hamiltonian_of, in_columns, scaled
+from gfnn_jax.models.next_motion import Motion, next_motions
 from gfnn_jax.models.residuals import Trace, whiteness
+from gfnn_jax.models.velocities import Velocity, velocities, with_channels
 
 _IMITATED = 1e-4  # of what a sensor's parameter changes, that no coefficient of the law does
 _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apart
@@ -37,7 +42,7 @@ _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apa
 
 def fit_recording(
     recording: Recording, *, friction: str = "auto", input_hold: str = "auto",
-    mass: Mapping[str, float] | None = None,
+    mass: Mapping[str, float] | None = None, terms: Sequence[Any] = (),
     on_progress: Callable[[str], Any] = lambda message: None,
 ) -> LearnedLaw:  # fmt: skip
     """The law of a recording, from its positions and inputs.
@@ -45,6 +50,8 @@ def fit_recording(
     friction: "auto", "none", "linear", "quadratic", "dry", or several of them, as
     "linear+dry". input_hold: "auto", or how inputs go on between samples: "hold", "linear" or
     "band". mass: the known mass (or moment of inertia) of one position, which fixes the scale of L.
+    terms: those of L, V and R, as text in the names of columns (`models.given_terms`), which are
+    then all that is fitted.
     Raises InputError for bad options or a recording without positions, FitError where no law is
     found.
     """
@@ -67,17 +74,31 @@ def fit_recording(
     scales = measure(found)
     given = np.array([recording.std[name] or np.nan for name in seen.channels])
     scales = dataclasses.replace(scales, sigma=np.where(given > 0, given, scales.sigma))
+    asked = _asked(terms, seen, options.dry_width * float(np.mean(scales.speed)))
     nodes = nodes_of(found, scales)
     if not recording.inputs:
         holds: tuple[str, ...] = ("hold",)
     else:
         holds = HOLDS if input_hold == "auto" else (input_hold,)
     inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
-    fit, hold, nodes = search(
-        nodes, scales, angles, len(recording.inputs), inputs, seen, told, options
-    )
+    record = (nodes, scales, angles, len(recording.inputs), inputs, seen, told, options)
+    gauge_of = np.concatenate([n.x[:, : seen.dim] for n in nodes])
+    fit, hold, nodes = search(*record) if asked is None else fit_given(asked, *record)
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
         raise FitError("no law of the library follows this recording: its arcs could not be closed")
+    speeds = velocities(recording, fit, nodes)
+    used = tuple(name for name, one in speeds.items() if one.used)
+    for name, one in speeds.items():
+        told(f"{name}: {one.text}")
+    if used:
+        own = np.array([speeds[name].sigma for name in used])
+        seen = seen.beside({n: recording.velocities.index(n) for n in used})
+        nodes, arcs = with_channels(recording, nodes, fit.arcs, fit.fitted.x, used)
+        bench = Workbench(gauge_of, inputs[hold], scales.omega, seen)
+        fit = bench.fit(fit.structure, fit.values, arcs, np.concatenate([fit.sigma, own]))
+        scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, own]))
+        given = np.array([recording.std[name] or np.nan for name in seen.channels])
+        found = _stretches(recording, seen, angles)
     first = fit.form.count + len(fit.structure.zeros)
     fitted = dataclasses.replace(seen, values=fit.p[first:])
     _check_told(fit, fitted)
@@ -111,8 +132,13 @@ def fit_recording(
     )
     map_ = _with_sensors(map_, used.sensors)
     traces = _traces(recording, seen.channels, fit, law, nodes, zeros)
-    return _described(recording, fit, map_, law, covariance, horizons, gauge, tuple(steps), traces,
-                      (q, v, u), [n.t for n in nodes], time.process_time() - started)  # fmt: skip
+    told("which motion to record next")
+    bench = Workbench(gauge_of, inputs[hold], scales.omega, seen)
+    motions = next_motions(bench, fit, angles)
+    return _described(
+        recording, fit, map_, law, covariance, horizons, gauge, tuple(steps), traces, motions,
+        (q, v, u), [n.t for n in nodes], time.process_time() - started, speeds,
+    )  # fmt: skip
 
 
 def _options(friction: str) -> SearchOptions:
@@ -142,7 +168,7 @@ def _check(recording: Recording, input_hold: str, mass: Mapping[str, float] | No
 
 
 def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
-    """How the columns show the coordinates, and which of these are angles.
+    """Observation of the coordinates by the columns, and the angles among them.
 
     Raises InputError where a sensor's parameter is one that every law has.
     """
@@ -185,6 +211,12 @@ def _check_told(fit: LawFit, seen: Observation) -> None:
             )
 
 
+def _asked(terms: Sequence[Any], seen: Observation, width: float) -> Given | None:
+    """The terms that were given, by the names of formulas."""
+    names = symbols((*seen.coordinates, *seen.speeds))
+    return given_terms(terms, names[: seen.dim], names[seen.dim :], width) if terms else None
+
+
 def _root(covariance: np.ndarray) -> np.ndarray:
     """rootᵀ root = covariance, of its eigenvalues above roundoff."""
     values, vectors = np.linalg.eigh(covariance)
@@ -198,8 +230,9 @@ def _with_sensors(map_: Any, sensors: Sensors) -> Any:
 
 def _described(
     recording: Recording, fit: LawFit, map_: Any, law: Any, covariance: np.ndarray,
-    horizons: Any, gauge: str, steps: tuple[str, ...], traces: tuple[Trace, ...], states: Any,
-    times: list[np.ndarray], seconds: float,
+    horizons: Any, gauge: str, steps: tuple[str, ...], traces: tuple[Trace, ...],
+    motions: list[Motion], states: Any, times: list[np.ndarray], seconds: float,
+    told_of: dict[str, Velocity],
 ) -> LearnedLaw:  # fmt: skip
     """The law in the words of the recording."""
     names = recording.coordinates
@@ -240,13 +273,41 @@ def _described(
         hamiltonian=hamiltonian_of(law.terms, lagrangian, codes), zeros=zeros,
         noise=dict(zip(channels, map(float, map_.sensors.sigma / factors), strict=True)),
         residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)), gauge=gauge,
-        whiteness=whiteness(traces, channels, recording.inputs), traces=traces,
+        velocities=told_of, whiteness=whiteness(traces, channels, recording.inputs), traces=traces,
+        next_motions=_in_words(motions, fit, recording, codes, of_speeds),
         observe={n: f for n, f in formulas.items() if n != f}, sensors=sensors,
         alike=_alike(fit, lagrangian, friction), horizon=tuple(horizons),
         energy=_energy(law, friction, recording.inputs, states, times),
         messages=tuple(messages), steps=steps, num_samples=len(recording), seconds=seconds,
         ended="every length of arcs was fitted",
     )  # fmt: skip
+
+
+def _in_words(
+    motions: list[Motion], fit: LawFit, recording: Recording, codes: Sequence[str],
+    speeds: Sequence[str],
+) -> tuple[NextMotion, ...]:  # fmt: skip
+    """Motions to record, in the file's units where a column shows the coordinate."""
+    named = []
+    for motion in motions:
+        start = {
+            name: float(q / recording.factors.get(name, 1.0))
+            for name, q in zip(recording.coordinates, motion.start, strict=True)
+        }
+        told = {_word(key, codes, speeds): gain for key, gain in motion.gains.items()}
+        named.append(NextMotion(start, told))
+    return tuple(named)
+
+
+def _word(key: Any, codes: Sequence[str], speeds: Sequence[str]) -> str:
+    """A coefficient by its term."""
+    kind, *rest = key
+    one, none = np.ones(1), np.zeros(1)
+    if kind == "term":
+        return terms_of(Terms.of(rest, len(codes)), one, none, codes, speeds).terms[0].term
+    if kind == "loss":
+        return "R: " + friction_of(Friction.of(rest, len(codes)), one, none, speeds).terms[0].term
+    return f"{'gain' if kind == 'gain' else 'zero'} of {codes[rest[0]]}"
 
 
 def _traces(

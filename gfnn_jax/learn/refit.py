@@ -22,6 +22,7 @@ from gfnn_jax.errors import FitWarning
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import gauss_newton, least_squares
+from gfnn_jax.fitting.descent import descended
 from gfnn_jax.fitting.gauss_newton import FlowFit
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps
@@ -34,6 +35,7 @@ from gfnn_jax.learn.fit import Fit
 from gfnn_jax.learn.formula import Term, formula
 from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.rows import of_rows, residual_weight
+from gfnn_jax.learn.stated import FEWEST_TESTED
 from gfnn_jax.maps.saved import packed, unpacked
 from gfnn_jax.maps.symplectic_map import SymplecticMap, serves_any_dt
 from gfnn_jax.phase_space import Pairs
@@ -52,7 +54,8 @@ _NO_WORSE = 1.1  # a refit whose error is larger by this factor than that of its
 
 
 def can_be_refitted(map_: SymplecticMap) -> bool:
-    """Whether `refit` knows what to do: S or H is linear in its coefficients. A network is not."""
+    """Return whether `refit` knows what to do: S or H is linear in its coefficients. A network is
+    not."""
     index = _fitted_piece(map_.pieces)
     return index is not None and hasattr(map_.pieces[index].family, "term_gradients")
 
@@ -124,7 +127,9 @@ def refit(
             )
         if found.map is not None:
             after = worker.error(found.map, held, tolerance).rms
-            candidate = with_error(old, worker.error(found.map, test, tolerance))
+            # Test pairs of few runs did not state the sample's error either, which then stands.
+            few = test.run is not None and len(np.unique(test.run)) < FEWEST_TESTED
+            candidate = old if few else with_error(old, worker.error(found.map, test, tolerance))
             chosen = dataclasses.replace(candidate, map=found.map, train_rms=found.train_rms)
             num_pairs = found.count
     else:
@@ -240,7 +245,7 @@ class _Refit:
         self.any_dt = len(pieces) == 1 and serves_any_dt(self.piece)
 
     def close(self, pairs: Pairs) -> np.ndarray:
-        """Which pairs (N,) the old map serves, and does not miss by far."""
+        """Mark the pairs (N,) that the old map serves, and does not miss by far."""
         served = self._served(pairs)
         served[served] = self._close(
             np.asarray(pairs.z1)[served], self._images(self.map, pairs.take(np.flatnonzero(served)))
@@ -248,12 +253,12 @@ class _Refit:
         return served
 
     def _served(self, pairs: Pairs) -> np.ndarray:
-        """Which pairs (N,) are apart by a dt that the map has steps of."""
+        """Mark the pairs (N,) that are apart by a dt that the map has steps of."""
         off = np.abs(np.broadcast_to(np.asarray(pairs.dt), len(pairs)) - self.dt)
         return np.full(len(pairs), True) if self.any_dt else off <= _PRINTED * self.dt
 
     def _own_dt(self, pairs: Pairs) -> np.ndarray | None:
-        """Their dt (N,), where a map of any dt must be told."""
+        """Time steps (N,) of the pairs, where a map of any dt must be told."""
         dt = np.broadcast_to(np.asarray(pairs.dt, float), len(pairs))
         same = not isinstance(self.piece.family, OfTimeStep) and np.ndim(pairs.dt) == 0
         if not self.any_dt or (same and np.all(np.abs(dt - self.dt) <= _SAME * self.dt)):
@@ -261,7 +266,7 @@ class _Refit:
         return np.array(dt)
 
     def _args(self, pairs: Pairs) -> dict[str, np.ndarray] | None:
-        """Those that the map depends on: others did not vary in the sample."""
+        """Args that the map depends on: others did not vary in the sample."""
         if self.map.parameters is None:
             return None
         given: dict[str, Any] = pairs.args or {}
@@ -325,7 +330,7 @@ class _Refit:
                 solved = least_squares.solve(train, judge, size)
                 coefficients, train_rms = solved.coefficients, solved.train_rms
         else:
-            c, found, made = gauss_newton.descended(
+            c, found, made = descended(
                 lambda c: _triangle(asked(c)), self.piece.params, gauss_newton.OPTIONS.most
             )
             rows = found.rows

@@ -1,4 +1,4 @@
-"""What is asked of a fit, checked before any work."""
+"""Request of a fit, checked before any work."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Request:
 
     @property
     def seeks_law(self) -> bool:
-        """Whether H is looked for."""
+        """Return whether H is looked for."""
         asked = self.options
         free = (asked.family, asked.chart, asked.base, asked.model) == ("auto", "auto", None, None)
         angles = self.structure is not None and bool(self.structure.angles)
@@ -63,7 +63,7 @@ class Request:
 
     @property
     def of_network(self) -> bool:
-        """Whether H is to be a network."""
+        """Return whether H is to be a network."""
         return (self.options.learn, self.options.family) == ("hamiltonian", "mlp")
 
 

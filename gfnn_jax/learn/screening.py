@@ -103,7 +103,7 @@ class _Model:
         self.left = max(left, left_back) / size if size > 0 else np.inf
 
     def bridge(self, first: int, steps: int, last: int) -> float:
-        """How far the image of row ``last`` is from ``steps`` steps from the state of row
+        """Distance of the image of row ``last`` from ``steps`` steps from the state of row
         ``first``, in units of the median residual and the number of steps."""
         coefficients, median = self._ahead
         y = self.y0[first : first + 1]
@@ -146,7 +146,7 @@ class _Model:
 
 
 def _models(data: Dataset, known: np.ndarray) -> Iterator[_Model]:
-    """By rising degree, as far as the pairs tell their terms."""
+    """Models by rising degree, as far as the pairs tell their terms."""
     coordinates, width = data.coordinates, data.y0.shape[1]
     width += len(coordinates.angles) - len(set(coordinates.cyclic) - set(coordinates.angles))
     most = min(_MOST_TERMS, int(known.sum()) // _PAIRS_PER_TERM)
@@ -180,7 +180,7 @@ def _resistant(design, move) -> tuple[np.ndarray, float]:
 
 
 def _ordinary_around(data: Dataset, unit, size, rows) -> np.ndarray:
-    """Which of the rows have ordinary neighbours, of the state or of the image: a state that is a
+    """Mark the rows that have ordinary neighbours, of the state or of the image: a state that is a
     gross error has no neighbours but its like."""
     near_one = np.zeros(len(rows), bool)
     for y in (data.y0 / unit, data.y1 / unit):

@@ -176,7 +176,7 @@ class Search:
         return [_known(r) for r in self._ratio]
 
     def found(self) -> Found:
-        """What there is; where nothing meets the tolerance, with the few best validated."""
+        """Gather what there is; where nothing meets the tolerance, with the few best validated."""
         met = bool(np.isfinite(self._cheapest))
         if not met:
             self._validate_the_best()
@@ -211,7 +211,7 @@ def _known(ratio: float) -> float:
 
 
 def _courses(seen, ratio: list[float]) -> list[Course | None]:
-    """Where the errors of each sweep lead."""
+    """Extrapolate the errors of each sweep."""
     return [course([(x, r * e) for x, e in sizes]) for sizes, r in zip(seen, ratio, strict=True)]
 
 
@@ -242,7 +242,7 @@ def _reached(seen, ratio: list[float]) -> list[float]:
 def _promised(
     sweeps: Sequence[Any], seen, ratio: list[float], stalled: Sequence[int], bound: float
 ) -> str:
-    """What the most accurate sweep's errors, extrapolated, say of a size that would meet the bound;
+    """Extrapolation of the most accurate sweep's errors to a size that would meet the bound;
     nothing where they stall, or are too few to say."""
     reached = _reached(seen, ratio)
     i = int(np.argmin(reached)) if reached else 0
@@ -299,13 +299,14 @@ def _ranking(entries: list[Entry], bound: float) -> list[Entry]:
 
 
 def _as_good(entry: Entry, best: Entry) -> bool:
-    """Whether an entry's error is no larger than the best one's but for what is not worth while."""
+    """Return whether an entry's error is no larger than the best one's but for what is not worth
+    while."""
     limit = _NO_WORSE * best.candidate.validation_relative
     return entry.candidate.validation_relative <= limit
 
 
 def _beats(rival: Candidate, candidate: Candidate) -> bool:
-    """Whether a size of another sweep is better for no more operations: at all for the same
+    """Return whether a size of another sweep is better for no more operations: at all for the same
     functions in another chart, by far for other functions, which may gain faster later."""
     if (rival.chart, rival.family) == (candidate.chart, candidate.family):
         return False
@@ -330,8 +331,8 @@ def _stalled_sweeps(entries: list[Entry]) -> set[tuple[str, str]]:
 
 
 def _why(sweeps: Sequence[Any], stalled: list[int], best: Sequence[float]) -> str:
-    """Why a search that met nothing ended before its time. Sweeps far from the best one's error
-    tell nothing."""
+    """Reason why a search that met nothing ended before its time. Sweeps far from the best one's
+    error tell nothing."""
     good = [i for i, s in enumerate(sweeps) if s.sizes and best[i] <= AS_FAR * min(best)]
     if any(stalled[i] == _STALLED for i in good):
         return "larger models are no more accurate: noise, or a structure they cannot represent"

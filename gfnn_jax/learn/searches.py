@@ -14,7 +14,7 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.learn.assemble import composed
 from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.choose_charts import Charts
-from gfnn_jax.learn.choose_law import DEARER, law_of
+from gfnn_jax.learn.choose_law import MAX_COST_RATIO, law_of
 from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.diagnosed import Diagnosis, diagnosed
 from gfnn_jax.learn.ensembles import EnsembleSweep
@@ -73,7 +73,7 @@ def searched(
     early = not _of_terms(data) or options.model is not None
     climb = Search(_sweeps(request, data, seen) if early else [], *given)
     climb.climb(most=_SMALL)
-    law = _law(request, data, better, DEARER * climb.cheapest)
+    law = _law(request, data, better, MAX_COST_RATIO * climb.cheapest)
     of_terms, failed = None, None
     met_by_law = law is not None and tolerance.met_by(law.candidate)
     wanted = not early and options.learn != "hamiltonian" and not met_by_law
@@ -93,7 +93,7 @@ def searched(
     dearest = law.candidate.operations if law is not None and met_by_law else np.inf
     climb.climb(dearest)
     found = climb.found()
-    dearest /= DEARER  # of maps that would be chosen
+    dearest /= MAX_COST_RATIO  # of maps that would be chosen
     lossy = seen.damping is not None or (law is not None and bool(law.friction))
     if data.varied or lossy:  # pairs of H's flow are drawn, and factored out, at one dt
         pass
@@ -139,7 +139,7 @@ def _met(found: LearnedMap | None, tolerance: Tolerance) -> bool:
 
 
 def _of_terms(data: Dataset) -> bool:
-    """Whether S, where it is learned, is a sum of terms: with parameters, or over sites."""
+    """Return whether S, where it is learned, is a sum of terms: with parameters, or over sites."""
     sites = isinstance(data.structure, Sites) and data.own_dt is None
     return sites or data.args is not None
 

@@ -1,51 +1,55 @@
 """The error that a fit states: that of the chosen map, on pairs that chose nothing.
 
-The test pairs are looked at here for the first time, after everything is chosen, and once. Where
-the pairs were too few to keep some apart, the chosen model is fitted anew without each fifth
-of the blocks in turn, and errs on that fifth.
+The test rows are looked at here for the first time, after everything is chosen, and once. Where
+they are of few runs, or the pairs were too few to keep some apart, the chosen model is fitted anew
+without each fifth of the runs in turn, and errs on that fifth: one run says nothing of the
+amplitudes of the others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
-from gfnn_jax.dataset.measured_error import measured_error
+from gfnn_jax.dataset.measured_error import FEWEST_RUNS, clusters, count_of_runs, measured_error
+from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.learn.assemble import stepped
 from gfnn_jax.learn.candidates import Candidate, with_error
 from gfnn_jax.learn.choose import Chosen
+from gfnn_jax.learn.clock import FLOW, ROWS, Budget
+from gfnn_jax.learn.law_work import work_of_refit
 from gfnn_jax.learn.network_sweep import NetworkSweep
-from gfnn_jax.learn.search import Entry
 from gfnn_jax.learn.searches import Searched
 
 _FOLDS = 5
-
-# rows that are left out -> images (n, 2d) of them in the user's coordinates, NaN where a step fails
-Predicts = Callable[[np.ndarray], np.ndarray]
+FEWEST_TESTED = 10  # runs that state the error for all others
+_WHAT = "the stated error by cross-validation"
 
 
 class Stated(NamedTuple):
     """The candidate with the error that is stated. by: "test", pairs that chose nothing;
     "cross-validation"; or "validation", pairs that chose too, where the model is neither a linear
-    S nor an H. pairs, blocks: how many it is measured by."""
+    S nor an H. pairs, clusters: how many it is measured by; runs: whether the clusters are runs."""
 
     candidate: Candidate
     by: str
     pairs: int
-    blocks: int
+    clusters: int
+    runs: bool
 
     @property
     def words(self) -> str:
-        """What the error was measured by, as text."""
+        """Text about what the error was measured by."""
         count = f"{self.pairs:,} pairs"
-        if self.blocks < self.pairs:
-            count += f" of {self.blocks:,} independent stretches"
+        if self.clusters < self.pairs:
+            count += f" of {self.clusters:,} {'runs' if self.runs else 'independent stretches'}"
         if self.by == "test":
             return f"{count} that took no part in the fit or its choices"
         if self.by == "cross-validation":
@@ -53,32 +57,61 @@ class Stated(NamedTuple):
         return f"{count} that also chose the model"
 
 
-def stated(chosen: Chosen, found: Searched) -> Stated:
-    """The chosen candidate with its error on the test pairs, or by cross-validation."""
-    data, candidate = found.data, chosen.candidate
-    block = data.split.stretch
+def stated(chosen: Chosen, found: Searched, budget: Budget) -> Stated:
+    """The chosen candidate with its error on the test rows, or by cross-validation over runs where
+    these are of few runs, or over blocks of time where all pairs are."""
+    data = found.data
+    if count_of_runs(data, data.test) >= FEWEST_TESTED:
+        return _stated(chosen, found, "test", data.test, _images_of(chosen, found, data.test))
+    everyone = np.concatenate([data.training, data.validation, data.test])
+    by_runs = count_of_runs(data, everyone) >= FEWEST_RUNS
+    if by_runs or not len(data.test):
+        cluster = data.run if by_runs else data.split.stretch
+        known = _by_folds(chosen, found, everyone, cluster, budget)
+        # A fit without some runs may have no image of them; that says nothing of the whole one.
+        if known and (np.isfinite(known.candidate.validation_bound) or not len(data.test)):
+            return known
     if len(data.test):
-        rows, by = data.test, "test"
-        images = _images_of(chosen, found, rows)
-    else:
-        by, predicts = "cross-validation", _predictor(chosen, found)
-        rows = np.concatenate([data.training, data.validation])
-        if predicts is None:
-            held = data.validation
-            return Stated(candidate, "validation", len(held), _count(block, held))
-        folds = np.array_split(np.unique(block[rows]), min(_FOLDS, _count(block, rows)))
-        out = [rows[np.isin(block[rows], fold)] for fold in folds]
-        rows, images = np.concatenate(out), np.concatenate([predicts(part) for part in out])
-    error = measured_error(data, found.tolerance, images, rows)
-    return Stated(with_error(candidate, error), by, len(rows), _count(block, rows))
+        return _stated(chosen, found, "test", data.test, _images_of(chosen, found, data.test))
+    cluster, runs = clusters(data, data.validation)
+    return Stated(
+        chosen.candidate, "validation", len(data.validation), len(np.unique(cluster)), runs
+    )
 
 
-def _count(block: np.ndarray, rows: np.ndarray) -> int:
-    return len(np.unique(block[rows]))
+def _stated(chosen: Chosen, found: Searched, by: str, rows, images) -> Stated:
+    """The error of these rows' images (n, 2d) in the user's coordinates."""
+    error = measured_error(found.data, found.tolerance, images, rows)
+    cluster, runs = clusters(found.data, rows)
+    candidate = with_error(chosen.candidate, error)
+    return Stated(candidate, by, len(rows), len(np.unique(cluster)), runs)
+
+
+def _by_folds(
+    chosen: Chosen, found: Searched, rows, cluster: np.ndarray, budget: Budget
+) -> Stated | None:
+    """The error of rows that are each predicted by a fit without their fold of clusters (N,); None
+    where such fits are not known how to make, or do not fit into the budget."""
+    model = _refits(chosen, found)
+    if model is None:
+        return None
+    folds = np.array_split(np.unique(cluster[rows]), _FOLDS)
+    out = [rows[np.isin(cluster[rows], fold)] for fold in folds if len(fold)]
+    try:
+        with budget.last(_WHAT, model.kind, len(out) * model.work):
+            parts = [model.predicts(np.setdiff1d(rows, part), part) for part in out]
+    except OutOfTime:  # told with what else was left out
+        return None
+    except (FitError, np.linalg.LinAlgError) as error:
+        budget.leave_out(_WHAT, str(error))
+        return None
+    images = np.concatenate(parts)
+    return _stated(chosen, found, "cross-validation", np.concatenate(out), images)
 
 
 def _images_of(chosen: Chosen, found: Searched, rows: np.ndarray) -> np.ndarray:
-    """By the steps that users run; in NumPy where the budget had no room for compiling them."""
+    """Images by the steps that users run; in NumPy where the budget had no room for compiling
+    them."""
     candidate, data, entry = chosen.candidate, chosen.data, chosen.entry
     pairs = found.data.pairs.take(rows)
     if candidate.microseconds_per_step is None and found.linear is not None:
@@ -96,25 +129,29 @@ def _images_of(chosen: Chosen, found: Searched, rows: np.ndarray) -> np.ndarray:
     return np.where(steps.failed[:, None], np.nan, steps.images)
 
 
-def _predictor(chosen: Chosen, found: Searched) -> Predicts | None:
-    """Fits the chosen model to all pairs but some, and predicts these; None where that is not
-    known how."""
+class _Refits(NamedTuple):
+    """The chosen model, to be fitted to other rows. predicts: rows that it is fitted to and rows
+    that it predicts -> images (n, 2d) of these in the user's coordinates, NaN where a step fails.
+    kind, work: of the operations that a fit takes."""
+
+    predicts: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    kind: str
+    work: float
+
+
+def _refits(chosen: Chosen, found: Searched) -> _Refits | None:
+    """The chosen model; None where it is not known how to fit it anew in little time."""
     entry, law = chosen.entry, found.law
     if entry is not None:
-        return _of_entry(entry) if entry.sweep.data.pairs is found.data.pairs else None
+        sweep, size = entry.sweep, entry.size
+        if isinstance(sweep, NetworkSweep) or sweep.data.pairs is not found.data.pairs:
+            return None
+        return _Refits(partial(sweep.predicted, size), ROWS, sweep.work_of_refit(size))
     flow = law is not None and chosen.candidate.learns == "hamiltonian" and law.terms
     return _of_law(found) if flow else None
 
 
-def _of_entry(entry: Entry) -> Predicts | None:
-    sweep = entry.sweep
-    if isinstance(sweep, NetworkSweep):  # each would be trained as long as the first
-        return None
-    everyone = np.concatenate([sweep.data.training, sweep.data.validation])
-    return lambda rows: sweep.predicted(entry.size, np.setdiff1d(everyone, rows), rows)
-
-
-def _of_law(found: Searched) -> Predicts:
+def _of_law(found: Searched) -> _Refits:
     data, law = found.data, found.law
     assert law is not None
     flow = law.flow
@@ -122,10 +159,9 @@ def _of_law(found: Searched) -> Predicts:
     steps = Steps(flow.stages, flow.over(np.max(data.each_dt)).substeps)
     coefficients = np.asarray(flow.params)
 
-    def predicts(rows: np.ndarray) -> np.ndarray:
-        others = np.setdiff1d(np.arange(len(data)), rows)
+    def predicts(others: np.ndarray, rows: np.ndarray) -> np.ndarray:
         fit = problem.fit(flow.family, coefficients, others, rounds=False, steps=steps)
         images = problem.images(flow.family, fit.coefficients, rows, steps)
         return to_user(data.coordinates, images.states)
 
-    return predicts
+    return _Refits(predicts, FLOW, work_of_refit(flow.family, len(data), data.dim, steps))

@@ -119,8 +119,8 @@ def sweep_of_dt(data: Dataset, tolerance: Tolerance, scene, factors=None) -> Lin
 
 
 class _Factors(NamedTuple):
-    """Of the training rows, of those held out, and of the training rows without the outermost
-    twentieth and of that twentieth alone."""
+    """Factors of the training rows, of those held out, and of the training rows without the
+    outermost twentieth and of that twentieth alone."""
 
     train: Triangle
     held: Triangle
@@ -134,14 +134,14 @@ class _Factors(NamedTuple):
 
 
 class Generates:
-    """What sweeps of S have in common: a solved size makes a piece."""
+    """Base of the sweeps of S: a solved size makes a piece."""
 
     data: Dataset
     chart: AnyChart
     tolerance: Tolerance
 
     def solve(self, size: Size, budget: Budget, say) -> tuple[Any, Any]:
-        """What is known of the solution, and the params of the size's family."""
+        """Solve for the params of the size's family; with them what is known of the solution."""
         raise NotImplementedError
 
     def piece(self, size: Size) -> Generated:
@@ -211,7 +211,7 @@ class LinearSweep(Generates):
         self._solved: dict[int, least_squares.LeastSquaresFit] = {}  # by the number of terms
 
     def named(self, size: Size) -> str:
-        """What is done to judge the size."""
+        """Name of the unit that judges the size."""
         return f"{self.chart.name} {self._prefix}{size.family.label}"
 
     def work(self, size: Size) -> float:
@@ -229,6 +229,11 @@ class LinearSweep(Generates):
         solution makes in their time."""
         steps = len(self.data.validation) * size.operations
         return OF_SOLVE * size.family.num_parameters**3 + OF_STEPS * steps
+
+    def work_of_refit(self, size: Size) -> float:
+        """Operations that a fit of the size to other rows takes."""
+        count, width = size.family.num_parameters, self._train[1].shape[1]
+        return 2.0 * len(self.data) * width * (count + 1) ** 2 + OF_SOLVE * count**3
 
     def judge(self, size: Size, budget: Budget, say: Callable[[str], Any]) -> Candidate:
         """The size with its error estimated from the held-out residual of the gradient."""
@@ -259,7 +264,7 @@ class LinearSweep(Generates):
         return dataclasses.replace(candidate, fit_seconds=seconds)
 
     def at(self, extent: float) -> str:
-        """What the size of this extent is, how many terms it has, and how many pairs they take."""
+        """Describe the size of this extent: its terms, and how many pairs they take."""
         family = self.sizes[0].family
         if not hasattr(family, "degree"):
             label = f"{family.name} {(terms := round(2**extent))}"
@@ -285,8 +290,11 @@ class LinearSweep(Generates):
     def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Images (n, 2d) of these rows, in the user's coordinates, by a fit to other rows; NaN
         where a step is not solved."""
+        return self._predicted(size, rows_of(self.data, self.chart, others)[0], rows)
+
+    def _predicted(self, size: Size, fitted_to, rows: np.ndarray) -> np.ndarray:
         data, family = self.data, self.in_rows(size.family)
-        train = least_squares.reduce(family, [rows_of(data, self.chart, others)[0]], self._weight)
+        train = least_squares.reduce(family, [fitted_to], self._weight)
         held = least_squares.reduce(family, [self._held], self._weight)
         solved = least_squares.solve(train, held, size.family.num_parameters)
         params = size.family.unflatten(solved.coefficients)
@@ -304,7 +312,7 @@ class LinearSweep(Generates):
         return weight * (gradient - target)
 
     def own_error(self, size: Size) -> float:
-        """What noise leaves wrong in the size's ∇S, in the measure of train_rms: half of the
+        """Error of the size's ∇S by noise, in the measure of train_rms: half of the
         difference between the fits to either half of the training pairs, blocks in time."""
         half = self.data.training // _HALVES_BLOCK % 2
         train, held = self.factors(size.group, Budget(), lambda message: None)[:2]
@@ -380,7 +388,8 @@ class LinearSweep(Generates):
 
     @property
     def moved_by_states(self) -> bool:
-        """Whether ``of_states`` is all that states' noise does: not behind the flow of a law."""
+        """Return whether ``of_states`` is all that states' noise does: not behind the flow of a
+        law."""
         return all(isinstance(p, (Affine, Damping)) for p in (*self.data.before, *self.data.after))
 
     @property
@@ -414,7 +423,7 @@ class LinearSweep(Generates):
         states = residual, *self.by_states(near.family, params, w, *args), goes_on
         scores = shared_noise.scores(slopes, *states)
         return [
-            shared_noise.freedom(slopes[..., :count], residual, scores[:, :count])
+            shared_noise.degrees_of_freedom(slopes[..., :count], residual, scores[:, :count])
             for count in counts
         ]
 
@@ -445,13 +454,13 @@ class LinearSweep(Generates):
                 self._factors[of.group].train if larger.group in self._factors
                 else least_squares.reduce(self.in_rows(of.family), [data], self._weight)
             )  # fmt: skip
-            freedom = float(count)
+            degrees = float(count)
             if states is not None:
                 slopes = self._slopes(of.family, data[0], *data[2:])
                 scores = shared_noise.scores(slopes, *states)
-                freedom = shared_noise.freedom(slopes, states[0], scores)
+                degrees = shared_noise.degrees_of_freedom(slopes, states[0], scores)
             square = reduced.residual_norm(count) ** 2 / max(reduced.rows, 1)
-            return square, freedom, reduced.rows
+            return square, degrees, reduced.rows
 
         (of_all, taken, _), (of_rest, more, rows) = left(size), left(larger)
         noise = of_rest / max(1.0 - more / rows, 1.0 / rows)
@@ -475,7 +484,7 @@ class LinearSweep(Generates):
         return further[-1] if further else None
 
     def factors(self, group, budget: Budget, say) -> _Factors:
-        """Those of a group's largest family, which answer for all of its sizes."""
+        """Factors of a group's largest family, which answer for all of its sizes."""
         if group not in self._factors:
             self._factors[group] = self._known(group) or self._computed(group, budget, say)
         return self._factors[group]
@@ -543,8 +552,8 @@ class _WithOdd:
 
 
 def is_even(data: Dataset) -> bool:
-    """Whether S(−w) = S(w) as far as any size of a sweep could tell: odd terms beside the even ones
-    of the highest degree that a sweep has do not make the held-out residual smaller.
+    """Return whether S(−w) = S(w) as far as any size of a sweep could tell: odd terms beside the
+    even ones of the highest degree that a sweep has do not make the held-out residual smaller.
 
     False where terms are not scarce, where angles or args are, or where the test would take too
     much.

@@ -125,7 +125,7 @@ def _without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
 
 
 def _same_phase(t0: np.ndarray, period: float) -> bool:
-    """Whether all these times of a drive are one, but for whole periods."""
+    """Return whether all these times of a drive are one, but for whole periods."""
     apart = np.mod(t0 - t0[0] + 0.5 * period, period) - 0.5 * period
     return bool(np.ptp(apart) <= _SAME * period)
 
@@ -139,7 +139,8 @@ def _one_phase(t0: float, dt: float, period: float) -> str:
 
 
 def given_by(data: Dataset) -> np.ndarray | None:
-    """What a pair's move depends on beside its state, (N, k) of unit sizes; None for nothing."""
+    """Args and dt that a pair's move depends on beside its state, (N, k) of unit sizes; None for
+    nothing."""
     if not data.varied:
         return None
     columns = [] if data.own_dt is None else [data.own_dt]

@@ -12,9 +12,9 @@ _PAIRS = 2_000  # whose residuals are looked at
 
 
 def leaves_white(law: LearnedHamiltonian, data: Dataset) -> bool:
-    """Whether no polynomial generator explains more than chance of what the law leaves over, by an
-    F test (`learned_law.unexplained`). False where the pairs are too few to tell, and of a law with
-    parameters or over sites."""
+    """Return whether no polynomial generator explains more than chance of what the law leaves over,
+    by an F test (`learned_law.unexplained`). False where the pairs are too few to tell, and of a
+    law with parameters or over sites."""
     family = law.flow.family
     if not isinstance(family, Terms) or data.varied or data.structure is not None:
         return False

@@ -11,8 +11,9 @@ from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.noise import robust
 from gfnn_jax.dataset.runs import steps_between
-from gfnn_jax.fitting.gauss_newton import FlowFit, Problem, significant
+from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
 from gfnn_jax.fitting.shooting import OPTIONS, Shooting, Shot, arcs_of, longest_arc
+from gfnn_jax.fitting.significance import significant
 
 _SHORTEST = 3  # steps of an arc that says more than its pairs do
 _CERTAIN = 4.0  # standard errors below which a term is noise
@@ -75,7 +76,7 @@ def fitted_to_sequences(
         return None
 
     def left(terms, coefficients) -> float:
-        """Of the held-out arcs, each from the state that suits it."""
+        """Residuals of the held-out arcs, each from the state that suits it."""
         found = held.fit(terms, coefficients, only_states=True)
         return np.inf if found is None else float(np.linalg.norm(found.noise / problem.scale))
 

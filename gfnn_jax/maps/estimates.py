@@ -31,8 +31,8 @@ _FINE = 0.16  # radians of the fastest motion in a step
 
 
 class Forecast(NamedTuple):
-    """What sensors will show, and coordinates that no column is named for: name -> (runs, n), and
-    their standard deviations."""
+    """Forecast of what sensors will show, and of coordinates that no column is named for: name ->
+    (runs, n), and their standard deviations."""
 
     times: np.ndarray
     values: dict[str, np.ndarray]
@@ -61,7 +61,7 @@ class Law(NamedTuple):
 
 
 def law_in_use(law: Lagrangian, root: np.ndarray | None, sensors: Sensors) -> Law:
-    """Of a Lagrangian without uniform friction and the root (m, n) of the covariance of (θ, ρ,
+    """Prepare a Lagrangian without uniform friction and the root (m, n) of the covariance of (θ, ρ,
     G)."""
     count = law.terms.count
     form = Form(law.terms, np.zeros(count), np.eye(count), law.friction, law.num_inputs)
@@ -70,7 +70,7 @@ def law_in_use(law: Lagrangian, root: np.ndarray | None, sensors: Sensors) -> La
 
 
 def law_of(map_: Any) -> Law:
-    """Of a map that was learned from a recording. Raises InputError for any other."""
+    """Law of a map that was learned from a recording. Raises InputError for any other."""
     if map_.sensors is None:
         raise InputError(
             "expected a map that was learned from a recording, which knows its sensors"
@@ -138,7 +138,8 @@ def forecast(
 def windows_of(sensors: Sensors, recording: Recording) -> list[Window]:
     """The last samples of each run. Raises InputError where a column is missing or they are few."""
     channels = sensors.seen.channels
-    missing = [n for n in (*channels, *sensors.inputs) if n not in recording.columns]
+    needed = (*sensors.seen.needed, *sensors.inputs)
+    missing = [n for n in needed if n not in recording.columns]
     if missing:
         raise InputError(f"{recording.source}: expected columns {', '.join(missing)}")
     windows = []

@@ -59,7 +59,8 @@ class Cells(NamedTuple):
 
 
 def of_cells(forward: Cells, backward: Cells, dt) -> ModifiedHamiltonian:
-    """Compute H̃ of the middle state from ``NUM_STEPS`` steps of the map and of its inverse. JAX."""
+    """Compute H̃ of the middle state from ``NUM_STEPS`` steps of the map and of its inverse.
+    JAX."""
     action = jnp.concatenate([-backward.action[::-1], forward.action])
     moved = jnp.concatenate([-backward.moved[::-1], forward.moved])
     start = jnp.zeros_like(forward.place[:1])

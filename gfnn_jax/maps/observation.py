@@ -163,6 +163,24 @@ class Observation:
         rank = np.linalg.matrix_rank(J, tol=1e-8)
         return x, np.where((rank == d) & np.isfinite(sizes), sizes, np.inf)
 
+    def beside(self, velocities: Mapping[str, int]) -> Observation:
+        """With columns that show the velocities of these coordinates as they are."""
+        code = symbols((*self.coordinates, *self.speeds))[self.dim :]
+        return dataclasses.replace(
+            self,
+            channels=(*self.channels, *velocities),
+            formulas=(*self.formulas, *(code[i] for i in velocities.values())),
+        )
+
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """Channels without which the coordinates are not told: those that show no velocity."""
+        moving = set(range(self.dim, 2 * self.dim))
+        return tuple(
+            name for name, tree in zip(self.channels, self._trees, strict=True)
+            if tree is None or not depends_on(tree) & moving
+        )  # fmt: skip
+
     def state_sigma(self, x: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         """σ (d,) of the coordinates, of that of the channels (k,), at states x (n, 2d)."""
         J = self(x).by_state[..., : self.dim] / sigma[:, None]

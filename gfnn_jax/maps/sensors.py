@@ -51,7 +51,8 @@ class Sensors:
         q = self.seen.coordinates_of(y, self.turning)
         known = np.isfinite(q).all(axis=1)
         for i in self.turning:
-            q[known, i] = np.unwrap(q[known, i])
+            if self.positions[i] not in self.seen.channels:
+                q[known, i] = np.unwrap(q[known, i])
         return q
 
     def misfit_at(self, ahead: np.ndarray) -> np.ndarray:

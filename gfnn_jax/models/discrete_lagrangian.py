@@ -68,7 +68,7 @@ def solve(family: Any, triples: Triples) -> Solved:
     return Solved(coefficients, 1 + int(told.sum()), float(values[0] / values[told][-1]))
 
 
-def left_over(family: Any, params: Any, triples: Triples) -> np.ndarray:
+def residuals(family: Any, params: Any, triples: Triples) -> np.ndarray:
     """(N, d): h² times what S leaves of the equations, in units of the positions: about the error
     of q₊, where the mixed term is about 1 everywhere."""
     count, dim = len(triples), triples.dim

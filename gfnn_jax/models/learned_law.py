@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,20 @@ from gfnn_jax.models.calibration import Horizon
 from gfnn_jax.models.law_fit import LawFit
 from gfnn_jax.models.law_text import Expression, Term, measured, terms_of
 from gfnn_jax.models.residuals import Trace, Whiteness
+from gfnn_jax.models.velocities import Velocity
+
+
+class NextMotion(NamedTuple):
+    """A motion to record: where to let go, at rest, and by how much that makes the standard errors
+    of terms smaller, the most improved first."""
+
+    start: dict[str, float]
+    gains: dict[str, float]
+
+    def __str__(self) -> str:
+        at = ", ".join(f"{name} = {q:.3g}" for name, q in self.start.items())
+        best = ", ".join(f"{t} {min(g, 1000):.2g}" for t, g in [*self.gains.items()][:3])
+        return f"let go at {at}: standard errors smaller by factors, {best}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -25,9 +39,11 @@ class LearnedLaw:
     standard error. hamiltonian: H in words, its terms as of L. zeros: angle -> (where it is zero,
     standard error), already inside the formula. observe: column -> what its sensor shows, where
     that is not the coordinate; sensors: the parameters in it, fitted, with standard errors. noise:
-    column -> σ of its samples; residual: of the fit's arcs, both in the file's unit. whiteness: of
+    column -> σ of its samples; residual: of the fit's arcs, both in the file's unit. velocities:
+    columns of these against the law of the positions, and whether they were used. whiteness: of
     the residuals, column by column; traces: the arcs that were fitted. gauge: what fixes the scale
-    of L. alike: coefficients that the record cannot tell apart. horizon: for how long a forecast
+    of L. alike: coefficients that the record cannot tell apart. next_motions: those that
+    would tell the most, the best first. horizon: for how long a forecast
     can be trusted. energy: stored, lost, supplied per second, means over the record. messages:
     warnings. steps: what the search did, line by line.
     num_samples, seconds (of the processor). ended: why the search ended.
@@ -43,10 +59,12 @@ class LearnedLaw:
     sensors: dict[str, tuple[float, float]]
     noise: dict[str, float]
     residual: dict[str, float]
+    velocities: dict[str, Velocity]
     whiteness: dict[str, Whiteness]
     traces: tuple[Trace, ...]
     gauge: str
     alike: tuple[str, ...]
+    next_motions: tuple[NextMotion, ...]
     horizon: tuple[Horizon, ...]
     energy: dict[str, Any]
     messages: tuple[str, ...]
@@ -69,6 +87,7 @@ class LearnedLaw:
         ]
         lines += [f"{column} shows {formula}" for column, formula in self.observe.items()]
         lines += [f"{name} = {measured(value, std)}" for name, (value, std) in self.sensors.items()]
+        lines += [f"{name}: {one.text}" for name, one in self.velocities.items()]
         for name, forces in self.gains.items():
             told = ", ".join(f"{q} {g:.6g} ± {s:.2g}" for q, (g, s) in forces.items())
             lines.append(f"force of {name}: {told}")
@@ -82,6 +101,7 @@ class LearnedLaw:
                 f"forecasts within {fraction:.0%} of the spread for {seconds:.3g} s (by the bands "
                 f"{predicted:.3g} s)"
             )
+        lines += [f"to record next: {motion}" for motion in self.next_motions[:1]]
         return "\n".join(lines)
 
     def __repr__(self) -> str:

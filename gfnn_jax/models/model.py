@@ -19,7 +19,8 @@ class TrainingData(NamedTuple):
     y0, y1: (n, 2d) states and images, angles lifted. dt: a number, or (n,). args: (n, k) values of
     ``parameters``, or None. scale: (2d,) sizes of the coordinates. angles, cyclic: indices of
     coordinates of period 2π, and of those that do not enter. run, place: (n,) the run of each
-    pair, and the number of y0 along it. std: (2d,) of the noise, or None where it is not known.
+    pair, and the number of y0 along it. std: (2d,) of the noise, or (n, 2d) of each
+    value, or None where it is not known.
     """
 
     y0: np.ndarray

@@ -1,4 +1,4 @@
-"""What a law leaves of its record: residuals along arcs, whether they are white, and whether inputs
+"""Residuals of a law along arcs of its record: whether they are white, and whether inputs
 are in them.
 
 Of N white residuals the correlation with any other series, and that with themselves some samples
@@ -43,9 +43,10 @@ class OfInput(NamedTuple):
 
 
 class Whiteness(NamedTuple):
-    """Of the residuals of one channel: lags (s) and the autocorrelation there, the size (three
-    standard deviations) that white residuals stay below, whether these do, correlations with inputs
-    by name, and the share of the channel's variation about its mean that the arcs follow, in %."""
+    """Autocorrelation of the residuals of one channel: lags (s) and the autocorrelation there, the
+    size (three standard deviations) that white residuals stay below, whether these do, correlations
+    with inputs by name, and the share of the channel's variation about its mean that the arcs
+    follow, in %."""
 
     lags: np.ndarray
     autocorrelation: np.ndarray
@@ -73,7 +74,7 @@ class Whiteness(NamedTuple):
 def whiteness(
     traces: Sequence[Trace], channels: Sequence[str], inputs: Sequence[str]
 ) -> dict[str, Whiteness]:
-    """Of each channel."""
+    """Whiteness of each channel."""
     steps = np.concatenate([np.diff(trace.t) for trace in traces])
     step = float(np.median(steps[steps > 0]))
     found = {}
@@ -102,8 +103,8 @@ def whiteness(
 
 
 def _correlation(a: Sequence[np.ndarray], b: Sequence[np.ndarray], lag: int) -> float:
-    """Of a with b ``lag`` samples later, within arcs, in units of all of both, so that few pairs of
-    a long lag count for as little; NaN counts as nothing."""
+    """Correlation of a with b ``lag`` samples later, within arcs, in units of all of both, so that
+    few pairs of a long lag count for as little; NaN counts as nothing."""
     early, late = [], []
     for one, other in zip(a, b, strict=True):
         n = len(one)

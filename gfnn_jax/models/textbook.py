@@ -18,7 +18,8 @@ import numpy as np
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
-from gfnn_jax.fitting.gauss_newton import Problem, null_terms
+from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.fitting.significance import null_terms
 from gfnn_jax.flows.collocation import Steps, of_lanes
 from gfnn_jax.models.arguments import arguments_of
 from gfnn_jax.models.atoms import (

@@ -27,9 +27,10 @@ def protected(structure: Structure) -> set[Key]:
 
 
 def weak_start(
-    structure: Structure, nodes: Sequence[Nodes], scales: Scales
+    structure: Structure, nodes: Sequence[Nodes], scales: Scales, prune: bool = True
 ) -> tuple[Structure, dict[Key, float]]:
-    """The structure less what is not seen at four standard errors, and its coefficients.
+    """The structure less what is not seen at four standard errors (if ``prune``), and its
+    coefficients.
 
     Raises FitError where a coordinate without mass and force solves the equations.
     """
@@ -60,7 +61,7 @@ def weak_start(
             np.inf if keys[k] in fixed else abs(value) / e
             for k, value, e in zip(keep, c, error, strict=True)
         ]
-        if not z or min(z) > _SIGNIFICANT:
+        if not prune or not z or min(z) > _SIGNIFICANT:
             break
         del keep[int(np.argmin(z))]
     kept = {keys[k]: float(value) for k, value in zip(keep, c, strict=True)}

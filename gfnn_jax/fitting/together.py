@@ -1,0 +1,166 @@
+"""Levenberg–Marquardt for several networks at once: one program linearises and tries a step of all.
+
+A member whose step does not lower its loss waits with more damping for the next iteration, so that
+no member's search makes the others wait.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from gfnn_jax.families import Family
+from gfnn_jax.fitting import row_blocks
+from gfnn_jax.fitting.levenberg_marquardt import (
+    Rows,
+    attempt,
+    check_rows,
+    chunked,
+    flattened,
+    linearize,
+    residual,
+    unflattened,
+)
+from gfnn_jax.fitting.training import Limits, LMResult, LMState, first_state, result_of, trained
+
+TOGETHER_GROWTH = 4.0  # of the damping, after a step that has not lowered F
+
+
+def levenberg_marquardt_together(
+    family: Family,
+    members: Sequence[Any],
+    w: Rows,
+    target_gradient: Rows,
+    *,
+    validation: tuple[Rows, Rows],
+    weight: Any = 1.0,
+    shares: Float[np.ndarray, "_ _"],
+    max_iterations: int = 200,
+    block: Callable[[int], AbstractContextManager] = lambda iterations: nullcontext(),
+    target_rms: float = 0.0,
+    patience: int = 20,
+    chunk: int = 500,
+    on_progress: Callable[[LMState], Any] | None = None,
+    checkpoint: Callable[[LMState], Any] | None = None,
+    resume: LMState | None = None,
+) -> LMResult:
+    """Minimise that loss for E members of a family at once, each from its own start and with its
+    own shares of the pairs; one program linearises and tries a step of all of them.
+
+    members: E starts, pytrees of one structure. shares: (E, N), 0 or more, of mean 1: what the
+    square of a pair's residual counts in each member's loss. All else is as for
+    `levenberg_marquardt`, but for this: a member whose step does not lower its loss waits with four
+    times the damping for the next iteration; validation errors are those of the members' mean ∇S;
+    theta and best_theta of a state are (E, P), its damping (E,); the params that are returned have
+    a leading axis E. The memory is E times as much.
+
+    On the devices of the fit (`fitting.row_blocks`) members are trained one at a time on each: to
+    the same bits on any number of devices, which one batch of all members would not give.
+    """
+    flat = [flattened(member) for member in members]
+    theta, layout = np.stack([t for t, _ in flat]), flat[0][1]
+    rows = (np.asarray(a) for a in (w, target_gradient, *validation))
+    w, target_gradient, held_w, held_target = rows
+    check_rows(theta, w, target_gradient, held_w, held_target)
+    weight = np.broadcast_to(np.asarray(weight, theta.dtype), w.shape[-1:])
+    held = jax.device_put((held_w, held_target, weight[None, :]))
+    *points, weights = chunked(w, target_gradient, weight, chunk)
+    padding = weights.shape[0] * weights.shape[1] - len(w)
+    parts = np.pad(np.sqrt(shares), ((0, 0), (0, padding))).reshape(-1, *weights.shape[:2], 1)
+    on_device = tuple(points), parts * weights
+
+    def descend(theta, damping):
+        theta, losses, damping = program(theta, damping)
+        if not np.isfinite(losses).all():
+            raise ValueError("∇S(params, w) is not finite on the training pairs at the start")
+        return theta, float(np.mean(losses)), np.asarray(damping)
+
+    def validation_rms(theta):
+        return math.sqrt(float(_loss_of_mean(family, held, theta, layout=layout)))
+
+    started, unknown = time.perf_counter(), np.full(len(theta), math.nan)
+    compiled = _compiled_on_devices if row_blocks.devices() else _compiled_together
+    program = compiled(family, on_device, theta, layout)
+    _loss_of_mean.lower(family, held, theta, layout=layout).compile()
+    compile_seconds = time.perf_counter() - started
+    options = Limits(
+        max_iterations, block, target_rms, patience, (on_progress, checkpoint)
+    )  # fmt: skip
+    first = first_state(theta, unknown, validation_rms(theta)) if resume is None else resume
+    state, why = trained(first, descend, validation_rms, w.size, options)
+    each = [unflattened(one, layout) for one in np.asarray(state.best_theta)]
+    return result_of(state, jax.tree.map(lambda *a: np.stack(a), *each), compile_seconds, why)
+
+
+def _compiled_together(family, rows, theta, layout):
+    """One trial step of all members (θ, μ) -> (θ, F, μ), compiled."""
+    given = (family, *jax.device_put(rows))
+    unknown = np.full(len(theta), math.nan)
+    _descend_together.lower(*given, theta, unknown, layout=layout).compile()
+    return partial(_descend_together, *given, layout=layout)
+
+
+def _compiled_on_devices(family, rows, theta, layout):
+    """The same, each member by itself on the next device that is free."""
+    points, weights = rows
+    own = [weights[i : i + 1] for i in range(len(theta))]
+    placed = {d: jax.device_put((family, points, own), d) for d in row_blocks.devices()}
+
+    def compile_on(device, _) -> None:
+        family, points, own = placed[device]
+        unknown = np.full(1, math.nan)
+        _descend_together.lower(family, points, own[0], theta[:1], unknown, layout=layout).compile()
+
+    def program(theta, damping):
+        def of_one(i: int, device):
+            family, points, own = placed[device]
+            start = theta[i : i + 1], damping[i : i + 1]
+            found = _descend_together(family, points, own[i], *start, layout=layout)
+            return jax.tree.map(np.asarray, found)
+
+        found = row_blocks.each(of_one, range(len(theta)))
+        return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
+
+    row_blocks.each(compile_on, placed)
+    return program
+
+
+@partial(jax.jit, static_argnames="layout")
+def _descend_together(family, points, weights, thetas, dampings, *, layout):
+    """One trial step of every member: θ (E, P), F and μ (E,) after it, θ as before where F did not
+    fall. The products AᵀA of all members are one batched product of matrices."""
+
+    def of_one(theta, damping, weight):
+        chunks = (*points, weight)
+        matrix, slope, loss = linearize(family, chunks, theta, layout=layout)
+        first = 1e-3 * jnp.max(jnp.diagonal(matrix))
+        damping = jnp.where(jnp.isnan(damping), first, damping)
+        trial, trial_loss, promised = attempt(
+            family, chunks, theta, matrix, slope, damping, layout=layout
+        )
+        decrease = loss - trial_loss
+        better = decrease > 0
+        shrunk = damping * jnp.maximum(1 / 3, 1 - (2 * decrease / promised - 1) ** 3)
+        return (
+            jnp.where(better, trial, theta),
+            jnp.where(better, trial_loss, loss),
+            jnp.where(better, shrunk, TOGETHER_GROWTH * damping),
+        )
+
+    return jax.vmap(of_one)(thetas, dampings, weights)
+
+
+@partial(jax.jit, static_argnames="layout")
+def _loss_of_mean(family, held, thetas, *, layout):
+    """The mean square of a component of the residual of the members' mean ∇S."""
+    each = jax.vmap(lambda theta: residual(family, layout, theta, *held))(thetas)
+    return jnp.mean(jnp.mean(each, axis=0) ** 2)

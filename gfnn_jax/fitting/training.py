@@ -1,0 +1,160 @@
+"""Training in iterations: the state of one, when there is no further one, what came of it.
+
+A method makes an iteration; here it is repeated in blocks, units of a fit's budget, and the
+parameters are kept that fit the validation pairs best.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gfnn_jax.errors import OutOfTime
+
+BLOCK = 10  # iterations that are made together: a unit of a fit's budget
+
+
+class LMState(NamedTuple):
+    """All that the next iteration depends on: arrays and numbers, ready for a checkpoint.
+
+    theta, best_theta: flattened parameters (P,), of now and of the best validation error so far.
+    damping:           μ; NaN before the first iteration, which takes it from AᵀA. (E,) of members
+                       that are trained together, whose theta are (E, P).
+    iteration:         iterations done.
+    train_rms, validation_rms, best_validation_rms: of ∇S − target_gradient, per
+                       component.
+    landmark_rms, landmark_iteration: the train_rms that progress is measured from, and its time.
+    seconds:           time spent so far, without compilation.
+    """
+
+    theta: Any
+    best_theta: Any
+    damping: Any
+    iteration: int
+    train_rms: float
+    validation_rms: float
+    best_validation_rms: float
+    landmark_rms: float
+    landmark_iteration: int
+    seconds: float
+
+
+class LMResult(NamedTuple):
+    """params: the parameters with the lowest validation error met, in the pytree that was given.
+
+    train_rms is of the last iteration, validation_rms of ``params``; both are per component of ∇S,
+    so that dt times them is the one-step state error to first order in dt. iterations and seconds
+    include what was resumed from. stopped_because: target, iterations, budget or no progress.
+    """
+
+    params: Any
+    train_rms: float
+    validation_rms: float
+    iterations: int
+    seconds: float
+    compile_seconds: float
+    stopped_because: str
+
+
+class Limits(NamedTuple):
+    """Limits of a training, and what is called with its states."""
+
+    max_iterations: int
+    block: Callable[[int], AbstractContextManager]
+    target_rms: float
+    patience: int
+    told: tuple[Callable[[LMState], Any] | None, ...]
+
+
+def trained(state: LMState, descend, validation_rms, size: int, options: Limits):
+    """The last state from this one on, and why there is no further one."""
+    started, seconds_before = time.perf_counter(), state.seconds
+
+    def reason_to_stop(state):
+        if state.best_validation_rms <= options.target_rms:
+            return "target"
+        if state.iteration >= options.max_iterations:
+            return "iterations"
+        if state.iteration - state.landmark_iteration >= options.patience:
+            return "no progress"
+        return None
+
+    def iterate(state):
+        """The next state, or None where no step lowers F."""
+        step = descend(state.theta, state.damping)
+        if step is None:
+            return None
+        theta, loss, damping = step
+        train_rms = math.sqrt(loss / size)
+        seconds = seconds_before + time.perf_counter() - started
+        state = _next_state(state, theta, damping, train_rms, validation_rms(theta), seconds)
+        for report in options.told:
+            if report is not None:
+                report(state)
+        return state
+
+    while (stopped_because := reason_to_stop(state)) is None:
+        try:
+            with options.block(BLOCK):
+                for _ in range(BLOCK):
+                    further = iterate(state)
+                    if further is None:
+                        return state, "no progress"
+                    state = further
+                    if reason_to_stop(state) is not None:
+                        break
+        except OutOfTime:
+            return state, "budget"
+    return state, stopped_because
+
+
+def result_of(state: LMState, params, compile_seconds: float, stopped_because: str) -> LMResult:
+    return LMResult(
+        params=jax.tree.map(jnp.asarray, params),
+        train_rms=state.train_rms,
+        validation_rms=state.best_validation_rms,
+        iterations=state.iteration,
+        seconds=state.seconds,
+        compile_seconds=compile_seconds,
+        stopped_because=stopped_because,
+    )
+
+
+def first_state(theta, damping, validation_rms):
+    return LMState(
+        theta=np.asarray(theta),
+        best_theta=np.asarray(theta),
+        damping=damping,
+        iteration=0,
+        train_rms=math.nan,
+        validation_rms=validation_rms,
+        best_validation_rms=validation_rms,
+        landmark_rms=math.inf,
+        landmark_iteration=0,
+        seconds=0.0,
+    )
+
+
+def _next_state(state, theta, damping, train_rms, validation_rms, seconds):
+    theta, iteration = np.asarray(theta), state.iteration + 1
+    better = validation_rms < state.best_validation_rms
+    progress = train_rms < 0.99 * state.landmark_rms
+    return LMState(
+        theta=theta,
+        best_theta=theta if better else state.best_theta,
+        damping=damping,
+        iteration=iteration,
+        train_rms=train_rms,
+        validation_rms=validation_rms,
+        best_validation_rms=validation_rms if better else state.best_validation_rms,
+        landmark_rms=train_rms if progress else state.landmark_rms,
+        landmark_iteration=iteration if progress else state.landmark_iteration,
+        seconds=seconds,
+    )

@@ -1,0 +1,60 @@
+"""The fit of a law whose terms are given: no search, but for the friction where none was named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of, with_states
+from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.maps.observation import Observation
+from gfnn_jax.models import libraries
+from gfnn_jax.models.given_terms import Given
+from gfnn_jax.models.law_fit import LawFit, Workbench
+from gfnn_jax.models.law_search import SearchOptions, choose_friction, describe
+from gfnn_jax.models.structure import Structure
+from gfnn_jax.models.weak_start import weak_start
+
+
+def fit_given(
+    given: Given, nodes: Sequence[Nodes], scales: Scales, angles: tuple[int, ...], num_inputs: int,
+    inputs: Mapping[str, Callable], seen: Observation, told: Callable[[str], object],
+    options: SearchOptions,
+) -> tuple[LawFit, str, list[Nodes]]:  # fmt: skip
+    """What `law_search.search` returns, with exactly the terms that are given."""
+    d = seen.dim
+    gauge = np.concatenate([n.x[:, :d] for n in nodes])
+    benches = {hold: Workbench(gauge, u, scales.omega, seen) for hold, u in inputs.items()}
+    sensors = tuple(zip(seen.parameters, map(float, seen.values), strict=True))
+    linear = tuple(libraries.losses(d, (LINEAR,), 0.0)[:d])
+    friction = linear if given.friction is None else given.friction
+    structure = Structure(d, given.terms, friction, (), num_inputs, sensors)
+    structure, known = weak_start(structure, nodes, scales, prune=False)
+    plain = all(row[3] == 0 for row in given.terms)  # a sine or a phase says where zero is
+    turned = [i for i in angles if i in seen.direct and i not in seen.shifts()]
+    zeros = [i for i in turned if plain and any(row[2][i] for row in given.terms)]
+    structure = structure.plus([("zero", i) for i in zeros])
+    fits: dict[str, LawFit] = {}
+    for periods in options.periods:
+        arcs = arcs_of(nodes, max(6, round(periods * scales.per_period)))
+        if fits and arcs.t.shape == next(iter(fits.values())).arcs.t.shape:
+            break  # no run is longer
+        for hold, bench in benches.items():
+            before = fits.get(hold)
+            if before is None:
+                fits[hold] = bench.fit(structure, known, arcs, scales.sigma)
+            else:
+                fits[hold] = bench.fit(structure, before.values, arcs, before.sigma)
+        hold = min(fits, key=lambda one: float(np.max(fits[one].rms() / scales.sigma)))
+        benches, fits = {hold: benches[hold]}, {hold: fits[hold]}
+        nodes = with_states(nodes, fits[hold].arcs, fits[hold].fitted.x)
+        told(f"{periods:g} periods: {describe(fits[hold])}")
+    ((hold, fit),) = fits.items()
+    if given.friction is None and (options.choose_friction or options.frictions):
+        width = options.dry_width * float(np.mean(scales.speed))
+        fit = choose_friction(benches[hold], nodes, fit, width, told, options)
+    elif given.friction is None:
+        drop = {("loss", row) for row in fit.structure.friction}
+        fit = benches[hold].fit(fit.structure.without(drop), fit.values, fit.arcs, fit.sigma)
+    return fit, hold, with_states(nodes, fit.arcs, fit.fitted.x)
