@@ -331,12 +331,12 @@ def fit(
         for asked, same in structures_to_try(request, data):
             request, data = asked, same
             seen = diagnose_request(request, data)
+            warn(seen.messages)
             if seen.damping is not None:
                 on_progress(str(seen.damping))
             found = searched(request, data, seen, on_better)
             if found.met_by_law:
                 break
-        warn(seen.messages)
         seen, found, about_pairs = without_gross_errors(request, seen, found)
         warn(about_pairs)
         found = without_bias(found, request)
