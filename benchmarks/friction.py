@@ -1,13 +1,14 @@
 """Friction: H with uniform or linear friction from clean pairs, and systems without any.
 
-    python benchmarks/friction.py            every row (about five minutes on two cores)
+    python benchmarks/friction.py            every row (about eight minutes on two cores)
     python benchmarks/friction.py --quick    two of them
 
 Each row learns from 200 pairs of a system whose law is known, and judges by states that no fit has
 seen: the one-step error, the coefficients of H and of friction, the defect ‖AᵀJA − μJ‖ of the
 executed step where a multiplier μ is claimed, and the energy along 1,000 steps beside that of
 another integrator, in units of its start. Of systems that keep their energy: whether friction is
-reported.
+reported. Of simulated recordings of positions with noise 1e-3 (`friction_kinds`): which kinds of
+friction are found.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import friction_kinds
 import numpy as np
 from harness import (
     SEED,
@@ -241,13 +243,16 @@ def twins(quick: bool) -> Numbers:
     return {"cases": cases, "reported": sum(bool(c["friction"]) for c in cases)}
 
 
-PIECES = {**{name: partial(with_friction, name) for name in SYSTEMS}, "twins": twins}
+PIECES = {
+    **{name: partial(with_friction, name) for name in SYSTEMS}, "twins": twins,
+    "which": friction_kinds.which, "none": friction_kinds.none,
+}  # fmt: skip
 
 
 def tables() -> None:
     """The table of RESULTS.md."""
     found = results(PIECES, "friction")
-    apart = found.pop("twins", None)
+    apart, which, none = (found.pop(name, None) for name in ("twins", "which", "none"))
     heads = ("system", "law", "coefficients", "friction", "one-step RMS", "μ", "defect",
              "energy, 1,000 steps", "fit, CPU s")  # fmt: skip
     before, after = (
@@ -267,7 +272,24 @@ def tables() -> None:
             f"\n\nOf {len(m['cases'])} fits of systems that keep their energy, with noise and "
             f"without, {m['reported']} report friction."
         )
+    if which is not None and none is not None:
+        text += f"\n\n{kinds_found(which['measured'], none['measured'])}"
     between_markers(TABLES, "friction", text)
+
+
+def kinds_found(which: Numbers, none: Numbers) -> str:
+    """A table of the recordings with each kind of friction, and a sentence."""
+    rows = [
+        [c["system"], "+".join(c["true"]), "+".join(c["found"]) or "none",
+         number(c["standard_errors"]), number(c["processor_seconds"])]
+        for c in which["cases"]
+    ]  # fmt: skip
+    heads = ("recording", "friction put in", "found", "coefficients, standard errors", "fit, CPU s")
+    return (
+        f"{markdown(heads, rows)}\n\nOf {len(which['cases'])} recordings the kinds of "
+        f"{which['right']} are found; of {len(none['cases'])} without friction {none['reported']} "
+        "report some."
+    )
 
 
 if __name__ == "__main__":

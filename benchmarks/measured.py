@@ -1,35 +1,45 @@
 """Measured records: the law of each from positions alone, and its forecasts of a part held out.
 
-    python benchmarks/measured.py DIR                     all records of the folder DIR
-    python benchmarks/measured.py DIR --only arm2 --fold 1
-    python benchmarks/measured.py DIR --quick             the four short records of 2009
+    python benchmarks/measured.py DIR                       all records of the folder DIR
+    python benchmarks/measured.py DIR --only arm2,video_double_pendulum --thirds 1
+    python benchmarks/measured.py DIR --quick               the four short records, into runs/
 
 DIR holds the records by name (pendulum.csv, arm1.csv, …); those that are not there are left out. Of
-each a third is held out: every third run, or the last third of each run (``--fold`` 0, 1, 2 is the
-first, middle or last). From 20 samples before a time in it the state is estimated, and the
-forecast compared with what was measured: medians over windows of the worst coordinate's error, by
-the time ahead; the rest of the record from one state; the share of errors within two standard
-deviations; seconds of the processor.
+each a third is held out in turn: every third run, or the first, middle and last third of each run.
+From 20 samples before a time in it the state is estimated, and the forecast compared with what was
+measured: medians over windows of the worst coordinate's error, by the time ahead; the rest of each
+held-out part from one state; the share of errors within two standard deviations; seconds of the
+processor. A third that has a result is not measured again (`--overwrite`).
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
 from typing import Any
 
-import jax
+import matplotlib.pyplot as plt
 import numpy as np
+
+# Sets float64, so it comes before all of JAX.
+from harness import (
+    FIGURES,
+    RESULTS,
+    TABLES,
+    Numbers,
+    between_markers,
+    markdown,
+    provenance,
+    read,
+    write,
+)
 
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import stretches
+from gfnn_jax.evaluate import figures
 from gfnn_jax.maps.estimates import Window, estimate_states, law_of, propagate
 
-jax.config.update("jax_enable_x64", True)
-
-OUT = Path(__file__).resolve().parent / "results" / "measured.json"
 SHORT = ("pendulum", "air_track", "two_carts", "double_pendulum")
 # name -> (times ahead in s, unit, {time or "rest": asked}, most seconds of the processor)
 RECORDS: dict[str, tuple[tuple[float, ...], float, dict[Any, float], float]] = {
@@ -44,28 +54,93 @@ RECORDS: dict[str, tuple[tuple[float, ...], float, dict[Any, float], float]] = {
     "robot_arm": ((0.1, 0.5, 1), 1e3, {1: 50}, 60),
     "silverbox": ((0.1, 0.5, 1), 1e3, {"rest": 0.24}, 60),
 }
-SAMPLES, WINDOWS = 20, 120
+THIRDS = ("first", "middle", "last")
+SAMPLES, WINDOWS, PERIODS = 20, 120, 60
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path, metavar="DIR")
-    parser.add_argument("--only", nargs="*", default=[], metavar="NAME")
-    parser.add_argument("--fold", type=int, choices=(0, 1, 2), default=2)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("folder", type=Path, nargs="?", metavar="DIR")
+    parser.add_argument("--only", metavar="A,B", help=", ".join(RECORDS))
+    parser.add_argument("--thirds", default="2,0,1", metavar="0,1,2", help="that are held out")
+    parser.add_argument("--quick", action="store_true", help="short records, the last third only")
+    parser.add_argument("--overwrite", action="store_true", help="measure finished thirds again")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
     parser.add_argument("--verbose", action="store_true")
     arguments = parser.parse_args()
-    names = arguments.only or (SHORT if arguments.quick else tuple(RECORDS))
-    found = {}
-    for name in names:
-        path = arguments.folder / f"{name}.csv"
-        if path.is_file():
-            found[name] = measure(name, path, arguments.fold, print if arguments.verbose else None)
-            print(line(name, found[name]), flush=True)
-    if not arguments.only:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n")
+    folder = arguments.out or (Path("runs") / "measured" if arguments.quick else RESULTS)
+    names = tuple(arguments.only.split(",")) if arguments.only else tuple(RECORDS)
+    unknown = [name for name in names if name not in RECORDS]
+    if unknown:
+        parser.error(f"unknown record '{unknown[0]}'; records: {', '.join(RECORDS)}")
+    names = tuple(n for n in names if n in SHORT) if arguments.quick else names
+    thirds = ("2",) if arguments.quick else tuple(arguments.thirds.split(","))
+    records = arguments.folder or Path()
+    for third in thirds:
+        for name in names if arguments.folder else ():
+            path, out = records / f"{name}.csv", folder / f"measured-{name}.json"
+            done = read({name: out}).get(name, {}).get("measured", {})
+            if not path.is_file() or (third in done and not arguments.overwrite):
+                continue
+            told = print if arguments.verbose else None
+            done[third] = measure(name, path, int(third), told)
+            write(out, {"piece": name, "measured": dict(sorted(done.items()))})
+            print(line(name, done[third]), flush=True)
+    if folder == RESULTS:
+        tables()
+
+
+def tables() -> None:
+    """The table of RESULTS.md, and the figure, of the results there are."""
+    found = read({name: RESULTS / f"measured-{name}.json" for name in RECORDS})
+    if not found:
+        return
+    rows = []
+    for name, result in found.items():
+        for third, m in result["measured"].items():
+            ahead = [
+                f"{t} s {e:.3g}" + (f" (≤ {m['asked'][t]:g})" if t in m["asked"] else "")
+                + f" [{m['within_two_deviations'][t]:.0%}]"
+                for t, e in m["median"].items() if e is not None
+            ]  # fmt: skip
+            rest = ", ".join(f"{r:.3g}" for r in m["rest"][:3])
+            rest += " …" if len(m["rest"]) > 3 else ""
+            rest += f" (≤ {m['asked']['rest']:g})" if "rest" in m["asked"] else ""
+            rows.append([
+                name, THIRDS[int(third)], "; ".join(ahead), rest,
+                m["which_friction"], f"{m['seconds']:.0f} (≤ {m['most_seconds']})",
+            ])  # fmt: skip
+    heads = ("record", "third held out", "median error ahead (asked) [within 2 σ]",
+             "rest of a part, RMS", "friction", "CPU s")  # fmt: skip
+    between_markers(TABLES, "measured", f"{markdown(heads, rows)}\n\n{provenance(found)}")
+    draw(found)
+
+
+def draw(found: dict[str, Numbers]) -> None:
+    """Median errors by the time ahead: a panel for each record, a line for each third, and a mark
+    for what was asked."""
+    with figures.style():
+        grid, axes = plt.subplots(
+            2, -(-len(found) // 2), figsize=(2.4 * -(-len(found) // 2), 4.6), squeeze=False,
+            layout="constrained",
+        )  # fmt: skip
+    for ax in axes.ravel()[len(found) :]:
+        ax.axis("off")
+    for ax, (name, result) in zip(axes.ravel(), found.items(), strict=False):
+        for third, m in sorted(result["measured"].items()):
+            seen = [(float(t), e) for t, e in m["median"].items() if e is not None]
+            look = {"label": THIRDS[int(third)], "color": f"C{third}"}
+            ax.plot(*zip(*seen, strict=True), ".-", **look)
+        asked = [(t, e) for t, e in RECORDS[name][2].items() if t != "rest"]
+        if asked:
+            ax.plot(*zip(*asked, strict=True), "k_", ms=10)
+        ax.set_title(name)
+        ax.set_ylim(bottom=0)
+    axes[0, 0].legend(title="third held out", fontsize=7, title_fontsize=7)
+    grid.supxlabel("time ahead [s]")
+    grid.supylabel("median error [mrad, units, mV]")
+    FIGURES.mkdir(exist_ok=True)
+    figures.save(grid, FIGURES / "measured.png")
 
 
 def measure(name: str, path: Path, fold: int, told: Any = None) -> dict[str, Any]:
@@ -84,9 +159,13 @@ def measure(name: str, path: Path, fold: int, told: Any = None) -> dict[str, Any
     rest = rest_of_record(fit.map, held)
     return {
         "formula": fit.formula, "friction": fit.friction.formula, "text": fit.table.split("\n")[:2],
+        "which_friction": "+".join(fit.which_friction.kinds) or "none",
+        "odds": fit.which_friction.odds,
         "seconds": seconds, "most_seconds": most, "unit": unit,
         "asked": {str(k): v for k, v in asked.items()},
-        "median": {str(t): e * unit for t, e in zip(times, errors, strict=True)},
+        "median": {
+            str(t): None if e is None else e * unit for t, e in zip(times, errors, strict=True)
+        },
         "within_two_deviations": {str(t): w for t, w in zip(times, within, strict=True)},
         "rest": [r * unit for r in rest],
         "residual": {k: v * unit for k, v in fit.residual.items()},
@@ -131,9 +210,9 @@ def table(part: Any, run: str, label: str) -> dict[str, Any]:
 
 def forecasts(
     map_: Any, held: list[Any], times: tuple[float, ...]
-) -> tuple[list[float], list[float]]:
+) -> tuple[list[float | None], list[float | None]]:
     """Median over windows of the worst coordinate's error at each time ahead, and the share within
-    two standard deviations."""
+    two standard deviations; None where no part is that long."""
     law = law_of(map_)
     parts = [s for recording in held for s in stretches(recording)]
     places = [(s, k) for s in parts for k in range(SAMPLES - 1, len(s.t) - 1)
@@ -152,20 +231,26 @@ def forecasts(
     last = np.array([w.t[-1] for w in windows])
     orbits = propagate(law, windows, x, covariance, last, np.array(ahead))
     error = np.abs(orbits.values - np.array(measured))
-    median = np.nanmedian(error, axis=0).max(axis=1)
-    good = np.where(np.isfinite(error), error <= 2 * orbits.std, np.nan)
-    return median.tolist(), np.nanmean(good, axis=(0, 2)).tolist()
+    seen = np.isfinite(error)
+    median, share = [], []
+    for n in range(len(times)):
+        some = seen[:, n].all(axis=1)
+        median.append(float(np.median(error[some, n], axis=0).max()) if some.any() else None)
+        good = error[some, n] <= 2 * orbits.std[some, n]
+        share.append(float(np.mean(good)) if some.any() else None)
+    return median, share
 
 
 def rest_of_record(map_: Any, held: list[Any]) -> list[float]:
-    """RMS of the worst coordinate over each held-out part, from its first 20 samples."""
-    found = []
+    """RMS of the worst coordinate over each held-out part, from its first 20 samples, for at most
+    60 periods of the fastest motion."""
+    found, longest = [], 2 * np.pi * PERIODS / law_of(map_).sensors.omega
     for recording in held:
         run = recording.runs[0]
         t = recording.times(run)
         start = recording.slice(stop=t[SAMPLES - 1])
-        later = recording.slice(start=t[SAMPLES])
-        every = max(1, len(t) // 2_000)
+        later = recording.slice(t[SAMPLES], t[SAMPLES] + longest)
+        every = max(1, len(later.times(run)) // 1_000)
         times = later.times(run)[::every]
         predicted = map_.forecast(start, times, recording if recording.inputs else None)
         rms = []
@@ -182,7 +267,7 @@ def line(name: str, m: dict[str, Any]) -> str:
     told = [
         f"{t} s {e:.3g}" + (f" (≤ {m['asked'][t]:g})" if t in m["asked"] else "")
         + f" [{m['within_two_deviations'][t]:.0%}]"
-        for t, e in m["median"].items()
+        for t, e in m["median"].items() if e is not None
     ]  # fmt: skip
     rest = ", ".join(f"{r:.3g}" for r in m["rest"])
     limit = f" (≤ {m['asked']['rest']:g})" if "rest" in m["asked"] else ""

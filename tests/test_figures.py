@@ -66,7 +66,11 @@ def test_every_figure_is_labelled_saved_and_leaves_matplotlib_as_it_was(name, tm
     assert axes[0].get_ylabel()
     assert axes[-1].get_xlabel()
     assert name == "sections" or all(ax.get_legend() is not None for ax in axes)
-    figures.save(axes[0].figure, tmp_path / "figure.png")
+    figure = axes[0].figure
+    figures.save(figure, tmp_path / "figure.png")
+    drawn, size = figure.get_tightbbox(), figure.get_size_inches()
+    assert (drawn.min >= 0).all(), "a label is cut off"
+    assert (drawn.max <= size).all(), "a label is cut off"
     assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
     assert dict(matplotlib.rcParams) == before
 

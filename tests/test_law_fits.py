@@ -15,7 +15,7 @@ from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import interpolate
 from gfnn_jax.models.law_text import speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
-from gfnn_jax.solve.latent_arcs import Observed, Steps, fit_arcs
+from gfnn_jax.solve.latent_arcs import Observed, Steps, fit_arcs, rows_of_arcs
 
 
 def pendulum(gamma=0.05, noise=1e-3, end=40.0, dt=0.05, amplitude=1.2):
@@ -79,6 +79,27 @@ def test_arcs_with_latent_states_find_a_rate_and_its_error():
     assert 0.75 < std.mean() / p.std() < 1.35
     fit = fit_arcs(_Decay(), np.array([0.1]), x, y, np.array([sigma]), np.array([sigma]))
     np.testing.assert_allclose(fit.x[:, 1:], np.exp(-0.1 * fit.p[0]) * fit.x[:, :-1], atol=1e-6)
+
+
+def test_rows_of_arcs_tell_the_residuals_of_other_coefficients():
+    """Against a fit of the states alone, the coefficient held elsewhere."""
+    t, k, sigma = 0.1 * np.arange(20), 0.7, np.array([0.3])  # no residual is an outlier
+    rng = np.random.default_rng(0)
+    y = np.array([[2.0], [-1.5]]) * np.exp(-k * t) + 0.01 * rng.normal(size=(2, 20))
+    y[0, 3] = np.nan
+    y = y[..., None]
+    x = np.where(np.isfinite(y), y, 0.0)
+    fit = fit_arcs(_Decay(), np.array([0.1]), x, y, sigma, sigma)
+    rows = rows_of_arcs(_Decay(), fit.p, fit.x, y, sigma)
+    assert rows.shape == (2, 20, 1, 2)
+    for change in (0.0, 0.01):
+        states = np.exp(-(fit.p[0] + change) * t)[:, None]
+        for arc in range(2):
+            seen = np.isfinite(y[arc, :, 0])
+            start = np.linalg.lstsq(states[seen], y[arc, seen], rcond=None)[0]
+            expected = np.sum((y[arc, seen] - states[seen] @ start) ** 2) / sigma**2
+            found = np.sum((rows[arc] @ [-change, 1.0]) ** 2)
+            np.testing.assert_allclose(found, expected, rtol=0.01)
 
 
 def test_steps_have_the_derivatives_of_finite_differences():
@@ -165,6 +186,33 @@ def test_a_damped_pendulum_from_noisy_angles(swing):
     assert abs(loss.coefficient - 0.025) < 4 * loss.std < 0.003
     assert fit.noise["theta"] == pytest.approx(1e-3, rel=0.2)
     assert abs(fit.energy["closure"]) < 0.01 * abs(fit.energy["stored"])
+
+
+def test_the_friction_that_a_record_shows(swing):
+    """Linear friction is told from the others, and limits of these are below what was put in."""
+    _, fit = swing
+    found = fit.which_friction
+    assert found.kinds == ("linear",)
+    assert found.odds["none"] > 1e6
+    assert found.odds["dry"] > 20
+    assert all(0 < limit < 0.002 for limit in found.limits.values())
+    assert "not seen: |ω|³ < 0.00" in str(found)
+    t, theta = pendulum(gamma=0.0, end=25.0)
+    recording = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
+    without = gfnn.fit(recording)
+    assert without.friction.terms == ()
+    assert without.which_friction.kinds == ()
+    assert max(without.which_friction.limits.values()) < 1e-3
+    dry = gfnn.fit(recording, friction="dry+linear")  # told to, it takes what dissipates
+    assert all(term.coefficient > 0 for term in dry.friction.terms)
+
+
+def test_energy_that_no_input_explains_is_named():
+    t, theta = pendulum(gamma=-0.03, end=25.0, amplitude=0.6)
+    recording = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
+    fit = gfnn.fit(recording)
+    assert fit.friction.terms == ()
+    assert any("gains energy that no input explains" in message for message in fit.messages)
 
 
 def test_forecasts_hold_what_their_bands_say(swing):
@@ -288,6 +336,9 @@ def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs():
     for name, value in (("u", 3.0), ("w", 0.0)):
         gain, std = fit.gains[name]["x"]
         assert abs(gain - value) < 4 * std < 0.05, name
+    named = [message for message in fit.messages if message.startswith("no force of input")]
+    assert len(named) == 1
+    assert "input w " in named[0]
     assert fit.friction.terms[0].coefficient == pytest.approx(0.1, rel=0.05)
     ahead = gfnn.Recording({k: v[500:] for k, v in table.items()}, positions=["x"],
                            inputs=["u", "w"])  # fmt: skip

@@ -63,7 +63,9 @@ def style():
 @style()
 def save(figure: Figure, path) -> None:
     """Write a figure as ``.png`` (200 dots per inch) or ``.pdf``, by the suffix of ``path``."""
-    figure.savefig(Path(path), dpi=200, bbox_inches="tight")
+    # A layout engine leaves room for all labels; "tight" would draw everything a second time.
+    whole = figure.get_layout_engine() is not None
+    figure.savefig(Path(path), dpi=200, bbox_inches=None if whole else "tight")
 
 
 def _axes(ax, width=WIDTH, height=HEIGHT) -> Axes:

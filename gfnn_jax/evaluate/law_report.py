@@ -49,7 +49,13 @@ def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:
         },
         "hamiltonian": _law(fit.hamiltonian),
         "lagrangian": {**_law(fit.lagrangian), "text": str(fit.lagrangian)},
-        "friction": {**_law(fit.friction), "text": str(fit.friction)},
+        "friction": {
+            **_law(fit.friction),
+            "text": str(fit.friction),
+            "kinds": list(fit.which_friction.kinds),
+            "odds": dict(fit.which_friction.odds),
+            "limits": dict(fit.which_friction.limits),
+        },
         "inputs": {
             "hold": sensors.hold,
             "delay": sensors.delay,

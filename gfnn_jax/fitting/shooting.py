@@ -125,8 +125,8 @@ class Shooting:
         self.least = max(resolved, float(np.finfo(float).eps)) * scale
 
     def fit(self, family, coefficients, *, only_states: bool = False) -> Shot | None:
-        """From coefficients that are close, or with these as they are (``only_states``); every arc
-        starts from one of its own states. None where the flow fails."""
+        """Fit from coefficients that are close, or with these as they are (``only_states``);
+        every arc starts from one of its own states. None where the flow fails."""
         c, x = np.array(coefficients, float), self._starts(family, coefficients)
         residual = self.residuals(family, c, x)
         noise = self._deviations(residual)

@@ -9,6 +9,7 @@ from gfnn_jax.flows.motion import NODES
 
 HOLDS = ("hold", "linear", "band")
 _TAPS = 32  # samples on either side, of band-limited interpolation
+_AT_ONCE = 4_096  # times
 
 
 def stage_times(t: np.ndarray, substeps: int) -> np.ndarray:
@@ -46,14 +47,13 @@ def _band_limited(t: np.ndarray, u: np.ndarray, at: np.ndarray) -> np.ndarray:
     well below its Nyquist frequency; the ends repeat their last value."""
     step = (t[-1] - t[0]) / (len(t) - 1)
     x = (at - t[0]) / step
-    nearest = np.floor(x).astype(int)
-    found = np.zeros((len(at), u.shape[1]))
-    total = np.zeros(len(at))
-    for k in range(-_TAPS + 1, _TAPS + 1):
-        index = nearest + k
-        s = x - index
-        window = np.i0(8 * np.sqrt(np.clip(1 - (s / _TAPS) ** 2, 0, None))) / np.i0(8.0)
-        weight = np.sinc(s) * window
-        total += weight
-        found += weight[:, None] * u[np.clip(index, 0, len(t) - 1)]
-    return found / total[:, None]
+    found = np.empty((len(at), u.shape[1]))
+    for first in range(0, len(at), _AT_ONCE):
+        some = x[first : first + _AT_ONCE, None]
+        index = np.floor(some).astype(int) + np.arange(1 - _TAPS, _TAPS + 1)
+        s = some - index
+        weight = np.sinc(s) * np.i0(8 * np.sqrt(np.clip(1 - (s / _TAPS) ** 2, 0, None)))
+        weight /= weight.sum(axis=1, keepdims=True)
+        near = u[np.clip(index, 0, len(t) - 1)]
+        found[first : first + _AT_ONCE] = np.einsum("nk,nkj->nj", weight, near)
+    return found

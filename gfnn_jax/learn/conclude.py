@@ -109,7 +109,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
 
 
 def _with_clock(ended: str, budget: Budget) -> str:
-    """Why the search ended, and that a budget did, wherever a unit of it was left out."""
+    """Reason why the search ended, and that a budget did, wherever a unit of it was left out."""
     clock = budget.ended
     if not clock or clock in ended:
         return ended

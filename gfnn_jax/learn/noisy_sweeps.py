@@ -207,7 +207,7 @@ class NoisySweep(LinearSweep):
         return validated(candidate, self.data, self.tolerance, self.chart, size.family, params)
 
     def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """By a fit to the states that other rows most likely had."""
+        """Predict by a fit to the states that other rows most likely had."""
         return self._predicted(size, self._rows(others), rows)
 
     def own_error(self, size: Size) -> float:

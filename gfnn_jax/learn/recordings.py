@@ -26,17 +26,26 @@ from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.arc_inputs import ArcInputs
 from gfnn_jax.models.calibration import calibrated
+from gfnn_jax.models.friction_choice import FrictionChoice
 from gfnn_jax.models.given_law import fit_given
 from gfnn_jax.models.given_terms import Given, given_terms
 from gfnn_jax.models.law_fit import LawFit, Workbench
-from gfnn_jax.models.law_search import FRICTIONS, SearchOptions, search
-from gfnn_jax.models.law_text import Expression, friction_of, speed_names, terms_of
+from gfnn_jax.models.law_search import SearchOptions, search
+from gfnn_jax.models.law_text import (
+    Expression,
+    friction_of,
+    speed_names,
+    terms_of,
+    which_friction_told,
+)
 from gfnn_jax.models.learned_law import LearnedLaw, NextMotion, hamiltonian_of, in_columns, scaled
+from gfnn_jax.models.libraries import FRICTIONS
 from gfnn_jax.models.next_motion import Motion, next_motions
 from gfnn_jax.models.residuals import Trace, whiteness
 from gfnn_jax.models.velocities import Velocity, velocities, with_channels
 
 _IMITATED = 1e-4  # of what a sensor's parameter changes, that no coefficient of the law does
+_SEEN = 3.0  # standard errors of a gain, below which its input is not seen to act
 _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apart
 
 
@@ -83,17 +92,17 @@ def fit_recording(
     inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
     record = (nodes, scales, angles, len(recording.inputs), inputs, seen, told, options)
     gauge_of = np.concatenate([n.x[:, : seen.dim] for n in nodes])
-    fit, hold, nodes = search(*record) if asked is None else fit_given(asked, *record)
+    fit, choice, hold, nodes = search(*record) if asked is None else fit_given(asked, *record)
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
         raise FitError("no law of the library follows this recording: its arcs could not be closed")
     speeds = velocities(recording, fit, nodes)
-    used = tuple(name for name, one in speeds.items() if one.used)
+    honest = tuple(name for name, one in speeds.items() if one.used)
     for name, one in speeds.items():
         told(f"{name}: {one.text}")
-    if used:
-        own = np.array([speeds[name].sigma for name in used])
-        seen = seen.beside({n: recording.velocities.index(n) for n in used})
-        nodes, arcs = with_channels(recording, nodes, fit.arcs, fit.fitted.x, used)
+    if honest:
+        own = np.array([speeds[name].sigma for name in honest])
+        seen = seen.beside({n: recording.velocities.index(n) for n in honest})
+        nodes, arcs = with_channels(recording, nodes, fit.arcs, fit.fitted.x, honest)
         bench = Workbench(gauge_of, inputs[hold], scales.omega, seen)
         fit = bench.fit(fit.structure, fit.values, arcs, np.concatenate([fit.sigma, own]))
         scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, own]))
@@ -105,10 +114,12 @@ def fit_recording(
     law, covariance = in_columns(fit)
     names = recording.coordinates
     gauge = f"the mean of M11 over the data is 1 ({names[0]})"
+    scale = 1.0
     if mass:
         (name, value), i = next(iter(mass.items())), names.index(next(iter(mass)))
         masses = law.masses(np.concatenate([n.x[:, : fit.form.dim] for n in nodes]))
-        law, covariance = scaled(law, covariance, value / float(np.mean(masses[:, i, i])))
+        scale = value / float(np.mean(masses[:, i, i]))
+        law, covariance = scaled(law, covariance, scale)
         gauge = f"the mean mass of {name} over the data is {value:g}"
     x = np.concatenate([n.x for n in nodes])
     d = fit.form.dim
@@ -136,8 +147,8 @@ def fit_recording(
     bench = Workbench(gauge_of, inputs[hold], scales.omega, seen)
     motions = next_motions(bench, fit, angles)
     return _described(
-        recording, fit, map_, law, covariance, horizons, gauge, tuple(steps), traces, motions,
-        (q, v, u), [n.t for n in nodes], time.process_time() - started, speeds,
+        recording, fit, map_, law, covariance, (choice, scale), horizons, gauge, tuple(steps),
+        traces, motions, (q, v, u), [n.t for n in nodes], time.process_time() - started, speeds,
     )  # fmt: skip
 
 
@@ -230,9 +241,9 @@ def _with_sensors(map_: Any, sensors: Sensors) -> Any:
 
 def _described(
     recording: Recording, fit: LawFit, map_: Any, law: Any, covariance: np.ndarray,
-    horizons: Any, gauge: str, steps: tuple[str, ...], traces: tuple[Trace, ...],
-    motions: list[Motion], states: Any, times: list[np.ndarray], seconds: float,
-    told_of: dict[str, Velocity],
+    chosen: tuple[FrictionChoice, float], horizons: Any, gauge: str, steps: tuple[str, ...],
+    traces: tuple[Trace, ...], motions: list[Motion], states: Any, times: list[np.ndarray],
+    seconds: float, told_of: dict[str, Velocity],
 ) -> LearnedLaw:  # fmt: skip
     """The law in the words of the recording."""
     names = recording.coordinates
@@ -266,10 +277,18 @@ def _described(
         for k, i in enumerate(fit.structure.zeros)
     }
     messages = [] if fit.fitted.converged else ["the last fit had not converged"]
-    if any(rho < 0 for rho in law.losses):
-        messages.append("friction with a negative coefficient: the record shows energy gained")
+    if chosen[0].gains:
+        messages.append(
+            "the record gains energy that no input explains: is a drive missing among the inputs?"
+        )
+    messages += [
+        f"no force of input {u} is seen: it hardly varies, or moves nothing"
+        for u, forces in gains.items()
+        if all(abs(gain) < _SEEN * error for gain, error in forces.values())
+    ]
     return LearnedLaw(
         map=map_, lagrangian=lagrangian, friction=friction, gains=gains,
+        which_friction=which_friction_told(*chosen, law.dim, of_speeds),
         hamiltonian=hamiltonian_of(law.terms, lagrangian, codes), zeros=zeros,
         noise=dict(zip(channels, map(float, map_.sensors.sigma / factors), strict=True)),
         residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)), gauge=gauge,

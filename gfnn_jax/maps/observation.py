@@ -164,7 +164,7 @@ class Observation:
         return x, np.where((rank == d) & np.isfinite(sizes), sizes, np.inf)
 
     def beside(self, velocities: Mapping[str, int]) -> Observation:
-        """With columns that show the velocities of these coordinates as they are."""
+        """Add columns that show the velocities of these coordinates as they are."""
         code = symbols((*self.coordinates, *self.speeds))[self.dim :]
         return dataclasses.replace(
             self,

@@ -10,9 +10,16 @@ from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of, with_states
 from gfnn_jax.families.lagrangian import LINEAR
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models import libraries
+from gfnn_jax.models.friction_choice import FrictionChoice
 from gfnn_jax.models.given_terms import Given
 from gfnn_jax.models.law_fit import LawFit, Workbench
-from gfnn_jax.models.law_search import SearchOptions, choose_friction, describe
+from gfnn_jax.models.law_search import (
+    Found,
+    SearchOptions,
+    choose_friction,
+    describe,
+    frictions_tried,
+)
 from gfnn_jax.models.structure import Structure
 from gfnn_jax.models.weak_start import weak_start
 
@@ -21,8 +28,8 @@ def fit_given(
     given: Given, nodes: Sequence[Nodes], scales: Scales, angles: tuple[int, ...], num_inputs: int,
     inputs: Mapping[str, Callable], seen: Observation, told: Callable[[str], object],
     options: SearchOptions,
-) -> tuple[LawFit, str, list[Nodes]]:  # fmt: skip
-    """What `law_search.search` returns, with exactly the terms that are given."""
+) -> Found:  # fmt: skip
+    """Fit exactly the terms that are given, with the result of `law_search.search`."""
     d = seen.dim
     gauge = np.concatenate([n.x[:, :d] for n in nodes])
     benches = {hold: Workbench(gauge, u, scales.omega, seen) for hold, u in inputs.items()}
@@ -51,10 +58,9 @@ def fit_given(
         nodes = with_states(nodes, fits[hold].arcs, fits[hold].fitted.x)
         told(f"{periods:g} periods: {describe(fits[hold])}")
     ((hold, fit),) = fits.items()
-    if given.friction is None and (options.choose_friction or options.frictions):
-        width = options.dry_width * float(np.mean(scales.speed))
-        fit = choose_friction(benches[hold], nodes, fit, width, told, options)
-    elif given.friction is None:
-        drop = {("loss", row) for row in fit.structure.friction}
-        fit = benches[hold].fit(fit.structure.without(drop), fit.values, fit.arcs, fit.sigma)
-    return fit, hold, with_states(nodes, fit.arcs, fit.fitted.x)
+    if given.friction is None:
+        tried = frictions_tried(d, scales, options)
+        fit, choice = choose_friction(benches[hold], nodes, fit, tried, told, options)
+    else:
+        choice = FrictionChoice(given.friction, {}, {}, gains=False)
+    return Found(fit, choice, hold, with_states(nodes, fit.arcs, fit.fitted.x))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,16 +19,16 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import LINEAR
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models import libraries
-from gfnn_jax.models.law_fit import LawFit, Workbench
+from gfnn_jax.models.friction_choice import FrictionChoice, which_friction
+from gfnn_jax.models.law_fit import FOLDS, LawFit, Workbench
+from gfnn_jax.models.libraries import FRICTIONS
 from gfnn_jax.models.structure import Key, Loss, Structure
 from gfnn_jax.models.weak_start import protected, weak_start
-
-FRICTIONS = ("linear", "quadratic", "dry")  # in the order of libraries.KINDS
 
 
 @dataclasses.dataclass(frozen=True)
 class SearchOptions:
-    """Constants of the search, the same for all records (`python -m benchmarks measured`)."""
+    """Constants of the search, the same for all records (`python benchmarks/measured.py DIR`)."""
 
     periods: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)  # lengths of arcs
     significant: float = 4.0  # standard errors, below which a term may be dropped
@@ -39,10 +39,20 @@ class SearchOptions:
         1.5  # times the residual of the larger library, the textbook's may have
     )
     gain: float = 0.05  # of the held-out cost, that a term has to bring
-    friction_gain: float = 0.1  # of the held-out cost, that another kind of friction has to bring
+    choices: int = 3  # of the friction, each close to the fit with the one before
     dry_width: float = 0.05  # ε of dry friction, in rms speeds
     frictions: tuple[str, ...] = FRICTIONS
     choose_friction: bool = True  # by held-out arcs; else all of these
+
+
+class Found(NamedTuple):
+    """What a search found: the fit to the longest arcs, which friction and how sure that is, the
+    rule of the inputs between samples, and the nodes with their states."""
+
+    fit: LawFit
+    choice: FrictionChoice
+    hold: str
+    nodes: list[Nodes]
 
 
 def search(
@@ -54,10 +64,9 @@ def search(
     seen: Observation,
     told: Callable[[str], object] = lambda line: None,
     options: SearchOptions = SearchOptions(),
-) -> tuple[LawFit, str, list[Nodes]]:
-    """The law of these nodes: its fit to the longest arcs; of the rules between samples of the
-    ``inputs`` (hold -> inputs of arcs) the best; and the nodes with the states found. ``seen`` says
-    how states are observed."""
+) -> Found:
+    """The law of these nodes, by the best of the rules between samples of the ``inputs`` (hold ->
+    inputs of arcs). ``seen`` says how states are observed."""
     d = seen.dim
     gauge = np.concatenate([n.x[:, :d] for n in nodes])
     benches = {hold: Workbench(gauge, u, scales.omega, seen) for hold, u in inputs.items()}
@@ -68,7 +77,6 @@ def search(
     def length(periods: float) -> int:
         return max(6, round(periods * scales.per_period))
 
-    width = options.dry_width * float(np.mean(scales.speed))
     linear = libraries.losses(d, (LINEAR,), 0.0)
     starts = []
     plain = [libraries.textbook(d, angles)]
@@ -113,12 +121,8 @@ def search(
         d, libraries.without_forces(
             (*libraries.first(d, angles), *libraries.more(d, angles)), shifted
         ),
-        _with_opposites(libraries.losses(d, libraries.KINDS, width)), turned, num_inputs, sensors,
+        frictions_tried(d, scales, options), turned, num_inputs, sensors,
     )  # fmt: skip
-    allowed = tuple(libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions)
-    every = dataclasses.replace(
-        every, friction=tuple(row for row in every.friction if row[1] in allowed)
-    )
     frictions = dataclasses.replace(every, terms=every.terms[:1])
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     for periods in options.periods[1:]:
@@ -132,11 +136,15 @@ def search(
             fit = grow(bench, nodes, fit, every, told, options)
         nodes = with_states(nodes, fit.arcs, fit.fitted.x)
         told(f"{periods:g} periods: {describe(fit)}")
-    fit = choose_friction(bench, nodes, fit, width, told, options)
-    fit = prune(bench, nodes, fit, told, options)
-    fit = grow(bench, nodes, fit, every, told, options)
-    fit = prune(bench, nodes, fit, told, options)
-    return fit, hold, with_states(nodes, fit.arcs, fit.fitted.x)
+    fit, choice = choose_friction(bench, nodes, fit, every.friction, told, options)
+    terms = dataclasses.replace(every, friction=())
+    before = fit.structure
+    fit = prune(bench, nodes, fit, told, options, friction=False)
+    fit = grow(bench, nodes, fit, terms, told, options)
+    fit = prune(bench, nodes, fit, told, options, friction=False)
+    if fit.structure != before:
+        fit, choice = choose_friction(bench, nodes, fit, every.friction, told, options)
+    return Found(fit, choice, hold, with_states(nodes, fit.arcs, fit.fitted.x))
 
 
 def describe(fit: LawFit) -> str:
@@ -148,16 +156,18 @@ def describe(fit: LawFit) -> str:
 
 
 def prune(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, told: Callable, options: SearchOptions
-) -> LawFit:
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, told: Callable, options: SearchOptions,
+    friction: bool = True,
+) -> LawFit:  # fmt: skip
     """The fit without terms that are not seen, the least seen first, as long as held-out arcs do
-    not lose; and without friction that would drive."""
+    not lose; and, unless ``friction`` has been chosen, without that which would drive."""
     refused: set[Key] = set()
     costs = None
     while True:
         z = significance(fit)
-        always = {k for k in z if k[0] in ("gain", "sensor")}
-        fixed = protected(fit.structure) | refused | always
+        stays = {k for k in z if k[0] in ("gain", "sensor")}
+        stays |= set() if friction else {k for k in z if k[0] == "loss"}
+        fixed = protected(fit.structure) | refused | stays
         z = {k: size for k, size in z.items() if k not in fixed and size < options.significant}
         if not z:
             return fit
@@ -222,50 +232,33 @@ def grow(
 
 
 def choose_friction(
-    bench: Workbench,
-    nodes: Sequence[Nodes],
-    fit: LawFit,
-    width: float,
-    told: Callable,
-    options: SearchOptions,
-) -> LawFit:
-    """The fit with the friction that predicts held-out arcs best; the smaller where two tie."""
-    d = fit.structure.dim
-    bare = dataclasses.replace(fit.structure, friction=())
-    kinds = [libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions]
-    best, lowest = bare, np.full(1, np.inf)
-    counts = range(len(kinds) + 1) if options.choose_friction else [len(kinds)]
-    for count in counts:
-        for chosen in combinations(kinds, count):
-            rows = libraries.losses(d, chosen, width)
-            structure = dataclasses.replace(bare, friction=tuple(rows))
-            structure = without_drives(bench, fit, structure)
-            costs = bench.cross_validate(nodes, fit, structure, fit.values)
-            told(f"  friction {structure.friction}: held-out {np.sum(costs):.5g}")
-            if gains(lowest, costs, options.friction_gain):
-                best, lowest = structure, costs
-    arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
-    return bench.fit(best, fit.values, arcs, fit.sigma)
-
-
-def without_drives(bench: Workbench, fit: LawFit, structure: Structure) -> Structure:
-    """The structure without friction that a fit would make negative, the worst first; that of a
-    relative speed gives way to that of the sum."""
-    arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
-    known = fit.values
-    while structure.friction:
-        found = bench.fit(structure, known, arcs, fit.sigma, rescale=False)
-        z = significance(found)
-        worst = min((("loss", row) for row in structure.friction), key=lambda k: z[k])
-        if z[worst] >= 0:
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, candidates: Sequence[Loss],
+    told: Callable, options: SearchOptions,
+) -> tuple[LawFit, FrictionChoice]:  # fmt: skip
+    """The fit with the friction that held-out arcs choose, and how sure that is. Arcs are as long
+    as those of the fit, or as long as three of them can be. A choice holds close to its fit, so
+    that it is made again until it stands."""
+    whole, sigma = dataclasses.replace(fit.arcs, x=fit.fitted.x), fit.sigma
+    length = max(6, min(whole.t.shape[1], sum(len(n.t) for n in nodes) // FOLDS))
+    arcs = arcs_of(with_states(nodes, whole, whole.x), length)
+    if arcs.t.shape != whole.t.shape:
+        fit = bench.fit(fit.structure, fit.values, arcs, sigma)
+    choice = which_friction(bench, fit, candidates, options.choose_friction)
+    for _ in range(options.choices):
+        told(f"  friction: {choice.rows}")
+        if set(choice.rows) == set(fit.structure.friction):
             break
-        turned = libraries.opposite(worst[1])
-        structure, known = structure.without({worst}), found.values
-        if turned is not None:
-            structure = structure.plus([("loss", turned)])
-    return structure
+        structure = dataclasses.replace(fit.structure, friction=choice.rows)
+        arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+        fit = bench.fit(structure, fit.values, arcs, fit.sigma)
+        choice = which_friction(bench, fit, candidates, options.choose_friction, choice)
+    choice = choice._replace(rows=fit.structure.friction)
+    return bench.fit(fit.structure, fit.values, whole, sigma), choice
 
 
-def _with_opposites(rows: list[Loss]) -> tuple[Loss, ...]:
+def frictions_tried(dim: int, scales: Scales, options: SearchOptions) -> tuple[Loss, ...]:
+    """Friction of all the kinds that are asked for, in every direction."""
+    kinds = tuple(libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions)
+    rows = libraries.losses(dim, kinds, options.dry_width * float(np.mean(scales.speed)))
     turned = (libraries.opposite(row) for row in rows)
     return (*rows, *(row for row in turned if row is not None))

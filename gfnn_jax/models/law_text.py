@@ -11,6 +11,8 @@ import numpy as np
 
 from gfnn_jax.exports.symbolic import as_sympy
 from gfnn_jax.families.lagrangian import LINEAR, QUADRATIC, Friction, Terms
+from gfnn_jax.models.friction_choice import FrictionChoice
+from gfnn_jax.models.libraries import FRICTIONS, KINDS, losses
 
 _GREEK = {
     "theta": "θ", "phi": "φ", "psi": "ψ", "alpha": "α", "beta": "β", "gamma": "γ", "omega": "ω",
@@ -73,14 +75,53 @@ def friction_of(
     for (c, kind, width), rho, s in zip(friction.rows(), losses, std, strict=True):
         parts = zip(reversed(c), reversed(list(speeds)), strict=True)
         speed = _sum(("-" if e < 0 else "") + _times(abs(e), v) for e, v in parts if e)
+        if kind == QUADRATIC:
+            listed.append(Term(f"abs({speed})**3", rho / 3, s / 3))
+            continue
         speed = f"({speed})" if sum(map(bool, c)) > 1 else speed
         if kind == LINEAR:
             listed.append(Term(f"{speed}**2", rho / 2, s / 2))
-        elif kind == QUADRATIC:
-            listed.append(Term(f"abs({speed})**3", rho / 3, s / 3))
         else:
             listed.append(Term(f"sqrt({speed}**2 + {width**2:.4g})", float(rho), float(s)))
     return Expression(tuple(listed))
+
+
+@dataclasses.dataclass(frozen=True)
+class WhichFriction:
+    """The kinds of friction that a record shows. odds: that they forecast better than other kinds
+    ("none", "quadratic", "linear+dry", …). limits: of terms of R of kinds that were not seen, the
+    largest coefficients that the record allows (two standard errors)."""
+
+    kinds: tuple[str, ...]
+    odds: dict[str, float]
+    limits: dict[str, float]
+
+    def __str__(self) -> str:
+        text = "+".join(self.kinds) or "none"
+        if self.odds:
+            rival = min(self.odds, key=lambda name: self.odds[name])
+            text += f", odds {_odds(self.odds[rival])} against {rival}"
+        seen = [f"{_pretty(term)} < {limit:.2g}" for term, limit in self.limits.items()]
+        return text + (f"; not seen: {', '.join(seen)}" if seen else "")
+
+
+def which_friction_told(
+    choice: FrictionChoice, scale: float, dim: int, speeds: Sequence[str]
+) -> WhichFriction:
+    """The choice in the recording's words; ``scale`` is that of L."""
+
+    def named(kinds: tuple[int, ...]) -> str:
+        return "+".join(FRICTIONS[KINDS.index(k)] for k in kinds) or "none"
+
+    plain = {direction for direction, _, _ in losses(dim, KINDS, 0.0)}
+    rows = [r for r in choice.limits if r[1] not in choice.kinds and r[0] in plain]
+    largest = scale * np.array([choice.limits[row] for row in rows])
+    terms = friction_of(Friction.of(rows, dim), largest, 0 * largest, speeds).terms
+    return WhichFriction(
+        tuple(FRICTIONS[KINDS.index(k)] for k in choice.kinds),
+        {named(kinds): odds for kinds, odds in choice.odds.items()},
+        {t.term: t.coefficient for t in terms},
+    )
 
 
 def speed_names(positions: Sequence[str], velocities: Sequence[str]) -> tuple[str, ...]:
@@ -122,6 +163,13 @@ def _sum(parts: Any) -> str:
         else:
             text += f" - {part[1:]}" if part.startswith("-") else f" + {part}"
     return text
+
+
+def _odds(odds: float) -> str:
+    """12 : 1, 1 : 3; those above a million are not told apart."""
+    if odds >= 1e6:
+        return "> 10⁶ : 1"
+    return f"{odds:,.2g} : 1" if odds >= 1 else f"1 : {1 / odds:,.2g}"
 
 
 def _digits(value: float, std: float) -> str:

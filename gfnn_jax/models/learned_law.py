@@ -12,7 +12,7 @@ from gfnn_jax.families.lagrangian import Lagrangian, Terms
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.calibration import Horizon
 from gfnn_jax.models.law_fit import LawFit
-from gfnn_jax.models.law_text import Expression, Term, measured, terms_of
+from gfnn_jax.models.law_text import Expression, Term, WhichFriction, measured, terms_of
 from gfnn_jax.models.residuals import Trace, Whiteness
 from gfnn_jax.models.velocities import Velocity
 
@@ -35,7 +35,8 @@ class LearnedLaw:
     """A law that was learned from a recording.
 
     map: its flow, which estimates and forecasts. lagrangian: L, and friction: Rayleigh's R, by the
-    names of columns, with standard errors. gains: input -> force on each position, with its
+    names of columns, with standard errors. which_friction: its kinds, with what odds, and limits of
+    those that were not seen. gains: input -> force on each position, with its
     standard error. hamiltonian: H in words, its terms as of L. zeros: angle -> (where it is zero,
     standard error), already inside the formula. observe: column -> what its sensor shows, where
     that is not the coordinate; sensors: the parameters in it, fitted, with standard errors. noise:
@@ -52,6 +53,7 @@ class LearnedLaw:
     map: SymplecticMap
     lagrangian: Expression
     friction: Expression
+    which_friction: WhichFriction
     gains: dict[str, dict[str, tuple[float, float]]]
     hamiltonian: Hamiltonian
     zeros: dict[str, tuple[float, float]]
@@ -81,7 +83,8 @@ class LearnedLaw:
     @property
     def table(self) -> str:
         """The law, its errors and its horizon, a line each."""
-        lines = [f"L = {self.lagrangian}", f"R = {self.friction}", f"gauge: {self.gauge}"]
+        lines = [f"L = {self.lagrangian}", f"R = {self.friction}"]
+        lines += [f"friction: {self.which_friction}", f"gauge: {self.gauge}"]
         lines += [
             f"{name}: zero at {zero:.5f}({std:.5f})" for name, (zero, std) in self.zeros.items()
         ]

@@ -19,6 +19,7 @@ from gfnn_jax.models.structure import Loss, Row
 
 SINE = -np.pi / 2
 KINDS = (LINEAR, QUADRATIC, DRY)
+FRICTIONS = ("linear", "quadratic", "dry")  # their names
 
 
 def unit(dim: int, *axes: int) -> tuple[int, ...]:

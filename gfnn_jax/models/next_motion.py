@@ -1,4 +1,4 @@
-"""Which motion to record next: one that would tell the coefficients that this record hardly does.
+"""Motion to record next: one that would tell the coefficients that this record hardly does.
 
 A motion from rest is followed by the law. With J its sensitivities, its own first state eliminated,
 a record of it turns the information RᵀR of the coefficients into RᵀR + JᵀJ (Fedorov, Theory of

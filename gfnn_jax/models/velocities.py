@@ -1,4 +1,4 @@
-"""Whether measured velocities are what they say, held against a law found from positions alone.
+"""Test of measured velocities against a law found from positions alone.
 
 Most velocities in files are filtered differences of the positions: their scale is a little low,
 they come late, and neighbouring values share their noise. Against the velocities v of a law, which
@@ -99,7 +99,7 @@ def _colour(left: np.ndarray) -> float:
 
 
 def _copied(recording: Recording, place: int, name: str) -> bool:
-    """Whether a velocity is a mere difference of its position."""
+    """Return whether a velocity is a mere difference of its position."""
     times = [recording.times(run) for run in recording.runs]
     x, v = (
         np.concatenate([recording.unwrapped(n, run) for run in recording.runs])

@@ -29,7 +29,7 @@ _SHRINK, _GROW = 0.2, 5.0  # of the damping
 
 
 class Steps(NamedTuple):
-    """What a model gives for states (A, L, m): those after each step (A, L − 1, m), and derivatives
+    """Steps of a model from states (A, L, m): those after each step (A, L − 1, m), and derivatives
     in the states before (…, m, m) and in the n coefficients (…, m, n)."""
 
     states: np.ndarray
@@ -77,7 +77,7 @@ class Fitted:
         return inverse @ inverse.T
 
     def last_covariance(self) -> np.ndarray:
-        """Of the last state of each arc (A, m, m), with p as it is."""
+        """Covariance of the last state of each arc (A, m, m), with p as it is."""
         root = self.transports @ np.linalg.pinv(self.arcs)
         return root @ root.swapaxes(1, 2)
 
@@ -156,13 +156,20 @@ def sensitivities(
 ) -> np.ndarray:
     """The triangle (n + 1, n + 1) of the coefficients and the residuals, the states of each arc
     eliminated, at p and x: what a test of coefficients needs."""
-    seen = np.isfinite(y)
-    steps, observed = model.steps(p, x), model.observe(p, x)
-    residuals = np.where(seen, (np.where(seen, y, 0.0) - observed.values) / sigma, 0.0)
-    defects = steps.states - x[:, 1:]
-    return _reduced(
-        _Iterate(p, x, steps, observed, seen, residuals, defects, 0.0, 0.0), sigma
-    ).triangle
+    return _reduced(_evaluated(model, p, x, y, sigma), sigma).triangle
+
+
+def rows_of_arcs(
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
+) -> np.ndarray:
+    """Rows (A, L, k, n + 1) of the coefficients and the residuals, weighted as robust loss has it,
+    after each arc's own δx_0 was projected out: residuals − rows · δp are those of any other
+    coefficients near p, each arc with the state that suits them best."""
+    at = _evaluated(model, p, x, y, sigma)
+    J, m = _weighted(at, sigma, _sensitivities(at)), x.shape[-1]
+    flat = J.reshape(len(x), -1, J.shape[-1])
+    Q = np.linalg.qr(flat[..., :m])[0]
+    return (flat[..., m:] - Q @ (Q.swapaxes(1, 2) @ flat[..., m:])).reshape(*J.shape[:-1], -1)
 
 
 def loss(residuals: np.ndarray) -> np.ndarray:
@@ -171,7 +178,7 @@ def loss(residuals: np.ndarray) -> np.ndarray:
 
 
 class _Iterate(NamedTuple):
-    """Where an iteration stands: residuals in units of σ, defects, the cost of the residuals, and
+    """Iterate: residuals in units of σ, defects, the cost of the residuals, and
     the norm of the defects in units of ``state_scale``."""
 
     p: np.ndarray
@@ -198,23 +205,48 @@ class _Rows(NamedTuple):
     sensitivities: np.ndarray
 
 
-def _reduced(at: _Iterate, sigma: np.ndarray) -> _Rows:
-    steps, observed, residuals = at.steps, at.observed, at.residuals
-    num_arcs, length, k, m = observed.by_state.shape
-    n = observed.by_coefficients.shape[-1]
+def _evaluated(
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
+) -> _Iterate:
+    """Where an iteration that began at p and x would stand."""
+    seen = np.isfinite(y)
+    steps, observed = model.steps(p, x), model.observe(p, x)
+    residuals = np.where(seen, (np.where(seen, y, 0.0) - observed.values) / sigma, 0.0)
+    defects = steps.states - x[:, 1:]
+    return _Iterate(p, x, steps, observed, seen, residuals, defects, 0.0, 0.0)
+
+
+def _sensitivities(at: _Iterate) -> np.ndarray:
+    """δx_n (A, L, m, m + n + 1) by δx_0, by δp, and by the defects before it."""
+    steps = at.steps
+    num_arcs, length, m = at.x.shape
+    n = steps.by_coefficients.shape[-1]
     S = np.zeros((num_arcs, length, m, m + n + 1))
     S[:, 0, range(m), range(m)] = 1.0
     for i in range(length - 1):
         S[:, i + 1] = steps.by_state[:, i] @ S[:, i]
         S[:, i + 1, :, m : m + n] += steps.by_coefficients[:, i]
         S[:, i + 1, :, -1] += at.defects[:, i]
+    return S
+
+
+def _weighted(at: _Iterate, sigma: np.ndarray, S: np.ndarray) -> np.ndarray:
+    """Rows (A, L, k, m + n + 1) of the residuals by δx_0 and δp, and of the residuals themselves,
+    in units of σ and weighted; 0 where nothing was seen."""
+    observed, residuals, m = at.observed, at.residuals, at.x.shape[-1]
     J = observed.by_state @ S
-    J[..., m : m + n] += observed.by_coefficients
+    J[..., m:-1] += observed.by_coefficients
     J /= sigma[..., None]
     J[..., -1] = residuals - J[..., -1]
     weight = (1 + (residuals / ROBUST) ** 2) ** -0.25  # the square root of ρ'(r)/2r
-    weight = np.where(at.seen, weight, 0.0)
-    J *= weight[..., None]
+    return J * np.where(at.seen, weight, 0.0)[..., None]
+
+
+def _reduced(at: _Iterate, sigma: np.ndarray) -> _Rows:
+    num_arcs, length, k, m = at.observed.by_state.shape
+    n = at.observed.by_coefficients.shape[-1]
+    S = _sensitivities(at)
+    J = _weighted(at, sigma, S)
     R = np.asarray(np.linalg.qr(J.reshape(num_arcs, length * k, -1), mode="r"))
     rest = R[:, m:, m:].reshape(-1, n + 1)
     rest = np.concatenate([rest, np.zeros((max(0, n + 1 - len(rest)), n + 1))])

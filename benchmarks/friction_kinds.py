@@ -1,0 +1,129 @@
+"""Which friction a simulated recording shows: positions with noise, of systems whose friction is
+known, by an integrator of SciPy."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, NamedTuple
+
+import numpy as np
+from harness import Numbers, once
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+
+NOISE = 1e-3  # radians
+WIDTH = 1e-3  # rad/s, within which dry friction turns over
+MIXED = (("linear", "dry"), ("quadratic", "dry"))  # of the first seed, and of the second
+
+
+class Swings(NamedTuple):
+    """A system of angles: masses and force at q, v; its joints (rows of relative speeds) and the
+    coefficients of friction there, by kind; the runs' starts, their end and step."""
+
+    masses: Any
+    force: Any
+    joints: np.ndarray
+    losses: dict[str, tuple[float, ...]]
+    starts: tuple[tuple[float, ...], ...]
+    end: float
+    dt: float
+
+
+def _chain_masses(q):
+    c = 0.4 * np.cos(q[0] - q[1])
+    return np.array([[1.0, c], [c, 0.5]])
+
+
+def _chain_force(q, v):
+    s = 0.4 * np.sin(q[0] - q[1])
+    return np.array([-s * v[1] ** 2 - 20 * np.sin(q[0]), s * v[0] ** 2 - 8 * np.sin(q[1])])
+
+
+SYSTEMS = {
+    "pendulum": Swings(
+        lambda q: np.eye(1), lambda q, v: -2 * np.sin(q), np.eye(1),
+        {"linear": (0.03,), "quadratic": (0.03,), "dry": (0.015,)},
+        ((1.4, 0.0), (0.6, 0.3)), 40.0, 0.05,
+    ),
+    "double-pendulum": Swings(
+        _chain_masses, _chain_force, np.array([[1.0, 0.0], [-1.0, 1.0]]),
+        {"linear": (0.06, 0.03), "quadratic": (0.02, 0.01), "dry": (0.1, 0.05)},
+        ((1.5, -0.6, 0.0, 0.0), (-0.8, 1.2, 0.0, 1.0), (0.5, 0.5, 0.0, 0.0)), 10.0, 0.02,
+    ),
+}  # fmt: skip
+
+
+def recording(system: Swings, kinds: tuple[str, ...], seed: int, share: float) -> gfnn.Recording:
+    """Positions with noise, of runs with these kinds of friction, each at a share of the system's
+    coefficients; starts differ by seed."""
+    d, rng = len(system.joints[0]), np.random.default_rng(seed)
+    t = np.arange(0, system.end, system.dt)
+
+    def rate(_, x):
+        q, v = x[:d], x[d:]
+        s = system.joints @ v
+        pull = np.zeros(len(s))
+        for kind in kinds:
+            of_speed = {"linear": s, "quadratic": s * abs(s), "dry": s / np.hypot(s, WIDTH)}[kind]
+            pull += share * np.array(system.losses[kind]) * of_speed
+        return [*v, *np.linalg.solve(system.masses(q), system.force(q, v) - system.joints.T @ pull)]
+
+    tables, names = [], [f"theta{i + 1}" for i in range(d)]
+    for run, start in enumerate(system.starts):
+        first = np.array(start) * rng.uniform(0.85, 1.15, 2 * d)
+        found = solve_ivp(rate, (0, t[-1]), first, t_eval=t, rtol=1e-9, atol=1e-10)
+        q = found.y[:d] + NOISE * rng.normal(size=(d, len(t)))
+        columns = dict(zip(names, q, strict=True))
+        tables.append({"run": np.full(len(t), str(run)), "t": t, **columns})
+    return gfnn.Recording(tables, positions=names, angles=names)
+
+
+def case(system: str, kinds: tuple[str, ...], seed: int) -> Numbers:
+    """The friction that is found in one recording, against that which was put in."""
+    share = 0.6 if len(kinds) > 1 else 1.0
+    record = recording(SYSTEMS[system], kinds, seed, share)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)
+        done = once(lambda: gfnn.fit(record))
+    fit = done.out
+    expected = {}
+    for kind in kinds:
+        factor = {"linear": 1 / 2, "quadratic": 1 / 3, "dry": 1.0}[kind]
+        for joint, loss in zip(("1", "2 - omega1"), SYSTEMS[system].losses[kind], strict=False):
+            expected[kind, joint] = factor * share * loss
+    errors = []
+    for term, coefficient, std in fit.friction.terms:
+        kind = "dry" if "sqrt" in term else "quadratic" if "abs" in term else "linear"
+        joint = "2 - omega1" if "omega2 - omega1" in term else "1" if "omega2" not in term else ""
+        errors.append(abs(coefficient - expected.get((kind, joint), 0.0)) / std)
+    return {
+        "system": system, "true": list(kinds), "seed": seed,
+        "found": list(fit.which_friction.kinds), "odds": fit.which_friction.odds,
+        "limits": fit.which_friction.limits, "text": str(fit.which_friction),
+        "standard_errors": max(errors, default=None),
+        "friction": {t.term: [t.coefficient, t.std] for t in fit.friction.terms},
+        "processor_seconds": done.processor_seconds,
+    }  # fmt: skip
+
+
+def which(quick: bool) -> Numbers:
+    """Two systems, each with linear, quadratic, dry and mixed friction, two recordings each: how
+    often the kinds that are found are those that were put in."""
+    cases = []
+    for name in SYSTEMS:
+        for seed in range(1 if quick else 2):
+            for kinds in (("linear",), ("quadratic",), ("dry",), MIXED[seed]):
+                cases.append(case(name, kinds, seed))
+                print(f"  {name} {'+'.join(kinds)}: {cases[-1]['text']}", flush=True)
+    return {"cases": cases, "right": sum(c["found"] == c["true"] for c in cases)}
+
+
+def none(quick: bool) -> Numbers:
+    """The same systems without friction: whether any is found, and whether limits hold."""
+    cases = []
+    for name in SYSTEMS:
+        for seed in range(1 if quick else 4):
+            cases.append(case(name, (), seed))
+            print(f"  {name} without friction: {cases[-1]['text']}", flush=True)
+    return {"cases": cases, "reported": sum(bool(c["found"]) for c in cases)}
