@@ -84,7 +84,7 @@ def powers_of(atom: Atom, arguments: Sequence[Argument], width: int) -> tuple[in
 
 
 def weight_of(atoms: Sequence[Atom]) -> float:
-    """How much there is to say of atoms."""
+    """Amount that there is to say of atoms."""
     return sum(complexity(factor.kind) for atom in atoms for factor in atom)
 
 
