@@ -4,6 +4,8 @@
     python -m benchmarks laws args         two of them, after one another
     python -m benchmarks --quick           all of them, small sizes, into runs/
     python -m benchmarks laws --only hard  options are handed to each study
+    python -m benchmarks --check           what is older than its code again, oldest first
+    python -m benchmarks --check --tell    only says which these are; with names, of these studies
 
 Each study is a script with a command line of its own (`python benchmarks/laws.py --help`) and runs
 in a process of its own: a process may map only so many compiled programs.
@@ -18,6 +20,10 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from current import check
 
 HERE = Path(__file__).resolve().parent
 
@@ -49,6 +55,13 @@ def main(argv: Sequence[str]) -> int:
         print(f"expected studies of this folder, got '{unknown[0]}'; there are "
               f"{', '.join(known)}", file=sys.stderr)  # fmt: skip
         return 2
+    if "--check" in options:
+        if set(options) - {"--check", "--tell"}:
+            print(
+                f"expected --check with --tell or alone, got {' '.join(options)}", file=sys.stderr
+            )
+            return 2
+        return check(names or list(known), HERE / "results", only_tell="--tell" in options)
     paths = os.pathsep.join([str(HERE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
     failed = []
     for name in names or known:

@@ -71,7 +71,8 @@ QUICK = ("single-orbit", "micro-units", "hidden-parameter", "twenty-pairs", "fri
 
 class Learned(NamedTuple):
     """Result of a case, by Python or the command line. seconds: of the processor. law: the line
-    about H, "" where there is none; formula: H, where it is shown. noise: (2d,) as `fit.noise`, or
+    about H, "" where there is none; formula: H, where it is shown. damping: of a map that loses
+    area. noise: (2d,) as `fit.noise`, or
     None."""
 
     map: gfnn.SymplecticMap
@@ -85,6 +86,7 @@ class Learned(NamedTuple):
     noise: list[float] | None
     law: str = ""
     formula: str | None = None
+    damping: str = ""
 
 
 # What is said and what is true
@@ -105,6 +107,7 @@ def by_python(case: Case) -> Learned:
         chosen.validation_relative, chosen.validation_bound, fit.met,
         None if fit.noise is None else fit.noise.tolist(),
         "" if fit.formula is None else f"H = {fit.formula}", fit.formula,
+        "" if fit.damping is None else f"friction: {fit.damping}",
     )  # fmt: skip
 
 
@@ -150,7 +153,8 @@ def true_error(map_: gfnn.SymplecticMap, case: Case) -> float:
 
 def untruths(case: Case, learned: Learned, error: float) -> list[str]:
     """List what the fit said wrongly, or did not say."""
-    said = " ".join([*learned.messages, learned.ended, learned.model, learned.law])
+    said = " ".join([*learned.messages, learned.ended, learned.model, learned.law,
+                     learned.damping])  # fmt: skip
     found = [f"not said: {pattern}" for pattern in case.words if not re.search(pattern, said)]
     found += [f"said: {pattern}" for pattern in case.never if re.search(pattern, said)]
     if case.quiet and learned.messages:

@@ -31,6 +31,8 @@ from posteriors.calibration import (
 )
 from posteriors.costs import COSTS, NETWORKS, cost, together
 from posteriors.figure import figure
+from posteriors.kinds import KINDS, of_kind
+from posteriors.kinds import STEPS as KIND_STEPS
 from posteriors.sequences import sequences
 from posteriors.told import told
 
@@ -78,6 +80,7 @@ PIECES = {
     "noise-dt-0.5": partial(sequences, 0.5),
     "noise-dt-0.05": partial(sequences, 0.05),
     "noise-told": told,
+    **{f"kind-{name}": partial(of_kind, name) for name in KINDS},
     "cost": cost,
     "together": together,
 }
@@ -157,6 +160,19 @@ def _told_table(found: dict[str, Numbers]) -> str:
     return markdown(head, rows)
 
 
+def _kinds_table(found: dict[str, Numbers]) -> str:
+    head = ["kind of data, noise 1e-3", "data sets", "chosen"]
+    head += [f"step {k}: covered %, width ÷ RMS, RMS" for k in KIND_STEPS]
+    rows = []
+    for name in (n for n in KINDS if f"kind-{n}" in found):
+        m = found[f"kind-{name}"]["measured"]
+        chance = m["coverage_error"] or [None] * len(KIND_STEPS)
+        each = zip(KIND_STEPS, m["coverage"], chance, m["width"], m["rms"], strict=True)
+        rows.append([name, str(m["data_sets"]), _labels(m["labels"]),
+                     *(_cell(Cell(*values)) for values in each)])  # fmt: skip
+    return markdown(head, rows)
+
+
 def _cost_table(found: dict[str, Numbers]) -> str:
     m = found["cost"]["measured"] if "cost" in found else {}
     head = ["map", "samples × states × steps", "as samples, s (CPU s)",
@@ -186,7 +202,10 @@ def tables() -> None:
     """The section of RESULTS.md, and the figure."""
     found, rows = results(PIECES, "bands"), calibration()
     parts = [_calibration_table(rows)]
-    parts += [part(found) for part in (_noise_table, _told_table, _cost_table, _together_table)]
+    parts += [
+        part(found)
+        for part in (_kinds_table, _noise_table, _told_table, _cost_table, _together_table)
+    ]
     between_markers(TABLES, "bands", "\n\n".join(parts))
     figure(rows)
 

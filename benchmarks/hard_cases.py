@@ -2,7 +2,7 @@
 
     python benchmarks/hard_cases.py                          pieces that have no result yet, tables
     python benchmarks/hard_cases.py --only chaos --overwrite one piece again
-    python benchmarks/hard_cases.py --quick                  two pieces, small, into runs/hard
+    python benchmarks/hard_cases.py --quick                  two small pieces, into runs/hard
 
 A piece's result is one JSON file, hard-*.json in benchmarks/results; the section of
 benchmarks/RESULTS.md and the figures are made from these files alone. The long pieces are fastest

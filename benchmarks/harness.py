@@ -10,6 +10,7 @@ import datetime
 import json
 import os
 import platform
+import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+from current import code_of
 
 jax.config.update("jax_enable_x64", True)
 
@@ -180,7 +182,7 @@ def cores() -> int | None:
 
 
 def circumstances() -> Numbers:
-    """Seed, machine, versions and date of a measurement."""
+    """Seed, machine, versions, date and code of a measurement."""
     return {
         "seed": SEED,
         "dtype": "float64",
@@ -194,6 +196,7 @@ def circumstances() -> Numbers:
         "python": platform.python_version(),
         "versions": versions(),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "code": code_of(Path(sys.argv[0]).resolve()) if Path(sys.argv[0]).suffix == ".py" else None,
     }
 
 

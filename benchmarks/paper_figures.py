@@ -43,6 +43,9 @@ SCENES: dict[str, tuple[tuple[int, ...], str]] = {
 }
 
 
+PREFIX = "compare"  # of the results' file names
+
+
 def pieces() -> list[tuple[str, int]]:
     """List (scene, seed), each scene's first seed before any second one."""
     most = max(len(seeds) for seeds, _ in SCENES.values())
@@ -53,7 +56,7 @@ def pieces() -> list[tuple[str, int]]:
 
 
 def result_path(folder: Path, name: str, seed: int) -> Path:
-    return folder / f"compare-{name}-{seed}.json"
+    return folder / f"{PREFIX}-{name}-{seed}.json"
 
 
 def run(name: str, seed: int, folder: Path, work: Path, **options) -> None:
@@ -263,6 +266,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("scenes", nargs="*", choices=[[], *SCENES], metavar="SCENE",
                         help=", ".join(SCENES))  # fmt: skip
+    parser.add_argument("--only", metavar="SCENE-SEED", help="one of a scene's seeds")
     parser.add_argument("--quick", action="store_true", help="two bodies only, small sizes")
     parser.add_argument("--cap", type=float, metavar="SECONDS", default=CAP,
                         help="most training time of a method (default %(default)g)")  # fmt: skip
@@ -277,6 +281,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         return
     for name, seed in [] if arguments.tables else pieces():
         asked = not arguments.scenes or name in arguments.scenes
+        asked &= arguments.only in (None, f"{name}-{seed}")
         path = result_path(RESULTS, name, seed)
         if asked and (arguments.overwrite or not path.exists()):
             if arguments.overwrite:

@@ -122,4 +122,4 @@ def test_a_search_for_h_ends_at_its_cap(monkeypatch):
     monkeypatch.setattr(choose_law, "_BESIDE", few)
     found = gfnn.fit(pairs, tolerance=1e-9, max_seconds=None)
     assert found.hamiltonian is None
-    assert any("left out: H: " in message for message in found.messages)
+    assert any("left out: H (" in message for message in found.messages)

@@ -164,6 +164,23 @@ def test_samples_roll_back_to_where_they_began(noisy):
         samples.rollout(z, -2, inputs=np.ones((2, 1)))
 
 
+def test_a_law_of_uneven_times_knows_each_rows_own_step():
+    """Of an oscillator, turned by h, noise σ leaves each of 2N numbers an error of σ√2, and a
+    coefficient moves them by about h times the states: two thirds of a unit in the square."""
+    rng = np.random.default_rng(3)
+    z, h = rng.uniform(-1, 1, (600, 2)), rng.uniform(0.1, 0.4, 600)
+    turn = np.stack([np.cos(h), np.sin(h), -np.sin(h), np.cos(h)], axis=1).reshape(-1, 2, 2)
+    image = (turn @ z[..., None])[..., 0]
+    noise = NOISE * rng.normal(size=(2, *z.shape))
+    pairs = gfnn.Pairs(z + noise[0], image + noise[1], h)
+    with pytest.warns(gfnn.FitWarning):
+        fit = gfnn.fit(pairs, learn="hamiltonian", terms=["q1**2", "p1**2"])
+    fit = fit.map.posterior
+    std = np.linalg.norm(np.asarray(fit.root), axis=0)
+    expected = NOISE * np.sqrt(2) / np.sqrt(600 * np.mean(h**2) * 4 / 3)
+    assert np.all((std > 0.3 * expected) & (std < 3 * expected)), std / expected
+
+
 def test_a_map_without_posterior_says_so(noisy):
     bare = jax.tree.map(lambda leaf: leaf, noisy[1].map)
     with pytest.raises(ValueError, match="no posterior to draw from"):

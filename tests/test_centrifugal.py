@@ -58,3 +58,8 @@ def test_centrifugal_terms_only_where_pairs_ask_for_them():
     shift = np.eye(4)[0]  # the pole at π then lies between the states
     assert asked(gfnn.Pairs(sphere.z0 + shift, sphere.z1 + shift, 0.1), cubic) == ()
     assert asked(henon_heiles_pairs(200), cubic) == ()
+    z0 = np.random.default_rng(1).uniform(-1.2, 1.2, (400, 4))
+    q, p = 0.5 * z0[:, :2], z0[:, 2:]
+    q1 = q + 0.01 * p  # wells of fourth degree, to first order: no angle, no cosine
+    wells = gfnn.Pairs(np.hstack([q, p]), np.hstack([q1, p + 0.01 * (q1 - 8 * q1**3)]), 0.01)
+    assert asked(wells, cubic) == ()

@@ -7,9 +7,12 @@ from pathlib import Path
 import gfnn_jax
 
 PACKAGE = Path(gfnn_jax.__file__).parent
-FRAGMENTS = set(
-    ["as", "before", "between", "but", "by", "for", "from", "how", "if", "in", "its", "no", "none", "not", "of", "on", "or", "so", "some", "than", "that", "their", "these", "this", "those", "to", "what", "when", "where", "whether", "which", "who", "whose", "why", "with", "without"]
-)
+FRAGMENTS = {
+    "as", "before", "between", "but", "by", "for", "from", "how", "if", "in", "its", "no",
+    "none", "not", "of", "on", "or", "so", "some", "than", "that", "their", "these", "this",
+    "those", "to", "what", "when", "where", "whether", "which", "who", "whose", "why", "with",
+    "without",
+}  # fmt: skip
 
 
 def openings():

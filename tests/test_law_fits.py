@@ -56,7 +56,7 @@ class _Decay:
         factor = np.exp(-0.1 * p[0])
         here = x[:, :-1]
         by_state = np.full((*here.shape, 1), factor)
-        return Steps(factor * here, by_state, -0.1 * factor * here[..., None])
+        return Steps(factor * here - x[:, 1:], by_state, -0.1 * factor * here[..., None])
 
     def observe(self, p, x):
         return Observed(x, np.ones((*x.shape, 1)), np.zeros((*x.shape, 1)))

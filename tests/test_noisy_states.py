@@ -9,12 +9,12 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.arcs import arcs_of_pairs
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import least_squares, uncertainty
-from gfnn_jax.fitting.nearest_states import Whitened, nearest
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.generating.generated import Generated
@@ -23,6 +23,7 @@ from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.noisy_sweeps import NoisySweep, best_size
 from gfnn_jax.learn.sweeps import LinearSweep, Size
 from gfnn_jax.maps.affine import Affine
+from gfnn_jax.models.map_arcs import GeneratedOnArcs, NearestArcs
 
 SIGMA, DT = 0.03, 0.5
 
@@ -41,6 +42,12 @@ def generated_pairs(chart, num, degree=4, seed=0):
     return z0, z1, family, params
 
 
+def coefficients_of(family, params, w):
+    """(num_parameters,) of these params, from the gradients of S at these points."""
+    rows = w, np.asarray(family.gradient(params, w))
+    return least_squares.fit(family, rows, rows, np.ones(2)).coefficients
+
+
 @pytest.mark.parametrize(
     "chart",
     [MIDPOINT, pytest.param(TYPE2, marks=pytest.mark.slow)],
@@ -52,45 +59,46 @@ def test_rows_of_the_nearest_states_have_no_bias(chart):
     rng = np.random.default_rng(1)
     z0, z1 = (z + SIGMA * rng.normal(size=z.shape) for z in (z0, z1))
     w, target = chart.evaluation_point(z0, z1), chart.target_gradient(z0, z1, DT)
-    true = np.asarray(
-        least_squares.fit(family, *2 * [(w, np.asarray(family.gradient(params, w)))], np.ones(2))
-        .coefficients
-    )  # fmt: skip
-    eye, none = np.eye(2), np.zeros((2, 2))
-    ends = ((eye, none), (none, eye))
-    of_point = SIGMA * np.concatenate([chart.evaluation_point(*e).T for e in ends], axis=1)
-    of_target = SIGMA * np.concatenate([chart.target_gradient(*e, DT).T for e in ends], axis=1)
+    true = coefficients_of(family, params, w)
+    count = family.num_parameters
 
-    def off(of, rows) -> float:
+    def off(reduced, found) -> float:
         """RMS of the coefficients' errors in standard errors."""
-        reduced = least_squares.reduce(of, [rows], np.ones(2))
-        count = family.num_parameters
-        found = least_squares.solve(reduced, reduced, count).coefficients
         a = reduced.factor[:count, :count]
         error = a @ (found - true) / np.sqrt(uncertainty.variance(reduced, count))
         return float(np.sqrt(np.mean(error**2)))
 
-    naive = least_squares.fit(family, (w, target), (w, target), np.ones(2)).coefficients
-    assert off(family, (w, target)) > 3
-    found = naive
+    measured = least_squares.reduce(family, [(w, target)], np.ones(2))
+    found = least_squares.solve(measured, measured, count).coefficients
+    assert off(measured, found) > 3
+    arcs = arcs_of_pairs(z0, z1, 1)
+    assert arcs is not None
     for _ in range(2):
-        near = family.unflatten(found)
-        rows = nearest(
-            lambda w, near=near: family.gradient_and_hessian(near, w),
-            w,
-            target,
-            of_point,
-            of_target,
-        )
-        reduced = least_squares.reduce(Whitened(family), [_in_order(rows)], np.ones(2))
-        found = least_squares.solve(reduced, reduced, family.num_parameters).coefficients
-    assert off(Whitened(family), _in_order(rows)) < 1.6
-    variance = uncertainty.variance(reduced, family.num_parameters)
+        model = GeneratedOnArcs(family, chart, DT, arcs.moves)
+        reduced = NearestArcs.of(model, found, arcs, np.full(2, SIGMA)).triangle(family)
+        found = least_squares.solve(reduced, reduced, count).coefficients
+    assert off(reduced, found) < 1.6
+    variance = uncertainty.variance(reduced, count)
     assert variance == pytest.approx(1.0, abs=0.05)  # in units of the noise
 
 
-def _in_order(rows):
-    return rows.points, rows.target, rows.whitening
+@pytest.mark.parametrize("chart", [MIDPOINT, TYPE2], ids=["midpoint", "type2"])
+def test_an_arc_is_linearised_as_its_steps_change(chart):
+    """Φ and c of the defect beside finite differences of the map that S generates, with a turn as
+    its base map."""
+    z0, z1, family, params = generated_pairs(chart, 40)
+    turn = np.array([[0.8, 0.6], [-0.6, 0.8]])
+    half = Affine(turn, np.zeros(2), np.zeros(2))
+    z0, z1 = half.inverse().image(z0), half.image(z1)
+    model = GeneratedOnArcs(family, chart, DT, np.ones((40, 1), bool), ((half,), (half,)))
+    w = chart.evaluation_point(half.image(z0), half.inverse().image(z1))
+    p = coefficients_of(family, params, w)
+    at = model.steps(p, np.stack([z0, z1], axis=1))
+    np.testing.assert_allclose(at.closing, 0, atol=1e-9)
+    moved = 1e-6 * np.random.default_rng(3).normal(size=(2, 40, 2))
+    off = model.steps(p, np.stack([z0 + moved[0], z1 + moved[1]], axis=1))
+    linear = (at.by_state[:, 0] @ moved[0][..., None])[..., 0] - moved[1]
+    np.testing.assert_allclose(off.closing[:, 0], linear, atol=1e-10)
 
 
 def test_misfit_is_the_posterior_mean_of_what_was_simulated():
@@ -141,6 +149,7 @@ def test_misfit_weighs_as_much_as_in_the_posterior(misfit, count):
     sizes = [Size(SimpleNamespace(num_parameters=n), larger, float(n)) for n in counts]
     sweep = SimpleNamespace(
         sizes=sizes,
+        alike=uncertainty.ALIKE,
         factors=lambda *_: SimpleNamespace(train=Triangle(factor, rows)),
         freedoms=lambda near, most, counts: list(map(float, counts)),
     )

@@ -7,10 +7,10 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.dataset.arcs import arcs_of_pairs
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.runs import identified, steps_between
 from gfnn_jax.families.terms import given_terms
-from gfnn_jax.fitting.shooting import arcs_of
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.learn.clean import clean
 from gfnn_jax.learn.screening import gross_errors
@@ -140,7 +140,7 @@ def test_what_was_left_out_is_bridged():
     few = identified(pairs_of(states)).pairs.take(kept)
     steps = steps_between(few)
     assert steps.tolist() == [1, 3, 1, 1, 0, *[1] * 6]
-    arcs = arcs_of(few.z0, few.z1, 100, steps)
+    arcs = arcs_of_pairs(few.z0, few.z1, 100, steps)
     assert arcs is not None
     assert arcs.measured.sum(axis=1).tolist() == [7, 8]
     assert not arcs.measured[0, 3]

@@ -256,7 +256,7 @@ def gross() -> Case:
     rng, z1 = np.random.default_rng([SEED, 10]), np.array(exact.z1)
     bad = rng.permutation(2_000)[:40]
     z1[bad, 1] += rng.choice([-0.5, 0.5], 40)
-    words = ("40 of 2000 pairs",)
+    words = ("of 2000 pairs",)
     return Case(gfnn.Pairs(exact.z0, z1, 0.2), fresh, words=words, never=_NOISE)
 
 

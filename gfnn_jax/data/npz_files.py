@@ -173,7 +173,7 @@ def open_npz(path: Path, stream, dt, initial: bool, driven: bool) -> Source:
         if times is not None:
             raise InputError(f"{path}: expected t0 or times, found both")
         if dt is None:
-            raise InputError(f"{path}: holds no time step, by which t0 goes on")
+            raise InputError(f"{path}: expected dt or times, by which t0 goes on, found neither")
         count, length = (1, *trajectories.shape)[-3:-1]
         times = _read_t0(path, member, count)[:, None] + dt * np.arange(length)
     dt = np.nan if initial or dt is None else dt

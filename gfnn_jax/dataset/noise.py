@@ -5,9 +5,9 @@ What is known of the motion decides which of these tells it:
 - `of_differences`: only that orbits are smooth, and their steps short.
 - `of_pairs`: the Jacobian M of the map, of whose pairs e₁ − M e₀ is left over.
 - `of_halves`: products of M with random signs, where all positions are alike, and all momenta.
-- `of_residuals`: the orbits themselves, on which the noise of the states is what is left over.
 
-`robust` is the deviation of normal noise in which some values are gross errors.
+Where the orbits themselves are known, the noise is what is left over of the states
+(`solve.robust.of_residuals`).
 """
 
 from __future__ import annotations
@@ -18,15 +18,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import nnls
 
-_NORMAL = 1.4826  # a normal deviation over the median of its size
 # Where the residuals cannot tell two coordinates' noise apart, each is given half of its own
 # residual's variance, by this weight beside the moments' own.
 _PRIOR = 0.1
-
-
-def robust(values: np.ndarray, axis: int | None = None) -> np.ndarray:
-    """The deviation of normal noise around 0, from the median of its size along the axis."""
-    return _NORMAL * np.median(np.abs(values), axis=axis)
 
 
 def of_differences(moves: Sequence[np.ndarray], order: int, alike: float) -> float | None:
@@ -87,14 +81,3 @@ def of_halves(residual: np.ndarray, grown: np.ndarray) -> np.ndarray:
     rows = np.concatenate([relative, _PRIOR * np.eye(2)])
     found, _ = nnls(rows, np.concatenate([np.ones(2), np.full(2, 0.5 * _PRIOR)]))
     return np.sqrt(mean * found)[halves]
-
-
-def of_residuals(residual: np.ndarray, free: float, outlying: float) -> np.ndarray:
-    """(2d,) from residuals (n, 2d) that are the noise of one state each.
-
-    free: the part of their degrees of freedom that a fit has left. outlying: robust deviations
-    beyond which a number is a gross error, and does not count.
-    """
-    inside = np.abs(residual) <= outlying * robust(residual, axis=0)
-    square = np.sum(np.where(inside, residual, 0.0) ** 2, axis=0)
-    return np.sqrt(square / np.maximum(inside.sum(axis=0), 1) / free)

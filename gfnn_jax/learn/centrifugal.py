@@ -26,7 +26,8 @@ _GAINED = 0.2  # of what the library leaves over, that may be left with them
 
 def centrifugal_terms(data: Dataset, rows: np.ndarray, family: Terms | Sums) -> tuple[str, ...]:
     """Centrifugal terms, and the cosine and sine of their angles, which with the quadratic terms
-    leave a fifth or less of what ``family`` leaves over; none where they do not.
+    leave a fifth or less of what ``family`` leaves over, and of what they leave without the
+    centrifugal ones: cosines alone stand in for any well. None where they do not.
 
     rows: of pairs in plain coordinates, without args or a structure. At states beyond a pole, and
     where one lies between states, a term is not tried."""
@@ -42,10 +43,13 @@ def centrifugal_terms(data: Dataset, rows: np.ndarray, family: Terms | Sums) -> 
     if not texts:
         return ()
     angles = [i for i in range(dim) if any(f"(q{i + 1})" in text for text in texts)]
-    texts += [f"{f}(q{i + 1})" for i in angles for f in ("cos", "sin")]
-    with_them = joined(given_terms(dim, texts), polynomial_terms(dim, 2))
+    waves = [f"{f}(q{i + 1})" for i in angles for f in ("cos", "sin")]
+    with_them, without = (
+        joined(given_terms(dim, own), polynomial_terms(dim, 2)) for own in (texts + waves, waves)
+    )
     left = _left_over(with_them, data, rows)
-    return tuple(texts) if left <= _GAINED * _left_over(family, data, rows) else ()
+    others = [_left_over(known, data, rows) for known in (family, without)]
+    return (*texts, *waves) if left <= _GAINED * min(others) else ()
 
 
 def _between_poles(q: np.ndarray, pole: float) -> bool:

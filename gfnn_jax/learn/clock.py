@@ -57,6 +57,9 @@ class Counted:
         self.spent += operations
 
 
+_NO_TIME = "there was no time for"
+
+
 class Budget:
     """The units that a fit has done, and whether the next one fits.
 
@@ -107,14 +110,15 @@ class Budget:
             self._reserved[then[0]] = max(self._reserved.get(then[0], 0.0), then[1])
         most = self.max_operations
         if most is not None and self.operations + count > most:
-            spent = f"the budget of {most:,} operations is spent"
-            self._end(spent, f"{name} would take {count:.1e} operations more")
+            left = max(most - self.operations, 0)
+            needed = f"{name} would take {count:.1e}, and {left:.1e} of {most:,} are left"
+            self._end("there were no operations for", needed)
         if self.max_seconds is not None:
             seconds, now = self._foretold(kind, count) + self._set_apart, self.seconds
             if now + seconds > self.max_seconds:
                 left = max(self.max_seconds - now, 0.0)
                 needed = f"{name} and what follows would take about {seconds:.2g} s"
-                self._end(self._spent, f"{needed}, and {left:.2g} s are left")
+                self._end(_NO_TIME, f"{needed}, and {left:.2g} of {self.max_seconds:g} s are left")
         with self._timed(kind, count):
             yield
         self.operations += count
@@ -135,7 +139,7 @@ class Budget:
             self._closed = self._closed or late
         spent = self.max_operations is not None and self.operations >= self.max_operations
         if self._closed or (decides and spent):
-            self.leave_out(name, "it does not fit into what is left of the budget")
+            self.leave_out(name, _NO_TIME)
             raise OutOfTime
         with self._timed(kind, operations):
             yield
@@ -146,8 +150,9 @@ class Budget:
         return self._timed(kind, operations)
 
     def leave_out(self, what: str, why: str) -> None:
-        """Have it told in the end."""
-        self.left_out.append(f"left out: {what}: {why}")
+        """Have it told in the end; what the clock ended is told at length once, in ``ended``."""
+        why = "no time" if why.startswith(_NO_TIME) else why
+        self.left_out.append(f"left out: {what} ({why})")
 
     def check(self) -> None:
         """Check between the parts of a unit: raises OutOfTime where it takes longer than foretold
@@ -155,7 +160,7 @@ class Budget:
         if self.over:
             raise OutOfTime
         if self.max_seconds is not None and self.seconds + self._set_apart > self.max_seconds:
-            self.ended = f"{self._spent}{self._after}"
+            self.ended = f"{_NO_TIME}{self._after}: {self.max_seconds:g} s are over"
             raise OutOfTime
 
     def _end(self, spent: str, needed: str) -> None:
@@ -163,12 +168,8 @@ class Budget:
         raise OutOfTime
 
     @property
-    def _spent(self) -> str:
-        return f"the clock ended it: the budget of {self.max_seconds:g} s is spent"
-
-    @property
     def _after(self) -> str:
-        return f" after unit {self._done}, {self._last}" if self._done else " before the first unit"
+        return f" more after unit {self._done} ({self._last})" if self._done else " one unit"
 
     @property
     def _set_apart(self) -> float:

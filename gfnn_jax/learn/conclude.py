@@ -17,6 +17,8 @@ from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.choose_law import long_step
 from gfnn_jax.learn.clock import SOLVE, Budget
 from gfnn_jax.learn.diagnose import differs_between_sequences, volume_change
+from gfnn_jax.learn.hidden_friction import hidden_friction
+from gfnn_jax.learn.neighbours import is_noise
 from gfnn_jax.learn.noise import noise_of_sites, state_noise
 from gfnn_jax.learn.propose import proposed
 from gfnn_jax.learn.request import Request
@@ -35,6 +37,7 @@ _SHARE = 0.1  # of the residual, that a change of volume must explain
 _KNOWN = 1.5  # times the noise that was given: up to it, what is left over is that noise
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 _RESIDUAL_PAIRS = 2_000  # whose residuals are looked at
+_FRICTION_PAIRS = 1_000  # where the tolerance is met
 _NOISE_PAIRS = 1_024  # from which the noise of the states is measured
 _NOISE_NUMBERS = 8_192  # the same of many sites: numbers of so many pairs
 
@@ -58,7 +61,8 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         ended = MET if met else cut or _NO_MORE[request.of_network]
     if ended.startswith(MET) and not met:
         ended = (
-            "the pairs that chose the map meet it, those that state its error do not"
+            "the validation pairs, which choose, meet the tolerance; the test pairs, which state "
+            "the error, do not"
             if np.isfinite(candidate.validation_relative)
             else "the steps of a map that was to meet it do not converge from some of the states"
         )
@@ -69,14 +73,15 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         said = on_law or (law.fast and not met)
         messages += law.messages if said else ()
         unmet = law.unmet if said else ""
+    structured = request.structure is not None  # too few pairs to look at their neighbours
     if met:
+        messages += [] if structured else _hidden(chosen, searched)
         ended = _with_clock(ended, request.budget)
         return Conclusion(
             ended, searched.data.noise_of_channels, [*messages, *request.budget.left_out]
         )
     diagnosis: list[str] = []
     jumps = wrapped(request.pairs, request.coordinates)
-    structured = request.structure is not None  # too few pairs to look at their neighbours
     if jumps:
         ended = reason = "no map follows the jumps of an angle that is wrapped and was not named"
     elif candidate.validation_relative > _ROUNDOFF and searched.linear is None:
@@ -106,6 +111,26 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     )
     messages += request.budget.left_out
     return Conclusion(ended, noise, messages)
+
+
+def _hidden(chosen: Chosen, searched: Searched) -> list[str]:
+    """Warn of friction that the tolerance hides."""
+    candidate, law, data = chosen.candidate, searched.law, searched.data
+    lossy = candidate.learns == "hamiltonian" and law is not None and bool(law.friction)
+    compiled = candidate.microseconds_per_step is not None
+    if lossy or not compiled or data.varied or not candidate.validation_relative > _ROUNDOFF:
+        return []
+    if data.coordinates.forward is not CARTESIAN.forward:
+        return []
+    sample = _residuals_of_sample(candidate, None, searched, _FRICTION_PAIRS)
+    found = hidden_friction(sample.image, sample.residual, data.user_angles)
+    if found is None:
+        return []
+    change, error = found
+    return [
+        f"phase-space volumes change by {change:.2g} (± {error:.1g}) of themselves in a step, as "
+        "by friction; the map keeps them and meets the tolerance, a smaller one asks for friction"
+    ]
 
 
 def _with_clock(ended: str, budget: Budget) -> str:
@@ -160,32 +185,34 @@ class _LeftOver(NamedTuple):
 
 
 class _Sample(NamedTuple):
-    """Rows of training pairs (n,), their states and residuals (n, 2d), sizes of these (2d,), and
-    the sequence that each is of (n,)."""
+    """Rows of training pairs (n,), their states, predicted images and residuals (n, 2d), sizes of
+    these (2d,), the sequence that each is of and its place there (n,)."""
 
     rows: np.ndarray
     y0: np.ndarray
+    image: np.ndarray
     residual: np.ndarray
     scale: np.ndarray
     sequence: np.ndarray
+    place: np.ndarray
 
 
 def _residuals_of_sample(
-    candidate: Candidate, entry: Entry | None, searched: Searched
+    candidate: Candidate, entry: Entry | None, searched: Searched, most: int = _RESIDUAL_PAIRS
 ) -> _Sample:  # fmt: skip
     """The residuals of the entry's map, or of the candidate's where there is none."""
     data = searched.data if entry is None else entry.sweep.data
-    rows = np.sort(data.training)[:_RESIDUAL_PAIRS]
-    y0, residual, solved = _residuals(candidate, entry, data, rows)
-    rows, y0, residual = rows[solved], y0[solved], residual[solved]
-    sequence = data.run[rows]
+    rows = np.sort(data.training)[:most]
+    y0, image, residual, solved = _residuals(candidate, entry, data, rows)
+    rows, y0, image, residual = rows[solved], y0[solved], image[solved], residual[solved]
     scale = data.spread if entry is None else data.scale
-    return _Sample(rows, y0, residual, scale, sequence)
+    place = np.asarray(data.pairs.place)[rows]
+    return _Sample(rows, y0, image, residual, scale, data.run[rows], place)
 
 
 def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
     """Describe these residuals, where they are something else than noise."""
-    _, y0, residual, scale, sequence = sample
+    _, y0, _, residual, scale, sequence, _ = sample
     if differs_between_sequences(y0 / scale, residual / scale, sequence):
         message = (
             "what is left over agrees within a sequence and differs between sequences: something "
@@ -205,13 +232,20 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
             f"(± {error:.1g}) of themselves in a step, as by friction: no symplectic map does"
         )
         return _LeftOver(None, [message], "volumes of phase space change, as by friction")
-    if np.isfinite(error):
+    if np.isfinite(error) or _told_by_neighbours(sample) is False:
         message = (
-            "what is left over is a smooth function of the states and no noise: a structure that "
-            "these functions cannot represent, or pairs of no symplectic map"
+            "what is left over is a function of the states and no noise, neighbouring pairs agree "
+            "in it: a structure that these functions cannot represent, or pairs of no symplectic "
+            "map"
         )
-        return _LeftOver(None, [message], "what is left over is smooth, and no noise")
+        return _LeftOver(None, [message], "what is left over is a function of the states")
     return None
+
+
+def _told_by_neighbours(sample: _Sample) -> bool | None:
+    """Whether what is left over is noise; None where the pairs lie too far apart to tell."""
+    _, y0, _, residual, scale, sequence, place = sample
+    return is_noise(y0 / scale, residual / scale, sequence, place)
 
 
 def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOver:
@@ -221,15 +255,23 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     The residuals are those of the chosen map, or of the best generated one where H was chosen.
     """
     candidate, data = chosen.candidate, searched.data
+    law = searched.law
     entry = chosen.entry or next(iter(searched.found.ranking), None)
+    if candidate.learns == "hamiltonian" and law is not None and law.friction:
+        entry = None  # S has none
     if entry is not None:
         data = entry.sweep.data
     sample = _residuals_of_sample(candidate, entry, searched)
+    of_h = law if candidate.learns == "hamiltonian" and entry is None else None
+    if not stalled and of_h is not None:  # the search for H ended before it met the noise
+        stalled = _told_by_neighbours(sample) is True and leaves_white(of_h, data)
     known = _no_noise(sample, stalled)
     if known is not None:
         return known
+    if data.noise_of_channels is None and _told_by_neighbours(sample) is None:
+        return _LeftOver(None, [], "the pairs lie too far apart to tell noise from what these "
+                         "functions lack")  # fmt: skip
     rows, sequence = sample.rows, sample.sequence
-    law = searched.law
     taken = candidate.num_parameters / (data.training.size * 2 * data.dim)
     noise = state_noise(candidate.map, data.pairs.take(rows[:_NOISE_PAIRS]), taken)
     if law is not None and law.noise is not None and candidate.learns == "hamiltonian":
@@ -242,12 +284,13 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     if candidate.learns == "map" and entry is not None and isinstance(entry.sweep, LinearSweep):
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / data.spread) ** 2))
         own = f" (the map's own error is then about {part:.1g} of it)"
-    hidden = ""
+    hidden, reason = "", "what is left over is noise"
     if len(np.unique(sequence)) == len(sequence):
         hidden = (
-            "or to depend on something that the states do not hold (a parameter, a drive), which "
-            "single pairs do not tell from noise, "
+            ", or depends on something that the states do not hold (a parameter, a drive), which "
+            "single pairs do not tell from noise"
         )
+        reason += ", or something that the states do not hold"
     of_law = law if candidate.learns == "hamiltonian" and not hidden else None
     if of_law is not None and leaves_white(of_law, searched.data):
         message = (
@@ -256,11 +299,10 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         )
         return _LeftOver(noise, [message], _RIGHT)
     message = (
-        "larger models are no more accurate: the pairs seem to carry noise of about "
-        f"{sizes_of_noise} on the coordinates in their order{own}, "
-        f"{hidden}or to have a structure that these functions cannot represent"
+        f"what is left over is noise of about {sizes_of_noise} on the coordinates in their "
+        f"order{own}{hidden}"
     )
-    return _LeftOver(noise, [message])
+    return _LeftOver(noise, [message], reason)
 
 
 def _beside_known(found: np.ndarray, known: np.ndarray) -> _LeftOver:
@@ -286,27 +328,28 @@ def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOv
     rows = np.sort(data.training)[:few]
     noise = noise_of_sites(chosen.candidate.map, data.pairs.take(rows))
     message = (
-        "other libraries of the structure are no more accurate: the pairs seem to carry noise of "
-        f"about {noise[0]:.1e} on positions and {noise[-1]:.1e} on momenta, or to have terms that "
-        "these libraries do not hold"
+        "other libraries of the structure are no more accurate: what is left over is noise of "
+        f"about {noise[0]:.1e} on positions and {noise[-1]:.1e} on momenta, or terms that these "
+        "libraries do not hold"
     )
     return _LeftOver(noise, [message])
 
 
 def _residuals(
     chosen: Candidate, entry: Entry | None, data: Dataset, rows
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States and residuals (N, 2d) of these pairs, and which of them were predicted (N,): as
-    inner ones where S was learned, in the user's coordinates where only a law was."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """States, predicted images and residuals (N, 2d) of these pairs, and which of them were
+    predicted (N,): as inner ones where S was learned, in the user's coordinates where only a law
+    was."""
     if entry is not None:
         images, solved = entry.sweep.images(entry.size, rows)
-        return data.y0[rows], data.y1[rows] - images, solved
+        return data.y0[rows], images, data.y1[rows] - images, solved
     pairs, coordinates = data.pairs.take(rows), chosen.map.coordinates
     angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
     z0 = np.asarray(pairs.z0)
     steps = stepped(chosen.map, z0, pairs.dt, pairs.args, timed=False)
     residual = nearest_image(np.asarray(pairs.z1) - steps.images, angles)
-    return z0, residual, ~steps.failed & np.isfinite(residual).all(axis=1)
+    return z0, steps.images, residual, ~steps.failed & np.isfinite(residual).all(axis=1)
 
 
 def not_met(chosen: Candidate, tolerance: Tolerance, ended: str) -> str:

@@ -169,6 +169,7 @@ def learned_from(
     z, args = data.y0[rows], data.given(rows)[1]
     some = slice(FREQUENCY_STATES)
     fastest = rates(family, fit.coefficients, data.y0[some], data.given(some)[1])
+    by_row = problem  # each at its own dt
     if data.own_dt is not None:  # the map's own dt, from which others follow
         problem = Problem(data.y0, data.y1, data.dt, data.scale, args=data.args)
     steps = _cheapest(problem, family, fit, fastest, data, tolerance, options)
@@ -203,7 +204,8 @@ def learned_from(
     omega_h = omega_h_of(family, fit.coefficients, data, fastest)
     left_out = len(np.setdiff1d(found.rows, fit.used))
     resolved = np.abs(off).max(axis=1) <= bound_of(tolerance, data.scale)
-    covariance = of_arcs or partial(covariance_root, found, problem, data, steps)
+    of_rows = steps if data.own_dt is None else of_all
+    covariance = of_arcs or partial(covariance_root, found, by_row, data, of_rows)
     if whole is not None:
         covariance = partial(np.asarray, whole.root)
     return LearnedHamiltonian(
@@ -215,7 +217,7 @@ def learned_from(
         stalled=found.stalled,
         covariance=covariance, noise=None if whole is None else whole.noise,
         arcs=0 if whole is None else whole.arcs,
-        dropped=found.dropped, unmet=_unmet(error, omega_h, data, tolerance, found),
+        dropped=found.dropped, unmet=_unmet(error, omega_h, tolerance, found),
         friction=friction,
     )  # fmt: skip
 
@@ -351,14 +353,20 @@ def unexplained(
     return part if part < 1 - by_chance else 1.0
 
 
-def _unmet(error: OneStepError, omega_h: float, data, tolerance, found: FittedLaw) -> str:
+def _unmet(error: OneStepError, omega_h: float, tolerance, found: FittedLaw) -> str:
     if error.bound <= tolerance.bound:
         return ""
+    why = "; terms that you know would help (terms)"
+    if omega_h > FAST:
+        why = (
+            f"; it oscillates by {omega_h:.2g} radians in a step, and beyond π one dt does not "
+            "tell H: sample with a shorter one"
+        )
+    elif found.ended:
+        why = f"; modes were added until {found.ended}"
     return (
-        f"no H of the terms tried meets the tolerance (best {error.relative:.2e} of the spread, "
-        f"its fastest oscillation {omega_h:.2g} in a step): the pairs carry noise, other terms are "
-        f"needed, the map has no flow, or ωh > π at dt = {data.dt:g}, and then only a shorter "
-        "dt tells H" + (f"; modes were added until {found.ended}" if found.ended else "")
+        "no H of the terms tried meets the tolerance: the best misses the images by "
+        f"{error.relative:.2e} of the spread{why}"
     )
 
 
@@ -388,13 +396,13 @@ def _messages(
         )
     if left_out:
         yield (
-            f"{left_out} of {len(found.rows)} pairs, as of close passages, are not resolved by the "
-            "steps of the fit: they are left out of it"
+            f"the steps of the fit are too coarse for {left_out} of {len(found.rows)} pairs, as of "
+            "close passages: it goes without them"
         )
     if unresolved:
         yield (
-            f"{unresolved} of {len(data.validation)} held-out pairs are not resolved to the "
-            "tolerance by the flow's own steps: there the map is in error, and not the law"
+            f"the steps of the flow are too coarse for {unresolved} of {len(data.validation)} "
+            "held-out pairs: there the map errs, and not H"
         )
 
 

@@ -2,31 +2,34 @@
 
 A search judges sizes by residuals that are nearly all noise, and fits at measured points. Where
 that is what stopped it, the sweeps that came as far as the best are fitted again to the states that
-the pairs most likely had (`fitting.nearest_states`). In these rows the residual is a distance from
-the map's graph in units of the noise, whatever the chart, and the expected error of every size on
+the pairs most likely had (`models.map_arcs`). In these rows the residual is a distance from the
+map's graph in units of the noise, whatever the chart, and the expected error of every size on
 fresh pairs follows from one factor, as Mallows' C_p does (Technometrics 15 (1973) 661).
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.dataset.arcs import arcs_of_pairs, onward
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import uncertainty
-from gfnn_jax.fitting.nearest_states import Whitened, nearest
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.learn.candidates import Candidate, validated
 from gfnn_jax.learn.choose_law import preferred
 from gfnn_jax.learn.clock import ROWS, Budget
 from gfnn_jax.learn.conclude import only_noise
 from gfnn_jax.learn.request import Request
-from gfnn_jax.learn.rows import rows_of
 from gfnn_jax.learn.search import AS_FAR, Entry
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.learn.sweeps import LinearSweep, Size
+from gfnn_jax.learn.sweeps import SAMPLE_ROWS, Factors, LinearSweep, Size, part_of_noise
+from gfnn_jax.models.map_arcs import LONGEST, GeneratedOnArcs, NearestArcs
 
 _MOST_SWEEPS = 3
 _WHAT = "the fit of S to the states that noisy pairs most likely had"
@@ -122,7 +125,7 @@ def best_size(sweep: LinearSweep, near: Size, most: Size, budget: Budget, say) -
         added = np.maximum(-np.diff(left) - noise * np.diff(taken), 0.0)
         misfit = np.append(np.cumsum(added[::-1])[::-1], 0.0)
         own = noise * taken / train.rows
-        errors = noise + own + uncertainty.ALIKE * misfit / train.rows
+        errors = noise + own + sweep.alike * misfit / train.rows
         best = int(np.argmin(errors))
         if best < place or place + 1 == len(sweep.sizes):
             return Expected(sizes[best], float(errors[best]), float(own[best]), noise)
@@ -164,7 +167,7 @@ def _corrected(rivals: list[Entry], request: Request) -> Entry:
 
 
 class NoisySweep(LinearSweep):
-    """The sizes of a sweep, in rows of the states that its pairs most likely had.
+    """The sizes of a sweep, in rows of the states that its arcs most likely had.
 
     plain: the sweep. near: one whose solution of ``size`` says where those states are. deviations:
     (2d,) of the noise of each coordinate, ÷ its scale.
@@ -174,26 +177,43 @@ class NoisySweep(LinearSweep):
         self, plain: LinearSweep, near: LinearSweep, size: Size, deviations: np.ndarray
     ):  # fmt: skip
         self.__dict__.update(plain.__dict__)
-        self.__dict__.pop("of_states", None)
         self.plain, self._kept, self._factors, self._solved = plain, None, {}, {}
-        family, params = size.family, near.solve(size, Budget(), lambda message: None)[1]
-        of_noise = np.tile(deviations, 2)
-        of_point, of_target = (of * of_noise for of in plain.of_states)
+        data, coefficients = self.data, near.solve(size, Budget(), _quiet)[0].coefficients
 
-        def rows(which):
-            (w, target), _ = rows_of(self.data, self.chart, which)
-            found = nearest(
-                lambda w: family.gradient_and_hessian(params, w), w, target, of_point, of_target
+        def nearest(rows) -> NearestArcs:
+            arcs = arcs_of_pairs(*_chained(data, np.sort(rows)))
+            assert arcs is not None
+            model = GeneratedOnArcs(
+                size.family, self.chart, data.dt, arcs.moves, (data.before, data.after)
             )
-            return found.points, found.target, found.whitening
+            return NearestArcs.of(model, coefficients, arcs, deviations * data.scale)
 
-        self._rows = rows
-        self._train, self._held = (rows(r) for r in (self.data.training, self.data.validation))
-        self._weight = np.ones(len(deviations))
+        self._along = nearest
+        self._nearest, self._nearest_held = map(nearest, (data.training, data.validation))
 
-    def in_rows(self, family: Any) -> Any:
-        """The family whose terms make the rows of this sweep."""
-        return Whitened(family)
+    def _computed(self, group, budget: Budget, say) -> Factors:
+        pairs, width = self._rows_of(group)
+        train = self._part(pairs * width).triangle(group, budget.check)
+        held = self._nearest_held.triangle(group, budget.check)
+        return Factors(train, held, train, Triangle.empty(group.num_parameters))
+
+    def _part(self, numbers: int) -> NearestArcs:
+        """Arcs that stand for about so many numbers, drawn at random."""
+        arcs = len(self._nearest.x)
+        share = numbers / (len(self.data.training) * self._width)
+        if share >= 1:
+            return self._nearest
+        drawn = np.random.default_rng(0).permutation(arcs)[: max(1, int(np.ceil(share * arcs)))]
+        return self._nearest.take(np.sort(drawn))
+
+    @property
+    def alike(self) -> float:
+        """Misfit's weight: along arcs of several steps it adds up in the rows themselves."""
+        return uncertainty.ALIKE if self._nearest.x.shape[1] == 2 else 1.0
+
+    def freedoms(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
+        """Count the terms: the rows of an arc are independent."""
+        return [float(count) for count in counts]
 
     def judge(self, size: Size, budget: Budget, say) -> Candidate:
         """Judge as the sweep that was corrected does, by the measured points."""
@@ -208,15 +228,54 @@ class NoisySweep(LinearSweep):
 
     def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Predict by a fit to the states that other rows most likely had."""
-        return self._predicted(size, self._rows(others), rows)
+        of = size.family
+        fitted_to, held = self._along(others).triangle(of), self._nearest_held.triangle(of)
+        return self._predicted(size, fitted_to, held, rows)
 
     def own_error(self, size: Size) -> float:
         """Own error of the measured points."""
         return self.plain.own_error(size)
 
-    def by_states(self, family, params, w, whitening) -> tuple[np.ndarray, np.ndarray]:
-        """The residual's derivatives in z₀ and z₁ (n, 2d, 2d), those ÷ their scale."""
-        hessian = family.gradient_and_hessian(params, w)[1]
-        of_point, of_target = self.of_states
-        by = whitening @ (hessian @ of_point - of_target)
-        return by[..., : len(of_point)], by[..., len(of_point) :]
+    def root(self, size: Size) -> np.ndarray:
+        """Root of the covariance, as the sweep's own, of rows that are independent."""
+        train, count = self.factors(size.group, Budget(), _quiet).train, size.family.num_parameters
+        solved, larger = self.solve(size, Budget(), _quiet)[0], self._larger(size)
+        most = size.family if larger is None else larger.family
+        sample = self._part(SAMPLE_ROWS * most.num_parameters)
+        blocks = list(sample.rows(most))
+        rows, numbers = np.concatenate([rows for rows, _ in blocks]), sum(n for _, n in blocks)
+        of_sample = Triangle.of(rows)
+
+        def left(of: Size) -> tuple[float, float, int]:
+            terms, known = of.family.num_parameters, larger and larger.group in self._factors
+            triangle = self._factors[of.group].train if known else of_sample
+            rows = triangle.rows if known else numbers
+            return triangle.residual_norm(terms) ** 2 / rows, float(terms), rows
+
+        noise = None if larger is None else part_of_noise(size, larger, left(size), left(larger))
+        slopes = rows[:, :count]
+        return uncertainty.root(
+            train, count, slopes, slopes @ solved.coefficients - rows[:, -1], noise=noise,
+            ridge=solved.ridge,
+        )  # fmt: skip
+
+
+def _chained(data: Dataset, rows) -> tuple[np.ndarray, np.ndarray, int, Any]:
+    """Arguments of `arcs_of_pairs` for these rows: inner coordinates without a base map, angles
+    lifted along an arc. A p of period 2π is none to S: its pairs are arcs of their own."""
+    z0, z1 = data.y0[rows], data.whole_image(data.y1[rows])
+    for piece in reversed(data.before):
+        z0 = piece.inverse().image(z0)
+    steps, angles = onward(data.pairs, rows), list(data.coordinates.angles)
+    if angles:
+        steps = np.where(max(angles) < data.dim, steps == 1, False).astype(int)
+        turns = np.round((z1[:-1] - z0[1:])[:, angles] / (2 * np.pi)) * steps[:, None]
+        lifted = 2 * np.pi * np.concatenate([np.zeros((1, len(angles))), np.cumsum(turns, axis=0)])
+        z0, z1 = z0.copy(), z1.copy()
+        z0[:, angles] += lifted
+        z1[:, angles] += lifted
+    return z0, z1, LONGEST, steps
+
+
+def _quiet(message: str) -> None:
+    """Say nothing of what is known already."""

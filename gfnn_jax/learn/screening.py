@@ -24,8 +24,8 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.noise import robust
 from gfnn_jax.learn.diagnose import looked_for_errors
+from gfnn_jax.solve.robust import Biweight, robust
 
 # Times the median residual: beyond the second, a pair is a gross error. Those between the two are
 # fewer than this part of them. Of normal noise and d = 1 one pair of 100,000 is beyond the first.
@@ -43,7 +43,8 @@ _WITHIN = 8.0
 _PAIRS_PER_TERM, _MOST_TERMS, _MOST_ROWS = 8, 130, 3_000
 _GAINED = 0.9  # of the residual, that a higher degree must leave
 _USABLE = 0.25  # of the moves' size: a polynomial that leaves more says nothing
-_ABSOLUTE, _BIWEIGHT, _TUKEY = 8, 7, 6.0  # rounds of either loss, and where the second is constant
+_ABSOLUTE, _BIWEIGHT = 8, 7  # rounds of either loss
+_TUKEY = Biweight(6.0)  # in medians
 _SPANNED = 1e-12  # of the largest: a smaller eigenvalue of a Gram matrix is roundoff
 
 
@@ -175,7 +176,7 @@ def _resistant(design, move) -> tuple[np.ndarray, float]:
         if n < _ABSOLUTE:
             weight = median / np.maximum(size, median)
         else:
-            weight = (1 - np.minimum(size / (_TUKEY * median), 1.0) ** 2) ** 2
+            weight = _TUKEY.weights(size / median)
     return turn @ coefficients, median
 
 

@@ -335,7 +335,7 @@ def _why(sweeps: Sequence[Any], stalled: list[int], best: Sequence[float]) -> st
     error tell nothing."""
     good = [i for i, s in enumerate(sweeps) if s.sizes and best[i] <= AS_FAR * min(best)]
     if any(stalled[i] == _STALLED for i in good):
-        return "larger models are no more accurate: noise, or a structure they cannot represent"
+        return "larger models are no more accurate"
     if any(sweeps[i].short_of_pairs for i in good):
         return "the pairs determine no larger model: more pairs would help"
     if good:

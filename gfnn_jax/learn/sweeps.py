@@ -56,7 +56,7 @@ OF_SOLVE, OF_STEPS = 22.0, 20.0
 # Pairs of a block that goes to one of two halves: long beside the noise that neighbours share.
 _HALVES_BLOCK = 50
 # Rows per term of a larger size, by which noise is told from misfit.
-_SAMPLE_ROWS = 6
+SAMPLE_ROWS = 6
 _NOISE_PAIRS = 4_096  # that tell the noise of each coordinate
 
 
@@ -118,7 +118,7 @@ def sweep_of_dt(data: Dataset, tolerance: Tolerance, scene, factors=None) -> Lin
     return LinearSweep(data, tolerance, MIDPOINT, "polynomial", None, reversor, factors)
 
 
-class _Factors(NamedTuple):
+class Factors(NamedTuple):
     """Factors of the training rows, of those held out, and of the training rows without the
     outermost twentieth and of that twentieth alone."""
 
@@ -128,7 +128,7 @@ class _Factors(NamedTuple):
     outer: Triangle
 
     @classmethod
-    def of(cls, inner: Triangle, outer: Triangle, held: Triangle) -> _Factors:
+    def of(cls, inner: Triangle, outer: Triangle, held: Triangle) -> Factors:
         """The rows of the outermost twentieth are appended to the others by their own triangle."""
         return cls(inner.append(outer.factor, outer.rows), held, inner, outer)
 
@@ -207,7 +207,7 @@ class LinearSweep(Generates):
         ]  # fmt: skip
         # Else the last size is the largest there is, or the most terms are reached.
         self.short_of_pairs = len(self.sizes) < known and rows < _ROWS_PER_TERM * _MOST_TERMS
-        self._factors: dict[Any, _Factors] = {}
+        self._factors: dict[Any, Factors] = {}
         self._solved: dict[int, least_squares.LeastSquaresFit] = {}  # by the number of terms
 
     def named(self, size: Size) -> str:
@@ -290,12 +290,16 @@ class LinearSweep(Generates):
     def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Images (n, 2d) of these rows, in the user's coordinates, by a fit to other rows; NaN
         where a step is not solved."""
-        return self._predicted(size, rows_of(self.data, self.chart, others)[0], rows)
+        family, given = self.in_rows(size.family), rows_of(self.data, self.chart, others)[0]
+        train, held = (
+            least_squares.reduce(family, [of], self._weight) for of in (given, self._held)
+        )
+        return self._predicted(size, train, held, rows)
 
-    def _predicted(self, size: Size, fitted_to, rows: np.ndarray) -> np.ndarray:
-        data, family = self.data, self.in_rows(size.family)
-        train = least_squares.reduce(family, [fitted_to], self._weight)
-        held = least_squares.reduce(family, [self._held], self._weight)
+    def _predicted(
+        self, size: Size, train: Triangle, held: Triangle, rows: np.ndarray
+    ) -> np.ndarray:  # fmt: skip
+        data = self.data
         solved = least_squares.solve(train, held, size.family.num_parameters)
         params = size.family.unflatten(solved.coefficients)
         images, known = refined_images(data, self.chart, size.family, params, rows)
@@ -338,7 +342,7 @@ class LinearSweep(Generates):
         family, solved = size.family, self.solve(size, Budget(), lambda message: None)[0]
         larger = self._larger(size)
         most = family if larger is None else larger.family
-        data, goes_on = self._sample(-(-_SAMPLE_ROWS * most.num_parameters // self._width))
+        data, goes_on = self._sample(-(-SAMPLE_ROWS * most.num_parameters // self._width))
         w, target, *args = data
         params = family.unflatten(solved.coefficients)
         slopes = self._slopes(family, w, *args)
@@ -393,6 +397,11 @@ class LinearSweep(Generates):
         return all(isinstance(p, (Affine, Damping)) for p in (*self.data.before, *self.data.after))
 
     @property
+    def alike(self) -> float:
+        """The weight of misfit beside noise, where a size is chosen by its expected error."""
+        return uncertainty.ALIKE
+
+    @property
     def largest_known(self) -> Size:
         """The largest size that a factor answers for."""
         return [size for size in self.sizes if size.group in self._factors][-1]
@@ -412,7 +421,7 @@ class LinearSweep(Generates):
         """Degrees of freedom that noise takes of a fit of so many of the leading terms of a size:
         as many, where no state stands in two pairs. near: whose residuals tell the noise; it may
         be the larger one, whose terms begin with those of the other."""
-        (w, target, *args), goes_on = self._sample(-(-_SAMPLE_ROWS * max(counts) // self._width))
+        (w, target, *args), goes_on = self._sample(-(-SAMPLE_ROWS * max(counts) // self._width))
         if not goes_on.any() or not self.moved_by_states:
             return [float(count) for count in counts]
         solved, params = self.solve(near, Budget(), lambda message: None)
@@ -462,14 +471,7 @@ class LinearSweep(Generates):
             square = reduced.residual_norm(count) ** 2 / max(reduced.rows, 1)
             return square, degrees, reduced.rows
 
-        (of_all, taken, _), (of_rest, more, rows) = left(size), left(larger)
-        noise = of_rest / max(1.0 - more / rows, 1.0 / rows)
-        if not noise > 0:
-            return 1.0 if not of_all > 0 else 0.0
-        further = larger.family.num_parameters - size.family.num_parameters
-        each = noise * max(more - taken, 0.0) / further  # of noise, in what a further term explains
-        explained = rows * max(of_all - of_rest, 0.0)
-        return noise / (noise + uncertainty.misfit(explained, further, each) / rows)
+        return part_of_noise(size, larger, left(size), left(larger))
 
     def _larger(self, size: Size) -> Size | None:
         """The size two further, as a symmetric map gains nothing from the odd degrees; the next, or
@@ -483,13 +485,13 @@ class LinearSweep(Generates):
             further += [Size(f, f, _extent(f)) for f in itertools.islice(beyond, 2 - len(further))]
         return further[-1] if further else None
 
-    def factors(self, group, budget: Budget, say) -> _Factors:
+    def factors(self, group, budget: Budget, say) -> Factors:
         """Factors of a group's largest family, which answer for all of its sizes."""
         if group not in self._factors:
             self._factors[group] = self._known(group) or self._computed(group, budget, say)
         return self._factors[group]
 
-    def _known(self, group) -> _Factors | None:
+    def _known(self, group) -> Factors | None:
         """The factors that an interrupted fit of the same pairs has kept."""
         stored = self._kept.load(self._named(group)) if self._kept is not None else None
         if stored is None:
@@ -498,9 +500,9 @@ class LinearSweep(Generates):
             Triangle(stored[part], int(stored[f"{part}_rows"]))
             for part in ("inner", "outer", "held")
         )
-        return _Factors.of(inner, outer, held)
+        return Factors.of(inner, outer, held)
 
-    def _computed(self, group, budget: Budget, say) -> _Factors:
+    def _computed(self, group, budget: Budget, say) -> Factors:
         taken, _ = self._rows_of(group)
         say(f"{self.chart.name}: {group.num_parameters} terms of {group.label}, {taken} pairs")
         started = time.perf_counter()
@@ -516,7 +518,7 @@ class LinearSweep(Generates):
                 self._named(group), inner=inner.factor, inner_rows=inner.rows, outer=outer.factor,
                 outer_rows=outer.rows, held=held.factor, held_rows=held.rows,
             )  # fmt: skip
-        return _Factors.of(inner, outer, held)
+        return Factors.of(inner, outer, held)
 
     def _named(self, group) -> str:
         return f"{self.chart.name} {self.kind} {group.num_parameters}"
@@ -530,6 +532,21 @@ class LinearSweep(Generates):
             validation_bound=error.bound, deviations=error.deviations, train_rms=train_rms,
             fit_seconds=seconds,
         )  # fmt: skip
+
+
+def part_of_noise(
+    size: Size, larger: Size, left: tuple[float, float, int], rest: tuple[float, float, int]
+) -> float:
+    """The part of what a size leaves over that is noise, by what a larger one explains of it: the
+    mean square that either leaves, the degrees of freedom that noise takes, and the rows."""
+    (of_all, taken, _), (of_rest, more, rows) = left, rest
+    noise = of_rest / max(1.0 - more / rows, 1.0 / rows)
+    if not noise > 0:
+        return 1.0 if not of_all > 0 else 0.0
+    further = larger.family.num_parameters - size.family.num_parameters
+    each = noise * max(more - taken, 0.0) / further  # of noise, in what a further term explains
+    explained = rows * max(of_all - of_rest, 0.0)
+    return noise / (noise + uncertainty.misfit(explained, further, each) / rows)
 
 
 def _extent(family) -> float:

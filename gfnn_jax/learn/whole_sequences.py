@@ -8,12 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.arcs import Arcs, arcs_of_pairs, onward
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.noise import robust
-from gfnn_jax.dataset.runs import steps_between
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
-from gfnn_jax.fitting.shooting import OPTIONS, Shooting, Shot, arcs_of, longest_arc
 from gfnn_jax.fitting.significance import significant
+from gfnn_jax.fitting.triangle import Triangle
+from gfnn_jax.models.flow_arcs import BIWEIGHT, FlowOnArcs, fit_flow, longest_arc
+from gfnn_jax.solve.latent_arcs import OUTLYING, Fitted
+from gfnn_jax.solve.robust import robust
 
 _SHORTEST = 3  # steps of an arc that says more than its pairs do
 _CERTAIN = 4.0  # standard errors below which a term is noise
@@ -56,61 +58,75 @@ def fitted_to_sequences(
         return None
     resolved = _STEP_ERROR * rms
     steps = problem.fine_steps(family, c, data.training, (resolved,))[0]
-    between = steps_between(data.pairs)
     longest = longest_arc(family, c, data.y0[some], data.dt, steps, rms)
 
-    def along(rows) -> Shooting | None:
+    def along(rows) -> Arcs | None:
         rows, pairs = np.sort(rows), data.pairs
-        # What was left out is bridged, what is held out is not.
-        onward = np.where(np.diff(rows) == 1, between[rows[:-1]], 0)
-        arcs = arcs_of(np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows], longest, onward)
+        z0, z1 = np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows]
+        arcs = arcs_of_pairs(z0, z1, longest, onward(pairs, rows))
         if arcs is None or np.median(arcs.measured.sum(axis=1)) <= _SHORTEST:
             return None
-        return Shooting(
-            arcs, data.dt, steps, problem.scale, coordinates.angles, resolved=resolved,
-            check=check,
-        )  # fmt: skip
+        return arcs
 
     train, held = along(data.training), along(data.validation)
     if train is None or held is None:
         return None
+    least = max(resolved, float(np.finfo(float).eps)) * problem.scale
+
+    def fitted(arcs: Arcs, terms, coefficients, **options) -> Fitted | None:
+        model = FlowOnArcs(terms, data.dt, steps, arcs.moves, check)
+        return fit_flow(model, coefficients, arcs, least, coordinates.angles, **options)
 
     def left(terms, coefficients) -> float:
-        """Residuals of the held-out arcs, each from the state that suits it."""
-        found = held.fit(terms, coefficients, only_states=True)
-        return np.inf if found is None else float(np.linalg.norm(found.noise / problem.scale))
+        """Noise of the held-out arcs, each from the state that suits it."""
+        found = fitted(held, terms, coefficients, only_states=True)
+        return np.inf if found is None else float(np.linalg.norm(found.sigma / problem.scale))
 
-    before, found = left(family, c), train.fit(family, c)
-    if found is None or not left(family, found.coefficients) <= _RISE * before:
+    before, found = left(family, c), fitted(train, family, c)
+    if found is None or not left(family, found.p) <= _RISE * before:
         return None
     kept = tuple(range(len(c)))
-    few = significant(found.triangle, found.coefficients, _CERTAIN)[0]
+    few = significant(_triangle(found), found.p, _CERTAIN)[0]
     if 0 < len(few) < len(c):
         fewer = family.take(tuple(few.tolist()))
-        again = train.fit(fewer, found.coefficients[few])
-        if again is not None and left(fewer, again.coefficients) <= _RISE * before:
+        again = fitted(train, fewer, found.p[few])
+        if again is not None and left(fewer, again.p) <= _RISE * before:
             kept, found, family = tuple(few.tolist()), again, fewer
-    if _ROWS_PER_TERM * len(kept) <= found.triangle.rows:
+    if _ROWS_PER_TERM * len(kept) <= _triangle(found).rows:
         everyone = along(np.arange(len(data.y0)))
-        again = everyone.fit(family, found.coefficients) if everyone is not None else None
-        if everyone is not None and again is not None:
-            train, found = everyone, again
+        again = fitted(everyone, family, found.p) if everyone is not None else None
+        if again is not None:
+            found = again
+    root = _root(found)
     return Whole(
-        kept, _as_fit(fit, found), found.root, found.noise, len(train.arcs.states),
-        _messages(found, int(train.arcs.measured.sum())),
+        kept,
+        fit._replace(coefficients=found.p, standard_errors=np.linalg.norm(root, axis=0)),
+        root, found.sigma, len(found.x), _messages(found),
     )  # fmt: skip
 
 
-def _as_fit(fit: FlowFit, found: Shot) -> FlowFit:
-    return fit._replace(
-        coefficients=found.coefficients, standard_errors=np.linalg.norm(found.root, axis=0)
-    )
+def _triangle(found: Fitted) -> Triangle:
+    """Triangle of [∂r/∂c, r] without the latent states, r predicted less measured, for the numbers
+    that have weight."""
+    factor = found.factor.copy()
+    factor[:, -1] *= -1
+    return Triangle(factor, int((np.abs(found.residuals) < BIWEIGHT.k).sum()))
 
 
-def _messages(found: Shot, measured: int) -> tuple[str, ...]:
-    if not found.outlying:
+def _root(found: Fitted) -> np.ndarray:
+    """(m, m), rootᵀ root the covariance: that of independent noise, widened where the arcs' own
+    gradients vary by more than noise makes them: misfit is alike along an arc."""
+    root, (arcs, count) = _triangle(found).spectrum().root().T, found.scores.shape
+    vary = np.sum((found.scores @ root.T) ** 2) / count / max(1 - count / arcs, 1 / arcs)
+    return root * np.sqrt(max(vary, 1.0))
+
+
+def _messages(found: Fitted) -> tuple[str, ...]:
+    measured = np.isfinite(found.residuals).all(axis=-1)
+    outlying = np.any(np.abs(found.residuals) > OUTLYING, axis=-1)
+    if not outlying.any():
         return ()
     return (
-        f"{found.outlying} of {measured} measured states lie more than {OPTIONS.outlying:g} times "
+        f"{outlying.sum()} of {measured.sum()} measured states lie more than {OUTLYING:g} times "
         "the noise from the sequences of the law: outliers, they were given little weight",
     )

@@ -198,9 +198,8 @@ class _Windows:
         start = x[:, :-1].reshape(num, m)
         step = self.law.form.step(self.law.p, start, self.h.reshape(num), u, sensitive=False)
         shape = (arcs, length - 1, m)
-        return Steps(
-            step.states.reshape(shape), step.by_state.reshape(*shape, m), np.zeros((*shape, 0))
-        )
+        closing = step.states.reshape(shape) - x[:, 1:]
+        return Steps(closing, step.by_state.reshape(*shape, m), np.zeros((*shape, 0)))
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         seen = self.law.sensors.seen(x)

@@ -46,7 +46,7 @@ class LawOnArcs:
         by[..., : step.by_coefficients.shape[-1]] = step.by_coefficients
         shape = (arcs, length - 1, m)
         return Steps(
-            step.states.reshape(shape),
+            step.states.reshape(shape) - x[:, 1:],
             step.by_state.reshape(*shape, m),
             by[..., self.free].reshape(*shape, len(self.free)),
         )

@@ -13,7 +13,7 @@ from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.law_arcs import LawOnArcs
 from gfnn_jax.models.structure import Key, Structure
-from gfnn_jax.solve.latent_arcs import Fitted, fit_arcs, loss, sensitivities
+from gfnn_jax.solve.latent_arcs import SOFT_L1, Fitted, fit_arcs, sensitivities
 
 _SETTLED = 1.15  # a noise scale that changed by less needs no second fit
 FOLDS = 3
@@ -104,7 +104,7 @@ class Workbench:
         found = fit_arcs(model, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, 1e-3)
         if not np.isfinite(found.cost):
             return np.full(len(arcs.home), np.inf)
-        return np.nansum(loss(found.residuals), axis=(1, 2))
+        return np.nansum(SOFT_L1.of(found.residuals), axis=(1, 2))
 
     def cross_validate(
         self, nodes: Sequence[Nodes], fit: LawFit, structure: Structure, known: Mapping[Key, float]

@@ -2,17 +2,20 @@
 
 An arc is a stretch of one run: states x_0 … x_{L−1} at its nodes, of which only
 
-    y_n = g(x_n; p) + noise,        x_{n+1} = F_n(x_n; p)
+    y_n = g(x_n; p) + noise,        D(x_n, x_{n+1}; p) = 0
 
-is known. All nodes are kept as unknowns, so that every step F_n is evaluated at once, and an arc
-need not be followed from its first state (multiple shooting; Bock, 1981). An iteration linearises
+is known. A model supplies g and the defect D between neighbouring states: of a law the end of its
+step, F(x_n; p) − x_{n+1}; of a generating function Z − z − h J∇S(w). A pair is an arc of two
+states. All nodes are kept as unknowns, so that every defect is evaluated at once, and an arc need
+not be followed from its first state (multiple shooting; Bock, Springer Ser. Chem. Phys. 18 (1981)
+102). An iteration linearises
 
-    δx_{n+1} = Φ_n δx_n + Γ_n δp + c_n,      c_n = F_n(x_n) − x_{n+1}   (the defect)
+    δx_{n+1} = Φ_n δx_n + Γ_n δp + c_n,
 
-which makes δx_n a function of δx_0 and δp alone. The arc's own δx_0 is eliminated by its own QR;
-what remains of all arcs are rows for δp. Where it converges the defects are zero, and each arc is
-an orbit of the law. Residuals enter in units of the noise through Huber's soft-L1 loss, ρ(r) =
-2k²(√(1 + (r/k)²) − 1).
+c_n the move of x_{n+1} that would close the defect, which makes δx_n a function of δx_0 and δp
+alone. The arc's own δx_0 is eliminated by its own QR; what remains of all arcs are rows for δp.
+Where it converges the defects are zero, and each arc is an orbit of the model. Residuals enter in
+units of the noise through a robust loss (`solve.robust`). The noise may be estimated on the way.
 """
 
 from __future__ import annotations
@@ -22,17 +25,22 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-ROBUST = 2.5  # k, in standard deviations
+from gfnn_jax.solve.robust import Loss, SoftL1, of_residuals
+
 _DEFECT = 0.1  # a defect of this many standard deviations costs as much as a residual of one
-_CLOSED = 0.1  # standard deviations, rms: arcs whose defects are smaller are orbits of the law
+_CLOSED = 0.1  # standard deviations, rms: arcs whose defects are smaller are orbits of the model
 _SHRINK, _GROW = 0.2, 5.0  # of the damping
+_SETTLED = 0.003  # of the noise: a change that needs no further iteration
+_BLOCK_BYTES = 64 * 2**20  # of the sensitivities of a block of arcs
+OUTLYING = 5.0  # standard deviations: a residual beyond does not tell the noise
+SOFT_L1 = SoftL1()
 
 
 class Steps(NamedTuple):
-    """Steps of a model from states (A, L, m): those after each step (A, L − 1, m), and derivatives
-    in the states before (…, m, m) and in the n coefficients (…, m, n)."""
+    """The linearised defects of states (A, L, m): c_n (A, L − 1, m), Φ_n (…, m, m) and, in the n
+    coefficients, Γ_n (…, m, n)."""
 
-    states: np.ndarray
+    closing: np.ndarray
     by_state: np.ndarray
     by_coefficients: np.ndarray
 
@@ -54,22 +62,55 @@ class Model(Protocol):
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed: ...
 
 
+def observed_whole(x: np.ndarray, coefficients: int) -> Observed:
+    """The states themselves, g(x; p) = x."""
+    own = np.broadcast_to(np.eye(x.shape[-1]), (*x.shape, x.shape[-1]))
+    return Observed(x, own, np.broadcast_to(0.0, (*x.shape, coefficients)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """A model whose coefficients p (n,) are known: only states are latent."""
+
+    model: Model
+    p: np.ndarray
+
+    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
+        closing, by_state, by_coefficients = self.model.steps(self.p, x)
+        return Steps(closing, by_state, by_coefficients[..., :0])
+
+    def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
+        values, by_state, by_coefficients = self.model.observe(self.p, x)
+        return Observed(values, by_state, by_coefficients[..., :0])
+
+
 @dataclasses.dataclass(frozen=True)
 class Fitted:
-    """The fit of all arcs: coefficients p (n,), states x (A, L, m), residuals (A, L, k) in units
-    of the noise (NaN where nothing was seen), the triangle of δp (RᵀR is the information matrix of
-    p), those of δx_0 (A, m, m) of each arc with p fixed, ∂x_{L−1}/∂x_0 (A, m, m), and whether it
-    converged."""
+    """The fit of all arcs.
+
+    p: (n,) coefficients. x: (A, L, m) states. residuals: (A, L, k) in units of the noise, NaN where
+    nothing was seen. sigma: the noise as given, or (k,) as estimated. factor: the triangle
+    (n + 1, n + 1) of [∂r/∂p, r] without the states. scores: (A, n) each arc's part of the gradient
+    in p. arcs: (A, m, m) triangles of each δx_0 with p fixed. transports: (A, m, m) ∂x_{L−1}/∂x_0.
+    cost: infinite where the defects could not be closed.
+    """
 
     p: np.ndarray
     x: np.ndarray
     residuals: np.ndarray
-    triangle: np.ndarray
+    sigma: np.ndarray
+    factor: np.ndarray
+    scores: np.ndarray
     arcs: np.ndarray
     transports: np.ndarray
     cost: float
     iterations: int
     converged: bool
+
+    @property
+    def triangle(self) -> np.ndarray:
+        """(n, n), of p alone."""
+        return self.factor[:-1, :-1]
 
     def covariance(self) -> np.ndarray:
         """(RᵀR)⁻¹, for white residuals of unit variance."""
@@ -91,6 +132,8 @@ def fit_arcs(
     state_scale: np.ndarray,
     max_iterations: int = 30,
     tolerance: float = 1e-4,
+    loss: Loss = SOFT_L1,
+    least: np.ndarray | None = None,
 ) -> Fitted:
     """Fit p (n,) and the states x (A, L, m), from what they start at, to y (A, L, k).
 
@@ -98,33 +141,32 @@ def fit_arcs(
     ``state_scale`` (m,) the defect that counts as one standard deviation. While defects matter, an
     iteration has to close them; then it has to lower the cost. Ends where it lowers it by less than
     ``tolerance`` of itself. The cost is infinite where the defects could not be closed.
+
+    least: (k,) what of the residuals is no noise; sigma (k,) is then where the noise starts from,
+    and is estimated by every iteration. None: sigma is known.
     """
     seen = np.isfinite(y)
     known = np.where(seen, y, 0.0)
 
-    def evaluate(p: np.ndarray, x: np.ndarray) -> _Iterate:
+    def evaluate(p: np.ndarray, x: np.ndarray, units: _Units) -> _Iterate:
         with np.errstate(all="ignore"):
             steps, observed = model.steps(p, x), model.observe(p, x)
-            residuals = np.where(seen, (known - observed.values) / sigma, 0.0)
-            defects = steps.states - x[:, 1:]
-            cost, gap = float(np.sum(loss(residuals))), float(np.linalg.norm(defects / state_scale))
-        if not np.isfinite(cost + gap):
-            cost = gap = np.inf
-        return _Iterate(p, x, steps, observed, seen, residuals, defects, cost, gap)
+            off = np.where(seen, known - observed.values, 0.0)
+        return _Iterate.at(p, x, steps, observed, seen, off, units)
 
-    here = best = evaluate(p, x)
+    here = best = evaluate(p, x, _Units(sigma, state_scale, loss))
     damping, converged, iteration = 1e-4, False, 0
     closed = _CLOSED * np.sqrt(x.size)
     while iteration < max_iterations:
         iteration += 1
         if not np.isfinite(here.cost):
             break
-        rows = _reduced(here, sigma)
+        rows = _reduced(here, leverage=least is not None)
         there, share = here, 1.0
         while share > 1e-3:
-            dp, dx = _solve(rows, damping)
-            there = evaluate(here.p + share * dp, here.x + share * dx)
-            if here.gap > closed:  # arcs that are not yet orbits of the law
+            dp, dx = _solve(rows, here.steps, damping)
+            there = evaluate(here.p + share * dp, here.x + share * dx, here.units)
+            if here.gap > closed:  # arcs that are not yet orbits of the model
                 better = there.gap < (1 - 0.5 * share) * here.gap
             else:
                 better = there.merit < here.merit * (1 + 1e-9)
@@ -138,25 +180,33 @@ def fit_arcs(
         gained = here.merit - there.merit
         settled = max(here.gap, there.gap) <= closed and gained <= tolerance * here.cost
         here = there
-        if here.gap <= closed and (best.gap > closed or here.merit < best.merit):
+        if least is not None:
+            before, here = here.units, here.rescaled(rows, least)
+            settled &= bool(np.allclose(here.units.sigma, before.sigma, rtol=_SETTLED, atol=0))
+            best = here
+        elif here.gap <= closed and (best.gap > closed or here.merit < best.merit):
             best = here
         if settled:
             converged = True
             break
     best = best if best.gap <= closed else here
-    rows, m = _reduced(best, sigma), x.shape[-1]
-    found = np.where(seen, best.residuals, np.nan)
-    cost = best.cost if best.gap <= closed else np.inf
-    own = rows.arcs[:, :, :m], rows.sensitivities[:, -1, :, :m]
-    return Fitted(best.p, best.x, found, rows.triangle[:-1, :-1], *own, cost, iteration, converged)
+    rows = _reduced(best)
+    return Fitted(
+        best.p, best.x, np.where(seen, best.residuals, np.nan), best.units.sigma, rows.factor,
+        rows.scores, rows.arcs[:, :, : x.shape[-1]], rows.transports,
+        best.cost if best.gap <= closed else np.inf, iteration, converged,
+    )  # fmt: skip
 
 
-def sensitivities(
-    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
-) -> np.ndarray:
-    """The triangle (n + 1, n + 1) of the coefficients and the residuals, the states of each arc
-    eliminated, at p and x: what a test of coefficients needs."""
-    return _reduced(_evaluated(model, p, x, y, sigma), sigma).triangle
+def eliminated_rows(
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
+    loss: Loss = SOFT_L1,
+) -> np.ndarray:  # fmt: skip
+    """Rows (R, n + 1) of [∂r/∂p, r] at p and x, without the states of each arc: what its own state
+    does not explain."""
+    J, m = _rows_at(model, p, x, y, sigma, loss), x.shape[-1]
+    across = np.linalg.qr(J[..., :m], mode="complete")[0][..., m:]
+    return (across.swapaxes(1, 2) @ J[..., m:]).reshape(-1, J.shape[-1] - m)
 
 
 def rows_of_arcs(
@@ -165,21 +215,40 @@ def rows_of_arcs(
     """Rows (A, L, k, n + 1) of the coefficients and the residuals, weighted as robust loss has it,
     after each arc's own δx_0 was projected out: residuals − rows · δp are those of any other
     coefficients near p, each arc with the state that suits them best."""
-    at = _evaluated(model, p, x, y, sigma)
-    J, m = _weighted(at, sigma, _sensitivities(at)), x.shape[-1]
-    flat = J.reshape(len(x), -1, J.shape[-1])
-    Q = np.linalg.qr(flat[..., :m])[0]
-    return (flat[..., m:] - Q @ (Q.swapaxes(1, 2) @ flat[..., m:])).reshape(*J.shape[:-1], -1)
+    J, m = _rows_at(model, p, x, y, sigma, SOFT_L1), x.shape[-1]
+    Q = np.linalg.qr(J[..., :m])[0]
+    return (J[..., m:] - Q @ (Q.swapaxes(1, 2) @ J[..., m:])).reshape(*y.shape, -1)
 
 
-def loss(residuals: np.ndarray) -> np.ndarray:
-    """ρ(r) = 2k²(√(1 + (r/k)²) − 1), which is r² where r is small."""
-    return 2 * ROBUST**2 * (np.sqrt(1 + (residuals / ROBUST) ** 2) - 1)
+def sensitivities(
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
+) -> np.ndarray:
+    """The triangle (n + 1, n + 1) of `eliminated_rows`: what a test of coefficients needs."""
+    factor = np.asarray(np.linalg.qr(eliminated_rows(model, p, x, y, sigma), mode="r"))
+    return np.concatenate([factor, np.zeros((factor.shape[1] - len(factor), factor.shape[1]))])
+
+
+def _rows_at(
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray, loss: Loss
+) -> np.ndarray:
+    """Weighted rows (A, L k, m + n + 1) of [δx_0, δp, r] at p and x."""
+    seen, steps, observed = np.isfinite(y), model.steps(p, x), model.observe(p, x)
+    off = np.where(seen, np.where(seen, y, 0.0) - observed.values, 0.0)
+    units = _Units(sigma, np.ones(x.shape[-1]), loss)
+    return _linearised(_Iterate.at(p, x, steps, observed, seen, off, units), slice(None))[0]
+
+
+class _Units(NamedTuple):
+    """σ of what is seen, the defects (m,) that count as much, and the loss."""
+
+    sigma: np.ndarray
+    state: np.ndarray
+    loss: Loss
 
 
 class _Iterate(NamedTuple):
-    """Iterate: residuals in units of σ, defects, the cost of the residuals, and
-    the norm of the defects in units of ``state_scale``."""
+    """Where an iteration stands: residuals in units of σ, the cost of the residuals, and the norm
+    of the defects in units of the states'."""
 
     p: np.ndarray
     x: np.ndarray
@@ -187,84 +256,113 @@ class _Iterate(NamedTuple):
     observed: Observed
     seen: np.ndarray
     residuals: np.ndarray
-    defects: np.ndarray
     cost: float
     gap: float
+    units: _Units
+
+    @classmethod
+    def at(cls, p, x, steps: Steps, observed: Observed, seen, off, units: _Units) -> _Iterate:
+        """off: residuals (A, L, k) in the units of y."""
+        with np.errstate(all="ignore"):
+            residuals = off / units.sigma
+            cost = float(np.sum(units.loss.of(residuals)))
+            gap = float(np.linalg.norm(steps.closing / units.state))
+        if not np.isfinite(cost + gap):
+            cost = gap = np.inf
+        return cls(p, x, steps, observed, seen, residuals, cost, gap, units)
 
     @property
     def merit(self) -> float:
         return self.cost + (self.gap / _DEFECT) ** 2
 
+    def rescaled(self, rows: _Rows, least: np.ndarray) -> _Iterate:
+        """In units of the noise that these residuals tell: of each number as much is left as the
+        latent state of its arc, and the coefficients, do not follow."""
+        off = self.residuals * self.units.sigma
+        free = np.where(self.seen, 1.0 - rows.leverage, 0.0)
+        free *= max(1.0 - len(self.p) / free.sum(), 1e-3)
+        sigma = np.hypot(of_residuals(np.where(self.seen, off, np.nan), free, OUTLYING), least)
+        # Of a state (q, v) whose positions are seen, velocities change as they do.
+        state = self.units.state * np.resize(sigma / self.units.sigma, self.units.state.shape)
+        units = _Units(sigma, state, self.units.loss)
+        return self.at(self.p, self.x, self.steps, self.observed, self.seen, off, units)
+
 
 class _Rows(NamedTuple):
     """Rows of one iteration: each arc's triangle for its own δx_0 (A, m, m + n + 1), the triangle
-    for δp (n + 1, n + 1), and the sensitivities of the states (A, L, m, m + n + 1)."""
+    for δp (n + 1, n + 1), each arc's part of its gradient (A, n), the transports (A, m, m) to the
+    last states, and, where asked for, how far the arc's own state follows each residual, in
+    [0, 1]."""
 
     arcs: np.ndarray
-    triangle: np.ndarray
-    sensitivities: np.ndarray
+    factor: np.ndarray
+    scores: np.ndarray
+    transports: np.ndarray
+    leverage: np.ndarray
 
 
-def _evaluated(
-    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
-) -> _Iterate:
-    """Where an iteration that began at p and x would stand."""
-    seen = np.isfinite(y)
-    steps, observed = model.steps(p, x), model.observe(p, x)
-    residuals = np.where(seen, (np.where(seen, y, 0.0) - observed.values) / sigma, 0.0)
-    defects = steps.states - x[:, 1:]
-    return _Iterate(p, x, steps, observed, seen, residuals, defects, 0.0, 0.0)
+def _reduced(at: _Iterate, *, leverage: bool = False) -> _Rows:
+    num_arcs, length, k, m = at.observed.by_state.shape
+    n = at.observed.by_coefficients.shape[-1]
+    size = max(1, _BLOCK_BYTES // (8 * length * max(k, m) * (m + n + 1)))
+    factor, parts = np.zeros((0, n + 1)), []
+    for first in range(0, num_arcs, size):
+        block = slice(first, first + size)
+        J, transports = _linearised(at, block)
+        R = np.asarray(np.linalg.qr(J, mode="r"))
+        rest = R[:, m:, m:]
+        stack = np.concatenate([factor, rest.reshape(-1, n + 1)])
+        factor = np.asarray(np.linalg.qr(stack, mode="r"))
+        scores = (rest[..., :n].swapaxes(1, 2) @ rest[..., n:])[..., 0]
+        follows = np.zeros((len(J), length, k))
+        if leverage:
+            own = np.linalg.qr(J[..., :m])[0]
+            follows = np.sum(own**2, axis=-1).reshape(follows.shape)
+        parts.append((R[:, :m], scores, transports, follows))
+    arcs, scores, transports, follows = (np.concatenate(p) for p in zip(*parts, strict=True))
+    factor = np.concatenate([factor, np.zeros((n + 1 - len(factor), n + 1))])
+    return _Rows(arcs, factor, scores, transports, follows)
 
 
-def _sensitivities(at: _Iterate) -> np.ndarray:
-    """δx_n (A, L, m, m + n + 1) by δx_0, by δp, and by the defects before it."""
-    steps = at.steps
-    num_arcs, length, m = at.x.shape
-    n = steps.by_coefficients.shape[-1]
+def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted rows (a, L k, m + n + 1) of [δx_0, δp, r] of these arcs, and their transports."""
+    steps = Steps(*(part[block] for part in at.steps))
+    observed = Observed(*(part[block] for part in at.observed))
+    residuals = at.residuals[block]
+    sigma = np.broadcast_to(at.units.sigma, at.residuals.shape)[block]
+    num_arcs, length, k, m = observed.by_state.shape
+    n = observed.by_coefficients.shape[-1]
     S = np.zeros((num_arcs, length, m, m + n + 1))
     S[:, 0, range(m), range(m)] = 1.0
     for i in range(length - 1):
         S[:, i + 1] = steps.by_state[:, i] @ S[:, i]
         S[:, i + 1, :, m : m + n] += steps.by_coefficients[:, i]
-        S[:, i + 1, :, -1] += at.defects[:, i]
-    return S
-
-
-def _weighted(at: _Iterate, sigma: np.ndarray, S: np.ndarray) -> np.ndarray:
-    """Rows (A, L, k, m + n + 1) of the residuals by δx_0 and δp, and of the residuals themselves,
-    in units of σ and weighted; 0 where nothing was seen."""
-    observed, residuals, m = at.observed, at.residuals, at.x.shape[-1]
+        S[:, i + 1, :, -1] += steps.closing[:, i]
     J = observed.by_state @ S
     J[..., m:-1] += observed.by_coefficients
     J /= sigma[..., None]
     J[..., -1] = residuals - J[..., -1]
-    weight = (1 + (residuals / ROBUST) ** 2) ** -0.25  # the square root of ρ'(r)/2r
-    return J * np.where(at.seen, weight, 0.0)[..., None]
+    weight = np.where(at.seen[block], np.sqrt(at.units.loss.weights(residuals)), 0.0)
+    J *= weight[..., None]
+    return J.reshape(num_arcs, length * k, -1), S[:, -1, :, :m]
 
 
-def _reduced(at: _Iterate, sigma: np.ndarray) -> _Rows:
-    num_arcs, length, k, m = at.observed.by_state.shape
-    n = at.observed.by_coefficients.shape[-1]
-    S = _sensitivities(at)
-    J = _weighted(at, sigma, S)
-    R = np.asarray(np.linalg.qr(J.reshape(num_arcs, length * k, -1), mode="r"))
-    rest = R[:, m:, m:].reshape(-1, n + 1)
-    rest = np.concatenate([rest, np.zeros((max(0, n + 1 - len(rest)), n + 1))])
-    return _Rows(R[:, :m], np.asarray(np.linalg.qr(rest, mode="r")), S)
-
-
-def _solve(rows: _Rows, damping: float) -> tuple[np.ndarray, np.ndarray]:
+def _solve(rows: _Rows, steps: Steps, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """δp (n,) and δx (A, L, m), with Levenberg and Marquardt's damping of δp."""
-    m = rows.arcs.shape[1]
-    R = rows.triangle
+    m, R = rows.arcs.shape[1], rows.factor
     n = R.shape[1] - 1
     scale = np.linalg.norm(R[:, :n], axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     matrix = np.concatenate([R[:, :n] / scale, np.sqrt(damping) * np.eye(n)])
     target = np.concatenate([R[:, n], np.zeros(n)])
     dp = np.linalg.lstsq(matrix, target, rcond=1e-13)[0] / scale
-    right = rows.arcs[:, :, -1] - rows.arcs[:, :, m : m + n] @ dp
-    first = np.linalg.solve(rows.arcs[:, :, :m], right[..., None])[..., 0]
-    dx = np.einsum("alij,aj->ali", rows.sensitivities[..., :m], first)
-    dx += rows.sensitivities[..., m : m + n] @ dp + rows.sensitivities[..., -1]
-    return dp, dx
+    right = (rows.arcs[:, :, -1] - rows.arcs[:, :, m : m + n] @ dp)[..., None]
+    try:
+        moved = np.linalg.solve(rows.arcs[:, :, :m], right)
+    except np.linalg.LinAlgError:  # an arc of gross errors alone
+        moved = np.linalg.pinv(rows.arcs[:, :, :m]) @ right
+    dx = [moved[..., 0]]
+    for i in range(steps.closing.shape[1]):
+        carried = (steps.by_state[:, i] @ dx[-1][..., None])[..., 0]
+        dx.append(carried + steps.by_coefficients[:, i] @ dp + steps.closing[:, i])
+    return dp, np.stack(dx, axis=1)

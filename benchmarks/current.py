@@ -1,0 +1,190 @@
+"""Which results are of current code, and those that are not measured again, oldest first.
+
+A result holds a digest of the code that it measured: of the package and of its study, comments,
+docstrings and layout left out. A run that is interrupted goes on with what is still old.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+HERE = Path(__file__).resolve().parent
+PACKAGE = HERE.parent / "gfnn_jax"
+# Numbers that moved by more than this part are told, the largest moves first; names of times and
+# circumstances, which move with the machine.
+_MOVED, _TOLD = 0.1, 4
+_OF_MACHINE = ("second", "load", "date", "time")
+
+
+class Result(NamedTuple):
+    """A result's file, the study that makes it and the piece, "" where a study has one result."""
+
+    path: Path
+    study: Path
+    piece: str
+
+    @property
+    def command(self) -> list[str]:
+        only = ["--only", self.piece, "--overwrite"] if self.piece else []
+        return [sys.executable, str(self.study), *only]
+
+    @property
+    def current(self) -> bool:
+        found = json.loads(self.path.read_text(encoding="utf-8"))
+        return found.get("code") == code_of(self.study)
+
+
+@functools.cache
+def code_of(study: Path) -> str:
+    """Digest of the package, of a study and of the studies' modules that it imports."""
+    digest = hashlib.sha256()
+    for path in [*sorted(PACKAGE.rglob("*.py")), *sorted(_modules_of(study))]:
+        digest.update(path.name.encode() + _meaning(path).encode())
+    return digest.hexdigest()[:16]
+
+
+def _modules_of(study: Path) -> set[Path]:
+    """The files in this folder that a study is made of."""
+    found, left = set(), [study]
+    while left:
+        path = left.pop()
+        if path in found:
+            continue
+        found.add(path)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            files = (HERE.joinpath(*name.split(".")).with_suffix(".py") for name in names)
+            left += [file for file in files if file.exists()]
+    return found
+
+
+def _meaning(path: Path) -> str:
+    """A module without comments, docstrings and layout."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
+            value = body[0].value
+            if isinstance(value, ast.Constant) and isinstance(value.value, str):
+                node.body = body[1:]  # pyright: ignore[reportAttributeAccessIssue]
+    return ast.dump(tree)
+
+
+def results_of(study: Path, folder: Path) -> Iterator[Result]:
+    """The results in a folder whose names begin as those of the study do: with the prefix that it
+    gives to the harness, or with its own name."""
+    prefix = _prefix(study)
+    alone = folder / f"{prefix}.json"
+    if alone.exists():
+        yield Result(alone, study, "")
+    for path in sorted(folder.glob(f"{prefix}-*.json")):
+        yield Result(path, study, path.stem.removeprefix(f"{prefix}-"))
+
+
+def _prefix(study: Path) -> str:
+    """The third argument of the call of ``harness.main``, or the constant ``PREFIX``, where there
+    is one of them."""
+    for node in ast.walk(ast.parse(study.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "PREFIX":
+            return ast.literal_eval(node.value)
+        name = (
+            node.func.id if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else ""
+        )
+        if name in ("main", "run_pieces") and len(node.args) > 2:  # pyright: ignore
+            third = node.args[2]  # pyright: ignore[reportAttributeAccessIssue]
+            if isinstance(third, ast.Constant) and isinstance(third.value, str):
+                return third.value
+    return study.stem.replace("_", "-")
+
+
+def check(
+    studies: list[str], folder: Path, *, only_tell: bool = False, say: Callable[[str], Any] = print
+) -> int:
+    """Measure again what is not of current code, oldest first; 1 where a study failed."""
+    known: dict[Path, Result] = {}
+    for name in studies:  # of two prefixes of a name the longer one is its study's
+        for result in results_of(HERE / f"{name}.py", folder):
+            other = known.get(result.path)
+            if other is None or len(result.piece) < len(other.piece):
+                known[result.path] = result
+    for path in sorted(set(folder.glob("*.json")) - set(known)):
+        say(f"{path.name}: no study of this folder makes it: remove it?")
+    old = [result for result in known.values() if not result.current]
+    say(f"{len(known) - len(old)} of {len(known)} results are of current code")
+    failed = False
+    for result in sorted(old, key=_age):
+        if only_tell:
+            say(f"{result.path.name}: older than the code that it measures ({_age(result)[0]})")
+            continue
+        before = json.loads(result.path.read_text(encoding="utf-8"))
+        aside = result.path.with_suffix(".before")
+        if not result.piece:  # such a study measures what has no result
+            result.path.rename(aside)
+        paths = os.pathsep.join(filter(None, [str(HERE.parent), os.environ.get("PYTHONPATH")]))
+        done = subprocess.run(result.command, check=False, env=os.environ | {"PYTHONPATH": paths})
+        if done.returncode or not result.path.exists():
+            if aside.exists():
+                aside.rename(result.path)
+            say(f"{result.path.name}: its study failed")
+            failed = True
+            continue
+        aside.unlink(missing_ok=True)
+        after = json.loads(result.path.read_text(encoding="utf-8"))
+        say(f"{result.path.name}: {what_moved(before.get('measured'), after.get('measured'))}")
+    return int(failed)
+
+
+def _age(result: Result) -> tuple[str, float]:
+    found = json.loads(result.path.read_text(encoding="utf-8"))
+    return found.get("date", ""), result.path.stat().st_mtime
+
+
+def what_moved(before: Any, after: Any) -> str:
+    """The numbers that moved by more than a tenth, and verdicts that changed."""
+    old, new = dict(_leaves(before)), dict(_leaves(after))
+    moved = []
+    for name in old.keys() & new.keys():
+        a, b = old[name], new[name]
+        if isinstance(a, (bool, str)) or isinstance(b, (bool, str)) or a is None or b is None:
+            size = math.inf if a != b and not isinstance(a, str) else 0.0
+        else:
+            size = abs(a - b) / max(abs(a), abs(b), 1e-300)
+        if size > _MOVED:
+            moved.append((size, f"{name} {_short(a)} → {_short(b)}"))
+    moved.sort(reverse=True)
+    words = [text for _, text in moved[:_TOLD]]
+    gone, come = len(old.keys() - new.keys()), len(new.keys() - old.keys())
+    if len(moved) > _TOLD:
+        words.append(f"{len(moved) - _TOLD} more")
+    if gone or come:
+        words.append(f"{gone} numbers gone, {come} new")
+    return "; ".join(words) or "nothing moved by more than a tenth"
+
+
+def _short(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    if any(word in name.rpartition(".")[2] for word in _OF_MACHINE):
+        return
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _leaves(inner, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, list):
+        for i, inner in enumerate(value):
+            yield from _leaves(inner, f"{name}[{i}]")
+    else:
+        yield name, value

@@ -1,0 +1,158 @@
+"""S along arcs of measured states: the states that they most likely had, and rows of S there.
+
+∇S(w) = g holds at the true states. Both w and g of a pair are linear in its two states and carry
+their noise, and a fit at the measured w is biased, however many pairs there are. With
+
+    F(z, Z) = ∇S(w) − g,        w, g of the chart,        F = 0 where S maps z onto Z,
+
+as the defect of an arc (`solve.latent_arcs`), the states of an S that is near are those nearest to
+the measured ones, in units of the noise, that it maps onto each other; and the rows of all other S
+there, without the moves of the states, are explicit and linear in their coefficients. Their fit
+minimises the squared distance of the arcs from the map's graph to first order (orthogonal distance
+regression: Britt & Luecke, Technometrics 15 (1973) 233; Boggs, Byrd & Schnabel, SIAM J. Sci. Stat.
+Comput. 8 (1987) 1052). Residuals have variance one where noise is all that is left, in any chart.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.dataset.arcs import Arcs
+from gfnn_jax.fitting.triangle import Triangle, folded
+from gfnn_jax.generating.charts import AnyChart
+from gfnn_jax.solve.latent_arcs import (
+    Known,
+    Observed,
+    Steps,
+    eliminated_rows,
+    fit_arcs,
+    observed_whole,
+)
+from gfnn_jax.solve.robust import Biweight
+from gfnn_jax.threads import one_thread
+
+LONGEST = 10  # steps of an arc: what S cannot represent adds up along a longer one
+# Of normal residuals it takes one part in forty, so that rows keep their variance of one.
+BIWEIGHT = Biweight(15.0)
+_SETTLED = 1e-3  # of the squared distance: what the states still gain moves no coefficient
+_LANES = 4_096  # steps whose matrices are computed at once
+_BLOCK_BYTES = 4 * 2**20  # of the rows of a block of arcs: they stay in the cache
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class GeneratedOnArcs:
+    """The map that S = Σ c_j φ_j generates, on arcs in which these steps ``moves`` (A, L − 1).
+
+    ends: affine pieces (before, after) around what S generates. along: a family whose rows are
+    wanted: F is then that of S = 0, its derivatives in the states stay those of S, and Γ is in the
+    coefficients of this family. None: no coefficient is free.
+    """
+
+    family: Any
+    chart: AnyChart
+    dt: float
+    moves: np.ndarray
+    ends: tuple[Sequence[Any], Sequence[Any]] = ((), ())
+    along: Any = None
+
+    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
+        width, free = x.shape[-1], 0 if self.along is None else self.along.num_parameters
+        found = np.zeros((*self.moves.shape, width, 1 + width + free))
+        found[..., 1 : 1 + width] = np.eye(width)
+        lanes = np.flatnonzero(self.moves)
+        for first in range(0, len(lanes), _LANES):
+            some = np.unravel_index(lanes[first : first + _LANES], self.moves.shape)
+            found[some] = self._linearised(p, x[:, :-1][some], x[:, 1:][some])
+        return Steps(found[..., 0], found[..., 1 : 1 + width], found[..., 1 + width :])
+
+    def _linearised(self, p: np.ndarray, y0: np.ndarray, y1: np.ndarray) -> np.ndarray:
+        """[c, Φ, Γ] (n, 2d, 1 + 2d + free) of steps from z to Z (n, 2d)."""
+        before, after = self._of_states(y0.shape[-1])
+        for piece in self.ends[0]:
+            y0 = piece.image(y0)
+        for piece in reversed(self.ends[1]):
+            y1 = piece.inverse().image(y1)
+        w, target = self.chart.evaluation_point(y0, y1), self.chart.target_gradient(y0, y1, self.dt)
+        gradient, hessian = self.family.gradient_and_hessian(self.family.unflatten(p), w)
+        miss = -target if self.along is not None else gradient - target
+        parts = [miss[..., None], hessian @ before[0] - before[1]]
+        if self.along is not None:
+            parts.append(self.along.term_gradients(w))
+        # F + ∂F/∂z δz + ∂F/∂Z δZ + ∇φ δc = 0, for δZ.
+        return -np.linalg.solve(hessian @ after[0] - after[1], np.concatenate(parts, axis=-1))
+
+    def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
+        return observed_whole(x, 0 if self.along is None else self.along.num_parameters)
+
+    def _of_states(self, width: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """(∂w, ∂g) in z, and in Z, (2d, 2d) each."""
+        first = second = eye = np.eye(width)
+        for piece in self.ends[0]:
+            first = piece.matrix @ first
+        for piece in self.ends[1]:
+            second = piece.matrix @ second
+        none = np.zeros_like(eye)
+        return [
+            (self.chart.evaluation_point(*e).T, self.chart.target_gradient(*e, self.dt).T)
+            for e in ((first.T, none), (none, np.linalg.inv(second).T))
+        ]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class NearestArcs:
+    """Arcs and the states x (A, L, 2d) that ``model`` with coefficients p finds nearest to them.
+    sigma: (2d,) noise of the measured states."""
+
+    model: GeneratedOnArcs
+    p: np.ndarray
+    arcs: Arcs
+    x: np.ndarray
+    sigma: np.ndarray
+
+    @classmethod
+    def of(cls, model: GeneratedOnArcs, p, arcs: Arcs, sigma) -> NearestArcs:
+        """Raises numpy.linalg.LinAlgError where the chart is singular at some pair, or no states
+        near the measured ones are an orbit."""
+        x = arcs.states.copy()
+        for n in range(1, x.shape[1]):  # one that is missing starts from the one before
+            x[:, n] = np.where(np.isfinite(x[:, n]), x[:, n], x[:, n - 1])
+        found = fit_arcs(
+            Known(model, p), p[:0], x, arcs.states, sigma, sigma, tolerance=_SETTLED, loss=BIWEIGHT
+        )
+        if not np.isfinite(found.cost):
+            raise np.linalg.LinAlgError("expected states near the measured ones")
+        return cls(model, p, arcs, found.x, sigma)
+
+    def rows(self, along: Any) -> Iterator[tuple[np.ndarray, int]]:
+        """Rows [A b] (R, n + 1) of the coefficients of a family, block by block, and for how many
+        numbers they stand."""
+        arcs, length, width = self.x.shape
+        bytes_of_arc = 16 * length * width * (along.num_parameters + width + 1)
+        size = max(1, _BLOCK_BYTES // bytes_of_arc)
+        for first in range(0, arcs, size):
+            some = slice(first, first + size)
+            model = dataclasses.replace(self.model, moves=self.arcs.moves[some], along=along)
+            y = self.arcs.states[some]
+            rows = eliminated_rows(model, self.p, self.x[some], y, self.sigma, BIWEIGHT)
+            yield rows, int(np.isfinite(y).sum()) - len(y) * width
+
+    def triangle(self, along: Any, on_block: Callable[[], Any] = lambda: None) -> Triangle:
+        """Triangle of the rows of a family; on_block: called before each block of rows."""
+        found = Triangle.empty(along.num_parameters)
+        factor, count = found.factor, 0
+        for rows, numbers in self.rows(along):
+            on_block()
+            with one_thread():
+                folded(factor, np.asfortranarray(rows))
+            count += numbers
+        return Triangle(factor, count)
+
+    def take(self, arcs: np.ndarray) -> NearestArcs:
+        """Keep these arcs alone."""
+        model = dataclasses.replace(self.model, moves=self.model.moves[arcs])
+        chosen = Arcs(self.arcs.states[arcs], self.arcs.moves[arcs])
+        return NearestArcs(model, self.p, chosen, self.x[arcs], self.sigma)

@@ -1,0 +1,80 @@
+"""Residuals in which some are gross errors: their loss, and the noise that the others tell.
+
+A loss ρ(r) is of residuals in units of their noise, and ρ(r) → r² where r is small.
+An iteration minimises Σ w r² with w = ρ'(r) ÷ 2r, the residuals' *weights* (iteratively reweighted
+least squares; Huber, Robust Statistics, 1981).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol
+
+import numpy as np
+
+_NORMAL = 1.4826  # a normal deviation over the median of its size
+
+
+class Loss(Protocol):
+    """ρ and its weights, elementwise."""
+
+    def of(self, residuals: np.ndarray) -> np.ndarray: ...
+
+    def weights(self, residuals: np.ndarray) -> np.ndarray: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class SoftL1:
+    """2k²(√(1 + (r/k)²) − 1): grows as |r|, and has one minimum, wherever a fit starts.
+
+    k: in standard deviations.
+    """
+
+    k: float = 2.5
+
+    def of(self, residuals: np.ndarray) -> np.ndarray:
+        return 2 * self.k**2 * (np.sqrt(1 + (residuals / self.k) ** 2) - 1)
+
+    def weights(self, residuals: np.ndarray) -> np.ndarray:
+        return (1 + (residuals / self.k) ** 2) ** -0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Biweight:
+    """Tukey's (k²/3)(1 − (1 − (r/k)²)³), constant beyond k: gross errors have no weight, in a fit
+    that starts from states that most of the others bear out.
+
+    k: in standard deviations.
+    """
+
+    k: float = 7.0
+
+    def of(self, residuals: np.ndarray) -> np.ndarray:
+        return self.k**2 / 3 * (1 - (1 - self._size(residuals) ** 2) ** 3)
+
+    def weights(self, residuals: np.ndarray) -> np.ndarray:
+        return (1 - self._size(residuals) ** 2) ** 2
+
+    def _size(self, residuals: np.ndarray) -> np.ndarray:
+        return np.minimum(np.abs(residuals) / self.k, 1.0)
+
+
+def robust(values: np.ndarray, axis: int | None = None) -> np.ndarray:
+    """The deviation of normal noise around 0, from the median of its size along the axis."""
+    return _NORMAL * np.median(np.abs(values), axis=axis)
+
+
+def of_residuals(residual: np.ndarray, free: np.ndarray | float, outlying: float) -> np.ndarray:
+    """(k,) from residuals (..., k) that are the noise of one number each; NaN where there is none.
+
+    free: (..., k) the part of each that what was fitted does not follow, 1 − its leverage: the sum
+    of squares of a coordinate is that much of its variances (Förstner, Z. Vermess. 104 (1979) 41).
+    outlying: robust deviations beyond which a number is a gross error, and does not count.
+    """
+    k = residual.shape[-1]
+    residual, free = residual.reshape(-1, k), np.broadcast_to(free, residual.shape).reshape(-1, k)
+    size = np.array([robust(column[np.isfinite(column)]) for column in residual.T])
+    inside = np.abs(residual) <= outlying * size
+    square = np.sum(np.where(inside, residual, 0.0) ** 2, axis=0)
+    left = np.sum(np.where(inside, free, 0.0), axis=0)
+    return np.sqrt(square / np.maximum(left, 1e-3 * np.maximum(inside.sum(axis=0), 1)))

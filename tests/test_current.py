@@ -1,0 +1,78 @@
+"""Results that are older than their code: found, measured again oldest first, what moved told."""
+
+import json
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+
+import current
+
+STUDY = '''"""A study."""
+import json, pathlib, sys
+sys.path.insert(0, {benchmarks!r})
+from current import code_of
+
+def main(doc, pieces, prefix):
+    piece = sys.argv[2]
+    if piece == "broken":
+        sys.exit(1)
+    out = pathlib.Path({out!r}) / f"{{prefix}}-{{piece}}.json"
+    code = {code!r}
+    out.write_text(json.dumps({{"date": "2026-11-23", "code": code, "measured": {{"rms": 2.0}}}}))
+
+main(__doc__, {{}}, "tries")
+'''
+
+
+def test_code_is_told_by_what_it_does(tmp_path):
+    one, other, third = (tmp_path / f"{n}.py" for n in ("a", "b", "c"))
+    one.write_text('"""Doc."""\ndef f(x):\n    """Adds."""\n    return x + 1  # one\n')
+    other.write_text("def f(x):\n    return (x+1)\n")
+    third.write_text("def f(x):\n    return x + 2\n")
+    meanings = [current._meaning(path) for path in (one, other, third)]
+    assert meanings[0] == meanings[1] != meanings[2]
+
+
+def test_what_is_old_is_measured_again(tmp_path, monkeypatch):
+    study, said = tmp_path / "tries.py", []
+    monkeypatch.setattr(current, "HERE", tmp_path)
+    monkeypatch.setattr(current, "PACKAGE", tmp_path / "none")
+    folder = str(Path(current.__file__).parent)
+    study.write_text(STUDY.format(benchmarks=folder, out=str(tmp_path), code="new"))
+    monkeypatch.setattr(current, "code_of", lambda path: "new")
+    for name, date, code in (
+        ("new", "2026-11-20", "new"), ("young", "2026-11-22", "old"), ("old", "2026-11-21", "old"),
+        ("broken", "2026-11-22", None),
+    ):  # fmt: skip
+        result = {"date": date, "code": code, "measured": {"rms": 1.0, "seconds": 9.0}}
+        (tmp_path / f"tries-{name}.json").write_text(json.dumps(result))
+    assert current.check(["tries"], tmp_path, only_tell=True, say=said.append) == 0
+    assert said[0] == "1 of 4 results are of current code"
+    assert [line.split(":")[0] for line in said[1:]] == [
+        "tries-old.json", "tries-young.json", "tries-broken.json"
+    ]  # fmt: skip
+    said.clear()
+    assert current.check(["tries"], tmp_path, say=said.append) == 1
+    assert said[1] == "tries-old.json: rms 1 → 2"
+    assert said[3] == "tries-broken.json: its study failed"
+    said.clear()
+    assert current.check(["tries"], tmp_path, only_tell=True, say=said.append) == 0
+    assert said[0] == "3 of 4 results are of current code"
+
+
+def test_what_moved():
+    before = {"a": 1.0, "b": [1.0, 2.0], "met": True, "seconds": 5.0, "gone": 0}
+    after = {"a": 1.05, "b": [1.0, 3.0], "met": False, "seconds": 50.0}
+    assert current.what_moved(before, after) == (
+        "met True → False; b[1] 2 → 3; 1 numbers gone, 0 new"
+    )
+    assert current.what_moved(before, before) == "nothing moved by more than a tenth"
+
+
+def test_every_result_of_the_repository_has_a_study():
+    from benchmarks.__main__ import studies
+
+    folder, said = Path(current.__file__).parent / "results", []
+    assert current.check(list(studies()), folder, only_tell=True, say=said.append) == 0
+    assert not [line for line in said if "no study" in line]
