@@ -19,10 +19,11 @@ from gfnn_jax.errors import OutOfTime
 MAX_SECONDS = 120.0  # of a fit that is told of no budget
 
 # Operations a second of a quiet core by kind of work, until units of a kind have been measured:
-# rows folded into a factor, singular values, flows and their derivatives in NumPy, iterations of a
-# network. What is compiled is counted in seconds.
+# rows folded into a factor, singular values, flows and their derivatives in NumPy, atoms of laws
+# matched to gradients, iterations of a network. What is compiled is counted in seconds.
 ROWS, SOLVE, FLOW, NETWORK, COMPILE = "rows", "solve", "flow", "network", "compile"
-_RATES = {ROWS: 1e10, SOLVE: 2e10, FLOW: 5e8, NETWORK: 5e9, COMPILE: 1.0}
+MATCHING = "matching"
+_RATES = {ROWS: 1e10, SOLVE: 2e10, FLOW: 5e8, MATCHING: 1e8, NETWORK: 5e9, COMPILE: 1.0}
 # Seconds, at these rates, of a unit that tells its kind's own: of shorter ones most is overhead.
 _TELLING = 0.1
 # Seconds that compiling a step takes, by 2d: small eliminations are unrolled, and larger ones call

@@ -40,6 +40,7 @@ from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.options import FitOptions, with_options
 from gfnn_jax.learn.positions import OfPositions, learn_positions
 from gfnn_jax.learn.posterior import with_posterior, work_of_posterior
+from gfnn_jax.learn.propose import structures_to_try
 from gfnn_jax.learn.recordings import fit_recording
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
@@ -327,11 +328,15 @@ def fit(
                 "those that the map misses by far are found in the end",
             )
         data = data.divided(options.seed)
-        seen = diagnose_request(request, data)
-        warn(seen.messages)
-        if seen.damping is not None:
-            on_progress(str(seen.damping))
-        found = searched(request, data, seen, on_better)
+        for asked, same in structures_to_try(request, data):
+            request, data = asked, same
+            seen = diagnose_request(request, data)
+            warn(seen.messages)
+            if seen.damping is not None:
+                on_progress(str(seen.damping))
+            found = searched(request, data, seen, on_better)
+            if found.met_by_law:
+                break
         seen, found, about_pairs = without_gross_errors(request, seen, found)
         warn(about_pairs)
         found = without_bias(found, request)

@@ -51,6 +51,7 @@ from gfnn_jax.learn.learned_law import (
     validation_error,
 )
 from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
+from gfnn_jax.learn.textbook import law_of_physics
 from gfnn_jax.learn.whole_sequences import fitted_to_sequences
 
 _ROUNDOFF = 1e-12  # of the spread: above it the pairs carry noise, and every one of them counts
@@ -104,10 +105,11 @@ def learn_hamiltonian(
     else:  # a state of many sites is in the middle and far out at once
         outer = np.zeros(len(data.training), bool)
     data = everywhere.trained_on(everywhere.training[~outer])
-    with_masses = None
+    with_masses, best = None, None
     if not terms and scene is None:
-        with_masses = mechanical(problem, work, data, tolerance)
-    best = with_masses
+        best = law_of_physics(problem, work, data, tolerance, say)
+        if best is None:
+            best = with_masses = mechanical(problem, work, data, tolerance)
     if best is None or not best.error.bound <= tolerance.bound:
         try:
             best, options = _of_libraries(

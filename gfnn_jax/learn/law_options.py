@@ -41,7 +41,7 @@ class Options:
     judged_rows: float = 12.0
     thresholds: tuple[float, ...] = (1e4, 1e3, 100.0, 30.0, 10.0, 5.0, 3.0)
     rise: float = 1.1
-    rounding: float = 1e-15
+    rounding: float = 5e-15
     flat: float = 1.2
     certain: float = 4.0
     explained: float = 2.0

@@ -1,7 +1,9 @@
-"""Proposal of a structure, where a fit of many degrees of freedom met nothing."""
+"""Structure of many degrees of freedom that pairs tell of: tried first where a sample bears it out,
+proposed where a fit met nothing."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,6 +14,7 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.fitting.linear_starts import fitted_gradients
 from gfnn_jax.generating.charts import CHARTS
+from gfnn_jax.learn.request import Request
 
 _FEWEST_DIM = 6  # below it a fit needs no structure
 _CHARTS = ("midpoint", "type2")  # of flows, to O(h²), and of kicked maps
@@ -19,21 +22,47 @@ _SAMPLE = 50  # pairs that a structure is fitted to; as many judge it
 _QUIET = 0.75  # of the sample, that moves least
 _MOST_TERMS = 60
 _EXPLAINED = 0.1  # of the forces or of the velocities, that the midpoint's error may leave over
+_TRIED = 0.02  # of them: so little that a law of the structure is looked for before anything else
 
 
 def proposed(data: Dataset) -> list[str]:
     """One line that names the structure which explains a sample of the pairs best, to O(h²); none
     where none does. data: without a base map or a structure."""
-    if data.dim < _FEWEST_DIM or data.varied or data.coordinates.angles:
-        return []
-    left = {text: _misfit(text, data) for text in _possible(data.dim)}
-    best = min(left, key=lambda text: left[text])
-    if not left[best] < _EXPLAINED:
+    best, left = _best(data)
+    if not left < _EXPLAINED:
         return []
     return [
-        f"--structure {best} explains these pairs: a sample leaves {left[best]:.1g} of forces and "
+        f"--structure {best} explains these pairs: a sample leaves {left:.1g} of forces and "
         f"velocities over, to second order in dt; fit with structure='{best}'"
     ]
+
+
+def structures_to_try(request: Request, data: Dataset) -> Iterator[tuple[Request, Dataset]]:
+    """The request and its data: with the structure that explains nearly all of a sample, where a
+    law is looked for and nothing is told of it; then as they are."""
+    told = request.options.terms or request.scene is not None or data.structure is not None
+    if request.seeks_law and not (told or request.of_network):
+        best, left = _best(data)
+        if left < _TRIED:
+            structure = structure_of(best, data.dim, data.coordinates)
+            request.say(
+                f"a {best} explains all but {left:.1g} of forces and velocities: tried first"
+            )
+            same = Dataset.of(data.pairs, data.coordinates, structure, data.row)
+            yield (
+                dataclasses.replace(request, structure=structure),
+                dataclasses.replace(same, split=data.split),
+            )
+    yield request, data
+
+
+def _best(data: Dataset) -> tuple[str, float]:
+    """The structure that leaves least of a sample's forces and velocities over, and that part."""
+    if data.dim < _FEWEST_DIM or data.varied or data.coordinates.angles:
+        return "", np.inf
+    left = {text: _misfit(text, data) for text in _possible(data.dim)}
+    best = min(left, key=lambda text: left[text])
+    return best, left[best]
 
 
 def _possible(dim: int) -> Iterator[str]:

@@ -1,0 +1,150 @@
+"""A textbook of laws, told nothing but pairs: which formulas come out, how exact, in what time.
+
+    python benchmarks/textbook.py                   every law that has no result yet
+    python benchmarks/textbook.py --only kepler     one of them
+    python benchmarks/textbook.py --quick           four of them, into runs/
+
+Each law of `textbook_laws` is learned from 1,000 clean pairs, told nothing but which coordinates
+are angles and the period of a drive. A law is found where ∇H agrees with the true one to 1e-8 at
+states of a box that is a fifth wider than that of the pairs, with no more terms than the truth has.
+Of the laws outside of every library, a formula that is chosen is counted as false.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from functools import partial
+
+import numpy as np
+from harness import (
+    SEED,
+    TABLES,
+    Numbers,
+    between_markers,
+    main,
+    markdown,
+    number,
+    provenance,
+    results,
+)
+from textbook_laws import LAWS, OUTSIDE, Law
+
+import gfnn_jax as gfnn
+from gfnn_jax.flows.flow import Flow
+
+PAIRS, FRESH, WIDER = 1_000, 200, 1.2
+FEW = 200  # pairs of the law that is also followed over STEPS steps
+STEPS, FOLLOWED = 1_000, 20
+TOLERANCE, BUDGET = 1e-8, 60.0
+EXACT = 1e-8
+
+
+def learned(law: Law, count: int = PAIRS) -> tuple[gfnn.Fit, Numbers]:
+    """The fit of pairs of this law, and its verdict."""
+    pairs, fresh = law.pairs(count, SEED), law.pairs(FRESH, SEED + 1)
+    busy = time.process_time()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)
+        fit = gfnn.fit(
+            pairs, tolerance=TOLERANCE, angles=law.angles, seed=SEED, max_seconds=BUDGET,
+            clock=time.process_time,
+        )  # fmt: skip
+    busy = time.process_time() - busy
+    t0 = {} if law.period is None else {"t0": fresh.t0}
+    error = np.asarray(fit.map.step(fresh.z0, **t0)[0]) - fresh.z1
+    found = fit.hamiltonian
+    terms = None if found is None else len(found.terms)
+    off = None if found is None else gradient_error(found.flow, law)
+    size = law.size or len(law.terms)
+    return fit, {
+        "kind": law.kind,
+        "dim": law.dim,
+        "pairs": count,
+        "label": fit.chosen.label,
+        "chosen": fit.chosen.learns,
+        "formula": None if found is None else found.formula,
+        "gradient_error": off,
+        "terms": terms,
+        "true_terms": size,
+        "found": off is not None and off <= EXACT and (terms or 0) <= size,
+        "one_step_rms": float(np.sqrt(np.mean(error**2))),
+        "tolerance_met": bool(fit.met),
+        "processor_seconds": busy,
+        "compile_seconds": fit.compile_seconds,
+        "ended": fit.ended,
+        "messages": list(fit.messages),
+    }
+
+
+def gradient_error(flow: Flow, law: Law) -> float | None:
+    """The RMS of ∇H − ∇H_true ÷ that of ∇H_true, at states of a wider box."""
+    rng = np.random.default_rng(SEED + 2)
+    z = law.states(FRESH, rng, WIDER)
+    t = None if law.period is None else rng.uniform(0, law.period, FRESH)
+    true = law.gradient(z, t)
+    try:
+        found = flow.family.gradient(
+            np.asarray(flow.params), z, *([] if t is None else [t[:, None]])
+        )
+    except (ValueError, IndexError):  # with friction, or of something else than states
+        return None
+    return float(np.sqrt(np.mean((np.asarray(found)[..., : 2 * law.dim] - true) ** 2))
+                 / np.sqrt(np.mean(true**2)))  # fmt: skip
+
+
+def measured(name: str, quick: bool) -> Numbers:
+    """One law."""
+    return learned({**LAWS, **OUTSIDE}[name])[1]
+
+
+def kepler_few(quick: bool) -> Numbers:
+    """Kepler's law from 200 pairs, and its orbits over 1,000 steps."""
+    law = LAWS["kepler"]
+    fit, found = learned(law, FEW)
+    # Bound orbits that keep away from the centre, nearly circular ones.
+    rng = np.random.default_rng(SEED + 3)
+    radius, turn, speed = (rng.uniform(*r, FOLLOWED) for r in ((0.9, 1.4), (0, 6.28), (0.9, 1.1)))
+    speed = speed / np.sqrt(radius)
+    cos, sin = np.cos(turn), np.sin(turn)
+    z0 = np.stack([radius * cos, radius * sin, -speed * sin, speed * cos], axis=1)
+    reference = law.followed(z0, STEPS)
+    states = np.asarray(fit.map.rollout(z0, STEPS, save_every=STEPS)[0])[:, -1]
+    error = np.linalg.norm((states - reference)[:, :2], axis=1)
+    return {**found, "steps": STEPS, "error_median": float(np.median(error)),
+            "error_worst": float(error.max())}  # fmt: skip
+
+
+PIECES = {"kepler-few": kepler_few, **{n: partial(measured, n) for n in (*LAWS, *OUTSIDE)}}
+QUICK = ("kepler", "relativistic", "duffing", "arctangent")
+
+
+def tables() -> None:
+    """The results between their markers."""
+    found = results(PIECES, "textbook")
+    if not found:
+        return
+    rows = []
+    for name, r in found.items():
+        m = r["measured"]
+        chosen = m["chosen"] == "hamiltonian"
+        verdict = "exact" if m["found"] else "approximate" if chosen else "a map"
+        rows.append([name, m["kind"], str(m["dim"]), verdict, number(m["gradient_error"]),
+                     str(m["terms"] or "–"), str(m["true_terms"]), number(m["one_step_rms"]),
+                     number(m["processor_seconds"])])  # fmt: skip
+    heads = ("law", "kind", "d", "verdict", "∇H off by", "terms", "true terms", "one-step RMS",
+             "CPU s")  # fmt: skip
+    of_laws = [r["measured"] for n, r in found.items() if n in LAWS]
+    outside = [r["measured"] for n, r in found.items() if n in OUTSIDE]
+    false = sum(m["chosen"] == "hamiltonian" for m in outside)
+    counted = (
+        f"{sum(m['found'] for m in of_laws)} of {len(of_laws)} laws are found exactly; of "
+        f"{len(outside)} laws outside of every library {false} came out as a formula."
+    )
+    between_markers(
+        TABLES, "textbook", "\n\n".join([markdown(heads, rows), counted, provenance(found)])
+    )
+
+
+if __name__ == "__main__":
+    main(__doc__ or "", PIECES, "textbook", tables, None, QUICK)

@@ -1,0 +1,212 @@
+"""Laws of physics told nothing: shapes, arguments, matching, the search, and a fit with it.
+
+Truths are closed formulas integrated by SciPy; derivatives are held against finite differences.
+"""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+from gfnn_jax.families.terms import given_terms
+from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.models.arguments import arguments_of
+from gfnn_jax.models.atoms import Factor, atom_text, dictionary_of, gradient_of, powers_of
+from gfnn_jax.models.matching import Matching, orthonormal
+from gfnn_jax.models.shapes import constants_for, has_constant, kinds_for, values
+from gfnn_jax.models.textbook import Textbook
+from gfnn_jax.phase_space import apply_j, sizes
+
+
+def pairs_of(gradient, z0, dt=0.1):
+    """Pairs of ż = J∇H by another solver."""
+    shape = z0.shape
+
+    def field(t, y):
+        return apply_j(gradient(y.reshape(shape))).ravel()
+
+    found = solve_ivp(field, (0, dt), z0.ravel(), "DOP853", rtol=1e-13, atol=1e-13)
+    return gfnn.Pairs(z0, found.y[:, -1].reshape(shape), dt)
+
+
+def ring(count, dim=2):
+    """Positions from 0.6 to 2 around the origin, momenta within 1."""
+    rng = np.random.default_rng(0)
+    radius, angle = rng.uniform(0.6, 2.0, count), rng.uniform(0, 2 * np.pi, count)
+    p = rng.uniform(-1, 1, (count, dim))
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), p])
+
+
+def kepler_pairs(count):
+    def gradient(z):
+        q, p = z[:, :2], z[:, 2:]
+        return np.concatenate([q / np.sum(q**2, axis=1, keepdims=True) ** 1.5, p], axis=1)
+
+    return pairs_of(gradient, ring(count))
+
+
+def morse_pairs(count):
+    rng = np.random.default_rng(0)
+    z0 = np.column_stack([rng.uniform(-0.5, 1.8, count), rng.uniform(-0.8, 0.8, count)])
+
+    def gradient(z):
+        e = np.exp(-1.3 * z[:, :1])
+        return np.concatenate([2.08 * (e - e * e), z[:, 1:]], axis=1)
+
+    return pairs_of(gradient, z0)
+
+
+def outside_pairs(count):
+    """H = ½p² + 0.8 q arctan(2.3 q) + 0.4 log(1 + e^(1.7 q)), of no library."""
+    z0 = np.random.default_rng(0).uniform(-1, 1, (count, 2)) * [2.0, 1.0]
+
+    def gradient(z):
+        q = z[:, :1]
+        force = 0.8 * (np.arctan(2.3 * q) + 2.3 * q / (1 + 5.29 * q * q))
+        return np.concatenate([force + 0.68 / (1 + np.exp(-1.7 * q)), z[:, 1:]], axis=1)
+
+    return pairs_of(gradient, z0)
+
+
+def searched(pairs, **options):
+    problem = Problem(pairs.z0, pairs.z1, pairs.dt, sizes(pairs.z0))
+    search = Textbook(problem, np.arange(len(pairs.z0)), **options)
+    return search.law(products=False) or search.law(products=True)
+
+
+def read(law):
+    """text -> coefficient of the terms that are not roundoff."""
+    named = zip(law.family.term_names, law.coefficients, strict=True)
+    return {name: c for name, c in named if abs(c) > 1e-9}
+
+
+# What laws are made of
+
+
+def test_every_shape_has_the_slope_of_its_value():
+    x, step = np.linspace(0.4, 1.9, 7), 1e-6
+    for kind in kinds_for(x):
+        for theta in constants_for(kind, x)[::5] if has_constant(kind) else [None]:
+            slope = values(kind, x, theta)[1]
+            ahead, behind = (values(kind, x + s, theta)[0] for s in (step, -step))
+            expected = (ahead - behind) / (2 * step)
+            size = 1e-7 * (np.abs(values(kind, x, theta)[0]).max() + np.abs(slope).max() + 1)
+            np.testing.assert_allclose(slope, expected, rtol=1e-6, atol=size, err_msg=str(kind))
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 4])
+def test_atoms_are_the_formulas_that_they_are_written_as(dim):
+    """Of every argument one atom; the text, parsed and differentiated, has the atom's gradient."""
+    z = np.random.default_rng(0).uniform(0.5, 1.5, (9, 2 * dim))
+    arguments = arguments_of(z, angles=(0,) if dim == 2 else ())
+    for place, argument in enumerate(arguments):
+        one_signed = np.ptp(np.sign(argument.value)) == 0
+        kinds = [("power", 3.0), ("root", 1.0), ("gauss", 0.0), ("exp", 1.0)]
+        kinds += [("power", -2.0)] if one_signed else []
+        for kind in kinds:
+            theta = 0.7 if has_constant(kind) else None
+            atom = (Factor(0, ("power", 2.0)), Factor(place, kind, theta))
+            text = atom_text(atom, arguments)
+            expected = given_terms(dim, [text]).gradient(np.ones(1), z)
+            np.testing.assert_allclose(
+                gradient_of(atom, arguments), expected, rtol=1e-11, atol=1e-12
+            )
+
+
+def test_the_derivative_in_a_constant_is_that_of_the_gradient():
+    z = ring(5)
+    arguments = arguments_of(z)
+    place = next(i for i, a in enumerate(arguments) if a.text == "sqrt(q1**2 + q2**2)")
+
+    def gradient(theta):
+        return gradient_of((Factor(place, ("exp", -1.0), theta),), arguments)
+
+    slope = gradient_of((Factor(place, ("exp", -1.0), -0.7),), arguments, along=0)
+    expected = (gradient(-0.7 + 1e-6) - gradient(-0.7 - 1e-6)) / 2e-6
+    np.testing.assert_allclose(slope, expected, rtol=1e-8)
+
+
+def test_products_of_coordinates_are_read_as_such():
+    arguments = arguments_of(ring(3))
+    atom = (Factor(0, ("power", 2.0)), Factor(3, ("power", 1.0)))
+    assert powers_of(atom, arguments, 4) == (2, 0, 0, 1)
+    assert powers_of((Factor(0, ("power", -1.0)),), arguments, 4) is None
+
+
+def test_matching_finds_atoms_that_were_put_there_and_their_constants():
+    z = ring(60)
+    arguments, weight = arguments_of(z), np.ones(4)
+    unit = np.broadcast_to(np.eye(4)[:, None, :], (4, 60, 4)).reshape(4, -1).T
+    base = orthonormal(unit)
+    place = {a.text: i for i, a in enumerate(arguments)}
+    true = (
+        (Factor(place["sqrt(q1**2 + q2**2)"], ("exp", -1.0), -0.7),),
+        (Factor(place["q1 - q2"], ("power", 3.0)),),
+    )
+    target = sum(c * gradient_of(a, arguments) for c, a in zip((-1.5, 0.2), true, strict=True))
+    matching = Matching(base, target.ravel(), weight, arguments)
+    dictionary = dictionary_of(arguments, weight, base, degree=3, products=False)
+    best = matching.best(dictionary, 3)[0]
+    assert best.left < 1e-12
+    found = {(f.place, f.kind): f.theta for atom in best.atoms for f in atom}
+    assert found[true[0][0].place, ("exp", -1.0)] == pytest.approx(-0.7, abs=1e-11)
+    assert (true[1][0].place, ("power", 3.0)) in found
+
+
+# The search
+
+
+def test_keplers_law_told_nothing():
+    found = read(searched(kepler_pairs(200)))
+    expected = {"p1²": 0.5, "p2²": 0.5, "1/sqrt(q1**2 + q2**2)": -1.0}
+    assert found == pytest.approx(expected, abs=1e-12)
+
+
+def test_constants_inside_come_out_exactly():
+    """Morse: ½p² + 0.8 (1 − e^(−1.3 q))²."""
+    found = read(searched(morse_pairs(150)))
+    expected = {"p1²": 0.5, "exp(-2.6*q1)": 0.8, "exp(-1.3*q1)": -1.6}
+    assert found == pytest.approx(expected, abs=1e-11)
+
+
+def test_a_law_outside_of_the_dictionary_is_no_formula():
+    assert searched(outside_pairs(150)) is None
+
+
+def test_a_good_approximation_is_no_formula():
+    """cos(q) e^(−q²/10) is of no dictionary; five atoms of others come to 1e-11 of it."""
+    z0 = np.random.default_rng(0).uniform(-1.3, 1.3, (240, 2))
+
+    def gradient(z):
+        q = z[:, :1]
+        force = (np.sin(q) + 0.2 * q * np.cos(q)) * np.exp(-0.1 * q * q)
+        return np.concatenate([force, z[:, 1:]], axis=1)
+
+    assert searched(pairs_of(gradient, z0, dt=0.2)) is None
+
+
+def test_noise_is_no_formula():
+    pairs = morse_pairs(100)
+    rng = np.random.default_rng(0)
+    noisy = gfnn.Pairs(pairs.z0, pairs.z1 + 1e-4 * rng.normal(size=pairs.z1.shape), pairs.dt)
+    assert searched(noisy) is None
+
+
+# In a fit
+
+
+def test_a_fit_told_nothing_finds_keplers_law():
+    pairs, fresh = kepler_pairs(200), kepler_pairs(250).take(np.arange(200, 250))
+    fit = gfnn.fit(pairs, tolerance=1e-8)
+    assert fit.chosen.learns == "hamiltonian"
+    assert fit.formula == "0.5*p1**2 + 0.5*p2**2 - 1/sqrt(q1**2 + q2**2)"
+    error = np.asarray(fit.map.step(fresh.z0)[0]) - fresh.z1
+    assert np.sqrt(np.mean(error**2)) < 1e-13
+    again = gfnn.fit(pairs, tolerance=1e-8, max_operations=fit.operations)
+    assert again.formula == fit.formula
+
+
+@pytest.mark.slow
+def test_a_law_outside_of_the_dictionary_ends_as_a_map():
+    fit = gfnn.fit(outside_pairs(400), tolerance=1e-6, max_seconds=None)
+    assert fit.chosen.learns == "map"
