@@ -41,7 +41,7 @@ class Velocity(NamedTuple):
     used: bool
 
     def scaled(self, factor: float) -> Velocity:
-        """In a unit of which ``factor`` make one."""
+        """Convert to a unit of which ``factor`` make one."""
         bias = self.bias[0] * factor, self.bias[1] * factor
         return self._replace(bias=bias, sigma=self.sigma * factor)
 
