@@ -51,12 +51,14 @@ class PositionArcs:
             terms = terms.reshape(arcs, length, m, -1)
             right = np.concatenate([right, terms[:, :-1, d:] + terms[:, 1:, :d]], axis=-1)
         solved = -np.linalg.solve(going[..., :d, d:], right)
-        states = np.concatenate([x[:, :-1, d:], x[:, 1:, d:] + solved[..., 0]], axis=-1)
+        closing = np.concatenate([x[:, :-1, d:] - x[:, 1:, :d], solved[..., 0]], axis=-1)
         moved = np.zeros((arcs, length - 1, d, m))
         moved[..., range(d), range(d, m)] = 1.0
         by_state = np.concatenate([moved, solved[..., 1 : 1 + m]], axis=-2)
         of_terms = solved[..., 1 + m :]
-        return Steps(states, by_state, np.concatenate([np.zeros_like(of_terms), of_terms], axis=-2))
+        return Steps(
+            closing, by_state, np.concatenate([np.zeros_like(of_terms), of_terms], axis=-2)
+        )
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         m = x.shape[-1]

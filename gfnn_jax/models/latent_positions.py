@@ -16,7 +16,7 @@ import numpy as np
 from gfnn_jax.generating.position_arcs import PositionArcs, nodes_of
 from gfnn_jax.models.discrete_lagrangian import Solved, residuals
 from gfnn_jax.models.triples import Triples
-from gfnn_jax.solve.latent_arcs import fit_arcs, loss
+from gfnn_jax.solve.latent_arcs import SOFT_L1, fit_arcs
 from gfnn_jax.threads import one_thread
 
 _LONGEST = 24  # nodes of an arc: its own two positions cost a twelfth of what it tells
@@ -108,7 +108,7 @@ def held_out_cost(
     found = fit_arcs(model, np.zeros(0), x, y, scale, scale)
     if not np.isfinite(found.cost):
         return np.full(len(arcs), np.inf)
-    return np.nansum(loss(found.residuals), axis=(1, 2))
+    return np.nansum(SOFT_L1.of(found.residuals), axis=(1, 2))
 
 
 def _size(residuals: np.ndarray, dim: int) -> np.ndarray:
