@@ -204,7 +204,7 @@ def eliminated_rows(
 ) -> np.ndarray:  # fmt: skip
     """Rows (R, n + 1) of [∂r/∂p, r] at p and x, without the states of each arc: what its own state
     does not explain."""
-    J, m = _rows_at(model, p, x, y, sigma, loss), x.shape[-1]
+    (J, _), m = _linearised_at(model, p, x, y, sigma, loss), x.shape[-1]
     across = np.linalg.qr(J[..., :m], mode="complete")[0][..., m:]
     return (across.swapaxes(1, 2) @ J[..., m:]).reshape(-1, J.shape[-1] - m)
 
@@ -213,9 +213,9 @@ def last_by_coefficients(
     model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
 ) -> np.ndarray:
     """Derivative (A, m, n) in p of the last state of each arc that was fitted to y with p fixed."""
-    rows, m = _reduced(_evaluated(model, p, x, y, sigma), sigma), x.shape[-1]
-    first = np.linalg.solve(rows.arcs[:, :, :m], -rows.arcs[:, :, m:-1])
-    last = rows.sensitivities[:, -1]
+    (J, last), m = _linearised_at(model, p, x, y, sigma, SOFT_L1), x.shape[-1]
+    R = np.asarray(np.linalg.qr(J, mode="r"))
+    first = np.linalg.solve(R[:, :m, :m], -R[:, :m, m:-1])
     return last[..., :m] @ first + last[..., m:-1]
 
 
@@ -225,7 +225,7 @@ def rows_of_arcs(
     """Rows (A, L, k, n + 1) of the coefficients and the residuals, weighted as robust loss has it,
     after each arc's own δx_0 was projected out: residuals − rows · δp are those of any other
     coefficients near p, each arc with the state that suits them best."""
-    J, m = _rows_at(model, p, x, y, sigma, SOFT_L1), x.shape[-1]
+    (J, _), m = _linearised_at(model, p, x, y, sigma, SOFT_L1), x.shape[-1]
     Q = np.linalg.qr(J[..., :m])[0]
     return (J[..., m:] - Q @ (Q.swapaxes(1, 2) @ J[..., m:])).reshape(*y.shape, -1)
 
@@ -238,14 +238,14 @@ def sensitivities(
     return np.concatenate([factor, np.zeros((factor.shape[1] - len(factor), factor.shape[1]))])
 
 
-def _rows_at(
+def _linearised_at(
     model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray, loss: Loss
-) -> np.ndarray:
-    """Weighted rows (A, L k, m + n + 1) of [δx_0, δp, r] at p and x."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """`_linearised` of all arcs at p and x."""
     seen, steps, observed = np.isfinite(y), model.steps(p, x), model.observe(p, x)
     off = np.where(seen, np.where(seen, y, 0.0) - observed.values, 0.0)
     units = _Units(sigma, np.ones(x.shape[-1]), loss)
-    return _linearised(_Iterate.at(p, x, steps, observed, seen, off, units), slice(None))[0]
+    return _linearised(_Iterate.at(p, x, steps, observed, seen, off, units), slice(None))
 
 
 class _Units(NamedTuple):
@@ -318,7 +318,7 @@ def _reduced(at: _Iterate, *, leverage: bool = False) -> _Rows:
     factor, parts = np.zeros((0, n + 1)), []
     for first in range(0, num_arcs, size):
         block = slice(first, first + size)
-        J, transports = _linearised(at, block)
+        J, last = _linearised(at, block)
         R = np.asarray(np.linalg.qr(J, mode="r"))
         rest = R[:, m:, m:]
         stack = np.concatenate([factor, rest.reshape(-1, n + 1)])
@@ -328,14 +328,15 @@ def _reduced(at: _Iterate, *, leverage: bool = False) -> _Rows:
         if leverage:
             own = np.linalg.qr(J[..., :m])[0]
             follows = np.sum(own**2, axis=-1).reshape(follows.shape)
-        parts.append((R[:, :m], scores, transports, follows))
+        parts.append((R[:, :m], scores, last[..., :m], follows))
     arcs, scores, transports, follows = (np.concatenate(p) for p in zip(*parts, strict=True))
     factor = np.concatenate([factor, np.zeros((n + 1 - len(factor), n + 1))])
     return _Rows(arcs, factor, scores, transports, follows)
 
 
 def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted rows (a, L k, m + n + 1) of [δx_0, δp, r] of these arcs, and their transports."""
+    """Weighted rows (a, L k, m + n + 1) of [δx_0, δp, r] of these arcs, and δx_{L−1}
+    (a, m, m + n + 1) by δx_0, by δp, and by the defects before it."""
     steps = Steps(*(part[block] for part in at.steps))
     observed = Observed(*(part[block] for part in at.observed))
     residuals = at.residuals[block]
@@ -354,7 +355,7 @@ def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
     J[..., -1] = residuals - J[..., -1]
     weight = np.where(at.seen[block], np.sqrt(at.units.loss.weights(residuals)), 0.0)
     J *= weight[..., None]
-    return J.reshape(num_arcs, length * k, -1), S[:, -1, :, :m]
+    return J.reshape(num_arcs, length * k, -1), S[:, -1]
 
 
 def _solve(rows: _Rows, steps: Steps, damping: float) -> tuple[np.ndarray, np.ndarray]:
