@@ -205,7 +205,7 @@ def cell(quick: bool, *, noise: float, tolerance: float) -> Numbers:
         "terms": fit.chosen.num_parameters,
         "next_reading": float(np.sqrt(np.mean(off**2))),
         "tunes": float(np.abs(theirs - found).max()), "detuning": detuning,
-        "detuning_error": float(np.max(np.abs(np.divide(*detuning[::-1]) - 1))),
+        "detuning_error": float(np.max(np.abs(np.array(detuning[1]) / np.array(detuning[0]) - 1))),
         "sigma": fit.positions.noise, "cpu_seconds": seconds, "defect": fit.symplecticity_defect,
     }  # fmt: skip
 

@@ -24,9 +24,9 @@ def bad_data(quick: bool) -> tuple[list[Case], Numbers]:
     options = {"chart": "midpoint", "family": "polynomial"}
     cases, measured = [], {}
 
-    def add(name, states, images, **more):
+    def add(name, states, images, truth=fresh, **more):
         pairs = gfnn.Pairs(states, images, scene.dt)
-        case, fit = tried(name, pairs, None, fresh, **options, **more)
+        case, fit = tried(name, pairs, None, truth, **options, **more)
         cases.append(case)
         measured[name] = {"messages": list(fit.messages) if fit else [case.failed]}
         if fit is not None and fit.noise is not None:
@@ -44,7 +44,9 @@ def bad_data(quick: bool) -> tuple[list[Case], Numbers]:
         add("float32 numbers, 1e-8 asked for", *(z.astype("f4").astype(float) for z in (z0, z1)),
             tolerance=1e-8)  # fmt: skip
     for rate in (0.1,) if quick else (1e-3, 0.1, 1.0):
-        add(f"friction, rate {rate:g}", z0, z1 * [1, math.exp(-rate * scene.dt)])
+        loss = np.array([1, math.exp(-rate * scene.dt)])
+        damped = gfnn.Pairs(fresh.z0, np.asarray(fresh.z1) * loss, scene.dt)
+        add(f"friction, rate {rate:g}", z0, z1 * loss, damped)
     if quick:
         return cases, measured
     clusters = 0.05 * z0 + np.where(np.arange(len(z0)) % 2, 0.8, -0.8)[:, None] * [1, 0]
