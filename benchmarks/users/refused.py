@@ -52,8 +52,8 @@ def mixed_lengths() -> Any:
 
 
 REFUSED: dict[str, Callable[[], Refused]] = {
-    "terms-none": lambda: Refused(fitted(terms=None), "sequence of terms"),
-    "terms-as-text": lambda: Refused(fitted(terms="p1**2"), "got the text"),
+    "terms-none": lambda: Refused(fitted(terms=None), "for none as terms, got None"),
+    "terms-as-text": lambda: Refused(fitted(terms="p1**2"), "as terms, got 'p1**2'"),
     "unknown-name": lambda: Refused(fitted(terms=["p1**2 + x**2"]), "the name 'x'"),
     "dt-backwards": lambda: Refused(
         of_pairs(lambda p: gfnn.Pairs(p.z0, p.z1, -0.2)), "z1 are the states and z0 their images"
@@ -66,8 +66,8 @@ REFUSED: dict[str, Callable[[], Refused]] = {
         of_pairs(lambda p: gfnn.Pairs(np.asarray(p.z0).T, np.asarray(p.z1).T, 0.2)), "transposed"
     ),
     "mixed-lengths": lambda: Refused(mixed_lengths, "shape"),
-    "no-time": lambda: Refused(fitted(max_seconds=0), "max_seconds above 0"),
-    "tolerance-text": lambda: Refused(fitted(tolerance="1e-6"), "a number as tolerance"),
+    "no-time": lambda: Refused(fitted(max_seconds=0), "as max_seconds, got 0"),
+    "tolerance-text": lambda: Refused(fitted(tolerance="1e-6"), "as tolerance, got '1e-6'"),
     "angle-of-five": lambda: Refused(fitted(angles=(5,)), "different angles among"),
     "inverse-without-state": lambda: Refused(inverse_without_state, "inverse"),
     "numpy-scene": lambda: Refused(
