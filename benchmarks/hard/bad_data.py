@@ -41,8 +41,8 @@ def bad_data(quick: bool) -> tuple[list[Case], Numbers]:
         add(f"noise, σ = {sigma:g}", z0 + noise[0], z1 + noise[1])
     if not quick:
         add("50 pairs", z0[:50], z1[:50])
-        add("float32 numbers, 1e-8 asked for", *(z.astype("f4").astype(float) for z in (z0, z1)),
-            tolerance=1e-8)  # fmt: skip
+        single = [z.astype("f4").astype(float) for z in (z0, z1)]
+        add("float32 numbers, 1e-8 asked for", single[0], single[1], tolerance=1e-8)
     for rate in (0.1,) if quick else (1e-3, 0.1, 1.0):
         loss = np.array([1, math.exp(-rate * scene.dt)])
         damped = gfnn.Pairs(fresh.z0, np.asarray(fresh.z1) * loss, scene.dt)

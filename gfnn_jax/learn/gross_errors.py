@@ -25,9 +25,12 @@ _BEYOND, _NEIGHBOURS, _BUT = 5.0, 10, 2
 # Those neighbours' residuals are ordinary, below so many times the median: a map that cannot follow
 # a close passage errs around it too.
 _ORDINARY = 2.5
-# Gross errors are apart from the others: residuals below the smallest of them, down to this part of
-# it, are fewer by this factor than they. What a map cannot represent has a tail without a gap.
-_TAIL, _APART = 0.6, 0.5
+# Gross errors are apart from the others: residuals between so many times the median and _BEYOND are
+# fewer by this factor than they. What a map cannot represent has a tail without a gap.
+_TAIL, _APART = 3.0, 0.5
+# Where there is none just there: of so many or more, residuals below the smallest of them, down to
+# this part of it, are fewer. One or two of few pairs lie apart by chance.
+_SEVERAL, _GAP = 5, 0.6
 _ROUNDOFF = 1e-10  # of the spread: below it residuals are arithmetic
 _MOST = 0.12  # of the pairs: gross errors of a twentieth of the states of sequences, two pairs each
 _ROUNDS = 3  # large ones hide smaller ones
@@ -124,9 +127,12 @@ def _standing_alone(data: Dataset, size) -> np.ndarray:
         near = cKDTree(y).query(y[rows], k=_NEIGHBOURS + 1)[1][:, 1:]
         around = np.minimum(around, np.sort(size[near], axis=1)[:, -1 - _BUT])
     alone = rows[(size[rows] > _BEYOND * around) & (around < _ORDINARY * middle)]
-    falling = alone[np.argsort(-size[alone])]
+    between = np.sum((size > _TAIL * middle) & (size <= _BEYOND * middle))
+    if between < _APART * len(alone):
+        return alone
+    falling, ordered = alone[np.argsort(-size[alone])], np.sort(size)
     least = size[falling]
-    ordered = np.sort(size)
-    below = np.searchsorted(ordered, least) - np.searchsorted(ordered, _TAIL * least, "right")
+    below = np.searchsorted(ordered, least) - np.searchsorted(ordered, _GAP * least, "right")
     apart = np.flatnonzero(below < _APART * np.arange(1, len(falling) + 1))
-    return np.sort(falling[: apart[-1] + 1]) if len(apart) else falling
+    several = apart[apart + 1 >= _SEVERAL]
+    return np.sort(falling[: several[-1] + 1]) if len(several) else falling[:0]

@@ -104,7 +104,7 @@ def learn_network(
         substeps = substeps_for(family, params, y0[:_STATES], dt, options.reach)
         flow = Flow(family, params, dt, scale, options.stages, substeps)
         images = np.asarray(_images(flow, y0))
-        error = measured_error(data, tolerance, to_user(coordinates, images[count:]), coordinates)
+        error = measured_error(data, tolerance, to_user(coordinates, images[count:]))
         say(f"{label}: {done} iterations, error {error.relative:.2e}")
         better = best is None or error.relative < (1 - options.gained) * best.error.relative
         idle = 0 if better else idle + 1
