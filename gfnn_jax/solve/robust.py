@@ -8,13 +8,14 @@ least squares; Huber, Robust Statistics, 1981).
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 _NORMAL = 1.4826  # a normal deviation over the median of its size
 
 
+@runtime_checkable
 class Loss(Protocol):
     """ρ and its weights, elementwise."""
 
