@@ -28,9 +28,9 @@ _ORDINARY = 2.5
 # Gross errors are apart from the others: residuals between so many times the median and _BEYOND are
 # fewer by this factor than they. What a map cannot represent has a tail without a gap.
 _TAIL, _APART = 3.0, 0.5
-# Where there is none just there: of so many or more, residuals below the smallest of them, down to
-# this part of it, are fewer. One or two of few pairs lie apart by chance.
-_SEVERAL, _GAP = 5, 0.6
+# Where there is none just there: residuals below the smallest of them, down to this part of it, are
+# fewer. One or two of few pairs lie apart by chance: fewer than so many need a wider gap.
+_GAP, _SEVERAL, _WIDE_GAP = 0.6, 5, 0.1
 _ROUNDOFF = 1e-10  # of the spread: below it residuals are arithmetic
 _MOST = 0.12  # of the pairs: gross errors of a twentieth of the states of sequences, two pairs each
 _ROUNDS = 3  # large ones hide smaller ones
@@ -131,8 +131,8 @@ def _standing_alone(data: Dataset, size) -> np.ndarray:
     if between < _APART * len(alone):
         return alone
     falling, ordered = alone[np.argsort(-size[alone])], np.sort(size)
-    least = size[falling]
-    below = np.searchsorted(ordered, least) - np.searchsorted(ordered, _GAP * least, "right")
-    apart = np.flatnonzero(below < _APART * np.arange(1, len(falling) + 1))
-    several = apart[apart + 1 >= _SEVERAL]
-    return np.sort(falling[: several[-1] + 1]) if len(several) else falling[:0]
+    count, least = np.arange(1, len(falling) + 1), size[falling]
+    reach = np.where(count < _SEVERAL, _WIDE_GAP, _GAP) * least
+    below = np.searchsorted(ordered, least) - np.searchsorted(ordered, reach, "right")
+    apart = np.flatnonzero(below < _APART * count)
+    return np.sort(falling[: apart[-1] + 1]) if len(apart) else falling[:0]
