@@ -40,9 +40,9 @@ def diagnose_request(request: Request, plain: Dataset) -> Diagnosis:
 
     plain: as taken. Raises FitError where no chart covers the data.
     """
-    if plain.varied or plain.structure is not None:  # H or a sum of terms is looked for first
-        return Diagnosis(plain, plain, Charts([], None, {}, []), float("nan"), [])
     data, options = plain, request.options
+    if plain.varied or plain.structure is not None:  # H or a sum of terms is looked for first
+        return _of_varied(plain, request)
     if options.base is not None:
         known = given_terms(plain.dim, (options.base,))
         flow = flow_of(known, np.ones(known.num_parameters), plain)
@@ -50,6 +50,21 @@ def diagnose_request(request: Request, plain: Dataset) -> Diagnosis:
     # A law of the user's keeps areas, and so does what H of an autonomous system generates.
     may_lose = options.base is None and options.learn != "hamiltonian" and not plain.after
     return diagnosed(data, options.chart, request.reversor, options.seed, may_lose=may_lose)
+
+
+def _of_varied(plain: Dataset, request: Request) -> Diagnosis:
+    """The diagnosis of pairs that differ in dt or args, or of sites: whether they lose area by
+    args, without a drive."""
+    options, damping = request.options, None
+    by_args = plain.args is not None and plain.period is None and plain.own_dt is None
+    if by_args and plain.structure is None and options.learn != "hamiltonian":
+        jacobians, error = local_jacobians(
+            plain.y0, plain.y1, plain.scale, given_by(plain), seed=options.seed
+        )
+        damping = learn_damping(plain, jacobians, error, options.chart, request.reversor)
+    if damping is not None:
+        plain = plain.without(None, damping.piece)
+    return Diagnosis(plain, plain, Charts([], None, {}, []), float("nan"), [], damping)
 
 
 def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = False) -> Diagnosis:
@@ -67,7 +82,9 @@ def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = F
         jacobians = damping.undone(jacobians)
         data = plain = plain.without(None, damping.piece)
     elif not look_symplectic(jacobians, error, plain.scale):
-        differing = where_areas_differ(jacobians, centres(plain.y0, jacobians, seed), plain.scale)
+        at = plain.y0 if plain.args is None else np.concatenate([plain.y0, plain.args], axis=1)
+        at = centres(at, jacobians, seed)
+        differing = where_areas_differ(jacobians, at, plain.scale, plain.parameters)
         messages.append(
             f"the pairs do not look symplectic: ‖MᵀJM − J‖ is about {defect:.2g}, known to within "
             f"{error:.1g} (0 for a symplectic map): are q and p in order, p momenta and not "
