@@ -230,7 +230,7 @@ class _Problem:
         return bool((np.abs(values @ found.factor - 1) > _CERTAIN * error).any())
 
     def told(self, found: _Fitted) -> LearnedDamping:
-        """What was found, without axes of length 1."""
+        """Damping that was found, without axes of length 1."""
         factor = found.factor
         std = np.linalg.norm(found.root, axis=1).reshape(factor.shape)
         b = self._values(found.functions) @ factor
