@@ -13,9 +13,10 @@ from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.learn import choose_law, flows
-from gfnn_jax.learn.arcs import arcs_of
-from gfnn_jax.learn.clock import Counted
+from gfnn_jax.models.hamiltonians import choose_law
+from gfnn_jax.models.hamiltonians import search as flows
+from gfnn_jax.models.hamiltonians.arcs import arcs_of
+from gfnn_jax.search.clock import Counted
 
 LAW, TRUE = given_terms(1, ["p**2", "q**2", "q**4"]), np.array([0.5, 0.5, 0.25])
 QUIETLY = pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")

@@ -30,13 +30,13 @@ from gfnn_jax.jobs import predict as predict_job
 from gfnn_jax.jobs import progress, search
 from gfnn_jax.learn import check
 from gfnn_jax.learn import fit as learn_fit
-from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.options import OPTIONS
 from gfnn_jax.maps import saved as models
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.inputs import HOLDS
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
+from gfnn_jax.search.candidates import Candidate
 from gfnn_jax.storage import checkpoints
 
 DT = 0.1
@@ -826,7 +826,7 @@ TRAINING = """
 import sys
 from gfnn_jax import cli
 from gfnn_jax.jobs import progress
-from gfnn_jax.learn import network_sweep
+from gfnn_jax.models.generating_functions import network_sweep
 
 network_sweep._CHECKPOINT_SECONDS = progress.BETWEEN = 0.0
 sys.exit(cli.main(sys.argv[1:]))

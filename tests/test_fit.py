@@ -11,8 +11,8 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.diagnosis.local_jacobians import local_jacobians, look_symplectic
 from gfnn_jax.learn import choose
-from gfnn_jax.learn.diagnose import local_jacobians, look_symplectic
 from gfnn_jax.scenes import DrawnFrom, Scene, henon_heiles
 from gfnn_jax.scenes.two_body import angular_momentum
 

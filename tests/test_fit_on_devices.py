@@ -19,7 +19,7 @@ from gfnn_jax.families.sines import Sines
 from gfnn_jax.fitting import accelerated, gauss_newton, least_squares, row_blocks
 from gfnn_jax.fitting.triangle import folded
 from gfnn_jax.flows.collocation import Steps
-from gfnn_jax.learn.clock import Counted
+from gfnn_jax.search.clock import Counted
 
 FITS = """
 import sys

@@ -17,7 +17,6 @@ from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.rollouts import NUM_STEPS, NUM_TRAJECTORIES, map_rollouts
 from gfnn_jax.jobs.search import refusals, scene_named, search
 from gfnn_jax.jobs.written import MODEL, Ran, already_done, pairs_digest, write
-from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.fit import Fit
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps.bands import bands
@@ -31,6 +30,7 @@ from gfnn_jax.scenes.trajectories import (
     sample_t0,
     sample_test_states,
 )
+from gfnn_jax.search.candidates import Candidate
 from gfnn_jax.storage.outputs import atomic_folder
 from gfnn_jax.storage.partial import unfinished
 

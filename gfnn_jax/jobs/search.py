@@ -14,13 +14,13 @@ import numpy as np
 from gfnn_jax import scenes
 from gfnn_jax.errors import FitError, InputError, WorkError
 from gfnn_jax.jobs.progress import Progress
-from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.fit import Fit, fit
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene
+from gfnn_jax.search.candidates import Candidate
 from gfnn_jax.storage.checkpoints import TrainingCheckpoints
 from gfnn_jax.storage.factors import KeptFactors
 

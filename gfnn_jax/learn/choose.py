@@ -8,15 +8,15 @@ from typing import NamedTuple
 
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import OutOfTime
-from gfnn_jax.learn.assemble import composed, measured
-from gfnn_jax.learn.candidates import Candidate
-from gfnn_jax.learn.choose_law import preferred
-from gfnn_jax.learn.clock import ROWS, Budget
-from gfnn_jax.learn.learned_law import assembled as flow_assembled
-from gfnn_jax.learn.map_of_terms import assembled as map_assembled
 from gfnn_jax.learn.request import Request
-from gfnn_jax.learn.search import Entry
 from gfnn_jax.learn.searches import Searched
+from gfnn_jax.models.generating_functions.map_of_terms import assembled as map_assembled
+from gfnn_jax.models.hamiltonians.choose_law import preferred
+from gfnn_jax.models.hamiltonians.learned_law import assembled as flow_assembled
+from gfnn_jax.search.assemble import composed, measured
+from gfnn_jax.search.candidates import Candidate
+from gfnn_jax.search.clock import ROWS, Budget
+from gfnn_jax.search.search import Entry
 
 _CONFIRMED = 1.1  # of the error that the search measured
 

@@ -9,23 +9,23 @@ import numpy as np
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.diagnosis.hidden_friction import hidden_friction
+from gfnn_jax.diagnosis.local_jacobians import differs_between_sequences, volume_change
+from gfnn_jax.diagnosis.neighbours import is_noise
+from gfnn_jax.diagnosis.noise import noise_of_sites, state_noise
 from gfnn_jax.errors import OutOfTime
-from gfnn_jax.learn.assemble import stepped
-from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.check import not_radians, wrapped
 from gfnn_jax.learn.choose import Chosen
-from gfnn_jax.learn.choose_law import long_step
-from gfnn_jax.learn.clock import SOLVE, Budget
-from gfnn_jax.learn.diagnose import differs_between_sequences, volume_change
-from gfnn_jax.learn.hidden_friction import hidden_friction
-from gfnn_jax.learn.neighbours import is_noise
-from gfnn_jax.learn.noise import noise_of_sites, state_noise
 from gfnn_jax.learn.propose import proposed
 from gfnn_jax.learn.request import Request
-from gfnn_jax.learn.search import AS_FAR, MET, Entry
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.learn.sweeps import OF_SOLVE, OF_STEPS, LinearSweep
-from gfnn_jax.learn.white import leaves_white
+from gfnn_jax.models.generating_functions.sweeps import OF_SOLVE, OF_STEPS, LinearSweep
+from gfnn_jax.models.hamiltonians.choose_law import long_step
+from gfnn_jax.models.hamiltonians.white import leaves_white
+from gfnn_jax.search.assemble import stepped
+from gfnn_jax.search.candidates import Candidate
+from gfnn_jax.search.clock import SOLVE, Budget
+from gfnn_jax.search.search import AS_FAR, MET, Entry
 
 _NO_MORE = {
     False: "no larger library of terms promised to meet it",

@@ -21,35 +21,35 @@ import numpy as np
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
+from gfnn_jax.diagnosis.clean import clean
+from gfnn_jax.diagnosis.damping import LearnedDamping
+from gfnn_jax.diagnosis.local_jacobians import ChartJudgement, looked_for_errors
 from gfnn_jax.errors import FitError, FitWarning, InputError, OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.assemble import block_of
-from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.choose import Chosen, choose
-from gfnn_jax.learn.clean import clean
-from gfnn_jax.learn.clock import COMPILE, MAX_SECONDS, ROWS, Budget
 from gfnn_jax.learn.conclude import conclude
-from gfnn_jax.learn.damping import LearnedDamping
-from gfnn_jax.learn.diagnose import ChartJudgement, looked_for_errors
-from gfnn_jax.learn.diagnosed import diagnose_request
-from gfnn_jax.learn.draw import NUM_PAIRS, drawn
+from gfnn_jax.learn.diagnose import diagnose_request
 from gfnn_jax.learn.gross_errors import without_gross_errors
-from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.options import FitOptions, with_options
-from gfnn_jax.learn.positions import OfPositions, learn_positions
 from gfnn_jax.learn.posterior import with_posterior, work_of_posterior
 from gfnn_jax.learn.propose import structures_to_try
-from gfnn_jax.learn.recordings import fit_recording
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.learn.stated import stated
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
+from gfnn_jax.models.lagrangians.recordings import fit_recording
+from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS, drawn
+from gfnn_jax.models.positions.positions import OfPositions, learn_positions
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
+from gfnn_jax.search.assemble import block_of
+from gfnn_jax.search.candidates import Candidate
+from gfnn_jax.search.clock import COMPILE, MAX_SECONDS, ROWS, Budget
 
 _OF_DERIVATIVE = 3.0  # times a step's: the time that compiling its derivative takes
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken
@@ -271,10 +271,10 @@ def fit(
     """Learn the map of these pairs: the cheapest candidate within the tolerance, else the best.
 
     Of a `Recording` learn its law, a Lagrangian with friction and inputs, from its positions: a
-    `models.learned_law.LearnedLaw`; of the options ``learn`` ("auto" or "lagrangian"),
-    ``friction``, ``input_hold``, ``mass`` and ``on_progress`` apply (`learn.recordings`). With
-    learn="map" learn the map of its positions instead, a `Fit`: see `fit_positions`. Of pairs a
-    `Fit`.
+    `models.lagrangians.learned_law.LearnedLaw`; of the options ``learn`` ("auto" or "lagrangian"),
+    ``friction``, ``input_hold``, ``mass`` and ``on_progress`` apply
+    (`models.lagrangians.recordings`). With learn="map" learn the map of its positions instead, a
+    `Fit`: see `fit_positions`. Of pairs a `Fit`.
 
     pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order.
                Of different dt, S is a function of dt too, in the midpoint chart. With parameters
@@ -402,8 +402,8 @@ def fit_positions(
 
     The map acts on z = (q, p), p = −h ∂S/∂q: ``map.from_positions`` and
     ``map.rollout(positions=(q, Q), …)`` start it. Positions of one place tell p but for a factor
-    and a gauge, which `models.discrete_lagrangian` fixes: frequencies, positions and stability do
-    not depend on them, the size of p, energies and areas do.
+    and a gauge, which `models.positions.discrete_lagrangian` fixes: frequencies, positions and
+    stability do not depend on them, the size of p, energies and areas do.
     Raises FitError where the recording has no positions at even times, or too few.
     """
     require_x64("a fit")

@@ -1,8 +1,8 @@
 """Pairs that the map found contradicts by far more than it does the pairs around them.
 
-Neighbours tell an outlier where states are dense (`learn.diagnose.outliers`); a map that all pairs
-agree on tells it anywhere. What a map cannot represent is smooth: its residual is as large at the
-neighbours. A gross error of measurement stands alone.
+Neighbours tell an outlier where states are dense (`diagnosis.local_jacobians.outliers`); a map that
+all pairs agree on tells it anywhere. What a map cannot represent is smooth: its residual is as
+large at the neighbours. A gross error of measurement stands alone.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.learn.diagnosed import Diagnosis, diagnose_request
+from gfnn_jax.diagnosis.diagnosis import Diagnosis
+from gfnn_jax.learn.diagnose import diagnose_request
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched, searched
-from gfnn_jax.learn.sweeps import LinearSweep
+from gfnn_jax.models.generating_functions.sweeps import LinearSweep
 
 # A residual beyond so many times what all but two of its neighbours stay below, and the median of
 # all. Of normal noise and d = 1 it is four times the median in one of 60,000 pairs.

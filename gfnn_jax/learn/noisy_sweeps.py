@@ -2,9 +2,10 @@
 
 A search judges sizes by residuals that are nearly all noise, and fits at measured points. Where
 that is what stopped it, the sweeps that came as far as the best are fitted again to the states that
-the pairs most likely had (`models.map_arcs`). In these rows the residual is a distance from the
-map's graph in units of the noise, whatever the chart, and the expected error of every size on
-fresh pairs follows from one factor, as Mallows' C_p does (Technometrics 15 (1973) 661).
+the pairs most likely had (`models.generating_functions.map_arcs`). In these rows the residual is a
+distance from the map's graph in units of the noise, whatever the chart, and the expected error of
+every size on fresh pairs follows from one factor, as Mallows' C_p does (Technometrics 15 (1973)
+661).
 """
 
 from __future__ import annotations
@@ -21,15 +22,21 @@ from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import uncertainty
 from gfnn_jax.fitting.triangle import Triangle
-from gfnn_jax.learn.candidates import Candidate, validated
-from gfnn_jax.learn.choose_law import preferred
-from gfnn_jax.learn.clock import ROWS, Budget
 from gfnn_jax.learn.conclude import only_noise
 from gfnn_jax.learn.request import Request
-from gfnn_jax.learn.search import AS_FAR, Entry
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.learn.sweeps import SAMPLE_ROWS, Factors, LinearSweep, Size, part_of_noise
-from gfnn_jax.models.map_arcs import LONGEST, GeneratedOnArcs, NearestArcs
+from gfnn_jax.models.generating_functions.map_arcs import LONGEST, GeneratedOnArcs, NearestArcs
+from gfnn_jax.models.generating_functions.sweeps import (
+    SAMPLE_ROWS,
+    Factors,
+    LinearSweep,
+    Size,
+    part_of_noise,
+)
+from gfnn_jax.models.hamiltonians.choose_law import preferred
+from gfnn_jax.search.candidates import Candidate, validated
+from gfnn_jax.search.clock import ROWS, Budget
+from gfnn_jax.search.search import AS_FAR, Entry
 
 _MOST_SWEEPS = 3
 _WHAT = "the fit of S to the states that noisy pairs most likely had"

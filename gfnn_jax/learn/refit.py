@@ -18,6 +18,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_inner, whole_turns
 from gfnn_jax.dataset.measured_error import Tolerance, one_step_error
+from gfnn_jax.dataset.rows import of_rows, residual_weight
 from gfnn_jax.errors import FitWarning
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.time_step import OfTimeStep
@@ -28,19 +29,18 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.assemble import stepped
-from gfnn_jax.learn.candidates import Candidate, with_error
 from gfnn_jax.learn.conclude import not_met
 from gfnn_jax.learn.fit import Fit
-from gfnn_jax.learn.formula import Term, formula
-from gfnn_jax.learn.learned_law import LearnedHamiltonian
-from gfnn_jax.learn.rows import of_rows, residual_weight
 from gfnn_jax.learn.stated import FEWEST_TESTED
 from gfnn_jax.maps.saved import packed, unpacked
 from gfnn_jax.maps.symplectic_map import SymplecticMap, serves_any_dt
+from gfnn_jax.models.hamiltonians.formula import Term, formula
+from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.processes import Group
 from gfnn_jax.scenes import Scene
+from gfnn_jax.search.assemble import stepped
+from gfnn_jax.search.candidates import Candidate, with_error
 
 _BLOCK = 20_000  # pairs at a time
 # A pair is an outlier that is missed by so many deviations, which are no smaller than roundoff. A

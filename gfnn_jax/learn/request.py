@@ -11,7 +11,7 @@ import numpy as np
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.structures import Structure, structure_of
-from gfnn_jax.learn.candidates import Candidate
+from gfnn_jax.dataset.varied import as_varied
 from gfnn_jax.learn.check import (
     check_moves,
     check_request,
@@ -19,11 +19,11 @@ from gfnn_jax.learn.check import (
     unlike_the_scene,
     unnamed_angles,
 )
-from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.options import FitOptions
-from gfnn_jax.learn.varied import as_varied
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
+from gfnn_jax.search.candidates import Candidate
+from gfnn_jax.search.clock import Budget
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,13 +20,13 @@ from gfnn_jax.dataset.measured_error import FEWEST_RUNS, clusters, count_of_runs
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps
-from gfnn_jax.learn.assemble import stepped
-from gfnn_jax.learn.candidates import Candidate, with_error
 from gfnn_jax.learn.choose import Chosen
-from gfnn_jax.learn.clock import FLOW, ROWS, Budget
-from gfnn_jax.learn.law_work import work_of_refit
-from gfnn_jax.learn.network_sweep import NetworkSweep
 from gfnn_jax.learn.searches import Searched
+from gfnn_jax.models.generating_functions.network_sweep import NetworkSweep
+from gfnn_jax.models.hamiltonians.work import work_of_refit
+from gfnn_jax.search.assemble import stepped
+from gfnn_jax.search.candidates import Candidate, with_error
+from gfnn_jax.search.clock import FLOW, ROWS, Budget
 
 _FOLDS = 5
 FEWEST_TESTED = 10  # runs that state the error for all others

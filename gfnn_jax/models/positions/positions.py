@@ -1,0 +1,363 @@
+"""``gfnn.fit`` of positions alone: the map behind them, by an S(q, Q) that is learned from triples.
+
+triples → sizes of S by rising degree, symmetric first → the smallest that meets the tolerance, else
+the best → where larger ones leave as much, and so the readings have noise, S with latent positions
+→ its map, judged by its own steps from positions that were held out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.coordinates import Coordinates, nearest_image
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, one_step_error
+from gfnn_jax.dataset.runs import identified
+from gfnn_jax.dataset.split import Split, split_rows
+from gfnn_jax.dataset.structures import Sites, structure_of
+from gfnn_jax.errors import FitError, OutOfTime
+from gfnn_jax.families.displacements import OfDisplacement
+from gfnn_jax.families.inputs import box_inputs, variable_signs
+from gfnn_jax.families.products import Products
+from gfnn_jax.generating.charts import TYPE1
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.maps.sensors import Sensors
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.positions.discrete_lagrangian import displacement, residuals, solve
+from gfnn_jax.models.positions.latent_positions import starting_noise
+from gfnn_jax.models.positions.noisy_positions import without_noise
+from gfnn_jax.models.positions.position_maps import images_of, map_of, states_of
+from gfnn_jax.models.positions.triples import Triples, triples_of
+from gfnn_jax.phase_space import Pairs, sizes
+from gfnn_jax.search.assemble import stepped
+from gfnn_jax.search.candidates import Candidate
+from gfnn_jax.search.clock import ROWS, Budget
+from gfnn_jax.search.search import MET
+
+_DEGREES = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)
+_ROWS_PER_TERM, _MOST_OPERATIONS = 3, 2e10  # of one solve: a few seconds on one core
+_FEWEST = 20  # triples
+_BETTER, _WORSE = 0.9, 3  # of the residual: sizes in a row that leave more end a sweep
+_GAIN = 0.5  # of the residual: what an S without symmetry must lower it to
+_ROUNDOFF = 1e-15  # of the spread
+_EXACT = 1e-10  # of the spread: readings whose S leaves less have no noise worth the name
+_STALLED = 0.5  # of the residual, that a larger S leaves at least where readings have noise
+_WINDOW = 40  # steps, from whose readings a state is estimated
+
+
+@dataclasses.dataclass(frozen=True)
+class OfPositions:
+    """Traits of an S of positions alone.
+
+    symmetric: whether S(q, Q) = S(Q, q). rank: how many combinations of its terms the data tell;
+    the others, the factor of S among them, are those of free motion. condition: of those told.
+    noise: σ (d,) of the readings, where they have noise and S was fitted with latent positions.
+    """
+
+    symmetric: bool
+    num_parameters: int
+    rank: int
+    condition: float
+    num_triples: int
+    noise: tuple[float, ...] | None = None
+
+    def __str__(self) -> str:
+        """Line about what was learned."""
+        left = self.num_parameters - self.rank
+        kind = "symmetric, as of a reversible map" if self.symmetric else "of no symmetry"
+        listed = "" if self.noise is None else ", ".join(f"{s:.3g}" for s in self.noise)
+        return (
+            f"S(q, Q) of {self.num_triples:,} triples of positions, {kind}; its factor, and so the "
+            "unit of momenta, is fixed by its mixed term"
+            + (f"; {left} more combinations of terms are left open, and are 0" if left else "")
+            + (f"; the readings have noise of {listed}" if listed else "")
+        )
+
+
+class LearnedPositions(NamedTuple):
+    """The map, every size that was tried, what its S is like, all states as pairs, the rows that
+    chose and those that state the error, and what is to be said."""
+
+    map: SymplecticMap
+    candidates: tuple[Candidate, ...]
+    positions: OfPositions
+    states: Pairs
+    validation: np.ndarray
+    test: np.ndarray
+    stated_by: str
+    messages: list[str]
+    ended: str
+    compile_seconds: float
+
+
+def learn_positions(
+    recording: Recording, *, tolerance: Tolerance, budget: Budget, structure: str | None = None,
+    seed: int = 0, say: Callable[[str], Any] = lambda message: None,
+    tell: Callable[[Candidate], Any] = lambda candidate: None,
+) -> LearnedPositions:  # fmt: skip
+    """The map behind the positions of a recording, at even times or by turns.
+
+    structure: "ring" or "chain" of equal sites. Raises FitError where the triples are too few for
+    the smallest S, or no S explains them.
+    """
+    triples = triples_of(recording, sites=structure is not None)
+    sites = structure_of(structure, triples.dim, Coordinates("positions", triples.angles))
+    if sites is not None and not isinstance(sites, Sites):
+        raise FitError(f"expected a ring or a chain of positions, got {structure!r}")
+    if len(triples) < _FEWEST:
+        raise FitError(f"expected at least {_FEWEST} triples of positions, got {len(triples)}")
+    sensors = Sensors(
+        recording.positions, (), recording.angles, np.zeros(triples.dim), 0.0,
+        _WINDOW * triples.dt, "hold", 0.0, np.array([triples.dt]), np.zeros((1, triples.dim)),
+    )  # fmt: skip
+    sweep = _Sweep(triples, sites, _split(triples, seed), tolerance, budget, say, tell, sensors)
+    best = sweep.best(symmetric=True)
+    if best is None or best.candidate.validation_bound > tolerance.bound:
+        other = sweep.best(symmetric=False)
+        if other is not None and (best is None or _clearly_better(other, best)):
+            best = other
+    if best is None:
+        raise FitError(
+            f"expected more triples of positions, or more time: {len(triples)} are too few for the "
+            "smallest S, or no S of theirs has a step"
+        )
+    return sweep.learned(sweep.without_noise(best), say)
+
+
+class _Found(NamedTuple):
+    """A piece, its error, what its S is like, a root (k, m) of the covariance of its coefficients,
+    and the noise (d,) of readings."""
+
+    piece: Generated
+    candidate: Candidate
+    about: OfPositions
+    root: np.ndarray
+    noise: np.ndarray
+
+
+def _clearly_better(one: _Found, other: _Found) -> bool:
+    return one.candidate.validation_bound < _GAIN * other.candidate.validation_bound
+
+
+@dataclasses.dataclass
+class _Sweep:
+    """The triples, which of them train, choose and test, and every size that was tried."""
+
+    triples: Triples
+    sites: Sites | None
+    split: Split
+    tolerance: Tolerance
+    budget: Budget
+    say: Callable[[str], Any]
+    tell: Callable[[Candidate], Any]
+    sensors: Sensors
+    tried: list[Candidate] = dataclasses.field(default_factory=list)
+
+    @property
+    def spread(self) -> np.ndarray:
+        """(d,) of the positions; of an angle at most that of its circle."""
+        size = sizes(self.triples.middle)
+        angles = list(self.triples.angles)
+        size[angles] = np.minimum(size[angles], np.pi / np.sqrt(3))
+        return size
+
+    def best(self, *, symmetric: bool) -> _Found | None:
+        """The smallest S whose steps meet the tolerance, else the most accurate; None where the
+        triples are too few for any, or no S has a step."""
+        found: _Found | None = None
+        worse = 0
+        for family in self._families(symmetric):
+            try:
+                with self.budget.unit(f"S of {family.label}", ROWS, self._work(family)):
+                    new = self._fitted(family, symmetric)
+            except OutOfTime:
+                break
+            if found is None or not new.candidate.validation_bound >= (
+                _BETTER * found.candidate.validation_bound
+            ):
+                found, worse = new, 0
+            else:
+                worse += 1
+            met = found.candidate.validation_bound <= max(self.tolerance.bound, _ROUNDOFF)
+            if met or worse == _WORSE:
+                break
+        if found is None or not np.isfinite(found.candidate.validation_bound):
+            return None
+        return found
+
+    def _families(self, symmetric: bool) -> Iterator[OfDisplacement]:
+        """Families by rising size, as many as the training triples determine."""
+        triples, rows = self.triples, len(self.split.training) * self.triples.dim
+        # An angle stays as it is: the middle of two would be known by half a turn only.
+        part, moves = 0.0 if triples.angles else 0.5, _centres_of_moves(triples)
+        for k, inner in enumerate(self._inner(symmetric, part)):
+            both = symmetric and getattr(inner, "signs", None) is None
+            family = OfDisplacement(inner, part, both, moves)
+            terms = family.num_parameters
+            if _ROWS_PER_TERM * terms > rows or (k and rows * terms**2 > _MOST_OPERATIONS):
+                return
+            yield family
+
+    def _inner(self, symmetric: bool, part: float) -> Iterator[Any]:
+        """The F of S, of a position and a displacement."""
+        dim = self.triples.dim
+        if self.sites is not None:
+            yield from self.sites.libraries(dim)
+            return
+        q, other = np.split(self.triples.ends, 2, axis=1)
+        x = np.concatenate([q + part * (other - q), other - q], axis=1)
+        if part:
+            turned = (1,) * dim + (-1,) * dim
+            inputs = box_inputs(x, reversor=turned)
+            signs = variable_signs(inputs, turned, x) if symmetric else None
+            yield from (Products(inputs, degree, signs) for degree in _DEGREES)
+            return
+        if symmetric:
+            x = np.concatenate([x, np.concatenate([other, q - other], axis=1)])
+        inputs = box_inputs(x, angles=self.triples.angles)
+        yield from (Products(inputs, degree) for degree in _DEGREES)
+
+    def without_noise(self, best: _Found) -> _Found:
+        """S with latent positions where the readings have noise, by which least squares is biased;
+        else the best as it is."""
+        if self.sites is not None or not self._stalls(best):
+            return best
+        self.say("larger S leave as much: the readings have noise")
+        symmetric, split = best.about.symmetric, self.split
+        training, held_out = (
+            self.triples.take(np.sort(rows)) for rows in (split.training, split.validation)
+        )
+        families = self._families(symmetric)
+        found = without_noise(families, training, held_out, self.budget, self.say)
+        if found is None:
+            return best
+        started = time.perf_counter()
+        noise = tuple(map(float, found.fit.sigma))
+        about = dataclasses.replace(
+            best.about, num_parameters=found.family.num_parameters, rank=found.solved.rank,
+            condition=found.solved.condition, noise=noise,
+        )  # fmt: skip
+        own = found.fit.coefficients, found.fit.root, found.fit.sigma
+        return self._found(found.family, about, *own, started)
+
+    def _stalls(self, best: _Found) -> bool:
+        """Whether the next larger S leaves as much as the best one does."""
+        error, terms = best.candidate.validation_relative, best.candidate.num_parameters
+        families = self._families(best.about.symmetric)
+        larger = next((f for f in families if f.num_parameters > terms), None)
+        if error <= _EXACT or larger is None:
+            return False
+        known = next((c for c in self.tried if c.num_parameters == larger.num_parameters), None)
+        if known is None:
+            try:
+                with self.budget.unit(f"S of {larger.label}", ROWS, self._work(larger)):
+                    known = self._fitted(larger, best.about.symmetric).candidate
+            except OutOfTime:
+                return False
+        return known.validation_relative > _STALLED * error
+
+    def _work(self, family: OfDisplacement) -> float:
+        """Operations of a solve."""
+        return float(len(self.split.training) * self.triples.dim * family.num_parameters**2)
+
+    def _fitted(self, family: OfDisplacement, symmetric: bool) -> _Found:
+        """S of this family by least squares."""
+        self.say(f"S of {family.label}, {family.num_parameters} terms")
+        started, training = time.perf_counter(), self.triples.take(self.split.training)
+        solved = solve(family, training)
+        about = OfPositions(
+            symmetric, family.num_parameters, solved.rank, solved.condition, len(self.triples)
+        )
+        left = residuals(family, family.unflatten(solved.coefficients), training)
+        deviation = np.sqrt(np.mean((left / displacement(training)) ** 2))
+        noise = starting_noise(family, solved.coefficients, training)
+        root = deviation * solved.root
+        return self._found(family, about, solved.coefficients, root, noise, started)
+
+    def _found(
+        self, family: OfDisplacement, about: OfPositions, coefficients: np.ndarray,
+        root: np.ndarray, noise: np.ndarray, started: float,
+    ) -> _Found:  # fmt: skip
+        """A candidate, with the error of its steps from positions that were held out."""
+        triples = self.triples
+        training, held = (triples.take(r) for r in (self.split.training, self.split.validation))
+        params = family.unflatten(coefficients)
+        states = states_of(family, params, triples)
+        piece = Generated(family, params, TYPE1, triples.dt, sizes(states[0]))
+        left = residuals(family, params, training) / self.spread
+        error = self.error_of(images_of(piece, held), self.split.validation)
+        gradient, with_hessian = family.operations
+        candidate = Candidate(
+            label=family.label, family=family.name, chart=TYPE1.name,
+            num_parameters=family.num_parameters, operations=float(gradient + with_hessian),
+            validation_rms=error.rms, validation_relative=error.relative,
+            validation_bound=error.bound, deviations=error.deviations,
+            train_rms=float(np.sqrt(np.mean(left**2))), validated=True,
+            fit_seconds=time.perf_counter() - started, condition=about.condition,
+            rank=about.rank,
+        )  # fmt: skip
+        self.tried.append(candidate)
+        self.tell(candidate)
+        return _Found(piece, candidate, about, root, noise)
+
+    def error_of(self, positions: np.ndarray, rows: np.ndarray) -> OneStepError:
+        """Error of the last positions (n, d) of these rows, as predicted."""
+        error = nearest_image(positions - self.triples.after[rows], self.triples.angles)
+        return one_step_error(error, self.spread, self.tolerance, self.split.stretch[rows])
+
+    def learned(self, best: _Found, say: Callable[[str], Any]) -> LearnedPositions:
+        """The map of the best S, its error that of the steps that users run, on triples that chose
+        nothing where there are enough."""
+        say(f"compiling the step of {best.candidate.label}")
+        sensors = dataclasses.replace(self.sensors, sigma=best.noise)
+        map_, states = map_of(best.piece, best.root, sensors, self.triples, self.sites)
+        test = self.split.test if len(self.split.test) else self.split.validation
+        steps = stepped(map_, states.z1[test])
+        images = np.where(steps.failed[:, None], np.nan, steps.images)[:, : self.triples.dim]
+        error = self.error_of(images, test)
+        chosen = dataclasses.replace(
+            best.candidate, validation_rms=error.rms, validation_relative=error.relative,
+            validation_bound=error.bound, deviations=error.deviations, map=map_, chosen=True,
+            newton_iterations_max=int(steps.iterations.max()),
+            microseconds_per_step=steps.microseconds_per_step,
+        )  # fmt: skip
+        others = [c for c in self.tried if c is not best.candidate]
+        met, messages = chosen.validation_bound <= self.tolerance.bound, []
+        ended = MET if met else self.budget.ended or "larger S are no more accurate"
+        if not met:
+            messages.append(
+                f"no S of positions meets the tolerance {self.tolerance.bound:g}: the most "
+                f"accurate has a one-step error of {chosen.validation_relative:.2e} of the spread "
+                f"(95 % bound {chosen.validation_bound:.2e}); the search ended because {ended}"
+            )
+        say(str(best.about))
+        part = "took no part in the fit or its choices" if test is self.split.test else "also chose"
+        return LearnedPositions(
+            map_, tuple(sorted([*others, chosen], key=lambda c: c.operations)), best.about, states,
+            self.split.validation, test, f"{len(test):,} triples that {part}", messages, ended,
+            steps.compile_seconds,
+        )  # fmt: skip
+
+
+def _split(triples: Triples, seed: int) -> Split:
+    """Split by runs, or of few runs by blocks of time, as pairs of states (q, Q − q) are split."""
+    coming, going = np.split(triples.moves, 2)
+    z0 = np.concatenate([triples.middle, coming], axis=1)
+    z1 = np.concatenate([triples.after, going], axis=1)
+    pairs = Pairs(z0, z1, triples.dt, run=triples.run, place=triples.place)
+    return split_rows(identified(pairs).pairs, seed)
+
+
+def _centres_of_moves(triples: Triples) -> np.ndarray | None:
+    """Centres as `OfDisplacement` has them."""
+    if not triples.wrapped:
+        return None
+    centres = np.full(triples.dim, np.nan)
+    for i in triples.angles:
+        centres[i] = 0.5 * (triples.moves[:, i].min() + triples.moves[:, i].max())
+    return centres
