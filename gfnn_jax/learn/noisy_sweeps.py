@@ -270,7 +270,7 @@ class NoisySweep(LinearSweep):
 def _chained(data: Dataset, rows) -> tuple[np.ndarray, np.ndarray, int, Any]:
     """Arguments of `arcs_of_pairs` for these rows: inner coordinates without a base map, angles
     lifted along an arc. A p of period 2π is none to S: its pairs are arcs of their own."""
-    z0, z1 = data.y0[rows], data.whole_image(data.y1[rows])
+    z0, z1 = data.y0[rows], data.whole_image(data.y1[rows], rows)
     for piece in reversed(data.before):
         z0 = piece.inverse().image(z0)
     steps, angles = onward(data.pairs, rows), list(data.coordinates.angles)

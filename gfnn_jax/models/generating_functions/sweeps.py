@@ -303,7 +303,7 @@ class LinearSweep(Generates):
         solved = least_squares.solve(train, held, size.family.num_parameters)
         params = size.family.unflatten(solved.coefficients)
         images, known = refined_images(data, self.chart, size.family, params, rows)
-        images = data.whole_image(np.where(known[:, None], images, np.nan))
+        images = data.whole_image(np.where(known[:, None], images, np.nan), rows)
         return to_user(data.coordinates, images)
 
     def left_over(self, size: Size) -> np.ndarray:
