@@ -172,7 +172,7 @@ def untruths(case: Case, learned: Learned, error: float) -> list[str]:
 def unreadable(case: Case, learned: Learned) -> list[str]:
     """A formula that sympy or ``terms`` does not read."""
     text, names = learned.formula, tuple(case.pairs.args or ())
-    if text is None or case.options.get("structure") or text.startswith("Legendre"):
+    if text is None or text.startswith("Legendre"):
         return []
     try:
         sympy.sympify(text)
