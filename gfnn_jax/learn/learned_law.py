@@ -171,7 +171,8 @@ def learned_from(
     steps = _resolving(family, fit.coefficients, steps, data, tolerance)
     contraction = contraction_of(fastest, data.dt, steps)
     by_newton = contraction > CONTRACTING and not matrix_free(family)
-    off = truncation(family, fit.coefficients, z, data.dt, steps, args=args) / data.scale
+    scale = data.scale
+    off = truncation(family, fit.coefficients, z, data.dt, steps, args=args, scale=scale) / scale
     flow = Flow(
         family, fit.coefficients, data.dt, data.scale, steps.stages, steps.substeps,
         by_newton,
@@ -234,7 +235,7 @@ def error_of_steps(
     family, coefficients, steps: Steps, data: Dataset, tolerance: Tolerance
 ) -> OneStepError:
     states, (dt, args) = data.y0[data.validation], data.given(data.validation)
-    found = images(family, coefficients, states, dt, steps, args=args).states
+    found = images(family, coefficients, states, dt, steps, args=args, scale=data.scale).states
     return measured_error(data, tolerance, to_user(data.coordinates, found))
 
 
@@ -250,9 +251,9 @@ def _resolving(family, coefficients, steps: Steps, data: Dataset, tolerance: Tol
     bound, states = bound_of(tolerance, data.scale), data.y0[data.validation]
     if error_of_steps(family, coefficients, steps, data, tolerance).bound <= tolerance.bound:
         return steps
-    dt, args = data.given(data.validation)
+    (dt, args), scale = data.given(data.validation), data.scale
     while 2 * steps.substeps <= MOST_SUBSTEPS:
-        off = truncation(family, coefficients, states, dt, steps, args=args) / data.scale
+        off = truncation(family, coefficients, states, dt, steps, args=args, scale=scale) / scale
         if np.sqrt(np.mean(off**2)) <= OPTIONS.truncation * bound:
             break
         steps = dataclasses.replace(steps, substeps=2 * steps.substeps)
