@@ -239,6 +239,10 @@ class NoisySweep(LinearSweep):
         fitted_to, held = self._along(others).triangle(of), self._nearest_held.triangle(of)
         return self._predicted(size, fitted_to, held, rows)
 
+    def work_of_test_rows(self, size: Size) -> float:
+        """None: noise falls with the root of the rows, by a twentieth."""
+        return 0.0
+
     def own_error(self, size: Size) -> float:
         """Own error of the measured points."""
         return self.plain.own_error(size)
