@@ -114,7 +114,7 @@ class Problem:
         along = (options.get("along") or family) if options.get("derivatives") else None
         self.allowance.spend(len(rows) * operations(family, self.z0.shape[1], steps, along))
         return images(
-            family, coefficients, self.z0[rows], dt, steps, args=args,
+            family, coefficients, self.z0[rows], dt, steps, args=args, scale=self.scale,
             on_substep=self.allowance.check, **options,
         )  # fmt: skip
 
@@ -281,8 +281,9 @@ class Problem:
         def own_error(block) -> np.ndarray:
             dt, args = self.given(block)
             return truncation(
-                family, c, self.z0[block], dt, steps, args=args, on_substep=self.allowance.check
-            )
+                family, c, self.z0[block], dt, steps, args=args, scale=self.scale,
+                on_substep=self.allowance.check,
+            )  # fmt: skip
 
         if row_blocks.devices() and len(rows):
             blocks = self._blocks(rows, 0, matrix_free(family))
