@@ -99,7 +99,8 @@ def fit_recording(
     inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
     record = (nodes, scales, angles, len(recording.inputs), inputs, seen, told, options)
     gauge_of = np.concatenate([n.x[:, : seen.dim] for n in nodes])
-    fit, choice, hold, nodes = search(*record) if asked is None else fit_given(asked, *record)
+    acting, choice, nodes = search(*record) if asked is None else fit_given(asked, *record)
+    fit, inputs_of = acting.fit, acting.bench.inputs
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
         raise FitError("no law of the library follows this recording: its arcs could not be closed")
     speeds = velocities(recording, fit, nodes)
@@ -110,7 +111,7 @@ def fit_recording(
         own = np.array([speeds[name].sigma for name in honest])
         seen = seen.beside({n: recording.velocities.index(n) for n in honest})
         nodes, arcs = with_channels(recording, nodes, fit.arcs, fit.fitted.x, honest)
-        bench = Workbench(gauge_of, inputs[hold], scales.omega, seen)
+        bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
         fit = bench.fit(fit.structure, fit.values, arcs, np.concatenate([fit.sigma, own]))
         scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, own]))
         given = np.array([recording.std[name] or np.nan for name in seen.channels])
@@ -136,26 +137,28 @@ def fit_recording(
     root = _root(covariance)
     noise = np.where(given > 0, given, np.minimum(scales.sigma, fit.rms()))
     sensors = Sensors(
-        names, recording.inputs, recording.angles, noise, scales.omega, scales.period, hold, 0.0,
-        np.array([scales.period]), np.zeros((1, len(noise))), None if seen.is_plain else fitted,
+        names, recording.inputs, recording.angles, noise, scales.omega, scales.period, acting.hold,
+        acting.delay, np.array([scales.period]), np.zeros((1, len(noise))),
+        None if seen.is_plain else fitted,
     )  # fmt: skip
     told("bands: forecasts from windows of the record")
     spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
     used, horizons = calibrated(law_in_use(law, root, sensors), found, scales, spread)
     z = np.concatenate([q, law.momentum(q, v)], axis=1)
     u = np.concatenate([n.stretch.u[n.at] for n in nodes])
-    signals = Signals(recording.inputs, hold) if recording.inputs else None
+    signals = Signals(recording.inputs, acting.hold, acting.delay) if recording.inputs else None
     map_ = map_of_law(
         law, z, scales.dt, angles=angles, signals=signals, inputs=u if signals else None, root=root
     )
     map_ = _with_sensors(map_, used.sensors)
     traces = _traces(recording, seen.channels, fit, law, nodes, zeros)
     told("which motion to record next")
-    bench = Workbench(gauge_of, inputs[hold], scales.omega, seen)
+    bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
     motions = next_motions(bench, fit, angles)
     return _described(
         recording, fit, map_, law, covariance, (choice, scale), horizons, gauge, tuple(steps),
         traces, motions, (q, v, u), [n.t for n in nodes], time.process_time() - started, speeds,
+        (acting.delay, acting.error) if recording.inputs else None,
     )  # fmt: skip
 
 
@@ -250,7 +253,7 @@ def _described(
     recording: Recording, fit: LawFit, map_: Any, law: Any, covariance: np.ndarray,
     chosen: tuple[FrictionChoice, float], horizons: Any, gauge: str, steps: tuple[str, ...],
     traces: tuple[Trace, ...], motions: list[Motion], states: Any, times: list[np.ndarray],
-    seconds: float, told_of: dict[str, Velocity],
+    seconds: float, told_of: dict[str, Velocity], delay: tuple[float, float] | None,
 ) -> LearnedLaw:  # fmt: skip
     """The law in the words of the recording."""
     names = recording.coordinates
@@ -294,7 +297,7 @@ def _described(
         if all(abs(gain) < _SEEN * error for gain, error in forces.values())
     ]
     return LearnedLaw(
-        map=map_, lagrangian=lagrangian, friction=friction, gains=gains,
+        map=map_, lagrangian=lagrangian, friction=friction, gains=gains, delay=delay,
         which_friction=which_friction_told(*chosen, law.dim, of_speeds),
         hamiltonian=hamiltonian_of(law.terms, lagrangian, codes), zeros=zeros,
         noise=dict(zip(channels, map(float, map_.sensors.sigma / factors), strict=True)),
