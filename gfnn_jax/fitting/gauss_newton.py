@@ -113,8 +113,8 @@ class Problem:
         along = (options.get("along") or family) if options.get("derivatives") else None
         self.spend(len(rows) * operations(family, self.z0.shape[1], steps, along))
         return images(
-            family, coefficients, self.z0[rows], dt, steps, args=args, on_substep=self.check,
-            **options,
+            family, coefficients, self.z0[rows], dt, steps, args=args, scale=self.scale,
+            on_substep=self.check, **options,
         )  # fmt: skip
 
     def residuals(self, family, coefficients, steps: Steps, rows) -> np.ndarray:
@@ -280,8 +280,9 @@ class Problem:
         def own_error(block) -> np.ndarray:
             dt, args = self.given(block)
             return truncation(
-                family, c, self.z0[block], dt, steps, args=args, on_substep=self.check
-            )
+                family, c, self.z0[block], dt, steps, args=args, scale=self.scale,
+                on_substep=self.check,
+            )  # fmt: skip
 
         if row_blocks.devices() and len(rows):
             blocks = self._blocks(rows, 0, matrix_free(family))

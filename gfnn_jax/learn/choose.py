@@ -37,9 +37,10 @@ def choose(searched: Searched, request: Request) -> Chosen:
     given = data, request.tolerance, request.budget
     if searched.linear is not None:
         return Chosen(searched.linear, data, 0.0)
-    if searched.of_terms is not None:
-        candidate, seconds, _ = map_assembled(searched.of_terms, *given)
-        return Chosen(candidate, data, seconds)
+    of_terms = searched.of_terms
+    if of_terms is not None:
+        candidate, seconds, _ = map_assembled(of_terms, request.tolerance, request.budget)
+        return Chosen(candidate, of_terms.data, seconds)
     ranking, bound = searched.found.ranking, request.tolerance.bound
     best = ranking[0].candidate if ranking else None
     if law is None or not (best is None or preferred(law.candidate, best, bound)):

@@ -31,6 +31,7 @@ _NO_MORE = {
     False: "no larger library of terms promised to meet it",
     True: "the training of the network gained no more",
 }
+_LOOK = "a look whether what the map leaves over is noise of the pairs"
 _RIGHT = "H is right, as far as these pairs tell, and what it leaves over is noise"
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _SHARE = 0.1  # of the residual, that a change of volume must explain
@@ -89,7 +90,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         left = _left_of_sites if structured else _what_is_left
         work = _work(chosen.entry or next(iter(found.ranking), None))
         try:
-            with request.budget.last("a look at what the map leaves over", SOLVE, work):
+            with request.budget.last(_LOOK, SOLVE, work):
                 noise, diagnosis, reason = left(chosen, searched, stalled)
         except OutOfTime:
             pass  # told with what else was left out

@@ -27,6 +27,7 @@ from gfnn_jax.diagnosis.local_jacobians import ChartJudgement, looked_for_errors
 from gfnn_jax.errors import FitError, FitWarning, InputError, OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
+from gfnn_jax.learn.all_rows import with_test_rows
 from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.conclude import conclude
 from gfnn_jax.learn.diagnose import diagnose_request
@@ -71,7 +72,8 @@ class Fit:
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
     scene: as given. damping: of a map that loses area, by how much of it in a step. positions: of a
     map that was learned from positions alone, what its S is like; num_pairs are then triples.
-    stated_by: the pairs by which the chosen candidate's error was measured.
+    stated_by: the pairs by which the chosen candidate's error was measured, and whether the map was
+    fitted to them afterwards.
     validation_pairs, test_pairs: that chose, and that stated the error; None where the pairs were
     too few for these. operations: of the search, as counted; as ``max_operations`` they give this
     map again, whatever the clock. budget: what is left of it. tells_defect: whether there is
@@ -344,7 +346,7 @@ def fit(
         chosen = with_posterior(choose(found, request), found)
         on_progress("the error that is stated, of pairs that chose nothing")
         error = stated(chosen, found, budget)
-        chosen = chosen._replace(candidate=error.candidate)
+        chosen, stated_by = with_test_rows(chosen, error, found, budget)
         conclusion = conclude(chosen, found, request)
         warn(conclusion.messages)
     judged = min(_JUDGED, block_of(2 * data.dim))
@@ -370,7 +372,7 @@ def fit(
         pairs=data.pairs,
         scene=scene,
         damping=seen.damping if chosen.candidate.learns == "map" else None,
-        stated_by=error.words,
+        stated_by=stated_by,
         test_pairs=data.pairs.take(data.test) if len(data.test) else None,
         operations=budget.operations,
         budget=budget,

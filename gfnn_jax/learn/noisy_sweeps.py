@@ -239,6 +239,10 @@ class NoisySweep(LinearSweep):
         fitted_to, held = self._along(others).triangle(of), self._nearest_held.triangle(of)
         return self._predicted(size, fitted_to, held, rows)
 
+    def work_of_test_rows(self, size: Size) -> float:
+        """No operations: noise falls with the root of the rows, by a twentieth."""
+        return 0.0
+
     def own_error(self, size: Size) -> float:
         """Own error of the measured points."""
         return self.plain.own_error(size)
@@ -270,7 +274,7 @@ class NoisySweep(LinearSweep):
 def _chained(data: Dataset, rows) -> tuple[np.ndarray, np.ndarray, int, Any]:
     """Arguments of `arcs_of_pairs` for these rows: inner coordinates without a base map, angles
     lifted along an arc. A p of period 2π is none to S: its pairs are arcs of their own."""
-    z0, z1 = data.y0[rows], data.whole_image(data.y1[rows])
+    z0, z1 = data.y0[rows], data.whole_image(data.y1[rows], rows)
     for piece in reversed(data.before):
         z0 = piece.inverse().image(z0)
     steps, angles = onward(data.pairs, rows), list(data.coordinates.angles)

@@ -427,12 +427,12 @@ class _Refit:
         turns = whole_turns(y0[:, angles] - np.asarray(self.map.angle_centre))
         y0[:, angles] -= turns
         y1[:, angles] -= turns
-        for piece in self.before:
-            y0 = piece.image(y0)
-        for piece in reversed(self.after):
-            y1 = piece.inverse().image(y1)
         args = self._args(pairs)
         columns = None if args is None else np.stack([*args.values()], axis=-1)
+        for piece in self.before:
+            y0 = piece.image(y0, columns)
+        for piece in reversed(self.after):
+            y1 = piece.inverse().image(y1, columns)
         return _Rows(y0, y1, self._own_dt(pairs), columns)
 
 

@@ -73,7 +73,11 @@ def searched(
     early = not _of_terms(data) or options.model is not None
     climb = Search(_sweeps(request, data, seen) if early else [], *given)
     climb.climb(most=_SMALL)
-    law = _law(request, data, better, MAX_COST_RATIO * climb.cheapest)
+    # H with friction that depends on args is not learned.
+    lossy_by_args = seen.damping is not None and data.args is not None
+    law = None
+    if not lossy_by_args:
+        law = _law(request, data, better, MAX_COST_RATIO * climb.cheapest)
     of_terms, failed = None, None
     met_by_law = law is not None and tolerance.met_by(law.candidate)
     wanted = not early and options.learn != "hamiltonian" and not met_by_law
@@ -84,7 +88,7 @@ def searched(
             failed = error
     if wanted and data.args is not None and not _met(of_terms, tolerance):
         try:
-            seen = diagnosed(data, options.chart, request.reversor, options.seed)
+            seen = diagnosed(seen.data, options.chart, request.reversor, options.seed)
         except FitError as error:
             failed = failed or error
         charts = seen.charts

@@ -123,7 +123,7 @@ def _images_of(chosen: Chosen, found: Searched, rows: np.ndarray) -> np.ndarray:
     own = sweep is not None and sweep.data.pairs is found.data.pairs
     if candidate.microseconds_per_step is None and entry is not None and own:
         images, solved = entry.sweep.images(entry.size, rows)
-        images = data.whole_image(np.where(solved[:, None], images, np.nan))
+        images = data.whole_image(np.where(solved[:, None], images, np.nan), rows)
         return to_user(data.coordinates, images)
     steps = stepped(candidate.map, np.asarray(pairs.z0), pairs.dt, pairs.args, timed=False)
     return np.where(steps.failed[:, None], np.nan, steps.images)

@@ -48,12 +48,14 @@ _SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved
 
 
 class LearnedMap(NamedTuple):
-    """The candidate, its error measured by steps in NumPy, and the piece that S generates.
+    """The candidate, its error measured by steps in NumPy, the piece that S generates, and the data
+    set that it was fitted to, of which a loss of area may be factored out.
     covariance: gives (m, m), rootᵀ root is that of the coefficients. stalled: whether another
     library of the chart was no less accurate, and the tolerance is missed."""
 
     candidate: Candidate
     piece: Generated
+    data: Dataset
     covariance: Callable[[], np.ndarray]
     stalled: bool
 
@@ -75,7 +77,7 @@ def learn_map(
 
     Raises FitError where no chart covers the data, or the pairs are too few.
     """
-    budget, started = budget or Budget(), time.perf_counter()
+    budget, started, given = budget or Budget(), time.perf_counter(), data
     best: _Tried | None = None
     tried: list[_Tried] = []
     try:
@@ -119,7 +121,7 @@ def learn_map(
         fit_seconds=time.perf_counter() - started,
     )  # fmt: skip
     covariance = partial(_root, piece, data)
-    return LearnedMap(with_error(candidate, best.error), piece, covariance, stalled)
+    return LearnedMap(with_error(candidate, best.error), piece, given, covariance, stalled)
 
 
 def map_of(
@@ -144,12 +146,10 @@ def map_of(
     return found
 
 
-def assembled(
-    learned: LearnedMap, data: Dataset, tolerance: Tolerance, budget: Budget
-) -> Assembled:  # fmt: skip
+def assembled(learned: LearnedMap, tolerance: Tolerance, budget: Budget) -> Assembled:
     """The candidate's map, measured."""
-    map_ = composed(learned.piece, data)
-    return measured(learned.candidate, map_, data, tolerance, budget)
+    map_ = composed(learned.piece, learned.data)
+    return measured(learned.candidate, map_, learned.data, tolerance, budget)
 
 
 @dataclasses.dataclass
@@ -258,6 +258,7 @@ def _judged(piece: Generated, data: Dataset, tolerance: Tolerance) -> _Tried:
         folds = not (determinant > SINGULAR).all() and not (determinant < -SINGULAR).all()
     bad = ~(off < _SOLVED) | folds
     images = np.where(bad[:, None], np.nan, images)
+    images = data.whole_image(images, rows)
     error = measured_error(data, tolerance, to_user(data.coordinates, images))
     w, target, args = _data(piece.chart, family, data, data.training)
     left = (family.gradient(params, w, args) - target) * _weight(data)

@@ -44,6 +44,8 @@ _MOST_TERMS = 3_100
 _ROWS_PER_TERM = 3
 # Enough to tell misfit from noise by a size, though not to choose it.
 _ROWS_THAT_TELL = 1.5
+# Rows per term up to which the test rows, an eighth as many, make the coefficients much better.
+_SCARCE = 6
 # Rows × terms² of one factor: about half a minute on one core. 2,000 terms take 80,000 rows.
 _MOST_OPERATIONS = 3.2e11
 # Whether S is even is tested where terms are scarce, from so many rows for each term, by odd terms
@@ -200,7 +202,9 @@ class LinearSweep(Generates):
             return ((of(inputs, degree, signs) for degree in g) for g in degrees)
 
         known = len(_SINES) if kind == "sines" or own is not None else sum(map(len, degrees))
-        self._groups, rows = groups, self._train[1].size
+        # Test rows determine a size too: once they have stated its error, it is fitted to them.
+        rows = self._train[1].size + len(data.test) * self._width
+        self._groups, self._determining = groups, rows
         self.sizes = [
             Size(family, group[-1], _extent(family))
             for group in _determined(groups(), rows) for family in group
@@ -272,9 +276,9 @@ class LinearSweep(Generates):
             degree = round(extent)
             label = f"{self._prefix}{family.name} {degree}"
             terms = family.terms_of(degree)
-        rows = self._train[0].shape
-        share = rows[0] / (rows[0] + len(self.data.validation))
-        pairs = int(np.ceil(_ROWS_PER_TERM * terms / rows[1] / share))
+        fitted = len(self._train[0]) + len(self.data.test)
+        share = fitted / (fitted + len(self.data.validation))
+        pairs = int(np.ceil(_ROWS_PER_TERM * terms / self._width / share))
         most = f", more than the {_MOST_TERMS:,} that are tried" if terms > _MOST_TERMS else ""
         return f"{label} ({terms:,} terms{most}; about {pairs:,} pairs)"
 
@@ -286,6 +290,23 @@ class LinearSweep(Generates):
             self._solved[count] = least_squares.solve(train, held, count)
         solved = self._solved[count]
         return solved, size.family.unflatten(solved.coefficients)
+
+    def work_of_test_rows(self, size: Size) -> float:
+        """Operations that `with_test_rows` takes; 0 where rows are not scarce."""
+        rows, count = self._train[1].size, size.family.num_parameters
+        if not len(self.data.test) or rows > _SCARCE * count:
+            return 0.0
+        more = len(self.data.test) * self._width
+        return 2.0 * more * (size.group.num_parameters + 1) ** 2 + OF_SOLVE * count**3
+
+    def with_test_rows(self, size: Size) -> least_squares.LeastSquaresFit:
+        """Solution of this size with the test rows among those that train. The validation rows
+        choose the ridge, as before."""
+        quiet = Budget(), lambda message: None
+        train, held = self.factors(size.group, *quiet)[:2]
+        test, _ = rows_of(self.data, self.chart, self.data.test)
+        more = least_squares.reduce(self.in_rows(size.group), [test], self._weight)
+        return least_squares.solve(train.merge(more), held, size.family.num_parameters)
 
     def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Images (n, 2d) of these rows, in the user's coordinates, by a fit to other rows; NaN
@@ -303,7 +324,7 @@ class LinearSweep(Generates):
         solved = least_squares.solve(train, held, size.family.num_parameters)
         params = size.family.unflatten(solved.coefficients)
         images, known = refined_images(data, self.chart, size.family, params, rows)
-        images = data.whole_image(np.where(known[:, None], images, np.nan))
+        images = data.whole_image(np.where(known[:, None], images, np.nan), rows)
         return to_user(data.coordinates, images)
 
     def left_over(self, size: Size) -> np.ndarray:
@@ -479,7 +500,7 @@ class LinearSweep(Generates):
         place = self.sizes.index(size)
         further = self.sizes[place + 1 : place + 3]
         if len(further) < 2:
-            rows = self._train[1].size
+            rows = self._determining
             families = (f for g in _determined(self._groups(), rows, _ROWS_THAT_TELL) for f in g)
             beyond = (f for f in families if f.num_parameters > rows // _ROWS_PER_TERM)
             further += [Size(f, f, _extent(f)) for f in itertools.islice(beyond, 2 - len(further))]

@@ -14,10 +14,9 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.exports.symbolic import as_latex, as_sympy
-from gfnn_jax.families.expressions import plain
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
-from gfnn_jax.families.sums import matrix_free
+from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
@@ -33,7 +32,7 @@ from gfnn_jax.models.hamiltonians.cost_of_flow import (
     omega_h_of,
     operations_of,
 )
-from gfnn_jax.models.hamiltonians.formula import Term, formula
+from gfnn_jax.models.hamiltonians.formula import Term, as_code, formula
 from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
 from gfnn_jax.models.hamiltonians.whole_sequences import Whole
 from gfnn_jax.phase_space import apply_j, symplectic_form
@@ -93,20 +92,17 @@ class LearnedHamiltonian:
 
     @property
     def formula(self) -> str | None:
-        """H as ``terms`` and sympy read it: "0.5*p1**2 - cos(q1)". None of a network; of a sum over
-        sites or bodies, and of a Lagrangian, which are no expression in q and p, as it is shown."""
-        return plain(self.shown) if self.shown and self._is_expression else self.shown
-
-    @property
-    def _is_expression(self) -> bool:
-        return isinstance(without_forces(self.flow.family), Terms)
+        """H as ``terms`` and sympy read it: "0.5*p1**2 - cos(q1)" (`learn.formula.as_code`). None
+        of a network; of a Lagrangian, which is no expression in q and p, as it is shown."""
+        family = without_forces(self.flow.family)
+        return as_code(family, self.terms) if isinstance(family, Terms | Sums) else self.shown
 
     def __str__(self) -> str:
         """H as people read it: "0.5 p1² - cos(q1)"."""
         return self.shown or "a network"
 
     def sympy(self) -> Any:
-        """H as a sympy expression. Raises ValueError of a network, a sum over sites or bodies."""
+        """H as a sympy expression. Raises ValueError of a network and a Lagrangian."""
         return as_sympy(self._expression)
 
     def latex(self) -> str:
@@ -115,10 +111,9 @@ class LearnedHamiltonian:
 
     @property
     def _expression(self) -> str:
-        if not self._is_expression or self.formula is None:
+        if self.formula is None or self.formula.startswith(Legendre.prefix):
             raise ValueError(
-                "expected an H that is an expression in q and p, got a network, a sum over sites "
-                "or bodies, or a Lagrangian"
+                "expected an H that is an expression in q and p, got a network or a Lagrangian"
             )
         return self.formula
 
@@ -176,7 +171,8 @@ def learned_from(
     steps = _resolving(family, fit.coefficients, steps, data, tolerance)
     contraction = contraction_of(fastest, data.dt, steps)
     by_newton = contraction > CONTRACTING and not matrix_free(family)
-    off = truncation(family, fit.coefficients, z, data.dt, steps, args=args) / data.scale
+    scale = data.scale
+    off = truncation(family, fit.coefficients, z, data.dt, steps, args=args, scale=scale) / scale
     flow = Flow(
         family, fit.coefficients, data.dt, data.scale, steps.stages, steps.substeps,
         by_newton,
@@ -239,7 +235,7 @@ def error_of_steps(
     family, coefficients, steps: Steps, data: Dataset, tolerance: Tolerance
 ) -> OneStepError:
     states, (dt, args) = data.y0[data.validation], data.given(data.validation)
-    found = images(family, coefficients, states, dt, steps, args=args).states
+    found = images(family, coefficients, states, dt, steps, args=args, scale=data.scale).states
     return measured_error(data, tolerance, to_user(data.coordinates, found))
 
 
@@ -255,9 +251,9 @@ def _resolving(family, coefficients, steps: Steps, data: Dataset, tolerance: Tol
     bound, states = bound_of(tolerance, data.scale), data.y0[data.validation]
     if error_of_steps(family, coefficients, steps, data, tolerance).bound <= tolerance.bound:
         return steps
-    dt, args = data.given(data.validation)
+    (dt, args), scale = data.given(data.validation), data.scale
     while 2 * steps.substeps <= MOST_SUBSTEPS:
-        off = truncation(family, coefficients, states, dt, steps, args=args) / data.scale
+        off = truncation(family, coefficients, states, dt, steps, args=args, scale=scale) / scale
         if np.sqrt(np.mean(off**2)) <= OPTIONS.truncation * bound:
             break
         steps = dataclasses.replace(steps, substeps=2 * steps.substeps)

@@ -25,6 +25,7 @@ _RISE = 1.01  # of the held-out arcs' noise, by chance
 _ROWS_PER_TERM = 200
 _STATES = 100  # from which the noise and its growth along an arc are measured
 _STEP_ERROR = 0.01  # of a step's own error ÷ the noise
+_IN_A_ROW = 2.5  # times the noise: neighbours of a state that stands alone stay below
 
 
 class Whole(NamedTuple):
@@ -126,6 +127,15 @@ def _messages(found: Fitted) -> tuple[str, ...]:
     outlying = np.any(np.abs(found.residuals) > OUTLYING, axis=-1)
     if not outlying.any():
         return ()
+    beside = np.any(np.abs(found.residuals) > _IN_A_ROW, axis=-1)
+    beside = np.pad(beside, ((0, 0), (1, 1)))
+    alone = outlying & ~(beside[:, :-2] | beside[:, 2:])
+    if 2 * alone.sum() < outlying.sum():
+        return (
+            f"the law misses {outlying.sum()} of {measured.sum()} measured states by more than "
+            f"{OUTLYING:g} times the noise, most of them in a row: it is less accurate there, and "
+            "they were given little weight",
+        )
     return (
         f"{outlying.sum()} of {measured.sum()} measured states lie more than {OUTLYING:g} times "
         "the noise from the sequences of the law: outliers, they were given little weight",
