@@ -352,6 +352,9 @@ def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs(tmp_path):
     delay, std = fit.delay
     assert abs(delay - 0.017) < 4 * std < 2e-3
     assert "linear between samples, acting 0.01" in fit.table
+    book = fit.energy
+    assert abs(book["closure"]) < 5e-3 * book["supplied"]["u"]
+    assert book["lost"]["v**2"] == pytest.approx(book["supplied"]["u"] - book["stored"], rel=0.01)
     fit.map.save(tmp_path / "model")
     for name, rows in (("past", slice(500)), ("ahead", slice(490, None))):
         columns = ["t", "x", "u", "w"] if name == "past" else ["t", "u", "w"]

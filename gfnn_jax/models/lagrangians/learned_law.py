@@ -103,6 +103,12 @@ class LearnedLaw:
             told = ", ".join(f"{q} {g:.6g} ± {s:.2g}" for q, (g, s) in forces.items())
             lines.append(f"force of {name}: {told}")
         lines += [self._inputs_told] if self.delay is not None else []
+        energy = self.energy
+        lines.append(
+            f"energy per second: stored {energy['stored']:.3g}, lost "
+            f"{sum(energy['lost'].values()):.3g}, supplied {sum(energy['supplied'].values()):.3g}, "
+            f"unexplained {energy['closure']:.1g}"
+        )
         for name, sigma in self.noise.items():
             lines.append(
                 f"{name}: noise {sigma:.3g}, residual of the law {self.residual[name]:.3g}, "
