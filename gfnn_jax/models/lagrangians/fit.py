@@ -4,7 +4,7 @@ cost."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -55,7 +55,7 @@ class Workbench:
     fastest frequency ω, and how states are seen."""
 
     gauge: np.ndarray
-    inputs: Callable[[Arcs], np.ndarray]
+    inputs: Any  # of arcs: ArcInputs, or a function in its place
     omega: float
     seen: Observation
 
