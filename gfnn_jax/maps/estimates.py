@@ -3,7 +3,7 @@
 The samples before a time are fitted by one arc of the law, its first state unknown: that gives the
 state there with its covariance. A forecast is the orbit from it. Its band holds the error of that
 state, of the law's coefficients, the noise of a sample, and the law's own misfit, as forecasts of
-the data that it was learned from have shown it.
+data that it was not learned from have shown it.
 """
 
 from __future__ import annotations

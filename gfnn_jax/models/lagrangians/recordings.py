@@ -26,8 +26,8 @@ from gfnn_jax.maps.laws import map_of_law
 from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.calibration import calibrated
-from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
+from gfnn_jax.models.lagrangians.calibration import Thirds, calibrated
+from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_law import fit_given
 from gfnn_jax.models.lagrangians.given_terms import Given, given_terms
@@ -141,9 +141,11 @@ def fit_recording(
         acting.delay, np.array([scales.period]), np.zeros((1, len(noise))),
         None if seen.is_plain else fitted,
     )  # fmt: skip
+    bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
     told("bands: forecasts from windows of the record")
     spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
-    used, horizons = calibrated(law_in_use(law, root, sensors), found, scales, spread)
+    thirds = _thirds(bench, nodes, fit, sensors, found)
+    used, horizons = calibrated(law_in_use(law, root, sensors), thirds, found, scales, spread)
     z = np.concatenate([q, law.momentum(q, v)], axis=1)
     u = np.concatenate([n.stretch.u[n.at] for n in nodes])
     signals = Signals(recording.inputs, acting.hold, acting.delay) if recording.inputs else None
@@ -153,7 +155,6 @@ def fit_recording(
     map_ = _with_sensors(map_, used.sensors)
     traces = _traces(recording, seen.channels, fit, law, nodes, zeros, inputs_of)
     told("which motion to record next")
-    bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
     motions = next_motions(bench, fit, angles)
     return _described(
         recording, fit, map_, law, covariance, (choice, scale), horizons, gauge, tuple(steps),
@@ -243,6 +244,26 @@ def _root(covariance: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(covariance)
     kept = values > 1e-14 * max(float(values.max(initial=0.0)), 1e-300)
     return np.sqrt(values[kept])[:, None] * vectors[:, kept].T
+
+
+def _thirds(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, sensors: Sensors,
+    found: Sequence[Stretch],
+) -> Thirds:  # fmt: skip
+    """The laws of the record without each third, of which less data tell less."""
+    fewer, laws, begins = np.sqrt(FOLDS / (FOLDS - 1)), [], []
+    for other, run, t in bench.without_thirds(nodes, fit):
+        law, covariance = in_columns(other)
+        own = sensors
+        if sensors.observation is not None:
+            first = fit.form.count + len(fit.structure.zeros)
+            shown = dataclasses.replace(sensors.observation, values=other.p[first:])
+            own = dataclasses.replace(sensors, observation=shown)
+        laws.append(law_in_use(law, fewer * _root(covariance), own))
+        begins.append(
+            next((i, t) for i, s in enumerate(found) if s.run == run and s.t[0] <= t <= s.t[-1])
+        )
+    return Thirds(tuple(laws), tuple(begins))
 
 
 def _with_sensors(map_: Any, sensors: Sensors) -> Any:
