@@ -178,8 +178,8 @@ def coarse_tolerance(pairs: Pairs, tolerance: Tolerance) -> list[str]:
         return []
     unit = " of the coordinates' spread" if tolerance.relative else ""
     return [
-        f"a step moves the states by {size:.1e}{unit}: maps that know little of the motion meet a "
-        f"tolerance of {tolerance.bound:g}, which is more than a hundredth of that"
+        f"a step moves the states by {size:.1e}{unit}: a tolerance of {tolerance.bound:g}, more "
+        "than a hundredth of that, is met by maps that hardly know the motion: ask for less"
     ]
 
 

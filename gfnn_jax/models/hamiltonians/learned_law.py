@@ -387,18 +387,18 @@ def _messages(
         names = found.undetermined
         some = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
         yield (
-            f"the pairs do not determine {len(names)} terms of H ({some}): they are left "
-            "out, and H is known only where the pairs are"
+            f"the pairs do not determine {len(names)} terms of H ({some}): these terms are left "
+            "out, and H is known only near the pairs"
         )
     if left_out:
         yield (
-            f"the steps of the fit are too coarse for {left_out} of {len(found.rows)} pairs, as of "
-            "close passages: it goes without them"
+            f"{left_out} of {len(found.rows)} pairs move too fast for the steps by which H was "
+            "fitted, as in close passages: they were left out"
         )
     if unresolved:
         yield (
-            f"the steps of the flow are too coarse for {unresolved} of {len(data.validation)} "
-            "held-out pairs: there the map errs, and not H"
+            f"{unresolved} of {len(data.validation)} held-out pairs move too fast for the map's "
+            "steps, as in close passages: there the map errs, and not H"
         )
 
 
