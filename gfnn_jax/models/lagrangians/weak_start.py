@@ -54,9 +54,7 @@ def weak_start(
             c, residual, inverse = _solve(X[..., keep] * weight[:, None], Y * weight)
             size = np.sqrt(np.mean(residual**2, axis=0))
             if not np.min(size) > 1e-9 * np.linalg.norm(X[..., keep] * c):
-                raise FitError(
-                    "these terms have a combination that vanishes along the recording: they tell no law"
-                )
+                raise FitError("a combination of these terms vanishes all along the recording")
             weight = np.maximum(weight / size, np.max(weight / size) / _APART)
         error = np.sqrt(_OVERLAP * np.mean(residual**2)) * np.linalg.norm(inverse, axis=1)
         z = [
