@@ -240,7 +240,7 @@ class NoisySweep(LinearSweep):
         return self._predicted(size, fitted_to, held, rows)
 
     def work_of_test_rows(self, size: Size) -> float:
-        """None: noise falls with the root of the rows, by a twentieth."""
+        """No operations: noise falls with the root of the rows, by a twentieth."""
         return 0.0
 
     def own_error(self, size: Size) -> float:
