@@ -358,6 +358,11 @@ def _unmet(error: OneStepError, omega_h: float, tolerance, found: FittedLaw) -> 
             f"; it oscillates by {omega_h:.2g} radians in a step, and beyond π one dt does not "
             "tell H: sample with a shorter one"
         )
+    elif without_forces(found.family) is not found.family:
+        why = (
+            "; its friction is linear in the velocities, and may be of another kind, dry or "
+            "quadratic: the law of a Recording of the positions tells which"
+        )
     elif found.ended:
         why = f"; modes were added until {found.ended}"
     return (
