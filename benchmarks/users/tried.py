@@ -168,8 +168,8 @@ def velocities() -> Case:
 
     laws = drawn(of_energy(CART, 2), box([1.0, 1.5, 1.0, 1.0]), 0.2, 2_000)
     data, fresh = (changed(pairs, velocity) for pairs in laws)
-    return Case(data, fresh, max_seconds=30.0, meets=None, words=("velocities, learn the law of a Recording",),
-                never=("H = ", *_NOISE))  # fmt: skip
+    words = ("velocities, learn the law of a Recording",)
+    return Case(data, fresh, max_seconds=30.0, meets=None, words=words, never=("H = ", *_NOISE))
 
 
 def told_angle() -> Case:
