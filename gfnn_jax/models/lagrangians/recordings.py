@@ -101,7 +101,7 @@ def fit_recording(
     gauge_of = np.concatenate([n.x[:, : seen.dim] for n in nodes])
     fit, choice, hold, nodes = search(*record) if asked is None else fit_given(asked, *record)
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
-        raise FitError("no law of the library follows this recording: its arcs could not be closed")
+        raise FitError("no law of the terms tried follows this recording from sample to sample")
     speeds = velocities(recording, fit, nodes)
     honest = tuple(name for name, one in speeds.items() if one.used)
     for name, one in speeds.items():
