@@ -4,8 +4,8 @@ cost."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -64,7 +64,7 @@ class Workbench:
     fastest frequency ω, and how states are seen."""
 
     gauge: np.ndarray
-    inputs: Callable[[Arcs], np.ndarray]
+    inputs: Any  # of arcs: ArcInputs, or a function in its place
     omega: float
     seen: Observation
 

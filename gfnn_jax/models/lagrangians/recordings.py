@@ -102,7 +102,7 @@ def fit_recording(
     acting, choice, nodes = search(*record) if asked is None else fit_given(asked, *record)
     fit, inputs_of = acting.fit, acting.bench.inputs
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
-        raise FitError("no law of the library follows this recording: its arcs could not be closed")
+        raise FitError("no law of the terms tried follows this recording from sample to sample")
     speeds = velocities(recording, fit, nodes)
     honest = tuple(name for name, one in speeds.items() if one.used)
     for name, one in speeds.items():
