@@ -209,7 +209,9 @@ def _of_law(found: Searched) -> _Refits:
     data, law = found.data, found.law
     assert law is not None
     flow = law.flow
-    problem = Problem(data.y0, data.y1, data.each_dt, data.scale, args=data.args)
+    problem = Problem(
+        data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
+    )
     steps = Steps(flow.stages, flow.over(np.max(data.each_dt)).substeps)
     coefficients = np.asarray(flow.params)
 
