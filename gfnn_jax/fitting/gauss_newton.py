@@ -107,7 +107,7 @@ class Problem:
         self.options, self.allowance = options, allowance
 
     def unit(self, rows) -> np.ndarray:
-        """What residuals of these rows are divided by: (2d,), or (n, 2d) of weighted ones."""
+        """Divisors of the residuals of these rows: (2d,), or (n, 2d) of weighted ones."""
         return self.scale if self.weight is None else self.scale / self.weight[rows]
 
     def given(self, rows) -> tuple[Any, Any]:
