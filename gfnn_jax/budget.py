@@ -195,7 +195,7 @@ class Budget:
 
 @dataclasses.dataclass(frozen=True)
 class Allowance:
-    """What the parts of a unit of work are held against: the time of its budget, and a cap on what
+    """Bounds of the parts of a unit of work: the time of its budget, and a cap on what
     its search may make. None: no bound."""
 
     budget: Budget | None = None
