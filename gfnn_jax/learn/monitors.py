@@ -188,7 +188,9 @@ def _matrix(stretch: float | np.ndarray | None, dim: int) -> np.ndarray | None:
         raise InputError(f"expected a symplectic matrix, got one of defect {defect:.2g}")
     values = np.linalg.svd(matrix[:dim, dim:], compute_uv=False)
     if not values[-1] > _SEEN * max(values[0], 1e-300):
-        raise InputError("a known stretch maps no momenta to positions: it does not tell them")
+        raise InputError(
+            "a known stretch turns no momenta into displacements: it does not tell them"
+        )
     return matrix
 
 
