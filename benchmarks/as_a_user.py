@@ -52,11 +52,11 @@ from users.refused import REFUSED
 from users.tried import TRIED
 
 import gfnn_jax as gfnn
+from gfnn_jax.candidates.assemble import stepped
 from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.errors import FitError, InputError, WorkError
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.phase_space import sizes
-from gfnn_jax.search.assemble import stepped
 
 # Factors by which claims may differ from the truth: errors of exact data, and the map's own error
 # under noise; and parts by which they may: measured noise, and changes of volume.

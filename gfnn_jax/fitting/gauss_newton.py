@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import UNBOUNDED, Allowance
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.fitting.descent import ROUNDOFF, descended, step
@@ -93,20 +94,19 @@ class Problem:
     dt: a number, or one of each pair (N,). args: of each pair (N, k), or None.
     scale: (2d,) sizes of the coordinates, by which residuals are divided. weight: (N, 2d) that they
     are multiplied by, where values differ in their noise; None: 1.
-    check: called between blocks; it may raise to stop. spend: called with the floating-point
-    operations of each evaluation of the flow before it is made; it may too.
+    allowance: the time and the operations that an evaluation of the flow may take: checked between
+    its blocks, spent before it is made.
     """
 
     def __init__(
         self, z0, z1, dt, scale, *, args=None, weight=None, options: Options = OPTIONS,
-        check: Callable[[], Any] = lambda: None, spend: Callable[[float], Any] = lambda _: None,
+        allowance: Allowance = UNBOUNDED,
     ):  # fmt: skip
         self.z0, self.z1, self.dt, self.scale, self.args = z0, z1, dt, scale, args
-        self.weight = weight
-        self.options, self.check, self.spend = options, check, spend
+        self.weight, self.options, self.allowance = weight, options, allowance
 
     def unit(self, rows) -> np.ndarray:
-        """What residuals of these rows are divided by: (2d,), or (n, 2d) of weighted ones."""
+        """Divisor of these rows' residuals: (2d,), or (n, 2d) of weighted ones."""
         return self.scale if self.weight is None else self.scale / self.weight[rows]
 
     def given(self, rows) -> tuple[Any, Any]:
@@ -117,10 +117,10 @@ class Problem:
         """`flows.collocation.images` of the states z0 of these rows, each after its own dt."""
         dt, args = self.given(rows)
         along = (options.get("along") or family) if options.get("derivatives") else None
-        self.spend(len(rows) * operations(family, self.z0.shape[1], steps, along))
+        self.allowance.spend(len(rows) * operations(family, self.z0.shape[1], steps, along))
         return images(
             family, coefficients, self.z0[rows], dt, steps, args=args, scale=self.scale,
-            on_substep=self.check, **options,
+            on_substep=self.allowance.check, **options,
         )  # fmt: skip
 
     def residuals(self, family, coefficients, steps: Steps, rows) -> np.ndarray:
@@ -174,11 +174,11 @@ class Problem:
     def _unpaid(self) -> Problem:
         """The problem whose operations are spent already."""
         problem = copy.copy(self)
-        problem.spend = lambda operations: None
+        problem.allowance = dataclasses.replace(self.allowance, cap=None)
         return problem
 
     def _paid(self, block, family, steps: Steps, along=None):
-        self.spend(len(block) * operations(family, self.z0.shape[1], steps, along))
+        self.allowance.spend(len(block) * operations(family, self.z0.shape[1], steps, along))
         return block
 
     def _parts(self, blocks, family, steps: Steps):
@@ -199,7 +199,7 @@ class Problem:
         most = self.options.part_bytes if row_blocks.devices() else self.options.block_bytes
         size = max(1 if free else 16, most // pair)
         for first in range(0, len(rows), size):
-            self.check()
+            self.allowance.check()
             yield rows[first : first + size]
 
     def fit(
@@ -288,7 +288,7 @@ class Problem:
             dt, args = self.given(block)
             return truncation(
                 family, c, self.z0[block], dt, steps, args=args, scale=self.scale,
-                on_substep=self.check,
+                on_substep=self.allowance.check,
             )  # fmt: skip
 
         if row_blocks.devices() and len(rows):

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from gfnn_jax import scenes
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.errors import FitError, InputError, WorkError
 from gfnn_jax.jobs.progress import Progress
 from gfnn_jax.learn.fit import Fit, fit
@@ -20,7 +21,6 @@ from gfnn_jax.maps import saved
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene
-from gfnn_jax.search.candidates import Candidate
 from gfnn_jax.storage.checkpoints import TrainingCheckpoints
 from gfnn_jax.storage.factors import KeptFactors
 

@@ -11,13 +11,13 @@ import dataclasses
 import jax
 import numpy as np
 
+from gfnn_jax.budget import ROWS, Budget
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.learn.stated import Stated
 from gfnn_jax.models.generating_functions.sweeps import LinearSweep
-from gfnn_jax.search.clock import ROWS, Budget
 
 _WHAT = "the fit of the chosen size to the test pairs too"
 _WORDS = "; the map is fitted to them too"

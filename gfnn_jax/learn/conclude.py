@@ -6,6 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import SOLVE, Budget
+from gfnn_jax.candidates.assemble import stepped
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
@@ -22,9 +25,6 @@ from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.generating_functions.sweeps import OF_SOLVE, OF_STEPS, LinearSweep
 from gfnn_jax.models.hamiltonians.choose_law import long_step
 from gfnn_jax.models.hamiltonians.white import leaves_white
-from gfnn_jax.search.assemble import stepped
-from gfnn_jax.search.candidates import Candidate
-from gfnn_jax.search.clock import SOLVE, Budget
 from gfnn_jax.search.search import AS_FAR, MET, Entry
 
 _NO_MORE = {

@@ -18,6 +18,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.budget import COMPILE, MAX_SECONDS, ROWS, Budget
+from gfnn_jax.candidates.assemble import block_of
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
@@ -34,6 +37,7 @@ from gfnn_jax.learn.diagnose import diagnose_request
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.options import FitOptions, with_options
+from gfnn_jax.learn.positions import OfPositions, learn_positions
 from gfnn_jax.learn.posterior import with_posterior, work_of_posterior
 from gfnn_jax.learn.propose import structures_to_try
 from gfnn_jax.learn.request import checked
@@ -45,12 +49,8 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.recordings import fit_recording
 from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS, drawn
-from gfnn_jax.models.positions.positions import OfPositions, learn_positions
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
-from gfnn_jax.search.assemble import block_of
-from gfnn_jax.search.candidates import Candidate
-from gfnn_jax.search.clock import COMPILE, MAX_SECONDS, ROWS, Budget
 
 _OF_DERIVATIVE = 3.0  # times a step's: the time that compiling its derivative takes
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken

@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import ROWS, Budget
+from gfnn_jax.candidates.candidate import Candidate, validated
 from gfnn_jax.dataset.arcs import arcs_of_pairs, onward
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import OutOfTime
@@ -34,8 +36,6 @@ from gfnn_jax.models.generating_functions.sweeps import (
     part_of_noise,
 )
 from gfnn_jax.models.hamiltonians.choose_law import preferred
-from gfnn_jax.search.candidates import Candidate, validated
-from gfnn_jax.search.clock import ROWS, Budget
 from gfnn_jax.search.search import AS_FAR, Entry
 
 _MOST_SWEEPS = 3
@@ -248,7 +248,7 @@ class NoisySweep(LinearSweep):
         return self._predicted(size, fitted_to, held, rows)
 
     def work_of_test_rows(self, size: Size) -> float:
-        """No operations: noise falls with the root of the rows, by a twentieth."""
+        """Zero: noise falls with the root of the rows, by a twentieth."""
         return 0.0
 
     def own_error(self, size: Size) -> float:

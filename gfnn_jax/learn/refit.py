@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gfnn_jax.candidates.assemble import stepped
+from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_inner, whole_turns
 from gfnn_jax.dataset.measured_error import Tolerance, one_step_error
 from gfnn_jax.dataset.rows import of_rows, residual_weight
@@ -39,8 +41,6 @@ from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.processes import Group
 from gfnn_jax.scenes import Scene
-from gfnn_jax.search.assemble import stepped
-from gfnn_jax.search.candidates import Candidate, with_error
 
 _BLOCK = 20_000  # pairs at a time
 # A pair is an outlier that is missed by so many deviations, which are no smaller than roundoff. A

@@ -7,6 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import Budget
+from gfnn_jax.candidates.assemble import composed
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.structures import Sites
@@ -31,9 +34,6 @@ from gfnn_jax.models.maps_of_laws.law_maps import (
     search_around,
     search_of_law,
 )
-from gfnn_jax.search.assemble import composed
-from gfnn_jax.search.candidates import Candidate
-from gfnn_jax.search.clock import Budget
 from gfnn_jax.search.search import Entry, Found, Search
 
 # Operations of a size of S that is judged before H is looked for: a fifth of a second.

@@ -15,6 +15,9 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from gfnn_jax.budget import FLOW, ROWS, Budget
+from gfnn_jax.candidates.assemble import stepped
+from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.measured_error import FEWEST_RUNS, clusters, count_of_runs, measured_error
 from gfnn_jax.errors import FitError, OutOfTime
@@ -24,9 +27,6 @@ from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.generating_functions.network_sweep import NetworkSweep
 from gfnn_jax.models.hamiltonians.work import work_of_refit
-from gfnn_jax.search.assemble import stepped
-from gfnn_jax.search.candidates import Candidate, with_error
-from gfnn_jax.search.clock import FLOW, ROWS, Budget
 
 _FOLDS = 5
 FEWEST_TESTED = 10  # runs that state the error for all others

@@ -15,6 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import ROWS, Budget
+from gfnn_jax.candidates.assemble import Assembled, composed, measured
+from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
@@ -31,9 +34,6 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import CHARTS, AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.models.parameters import functions_of_parameters, state_libraries, walked
-from gfnn_jax.search.assemble import Assembled, composed, measured
-from gfnn_jax.search.candidates import Candidate, with_error
-from gfnn_jax.search.clock import ROWS, Budget
 
 _CHARTS = ("type2", "midpoint", "type3")  # that are tried, in this order
 _MOST_TERMS, _ROWS_PER_TERM = 500, 3

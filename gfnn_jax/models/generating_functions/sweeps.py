@@ -11,6 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import Budget
+from gfnn_jax.candidates.assemble import with_predictor
+from gfnn_jax.candidates.candidate import Candidate, refined_images, validated
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
@@ -29,9 +32,6 @@ from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping
-from gfnn_jax.search.assemble import with_predictor
-from gfnn_jax.search.candidates import Candidate, refined_images, validated
-from gfnn_jax.search.clock import Budget
 
 # Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
 # judged from one factor of the rows of its largest.

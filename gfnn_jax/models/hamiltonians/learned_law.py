@@ -9,6 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import Budget
+from gfnn_jax.candidates.assemble import Assembled, composed, measured
+from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
@@ -36,9 +39,6 @@ from gfnn_jax.models.hamiltonians.formula import Term, as_code, formula
 from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
 from gfnn_jax.models.hamiltonians.whole_sequences import Whole
 from gfnn_jax.phase_space import apply_j, symplectic_form
-from gfnn_jax.search.assemble import Assembled, composed, measured
-from gfnn_jax.search.candidates import Candidate, with_error
-from gfnn_jax.search.clock import Budget
 
 FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
 _NEAR_ROUNDOFF = 3e-15  # of the spread

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.budget import UNBOUNDED, Allowance, Budget
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
@@ -57,7 +58,6 @@ from gfnn_jax.models.hamiltonians.whole_sequences import fitted_to_sequences
 from gfnn_jax.models.hamiltonians.work import LawWork
 from gfnn_jax.models.hamiltonians.worth import too_dear
 from gfnn_jax.models.parameters import functions_of_parameters, state_libraries, walked
-from gfnn_jax.search.clock import Budget
 
 _ROUNDOFF = 1e-12  # of the spread: above it the pairs carry noise, and every one of them counts
 _HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
@@ -151,7 +151,7 @@ def learn_hamiltonian(
                 best = _refitted(problem, best, everywhere.training, data, tolerance)
     except OutOfTime:  # what was found stands
         budget.leave_out(what, work.ended)
-    problem.check, problem.spend = lambda: None, lambda operations: None
+    problem.allowance = UNBOUNDED
     of_arcs = None
     if arcs is not None:
         of_arcs = partial(covariance_root, best, problem, everywhere, best.fit.steps)
@@ -497,7 +497,7 @@ def _of_sequences(problem, found: FittedLaw, data, tolerance, budget: Budget) ->
     """Fitted to whole sequences, where there are such and held-out steps bear it out."""
     if found.error.relative <= _ROUNDOFF:
         return found
-    whole = fitted_to_sequences(problem, found.family, found.fit, data, budget.check)
+    whole = fitted_to_sequences(problem, found.family, found.fit, data, Allowance(budget))
     if whole is None:
         return found
     family = found.family.take(whole.kept)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import Allowance
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.arcs import Arcs, arcs_of_pairs, onward
 from gfnn_jax.dataset.dataset import Dataset
@@ -51,7 +51,7 @@ class _Measured(NamedTuple):
 
 def fitted_to_sequences(
     problem: Problem, family, fit: FlowFit, data: Dataset,
-    check: Callable[[], Any],
+    allowance: Allowance,
 ) -> Whole | None:  # fmt: skip
     """The law of these pairs' fit, fitted to their sequences. None where they are none of one dt in
     plain coordinates, where noise soon grows beyond the linear, or where held-out sequences do not
@@ -88,7 +88,7 @@ def fitted_to_sequences(
     least = max(resolved, float(np.finfo(float).eps)) * problem.scale
 
     def fitted(of: _Measured, terms, coefficients, **options) -> Fitted | None:
-        model = FlowOnArcs(terms, data.dt, steps, of.arcs.moves, check)
+        model = FlowOnArcs(terms, data.dt, steps, of.arcs.moves, allowance)
         return fit_flow(
             model, coefficients, of.arcs, least, coordinates.angles, relative=of.relative, **options
         )

@@ -10,6 +10,7 @@ the clock. Without a budget nothing looks at the clock.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from typing import Literal
@@ -190,3 +191,25 @@ class Budget:
         if operations >= _TELLING * _RATES[kind]:
             done, seconds = self._measured.get(kind, (0.0, 0.0))
             self._measured[kind] = done + operations, seconds + self._clock() - started
+
+
+@dataclasses.dataclass(frozen=True)
+class Allowance:
+    """Bounds of the parts of a unit of work: the time of its budget, and a cap on what
+    its search may make. None: no bound."""
+
+    budget: Budget | None = None
+    cap: Counted | None = None
+
+    def check(self) -> None:
+        """Check the time: `Budget.check`."""
+        if self.budget is not None:
+            self.budget.check()
+
+    def spend(self, operations: float) -> None:
+        """Count operations before they are made: `Counted.spend`."""
+        if self.cap is not None:
+            self.cap.spend(operations)
+
+
+UNBOUNDED = Allowance()
