@@ -49,7 +49,8 @@ class GeneratedOnArcs:
 
     ends: affine pieces (before, after) around what S generates. along: a family whose rows are
     wanted: F is then that of S = 0, its derivatives in the states stay those of S, and Γ is in the
-    coefficients of this family. None: no coefficient is free.
+    coefficients of this family. None: no coefficient is free. joint: F is that of S all the same,
+    where ``along`` is its own family: `fit_arcs` then moves states and coefficients together.
     """
 
     family: Any
@@ -58,6 +59,7 @@ class GeneratedOnArcs:
     moves: np.ndarray
     ends: tuple[Sequence[Any], Sequence[Any]] = ((), ())
     along: Any = None
+    joint: bool = False
 
     def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
         width, free = x.shape[-1], 0 if self.along is None else self.along.num_parameters
@@ -78,7 +80,7 @@ class GeneratedOnArcs:
             y1 = piece.inverse().image(y1)
         w, target = self.chart.evaluation_point(y0, y1), self.chart.target_gradient(y0, y1, self.dt)
         gradient, hessian = self.family.gradient_and_hessian(self.family.unflatten(p), w)
-        miss = -target if self.along is not None else gradient - target
+        miss = -target if self.along is not None and not self.joint else gradient - target
         parts = [miss[..., None], hessian @ before[0] - before[1]]
         if self.along is not None:
             parts.append(self.along.term_gradients(w))

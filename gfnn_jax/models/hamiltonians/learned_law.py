@@ -359,6 +359,11 @@ def _unmet(error: OneStepError, omega_h: float, tolerance, found: FittedLaw) -> 
             f"; it oscillates by {omega_h:.2g} radians in a step, and beyond π one dt does not "
             "tell H: sample with a shorter one"
         )
+    elif without_forces(found.family) is not found.family:
+        why = (
+            "; its friction is linear in the velocities, and may be of another kind, dry or "
+            "quadratic: the law of a Recording of the positions tells which"
+        )
     elif found.ended:
         why = f"; modes were added until {found.ended}"
     return (
@@ -388,18 +393,18 @@ def _messages(
         names = found.undetermined
         some = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
         yield (
-            f"the pairs do not determine {len(names)} terms of H ({some}): they are left "
-            "out, and H is known only where the pairs are"
+            f"the pairs do not determine {len(names)} terms of H ({some}): these terms are left "
+            "out, and H is known only near the pairs"
         )
     if left_out:
         yield (
-            f"the steps of the fit are too coarse for {left_out} of {len(found.rows)} pairs, as of "
-            "close passages: it goes without them"
+            f"{left_out} of {len(found.rows)} pairs move too fast for the steps by which H was "
+            "fitted, as in close passages: they were left out"
         )
     if unresolved:
         yield (
-            f"the steps of the flow are too coarse for {unresolved} of {len(data.validation)} "
-            "held-out pairs: there the map errs, and not H"
+            f"{unresolved} of {len(data.validation)} held-out pairs move too fast for the map's "
+            "steps, as in close passages: there the map errs, and not H"
         )
 
 

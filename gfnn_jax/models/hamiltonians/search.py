@@ -129,7 +129,9 @@ def learn_hamiltonian(
             best = with_masses._replace(noisy=True)
     everyone = np.arange(len(data))
     if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
-        raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
+        raise FitError(
+            "expected pairs of a flow: the H that was found moves faster than its steps follow"
+        )
     outside, what = None, ""
     try:
         if best.noisy:

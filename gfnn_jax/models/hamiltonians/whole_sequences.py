@@ -117,7 +117,7 @@ def fitted_to_sequences(
     return Whole(
         kept,
         fit._replace(coefficients=found.p, standard_errors=np.linalg.norm(root, axis=0)),
-        root, _noise(found), len(found.x), _messages(found),
+        root, _noise(found), len(found.x), about_outliers(found.residuals),
     )  # fmt: skip
 
 
@@ -145,12 +145,16 @@ def _root(found: Fitted) -> np.ndarray:
     return root * np.sqrt(max(vary, 1.0))
 
 
-def _messages(found: Fitted) -> tuple[str, ...]:
-    measured = np.isfinite(found.residuals).all(axis=-1)
-    outlying = np.any(np.abs(found.residuals) > OUTLYING, axis=-1)
+def about_outliers(residuals: np.ndarray) -> tuple[str, ...]:
+    """Message about measured states that the law misses by far: gross errors stand alone.
+
+    residuals: (arcs, L, 2d) in units of the noise.
+    """
+    measured = np.isfinite(residuals).all(axis=-1)
+    outlying = np.any(np.abs(residuals) > OUTLYING, axis=-1)
     if not outlying.any():
         return ()
-    beside = np.any(np.abs(found.residuals) > _IN_A_ROW, axis=-1)
+    beside = np.any(np.abs(residuals) > _IN_A_ROW, axis=-1)
     beside = np.pad(beside, ((0, 0), (1, 1)))
     alone = outlying & ~(beside[:, :-2] | beside[:, 2:])
     if 2 * alone.sum() < outlying.sum():
