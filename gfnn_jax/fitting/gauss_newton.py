@@ -103,8 +103,7 @@ class Problem:
         allowance: Allowance = UNBOUNDED,
     ):  # fmt: skip
         self.z0, self.z1, self.dt, self.scale, self.args = z0, z1, dt, scale, args
-        self.weight = weight
-        self.options, self.allowance = options, allowance
+        self.weight, self.options, self.allowance = weight, options, allowance
 
     def unit(self, rows) -> np.ndarray:
         """Divisors of the residuals of these rows: (2d,), or (n, 2d) of weighted ones."""
