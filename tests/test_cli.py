@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from gfnn_jax import cli, scenes
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitWarning
@@ -36,7 +37,6 @@ from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.inputs import HOLDS
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
-from gfnn_jax.search.candidates import Candidate
 from gfnn_jax.storage import checkpoints
 
 DT = 0.1

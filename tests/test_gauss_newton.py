@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gfnn_jax.budget import Budget
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
@@ -17,7 +18,6 @@ from gfnn_jax.models.hamiltonians.formula import Term, formula
 from gfnn_jax.models.hamiltonians.learned_law import assembled
 from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.phase_space import Pairs
-from gfnn_jax.search.clock import Budget
 
 HENON_HEILES = Terms(
     2, ("q1", "q2", "p1", "p2"),

@@ -14,11 +14,12 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 
 # A module imports only from rooms before its own; the modules of a room share its place.
 ORDER = (
-    "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes",
+    "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes", "budget",
     "storage", "signals", "data", "records", "scenes", "families", "solve", "generating", "flows",
-    "maps", "dataset", "exports", "fitting", "search", "diagnosis",
+    "maps", "dataset", "exports", "fitting", "candidates", "diagnosis",
     "models.model", "models.parameters", "models.positions", "models.lagrangians",
-    "models.textbook", "models.generating_functions", "models.hamiltonians", "models.maps_of_laws",
+    "models.textbook", "models.generating_functions", "models.hamiltonians",
+    "search", "models.maps_of_laws",
     "learn", "baselines", "evaluate", "jobs", "cli_columns", "cli_parser", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.

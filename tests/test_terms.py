@@ -126,7 +126,7 @@ def test_functions_are_traced(function):
         ("q1 +", "is no expression"),
         ("'a'", "expected numbers"),
         ("9.0**9**9*q1", "is no expression"),
-        ("q1 + " * 400 + "q1", "at most"),
+        ("q1 + " * 4_000 + "q1", "at most"),
         ("-" * 200 + "q1", "levels"),
         ("", "is no expression"),
         ("1e999*q1", "a number that is beyond float64"),

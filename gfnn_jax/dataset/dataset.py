@@ -20,11 +20,11 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.damping import Damping
+from gfnn_jax.maps.damping import Damping, DampingOfArgs
 from gfnn_jax.maps.domain import Domain, Ranges, covering
 from gfnn_jax.phase_space import Pairs, sizes
 
-Factored = Affine | Damping | Flow  # pieces that can be factored out of pairs
+Factored = Affine | Damping | DampingOfArgs | Flow  # pieces that can be factored out of pairs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,6 +125,20 @@ class Dataset:
         return np.sqrt(np.mean(self.noise**2, axis=0))
 
     @cached_property
+    def weight(self) -> np.ndarray | None:
+        """(N, 2d): the usual noise of a coordinate, its RMS over the rows, ÷ that of each value,
+        where it was given of each value and differs; else None. A row of a least-squares problem is
+        multiplied by it. Behind a change of coordinates, or what was factored out, which mix them,
+        all values of a pair have one weight.
+        """
+        if self.noise is None or self.noise.ndim == 1 or not np.ptp(self.noise, axis=0).any():
+            return None
+        relative = self.noise / self.noise_of_channels
+        if self.before or self.after or self.coordinates.forward is not CARTESIAN.forward:
+            relative = np.sqrt(np.mean(relative**2, axis=1, keepdims=True))
+        return np.broadcast_to(1.0 / relative, self.y0.shape)
+
+    @cached_property
     def spread(self) -> np.ndarray:
         """(2d,) sizes of the user's coordinates."""
         return sizes(self.pairs.z0)
@@ -221,18 +235,20 @@ class Dataset:
         found = self
         if before is not None:
             found = dataclasses.replace(
-                found, y0=before.image(found.y0), before=(*found.before, before)
+                found, y0=before.image(found.y0, found.args), before=(*found.before, before)
             )
         if after is not None:
             found = dataclasses.replace(
-                found, y1=after.inverse().image(found.y1), after=(after, *found.after)
+                found,
+                y1=after.inverse().image(found.y1, found.args),
+                after=(after, *found.after),
             )
         return found
 
-    def whole_image(self, y: np.ndarray) -> np.ndarray:
-        """The images of what is learned, y (N, 2d), as those of the map."""
+    def whole_image(self, y: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """The images of what is learned, y (n, 2d) of these rows, as those of the map."""
         for piece in self.after:
-            y = piece.image(y)
+            y = piece.image(y, of_lanes(self.args, rows))
         return y
 
     def _measured(self) -> Dataset:

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.varied import given_by
 from gfnn_jax.diagnosis.charts import Charts, choose_charts
@@ -30,6 +32,18 @@ class Diagnosis(NamedTuple):
     damping: LearnedDamping | None = None
 
 
+def lossy(data: Dataset, chart: str, reversor, seed: int) -> Diagnosis:
+    """Diagnose whether pairs that differ in their args lose area; no chart is chosen yet."""
+    jacobians, error = local_jacobians(data.y0, data.y1, data.scale, given_by(data), seed=seed)
+    damping = learn_damping(data, jacobians, error, chart, reversor)
+    return undiagnosed(data if damping is None else data.without(None, damping.piece), damping)
+
+
+def undiagnosed(data: Dataset, damping: LearnedDamping | None = None) -> Diagnosis:
+    """Data of which no chart is chosen yet: H, or a sum of terms, is looked for first."""
+    return Diagnosis(data, data, Charts([], None, {}, []), float("nan"), [], damping)
+
+
 def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = False) -> Diagnosis:
     """Diagnose by the local Jacobians whether the pairs look symplectic, and which charts cover
     them; the base map is factored out where one is needed.
@@ -45,11 +59,14 @@ def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = F
         jacobians = damping.undone(jacobians)
         data = plain = plain.without(None, damping.piece)
     elif not look_symplectic(jacobians, error, plain.scale):
-        differing = where_areas_differ(jacobians, centres(plain.y0, jacobians, seed), plain.scale)
+        at = plain.y0 if plain.args is None else np.concatenate([plain.y0, plain.args], axis=1)
+        at = centres(at, jacobians, seed)
+        differing = where_areas_differ(jacobians, at, plain.scale, plain.parameters)
         messages.append(
             f"the pairs do not look symplectic: ‖MᵀJM − J‖ is about {defect:.2g}, known to within "
-            f"{error:.1g} (0 for a symplectic map): are q and p in order, p momenta and not "
-            f"velocities, and no friction?{differing}"
+            f"{error:.1g} (0 for a symplectic map): are q and p in order, and is there friction? "
+            "If p are velocities, learn the law of a Recording of them (--positions, --velocities)."
+            f"{differing}"
         )
     charts = choose_charts(chart, data, reversor, jacobians)
     if charts.half is not None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from gfnn_jax.candidates.assemble import stepped
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
 from gfnn_jax.dataset.noise import of_halves, of_pairs
 from gfnn_jax.dataset.runs import next_of
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, sizes
-from gfnn_jax.search.assemble import stepped
 
 _APART = 1e-4  # of the coordinates' sizes: the step of the central differences
 _PROBES = 4  # random directions of each half of the coordinates

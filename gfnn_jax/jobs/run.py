@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.structures import Bodies, structure_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import figures, figures_of_many, metrics, report
@@ -30,7 +31,6 @@ from gfnn_jax.scenes.trajectories import (
     sample_t0,
     sample_test_states,
 )
-from gfnn_jax.search.candidates import Candidate
 from gfnn_jax.storage.outputs import atomic_folder
 from gfnn_jax.storage.partial import unfinished
 

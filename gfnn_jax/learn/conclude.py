@@ -6,6 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import SOLVE, Budget
+from gfnn_jax.candidates.assemble import stepped
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
@@ -22,15 +25,13 @@ from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.generating_functions.sweeps import OF_SOLVE, OF_STEPS, LinearSweep
 from gfnn_jax.models.hamiltonians.choose_law import long_step
 from gfnn_jax.models.hamiltonians.white import leaves_white
-from gfnn_jax.search.assemble import stepped
-from gfnn_jax.search.candidates import Candidate
-from gfnn_jax.search.clock import SOLVE, Budget
 from gfnn_jax.search.search import AS_FAR, MET, Entry
 
 _NO_MORE = {
     False: "no larger library of terms promised to meet it",
     True: "the training of the network gained no more",
 }
+_LOOK = "a look whether what the map leaves over is noise of the pairs"
 _RIGHT = "H is right, as far as these pairs tell, and what it leaves over is noise"
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _SHARE = 0.1  # of the residual, that a change of volume must explain
@@ -89,7 +90,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         left = _left_of_sites if structured else _what_is_left
         work = _work(chosen.entry or next(iter(found.ranking), None))
         try:
-            with request.budget.last("a look at what the map leaves over", SOLVE, work):
+            with request.budget.last(_LOOK, SOLVE, work):
                 noise, diagnosis, reason = left(chosen, searched, stalled)
         except OutOfTime:
             pass  # told with what else was left out
@@ -216,8 +217,8 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
     if differs_between_sequences(y0 / scale, residual / scale, sequence):
         message = (
             "what is left over agrees within a sequence and differs between sequences: something "
-            "that the states do not hold (a mass, a length, a field) differs between them; learn "
-            "those of one value by themselves"
+            "that the states do not hold (a mass, a length, a field) differs between them: give it "
+            "as a parameter (args), or fit the sequences of one value by themselves"
         )
         return _LeftOver(None, [message], "something that the states do not hold differs between "
                          "the sequences")  # fmt: skip
@@ -234,9 +235,8 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
         return _LeftOver(None, [message], "volumes of phase space change, as by friction")
     if np.isfinite(error) or _told_by_neighbours(sample) is False:
         message = (
-            "what is left over is a function of the states and no noise, neighbouring pairs agree "
-            "in it: a structure that these functions cannot represent, or pairs of no symplectic "
-            "map"
+            "what is left over is no noise, for neighbouring pairs agree in it: the motion has a "
+            "structure that these functions cannot represent, or it is not symplectic"
         )
         return _LeftOver(None, [message], "what is left over is a function of the states")
     return None

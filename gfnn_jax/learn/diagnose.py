@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.diagnosis.charts import Charts
-from gfnn_jax.diagnosis.diagnosis import Diagnosis, diagnosed
+from gfnn_jax.diagnosis.diagnosis import Diagnosis, diagnosed, lossy, undiagnosed
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.learn.request import Request
 from gfnn_jax.models.maps_of_laws.factor_out import factored_out, flow_of
@@ -17,9 +16,12 @@ def diagnose_request(request: Request, plain: Dataset) -> Diagnosis:
 
     plain: as taken. Raises FitError where no chart covers the data.
     """
-    if plain.varied or plain.structure is not None:  # H or a sum of terms is looked for first
-        return Diagnosis(plain, plain, Charts([], None, {}, []), float("nan"), [])
     data, options = plain, request.options
+    by_args = plain.args is not None and plain.period is None and plain.own_dt is None
+    if by_args and plain.structure is None and options.learn != "hamiltonian":
+        return lossy(plain, options.chart, request.reversor, options.seed)
+    if plain.varied or plain.structure is not None:
+        return undiagnosed(plain)
     if options.base is not None:
         known = given_terms(plain.dim, (options.base,))
         flow = flow_of(known, np.ones(known.num_parameters), plain)

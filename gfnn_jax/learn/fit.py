@@ -18,6 +18,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.budget import COMPILE, MAX_SECONDS, ROWS, Budget
+from gfnn_jax.candidates.assemble import block_of
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
@@ -27,12 +30,14 @@ from gfnn_jax.diagnosis.local_jacobians import ChartJudgement, looked_for_errors
 from gfnn_jax.errors import FitError, FitWarning, InputError, OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
+from gfnn_jax.learn.all_rows import with_test_rows
 from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.conclude import conclude
 from gfnn_jax.learn.diagnose import diagnose_request
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.options import FitOptions, with_options
+from gfnn_jax.learn.positions import OfPositions, learn_positions
 from gfnn_jax.learn.posterior import with_posterior, work_of_posterior
 from gfnn_jax.learn.propose import structures_to_try
 from gfnn_jax.learn.request import checked
@@ -44,12 +49,8 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.recordings import fit_recording
 from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS, drawn
-from gfnn_jax.models.positions.positions import OfPositions, learn_positions
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
-from gfnn_jax.search.assemble import block_of
-from gfnn_jax.search.candidates import Candidate
-from gfnn_jax.search.clock import COMPILE, MAX_SECONDS, ROWS, Budget
 
 _OF_DERIVATIVE = 3.0  # times a step's: the time that compiling its derivative takes
 _JUDGED = 200  # states at which the chosen map's defect and determinant are taken
@@ -71,7 +72,8 @@ class Fit:
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
     scene: as given. damping: of a map that loses area, by how much of it in a step. positions: of a
     map that was learned from positions alone, what its S is like; num_pairs are then triples.
-    stated_by: the pairs by which the chosen candidate's error was measured.
+    stated_by: the pairs by which the chosen candidate's error was measured, and whether the map was
+    fitted to them afterwards.
     validation_pairs, test_pairs: that chose, and that stated the error; None where the pairs were
     too few for these. operations: of the search, as counted; as ``max_operations`` they give this
     map again, whatever the clock. budget: what is left of it. tells_defect: whether there is
@@ -261,6 +263,7 @@ def fit(
     *,
     options: FitOptions | None = None,
     clock: Callable[[], float] = time.perf_counter,
+    spent: float = 0.0,
     checkpoints: Any = None,
     factors: Any = None,
     on_progress: Callable[[str], Any] = lambda message: None,
@@ -282,7 +285,8 @@ def fit(
                learn="map" ask for.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
     options:   a `FitOptions`, which the keywords below change; None: its defaults.
-    clock:     gives the seconds that max_seconds is held against.
+    clock:     gives the seconds that max_seconds is held against. spent: seconds of them that are
+               gone already, as on reading files.
     checkpoints, factors: a ``TrainingCheckpoints`` and a ``KeptFactors``, which an interrupted fit
                has saved to and the same fit goes on from.
     on_progress, on_candidate: called with what is being done, and with every candidate.
@@ -301,9 +305,11 @@ def fit(
             return fit_positions(pairs, options, clock, on_progress, on_candidate)
         return fit_recording(
             pairs, friction=options.friction, input_hold=options.input_hold, mass=options.mass,
-            terms=tuple(options.terms), on_progress=on_progress,
+            terms=tuple(options.terms), loss=options.loss, on_progress=on_progress,
         )  # fmt: skip
-    budget = options.budget(clock, pairs.dim if isinstance(pairs, Pairs) else None)
+    if options.loss is not None:
+        raise FitError("a loss is of a recording whose law is learned: expected none of pairs")
+    budget = options.budget(clock, pairs.dim if isinstance(pairs, Pairs) else None, spent)
     require_x64("a fit")
     messages: list[str] = []
 
@@ -344,9 +350,9 @@ def fit(
         chosen = with_posterior(choose(found, request), found)
         on_progress("the error that is stated, of pairs that chose nothing")
         error = stated(chosen, found, budget)
-        chosen = chosen._replace(candidate=error.candidate)
+        chosen, stated_by = with_test_rows(chosen, error, found, budget)
         conclusion = conclude(chosen, found, request)
-        warn(conclusion.messages)
+        warn([*conclusion.messages, *filter(None, [error.few])])
     judged = min(_JUDGED, block_of(2 * data.dim))
     some = chosen.data.pairs.take(chosen.data.validation[:judged])
     return Fit(
@@ -370,7 +376,7 @@ def fit(
         pairs=data.pairs,
         scene=scene,
         damping=seen.damping if chosen.candidate.learns == "map" else None,
-        stated_by=error.words,
+        stated_by=stated_by,
         test_pairs=data.pairs.take(data.test) if len(data.test) else None,
         operations=budget.operations,
         budget=budget,
@@ -385,6 +391,8 @@ def _check_of_recording(scene: Scene | None, options: FitOptions) -> None:
         )
     if scene is not None or options.base is not None:
         raise InputError("expected no scene or base of a recording")
+    if options.learn == "map" and options.loss is not None:
+        raise InputError("a loss is of a recording whose law is learned: expected none of its map")
     if options.learn != "map" and options.structure is not None:
         raise InputError("expected no structure of a recording whose law is learned")
 

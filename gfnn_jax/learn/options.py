@@ -14,9 +14,9 @@ from dataclasses import field
 from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple
 
+from gfnn_jax.budget import Budget, seconds_allowed
 from gfnn_jax.dataset.structure_names import EXPECTED, STRUCTURES, names_structure
 from gfnn_jax.errors import FitError
-from gfnn_jax.search.clock import Budget, seconds_allowed
 
 RUN, FIT = ("gfnn run", "gfnn fit"), ("gfnn fit",)
 
@@ -94,6 +94,10 @@ _MASSES = Kind("a mapping of a position's name to its mass", lambda v: isinstanc
 _MODEL = Kind(
     "a model with a name, sizes(data) and fit(data, size)",
     lambda v: all(hasattr(v, name) for name in ("name", "sizes", "fit")),
+)
+_LOSS = Kind(
+    "a loss with of(residuals) and weights(residuals)",
+    lambda v: all(hasattr(v, name) for name in ("of", "weights")),
 )
 
 
@@ -210,6 +214,11 @@ class FitOptions:
     mass: Mapping[str, float] | None = field(default=None, metadata=_about(
         _MASSES, "of a recording: the known mass of one position", commands=()
     ))  # fmt: skip
+    loss: Any = field(default=None, metadata=_about(
+        _LOSS,
+        "of a recording whose law is learned: the loss of residuals in units of their noise, of "
+        "one's own", commands=()
+    ))  # fmt: skip
     devices: int | str | None = field(default=None, metadata=_about(
         DEVICES,
         "number of devices that share the rows, and the networks of an ensemble; on a CPU these "
@@ -230,12 +239,12 @@ class FitOptions:
             and not self.terms and self.structure is None
         ):  # fmt: skip
             raise FitError(
-                "a model of one's own is all that is learned: expected no learn, terms, base, "
+                "with model=… nothing else is learned: expected no learn, terms, base, "
                 "structure, family or chart beside it"
             )
         if self.ensemble > 1 and (self.family != "mlp" or of_h):
             raise FitError(
-                "an ensemble is of networks S: expected family='mlp', and S to be learned"
+                "an ensemble is of networks S: expected family='mlp', and no learn='hamiltonian'"
             )
         if self.terms and (self.learn == "map" or not plain):
             raise FitError(
@@ -243,7 +252,9 @@ class FitOptions:
                 "chart"
             )
         if self.base is not None and (of_h or self.terms):
-            raise FitError("a base Hamiltonian is factored out of the map: it goes with S alone")
+            raise FitError(
+                "base is factored out of a map S: expected no terms and no learn='hamiltonian'"
+            )
         if of_h and (self.family not in ("auto", "mlp") or self.chart != "auto"):
             raise FitError(
                 "family and chart are those of S: learn='hamiltonian' has no chart, and no family "
@@ -256,10 +267,13 @@ class FitOptions:
         values = {name: getattr(self, name) for name, about in OPTIONS.items() if about.decides}
         return {n: list(v) if isinstance(v, (tuple, list)) else v for n, v in values.items()}
 
-    def budget(self, clock: Callable[[], float], dim: int | None) -> Budget:
-        """Start the budget of a fit whose map has ``dim`` degrees of freedom."""
+    def budget(
+        self, clock: Callable[[], float], dim: int | None, spent: float = 0.0
+    ) -> Budget:  # fmt: skip
+        """Start the budget of a fit whose map has ``dim`` degrees of freedom, ``spent`` seconds
+        ago."""
         seconds = seconds_allowed(self.max_seconds, self.max_operations)
-        return Budget(seconds, self.max_operations, clock, dim)
+        return Budget(seconds, self.max_operations, clock, dim, spent)
 
 
 OPTIONS: dict[str, About] = {f.name: f.metadata["about"] for f in dataclasses.fields(FitOptions)}

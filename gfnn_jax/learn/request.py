@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.budget import Budget
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.structures import Structure, structure_of
@@ -22,8 +24,6 @@ from gfnn_jax.learn.check import (
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
-from gfnn_jax.search.candidates import Candidate
-from gfnn_jax.search.clock import Budget
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,6 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import Budget
+from gfnn_jax.candidates.assemble import composed
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.structures import Sites
@@ -31,9 +34,6 @@ from gfnn_jax.models.maps_of_laws.law_maps import (
     search_around,
     search_of_law,
 )
-from gfnn_jax.search.assemble import composed
-from gfnn_jax.search.candidates import Candidate
-from gfnn_jax.search.clock import Budget
 from gfnn_jax.search.search import Entry, Found, Search
 
 # Operations of a size of S that is judged before H is looked for: a fifth of a second.
@@ -73,7 +73,11 @@ def searched(
     early = not _of_terms(data) or options.model is not None
     climb = Search(_sweeps(request, data, seen) if early else [], *given)
     climb.climb(most=_SMALL)
-    law = _law(request, data, better, MAX_COST_RATIO * climb.cheapest)
+    # H with friction that depends on args is not learned.
+    lossy_by_args = seen.damping is not None and data.args is not None
+    law = None
+    if not lossy_by_args:
+        law = _law(request, data, better, MAX_COST_RATIO * climb.cheapest)
     of_terms, failed = None, None
     met_by_law = law is not None and tolerance.met_by(law.candidate)
     wanted = not early and options.learn != "hamiltonian" and not met_by_law
@@ -84,7 +88,7 @@ def searched(
             failed = error
     if wanted and data.args is not None and not _met(of_terms, tolerance):
         try:
-            seen = diagnosed(data, options.chart, request.reversor, options.seed)
+            seen = diagnosed(seen.data, options.chart, request.reversor, options.seed)
         except FitError as error:
             failed = failed or error
         charts = seen.charts

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.search.candidates import Candidate
-from gfnn_jax.search.clock import ROWS, SOLVE, Budget, OutOfTime
+from gfnn_jax.budget import ROWS, SOLVE, Budget, OutOfTime
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.search.extrapolate import Course, course
 
 # A size that gains less than this has stalled; so many in a row (a symmetric map gains nothing from

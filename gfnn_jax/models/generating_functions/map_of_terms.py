@@ -15,6 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import ROWS, Budget
+from gfnn_jax.candidates.assemble import Assembled, composed, measured
+from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
@@ -23,7 +26,7 @@ from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import Sums, matrix_free
-from gfnn_jax.families.terms import Terms
+from gfnn_jax.families.terms import Terms, joined, multiplied
 from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.linear_starts import fitted_gradients
 from gfnn_jax.fitting.significance import null_terms, significant
@@ -31,9 +34,6 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import CHARTS, AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.models.parameters import functions_of_parameters, state_libraries, walked
-from gfnn_jax.search.assemble import Assembled, composed, measured
-from gfnn_jax.search.candidates import Candidate, with_error
-from gfnn_jax.search.clock import ROWS, Budget
 
 _CHARTS = ("type2", "midpoint", "type3")  # that are tried, in this order
 _MOST_TERMS, _ROWS_PER_TERM = 500, 3
@@ -48,12 +48,14 @@ _SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved
 
 
 class LearnedMap(NamedTuple):
-    """The candidate, its error measured by steps in NumPy, and the piece that S generates.
+    """The candidate, its error measured by steps in NumPy, the piece that S generates, and the data
+    set that it was fitted to, of which a loss of area may be factored out.
     covariance: gives (m, m), rootᵀ root is that of the coefficients. stalled: whether another
     library of the chart was no less accurate, and the tolerance is missed."""
 
     candidate: Candidate
     piece: Generated
+    data: Dataset
     covariance: Callable[[], np.ndarray]
     stalled: bool
 
@@ -75,7 +77,7 @@ def learn_map(
 
     Raises FitError where no chart covers the data, or the pairs are too few.
     """
-    budget, started = budget or Budget(), time.perf_counter()
+    budget, started, given = budget or Budget(), time.perf_counter(), data
     best: _Tried | None = None
     tried: list[_Tried] = []
     try:
@@ -119,7 +121,7 @@ def learn_map(
         fit_seconds=time.perf_counter() - started,
     )  # fmt: skip
     covariance = partial(_root, piece, data)
-    return LearnedMap(with_error(candidate, best.error), piece, covariance, stalled)
+    return LearnedMap(with_error(candidate, best.error), piece, given, covariance, stalled)
 
 
 def map_of(
@@ -144,12 +146,10 @@ def map_of(
     return found
 
 
-def assembled(
-    learned: LearnedMap, data: Dataset, tolerance: Tolerance, budget: Budget
-) -> Assembled:  # fmt: skip
+def assembled(learned: LearnedMap, tolerance: Tolerance, budget: Budget) -> Assembled:
     """The candidate's map, measured."""
-    map_ = composed(learned.piece, data)
-    return measured(learned.candidate, map_, data, tolerance, budget)
+    map_ = composed(learned.piece, learned.data)
+    return measured(learned.candidate, map_, learned.data, tolerance, budget)
 
 
 @dataclasses.dataclass
@@ -258,6 +258,7 @@ def _judged(piece: Generated, data: Dataset, tolerance: Tolerance) -> _Tried:
         folds = not (determinant > SINGULAR).all() and not (determinant < -SINGULAR).all()
     bad = ~(off < _SOLVED) | folds
     images = np.where(bad[:, None], np.nan, images)
+    images = data.whole_image(images, rows)
     error = measured_error(data, tolerance, to_user(data.coordinates, images))
     w, target, args = _data(piece.chart, family, data, data.training)
     left = (family.gradient(params, w, args) - target) * _weight(data)
@@ -270,25 +271,38 @@ def _weight(data: Dataset) -> np.ndarray:
 
 
 def _root(piece: Generated, data: Dataset) -> np.ndarray:
-    """Root of the covariance. The next library tells the noise in the residual, which it leaves;
-    without a structure all of it may be misfit."""
+    """Root of the covariance. A larger library tells the noise in the residual, which it leaves."""
     family, count = piece.family, piece.family.num_parameters
     w, target, args = _data(piece.chart, family, data, data.training)
     weight = _weight(data)
     aim = (target * weight).ravel()
     slopes = (family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
     residual, noise = slopes @ np.asarray(piece.params) - aim, None
-    if data.structure is not None:
-        larger = (f for f in data.structure.libraries(data.dim) if f.num_parameters > count)
-        found = next(larger, None)
-        if found is not None and _ROWS_PER_TERM * found.num_parameters <= target.size:
-            known = found.take(null_terms(found, w[: max(1, _NULL_ROWS // w.shape[1])])[0])
-            both = least_squares.reduce(known, [(w, target)], weight)
-            part = uncertainty.variance(both, known.num_parameters)
-            left = float(np.sum(residual**2)) / max(target.size - count, 1)
-            noise = min(part / left, 1.0) if left > 0 else 1.0
+    found = _larger(family, data)
+    if found is not None and _ROWS_PER_TERM * found.num_parameters <= target.size:
+        some = slice(max(1, _NULL_ROWS // w.shape[1]))
+        given = () if args is None else (args,)
+        few = null_terms(found, w[some], args=None if args is None else args[some])[0]
+        known = found.take(few)
+        both = least_squares.reduce(known, [(w, target, *given)], weight)
+        part = uncertainty.variance(both, known.num_parameters)
+        left = float(np.sum(residual**2)) / max(target.size - count, 1)
+        noise = min(part / left, 1.0) if left > 0 else 1.0
     train = Triangle.of(np.column_stack([slopes, aim]))
     return uncertainty.root(train, count, slopes, residual, noise=noise)
+
+
+def _larger(family: Terms | Sums, data: Dataset) -> Terms | Sums | None:
+    """The next library of a structure; of other terms they and their products with each variable of
+    theirs, coordinates and parameters."""
+    if data.structure is not None:
+        count = family.num_parameters
+        return next(
+            (f for f in data.structure.libraries(data.dim) if f.num_parameters > count), None
+        )
+    units = tuple(tuple(row) for row in np.eye(len(family.variables), dtype=int).tolist())
+    variables = Terms(family.dim, family.variables, units, family.parameters)
+    return joined(family, multiplied(family, variables))
 
 
 def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance) -> _Tried:

@@ -9,6 +9,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.budget import NETWORK, Budget
+from gfnn_jax.candidates.candidate import Candidate, validated
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
 from gfnn_jax.dataset.rows import rows_of
@@ -17,8 +19,6 @@ from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
 from gfnn_jax.fitting.training import LMResult, LMState
 from gfnn_jax.models.generating_functions.sweeps import OF_STEPS, Generates, Size
-from gfnn_jax.search.candidates import Candidate, validated
-from gfnn_jax.search.clock import NETWORK, Budget
 
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
 _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.budget import Budget, OutOfTime
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError
@@ -16,8 +18,6 @@ from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.options import OPTIONS
 from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.scenes.scene import Scene
-from gfnn_jax.search.candidates import Candidate
-from gfnn_jax.search.clock import Budget, OutOfTime
 
 # Beside a map only a law of few terms is looked for: a larger one is no shorter to say than S. Its
 # budget is counted, so that a busy machine chooses no other candidate: 20 and 30 seconds of a quiet

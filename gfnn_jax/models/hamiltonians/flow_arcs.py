@@ -9,11 +9,11 @@ noise is normal (`solve.latent_arcs`). An arc ends where noise would have grown 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from gfnn_jax.budget import UNBOUNDED, Allowance
 from gfnn_jax.dataset.arcs import Arcs
 from gfnn_jax.flows.collocation import Steps as FlowSteps
 from gfnn_jax.flows.collocation import images
@@ -44,14 +44,13 @@ OPTIONS, BIWEIGHT = Options(), Biweight()
 @dataclasses.dataclass(frozen=True, eq=False)
 class FlowOnArcs:
     """The flow over dt of H = Σ c_j φ_j on arcs in which these steps ``moves`` (A, L − 1); what
-    comes after an arc's end stays as it is. check: called before each block of lanes; it may raise
-    to stop."""
+    comes after an arc's end stays as it is. allowance: checked before each block of lanes."""
 
     family: Any
     dt: float
     how: FlowSteps
     moves: np.ndarray
-    check: Callable[[], Any] = lambda: None
+    allowance: Allowance = UNBOUNDED
 
     def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
         arcs, length, width = x.shape
@@ -61,7 +60,7 @@ class FlowOnArcs:
         by_p = np.zeros((arcs, length - 1, width, len(p)))
         lanes = np.flatnonzero(self.moves)
         for first in range(0, len(lanes), OPTIONS.block):
-            self.check()
+            self.allowance.check()
             some = np.unravel_index(lanes[first : first + OPTIONS.block], self.moves.shape)
             found = images(self.family, p, x[some], self.dt, self.how, derivatives=True)
             ends[some], by_state[some] = found.states, found.by_state
@@ -73,19 +72,19 @@ class FlowOnArcs:
 
     def images(self, p: np.ndarray, z: np.ndarray, direction: int = 1) -> np.ndarray:
         """Images of states z (n, 2d), a step ahead or back."""
-        self.check()
+        self.allowance.check()
         return images(self.family, p, z, direction * self.dt, self.how).states
 
 
 def fit_flow(
     model: FlowOnArcs, coefficients, arcs: Arcs, least, angles: tuple[int, ...] = (), *,
-    only_states: bool = False,
+    only_states: bool = False, relative: np.ndarray | float = 1.0,
 ) -> Fitted | None:  # fmt: skip
     """Coefficients, states and noise, from coefficients that are close, or with these as they are
     (``only_states``). None where the flow fails.
 
     least: (2d,) of what is left over, what is no noise. angles: coordinates that are measured
-    modulo 2π.
+    modulo 2π. relative: (A, L, 2d) the noise of each value, in parts of the usual one.
     """
     c = np.array(coefficients, float)
     y = _lifted(model, c, arcs, angles)
@@ -95,8 +94,9 @@ def fit_flow(
         return None
     given, free = (Known(model, c), c[:0]) if only_states else (model, c)
     found = fit_arcs(
-        given, free, x, y, noise, noise, tolerance=OPTIONS.gained, loss=BIWEIGHT, least=least
-    )
+        given, free, x, y, noise * relative, noise, tolerance=OPTIONS.gained, loss=BIWEIGHT,
+        least=least,
+    )  # fmt: skip
     if not np.isfinite(found.cost):
         return None
     return dataclasses.replace(found, p=c) if only_states else found

@@ -1,4 +1,4 @@
-"""H as text: the terms of a law with their coefficients."""
+"""H as text: the terms of a law with their coefficients, as people and as programs read them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+
+from gfnn_jax.families.expressions import plain
+from gfnn_jax.families.sums import Sums
+from gfnn_jax.families.terms import Terms
 
 
 class Term(NamedTuple):
@@ -33,6 +37,21 @@ def formula(terms: Sequence[Term]) -> str:
         shown = f"({term})" if factor and _is_sum(term) else term
         text += (sign if text else sign.strip().removeprefix("+")) + factor + shown
     return text or "0"
+
+
+def as_code(family: Terms | Sums, terms: Sequence[Term]) -> str:
+    """H as `gfnn.fit(terms=[…])` and sympy read it: "0.5*p1**2 - cos(q1)"; over equal sites
+    "Sum(0.5*p(i)**2, (i, 1, 8))"; over bodies written out, their coordinates one after another.
+
+    terms: the family's, in their order.
+    """
+    if isinstance(family, Terms):
+        return plain(formula(terms))
+    texts, ahead = [], iter(terms)
+    for part in family.parts:
+        own = [next(ahead)._replace(term=name) for name in part.terms.term_names]
+        texts.append(plain(formula(own)))
+    return family.as_code(texts)
 
 
 def _is_sum(term: str) -> bool:

@@ -9,15 +9,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import Budget
+from gfnn_jax.candidates.assemble import Assembled, composed, measured
+from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.exports.symbolic import as_latex, as_sympy
-from gfnn_jax.families.expressions import plain
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
-from gfnn_jax.families.sums import matrix_free
+from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
@@ -33,13 +35,10 @@ from gfnn_jax.models.hamiltonians.cost_of_flow import (
     omega_h_of,
     operations_of,
 )
-from gfnn_jax.models.hamiltonians.formula import Term, formula
+from gfnn_jax.models.hamiltonians.formula import Term, as_code, formula
 from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
 from gfnn_jax.models.hamiltonians.whole_sequences import Whole
 from gfnn_jax.phase_space import apply_j, symplectic_form
-from gfnn_jax.search.assemble import Assembled, composed, measured
-from gfnn_jax.search.candidates import Candidate, with_error
-from gfnn_jax.search.clock import Budget
 
 FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
 _NEAR_ROUNDOFF = 3e-15  # of the spread
@@ -93,20 +92,17 @@ class LearnedHamiltonian:
 
     @property
     def formula(self) -> str | None:
-        """H as ``terms`` and sympy read it: "0.5*p1**2 - cos(q1)". None of a network; of a sum over
-        sites or bodies, and of a Lagrangian, which are no expression in q and p, as it is shown."""
-        return plain(self.shown) if self.shown and self._is_expression else self.shown
-
-    @property
-    def _is_expression(self) -> bool:
-        return isinstance(without_forces(self.flow.family), Terms)
+        """H as ``terms`` and sympy read it: "0.5*p1**2 - cos(q1)" (`learn.formula.as_code`). None
+        of a network; of a Lagrangian, which is no expression in q and p, as it is shown."""
+        family = without_forces(self.flow.family)
+        return as_code(family, self.terms) if isinstance(family, Terms | Sums) else self.shown
 
     def __str__(self) -> str:
         """H as people read it: "0.5 p1² - cos(q1)"."""
         return self.shown or "a network"
 
     def sympy(self) -> Any:
-        """H as a sympy expression. Raises ValueError of a network, a sum over sites or bodies."""
+        """H as a sympy expression. Raises ValueError of a network and a Lagrangian."""
         return as_sympy(self._expression)
 
     def latex(self) -> str:
@@ -115,10 +111,9 @@ class LearnedHamiltonian:
 
     @property
     def _expression(self) -> str:
-        if not self._is_expression or self.formula is None:
+        if self.formula is None or self.formula.startswith(Legendre.prefix):
             raise ValueError(
-                "expected an H that is an expression in q and p, got a network, a sum over sites "
-                "or bodies, or a Lagrangian"
+                "expected an H that is an expression in q and p, got a network or a Lagrangian"
             )
         return self.formula
 
@@ -171,12 +166,13 @@ def learned_from(
     fastest = rates(family, fit.coefficients, data.y0[some], data.given(some)[1])
     by_row = problem  # each at its own dt
     if data.own_dt is not None:  # the map's own dt, from which others follow
-        problem = Problem(data.y0, data.y1, data.dt, data.scale, args=data.args)
+        problem = Problem(data.y0, data.y1, data.dt, data.scale, args=data.args, weight=data.weight)
     steps = _cheapest(problem, family, fit, fastest, data, tolerance, options)
     steps = _resolving(family, fit.coefficients, steps, data, tolerance)
     contraction = contraction_of(fastest, data.dt, steps)
     by_newton = contraction > CONTRACTING and not matrix_free(family)
-    off = truncation(family, fit.coefficients, z, data.dt, steps, args=args) / data.scale
+    scale = data.scale
+    off = truncation(family, fit.coefficients, z, data.dt, steps, args=args, scale=scale) / scale
     flow = Flow(
         family, fit.coefficients, data.dt, data.scale, steps.stages, steps.substeps,
         by_newton,
@@ -239,7 +235,7 @@ def error_of_steps(
     family, coefficients, steps: Steps, data: Dataset, tolerance: Tolerance
 ) -> OneStepError:
     states, (dt, args) = data.y0[data.validation], data.given(data.validation)
-    found = images(family, coefficients, states, dt, steps, args=args).states
+    found = images(family, coefficients, states, dt, steps, args=args, scale=data.scale).states
     return measured_error(data, tolerance, to_user(data.coordinates, found))
 
 
@@ -255,9 +251,9 @@ def _resolving(family, coefficients, steps: Steps, data: Dataset, tolerance: Tol
     bound, states = bound_of(tolerance, data.scale), data.y0[data.validation]
     if error_of_steps(family, coefficients, steps, data, tolerance).bound <= tolerance.bound:
         return steps
-    dt, args = data.given(data.validation)
+    (dt, args), scale = data.given(data.validation), data.scale
     while 2 * steps.substeps <= MOST_SUBSTEPS:
-        off = truncation(family, coefficients, states, dt, steps, args=args) / data.scale
+        off = truncation(family, coefficients, states, dt, steps, args=args, scale=scale) / scale
         if np.sqrt(np.mean(off**2)) <= OPTIONS.truncation * bound:
             break
         steps = dataclasses.replace(steps, substeps=2 * steps.substeps)
@@ -288,20 +284,21 @@ def covariance_root(found: FittedLaw, problem: Problem, data: Dataset, steps: St
     if structure is not None:
         most = structure.fewest(data.y0.shape[1])
     places, goes_on = looked_at(data.pairs, fit.used, most)
-    rows, scale = fit.used[places], problem.scale
+    rows = fit.used[places]
+    unit, scale = problem.unit(rows), problem.scale
     images = problem.images(found.family, fit.coefficients, rows, steps, derivatives=True)
     residual = images.states - data.y1[rows]
     if not np.isfinite(residual).all():  # of a flow that runs away from some of the states
         return np.full((count, count), np.nan)
-    slopes = images.by_coefficient / scale[:, None]
-    left, scores, states, noise = residual / scale, None, None, None
+    slopes = images.by_coefficient / unit[..., None]
+    left, scores, states, noise = residual / unit, None, None, None
     family = without_forces(found.family)
     if isinstance(family, Terms):  # of many coordinates both would take too much
         if goes_on.any():
             first = images.by_state * scale
             second = np.broadcast_to(-np.diag(scale), first.shape)
             scores = shared_noise.scores(
-                slopes, left, first / scale[:, None], second / scale[:, None], goes_on
+                slopes, left, first / unit[..., None], second / unit[..., None], goes_on
             )
             states = first, second, goes_on
         degree = int(np.max(np.sum(family.powers, axis=1)))
@@ -362,6 +359,11 @@ def _unmet(error: OneStepError, omega_h: float, tolerance, found: FittedLaw) -> 
             f"; it oscillates by {omega_h:.2g} radians in a step, and beyond π one dt does not "
             "tell H: sample with a shorter one"
         )
+    elif without_forces(found.family) is not found.family:
+        why = (
+            "; its friction is linear in the velocities, and may be of another kind, dry or "
+            "quadratic: the law of a Recording of the positions tells which"
+        )
     elif found.ended:
         why = f"; modes were added until {found.ended}"
     return (
@@ -391,18 +393,18 @@ def _messages(
         names = found.undetermined
         some = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
         yield (
-            f"the pairs do not determine {len(names)} terms of H ({some}): they are left "
-            "out, and H is known only where the pairs are"
+            f"the pairs do not determine {len(names)} terms of H ({some}): these terms are left "
+            "out, and H is known only near the pairs"
         )
     if left_out:
         yield (
-            f"the steps of the fit are too coarse for {left_out} of {len(found.rows)} pairs, as of "
-            "close passages: it goes without them"
+            f"{left_out} of {len(found.rows)} pairs move too fast for the steps by which H was "
+            "fitted, as in close passages: they were left out"
         )
     if unresolved:
         yield (
-            f"the steps of the flow are too coarse for {unresolved} of {len(data.validation)} "
-            "held-out pairs: there the map errs, and not H"
+            f"{unresolved} of {len(data.validation)} held-out pairs move too fast for the map's "
+            "steps, as in close passages: there the map errs, and not H"
         )
 
 

@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gfnn_jax.budget import NETWORK, Budget
+from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
@@ -33,8 +35,6 @@ from gfnn_jax.models.hamiltonians.choose_law import unfit_for_law
 from gfnn_jax.models.hamiltonians.cost_of_flow import contraction_of, omega_h_of, operations_of
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.scenes.scene import Scene
-from gfnn_jax.search.candidates import Candidate, with_error
-from gfnn_jax.search.clock import NETWORK, Budget
 
 
 @dataclasses.dataclass(frozen=True)

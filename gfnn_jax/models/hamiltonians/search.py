@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.budget import UNBOUNDED, Allowance, Budget
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
@@ -57,7 +58,6 @@ from gfnn_jax.models.hamiltonians.whole_sequences import fitted_to_sequences
 from gfnn_jax.models.hamiltonians.work import LawWork
 from gfnn_jax.models.hamiltonians.worth import too_dear
 from gfnn_jax.models.parameters import functions_of_parameters, state_libraries, walked
-from gfnn_jax.search.clock import Budget
 
 _ROUNDOFF = 1e-12  # of the spread: above it the pairs carry noise, and every one of them counts
 _HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
@@ -101,7 +101,9 @@ def learn_hamiltonian(
     if arcs is not None:
         say(f"H: arcs of {arcs.length} steps, in which the states move far against their noise")
         data = arcs.data
-    problem = Problem(data.y0, data.y1, data.each_dt, data.scale, args=data.args)
+    problem = Problem(
+        data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
+    )
     most = options.max_operations if basis is None else options.mode_operations
     work = LawWork(problem, budget, most, dearest)
     everywhere, free = data, (*data.coordinates.cyclic, *data.whole)
@@ -127,7 +129,9 @@ def learn_hamiltonian(
             best = with_masses._replace(noisy=True)
     everyone = np.arange(len(data))
     if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
-        raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
+        raise FitError(
+            "expected pairs of a flow: the H that was found moves faster than its steps follow"
+        )
     outside, what = None, ""
     try:
         if best.noisy:
@@ -149,12 +153,14 @@ def learn_hamiltonian(
                 best = _refitted(problem, best, everywhere.training, data, tolerance)
     except OutOfTime:  # what was found stands
         budget.leave_out(what, work.ended)
-    problem.check, problem.spend = lambda: None, lambda operations: None
+    problem.allowance = UNBOUNDED
     of_arcs = None
     if arcs is not None:
         of_arcs = partial(covariance_root, best, problem, everywhere, best.fit.steps)
         everywhere = of_steps
-        problem = Problem(of_steps.y0, of_steps.y1, of_steps.dt, of_steps.scale)
+        problem = Problem(
+            of_steps.y0, of_steps.y1, of_steps.dt, of_steps.scale, weight=of_steps.weight
+        )
         best = best._replace(error=validation_error(best.family, best.fit, of_steps, tolerance))
     noisy = best.noisy or arcs is not None
     if noisy and best.error.bound > tolerance.bound:
@@ -493,7 +499,7 @@ def _of_sequences(problem, found: FittedLaw, data, tolerance, budget: Budget) ->
     """Fitted to whole sequences, where there are such and held-out steps bear it out."""
     if found.error.relative <= _ROUNDOFF:
         return found
-    whole = fitted_to_sequences(problem, found.family, found.fit, data, budget.check)
+    whole = fitted_to_sequences(problem, found.family, found.fit, data, Allowance(budget))
     if whole is None:
         return found
     family = found.family.take(whole.kept)

@@ -7,11 +7,13 @@ bear it out to the tolerance: an H of few terms, with the constants inside them,
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from gfnn_jax.budget import MATCHING
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import OutOfTime
@@ -19,7 +21,6 @@ from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
 from gfnn_jax.models.hamiltonians.work import LawWork
 from gfnn_jax.models.textbook.search import OPTIONS, Law, Textbook
-from gfnn_jax.search.clock import MATCHING
 
 # Operations of a search by degrees of freedom from 1, without products and with them: about the
 # longest of the laws of benchmarks/textbook.py.
@@ -39,7 +40,7 @@ def law_of_physics(
         return None
     rows, coordinates = data.training, data.coordinates
     own = copy.copy(problem)  # its flows are no part of what libraries may take
-    own.spend = lambda operations: None
+    own.allowance = dataclasses.replace(problem.allowance, cap=None)
     search = Textbook(
         own, rows, angles=tuple(a for a in coordinates.angles if a < data.dim),
         cyclic=coordinates.cyclic, say=say,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
+from gfnn_jax.budget import FLOW, Allowance, Budget, Counted
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps, operations
-from gfnn_jax.search.clock import FLOW, Budget, Counted
 
 # Evaluations of the flow, with its derivatives, that a fit of a library is expected to take; of
 # terms that are known to be close to their optimum.
@@ -32,7 +32,7 @@ class LawWork:
         self._problem, self.budget, self._cap = problem, budget, Counted(most)
         self.dearest = dearest
         self._evaluations = float(_EVALUATIONS)
-        problem.check, problem.spend = budget.check, self._cap.spend
+        problem.allowance = Allowance(budget, self._cap)
 
     @property
     def ended(self) -> str:
@@ -58,9 +58,9 @@ class LawWork:
         """The fit of a library to so many pairs. first: it is fitted whatever the budget, where
         nothing else would be left."""
         one = self._one(family, rows)
-        before, check = self._cap.spent, self._problem.check
+        before, allowance = self._cap.spent, self._problem.allowance
         if first:
-            self._problem.check = lambda: None
+            self._problem.allowance = Allowance(cap=self._cap)
             unit = self.budget.free(FLOW, self._evaluations * one)
         else:
             unit = self.budget.unit(name, FLOW, self._evaluations * one)
@@ -68,7 +68,7 @@ class LawWork:
             with unit:
                 yield
         finally:
-            self._problem.check = check
+            self._problem.allowance = allowance
         self._evaluations = (self._cap.spent - before) / one
 
     def again(self, name: str, family, rows: int):

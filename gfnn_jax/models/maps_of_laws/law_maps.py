@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import FLOW, Budget
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.diagnosis.charts import Charts
@@ -22,7 +23,6 @@ from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS, drawn
 from gfnn_jax.models.maps_of_laws.factor_out import TRIAL_PAIRS, factored_out, flow_of
 from gfnn_jax.scenes.scene import Scene
-from gfnn_jax.search.clock import FLOW, Budget
 from gfnn_jax.search.search import Entry, Found, search
 
 _FITTED, _MOST_STRONG = 200, 4  # pairs and terms of the simplest laws

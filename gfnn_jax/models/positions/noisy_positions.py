@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import FLOW, Budget
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.models.positions.discrete_lagrangian import Solved, solve
 from gfnn_jax.models.positions.latent_positions import (
@@ -22,7 +23,6 @@ from gfnn_jax.models.positions.latent_positions import (
     starting_noise,
 )
 from gfnn_jax.models.positions.triples import Triples
-from gfnn_jax.search.clock import FLOW, Budget
 
 _CERTAIN = 2.0  # standard errors, by which least squares has to be better to be kept
 _WORSE = 2  # sizes in a row that are no better end the search

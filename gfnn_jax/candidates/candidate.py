@@ -86,7 +86,7 @@ def validated(
     """The candidate with its error measured by steps on the validation rows."""
     images, solved = refined_images(data, chart, family, params, data.validation)
     images = np.where(solved[:, None], images, np.nan)
-    images = data.whole_image(images)
+    images = data.whole_image(images, data.validation)
     error = measured_error(data, tolerance, to_user(data.coordinates, images))
     return with_error(candidate, error)
 

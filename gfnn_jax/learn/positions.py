@@ -14,6 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import ROWS, Budget
+from gfnn_jax.candidates.assemble import stepped
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import Coordinates, nearest_image
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, one_step_error
@@ -34,9 +37,6 @@ from gfnn_jax.models.positions.noisy_positions import without_noise
 from gfnn_jax.models.positions.position_maps import images_of, map_of, states_of
 from gfnn_jax.models.positions.triples import Triples, triples_of
 from gfnn_jax.phase_space import Pairs, sizes
-from gfnn_jax.search.assemble import stepped
-from gfnn_jax.search.candidates import Candidate
-from gfnn_jax.search.clock import ROWS, Budget
 from gfnn_jax.search.search import MET
 
 _DEGREES = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)
@@ -225,7 +225,7 @@ class _Sweep:
     def without_noise(self, best: _Found) -> _Found:
         """S with latent positions where the readings have noise, by which least squares is biased;
         else the best as it is."""
-        if self.sites is not None or not self._stalls(best):
+        if not self._stalls(best):
             return best
         self.say("larger S leave as much: the readings have noise")
         symmetric, split = best.about.symmetric, self.split

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gfnn_jax.budget import COMPILE, Budget
+from gfnn_jax.candidates.candidate import Candidate, refined_images, with_error
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, measured_error
 from gfnn_jax.errors import OutOfTime
@@ -18,8 +20,6 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
 from gfnn_jax.maps.parameters import Parameters, sampled
 from gfnn_jax.maps.symplectic_map import Piece, SymplecticMap
-from gfnn_jax.search.candidates import Candidate, refined_images, with_error
-from gfnn_jax.search.clock import COMPILE, Budget
 from gfnn_jax.solve.status import LEFT_DOMAIN
 
 _TIMING = "the time of a step, and the error of compiled ones"
