@@ -19,7 +19,7 @@ class ArcInputs:
         self._nodes, self._substeps = nodes, substeps
         if (
             hold == "hold" and nodes[0].stretch.u.shape[1]
-        ):  # a substep for each sample: none is lost
+        ):  # a substep for each: none is lost
             apart = max(int(np.max(np.diff(n.at), initial=1)) for n in nodes)
             substeps = apart * -(-substeps // apart)
         self._of_nodes = [
