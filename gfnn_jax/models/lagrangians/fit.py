@@ -46,17 +46,18 @@ class LawFit:
         """Covariance of p: that of white residuals, times their correlation time."""
         return self.fitted.covariance() * self.correlation
 
-    def untold(self) -> list[Key]:
-        """Coefficients of a combination that moves nothing, where there is one: as any two springs
-        without friction follow from Lagrangians of a whole family."""
+    def untold(self) -> dict[Key, float]:
+        """The combination of coefficients that moves nothing, where there is one: as any two
+        springs without friction follow from Lagrangians of a whole family."""
         R = self.fitted.triangle
         size = np.linalg.norm(R, axis=0)
         _, singular, across = np.linalg.svd(R / np.where(size > 0, size, 1.0))
         if not len(singular) or singular[-1] > _NOTHING * singular[0]:
-            return []
+            return {}
         part = np.abs(across[-1])
+        step = across[-1] / np.where(size > 0, size, 1.0)
         keys = self.structure.keys()
-        return [key for key, one in zip(keys, part, strict=True) if one > _PART * part.max()]
+        return {keys[k]: float(step[k]) for k in np.flatnonzero(part > _PART * part.max())}
 
     def rms(self) -> np.ndarray:
         """Root mean square residual (k,), in units of the channels."""

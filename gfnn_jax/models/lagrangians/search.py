@@ -207,16 +207,22 @@ def told_apart(bench: Workbench, fit: LawFit, told: Callable) -> LawFit:
             larger = fit.structure.plus([("term", spring)])
             with_it = bench.fit(larger, fit.values, arcs, fit.sigma, rescale=False)
             fit = with_it if with_it.untold() else fit
-    while untold := [k for k in fit.untold() if k[0] == "term" and k not in fixed]:
-        smaller = fit.structure.without({untold[0]})
+    while True:
+        step = fit.untold()
+        open_ = [key for key in step if key[0] == "term" and key not in fixed]
+        if not open_:
+            return fit
+        values, gone = fit.values, open_[0]
+        along = values[gone] / step[gone]
+        moved = {key: value - along * step.get(key, 0.0) for key, value in values.items()}
+        smaller = fit.structure.without({gone})
         arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
-        without = bench.fit(smaller, fit.values, arcs, fit.sigma, rescale=False)
+        without = bench.fit(smaller, moved, arcs, fit.sigma, rescale=False)
         if without.fitted.cost > _AS_WELL * fit.fitted.cost:  # its zero is out of reach
-            fixed = fixed | {untold[0]}
+            fixed = fixed | {gone}
             continue
-        told(f"  without {untold[0]}: told only together with {untold[1:]}")
+        told(f"  without {gone}: told only together with {open_[1:]}")
         fit = without
-    return fit
 
 
 def significance(fit: LawFit) -> dict[Key, float]:
