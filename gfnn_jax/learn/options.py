@@ -201,7 +201,7 @@ class FitOptions:
     ))  # fmt: skip
     friction: str = field(default="auto", metadata=_about(
         _TEXT,
-        "of a recording: auto, none, linear, quadratic, dry, or some joined by +", "KIND", FIT,
+        "of a recording: auto, none, linear, quadratic, dry, uniform, some joined by +", "KIND", FIT,
     ))  # fmt: skip
     input_hold: str = field(default="auto", metadata=_about(
         _one_of("auto", "hold", "linear", "band"),
