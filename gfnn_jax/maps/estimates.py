@@ -3,7 +3,7 @@
 The samples before a time are fitted by one arc of the law, its first state unknown: that gives the
 state there with its covariance. A forecast is the orbit from it. Its band holds the error of that
 state, of the law's coefficients, the noise of a sample, and the law's own misfit, as forecasts of
-the data that it was learned from have shown it.
+data that it was not learned from have shown it.
 """
 
 from __future__ import annotations
@@ -234,7 +234,8 @@ def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np
     arcs = _Windows(law, np.diff(t, axis=1), u)
     sigma = sensors.seen.state_sigma(x[:, -1], sensors.sigma)
     scale = np.concatenate([sigma, sigma * sensors.omega])
-    found = fit_arcs(arcs, np.zeros(0), x, y, sensors.sigma * np.array(noise), scale)
+    sigma = sensors.sigma * np.array(noise)
+    found = fit_arcs(arcs, np.zeros(0), x, y, sigma, scale, loss=sensors.seen.loss)
     return found.x[:, -1], found.last_covariance()
 
 

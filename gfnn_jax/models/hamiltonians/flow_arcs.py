@@ -78,13 +78,13 @@ class FlowOnArcs:
 
 def fit_flow(
     model: FlowOnArcs, coefficients, arcs: Arcs, least, angles: tuple[int, ...] = (), *,
-    only_states: bool = False,
+    only_states: bool = False, relative: np.ndarray | float = 1.0,
 ) -> Fitted | None:  # fmt: skip
     """Coefficients, states and noise, from coefficients that are close, or with these as they are
     (``only_states``). None where the flow fails.
 
     least: (2d,) of what is left over, what is no noise. angles: coordinates that are measured
-    modulo 2π.
+    modulo 2π. relative: (A, L, 2d) the noise of each value, in parts of the usual one.
     """
     c = np.array(coefficients, float)
     y = _lifted(model, c, arcs, angles)
@@ -94,8 +94,9 @@ def fit_flow(
         return None
     given, free = (Known(model, c), c[:0]) if only_states else (model, c)
     found = fit_arcs(
-        given, free, x, y, noise, noise, tolerance=OPTIONS.gained, loss=BIWEIGHT, least=least
-    )
+        given, free, x, y, noise * relative, noise, tolerance=OPTIONS.gained, loss=BIWEIGHT,
+        least=least,
+    )  # fmt: skip
     if not np.isfinite(found.cost):
         return None
     return dataclasses.replace(found, p=c) if only_states else found

@@ -41,6 +41,14 @@ class Whole(NamedTuple):
     messages: tuple[str, ...]
 
 
+class _Measured(NamedTuple):
+    """Arcs of measured states, and the noise of each value in parts of the usual one, (A, L, 2d) or
+    1."""
+
+    arcs: Arcs
+    relative: np.ndarray | float
+
+
 def fitted_to_sequences(
     problem: Problem, family, fit: FlowFit, data: Dataset,
     allowance: Allowance,
@@ -61,49 +69,65 @@ def fitted_to_sequences(
     steps = problem.fine_steps(family, c, data.training, (resolved,))[0]
     longest = longest_arc(family, c, data.y0[some], data.dt, steps, rms)
 
-    def along(rows) -> Arcs | None:
+    def along(rows) -> _Measured | None:
         rows, pairs = np.sort(rows), data.pairs
-        z0, z1 = np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows]
-        arcs = arcs_of_pairs(z0, z1, longest, onward(pairs, rows))
+        onto = longest, onward(pairs, rows)
+        arcs = arcs_of_pairs(np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows], *onto)
         if arcs is None or np.median(arcs.measured.sum(axis=1)) <= _SHORTEST:
             return None
-        return arcs
+        if data.weight is None:
+            return _Measured(arcs, 1.0)
+        each = 1.0 / data.weight[rows]
+        of_values = arcs_of_pairs(each, each, *onto)
+        assert of_values is not None
+        return _Measured(arcs, np.nan_to_num(of_values.states, nan=1.0))
 
     train, held = along(data.training), along(data.validation)
     if train is None or held is None:
         return None
     least = max(resolved, float(np.finfo(float).eps)) * problem.scale
 
-    def fitted(arcs: Arcs, terms, coefficients, **options) -> Fitted | None:
-        model = FlowOnArcs(terms, data.dt, steps, arcs.moves, allowance)
-        return fit_flow(model, coefficients, arcs, least, coordinates.angles, **options)
+    def fitted(of: _Measured, terms, coefficients, **options) -> Fitted | None:
+        model = FlowOnArcs(terms, data.dt, steps, of.arcs.moves, allowance)
+        return fit_flow(
+            model, coefficients, of.arcs, least, coordinates.angles, relative=of.relative, **options
+        )
 
     def left(terms, coefficients) -> float:
         """Noise of the held-out arcs, each from the state that suits it."""
         found = fitted(held, terms, coefficients, only_states=True)
-        return np.inf if found is None else float(np.linalg.norm(found.sigma / problem.scale))
+        return np.inf if found is None else float(np.linalg.norm(_noise(found) / problem.scale))
 
     before, found = left(family, c), fitted(train, family, c)
     if found is None or not left(family, found.p) <= _RISE * before:
         return None
-    kept = tuple(range(len(c)))
+    kept, widened = tuple(range(len(c))), 1.0
     few = significant(_triangle(found), found.p, _CERTAIN)[0]
     if 0 < len(few) < len(c):
         fewer = family.take(tuple(few.tolist()))
         again = fitted(train, fewer, found.p[few])
         if again is not None and left(fewer, again.p) <= _RISE * before:
+            widened = _of_selection(_triangle(found), found.p, few)
             kept, found, family = tuple(few.tolist()), again, fewer
     if _ROWS_PER_TERM * len(kept) <= _triangle(found).rows:
         everyone = along(np.arange(len(data.y0)))
         again = fitted(everyone, family, found.p) if everyone is not None else None
         if again is not None:
             found = again
-    root = _root(found)
+    root = widened * _root(found)
     return Whole(
         kept,
         fit._replace(coefficients=found.p, standard_errors=np.linalg.norm(root, axis=0)),
-        root, found.sigma, len(found.x), _messages(found),
+        root, _noise(found), len(found.x), about_outliers(found.residuals),
     )  # fmt: skip
+
+
+def _noise(found: Fitted) -> np.ndarray:
+    """(2d,): of noise of each value the root of the mean square over what was measured."""
+    if found.sigma.ndim == 1:
+        return found.sigma
+    return np.sqrt(np.nanmean(np.where(np.isfinite(found.residuals), found.sigma, np.nan) ** 2,
+                              axis=(0, 1)))  # fmt: skip
 
 
 def _triangle(found: Fitted) -> Triangle:
@@ -114,6 +138,20 @@ def _triangle(found: Fitted) -> Triangle:
     return Triangle(factor, int((np.abs(found.residuals) < BIWEIGHT.k).sum()))
 
 
+def _of_selection(triangle: Triangle, c: np.ndarray, few: np.ndarray) -> float:
+    """Factor of the standard errors of these terms that stands for the others, which were dropped.
+
+    Terms that are no more than noise each may be more together: without them the sum of squares
+    rises by Δ, of mean n for n terms that are truly zero, with variance 2 n. What it exceeds n by,
+    and a standard deviation more, is a bias beside the k squares of the k coefficients' own error.
+    """
+    dropped = len(c) - len(few)
+    squares = triangle.rebased(c).pruned(few).spectrum().residual_norm ** 2
+    rise = squares - triangle.residual_norm(len(c)) ** 2
+    bias = max(rise - dropped, 0.0) + np.sqrt(2 * dropped)
+    return float(np.sqrt(1 + bias / len(few)))
+
+
 def _root(found: Fitted) -> np.ndarray:
     """(m, m), rootᵀ root the covariance: that of independent noise, widened where the arcs' own
     gradients vary by more than noise makes them: misfit is alike along an arc."""
@@ -122,12 +160,16 @@ def _root(found: Fitted) -> np.ndarray:
     return root * np.sqrt(max(vary, 1.0))
 
 
-def _messages(found: Fitted) -> tuple[str, ...]:
-    measured = np.isfinite(found.residuals).all(axis=-1)
-    outlying = np.any(np.abs(found.residuals) > OUTLYING, axis=-1)
+def about_outliers(residuals: np.ndarray) -> tuple[str, ...]:
+    """Message about measured states that the law misses by far: gross errors stand alone.
+
+    residuals: (arcs, L, 2d) in units of the noise.
+    """
+    measured = np.isfinite(residuals).all(axis=-1)
+    outlying = np.any(np.abs(residuals) > OUTLYING, axis=-1)
     if not outlying.any():
         return ()
-    beside = np.any(np.abs(found.residuals) > _IN_A_ROW, axis=-1)
+    beside = np.any(np.abs(residuals) > _IN_A_ROW, axis=-1)
     beside = np.pad(beside, ((0, 0), (1, 1)))
     alone = outlying & ~(beside[:, :-2] | beside[:, 2:])
     if 2 * alone.sum() < outlying.sum():

@@ -116,8 +116,8 @@ class LearnedLaw:
             )
         for fraction, seconds, predicted in self.horizon:
             lines.append(
-                f"forecasts within {fraction:.0%} of the spread for {seconds:.3g} s (by the bands "
-                f"{predicted:.3g} s)"
+                f"95 % of forecasts within {fraction:.0%} of the spread for {seconds:.3g} s (by "
+                f"the bands {predicted:.3g} s)"
             )
         lines += [f"to record next: {motion}" for motion in self.next_motions[:1]]
         return "\n".join(lines)

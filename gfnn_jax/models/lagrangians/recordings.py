@@ -26,8 +26,8 @@ from gfnn_jax.maps.laws import conformal, map_of_law
 from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.calibration import calibrated
-from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
+from gfnn_jax.models.lagrangians.calibration import Thirds, calibrated
+from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_law import fit_given
 from gfnn_jax.models.lagrangians.given_terms import Given, given_terms
@@ -51,6 +51,7 @@ from gfnn_jax.models.lagrangians.text import (
     which_friction_told,
 )
 from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels
+from gfnn_jax.solve.robust import Loss
 
 _IMITATED = 1e-4  # of what a sensor's parameter changes, that no coefficient of the law does
 _SEEN = 3.0  # standard errors of a gain, below which its input is not seen to act
@@ -59,7 +60,7 @@ _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apa
 
 def fit_recording(
     recording: Recording, *, friction: str = "auto", input_hold: str = "auto",
-    mass: Mapping[str, float] | None = None, terms: Sequence[Any] = (),
+    mass: Mapping[str, float] | None = None, terms: Sequence[Any] = (), loss: Loss | None = None,
     on_progress: Callable[[str], Any] = lambda message: None,
 ) -> LearnedLaw:  # fmt: skip
     """The law of a recording, from its positions and inputs.
@@ -68,7 +69,8 @@ def fit_recording(
     "linear+dry". input_hold: "auto", or how inputs go on between samples: "hold", "linear" or
     "band". mass: the known mass (or moment of inertia) of one position, which fixes the scale of L.
     terms: those of L, V and R, as text in the names of columns (`models.lagrangians.given_terms`),
-    which are then all that is fitted.
+    which are then all that is fitted. loss: of residuals in units of their noise; None: the soft L1
+    of `solve.robust`.
     Raises InputError for bad options or a recording without positions, FitError where no law is
     found.
     """
@@ -82,6 +84,7 @@ def fit_recording(
         on_progress(line)
 
     seen, angles = _observation(recording)
+    seen = seen if loss is None else dataclasses.replace(seen, loss=loss)
     found = _stretches(recording, seen, angles)
     far = [i for i in seen.shifts() if i not in angles]
     if far and not recording.guess:
@@ -103,7 +106,7 @@ def fit_recording(
     acting, choice, nodes = search(*record) if asked is None else fit_given(asked, *record)
     fit, inputs_of = acting.fit, acting.bench.inputs
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
-        raise FitError("no law of the library follows this recording: its arcs could not be closed")
+        raise FitError("no law of the terms tried follows this recording from sample to sample")
     speeds = velocities(recording, fit, nodes)
     honest = tuple(name for name, one in speeds.items() if one.used)
     for name, one in speeds.items():
@@ -141,11 +144,13 @@ def fit_recording(
     sensors = Sensors(
         names, recording.inputs, recording.angles, noise, scales.omega, scales.period, acting.hold,
         acting.delay, np.array([scales.period]), np.zeros((1, len(noise))),
-        None if seen.is_plain else fitted,
+        None if seen.is_plain and loss is None else fitted,
     )  # fmt: skip
+    bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
     told("bands: forecasts from windows of the record")
     spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
-    used, horizons = calibrated(law_in_use(moving, root, sensors), found, scales, spread)
+    thirds = _thirds(bench, nodes, fit, sensors, found)
+    used, horizons = calibrated(law_in_use(moving, root, sensors), thirds, found, scales, spread)
     z = np.concatenate([q, law.momentum(q, v)], axis=1)
     u = np.concatenate([n.stretch.u[n.at] for n in nodes])
     signals = Signals(recording.inputs, acting.hold, acting.delay) if recording.inputs else None
@@ -161,7 +166,6 @@ def fit_recording(
     map_ = _with_sensors(map_, used.sensors)
     traces = _traces(recording, seen.channels, fit, law, nodes, zeros, inputs_of)
     told("which motion to record next")
-    bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
     motions = next_motions(bench, fit, angles)
     return _described(
         recording, fit, map_, law, covariance, (choice, scale), horizons, gauge, tuple(steps),
@@ -251,6 +255,26 @@ def _root(covariance: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(covariance)
     kept = values > 1e-14 * max(float(values.max(initial=0.0)), 1e-300)
     return np.sqrt(values[kept])[:, None] * vectors[:, kept].T
+
+
+def _thirds(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, sensors: Sensors,
+    found: Sequence[Stretch],
+) -> Thirds:  # fmt: skip
+    """The laws of the record without each third, of which less data tell less."""
+    fewer, laws, begins = np.sqrt(FOLDS / (FOLDS - 1)), [], []
+    for other, run, t in bench.without_thirds(nodes, fit):
+        law, covariance = in_columns(other)
+        own = sensors
+        if sensors.observation is not None:
+            first = fit.form.count + len(fit.structure.zeros)
+            shown = dataclasses.replace(sensors.observation, values=other.p[first:])
+            own = dataclasses.replace(sensors, observation=shown)
+        laws.append(law_in_use(law, fewer * _root(covariance), own))
+        begins.append(
+            next((i, t) for i, s in enumerate(found) if s.run == run and s.t[0] <= t <= s.t[-1])
+        )
+    return Thirds(tuple(laws), tuple(begins))
 
 
 def _with_sensors(map_: Any, sensors: Sensors) -> Any:

@@ -104,7 +104,10 @@ def search(
             starts.append(rule.fit)
             told(f"{options.periods[0]:g} periods: {describe(starts[-1])}")
     if not starts:
-        raise FitError("no library of terms follows this recording: do its positions move freely?")
+        raise FitError(
+            "no law of the terms tried follows this recording: is something missing that moves its "
+            "positions (an input, another position), or that stops them?"
+        )
     (bench,) = benches.values()
     misfit = [
         float(np.max(start.rms() / scales.sigma)) if np.isfinite(start.fitted.cost) else np.inf
