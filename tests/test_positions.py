@@ -10,8 +10,9 @@ from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax import cli
-from gfnn_jax.coordinates import nearest_image
+from gfnn_jax.coordinates import Coordinates, nearest_image
 from gfnn_jax.data.recording import Recording
+from gfnn_jax.dataset.structures import structure_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs, variable_signs
@@ -274,6 +275,36 @@ def test_bands_of_forecasts_hold(of_noisy):
     inside = (off < 2 * np.sqrt(std**2 - sigma**2)).mean(axis=0)
     assert ((inside > 0.9) & (inside < 0.99)).all()
     assert np.median(off[:, 0]) < 0.6e-3  # a reading's own error is 0.67e-3 in the median
+
+
+def test_forecasts_of_wrapped_readings_go_on_over_whole_turns(of_noisy):
+    """Moves of a kicked map reach beyond half a turn: each reading is lifted to where S leads."""
+    read = noisy(np.mod(turns(150, 12, 0), 2 * np.pi), 1e-3, 50)
+    learned = gfnn.fit(recorded(read, ["theta"], ["theta"]), learn="map", tolerance=1e-2)
+    true = turns(200, 14, 1)
+    begun = noisy(np.mod(true[:, :11], 2 * np.pi), 1e-3, 51)
+    found = learned.map.forecast(recorded(begun, ["theta"], ["theta"]), 10.0 + np.array([1, 2, 4]))
+    off = nearest_image(found.values["theta"] - true[:, [11, 12, 14], 0], (0, 1, 2))
+    own = np.sqrt(found.std["theta"] ** 2 - learned.positions.noise[0] ** 2)
+    assert ((np.abs(off) < 2 * own).mean(axis=0) > 0.9).all()
+    assert np.median(np.abs(off[:, 0])) < 1e-3
+
+
+def test_latent_positions_of_a_ring_of_equal_sites():
+    """The coupling of a ring of six from noisy angles, told that it is a ring."""
+    names = [f"theta{i}" for i in range(1, 7)]
+    recording = recorded(noisy(ring(60, 12, 6, 0), 1e-3, 5), names, names)
+    triples = triples_of(recording, sites=True)
+    sites = structure_of("ring", 6, Coordinates("positions", triples.angles))
+    family = OfDisplacement(next(iter(sites.libraries(6))), 0.0, True)
+    solved = solve(family, triples)
+    sigma = starting_noise(family, solved.coefficients, triples)
+    found = fit_latent(family, solved, triples, sigma, arcs_of(triples))
+    assert found.converged
+    assert np.abs(found.sigma / 1e-3 - 1).max() < 0.15
+    coupling = family.family.term_names.index("cos(q_{i+1} - q_i)")
+    std = np.linalg.norm(found.root[:, coupling])
+    assert abs(found.coefficients[coupling] - 0.1) < 3 * std < 1e-3
 
 
 def test_a_state_is_estimated_from_all_readings_before_it(of_noisy):

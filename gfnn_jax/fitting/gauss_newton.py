@@ -106,7 +106,7 @@ class Problem:
         self.weight, self.options, self.allowance = weight, options, allowance
 
     def unit(self, rows) -> np.ndarray:
-        """Divisor of these rows' residuals: (2d,), or (n, 2d) of weighted ones."""
+        """Divisors of the residuals of these rows: (2d,), or (n, 2d) of weighted ones."""
         return self.scale if self.weight is None else self.scale / self.weight[rows]
 
     def given(self, rows) -> tuple[Any, Any]:

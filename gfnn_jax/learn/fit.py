@@ -305,8 +305,10 @@ def fit(
             return fit_positions(pairs, options, clock, on_progress, on_candidate)
         return fit_recording(
             pairs, friction=options.friction, input_hold=options.input_hold, mass=options.mass,
-            terms=tuple(options.terms), on_progress=on_progress,
+            terms=tuple(options.terms), loss=options.loss, on_progress=on_progress,
         )  # fmt: skip
+    if options.loss is not None:
+        raise FitError("a loss is of a recording whose law is learned: expected none of pairs")
     budget = options.budget(clock, pairs.dim if isinstance(pairs, Pairs) else None, spent)
     require_x64("a fit")
     messages: list[str] = []
@@ -389,6 +391,8 @@ def _check_of_recording(scene: Scene | None, options: FitOptions) -> None:
         )
     if scene is not None or options.base is not None:
         raise InputError("expected no scene or base of a recording")
+    if options.learn == "map" and options.loss is not None:
+        raise InputError("a loss is of a recording whose law is learned: expected none of its map")
     if options.learn != "map" and options.structure is not None:
         raise InputError("expected no structure of a recording whose law is learned")
 

@@ -95,6 +95,10 @@ _MODEL = Kind(
     "a model with a name, sizes(data) and fit(data, size)",
     lambda v: all(hasattr(v, name) for name in ("name", "sizes", "fit")),
 )
+_LOSS = Kind(
+    "a loss with of(residuals) and weights(residuals)",
+    lambda v: all(hasattr(v, name) for name in ("of", "weights")),
+)
 
 
 class About(NamedTuple):
@@ -209,6 +213,11 @@ class FitOptions:
     ))  # fmt: skip
     mass: Mapping[str, float] | None = field(default=None, metadata=_about(
         _MASSES, "of a recording: the known mass of one position", commands=()
+    ))  # fmt: skip
+    loss: Any = field(default=None, metadata=_about(
+        _LOSS,
+        "of a recording whose law is learned: the loss of residuals in units of their noise, of "
+        "one's own", commands=()
     ))  # fmt: skip
     devices: int | str | None = field(default=None, metadata=_about(
         DEVICES,

@@ -228,7 +228,8 @@ def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np
     arcs = _Windows(law, np.diff(t, axis=1), u)
     sigma = sensors.seen.state_sigma(x[:, -1], sensors.sigma)
     scale = np.concatenate([sigma, sigma * sensors.omega])
-    found = fit_arcs(arcs, np.zeros(0), x, y, sensors.sigma * np.array(noise), scale)
+    sigma = sensors.sigma * np.array(noise)
+    found = fit_arcs(arcs, np.zeros(0), x, y, sigma, scale, loss=sensors.seen.loss)
     return found.x[:, -1], found.last_covariance()
 
 

@@ -136,7 +136,8 @@ class _Table:
         larger = structure.plus([("loss", row) for row in others])
         p = larger.start(fit.values)
         model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
-        rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, fit.sigma * fit.arcs.noise)
+        noise, loss = fit.sigma * fit.arcs.noise, bench.seen.loss
+        rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, noise, loss)
         keys = larger.keys()
         own = [keys.index(("loss", row)) for row in candidates]
         rest = [k for k in range(len(keys)) if k not in own]

@@ -50,6 +50,7 @@ from gfnn_jax.models.lagrangians.text import (
     which_friction_told,
 )
 from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels
+from gfnn_jax.solve.robust import Loss
 
 _IMITATED = 1e-4  # of what a sensor's parameter changes, that no coefficient of the law does
 _SEEN = 3.0  # standard errors of a gain, below which its input is not seen to act
@@ -58,7 +59,7 @@ _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apa
 
 def fit_recording(
     recording: Recording, *, friction: str = "auto", input_hold: str = "auto",
-    mass: Mapping[str, float] | None = None, terms: Sequence[Any] = (),
+    mass: Mapping[str, float] | None = None, terms: Sequence[Any] = (), loss: Loss | None = None,
     on_progress: Callable[[str], Any] = lambda message: None,
 ) -> LearnedLaw:  # fmt: skip
     """The law of a recording, from its positions and inputs.
@@ -67,7 +68,8 @@ def fit_recording(
     "linear+dry". input_hold: "auto", or how inputs go on between samples: "hold", "linear" or
     "band". mass: the known mass (or moment of inertia) of one position, which fixes the scale of L.
     terms: those of L, V and R, as text in the names of columns (`models.lagrangians.given_terms`),
-    which are then all that is fitted.
+    which are then all that is fitted. loss: of residuals in units of their noise; None: the soft L1
+    of `solve.robust`.
     Raises InputError for bad options or a recording without positions, FitError where no law is
     found.
     """
@@ -81,6 +83,7 @@ def fit_recording(
         on_progress(line)
 
     seen, angles = _observation(recording)
+    seen = seen if loss is None else dataclasses.replace(seen, loss=loss)
     found = _stretches(recording, seen, angles)
     far = [i for i in seen.shifts() if i not in angles]
     if far and not recording.guess:
@@ -139,7 +142,7 @@ def fit_recording(
     sensors = Sensors(
         names, recording.inputs, recording.angles, noise, scales.omega, scales.period, acting.hold,
         acting.delay, np.array([scales.period]), np.zeros((1, len(noise))),
-        None if seen.is_plain else fitted,
+        None if seen.is_plain and loss is None else fitted,
     )  # fmt: skip
     bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
     told("bands: forecasts from windows of the record")
