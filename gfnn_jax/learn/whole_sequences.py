@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +15,7 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
 from gfnn_jax.fitting.significance import significant
 from gfnn_jax.fitting.triangle import Triangle
+from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.models.flow_arcs import BIWEIGHT, FlowOnArcs, fit_flow, longest_arc
 from gfnn_jax.solve.latent_arcs import OUTLYING, Fitted
 from gfnn_jax.solve.robust import robust
@@ -40,6 +43,57 @@ class Whole(NamedTuple):
     messages: tuple[str, ...]
 
 
+@dataclasses.dataclass(frozen=True)
+class Sequences:
+    """The sequences of a data set, cut into arcs of at most ``longest`` steps, along which noise
+    stays linear. steps: of a flow, whose own error is far below the noise. least: (2d,) of what is
+    left over, what is no noise. check: called between blocks of lanes; it may raise to stop."""
+
+    data: Dataset
+    steps: Steps
+    longest: int
+    least: np.ndarray
+    check: Callable[[], Any]
+
+    @classmethod
+    def along(
+        cls, problem: Problem, family, fit: FlowFit, data: Dataset, check: Callable[[], Any]
+    ) -> Sequences | None:
+        """As long as the law of this fit allows. None where there are none of one dt in plain
+        coordinates."""
+        plain = data.coordinates.forward is CARTESIAN.forward and data.structure is None
+        if not plain or data.varied:
+            return None
+        c = fit.coefficients
+        some = data.training[:_STATES]
+        rms = float(robust(problem.residuals(family, c, fit.steps, some)))
+        if not 0 < rms < np.inf:
+            return None
+        resolved = _STEP_ERROR * rms
+        steps = problem.fine_steps(family, c, data.training, (resolved,))[0]
+        longest = longest_arc(family, c, data.y0[some], data.dt, steps, rms)
+        least = max(resolved, float(np.finfo(float).eps)) * problem.scale
+        return cls(data, steps, longest, least, check)
+
+    def arcs(self, rows: np.ndarray) -> Arcs | None:
+        """Those of these rows; None where they say no more than their pairs do."""
+        rows, pairs = np.sort(rows), self.data.pairs
+        z0, z1 = np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows]
+        arcs = arcs_of_pairs(z0, z1, self.longest, onward(pairs, rows))
+        if arcs is None or np.median(arcs.measured.sum(axis=1)) <= _SHORTEST:
+            return None
+        return arcs
+
+    def fitted(
+        self, arcs: Arcs, law: Callable[..., FlowOnArcs], p: np.ndarray, *,
+        only_states: bool = False,
+    ) -> Fitted | None:  # fmt: skip
+        """The law with its numbers near p; law: makes the model of dt, steps, moves and check."""
+        model = law(dt=self.data.dt, how=self.steps, moves=arcs.moves, check=self.check)
+        angles = self.data.coordinates.angles
+        return fit_flow(model, p, arcs, self.least, angles, only_states=only_states)
+
+
 def fitted_to_sequences(
     problem: Problem, family, fit: FlowFit, data: Dataset,
     check: Callable[[], Any],
@@ -47,65 +101,52 @@ def fitted_to_sequences(
     """The law of these pairs' fit, fitted to their sequences. None where they are none of one dt in
     plain coordinates, where noise soon grows beyond the linear, or where held-out sequences do not
     bear the law out."""
-    coordinates = data.coordinates
-    plain = coordinates.forward is CARTESIAN.forward and data.structure is None
-    if not plain or data.varied:
+    sequences = Sequences.along(problem, family, fit, data, check)
+    if sequences is None:
         return None
-    c = fit.coefficients
-    some = data.training[:_STATES]
-    rms = float(robust(problem.residuals(family, c, fit.steps, some)))
-    if not 0 < rms < np.inf:
-        return None
-    resolved = _STEP_ERROR * rms
-    steps = problem.fine_steps(family, c, data.training, (resolved,))[0]
-    longest = longest_arc(family, c, data.y0[some], data.dt, steps, rms)
-
-    def along(rows) -> Arcs | None:
-        rows, pairs = np.sort(rows), data.pairs
-        z0, z1 = np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows]
-        arcs = arcs_of_pairs(z0, z1, longest, onward(pairs, rows))
-        if arcs is None or np.median(arcs.measured.sum(axis=1)) <= _SHORTEST:
-            return None
-        return arcs
-
-    train, held = along(data.training), along(data.validation)
+    train, held = sequences.arcs(data.training), sequences.arcs(data.validation)
     if train is None or held is None:
         return None
-    least = max(resolved, float(np.finfo(float).eps)) * problem.scale
 
-    def fitted(arcs: Arcs, terms, coefficients, **options) -> Fitted | None:
-        model = FlowOnArcs(terms, data.dt, steps, arcs.moves, check)
-        return fit_flow(model, coefficients, arcs, least, coordinates.angles, **options)
+    def fitted(arcs: Arcs, terms, coefficients) -> Fitted | None:
+        return sequences.fitted(arcs, partial(FlowOnArcs, terms), coefficients)
 
     def left(terms, coefficients) -> float:
         """Noise of the held-out arcs, each from the state that suits it."""
-        found = fitted(held, terms, coefficients, only_states=True)
+        found = sequences.fitted(held, partial(FlowOnArcs, terms), coefficients, only_states=True)
         return np.inf if found is None else float(np.linalg.norm(found.sigma / problem.scale))
 
+    c = fit.coefficients
     before, found = left(family, c), fitted(train, family, c)
     if found is None or not left(family, found.p) <= _RISE * before:
         return None
     kept = tuple(range(len(c)))
-    few = significant(_triangle(found), found.p, _CERTAIN)[0]
+    few = significant(triangle_of(found), found.p, _CERTAIN)[0]
     if 0 < len(few) < len(c):
         fewer = family.take(tuple(few.tolist()))
         again = fitted(train, fewer, found.p[few])
         if again is not None and left(fewer, again.p) <= _RISE * before:
             kept, found, family = tuple(few.tolist()), again, fewer
-    if _ROWS_PER_TERM * len(kept) <= _triangle(found).rows:
-        everyone = along(np.arange(len(data.y0)))
+    if tells(found, len(kept)):
+        everyone = sequences.arcs(np.arange(len(data.y0)))
         again = fitted(everyone, family, found.p) if everyone is not None else None
         if again is not None:
             found = again
-    root = _root(found)
+    root = root_of(found)
     return Whole(
         kept,
         fit._replace(coefficients=found.p, standard_errors=np.linalg.norm(root, axis=0)),
-        root, found.sigma, len(found.x), _messages(found),
+        root, found.sigma, len(found.x), messages_of(found),
     )  # fmt: skip
 
 
-def _triangle(found: Fitted) -> Triangle:
+def tells(found: Fitted, numbers: int) -> bool:
+    """Whether the arcs are so many for so many numbers of a law that it may be fitted to the
+    held-out sequences too."""
+    return _ROWS_PER_TERM * numbers <= triangle_of(found).rows
+
+
+def triangle_of(found: Fitted) -> Triangle:
     """Triangle of [∂r/∂c, r] without the latent states, r predicted less measured, for the numbers
     that have weight."""
     factor = found.factor.copy()
@@ -113,15 +154,15 @@ def _triangle(found: Fitted) -> Triangle:
     return Triangle(factor, int((np.abs(found.residuals) < BIWEIGHT.k).sum()))
 
 
-def _root(found: Fitted) -> np.ndarray:
+def root_of(found: Fitted) -> np.ndarray:
     """(m, m), rootᵀ root the covariance: that of independent noise, widened where the arcs' own
     gradients vary by more than noise makes them: misfit is alike along an arc."""
-    root, (arcs, count) = _triangle(found).spectrum().root().T, found.scores.shape
+    root, (arcs, count) = triangle_of(found).spectrum().root().T, found.scores.shape
     vary = np.sum((found.scores @ root.T) ** 2) / count / max(1 - count / arcs, 1 / arcs)
     return root * np.sqrt(max(vary, 1.0))
 
 
-def _messages(found: Fitted) -> tuple[str, ...]:
+def messages_of(found: Fitted) -> tuple[str, ...]:
     measured = np.isfinite(found.residuals).all(axis=-1)
     outlying = np.any(np.abs(found.residuals) > OUTLYING, axis=-1)
     if not outlying.any():

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.dataset.arcs import Arcs
+from gfnn_jax.errors import InputError
 from gfnn_jax.flows.collocation import Steps as FlowSteps
 from gfnn_jax.flows.collocation import images
 from gfnn_jax.solve.latent_arcs import Fitted, Known, Observed, Steps, fit_arcs, observed_whole
@@ -39,6 +40,7 @@ class Options:
 
 
 OPTIONS, BIWEIGHT = Options(), Biweight()
+_CENTRAL = 1e-5  # of a constant: half the distance of a central difference, whose error is 1e-10
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -165,3 +167,37 @@ def longest_arc(family, c, z, dt: float, how: FlowSteps, noise) -> int:
         if not size_at_end < OPTIONS.grown:
             return max(k - 1, 1)
     return OPTIONS.longest
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FlowWithConstants(FlowOnArcs):
+    """The flow of H = Σ c_j φ_j(z; θ) on arcs, p = (c, θ). family: θ (k,) -> that of the terms,
+    which are so many. Raises nothing for θ without terms: the steps are then not finite."""
+
+    terms: int = 0
+
+    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
+        c, constants = p[: self.terms], p[self.terms :]
+        try:
+            found = self._at(constants).steps(c, x)
+            ends, z = np.zeros((2, *found.closing.shape)), x[:, :-1][self.moves]
+            by_constant = []
+            for k, theta in enumerate(constants):
+                apart = _CENTRAL * max(abs(theta), _CENTRAL)
+                for side, sign in zip(ends, (1, -1), strict=True):
+                    moved = constants.copy()
+                    moved[k] += sign * apart
+                    side[self.moves] = self._at(moved).images(c, z)
+                by_constant.append((ends[0] - ends[1]) / (2 * apart))
+        except InputError:
+            arcs, length, width = x.shape
+            lost = np.full((arcs, length - 1, width, max(width, len(p))), np.nan)
+            return Steps(lost[..., 0], lost[..., :width], lost[..., : len(p)])
+        slopes = np.stack([*np.moveaxis(found.by_coefficients, -1, 0), *by_constant], axis=-1)
+        return Steps(found.closing, found.by_state, slopes)
+
+    def images(self, p: np.ndarray, z: np.ndarray, direction: int = 1) -> np.ndarray:
+        return self._at(p[self.terms :]).images(p[: self.terms], z, direction)
+
+    def _at(self, constants: np.ndarray) -> FlowOnArcs:
+        return FlowOnArcs(self.family(constants), self.dt, self.how, self.moves, self.check)

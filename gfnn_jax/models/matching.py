@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gfnn_jax.models.arguments import Argument
-from gfnn_jax.models.atoms import Atom, Dictionary, gradient_of, weight_of
+from gfnn_jax.models.atoms import Atom, Average, Dictionary, gradient_of, weight_of
 
 _BEAM = 4  # states that go on
 _PAIRED = 160  # atoms, those that explain most, whose pairs are tried
@@ -38,16 +38,17 @@ class Match:
 class Matching:
     """The search for atoms that, beside a base, have the gradient ``target`` (rows,).
 
-    base: (rows, n) orthonormal columns that are always there. weight: (2d,) by which gradients are
-    multiplied. arguments: at the states of the rows. said: halvings of what is left over that a
-    unit of complexity must bring.
+    base: (rows, n) orthonormal columns that are always there. weight: (2d,), or of each row, by
+    which gradients are multiplied. arguments: at the states of the rows. said: halvings of what is left over that a
+    unit of complexity must bring. average: makes the rows of gradients at the states, where they
+    are not these themselves.
     """
 
     def __init__(
         self, base: np.ndarray, target: np.ndarray, weight: np.ndarray, arguments: list[Argument],
-        said: float = SAID,
+        said: float = SAID, average: Average = np.asarray,
     ):  # fmt: skip
-        self.weight, self.arguments, self._said = weight, arguments, said
+        self.weight, self.arguments, self._said, self._average = weight, arguments, said, average
         self.base, self.target = base, target
         self.size = float(np.linalg.norm(target))
 
@@ -220,7 +221,7 @@ class Matching:
         return np.where(told, residual @ columns / np.where(told, size, 1.0), 0.0), size
 
     def _flat(self, gradient: np.ndarray) -> np.ndarray:
-        return (gradient * self.weight).ravel()
+        return (self._average(gradient) * self.weight).ravel()
 
 
 def _apart(order: np.ndarray, atoms: list[Atom], count: int) -> list[int]:
