@@ -50,6 +50,7 @@ from gfnn_jax.learn.learned_law import (
     learned_from,
     validation_error,
 )
+from gfnn_jax.learn.noisy_textbook import law_of_sequences
 from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
 from gfnn_jax.learn.textbook import law_of_physics
 from gfnn_jax.learn.whole_sequences import fitted_to_sequences
@@ -92,12 +93,20 @@ def learn_hamiltonian(
     started = time.perf_counter()
     if terms and data.structure is None:
         check_finite(own_terms(data, terms), data, data.training)
+    most = options.max_operations if basis is None else options.mode_operations
+    if not terms and scene is None:
+        problem = Problem(data.y0, data.y1, data.each_dt, data.scale, args=data.args)
+        own = LawWork(problem, budget, most, dearest)
+        whole = law_of_sequences(problem, own, data, tolerance, say)
+        if whole is not None:
+            seconds = time.perf_counter() - started
+            problem.check, problem.spend = lambda: None, lambda operations: None
+            return learned_from(whole, problem, data, tolerance, seconds, options, None)
     of_steps, arcs = data, arcs_of(data)
     if arcs is not None:
         say(f"H: arcs of {arcs.length} steps, in which the states move far against their noise")
         data = arcs.data
     problem = Problem(data.y0, data.y1, data.each_dt, data.scale, args=data.args)
-    most = options.max_operations if basis is None else options.mode_operations
     work = LawWork(problem, budget, most, dearest)
     everywhere, free = data, (*data.coordinates.cyclic, *data.whole)
     if data.structure is None:

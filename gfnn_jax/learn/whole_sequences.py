@@ -57,16 +57,16 @@ class Sequences:
 
     @classmethod
     def along(
-        cls, problem: Problem, family, fit: FlowFit, data: Dataset, check: Callable[[], Any]
-    ) -> Sequences | None:
-        """As long as the law of this fit allows. None where there are none of one dt in plain
-        coordinates."""
+        cls, problem: Problem, family, c: np.ndarray, how: Steps, data: Dataset,
+        check: Callable[[], Any],
+    ) -> Sequences | None:  # fmt: skip
+        """As long as a law with coefficients c that are close allows, by steps that resolve it.
+        None where there are none of one dt in plain coordinates."""
         plain = data.coordinates.forward is CARTESIAN.forward and data.structure is None
         if not plain or data.varied:
             return None
-        c = fit.coefficients
         some = data.training[:_STATES]
-        rms = float(robust(problem.residuals(family, c, fit.steps, some)))
+        rms = float(robust(problem.residuals(family, c, how, some)))
         if not 0 < rms < np.inf:
             return None
         resolved = _STEP_ERROR * rms
@@ -101,7 +101,7 @@ def fitted_to_sequences(
     """The law of these pairs' fit, fitted to their sequences. None where they are none of one dt in
     plain coordinates, where noise soon grows beyond the linear, or where held-out sequences do not
     bear the law out."""
-    sequences = Sequences.along(problem, family, fit, data, check)
+    sequences = Sequences.along(problem, family, fit.coefficients, fit.steps, data, check)
     if sequences is None:
         return None
     train, held = sequences.arcs(data.training), sequences.arcs(data.validation)

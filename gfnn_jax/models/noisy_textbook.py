@@ -49,8 +49,8 @@ _LOOKED_AT = 30  # matches that are read as laws
 class Formula(NamedTuple):
     """H = Σ c_j φ_j: terms without constants inside, and atoms with them.
 
-    left: RMS of what it leaves over of the weak gradients, in units of their noise. said: what
-    there is to say of its atoms.
+    left: RMS of what it leaves over of the weak gradients, in units of their noise; rows: so many
+    numbers. said: what there is to say of its atoms.
     """
 
     plain: Terms
@@ -58,6 +58,7 @@ class Formula(NamedTuple):
     arguments: list[Argument]
     coefficients: np.ndarray
     left: float
+    rows: int
     said: float
 
     @property
@@ -65,19 +66,24 @@ class Formula(NamedTuple):
         """(k,): the constants inside the atoms."""
         return np.array([f.theta for atom in self.atoms for f in atom if f.theta is not None])
 
+    @property
+    def numbers(self) -> list[list[int]]:
+        """Places among coefficients and constants of the constants of each term."""
+        found: list[list[int]] = [[] for _ in range(self.plain.num_parameters)]
+        place = len(self.coefficients)
+        for atom in self.atoms:
+            inside = sum(f.theta is not None for f in atom)
+            found.append(list(range(place, place + inside)))
+            place += inside
+        return found
+
+    def with_constants(self, constants: np.ndarray) -> Formula:
+        """The same with these constants inside."""
+        return self._replace(atoms=_with(self.atoms, constants))
+
     def family(self, constants: np.ndarray) -> Terms:
         """The terms, with these constants inside. Raises InputError for one that has run away."""
-        given = iter(constants.tolist())
-        texts = [
-            atom_text(
-                tuple(
-                    f if f.theta is None else dataclasses.replace(f, theta=next(given))
-                    for f in atom
-                ),
-                self.arguments,
-            )
-            for atom in self.atoms
-        ]
+        texts = [atom_text(atom, self.arguments) for atom in _with(self.atoms, constants)]
         dim = self.plain.dim
         return joined(self.plain, given_terms(dim, texts)) if texts else self.plain
 
@@ -95,6 +101,17 @@ class Formula(NamedTuple):
         return self._replace(
             plain=plain, atoms=atoms, coefficients=coefficients, said=said_of(plain, atoms)
         )
+
+
+def _with(atoms: Sequence[Atom], constants: np.ndarray) -> tuple[Atom, ...]:
+    """The atoms with these constants (k,) inside."""
+    given = iter(constants.tolist())
+    return tuple(
+        tuple(
+            f if f.theta is None else dataclasses.replace(f, theta=next(given)) for f in atom
+        )
+        for atom in atoms
+    )  # fmt: skip
 
 
 def said_of(plain: Terms, atoms: Sequence[Atom]) -> float:
@@ -197,8 +214,9 @@ class NoisyTextbook:
             plain = joined(plain, Terms(self._dim, names, tuple(dict.fromkeys(rows))))
         atoms = tuple(others)
         whole = Formula(
-            plain, atoms, self._arguments, np.zeros(0), np.inf, said_of(plain, atoms)
-        )
+            plain, atoms, self._arguments, np.zeros(0), np.inf, len(self._target),
+            said_of(plain, atoms),
+        )  # fmt: skip
         columns = self._columns(whole.family(whole.constants))
         kept = np.arange(columns.shape[1])
         while True:
@@ -219,4 +237,3 @@ class NoisyTextbook:
         gradients = np.moveaxis(family.term_gradients(self._weak.states), -1, 0)
         rows = self._weak.average(gradients) * self._weight
         return rows.reshape(len(rows), -1).T
-

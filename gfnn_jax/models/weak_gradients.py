@@ -23,7 +23,9 @@ from gfnn_jax.phase_space import apply_j
 _STATES = 13  # of a window
 _EVERY = 6  # states, at which windows begin
 _SMOOTHED, _DEGREE = (9, 7), 4  # states and degree of local polynomials that smooth a sequence
-_BIASED = 1.3  # times the noise: what a local polynomial leaves over where it is no longer the orbit
+_BIASED = (
+    1.3  # times the noise: what a local polynomial leaves over where it is no longer the orbit
+)
 _MOST = 320  # windows
 
 
@@ -50,14 +52,18 @@ class WeakGradients(NamedTuple):
 
     def average(self, gradients: np.ndarray) -> np.ndarray:
         """The means (…, R, 2d) over the windows of gradients (…, N, 2d) at the states."""
-        parts = (b * gradients[..., own, :] for b, own in zip(self.bump, self.places.T, strict=True))
+        parts = (
+            b * gradients[..., own, :] for b, own in zip(self.bump, self.places.T, strict=True)
+        )
         total = next(parts)
         for part in parts:
             total = total + part
         return total
 
 
-def weak_gradients(sequences: list[np.ndarray], dt: float, noise: np.ndarray) -> WeakGradients | None:
+def weak_gradients(
+    sequences: list[np.ndarray], dt: float, noise: np.ndarray
+) -> WeakGradients | None:
     """The windows of sequences (L, 2d) of states dt apart, with noise (2d,) on each coordinate; None
     where no sequence is as long as a window."""
     u = np.arange(1, _STATES + 1) / (_STATES + 1) * 2 - 1
