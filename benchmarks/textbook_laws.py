@@ -8,6 +8,7 @@ system makes round (1, ½) the values are odd, so that none is met by chance.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 
 import numpy as np
@@ -73,7 +74,7 @@ class Law:
 
     def gradient(self, z, t=None) -> np.ndarray:
         """∇H (n, 2d) at states z (n, 2d), of a drive at the times t (n,)."""
-        family = given_terms(self.dim, list(self.terms), self.parameters)
+        family = _family(self.dim, tuple(self.terms), self.parameters)
         args = None if t is None else np.reshape(t, (-1, 1))
         return family.gradient(np.array(list(self.terms.values())), z, args)
 
@@ -170,6 +171,11 @@ class Law:
             return gfnn.Pairs(z, self.images(z), self.dt)
         t0 = rng.uniform(0, self.period, count)
         return gfnn.Pairs(z, self.images(z, t0), self.dt, t0=t0, period=self.period)
+
+
+@functools.lru_cache(4)
+def _family(dim: int, terms: tuple[str, ...], parameters: tuple[str, ...]):
+    return given_terms(dim, terms, parameters)
 
 
 def _kinetic(dim: int) -> dict[str, float]:

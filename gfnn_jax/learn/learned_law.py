@@ -62,7 +62,8 @@ class LearnedHamiltonian:
     None of a network. unmet: that the tolerance is missed, and what that may be from; "" where it
     is met. ended: what cut the search for it short, "" where nothing did. dropped: terms that went
     in the end. friction: γ where that is uniform, else the terms of Rayleigh's R; of a system
-    without, ().
+    without, (). constants: numbers inside terms that noisy sequences told, each with its term and
+    its standard error.
     """
 
     candidate: Candidate
@@ -84,6 +85,7 @@ class LearnedHamiltonian:
     ended: str = ""
     dropped: Dropped | None = None
     friction: tuple[Term, ...] = ()
+    constants: tuple[Term, ...] = ()
 
     @cached_property
     def root(self) -> np.ndarray | None:
@@ -143,7 +145,8 @@ class FittedLaw(NamedTuple):
     library that grew did so no longer. stalled: whether larger libraries were no better. noisy:
     whether their errors were the same, which is that of the pairs; larger: the largest
     of those. dropped: terms that went in the end. whole:
-    what whole sequences tell, where they were fitted."""
+    what whole sequences tell, where they were fitted. constants: numbers inside terms that were
+    fitted with them."""
 
     family: Any  # of terms of H, or of L, with friction or without
     fit: FlowFit
@@ -157,6 +160,7 @@ class FittedLaw(NamedTuple):
     larger: FittedLaw | None = None
     dropped: Dropped | None = None
     whole: Whole | None = None
+    constants: tuple[Term, ...] = ()
 
 
 def learned_from(
@@ -218,7 +222,7 @@ def learned_from(
         covariance=covariance, noise=None if whole is None else whole.noise,
         arcs=0 if whole is None else whole.arcs,
         dropped=found.dropped, unmet=_unmet(error, omega_h, tolerance, found),
-        friction=friction,
+        friction=friction, constants=found.constants,
     )  # fmt: skip
 
 

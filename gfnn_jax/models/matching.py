@@ -39,9 +39,9 @@ class Matching:
     """The search for atoms that, beside a base, have the gradient ``target`` (rows,).
 
     base: (rows, n) orthonormal columns that are always there. weight: (2d,), or of each row, by
-    which gradients are multiplied. arguments: at the states of the rows. said: halvings of what is left over that a
-    unit of complexity must bring. average: makes the rows of gradients at the states, where they
-    are not these themselves.
+    which gradients are multiplied. arguments: at the states. said: halvings of what is left over
+    that a unit of complexity must bring. average: makes the rows of gradients at the states, where
+    they are not these themselves.
     """
 
     def __init__(

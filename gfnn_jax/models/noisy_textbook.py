@@ -1,7 +1,7 @@
 """The search for laws of physics behind noisy sequences: which few atoms are worth a fit.
 
-Atoms are matched, as in `models.textbook`, to the gradients of H along sequences; these are known in
-weak form (`models.weak_gradients`), without the error of a midpoint, so that one round is enough.
+Atoms are matched, as in `models.textbook`, to the gradients of H along sequences. These are known
+in weak form (`models.weak_gradients`), without the error of a midpoint: one round is enough.
 The noise of the states is known too: columns are in its units, and an atom has to bring as much
 likelihood as there is to say of it. Noise does not tell the right law from one that is within it,
 so that several are handed on; whole sequences choose.

@@ -23,9 +23,7 @@ from gfnn_jax.phase_space import apply_j
 _STATES = 13  # of a window
 _EVERY = 6  # states, at which windows begin
 _SMOOTHED, _DEGREE = (9, 7), 4  # states and degree of local polynomials that smooth a sequence
-_BIASED = (
-    1.3  # times the noise: what a local polynomial leaves over where it is no longer the orbit
-)
+_BIASED = 1.3  # times the noise, that a local polynomial leaves over where it is not the orbit
 _MOST = 320  # windows
 
 
@@ -52,20 +50,17 @@ class WeakGradients(NamedTuple):
 
     def average(self, gradients: np.ndarray) -> np.ndarray:
         """The means (…, R, 2d) over the windows of gradients (…, N, 2d) at the states."""
-        parts = (
-            b * gradients[..., own, :] for b, own in zip(self.bump, self.places.T, strict=True)
-        )
-        total = next(parts)
-        for part in parts:
-            total = total + part
+        total = self.bump[0] * gradients[..., self.places[:, 0], :]
+        for weight, own in zip(self.bump[1:], self.places.T[1:], strict=True):
+            total = total + weight * gradients[..., own, :]
         return total
 
 
 def weak_gradients(
     sequences: list[np.ndarray], dt: float, noise: np.ndarray
 ) -> WeakGradients | None:
-    """The windows of sequences (L, 2d) of states dt apart, with noise (2d,) on each coordinate; None
-    where no sequence is as long as a window."""
+    """The windows of sequences (L, 2d) of states dt apart, with noise (2d,) on each coordinate.
+    None where no sequence is as long as a window."""
     u = np.arange(1, _STATES + 1) / (_STATES + 1) * 2 - 1
     bump = (1 - u**2) ** 4
     bump /= bump.sum()
@@ -93,7 +88,7 @@ def weak_gradients(
 
 
 def _smoothed(sequence: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The sequence (L, 2d) smoothed as far as its orbit allows, and the noise (2d,) that is left."""
+    """The sequence (L, 2d) smoothed as far as its orbit allows, and the noise (2d,) left on it."""
     for size in _SMOOTHED:
         kept = savgol_coeffs(size, _DEGREE)[size // 2]  # of a state's own noise
         smooth = savgol_filter(sequence, size, _DEGREE, axis=0)
