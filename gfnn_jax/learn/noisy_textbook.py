@@ -45,6 +45,9 @@ _OPERATIONS = (2e8, 4e8, 8e8, 1.6e9)  # of a search, by degrees of freedom from 
 _ORDER, _ALIKE = 6, 1.5  # of the differences that tell the noise, see `learn.arcs`
 _CERTAIN = 4.0  # standard errors below which a term is noise
 _BEHIND = 40.0  # natural logarithms of likelihood by which a law is behind that is not fitted
+_BROUGHT = 3.0  # of it, that further terms must bring
+_FITTED = 4  # laws
+_SCREENED, _ITERATIONS = 3e-4, 12  # of the cost, and iterations, while laws are compared
 _AS_NOISE = 1.2  # times the noise, that a law may leave over
 _STEPS = Steps(6, 1)
 
@@ -122,7 +125,7 @@ def _chosen(
     if train is None or held is None:
         return None
     told = [
-        found for formula in formulas if _behind(formula, first) < _BEHIND
+        found for formula in _worth(formulas)
         for found in [_told(sequences, train, formula)] if found is not None
     ]  # fmt: skip
     if not told:
@@ -140,16 +143,29 @@ def _chosen(
     return _law(problem, formula, fitted, data, tolerance)
 
 
-def _behind(formula: Formula, first: Formula) -> float:
-    """Logarithm of the odds by which the first law's weak residuals are likelier."""
-    return first.rows * float(np.log(formula.left / first.left))
+def _worth(formulas: list[Formula]) -> list[Formula]:
+    """The laws that are not far behind the first, nor one before them with terms that bring
+    nothing."""
+
+    def behind(formula: Formula, other: Formula) -> float:
+        """Logarithm of the odds by which the other law's weak residuals are likelier."""
+        return formula.rows * float(np.log(formula.left / other.left))
+
+    kept: list[Formula] = []
+    for formula in formulas:
+        if behind(formula, formulas[0]) > _BEHIND:
+            continue
+        if any(o.kind < formula.kind and behind(formula, o) > -_BROUGHT for o in kept):
+            continue
+        kept.append(formula)
+    return kept[:_FITTED]
 
 
 def _told(sequences: Sequences, arcs: Arcs, formula: Formula) -> _Told | None:
     """The terms of a law that whole sequences tell from noise, fitted to them."""
     p = np.concatenate([formula.coefficients, formula.constants])
     while True:
-        found = _fitted(sequences, arcs, formula, p)
+        found = _fitted(sequences, arcs, formula, p, gained=_SCREENED, iterations=_ITERATIONS)
         if found is None:
             return None
         kept = _certain(found, formula)

@@ -85,13 +85,13 @@ class Sequences:
         return arcs
 
     def fitted(
-        self, arcs: Arcs, law: Callable[..., FlowOnArcs], p: np.ndarray, *,
-        only_states: bool = False,
-    ) -> Fitted | None:  # fmt: skip
-        """The law with its numbers near p; law: makes the model of dt, steps, moves and check."""
+        self, arcs: Arcs, law: Callable[..., FlowOnArcs], p: np.ndarray, **options: Any
+    ) -> Fitted | None:
+        """The law with its numbers near p; law: makes the model of dt, steps, moves and check.
+        options: of `models.flow_arcs.fit_flow`."""
         model = law(dt=self.data.dt, how=self.steps, moves=arcs.moves, check=self.check)
         angles = self.data.coordinates.angles
-        return fit_flow(model, p, arcs, self.least, angles, only_states=only_states)
+        return fit_flow(model, p, arcs, self.least, angles, **options)
 
 
 def fitted_to_sequences(

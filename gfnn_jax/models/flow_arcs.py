@@ -40,7 +40,7 @@ class Options:
 
 
 OPTIONS, BIWEIGHT = Options(), Biweight()
-_CENTRAL = 1e-5  # of a constant: half the distance of a central difference, whose error is 1e-10
+_FORWARD = 1e-6  # of a constant: a forward difference, whose error is as large a part of it
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,10 +81,10 @@ class FlowOnArcs:
 
 def fit_flow(
     model: FlowOnArcs, coefficients, arcs: Arcs, least, angles: tuple[int, ...] = (), *,
-    only_states: bool = False,
+    only_states: bool = False, gained: float = OPTIONS.gained, iterations: int = 30,
 ) -> Fitted | None:  # fmt: skip
     """Coefficients, states and noise, from coefficients that are close, or with these as they are
-    (``only_states``). None where the flow fails.
+    (``only_states``). None where the flow fails. gained: as of the options; iterations: at most.
 
     least: (2d,) of what is left over, what is no noise. angles: coordinates that are measured
     modulo 2π.
@@ -97,8 +97,9 @@ def fit_flow(
         return None
     given, free = (Known(model, c), c[:0]) if only_states else (model, c)
     found = fit_arcs(
-        given, free, x, y, noise, noise, tolerance=OPTIONS.gained, loss=BIWEIGHT, least=least
-    )
+        given, free, x, y, noise, noise, max_iterations=iterations, tolerance=gained,
+        loss=BIWEIGHT, least=least,
+    )  # fmt: skip
     if not np.isfinite(found.cost):
         return None
     return dataclasses.replace(found, p=c) if only_states else found
@@ -180,15 +181,13 @@ class FlowWithConstants(FlowOnArcs):
         c, constants = p[: self.terms], p[self.terms :]
         try:
             found = self._at(constants).steps(c, x)
-            ends, z = np.zeros((2, *found.closing.shape)), x[:, :-1][self.moves]
             by_constant = []
             for k, theta in enumerate(constants):
-                apart = _CENTRAL * max(abs(theta), _CENTRAL)
-                for side, sign in zip(ends, (1, -1), strict=True):
-                    moved = constants.copy()
-                    moved[k] += sign * apart
-                    side[self.moves] = self._at(moved).images(c, z)
-                by_constant.append((ends[0] - ends[1]) / (2 * apart))
+                moved, slope = constants.copy(), np.zeros(found.closing.shape)
+                moved[k] += _FORWARD * abs(theta)
+                ends = self._at(moved).images(c, x[:, :-1][self.moves])
+                slope[self.moves] = ends - (found.closing + x[:, 1:])[self.moves]
+                by_constant.append(slope / (_FORWARD * abs(theta)))
         except InputError:
             arcs, length, width = x.shape
             lost = np.full((arcs, length - 1, width, max(width, len(p))), np.nan)

@@ -88,10 +88,10 @@ class Formula(NamedTuple):
         return joined(self.plain, given_terms(dim, texts)) if texts else self.plain
 
     @property
-    def kind(self) -> tuple:
+    def kind(self) -> frozenset:
         """The terms without their constants."""
-        shapes = (tuple(sorted((f.place, f.kind) for f in atom)) for atom in self.atoms)
-        return (*sorted(self.plain.term_names), *sorted(shapes))
+        shapes = [tuple(sorted((f.place, f.kind) for f in atom)) for atom in self.atoms]
+        return frozenset([*self.plain.term_names, *((s, shapes.count(s)) for s in shapes)])
 
     def take(self, kept: Sequence[int], coefficients: np.ndarray) -> Formula:
         """These terms alone."""
@@ -153,7 +153,7 @@ class NoisyTextbook:
 
     def _searched(self, products: bool) -> list[Formula]:
         """The laws of each kind, by rising length."""
-        found: dict[tuple, Formula] = {}
+        found: dict[frozenset, Formula] = {}
         for match in sorted(self._matches(products), key=self._length_of_match)[:_LOOKED_AT]:
             formula = self._formula(match)
             if found.setdefault(formula.kind, formula).left > formula.left:
