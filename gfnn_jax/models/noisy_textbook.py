@@ -31,7 +31,8 @@ class Options:
     coordinates and products of two. said: natural logarithms of likelihood that a unit of
     complexity must bring. finalists: laws that are handed on. explained: RMS of what a match leaves
     over, in units of the noise, from which on products of shapes are looked at too. kept: standard
-    errors of a coordinate, or a product of two, that a law is handed on with.
+    errors of a coordinate, or a product of two, that a law is handed on with. exchanged:
+    matches whose atoms are tried in other shapes.
     """
 
     degrees: tuple[int, ...] = (6, 4, 4)
@@ -40,6 +41,7 @@ class Options:
     finalists: int = 6
     explained: float = 1.5
     kept: float = 2.0
+    exchanged: int = 4
 
 
 OPTIONS = Options()
@@ -188,8 +190,8 @@ class NoisyTextbook:
             most = len(self._target) / 4 - self._base.num_parameters
             blocks = [b for b in blocks_of(self._arguments, self._degree) if len(b) < most]
             found += [matching.refined(block) for block in blocks]
-        found += [matching.plainer(m, dictionary) for m in found[:2]]
-        return found
+        likeliest = sorted(found, key=self._length_of_match)[: options.exchanged]
+        return found + [m for best in likeliest for m in matching.exchanged(best, dictionary)]
 
     def _length_of_match(self, match: Match) -> float:
         said = self._options.said * weight_of(match.atoms)

@@ -6,7 +6,7 @@ The equation of motion times a bump φ, integrated by parts over a window of a s
 
 asks for no derivative of the measured states, so that their noise is averaged and not divided by
 the time step (Messenger & Bortz, SIAM Multiscale Model. Simul. 19 (2021) 1474). The bumps
-φ = (1 − u²)⁴ and their slopes are summed over the states, to 1e-6 of the integrals. The left-hand
+φ = (1 − u²)⁶ and their slopes are summed over the states, to 1e-5 of the integrals. The left-hand
 side is evaluated at states that are smoothed where the orbit is smooth: noise e there moves the
 columns by ∫ φ J H'' e dt.
 """
@@ -20,7 +20,8 @@ from scipy.signal import savgol_coeffs, savgol_filter
 
 from gfnn_jax.phase_space import apply_j
 
-_STATES = 13  # of a window
+_STATES = 15  # of a window
+_POWER = 6  # of the bump: with 4 the sums over its slope are off by 2e-4
 _EVERY = 6  # states, at which windows begin
 _SMOOTHED, _DEGREE = (9, 7), 4  # states and degree of local polynomials that smooth a sequence
 _BIASED = 1.3  # times the noise, that a local polynomial leaves over where it is not the orbit
@@ -62,9 +63,9 @@ def weak_gradients(
     """The windows of sequences (L, 2d) of states dt apart, with noise (2d,) on each coordinate.
     None where no sequence is as long as a window."""
     u = np.arange(1, _STATES + 1) / (_STATES + 1) * 2 - 1
-    bump = (1 - u**2) ** 4
+    bump = (1 - u**2) ** _POWER
     bump /= bump.sum()
-    slope = u * (1 - u**2) ** 3
+    slope = u * (1 - u**2) ** (_POWER - 1)
     time = np.arange(_STATES) * dt
     slope /= slope @ time  # of a state that moves at rate 1 the mean rate is 1
     states, noises, measured, places, count = [], [], [], [], 0
