@@ -42,7 +42,7 @@ from textbook_laws import LAWS, OUTSIDE, Law
 import gfnn_jax as gfnn
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.flows.flow import Flow
-from gfnn_jax.models import shapes as texts
+from gfnn_jax.models.textbook import shapes as texts
 
 PAIRS, FRESH, WIDER = 1_000, 200, 1.2
 FEW = 200  # pairs of the law that is also followed over STEPS steps

@@ -10,9 +10,9 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps
-from gfnn_jax.models.flow_arcs import FlowWithConstants
-from gfnn_jax.models.noisy_textbook import NoisyTextbook
-from gfnn_jax.models.weak_gradients import weak_gradients
+from gfnn_jax.models.hamiltonians.flow_arcs import FlowWithConstants
+from gfnn_jax.models.textbook.noisy_search import NoisyTextbook
+from gfnn_jax.models.textbook.weak_gradients import weak_gradients
 from gfnn_jax.phase_space import apply_j
 
 

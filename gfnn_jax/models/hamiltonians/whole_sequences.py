@@ -1,0 +1,184 @@
+"""H fitted to whole noisy sequences, where pairs are parts of them and a law was found."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.budget import Allowance
+from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.arcs import Arcs, arcs_of_pairs, onward
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
+from gfnn_jax.fitting.significance import significant
+from gfnn_jax.fitting.triangle import Triangle
+from gfnn_jax.flows.collocation import Steps
+from gfnn_jax.models.hamiltonians.flow_arcs import BIWEIGHT, FlowOnArcs, fit_flow, longest_arc
+from gfnn_jax.solve.latent_arcs import OUTLYING, Fitted
+from gfnn_jax.solve.robust import robust
+
+_SHORTEST = 3  # steps of an arc that says more than its pairs do
+_CERTAIN = 4.0  # standard errors below which a term is noise
+_RISE = 1.01  # of the held-out arcs' noise, by chance
+# Measured numbers for each term from which on a law that held-out sequences have borne out is
+# fitted to these too: what judges it then is off by less than 1 / 200 of the noise's variance.
+_ROWS_PER_TERM = 200
+_STATES = 100  # from which the noise and its growth along an arc are measured
+_STEP_ERROR = 0.01  # of a step's own error ÷ the noise
+_IN_A_ROW = 2.5  # times the noise: neighbours of a state that stands alone stay below
+
+
+class Whole(NamedTuple):
+    """kept: places of the family's terms that are left. fit: theirs. root: (k, k), rootᵀ root is
+    the coefficients' covariance. noise: (2d,) standard deviation of each coordinate's noise. arcs:
+    into which the sequences were cut. messages: about gross errors."""
+
+    kept: tuple[int, ...]
+    fit: FlowFit
+    root: np.ndarray
+    noise: np.ndarray
+    arcs: int
+    messages: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Sequences:
+    """The sequences of a data set, cut into arcs of at most ``longest`` steps, along which noise
+    stays linear. steps: of a flow, whose own error is far below the noise. least: (2d,) of what is
+    left over, what is no noise. allowance: checked before each block of lanes."""
+
+    data: Dataset
+    steps: Steps
+    longest: int
+    least: np.ndarray
+    allowance: Allowance
+
+    @classmethod
+    def along(
+        cls, problem: Problem, family, c: np.ndarray, how: Steps, data: Dataset,
+        allowance: Allowance,
+    ) -> Sequences | None:  # fmt: skip
+        """As long as a law with coefficients c that are close allows, by steps that resolve it.
+        None where there are none of one dt in plain coordinates."""
+        plain = data.coordinates.forward is CARTESIAN.forward and data.structure is None
+        if not plain or data.varied:
+            return None
+        some = data.training[:_STATES]
+        rms = float(robust(problem.residuals(family, c, how, some)))
+        if not 0 < rms < np.inf:
+            return None
+        resolved = _STEP_ERROR * rms
+        steps = problem.fine_steps(family, c, data.training, (resolved,))[0]
+        longest = longest_arc(family, c, data.y0[some], data.dt, steps, rms)
+        least = max(resolved, float(np.finfo(float).eps)) * problem.scale
+        return cls(data, steps, longest, least, allowance)
+
+    def arcs(self, rows: np.ndarray) -> Arcs | None:
+        """Those of these rows; None where they say no more than their pairs do."""
+        rows, pairs = np.sort(rows), self.data.pairs
+        z0, z1 = np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows]
+        arcs = arcs_of_pairs(z0, z1, self.longest, onward(pairs, rows))
+        if arcs is None or np.median(arcs.measured.sum(axis=1)) <= _SHORTEST:
+            return None
+        return arcs
+
+    def fitted(
+        self, arcs: Arcs, law: Callable[..., FlowOnArcs], p: np.ndarray, **options: Any
+    ) -> Fitted | None:
+        """The law with its numbers near p; law: makes the model of dt, steps, moves and allowance.
+        options: of `flow_arcs.fit_flow`."""
+        model = law(dt=self.data.dt, how=self.steps, moves=arcs.moves, allowance=self.allowance)
+        angles = self.data.coordinates.angles
+        return fit_flow(model, p, arcs, self.least, angles, **options)
+
+
+def fitted_to_sequences(
+    problem: Problem, family, fit: FlowFit, data: Dataset,
+    allowance: Allowance,
+) -> Whole | None:  # fmt: skip
+    """The law of these pairs' fit, fitted to their sequences. None where they are none of one dt in
+    plain coordinates, where noise soon grows beyond the linear, or where held-out sequences do not
+    bear the law out."""
+    sequences = Sequences.along(problem, family, fit.coefficients, fit.steps, data, allowance)
+    if sequences is None:
+        return None
+    train, held = sequences.arcs(data.training), sequences.arcs(data.validation)
+    if train is None or held is None:
+        return None
+
+    def fitted(arcs: Arcs, terms, coefficients) -> Fitted | None:
+        return sequences.fitted(arcs, partial(FlowOnArcs, terms), coefficients)
+
+    def left(terms, coefficients) -> float:
+        """Noise of the held-out arcs, each from the state that suits it."""
+        found = sequences.fitted(held, partial(FlowOnArcs, terms), coefficients, only_states=True)
+        return np.inf if found is None else float(np.linalg.norm(found.sigma / problem.scale))
+
+    c = fit.coefficients
+    before, found = left(family, c), fitted(train, family, c)
+    if found is None or not left(family, found.p) <= _RISE * before:
+        return None
+    kept = tuple(range(len(c)))
+    few = significant(triangle_of(found), found.p, _CERTAIN)[0]
+    if 0 < len(few) < len(c):
+        fewer = family.take(tuple(few.tolist()))
+        again = fitted(train, fewer, found.p[few])
+        if again is not None and left(fewer, again.p) <= _RISE * before:
+            kept, found, family = tuple(few.tolist()), again, fewer
+    if tells(found, len(kept)):
+        everyone = sequences.arcs(np.arange(len(data.y0)))
+        again = fitted(everyone, family, found.p) if everyone is not None else None
+        if again is not None:
+            found = again
+    root = root_of(found)
+    return Whole(
+        kept,
+        fit._replace(coefficients=found.p, standard_errors=np.linalg.norm(root, axis=0)),
+        root, found.sigma, len(found.x), messages_of(found),
+    )  # fmt: skip
+
+
+def tells(found: Fitted, numbers: int) -> bool:
+    """Whether the arcs are so many for so many numbers of a law that it may be fitted to the
+    held-out sequences too."""
+    return _ROWS_PER_TERM * numbers <= triangle_of(found).rows
+
+
+def triangle_of(found: Fitted) -> Triangle:
+    """Triangle of [∂r/∂c, r] without the latent states, r predicted less measured, for the numbers
+    that have weight."""
+    factor = found.factor.copy()
+    factor[:, -1] *= -1
+    return Triangle(factor, int((np.abs(found.residuals) < BIWEIGHT.k).sum()))
+
+
+def root_of(found: Fitted) -> np.ndarray:
+    """(m, m), rootᵀ root the covariance: that of independent noise, widened where the arcs' own
+    gradients vary by more than noise makes them: misfit is alike along an arc."""
+    root, (arcs, count) = triangle_of(found).spectrum().root().T, found.scores.shape
+    vary = np.sum((found.scores @ root.T) ** 2) / count / max(1 - count / arcs, 1 / arcs)
+    return root * np.sqrt(max(vary, 1.0))
+
+
+def messages_of(found: Fitted) -> tuple[str, ...]:
+    measured = np.isfinite(found.residuals).all(axis=-1)
+    outlying = np.any(np.abs(found.residuals) > OUTLYING, axis=-1)
+    if not outlying.any():
+        return ()
+    beside = np.any(np.abs(found.residuals) > _IN_A_ROW, axis=-1)
+    beside = np.pad(beside, ((0, 0), (1, 1)))
+    alone = outlying & ~(beside[:, :-2] | beside[:, 2:])
+    if 2 * alone.sum() < outlying.sum():
+        return (
+            f"the law misses {outlying.sum()} of {measured.sum()} measured states by more than "
+            f"{OUTLYING:g} times the noise, most of them in a row: it is less accurate there, and "
+            "they were given little weight",
+        )
+    return (
+        f"{outlying.sum()} of {measured.sum()} measured states lie more than {OUTLYING:g} times "
+        "the noise from the sequences of the law: outliers, they were given little weight",
+    )
