@@ -26,8 +26,11 @@ from gfnn_jax.errors import InputError, OutOfTime
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.models.hamiltonians.flow_arcs import FlowWithConstants
-from gfnn_jax.models.hamiltonians.formula import Term
+from gfnn_jax.models.hamiltonians.formula import Rival, Term
+from gfnn_jax.models.hamiltonians.formula import formula as formula_of
+from gfnn_jax.models.hamiltonians.fractions import proposals
 from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
+from gfnn_jax.models.hamiltonians.symmetries import restricted
 from gfnn_jax.models.hamiltonians.whole_sequences import (
     Sequences,
     Whole,
@@ -50,6 +53,7 @@ _FITTED = 4  # laws
 _SCREENED, _ITERATIONS = 3e-4, 12  # of the cost, and iterations, while laws are compared
 _AS_NOISE = 1.2  # times the noise, that a law may leave over
 _STEPS = Steps(6, 1)
+_SURE = 40.0  # logarithm of the largest odds that are told
 
 
 class _Told(NamedTuple):
@@ -140,7 +144,27 @@ def _chosen(
         everyone = sequences.arcs(np.arange(len(data.y0)))
         again = None if everyone is None else _fitted(sequences, everyone, formula, fitted.p)
         fitted = again or fitted
-    return _law(problem, formula, fitted, data, tolerance)
+    found = _law(problem, formula, fitted, data, tolerance)
+    return found._replace(rivals=_rivals(best, told))
+
+
+def _rivals(best: _Told, told: list[_Told]) -> tuple[Rival, ...]:
+    """The next two laws of least description length, with the odds of the best against them."""
+    others: dict[frozenset, _Told] = {}
+    for law in sorted(told, key=lambda law: law.length):
+        if law.formula.kind != best.formula.kind:
+            others.setdefault(law.formula.kind, law)
+    found = []
+    for law in list(others.values())[:2]:
+        formula, p = law.formula, law.fitted.p
+        terms = len(formula.coefficients)
+        deviations = np.linalg.norm(root_of(law.fitted), axis=0)
+        inside = map(_readable, p[terms:].tolist(), deviations[terms:].tolist())
+        names = formula.family(np.array(list(inside))).term_names
+        shown = map(Term, names, p[:terms].tolist(), deviations[:terms].tolist())
+        odds = float(np.exp(min(law.length - best.length, _SURE)))
+        found.append(Rival(formula_of(list(shown)), odds))
+    return tuple(found)
 
 
 def _worth(formulas: list[Formula]) -> list[Formula]:
@@ -224,25 +248,41 @@ def _law(
     images at the states as it is.
     """
     root, terms = root_of(fitted), len(formula.coefficients)
-    deviations = np.linalg.norm(root, axis=0)
-    constants = [
-        _readable(*pair) for pair in zip(fitted.p[terms:], deviations[terms:], strict=True)
-    ]
-    family, c = formula.family(np.array(constants)), fitted.p[:terms]
+    coordinates, rows = data.coordinates, triangle_of(fitted).rows
+    family = formula.family(fitted.p[terms:])
+    known = restricted(
+        family, fitted.p, root.T @ root, data.y0[data.training], coordinates.angles, rows
+    )
+    c, covariance = known.numbers[:terms], known.covariance
+    deviations = np.sqrt(np.diag(covariance).clip(0.0))
+    constants = list(map(_readable, known.numbers[terms:].tolist(), deviations[terms:].tolist()))
+    family = formula.family(np.array(constants))
     inside = [j for j, places in enumerate(formula.numbers) for _ in places]
     names = [family.term_names[j] for j in inside]
-    told = map(Term, names, constants, deviations[terms:].tolist())
-    more = len(fitted.p) / terms
-    own = np.linalg.inv(np.linalg.inv(root.T @ root)[:terms, :terms])
+    told = tuple(map(Term, names, constants, deviations[terms:].tolist()))
+    coefficients = map(Term, family.term_names, c.tolist(), deviations.tolist())
+    near = proposals([*coefficients, *told], covariance, len(told))
     fit = problem.fit(family, c, data.training, rounds=False)
     fit = fit._replace(coefficients=c, standard_errors=deviations[:terms])
     whole = Whole(
-        tuple(range(terms)), fit, np.linalg.cholesky(more * own).T, fitted.sigma, len(fitted.x),
-        messages_of(fitted),
+        tuple(range(terms)), fit, _root_of_coefficients(covariance, terms), fitted.sigma,
+        len(fitted.x), messages_of(fitted),
     )  # fmt: skip
     error = validation_error(family, fit, data, tolerance)
-    return FittedLaw(family, fit, data.training, error, (), noisy=True, stalled=True, whole=whole,
-                     constants=tuple(told))  # fmt: skip
+    return FittedLaw(
+        family, fit, data.training, error, (), noisy=True, stalled=True, whole=whole,
+        constants=told, symmetries=known.symmetries, proposals=near,
+    )  # fmt: skip
+
+
+def _root_of_coefficients(covariance: np.ndarray, terms: int) -> np.ndarray:
+    """(terms, terms), rootᵀ root that of the coefficients with the constants as they are, times
+    (m + k)/m. The covariance may be singular."""
+    own, across = covariance[:terms, :terms], covariance[:terms, terms:]
+    inverse = np.linalg.pinv(covariance[terms:, terms:], hermitian=True)
+    values, vectors = np.linalg.eigh(own - across @ inverse @ across.T)
+    more = len(covariance) / terms
+    return np.sqrt(more * values.clip(0.0))[:, None] * vectors.T
 
 
 def _readable(constant: float, deviation: float) -> float:

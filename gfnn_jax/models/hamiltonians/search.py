@@ -106,7 +106,10 @@ def learn_hamiltonian(
         if whole is not None:
             seconds = time.perf_counter() - started
             problem.allowance = UNBOUNDED
-            return learned_from(whole, problem, data, tolerance, seconds, options, None)
+            found = learned_from(whole, problem, data, tolerance, seconds, options, None)
+            for note in found.notes:
+                say(note)
+            return found
     of_steps, arcs = data, arcs_of(data)
     if arcs is not None:
         say(f"H: arcs of {arcs.length} steps, in which the states move far against their noise")

@@ -1,8 +1,8 @@
 """The search for laws of physics behind noisy sequences: which few atoms are worth a fit.
 
-Atoms are matched, as in `models.textbook.search`, to the gradients of H along sequences. These are known
-in weak form (`weak_gradients`), without the error of a midpoint: one round is enough.
-The noise of the states is known too: columns are in its units, and an atom has to bring as much
+Atoms are matched, as in `models.textbook.search`, to the gradients of H along sequences. These are
+known in weak form (`weak_gradients`), without the error of a midpoint: one round is enough. The
+noise of the states is known too: columns are in its units, and an atom has to bring as much
 likelihood as there is to say of it. Noise does not tell the right law from one that is within it,
 so that several are handed on; whole sequences choose.
 """
