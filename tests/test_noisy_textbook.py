@@ -54,13 +54,13 @@ def pairs_of(z, dt=0.1):
     )  # fmt: skip
 
 
-def morse_orbits(count=30):
+def morse_orbits(count=20):
     rng = np.random.default_rng(0)
     z0 = np.column_stack([rng.uniform(-0.5, 1.6, count), rng.uniform(-0.7, 0.7, count)])
     return orbits(morse, z0)
 
 
-def radial_orbits(count=30):
+def radial_orbits(count=20):
     rng = np.random.default_rng(0)
     z0 = np.column_stack([rng.uniform(0.7, 2.3, count), rng.uniform(-0.4, 0.4, count)])
     return orbits(radial, z0)
@@ -141,6 +141,7 @@ def test_a_fit_of_noisy_sequences_finds_morses_law_with_the_errors_of_its_number
     np.testing.assert_allclose(law.noise, noise, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_clean_sequences_are_left_to_the_search_for_exact_laws():
     z = radial_orbits(20)[:, :20]
     fit = gfnn.fit(pairs_of(z), learn="hamiltonian", tolerance=1e-6, max_seconds=None)

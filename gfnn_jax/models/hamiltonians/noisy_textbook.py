@@ -51,7 +51,7 @@ _BEHIND = 40.0  # natural logarithms of likelihood by which a law is behind that
 _BROUGHT = 3.0  # of it, that further terms must bring
 _FITTED = 4  # laws
 _SCREENED, _ITERATIONS = 3e-4, 12  # of the cost, and iterations, while laws are compared
-_AS_NOISE = 1.2  # times the noise, that a law may leave over
+_AS_NOISE = 1.1  # times the noise, that a law may leave over
 _STEPS = Steps(6, 1)
 _SURE = 40.0  # logarithm of the largest odds that are told
 
@@ -84,7 +84,7 @@ def law_of_sequences(
             formulas = search.formulas()
         family = formulas[0].family(formulas[0].constants)
         with work.library(name, family, len(formulas) * len(data.training)):
-            return _chosen(problem, formulas, data, tolerance, noise, Allowance(work.budget))
+            return _chosen(problem, formulas, data, tolerance, noise, Allowance(work.budget), say)
     except OutOfTime:
         work.budget.leave_out(name, work.ended)
     except (np.linalg.LinAlgError, InputError):
@@ -116,7 +116,7 @@ def _noise_of(stretches: list[np.ndarray], scale: np.ndarray) -> np.ndarray | No
 
 def _chosen(
     problem: Problem, formulas: list[Formula], data: Dataset, tolerance: Tolerance,
-    noise: np.ndarray, allowance: Allowance,
+    noise: np.ndarray, allowance: Allowance, say: Callable[[str], Any],
 ) -> FittedLaw | None:  # fmt: skip
     """The law of least description length, where it leaves no more than noise."""
     first = formulas[0]
@@ -138,6 +138,9 @@ def _chosen(
     judged = _fitted(sequences, held, best.formula, best.fitted.p, only_states=True)
     for found in (best.fitted, judged):
         if found is None or not _rms(found.sigma / noise) <= _AS_NOISE:
+            for law in sorted(told, key=lambda law: law.length)[:3]:
+                left = _rms(law.fitted.sigma / noise)
+                say(f"H: a partial law leaves {left:.2g} times the noise over: {_shown(law)}")
             return None
     formula, fitted = best.formula, best.fitted
     if tells(fitted, len(fitted.p)):
@@ -154,17 +157,20 @@ def _rivals(best: _Told, told: list[_Told]) -> tuple[Rival, ...]:
     for law in sorted(told, key=lambda law: law.length):
         if law.formula.kind != best.formula.kind:
             others.setdefault(law.formula.kind, law)
-    found = []
-    for law in list(others.values())[:2]:
-        formula, p = law.formula, law.fitted.p
-        terms = len(formula.coefficients)
-        deviations = np.linalg.norm(root_of(law.fitted), axis=0)
-        inside = map(_readable, p[terms:].tolist(), deviations[terms:].tolist())
-        names = formula.family(np.array(list(inside))).term_names
-        shown = map(Term, names, p[:terms].tolist(), deviations[:terms].tolist())
-        odds = float(np.exp(min(law.length - best.length, _SURE)))
-        found.append(Rival(formula_of(list(shown)), odds))
-    return tuple(found)
+    return tuple(
+        Rival(_shown(law), float(np.exp(min(law.length - best.length, _SURE))))
+        for law in list(others.values())[:2]
+    )
+
+
+def _shown(law: _Told) -> str:
+    """The law as people read it."""
+    formula, p = law.formula, law.fitted.p
+    terms = len(formula.coefficients)
+    deviations = np.linalg.norm(root_of(law.fitted), axis=0)
+    inside = map(_readable, p[terms:].tolist(), deviations[terms:].tolist())
+    names = formula.family(np.array(list(inside))).term_names
+    return formula_of(list(map(Term, names, p[:terms].tolist(), deviations[:terms].tolist())))
 
 
 def _worth(formulas: list[Formula]) -> list[Formula]:

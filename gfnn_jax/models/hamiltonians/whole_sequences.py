@@ -62,8 +62,8 @@ class Sequences:
         cls, problem: Problem, family, c: np.ndarray, how: Steps, data: Dataset,
         allowance: Allowance,
     ) -> Sequences | None:  # fmt: skip
-        """As long as a law with coefficients c that are close allows, by steps that resolve it.
-        None where there are none of one dt in plain coordinates."""
+        """Cut them as long as a law with coefficients c that are close allows, by steps that
+        resolve it. None where there are none of one dt in plain coordinates."""
         plain = data.coordinates.forward is CARTESIAN.forward and data.structure is None
         if not plain or data.varied:
             return None
@@ -78,7 +78,7 @@ class Sequences:
         return cls(data, steps, longest, least, allowance)
 
     def arcs(self, rows: np.ndarray) -> Arcs | None:
-        """Those of these rows; None where they say no more than their pairs do."""
+        """Arcs of these rows; None where they say no more than their pairs do."""
         rows, pairs = np.sort(rows), self.data.pairs
         z0, z1 = np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows]
         arcs = arcs_of_pairs(z0, z1, self.longest, onward(pairs, rows))
@@ -143,8 +143,8 @@ def fitted_to_sequences(
 
 
 def tells(found: Fitted, numbers: int) -> bool:
-    """Whether the arcs are so many for so many numbers of a law that it may be fitted to the
-    held-out sequences too."""
+    """Return whether the arcs are so many for so many numbers of a law that it may be fitted to
+    the held-out sequences too."""
     return _ROWS_PER_TERM * numbers <= triangle_of(found).rows
 
 

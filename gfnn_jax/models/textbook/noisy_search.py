@@ -103,7 +103,7 @@ class Formula(NamedTuple):
         return frozenset([*self.plain.term_names, *((s, shapes.count(s)) for s in shapes)])
 
     def take(self, kept: Sequence[int], coefficients: np.ndarray) -> Formula:
-        """These terms alone."""
+        """Take these terms alone."""
         count = self.plain.num_parameters
         atoms = tuple(self.atoms[j - count] for j in kept if j >= count)
         plain = self.plain.take([j for j in kept if j < count])
@@ -124,7 +124,7 @@ def _with(atoms: Sequence[Atom], constants: np.ndarray) -> tuple[Atom, ...]:
 
 
 def said_of(plain: Terms, atoms: Sequence[Atom]) -> float:
-    """What there is to say of a law, in units of complexity: its atoms, and products of coordinates
+    """Complexity of a law, in units of `shapes.complexity`: its atoms, and products of coordinates
     beyond those of two."""
     beyond = [row for row in plain.powers if sum(row) > 2]
     return weight_of(atoms) + sum(1.0 + 0.1 * n for row in beyond for n in row if n)
