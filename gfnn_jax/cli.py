@@ -142,7 +142,7 @@ def _look(arguments: argparse.Namespace) -> None:
         print(f"figure: {figure}")
     wrong = sum(fault.wrong for fault in summary.faults)
     if arguments.strict and wrong:
-        raise WorkError(f"{arguments.data[0]}: wrong in {wrong} ways (--strict)")
+        raise WorkError(f"{arguments.data[0]}: mistakes found: {wrong} (--strict)")
 
 
 def _fit(arguments: argparse.Namespace) -> None:

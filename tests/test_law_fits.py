@@ -12,7 +12,8 @@ from gfnn_jax.cli import main
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, Friction, Lagrangian, Terms
 from gfnn_jax.flows.motion import Form
-from gfnn_jax.flows.schedules import interpolate
+from gfnn_jax.flows.schedules import at_stages, interpolate
+from gfnn_jax.jobs.forecast import forecast_recording
 from gfnn_jax.models.lagrangians.text import speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
 from gfnn_jax.solve.latent_arcs import Observed, Steps, fit_arcs, rows_of_arcs
@@ -150,7 +151,11 @@ def test_inputs_between_samples():
     at = np.linspace(4, 6, 41)
     assert np.abs(interpolate(t, u, at, "band")[:, 0] - np.sin(3 * at)).max() < 1e-3
     assert np.abs(interpolate(t, u, at, "linear")[:, 0] - np.sin(3 * at)).max() < 0.02
-    np.testing.assert_array_equal(interpolate(t, u, np.array([4.05]), "hold")[0], u[40])
+    held = at_stages(t, u, np.array([4.0, 4.1, 4.3, 4.3]), 1, "hold", delay=0.03)
+    for step, mean in enumerate((0.3 * u[39] + 0.7 * u[40], 0.15 * u[40] + 0.5 * u[41])):
+        mean = mean + (0.35 * u[42] if step else 0.0)
+        np.testing.assert_allclose(held[step, 0], np.tile(mean, (6, 1)), atol=1e-12)
+    np.testing.assert_array_equal(held[2, 0], np.tile(u[42], (6, 1)))  # no time: the value there
 
 
 def test_text_of_a_law():
@@ -315,14 +320,14 @@ def test_the_command_line_learns_and_forecasts(tmp_path, capsys):
     assert "--num-steps" in capsys.readouterr().err
 
 
-def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs():
-    """ẍ = −4 x − 0.2 ẋ + 3 u, and an input that does nothing."""
+def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs(tmp_path):
+    """ẍ = −4 x − 0.2 ẋ + 3 u(t − 0.017), and an input that does nothing."""
     t = np.arange(0, 30, 0.05)
     rng = np.random.default_rng(0)
     wave = np.sin(0.7 * t) + 0.7 * np.sin(1.9 * t + 1) + 0.5 * np.sin(3.1 * t + 2)
 
     def rate(s, x):
-        return [x[1], -4 * x[0] - 0.2 * x[1] + 3 * np.interp(s, t, wave)]
+        return [x[1], -4 * x[0] - 0.2 * x[1] + 3 * np.interp(s - 0.017, t, wave)]
 
     x = solve_ivp(rate, (0, t[-1]), [0.5, 0.0], t_eval=t, rtol=1e-9, max_step=0.05).y[0]
     table = {
@@ -344,3 +349,24 @@ def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs():
                            inputs=["u", "w"])  # fmt: skip
     found = fit.map.forecast(recording.slice(20.0, 24.95), t[501:], ahead)
     assert np.abs(found.values["x"][0] - x[501:]).max() < 0.02
+    delay, std = fit.delay
+    assert abs(delay - 0.017) < 4 * std < 2e-3
+    assert "linear between samples, acting 0.01" in fit.table
+    book = fit.energy
+    assert abs(book["closure"]) < 5e-3 * book["supplied"]["u"]
+    assert book["lost"]["v**2"] == pytest.approx(book["supplied"]["u"] - book["stored"], rel=0.01)
+    fit.map.save(tmp_path / "model")
+    for name, rows in (("past", slice(500)), ("ahead", slice(490, None))):
+        columns = ["t", "x", "u", "w"] if name == "past" else ["t", "u", "w"]
+        lines = [
+            ",".join(columns),
+            *(",".join(f"{table[c][i]:.9g}" for c in columns) for i in range(len(t))[rows]),
+        ]
+        (tmp_path / f"{name}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    out = tmp_path / "out.csv"
+    forecast_recording(
+        tmp_path / "model", tmp_path / "past.csv", inputs=tmp_path / "ahead.csv", num_steps=99,
+        out=out,
+    )  # fmt: skip
+    rows = np.genfromtxt(out, delimiter=",", names=True)
+    assert np.abs(rows["x"] - x[500:599]).max() < 0.02

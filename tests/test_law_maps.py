@@ -67,6 +67,22 @@ def test_inputs_between_their_samples(hold, input_at):
         np.testing.assert_allclose(each[0, :-1], states[0, :-1], atol=1e-14)
 
 
+@pytest.mark.parametrize(("hold", "delay"), [("hold", 0.3), ("linear", 1.4), ("band", 0.6)])
+def test_delayed_inputs_keep_their_momentum(hold, delay):
+    """The integral of a step's polynomial is that of the input, moved by the delay."""
+    u = np.cos(0.4 * np.arange(200) + 1)[:, None]
+    coefficients = Signals(("u",), hold, 0.1 * delay).coefficients(u, 0.1)
+    powers = np.arange(coefficients.shape[-1])
+    found = coefficients @ (0.1 ** (powers + 1) / (powers + 1))
+    fine = np.arange(0, 200, 0.01) + 0.005 - delay
+    inside = {
+        "hold": u[np.clip(np.floor(fine).astype(int), 0, 199), 0],
+        "linear": np.interp(fine, np.arange(200), u[:, 0]), "band": np.cos(0.4 * fine + 1),
+    }  # fmt: skip
+    expected = 0.1 * inside[hold].reshape(200, 100).mean(axis=1)
+    np.testing.assert_allclose(found[40:-40], expected[40:-40], atol=1e-5)
+
+
 def test_band_limited_inputs():
     """Sampled at 1.5 times the Nyquist rate, away from the ends, to the window's accuracy."""
     n = np.arange(200)

@@ -28,7 +28,7 @@ _A = np.array([
     [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
     [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
 ])  # fmt: skip
-_B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
+WEIGHTS = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
 
 
 class Step(NamedTuple):
@@ -132,8 +132,8 @@ class Form:
                 slope[:, d:, 2 * d :] += by[..., 2 * d :]
                 rates.append(np.concatenate([xi[:, d:], a], axis=1))
                 slopes.append(slope)
-            for i in np.flatnonzero(_B):
-                x, D = x + _B[i] * h * rates[i], D + _B[i] * wide * slopes[i]
+            for i in np.flatnonzero(WEIGHTS):
+                x, D = x + WEIGHTS[i] * h * rates[i], D + WEIGHTS[i] * wide * slopes[i]
         return Step(x, D[..., : 2 * d], D[..., 2 * d :])
 
     def advance(self, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -148,6 +148,6 @@ class Form:
                     xi = xi + _A[i, j] * h * rates[j]
                 a = law.acceleration(xi[:, :d], xi[:, d:], u[:, k, i])
                 rates.append(np.concatenate([xi[:, d:], a], axis=1))
-            for i in np.flatnonzero(_B):
-                x = x + _B[i] * h * rates[i]
+            for i in np.flatnonzero(WEIGHTS):
+                x = x + WEIGHTS[i] * h * rates[i]
         return x

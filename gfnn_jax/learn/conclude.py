@@ -217,8 +217,8 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
     if differs_between_sequences(y0 / scale, residual / scale, sequence):
         message = (
             "what is left over agrees within a sequence and differs between sequences: something "
-            "that the states do not hold (a mass, a length, a field) differs between them; learn "
-            "those of one value by themselves"
+            "that the states do not hold (a mass, a length, a field) differs between them: give it "
+            "as a parameter (args), or fit the sequences of one value by themselves"
         )
         return _LeftOver(None, [message], "something that the states do not hold differs between "
                          "the sequences")  # fmt: skip
@@ -235,9 +235,8 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
         return _LeftOver(None, [message], "volumes of phase space change, as by friction")
     if np.isfinite(error) or _told_by_neighbours(sample) is False:
         message = (
-            "what is left over is a function of the states and no noise, neighbouring pairs agree "
-            "in it: a structure that these functions cannot represent, or pairs of no symplectic "
-            "map"
+            "what is left over is no noise, for neighbouring pairs agree in it: the motion has a "
+            "structure that these functions cannot represent, or it is not symplectic"
         )
         return _LeftOver(None, [message], "what is left over is a function of the states")
     return None

@@ -348,7 +348,7 @@ def fit(
         error = stated(chosen, found, budget)
         chosen, stated_by = with_test_rows(chosen, error, found, budget)
         conclusion = conclude(chosen, found, request)
-        warn(conclusion.messages)
+        warn([*conclusion.messages, *filter(None, [error.few])])
     judged = min(_JUDGED, block_of(2 * data.dim))
     some = chosen.data.pairs.take(chosen.data.validation[:judged])
     return Fit(

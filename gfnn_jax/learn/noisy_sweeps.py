@@ -188,12 +188,20 @@ class NoisySweep(LinearSweep):
         data, coefficients = self.data, near.solve(size, Budget(), _quiet)[0].coefficients
 
         def nearest(rows) -> NearestArcs:
-            arcs = arcs_of_pairs(*_chained(data, np.sort(rows)))
+            rows = np.sort(rows)
+            z0, z1, longest, steps = _chained(data, rows)
+            arcs = arcs_of_pairs(z0, z1, longest, steps)
             assert arcs is not None
+            sigma = deviations * data.scale
+            if data.weight is not None:
+                own = sigma / data.weight[rows]
+                along = arcs_of_pairs(own, own, longest, steps)
+                assert along is not None
+                sigma = np.where(np.isfinite(along.states), along.states, sigma)
             model = GeneratedOnArcs(
                 size.family, self.chart, data.dt, arcs.moves, (data.before, data.after)
             )
-            return NearestArcs.of(model, coefficients, arcs, deviations * data.scale)
+            return NearestArcs.of(model, coefficients, arcs, sigma)
 
         self._along = nearest
         self._nearest, self._nearest_held = map(nearest, (data.training, data.validation))

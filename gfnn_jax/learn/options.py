@@ -230,12 +230,12 @@ class FitOptions:
             and not self.terms and self.structure is None
         ):  # fmt: skip
             raise FitError(
-                "a model of one's own is all that is learned: expected no learn, terms, base, "
+                "with model=… nothing else is learned: expected no learn, terms, base, "
                 "structure, family or chart beside it"
             )
         if self.ensemble > 1 and (self.family != "mlp" or of_h):
             raise FitError(
-                "an ensemble is of networks S: expected family='mlp', and S to be learned"
+                "an ensemble is of networks S: expected family='mlp', and no learn='hamiltonian'"
             )
         if self.terms and (self.learn == "map" or not plain):
             raise FitError(
@@ -243,7 +243,9 @@ class FitOptions:
                 "chart"
             )
         if self.base is not None and (of_h or self.terms):
-            raise FitError("a base Hamiltonian is factored out of the map: it goes with S alone")
+            raise FitError(
+                "base is factored out of a map S: expected no terms and no learn='hamiltonian'"
+            )
         if of_h and (self.family not in ("auto", "mlp") or self.chart != "auto"):
             raise FitError(
                 "family and chart are those of S: learn='hamiltonian' has no chart, and no family "

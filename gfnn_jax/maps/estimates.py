@@ -3,7 +3,7 @@
 The samples before a time are fitted by one arc of the law, its first state unknown: that gives the
 state there with its covariance. A forecast is the orbit from it. Its band holds the error of that
 state, of the law's coefficients, the noise of a sample, and the law's own misfit, as forecasts of
-the data that it was learned from have shown it.
+data that it was not learned from have shown it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.flows.motion import Form
-from gfnn_jax.flows.schedules import interpolate, stage_times
+from gfnn_jax.flows.schedules import at_stages
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.signals.local_cubics import smooth
@@ -224,7 +224,7 @@ def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np
         noise.append(np.concatenate([np.ones((pad, count)), own_noise]))
         x.append(np.concatenate([np.repeat(own[:1], pad, axis=0), own]))
     t, y, x = np.array(t), np.array(y), np.array(x)
-    u, _ = _inputs(law, windows, t, substeps_of(sensors, np.max(np.diff(t, axis=1), initial=0.0)))
+    u = _inputs(law, windows, t, substeps_of(sensors, np.max(np.diff(t, axis=1), initial=0.0)))
     arcs = _Windows(law, np.diff(t, axis=1), u)
     sigma = sensors.seen.state_sigma(x[:, -1], sensors.sigma)
     scale = np.concatenate([sigma, sigma * sensors.omega])
@@ -262,7 +262,7 @@ def propagate(
     for k in range(times.shape[1]):
         parts = substeps_of(sensors, np.max(steps[:, k], initial=0.0))
         both = np.stack([now, times[:, k]], axis=1)
-        u, _ = _inputs(law, windows, both, parts)
+        u = _inputs(law, windows, both, parts)
         step = law.form.step(law.p, x, steps[:, k], u[:, 0])
         x, now = step.states, times[:, k]
         spread = step.by_state @ spread
@@ -281,14 +281,13 @@ def substeps_of(sensors: Sensors, h: float) -> int:
     return max(1, int(np.ceil(h * sensors.omega / _FINE)))
 
 
-def _inputs(
-    law: Law, windows: Sequence[Window], t: np.ndarray, substeps: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Inputs (B, L − 1, substeps, 6, k) of the steps between times t (B, L), and their times."""
-    at = stage_times(t, substeps) - law.sensors.delay
-    starts = np.broadcast_to(at[..., :1], at.shape)
-    u = np.stack([
-        interpolate(w.inputs_t, w.inputs, a, law.sensors.hold, s)
-        for w, a, s in zip(windows, at, starts, strict=True)
+def _inputs(law: Law, windows: Sequence[Window], t: np.ndarray, substeps: int) -> np.ndarray:
+    """Inputs (B, L − 1, substeps, 6, k) of the steps between times t (B, L)."""
+    sensors = law.sensors
+    if sensors.inputs and sensors.hold == "hold":  # a substep for each of their samples at least
+        between = min(float(np.median(np.diff(w.inputs_t))) for w in windows)
+        substeps = max(substeps, int(np.ceil(np.max(np.diff(t)) / between - 1e-6)))
+    return np.stack([
+        at_stages(w.inputs_t, w.inputs, ends, substeps, sensors.hold, sensors.delay)
+        for w, ends in zip(windows, t, strict=True)
     ])  # fmt: skip
-    return u, at

@@ -318,7 +318,7 @@ def _started(g: Observation) -> np.ndarray:
     missing = [g.parameters[i] for i in open_ if not told[i] or not np.isfinite(values[i])]
     if missing:
         raise InputError(
-            f"observe: {', '.join(missing)}: where do they start? guess={{{missing[0]!r}: …}} "
+            f"observe: {', '.join(missing)}: expected a first guess, guess={{{missing[0]!r}: …}} "
             f"(--guess {missing[0]}=…)"
         )
     return np.where(np.abs(values) < 1e-12, 0.0, values)

@@ -89,10 +89,10 @@ class Fitted:
     """The fit of all arcs.
 
     p: (n,) coefficients. x: (A, L, m) states. residuals: (A, L, k) in units of the noise, NaN where
-    nothing was seen. sigma: the noise as given, or (k,) as estimated. factor: the triangle
-    (n + 1, n + 1) of [∂r/∂p, r] without the states. scores: (A, n) each arc's part of the gradient
-    in p. arcs: (A, m, m) triangles of each δx_0 with p fixed. transports: (A, m, m) ∂x_{L−1}/∂x_0.
-    cost: infinite where the defects could not be closed.
+    nothing was seen. sigma: the noise as given or estimated, (k,) or (A, L, k). factor: the
+    triangle (n + 1, n + 1) of [∂r/∂p, r] without the states. scores: (A, n) each arc's part of the
+    gradient in p. arcs: (A, m, m) triangles of each δx_0 with p fixed. transports: (A, m, m)
+    ∂x_{L−1}/∂x_0. cost: infinite where the defects could not be closed.
     """
 
     p: np.ndarray
@@ -142,8 +142,8 @@ def fit_arcs(
     iteration has to close them; then it has to lower the cost. Ends where it lowers it by less than
     ``tolerance`` of itself. The cost is infinite where the defects could not be closed.
 
-    least: (k,) what of the residuals is no noise; sigma (k,) is then where the noise starts from,
-    and is estimated by every iteration. None: sigma is known.
+    least: (k,) what of the residuals is no noise; sigma is then where the noise starts from, and is
+    estimated by every iteration, of (A, L, k) one factor for each of the k. None: sigma is known.
     """
     seen = np.isfinite(y)
     known = np.where(seen, y, 0.0)
@@ -288,12 +288,19 @@ class _Iterate(NamedTuple):
     def rescaled(self, rows: _Rows, least: np.ndarray) -> _Iterate:
         """Iterate in units of the noise that these residuals tell: of each number as much is left
         as the latent state of its arc, and the coefficients, do not follow."""
-        off = self.residuals * self.units.sigma
+        before = self.units.sigma
+        off = self.residuals * before
         free = np.where(self.seen, 1.0 - rows.leverage, 0.0)
         free *= max(1.0 - len(self.p) / free.sum(), 1e-3)
-        sigma = np.hypot(of_residuals(np.where(self.seen, off, np.nan), free, OUTLYING), least)
+        if before.ndim == 1:
+            sigma = np.hypot(of_residuals(np.where(self.seen, off, np.nan), free, OUTLYING), least)
+            moved = sigma / before
+        else:
+            left = np.where(self.seen, self.residuals, np.nan)
+            moved = of_residuals(left, free, OUTLYING)
+            sigma = np.hypot(moved * before, least)
         # Of a state (q, v) whose positions are seen, velocities change as they do.
-        state = self.units.state * np.resize(sigma / self.units.sigma, self.units.state.shape)
+        state = self.units.state * np.resize(moved, self.units.state.shape)
         units = _Units(sigma, state, self.units.loss)
         return self.at(self.p, self.x, self.steps, self.observed, self.seen, off, units)
 

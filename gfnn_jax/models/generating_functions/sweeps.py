@@ -18,7 +18,7 @@ from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
 from gfnn_jax.dataset.noise import of_pairs
-from gfnn_jax.dataset.rows import of_rows, rows_of
+from gfnn_jax.dataset.rows import of_rows, rows_of, weighted_rows_of
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.dataset.split import outermost
 from gfnn_jax.families.inputs import Inputs, box_inputs, variable_signs
@@ -176,8 +176,8 @@ class LinearSweep(Generates):
         reversor = (-1,) * 2 * data.dim if even else reversor
         self._kept, self._prefix = factors, "even " if even else ""
         self.data, self.tolerance, self.chart, self.kind = data, tolerance, chart, kind
-        self._train, self._weight = rows_of(data, chart, data.training)
-        self._held, _ = rows_of(data, chart, data.validation)
+        self._train, self._weight = weighted_rows_of(data, chart, data.training)
+        self._held, _ = weighted_rows_of(data, chart, data.validation)
         free = (*data.coordinates.cyclic, *data.whole)
         self._outermost = outermost(data.y0[data.training], free)
         coordinates = data.coordinates
@@ -304,14 +304,15 @@ class LinearSweep(Generates):
         choose the ridge, as before."""
         quiet = Budget(), lambda message: None
         train, held = self.factors(size.group, *quiet)[:2]
-        test, _ = rows_of(self.data, self.chart, self.data.test)
+        test, _ = weighted_rows_of(self.data, self.chart, self.data.test)
         more = least_squares.reduce(self.in_rows(size.group), [test], self._weight)
         return least_squares.solve(train.merge(more), held, size.family.num_parameters)
 
     def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Images (n, 2d) of these rows, in the user's coordinates, by a fit to other rows; NaN
         where a step is not solved."""
-        family, given = self.in_rows(size.family), rows_of(self.data, self.chart, others)[0]
+        family = self.in_rows(size.family)
+        given, _ = weighted_rows_of(self.data, self.chart, others)
         train, held = (
             least_squares.reduce(family, [of], self._weight) for of in (given, self._held)
         )
@@ -383,15 +384,18 @@ class LinearSweep(Generates):
 
     def in_rows(self, family: Any) -> Any:
         """The family whose terms make the rows of this sweep."""
-        return of_rows(family)
+        return of_rows(family, weighted=self.data.weight is not None)
 
     def by_states(self, family, params, w, *args) -> tuple[np.ndarray, np.ndarray]:
         """The residual's derivatives in z₀ and z₁ (n, 2d, 2d), those ÷ their scale."""
+        of_row = 1.0
+        if self.data.weight is not None:
+            *args, of_row = (*args[:-1], args[-1][..., None])
         hessian = family.gradient_and_hessian(params, w, *args)[1]
         if self.data.own_dt is not None:
             hessian = args[0][..., None] * hessian
         of_point, of_target = self.of_states
-        by = self._weight[:, None] * (hessian @ of_point - of_target)
+        by = of_row * self._weight[:, None] * (hessian @ of_point - of_target)
         return by[..., : len(of_point)], by[..., len(of_point) :]
 
     @cached_property

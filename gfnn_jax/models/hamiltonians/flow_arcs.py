@@ -80,13 +80,14 @@ class FlowOnArcs:
 
 def fit_flow(
     model: FlowOnArcs, coefficients, arcs: Arcs, least, angles: tuple[int, ...] = (), *,
-    only_states: bool = False, gained: float = OPTIONS.gained, iterations: int = 30,
+    only_states: bool = False, relative: np.ndarray | float = 1.0,
+    gained: float = OPTIONS.gained, iterations: int = 30,
 ) -> Fitted | None:  # fmt: skip
     """Coefficients, states and noise, from coefficients that are close, or with these as they are
     (``only_states``). None where the flow fails. gained: as of the options; iterations: at most.
 
     least: (2d,) of what is left over, what is no noise. angles: coordinates that are measured
-    modulo 2π.
+    modulo 2π. relative: (A, L, 2d) the noise of each value, in parts of the usual one.
     """
     c = np.array(coefficients, float)
     y = _lifted(model, c, arcs, angles)
@@ -96,8 +97,8 @@ def fit_flow(
         return None
     given, free = (Known(model, c), c[:0]) if only_states else (model, c)
     found = fit_arcs(
-        given, free, x, y, noise, noise, max_iterations=iterations, tolerance=gained,
-        loss=BIWEIGHT, least=least,
+        given, free, x, y, noise * relative, noise, max_iterations=iterations,
+        tolerance=gained, loss=BIWEIGHT, least=least,
     )  # fmt: skip
     if not np.isfinite(found.cost):
         return None

@@ -211,7 +211,7 @@ def learned_from(
     fastest = rates(family, fit.coefficients, data.y0[some], data.given(some)[1])
     by_row = problem  # each at its own dt
     if data.own_dt is not None:  # the map's own dt, from which others follow
-        problem = Problem(data.y0, data.y1, data.dt, data.scale, args=data.args)
+        problem = Problem(data.y0, data.y1, data.dt, data.scale, args=data.args, weight=data.weight)
     steps = _cheapest(problem, family, fit, fastest, data, tolerance, options)
     steps = _resolving(family, fit.coefficients, steps, data, tolerance)
     contraction = contraction_of(fastest, data.dt, steps)
@@ -333,20 +333,21 @@ def covariance_root(found: FittedLaw, problem: Problem, data: Dataset, steps: St
     if structure is not None:
         most = structure.fewest(data.y0.shape[1])
     places, goes_on = looked_at(data.pairs, fit.used, most)
-    rows, scale = fit.used[places], problem.scale
+    rows = fit.used[places]
+    unit, scale = problem.unit(rows), problem.scale
     images = problem.images(found.family, fit.coefficients, rows, steps, derivatives=True)
     residual = images.states - data.y1[rows]
     if not np.isfinite(residual).all():  # of a flow that runs away from some of the states
         return np.full((count, count), np.nan)
-    slopes = images.by_coefficient / scale[:, None]
-    left, scores, states, noise = residual / scale, None, None, None
+    slopes = images.by_coefficient / unit[..., None]
+    left, scores, states, noise = residual / unit, None, None, None
     family = without_forces(found.family)
     if isinstance(family, Terms):  # of many coordinates both would take too much
         if goes_on.any():
             first = images.by_state * scale
             second = np.broadcast_to(-np.diag(scale), first.shape)
             scores = shared_noise.scores(
-                slopes, left, first / scale[:, None], second / scale[:, None], goes_on
+                slopes, left, first / unit[..., None], second / unit[..., None], goes_on
             )
             states = first, second, goes_on
         degree = int(np.max(np.sum(family.powers, axis=1)))
@@ -407,6 +408,11 @@ def _unmet(error: OneStepError, omega_h: float, tolerance, found: FittedLaw) -> 
             f"; it oscillates by {omega_h:.2g} radians in a step, and beyond π one dt does not "
             "tell H: sample with a shorter one"
         )
+    elif without_forces(found.family) is not found.family:
+        why = (
+            "; its friction is linear in the velocities, and may be of another kind, dry or "
+            "quadratic: the law of a Recording of the positions tells which"
+        )
     elif found.ended:
         why = f"; modes were added until {found.ended}"
     return (
@@ -436,18 +442,18 @@ def _messages(
         names = found.undetermined
         some = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
         yield (
-            f"the pairs do not determine {len(names)} terms of H ({some}): they are left "
-            "out, and H is known only where the pairs are"
+            f"the pairs do not determine {len(names)} terms of H ({some}): these terms are left "
+            "out, and H is known only near the pairs"
         )
     if left_out:
         yield (
-            f"the steps of the fit are too coarse for {left_out} of {len(found.rows)} pairs, as of "
-            "close passages: it goes without them"
+            f"{left_out} of {len(found.rows)} pairs move too fast for the steps by which H was "
+            "fitted, as in close passages: they were left out"
         )
     if unresolved:
         yield (
-            f"the steps of the flow are too coarse for {unresolved} of {len(data.validation)} "
-            "held-out pairs: there the map errs, and not H"
+            f"{unresolved} of {len(data.validation)} held-out pairs move too fast for the map's "
+            "steps, as in close passages: there the map errs, and not H"
         )
 
 

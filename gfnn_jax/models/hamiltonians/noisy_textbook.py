@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.budget import MATCHING, Allowance
-from gfnn_jax.dataset.arcs import Arcs
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.noise import of_differences
@@ -32,9 +31,11 @@ from gfnn_jax.models.hamiltonians.fractions import proposals
 from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
 from gfnn_jax.models.hamiltonians.symmetries import restricted
 from gfnn_jax.models.hamiltonians.whole_sequences import (
+    Measured,
     Sequences,
     Whole,
-    messages_of,
+    about_outliers,
+    noise_of,
     root_of,
     tells,
     triangle_of,
@@ -137,9 +138,9 @@ def _chosen(
     best = min(told, key=lambda law: law.length)
     judged = _fitted(sequences, held, best.formula, best.fitted.p, only_states=True)
     for found in (best.fitted, judged):
-        if found is None or not _rms(found.sigma / noise) <= _AS_NOISE:
+        if found is None or not _rms(noise_of(found) / noise) <= _AS_NOISE:
             for law in sorted(told, key=lambda law: law.length)[:3]:
-                left = _rms(law.fitted.sigma / noise)
+                left = _rms(noise_of(law.fitted) / noise)
                 say(f"H: a partial law leaves {left:.2g} times the noise over: {_shown(law)}")
             return None
     formula, fitted = best.formula, best.fitted
@@ -191,7 +192,7 @@ def _worth(formulas: list[Formula]) -> list[Formula]:
     return kept[:_FITTED]
 
 
-def _told(sequences: Sequences, arcs: Arcs, formula: Formula) -> _Told | None:
+def _told(sequences: Sequences, arcs: Measured, formula: Formula) -> _Told | None:
     """The terms of a law that whole sequences tell from noise, fitted to them."""
     p = np.concatenate([formula.coefficients, formula.constants])
     while True:
@@ -209,14 +210,14 @@ def _told(sequences: Sequences, arcs: Arcs, formula: Formula) -> _Told | None:
     formula = formula.with_constants(found.p[len(formula.coefficients) :])
     count = np.isfinite(found.residuals).sum(axis=(0, 1))
     length = float(
-        np.sum(count * np.log(found.sigma))
+        np.sum(count * np.log(noise_of(found)))
         + 0.5 * np.log(count.sum()) * len(found.p) + OPTIONS.said * formula.said
     )  # fmt: skip
     return _Told(formula, found, length)
 
 
 def _fitted(
-    sequences: Sequences, arcs: Arcs, formula: Formula, p: np.ndarray, **options: Any
+    sequences: Sequences, arcs: Measured, formula: Formula, p: np.ndarray, **options: Any
 ) -> Fitted | None:
     law = partial(FlowWithConstants, formula.family, terms=len(p) - len(formula.constants))
     return sequences.fitted(arcs, law, p, **options)
@@ -271,8 +272,8 @@ def _law(
     fit = problem.fit(family, c, data.training, rounds=False)
     fit = fit._replace(coefficients=c, standard_errors=deviations[:terms])
     whole = Whole(
-        tuple(range(terms)), fit, _root_of_coefficients(covariance, terms), fitted.sigma,
-        len(fitted.x), messages_of(fitted),
+        tuple(range(terms)), fit, _root_of_coefficients(covariance, terms), noise_of(fitted),
+        len(fitted.x), about_outliers(fitted.residuals),
     )  # fmt: skip
     error = validation_error(family, fit, data, tolerance)
     return FittedLaw(

@@ -100,7 +100,9 @@ def learn_hamiltonian(
         check_finite(own_terms(data, terms), data, data.training)
     most = options.max_operations if basis is None else options.mode_operations
     if not terms and scene is None:
-        problem = Problem(data.y0, data.y1, data.each_dt, data.scale, args=data.args)
+        problem = Problem(
+            data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
+        )
         own = LawWork(problem, budget, most, dearest)
         whole = law_of_sequences(problem, own, data, tolerance, say)
         if whole is not None:
@@ -114,7 +116,9 @@ def learn_hamiltonian(
     if arcs is not None:
         say(f"H: arcs of {arcs.length} steps, in which the states move far against their noise")
         data = arcs.data
-    problem = Problem(data.y0, data.y1, data.each_dt, data.scale, args=data.args)
+    problem = Problem(
+        data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
+    )
     work = LawWork(problem, budget, most, dearest)
     everywhere, free = data, (*data.coordinates.cyclic, *data.whole)
     if data.structure is None:
@@ -139,7 +143,9 @@ def learn_hamiltonian(
             best = with_masses._replace(noisy=True)
     everyone = np.arange(len(data))
     if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
-        raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
+        raise FitError(
+            "expected pairs of a flow: the H that was found moves faster than its steps follow"
+        )
     outside, what = None, ""
     try:
         if best.noisy:
@@ -166,7 +172,9 @@ def learn_hamiltonian(
     if arcs is not None:
         of_arcs = partial(covariance_root, best, problem, everywhere, best.fit.steps)
         everywhere = of_steps
-        problem = Problem(of_steps.y0, of_steps.y1, of_steps.dt, of_steps.scale)
+        problem = Problem(
+            of_steps.y0, of_steps.y1, of_steps.dt, of_steps.scale, weight=of_steps.weight
+        )
         best = best._replace(error=validation_error(best.family, best.fit, of_steps, tolerance))
     noisy = best.noisy or arcs is not None
     if noisy and best.error.bound > tolerance.bound:

@@ -30,6 +30,7 @@ _ROWS_PER_TERM = 200
 _STATES = 100  # from which the noise and its growth along an arc are measured
 _STEP_ERROR = 0.01  # of a step's own error ÷ the noise
 _IN_A_ROW = 2.5  # times the noise: neighbours of a state that stands alone stay below
+_IN_A_ROW = 2.5  # times the noise: neighbours of a state that stands alone stay below
 
 
 class Whole(NamedTuple):
@@ -43,6 +44,14 @@ class Whole(NamedTuple):
     noise: np.ndarray
     arcs: int
     messages: tuple[str, ...]
+
+
+class Measured(NamedTuple):
+    """Arcs of measured states, and the noise of each value in parts of the usual one, (A, L, 2d) or
+    1."""
+
+    arcs: Arcs
+    relative: np.ndarray | float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,23 +86,28 @@ class Sequences:
         least = max(resolved, float(np.finfo(float).eps)) * problem.scale
         return cls(data, steps, longest, least, allowance)
 
-    def arcs(self, rows: np.ndarray) -> Arcs | None:
+    def arcs(self, rows: np.ndarray) -> Measured | None:
         """Arcs of these rows; None where they say no more than their pairs do."""
-        rows, pairs = np.sort(rows), self.data.pairs
-        z0, z1 = np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows]
-        arcs = arcs_of_pairs(z0, z1, self.longest, onward(pairs, rows))
+        rows, pairs, weight = np.sort(rows), self.data.pairs, self.data.weight
+        onto = self.longest, onward(pairs, rows)
+        arcs = arcs_of_pairs(np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows], *onto)
         if arcs is None or np.median(arcs.measured.sum(axis=1)) <= _SHORTEST:
             return None
-        return arcs
+        if weight is None:
+            return Measured(arcs, 1.0)
+        each = 1.0 / weight[rows]
+        of_values = arcs_of_pairs(each, each, *onto)
+        assert of_values is not None
+        return Measured(arcs, np.nan_to_num(of_values.states, nan=1.0))
 
     def fitted(
-        self, arcs: Arcs, law: Callable[..., FlowOnArcs], p: np.ndarray, **options: Any
+        self, of: Measured, law: Callable[..., FlowOnArcs], p: np.ndarray, **options: Any
     ) -> Fitted | None:
         """The law with its numbers near p; law: makes the model of dt, steps, moves and allowance.
         options: of `flow_arcs.fit_flow`."""
+        arcs, angles = of.arcs, self.data.coordinates.angles
         model = law(dt=self.data.dt, how=self.steps, moves=arcs.moves, allowance=self.allowance)
-        angles = self.data.coordinates.angles
-        return fit_flow(model, p, arcs, self.least, angles, **options)
+        return fit_flow(model, p, arcs, self.least, angles, relative=of.relative, **options)
 
 
 def fitted_to_sequences(
@@ -110,13 +124,13 @@ def fitted_to_sequences(
     if train is None or held is None:
         return None
 
-    def fitted(arcs: Arcs, terms, coefficients) -> Fitted | None:
-        return sequences.fitted(arcs, partial(FlowOnArcs, terms), coefficients)
+    def fitted(of: Measured, terms, coefficients) -> Fitted | None:
+        return sequences.fitted(of, partial(FlowOnArcs, terms), coefficients)
 
     def left(terms, coefficients) -> float:
         """Noise of the held-out arcs, each from the state that suits it."""
         found = sequences.fitted(held, partial(FlowOnArcs, terms), coefficients, only_states=True)
-        return np.inf if found is None else float(np.linalg.norm(found.sigma / problem.scale))
+        return np.inf if found is None else float(np.linalg.norm(noise_of(found) / problem.scale))
 
     c = fit.coefficients
     before, found = left(family, c), fitted(train, family, c)
@@ -138,7 +152,7 @@ def fitted_to_sequences(
     return Whole(
         kept,
         fit._replace(coefficients=found.p, standard_errors=np.linalg.norm(root, axis=0)),
-        root, found.sigma, len(found.x), messages_of(found),
+        root, noise_of(found), len(found.x), about_outliers(found.residuals),
     )  # fmt: skip
 
 
@@ -146,6 +160,14 @@ def tells(found: Fitted, numbers: int) -> bool:
     """Return whether the arcs are so many for so many numbers of a law that it may be fitted to
     the held-out sequences too."""
     return _ROWS_PER_TERM * numbers <= triangle_of(found).rows
+
+
+def noise_of(found: Fitted) -> np.ndarray:
+    """(2d,): of noise of each value the root of the mean square over what was measured."""
+    if found.sigma.ndim == 1:
+        return found.sigma
+    return np.sqrt(np.nanmean(np.where(np.isfinite(found.residuals), found.sigma, np.nan) ** 2,
+                              axis=(0, 1)))  # fmt: skip
 
 
 def triangle_of(found: Fitted) -> Triangle:
@@ -164,12 +186,16 @@ def root_of(found: Fitted) -> np.ndarray:
     return root * np.sqrt(max(vary, 1.0))
 
 
-def messages_of(found: Fitted) -> tuple[str, ...]:
-    measured = np.isfinite(found.residuals).all(axis=-1)
-    outlying = np.any(np.abs(found.residuals) > OUTLYING, axis=-1)
+def about_outliers(residuals: np.ndarray) -> tuple[str, ...]:
+    """Message about measured states that the law misses by far: gross errors stand alone.
+
+    residuals: (arcs, L, 2d) in units of the noise.
+    """
+    measured = np.isfinite(residuals).all(axis=-1)
+    outlying = np.any(np.abs(residuals) > OUTLYING, axis=-1)
     if not outlying.any():
         return ()
-    beside = np.any(np.abs(found.residuals) > _IN_A_ROW, axis=-1)
+    beside = np.any(np.abs(residuals) > _IN_A_ROW, axis=-1)
     beside = np.pad(beside, ((0, 0), (1, 1)))
     alone = outlying & ~(beside[:, :-2] | beside[:, 2:])
     if 2 * alone.sum() < outlying.sum():

@@ -4,7 +4,8 @@ cost."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.arcs import LawOnArcs
 from gfnn_jax.models.lagrangians.structure import Key, Structure
-from gfnn_jax.solve.latent_arcs import SOFT_L1, Fitted, fit_arcs, sensitivities
+from gfnn_jax.solve.latent_arcs import SOFT_L1, Fitted, fit_arcs, rows_of_arcs, sensitivities
 
 _SETTLED = 1.15  # a noise scale that changed by less needs no second fit
 FOLDS = 3
@@ -49,13 +50,21 @@ class LawFit:
         return np.sqrt(np.nanmean(left**2, axis=(0, 1))) * self.sigma
 
 
+class Without(NamedTuple):
+    """A fit without a third of the record, and the run and the time at which that third begins."""
+
+    fit: LawFit
+    run: str
+    begins: float
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Workbench:
     """Basis that all fits of one recording share: positions of the gauge, the inputs of arcs, the
     fastest frequency ω, and how states are seen."""
 
     gauge: np.ndarray
-    inputs: Callable[[Arcs], np.ndarray]
+    inputs: Any  # of arcs: ArcInputs, or a function in its place
     omega: float
     seen: Observation
 
@@ -110,17 +119,33 @@ class Workbench:
         self, nodes: Sequence[Nodes], fit: LawFit, structure: Structure, known: Mapping[Key, float]
     ) -> np.ndarray:
         """Held-out cost (A,) of each arc: of three blocks of arcs, each left out of a fit. All in
-        the noise scale of ``fit``; infinite where a fit fails. Arcs are as long as those of the
-        fit, or as long as three of them can be."""
-        total = sum(len(n.t) for n in nodes)
-        length = min(fit.arcs.t.shape[1], total // FOLDS)
-        arcs = arcs_of(with_states(nodes, fit.arcs, fit.fitted.x), length)
-        fold = np.arange(len(arcs.home)) * FOLDS // len(arcs.home)
+        the noise scale of ``fit``; infinite where a fit fails."""
+        arcs, third = in_thirds(nodes, fit)
         costs = np.full(len(arcs.home), np.inf)
         for k in range(FOLDS):
-            some = self.fit(structure, known, arcs.take(fold != k), fit.sigma, rescale=False)
-            costs[fold == k] = self.held_out(some, arcs.take(fold == k))
+            some = self.fit(structure, known, arcs.take(third != k), fit.sigma, rescale=False)
+            costs[third == k] = self.held_out(some, arcs.take(third == k))
         return costs
+
+    def without_thirds(self, nodes: Sequence[Nodes], fit: LawFit) -> list[Without]:
+        """The fit without each third of the record, by one Gauss–Newton step from that to all of
+        it: close to a fit its residuals are linear in the coefficients."""
+        arcs, third = in_thirds(nodes, fit)
+        noise = fit.sigma * arcs.noise
+        known = self.model(fit.structure, arcs, fit.p, np.arange(0))
+        own = fit_arcs(known, np.zeros(0), arcs.x, arcs.y, noise, self.state_scale(fit.sigma), 15)
+        model = self.model(fit.structure, arcs, fit.p, np.arange(len(fit.p)))
+        rows = rows_of_arcs(model, fit.p, own.x, arcs.y, noise)
+        found = []
+        for k in np.unique(third):
+            i, first, _ = arcs.home[int(np.argmax(third == k))]
+            others = rows[third != k].reshape(-1, rows.shape[-1])
+            size = np.maximum(np.linalg.norm(others[:, :-1], axis=0), 1e-300)
+            change = np.linalg.lstsq(others[:, :-1] / size, others[:, -1], rcond=1e-10)[0] / size
+            fitted = dataclasses.replace(fit.fitted, p=fit.p + change)
+            moved = dataclasses.replace(fit, fitted=fitted)
+            found.append(Without(moved, nodes[i].stretch.run, float(nodes[i].t[first])))
+        return found
 
     def scores(self, fit: LawFit, candidates: Structure) -> dict[Key, float]:
         """Distance from zero, in standard errors, of each coefficient of ``candidates`` that the
@@ -145,6 +170,14 @@ class Workbench:
             z = rest[:, k] @ rest[:, -1] / size / np.sqrt(fit.correlation) if told_apart else 0.0
             scores[key] = float(abs(z))
         return scores
+
+
+def in_thirds(nodes: Sequence[Nodes], fit: LawFit) -> tuple[Arcs, np.ndarray]:
+    """Arcs of the nodes, and the third of the record (A,) that each lies in. They are as long as
+    those of the fit, or as long as three of them can be."""
+    length = min(fit.arcs.t.shape[1], sum(len(n.t) for n in nodes) // FOLDS)
+    arcs = arcs_of(with_states(nodes, fit.arcs, fit.fitted.x), length)
+    return arcs, np.arange(len(arcs.home)) * FOLDS // len(arcs.home)
 
 
 def correlation_time(residuals: np.ndarray) -> float:

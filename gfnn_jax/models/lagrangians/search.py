@@ -19,8 +19,10 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import LINEAR
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, which_friction
+from gfnn_jax.models.lagrangians.input_rules import Acting, choose_rule, with_delay
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.structure import Key, Loss, Structure
 from gfnn_jax.models.lagrangians.weak_start import protected, weak_start
@@ -46,12 +48,11 @@ class SearchOptions:
 
 
 class Found(NamedTuple):
-    """Findings of a search: the fit to the longest arcs, which friction and how sure that is, the
-    rule of the inputs between samples, and the nodes with their states."""
+    """Findings of a search: the fit to the longest arcs with the inputs as they act, which friction
+    and how sure that is, and the nodes with their states."""
 
-    fit: LawFit
+    acting: Acting
     choice: FrictionChoice
-    hold: str
     nodes: list[Nodes]
 
 
@@ -60,7 +61,7 @@ def search(
     scales: Scales,
     angles: tuple[int, ...],
     num_inputs: int,
-    inputs: Mapping[str, Callable],
+    inputs: Mapping[str, ArcInputs],
     seen: Observation,
     told: Callable[[str], object] = lambda line: None,
     options: SearchOptions = SearchOptions(),
@@ -98,17 +99,16 @@ def search(
         )
         if all(structure.terms != other.structure.terms for other in starts):
             arcs = arcs_of(nodes, length(options.periods[0]))
-            fits = {
-                hold: bench.fit(structure, known, arcs, scales.sigma)
-                for hold, bench in benches.items()
-            }
-            hold = min(fits, key=lambda hold: float(np.max(fits[hold].rms() / scales.sigma)))
-            benches = {hold: benches[hold]}  # inputs go on between samples as fits best
-            starts.append(fits[hold])
+            rule = choose_rule(benches, nodes, structure, known, arcs, scales.sigma, scales.dt)
+            benches = {rule.hold: rule.bench}  # inputs act so in the other libraries too
+            starts.append(rule.fit)
             told(f"{options.periods[0]:g} periods: {describe(starts[-1])}")
     if not starts:
-        raise FitError("no library of terms follows this recording: do its positions move freely?")
-    (hold, bench), *_ = benches.items()
+        raise FitError(
+            "no law of the terms tried follows this recording: is something missing that moves its "
+            "positions (an input, another position), or that stops them?"
+        )
+    (bench,) = benches.values()
     misfit = [
         float(np.max(start.rms() / scales.sigma)) if np.isfinite(start.fitted.cost) else np.inf
         for start in starts
@@ -144,7 +144,8 @@ def search(
     fit = prune(bench, nodes, fit, told, options, friction=False)
     if fit.structure != before:
         fit, choice = choose_friction(bench, nodes, fit, every.friction, told, options)
-    return Found(fit, choice, hold, with_states(nodes, fit.arcs, fit.fitted.x))
+    nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+    return Found(with_delay(bench, nodes, fit, scales.dt), choice, nodes)
 
 
 def describe(fit: LawFit) -> str:
