@@ -47,6 +47,8 @@ from gfnn_jax.solve.latent_arcs import Fitted
 
 _OPERATIONS = (2e8, 4e8, 8e8, 1.6e9)  # of a search, by degrees of freedom from 1
 _ORDER, _ALIKE = 6, 1.5  # of the differences that tell the noise, see `arcs`
+_LEAST = 3e-6  # of the spread: less noise than that is not what weak gradients leave over
+_LOOKED_AT = 20_000  # rows by which laws are compared
 _CERTAIN = 4.0  # standard errors below which a term is noise
 _BEHIND = 40.0  # natural logarithms of likelihood by which a law is behind that is not fitted
 _BROUGHT = 3.0  # of it, that further terms must bring
@@ -95,7 +97,7 @@ def law_of_sequences(
 
 def _stretches(data: Dataset) -> list[np.ndarray]:
     """States (L, 2d) of the training sequences without gaps, their angles going on over turns."""
-    rows = np.sort(data.training)
+    rows = np.sort(data.training)[:_LOOKED_AT]
     breaks = np.flatnonzero(~next_of(data.pairs, rows)) + 1
     moved = data.y1 - data.y0
     return [
@@ -112,7 +114,9 @@ def _noise_of(stretches: list[np.ndarray], scale: np.ndarray) -> np.ndarray | No
         if not any(len(own) > _ORDER for own in moves):
             return None
         found.append(of_differences(moves, _ORDER, _ALIKE))
-    return None if None in found else np.array(found, float) * scale
+    if None in found or min(found) < _LEAST:
+        return None
+    return np.array(found, float) * scale
 
 
 def _chosen(
@@ -126,13 +130,16 @@ def _chosen(
     )
     if sequences is None:
         return None
-    train, held = sequences.arcs(data.training), sequences.arcs(data.validation)
+    train = sequences.arcs(np.sort(data.training)[:_LOOKED_AT])
+    held = sequences.arcs(np.sort(data.validation)[:_LOOKED_AT])
     if train is None or held is None:
         return None
-    told = [
-        found for formula in _worth(formulas)
-        for found in [_told(sequences, train, formula)] if found is not None
-    ]  # fmt: skip
+    told: list[_Told] = []
+    for tried, formula in enumerate(_worth(formulas)):
+        found = _told(sequences, train, formula)
+        told += [] if found is None else [found]
+        if tried and not told:  # none of the likeliest two can be followed along its arcs
+            return None
     if not told:
         return None
     best = min(told, key=lambda law: law.length)

@@ -53,6 +53,7 @@ class Options:
 
 OPTIONS = Options()
 _LOOKED_AT = 30  # matches that are read as laws
+_FAR = 3.0  # deviations, beyond which a row has less weight
 
 
 class Formula(NamedTuple):
@@ -176,10 +177,13 @@ class NoisyTextbook:
         self._spanned = orthonormal(self._columns(self._base))
 
     def _deviations(self, formula: Formula) -> np.ndarray:
-        """(R, 2d) of the noise of the rows, as far as this law tells how states move them."""
-        family = formula.family(formula.constants)
-        hessian = family.gradient_and_hessian(formula.coefficients, self._weak.states)[1]
-        return self._weak.deviations(hessian)
+        """(R, 2d) of the noise of the rows, as far as this law tells how states move them; more
+        of those that it misses by far, as where an orbit turns too fast for a window's sums."""
+        family, c = formula.family(formula.constants), formula.coefficients
+        gradient, hessian = family.gradient_and_hessian(c, self._weak.states)
+        found = self._weak.deviations(hessian)
+        off = np.abs(self._weak.average(gradient) - self._weak.target) / found
+        return found * np.maximum(1.0, np.where(np.isfinite(off), off, np.inf) / _FAR)
 
     def _matches(self, products: bool) -> list[Match]:
         options = self._options
