@@ -60,7 +60,7 @@ class Biweight:
         return np.minimum(np.abs(residuals) / self.k, 1.0)
 
 
-def robust(values: np.ndarray, axis: int | None = None) -> np.ndarray:
+def robust(values: np.ndarray, axis: int | None = None) -> np.ndarray | np.floating:
     """The deviation of normal noise around 0, from the median of its size along the axis."""
     return _NORMAL * np.median(np.abs(values), axis=axis)
 
