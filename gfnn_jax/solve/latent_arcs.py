@@ -156,7 +156,7 @@ def fit_arcs(
 
     here = best = evaluate(p, x, _Units(sigma, state_scale, loss))
     damping, converged, iteration = 1e-4, False, 0
-    closed = _CLOSED * np.sqrt(x.size)
+    closed = float(_CLOSED * np.sqrt(x.size))
     while iteration < max_iterations:
         iteration += 1
         if not np.isfinite(here.cost):
@@ -220,21 +220,23 @@ def last_by_coefficients(
 
 
 def rows_of_arcs(
-    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
-) -> np.ndarray:
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
+    loss: Loss = SOFT_L1,
+) -> np.ndarray:  # fmt: skip
     """Rows (A, L, k, n + 1) of the coefficients and the residuals, weighted as robust loss has it,
     after each arc's own δx_0 was projected out: residuals − rows · δp are those of any other
     coefficients near p, each arc with the state that suits them best."""
-    (J, _), m = _linearised_at(model, p, x, y, sigma, SOFT_L1), x.shape[-1]
+    (J, _), m = _linearised_at(model, p, x, y, sigma, loss), x.shape[-1]
     Q = np.linalg.qr(J[..., :m])[0]
     return (J[..., m:] - Q @ (Q.swapaxes(1, 2) @ J[..., m:])).reshape(*y.shape, -1)
 
 
 def sensitivities(
-    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
-) -> np.ndarray:
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
+    loss: Loss = SOFT_L1,
+) -> np.ndarray:  # fmt: skip
     """The triangle (n + 1, n + 1) of `eliminated_rows`: what a test of coefficients needs."""
-    factor = np.asarray(np.linalg.qr(eliminated_rows(model, p, x, y, sigma), mode="r"))
+    factor = np.asarray(np.linalg.qr(eliminated_rows(model, p, x, y, sigma, loss), mode="r"))
     return np.concatenate([factor, np.zeros((factor.shape[1] - len(factor), factor.shape[1]))])
 
 

@@ -136,19 +136,20 @@ def fitted_to_sequences(
     before, found = left(family, c), fitted(train, family, c)
     if found is None or not left(family, found.p) <= _RISE * before:
         return None
-    kept = tuple(range(len(c)))
+    kept, widened = tuple(range(len(c))), 1.0
     few = significant(triangle_of(found), found.p, _CERTAIN)[0]
     if 0 < len(few) < len(c):
         fewer = family.take(tuple(few.tolist()))
         again = fitted(train, fewer, found.p[few])
         if again is not None and left(fewer, again.p) <= _RISE * before:
+            widened = _of_selection(triangle_of(found), found.p, few)
             kept, found, family = tuple(few.tolist()), again, fewer
     if tells(found, len(kept)):
         everyone = sequences.arcs(np.arange(len(data.y0)))
         again = fitted(everyone, family, found.p) if everyone is not None else None
         if again is not None:
             found = again
-    root = root_of(found)
+    root = widened * root_of(found)
     return Whole(
         kept,
         fit._replace(coefficients=found.p, standard_errors=np.linalg.norm(root, axis=0)),
@@ -176,6 +177,20 @@ def triangle_of(found: Fitted) -> Triangle:
     factor = found.factor.copy()
     factor[:, -1] *= -1
     return Triangle(factor, int((np.abs(found.residuals) < BIWEIGHT.k).sum()))
+
+
+def _of_selection(triangle: Triangle, c: np.ndarray, few: np.ndarray) -> float:
+    """Factor of the standard errors of these terms that stands for the others, which were dropped.
+
+    Terms that are no more than noise each may be more together: without them the sum of squares
+    rises by Δ, of mean n for n terms that are truly zero, with variance 2 n. What it exceeds n by,
+    and a standard deviation more, is a bias beside the k squares of the k coefficients' own error.
+    """
+    dropped = len(c) - len(few)
+    squares = triangle.rebased(c).pruned(few).spectrum().residual_norm ** 2
+    rise = squares - triangle.residual_norm(len(c)) ** 2
+    bias = max(rise - dropped, 0.0) + np.sqrt(2 * dropped)
+    return float(np.sqrt(1 + bias / len(few)))
 
 
 def root_of(found: Fitted) -> np.ndarray:

@@ -14,9 +14,11 @@ from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.arcs import LawOnArcs
 from gfnn_jax.models.lagrangians.structure import Key, Structure
-from gfnn_jax.solve.latent_arcs import SOFT_L1, Fitted, fit_arcs, rows_of_arcs, sensitivities
+from gfnn_jax.solve.latent_arcs import Fitted, fit_arcs, rows_of_arcs, sensitivities
 
 _SETTLED = 1.15  # a noise scale that changed by less needs no second fit
+_NOTHING = 1e-9  # of the largest singular value of scaled columns: a combination that does nothing
+_PART = 1e-3  # of the largest coefficient of a combination, that is part of it
 FOLDS = 3
 
 
@@ -43,6 +45,18 @@ class LawFit:
     def covariance(self) -> np.ndarray:
         """Covariance of p: that of white residuals, times their correlation time."""
         return self.fitted.covariance() * self.correlation
+
+    def untold(self) -> list[Key]:
+        """Coefficients of a combination that moves nothing, where there is one: as any two springs
+        without friction follow from Lagrangians of a whole family."""
+        R = self.fitted.triangle
+        size = np.linalg.norm(R, axis=0)
+        _, singular, across = np.linalg.svd(R / np.where(size > 0, size, 1.0))
+        if not len(singular) or singular[-1] > _NOTHING * singular[0]:
+            return []
+        part = np.abs(across[-1])
+        keys = self.structure.keys()
+        return [key for key, one in zip(keys, part, strict=True) if one > _PART * part.max()]
 
     def rms(self) -> np.ndarray:
         """Root mean square residual (k,), in units of the channels."""
@@ -97,7 +111,10 @@ class Workbench:
         model = self.model(structure, arcs, p, np.arange(len(p)))
         for _ in range(3 if rescale else 1):
             noise, scale = sigma * arcs.noise, self.state_scale(sigma)
-            found = fit_arcs(model, p, x, arcs.y, noise, scale, tolerance=1e-4 if rescale else 1e-3)
+            found = fit_arcs(
+                model, p, x, arcs.y, noise, scale, tolerance=1e-4 if rescale else 1e-3,
+                loss=self.seen.loss,
+            )  # fmt: skip
             p, x = found.p, found.x
             change = np.nanmedian(np.abs(found.residuals), axis=(0, 1)) / 0.6745
             change = np.maximum(change, 1e-3)
@@ -110,10 +127,11 @@ class Workbench:
         """The cost (A,) of arcs that the fit has not seen, with their own states."""
         model = self.model(fit.structure, arcs, fit.p, np.arange(0))
         noise, scale = fit.sigma * arcs.noise, self.state_scale(fit.sigma)
-        found = fit_arcs(model, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, 1e-3)
+        loss = self.seen.loss
+        found = fit_arcs(model, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, 1e-3, loss)
         if not np.isfinite(found.cost):
             return np.full(len(arcs.home), np.inf)
-        return np.nansum(SOFT_L1.of(found.residuals), axis=(1, 2))
+        return np.nansum(loss.of(found.residuals), axis=(1, 2))
 
     def cross_validate(
         self, nodes: Sequence[Nodes], fit: LawFit, structure: Structure, known: Mapping[Key, float]
@@ -131,11 +149,11 @@ class Workbench:
         """The fit without each third of the record, by one Gauss–Newton step from that to all of
         it: close to a fit its residuals are linear in the coefficients."""
         arcs, third = in_thirds(nodes, fit)
-        noise = fit.sigma * arcs.noise
+        noise, scale, loss = fit.sigma * arcs.noise, self.state_scale(fit.sigma), self.seen.loss
         known = self.model(fit.structure, arcs, fit.p, np.arange(0))
-        own = fit_arcs(known, np.zeros(0), arcs.x, arcs.y, noise, self.state_scale(fit.sigma), 15)
+        own = fit_arcs(known, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, loss=loss)
         model = self.model(fit.structure, arcs, fit.p, np.arange(len(fit.p)))
-        rows = rows_of_arcs(model, fit.p, own.x, arcs.y, noise)
+        rows = rows_of_arcs(model, fit.p, own.x, arcs.y, noise, loss)
         found = []
         for k in np.unique(third):
             i, first, _ = arcs.home[int(np.argmax(third == k))]
@@ -157,7 +175,7 @@ class Workbench:
         p = larger.start(known)
         model = self.model(larger, fit.arcs, p, np.arange(len(p)))
         noise = fit.sigma * fit.arcs.noise
-        R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise)
+        R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, self.seen.loss)
         old = [keys.index(k) for k in known]
         own = [keys.index(k) for k in new]
         Q = np.linalg.qr(R[:, old])[0] if old else np.zeros((len(R), 0))

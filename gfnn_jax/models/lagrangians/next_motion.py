@@ -48,7 +48,7 @@ def next_motions(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[M
     keys = larger.keys()
     p, noise = larger.start(fit.values), fit.sigma * fit.arcs.noise
     model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
-    R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise)[:, :-1]
+    R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, bench.seen.loss)[:, :-1]
     own = [k for k, key in enumerate(keys) if key in known]
     Q = np.linalg.qr(R[:, own])[0]
     rest = np.linalg.norm(R - Q @ (Q.T @ R), axis=0)
