@@ -41,7 +41,7 @@ from gfnn_jax.models.lagrangians.learned_law import (
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.next_motion import Motion, next_motions
 from gfnn_jax.models.lagrangians.residuals import Trace, whiteness
-from gfnn_jax.models.lagrangians.search import SearchOptions, search
+from gfnn_jax.models.lagrangians.search import SearchOptions, describe, search
 from gfnn_jax.models.lagrangians.text import (
     Expression,
     Term,
@@ -107,6 +107,12 @@ def fit_recording(
     fit, inputs_of = acting.fit, acting.bench.inputs
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
         raise FitError("no law of the terms tried follows this recording from sample to sample")
+    finer = scales.substeps_for(fit.sigma)  # local cubics may have seen more noise than there is
+    if finer > scales.substeps:
+        inputs_of = ArcInputs(nodes, finer, acting.hold, acting.delay)
+        bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
+        fit = bench.fit(fit.structure, fit.values, fit.arcs, fit.sigma)
+        told(f"{finer} steps between nodes: {describe(fit)}")
     speeds = velocities(recording, fit, nodes)
     honest = tuple(name for name, one in speeds.items() if one.used)
     for name, one in speeds.items():
@@ -418,11 +424,11 @@ def _alike(fit: LawFit, lagrangian: Expression, friction: Expression) -> tuple[s
         correlation = covariance / scale / scale[:, None]
     texts = dict(zip(fit.structure.terms, (t.term for t in lagrangian.terms), strict=True))
     texts |= dict(zip(fit.structure.friction, (t.term for t in friction.terms), strict=True))
-    names = [texts.get(key[1], " ".join(map(str, key))) for key in fit.values]
-    return tuple(
-        f"{names[i]} and {names[j]} ({correlation[i, j]:+.3f})"
-        for i, j in zip(*np.nonzero(np.triu(np.abs(correlation) > _ALIKE, 1)), strict=True)
-    )
+    names = {key: texts.get(key[1], " ".join(map(str, key))) for key in fit.values}
+    listed, together = list(names.values()), [names[key] for key in fit.untold()]
+    pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > _ALIKE, 1)), strict=True)
+    only = (f"{', '.join(together)}: only together",) if together else ()
+    return only + tuple(f"{listed[i]} and {listed[j]} ({correlation[i, j]:+.3f})" for i, j in pairs)
 
 
 def _energy(

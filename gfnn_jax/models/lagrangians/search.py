@@ -27,6 +27,8 @@ from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.structure import Key, Loss, Structure
 from gfnn_jax.models.lagrangians.weak_start import protected, weak_start
 
+_AS_WELL = 1.01  # times the cost, with which a law follows the record as well
+
 
 @dataclasses.dataclass(frozen=True)
 class SearchOptions:
@@ -161,8 +163,10 @@ def prune(
     friction: bool = True,
 ) -> LawFit:  # fmt: skip
     """The fit without terms that are not seen, the least seen first, as long as held-out arcs do
-    not lose; and, unless ``friction`` has been chosen, without that which would drive."""
+    not lose; and, unless ``friction`` has been chosen, without that which would drive. First, of
+    terms that the record tells only together, without one."""
     refused: set[Key] = set()
+    fit = told_apart(bench, fit, told)
     costs = None
     while True:
         z = significance(fit)
@@ -184,6 +188,22 @@ def prune(
         told(f"  without {key}: {z[key]:.1f} standard errors")
         arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
         fit, costs = bench.fit(smaller, fit.values, arcs, fit.sigma), None
+
+
+def told_apart(bench: Workbench, fit: LawFit, told: Callable) -> LawFit:
+    """The fit without the first term, kinetic ones before others, of each combination that moves
+    nothing; which costs nothing."""
+    fixed = protected(fit.structure)
+    while untold := [k for k in fit.untold() if k[0] == "term" and k not in fixed]:
+        smaller = fit.structure.without({untold[0]})
+        arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+        without = bench.fit(smaller, fit.values, arcs, fit.sigma, rescale=False)
+        if without.fitted.cost > _AS_WELL * fit.fitted.cost:  # its zero is out of reach
+            fixed = fixed | {untold[0]}
+            continue
+        told(f"  without {untold[0]}: told only together with {untold[1:]}")
+        fit = without
+    return fit
 
 
 def significance(fit: LawFit) -> dict[Key, float]:

@@ -103,7 +103,7 @@ class WhichFriction:
         text = "+".join(self.kinds) or "none"
         if self.odds:
             rival = min(self.odds, key=lambda name: self.odds[name])
-            text += f", odds {_odds(self.odds[rival])} against {rival}"
+            text += f", odds {odds_text(self.odds[rival])} against {rival}"
         seen = [f"{_pretty(term)} < {limit:.2g}" for term, limit in self.limits.items()]
         return text + (f"; not seen: {', '.join(seen)}" if seen else "")
 
@@ -168,7 +168,7 @@ def _sum(parts: Any) -> str:
     return text
 
 
-def _odds(odds: float) -> str:
+def odds_text(odds: float) -> str:
     """12 : 1, 1 : 3; those above a million are not told apart."""
     if odds >= 1e6:
         return "> 10⁶ : 1"
