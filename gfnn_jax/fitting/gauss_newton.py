@@ -103,11 +103,10 @@ class Problem:
         allowance: Allowance = UNBOUNDED,
     ):  # fmt: skip
         self.z0, self.z1, self.dt, self.scale, self.args = z0, z1, dt, scale, args
-        self.weight = weight
-        self.options, self.allowance = options, allowance
+        self.weight, self.options, self.allowance = weight, options, allowance
 
     def unit(self, rows) -> np.ndarray:
-        """What residuals of these rows are divided by: (2d,), or (n, 2d) of weighted ones."""
+        """Divisors of the residuals of these rows: (2d,), or (n, 2d) of weighted ones."""
         return self.scale if self.weight is None else self.scale / self.weight[rows]
 
     def given(self, rows) -> tuple[Any, Any]:

@@ -263,6 +263,7 @@ def fit(
     *,
     options: FitOptions | None = None,
     clock: Callable[[], float] = time.perf_counter,
+    spent: float = 0.0,
     checkpoints: Any = None,
     factors: Any = None,
     on_progress: Callable[[str], Any] = lambda message: None,
@@ -284,7 +285,8 @@ def fit(
                learn="map" ask for.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
     options:   a `FitOptions`, which the keywords below change; None: its defaults.
-    clock:     gives the seconds that max_seconds is held against.
+    clock:     gives the seconds that max_seconds is held against. spent: seconds of them that are
+               gone already, as on reading files.
     checkpoints, factors: a ``TrainingCheckpoints`` and a ``KeptFactors``, which an interrupted fit
                has saved to and the same fit goes on from.
     on_progress, on_candidate: called with what is being done, and with every candidate.
@@ -307,7 +309,7 @@ def fit(
         )  # fmt: skip
     if options.loss is not None:
         raise FitError("a loss is of a recording whose law is learned: expected none of pairs")
-    budget = options.budget(clock, pairs.dim if isinstance(pairs, Pairs) else None)
+    budget = options.budget(clock, pairs.dim if isinstance(pairs, Pairs) else None, spent)
     require_x64("a fit")
     messages: list[str] = []
 

@@ -205,7 +205,8 @@ class FitOptions:
     ))  # fmt: skip
     friction: str = field(default="auto", metadata=_about(
         _TEXT,
-        "of a recording: auto, none, linear, quadratic, dry, or some joined by +", "KIND", FIT,
+        "of a recording: auto, none, linear, quadratic, dry, uniform, several joined by +", "KIND",
+        FIT,
     ))  # fmt: skip
     input_hold: str = field(default="auto", metadata=_about(
         _one_of("auto", "hold", "linear", "band"),
@@ -267,10 +268,13 @@ class FitOptions:
         values = {name: getattr(self, name) for name, about in OPTIONS.items() if about.decides}
         return {n: list(v) if isinstance(v, (tuple, list)) else v for n, v in values.items()}
 
-    def budget(self, clock: Callable[[], float], dim: int | None) -> Budget:
-        """Start the budget of a fit whose map has ``dim`` degrees of freedom."""
+    def budget(
+        self, clock: Callable[[], float], dim: int | None, spent: float = 0.0
+    ) -> Budget:  # fmt: skip
+        """Start the budget of a fit whose map has ``dim`` degrees of freedom, ``spent`` seconds
+        ago."""
         seconds = seconds_allowed(self.max_seconds, self.max_operations)
-        return Budget(seconds, self.max_operations, clock, dim)
+        return Budget(seconds, self.max_operations, clock, dim, spent)
 
 
 OPTIONS: dict[str, About] = {f.name: f.metadata["about"] for f in dataclasses.fields(FitOptions)}

@@ -17,7 +17,7 @@ import numpy as np
 from gfnn_jax.data.channels import channels_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.lagrangian import Lagrangian
+from gfnn_jax.families.lagrangian import UNIFORM, Friction, Lagrangian
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import at_stages
 from gfnn_jax.maps.laws import law_of_map
@@ -61,12 +61,18 @@ class Law(NamedTuple):
 
 
 def law_in_use(law: Lagrangian, root: np.ndarray | None, sensors: Sensors) -> Law:
-    """Prepare a Lagrangian without uniform friction and the root (m, n) of the covariance of (θ, ρ,
-    G)."""
-    count = law.terms.count
-    form = Form(law.terms, np.zeros(count), np.eye(count), law.friction, law.num_inputs)
-    p = np.concatenate([law.coefficients, law.losses, np.ravel(law.gains)])
-    return Law(form, p, np.zeros((0, len(p))) if root is None else np.asarray(root), sensors)
+    """Prepare a Lagrangian and the root (m, n) of the covariance of (θ, ρ, G), and of γ where there
+    is uniform friction."""
+    count, rows, losses = law.terms.count, law.friction.rows(), law.losses
+    order = np.arange(count + law.friction.count + law.gains.size)
+    if law.uniform != 0:  # γ, the last of all, stands behind ρ in a form
+        rows, losses = [*rows, ((0,) * law.dim, UNIFORM, 0.0)], np.append(losses, law.uniform)
+        order = np.insert(order, count + law.friction.count, len(order))
+    friction = Friction.of(rows, law.dim)
+    form = Form(law.terms, np.zeros(count), np.eye(count), friction, law.num_inputs)
+    p = np.concatenate([law.coefficients, losses, np.ravel(law.gains)])
+    known = np.zeros((0, len(p))) if root is None else np.asarray(root)[:, order]
+    return Law(form, p, known, sensors)
 
 
 def law_of(map_: Any) -> Law:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.coordinates import Coordinates, lift
-from gfnn_jax.families.lagrangian import DRY, Lagrangian
+from gfnn_jax.families.lagrangian import DRY, LINEAR, Lagrangian
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre, family_of, law_of
@@ -82,6 +82,25 @@ def sticking(law: Lagrangian, noise: float, duration: float) -> Lagrangian:
     friction = law.friction
     widths = np.where(friction.kinds == DRY, noise / duration, friction.widths)
     return dataclasses.replace(law, friction=dataclasses.replace(friction, widths=widths))
+
+
+def conformal(law: Lagrangian, covariance: np.ndarray) -> tuple[Lagrangian, np.ndarray]:
+    """The same law with its friction as uniform friction, where one degree of freedom has constant
+    mass m and R = ½ρv² alone: γ = ρ/m; and the covariance (n, n) of (θ, γ), from that of (θ, ρ).
+    Its map keeps a multiple of the symplectic form. Any other law as it is."""
+    rows = law.terms.rows()
+    moved = [(k, n, m) for k, n, m, _ in rows if any(k)]
+    plain = all(sum(k) == 2 and not any(n) and not any(m) for k, n, m in moved)
+    alone = [row[1] for row in law.friction.rows()] == [LINEAR] and law.uniform == 0
+    if law.dim > 1 or law.num_inputs or not plain or not alone:
+        return law, covariance
+    mass = 2 * sum(c for c, row in zip(law.coefficients, rows, strict=True) if any(row[0]))
+    by = np.append(np.ones(law.terms.count), 1 / mass)
+    even = dataclasses.replace(
+        law, friction=law.friction.take([]), losses=law.losses[:0],
+        uniform=float(law.losses[0]) / mass,
+    )  # fmt: skip
+    return even, by[:, None] * covariance * by
 
 
 def law_of_map(map_: SymplecticMap) -> Lagrangian:

@@ -17,6 +17,8 @@ from gfnn_jax.models.lagrangians.structure import Key, Structure
 from gfnn_jax.solve.latent_arcs import Fitted, fit_arcs, rows_of_arcs, sensitivities
 
 _SETTLED = 1.15  # a noise scale that changed by less needs no second fit
+_NOTHING = 1e-9  # of the largest singular value of scaled columns: a combination that does nothing
+_PART = 1e-3  # of the largest coefficient of a combination, that is part of it
 FOLDS = 3
 
 
@@ -43,6 +45,18 @@ class LawFit:
     def covariance(self) -> np.ndarray:
         """Covariance of p: that of white residuals, times their correlation time."""
         return self.fitted.covariance() * self.correlation
+
+    def untold(self) -> list[Key]:
+        """Coefficients of a combination that moves nothing, where there is one: as any two springs
+        without friction follow from Lagrangians of a whole family."""
+        R = self.fitted.triangle
+        size = np.linalg.norm(R, axis=0)
+        _, singular, across = np.linalg.svd(R / np.where(size > 0, size, 1.0))
+        if not len(singular) or singular[-1] > _NOTHING * singular[0]:
+            return []
+        part = np.abs(across[-1])
+        keys = self.structure.keys()
+        return [key for key, one in zip(keys, part, strict=True) if one > _PART * part.max()]
 
     def rms(self) -> np.ndarray:
         """Root mean square residual (k,), in units of the channels."""

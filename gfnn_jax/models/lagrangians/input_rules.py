@@ -1,5 +1,5 @@
-"""How the inputs of a record act: what they do between their samples, and how much later than they
-were measured.
+"""Actions of the inputs of a record: what they do between their samples, and how much later than
+they were measured.
 
 A fit's residuals are linear in a small delay τ as they are in the coefficients:
 

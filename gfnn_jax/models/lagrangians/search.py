@@ -16,7 +16,7 @@ import numpy as np
 
 from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of, with_states
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
@@ -26,6 +26,8 @@ from gfnn_jax.models.lagrangians.input_rules import Acting, choose_rule, with_de
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.structure import Key, Loss, Structure
 from gfnn_jax.models.lagrangians.weak_start import protected, weak_start
+
+_AS_WELL = 1.01  # times the cost, with which a law follows the record as well
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,8 +163,10 @@ def prune(
     friction: bool = True,
 ) -> LawFit:  # fmt: skip
     """The fit without terms that are not seen, the least seen first, as long as held-out arcs do
-    not lose; and, unless ``friction`` has been chosen, without that which would drive."""
+    not lose; and, unless ``friction`` has been chosen, without that which would drive. First, of
+    terms that the record tells only together, without one."""
     refused: set[Key] = set()
+    fit = told_apart(bench, fit, told)
     costs = None
     while True:
         z = significance(fit)
@@ -184,6 +188,22 @@ def prune(
         told(f"  without {key}: {z[key]:.1f} standard errors")
         arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
         fit, costs = bench.fit(smaller, fit.values, arcs, fit.sigma), None
+
+
+def told_apart(bench: Workbench, fit: LawFit, told: Callable) -> LawFit:
+    """The fit without the first term, kinetic ones before others, of each combination that moves
+    nothing; which costs nothing."""
+    fixed = protected(fit.structure)
+    while untold := [k for k in fit.untold() if k[0] == "term" and k not in fixed]:
+        smaller = fit.structure.without({untold[0]})
+        arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+        without = bench.fit(smaller, fit.values, arcs, fit.sigma, rescale=False)
+        if without.fitted.cost > _AS_WELL * fit.fitted.cost:  # its zero is out of reach
+            fixed = fixed | {untold[0]}
+            continue
+        told(f"  without {untold[0]}: told only together with {untold[1:]}")
+        fit = without
+    return fit
 
 
 def significance(fit: LawFit) -> dict[Key, float]:
@@ -260,6 +280,8 @@ def choose_friction(
 def frictions_tried(dim: int, scales: Scales, options: SearchOptions) -> tuple[Loss, ...]:
     """Friction of all the kinds that are asked for, in every direction."""
     kinds = tuple(libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions)
+    if dim == 1 and len(kinds) > 1:  # linear friction is uniform there
+        kinds = tuple(kind for kind in kinds if kind != UNIFORM)
     rows = libraries.losses(dim, kinds, options.dry_width * float(np.mean(scales.speed)))
-    turned = (libraries.opposite(row) for row in rows)
-    return (*rows, *(row for row in turned if row is not None))
+    turned = [one for one in map(libraries.opposite, rows) if one is not None]
+    return tuple(sorted((*rows, *turned), key=lambda row: row[1] == UNIFORM))
