@@ -5,9 +5,9 @@ stands where it has to. Of a ratio near one its distance from one is halved and 
 the RMS of one step on fresh states ÷ spread, cost the operations of a step of the chosen map; both
 relative to those of the constants as they are.
 
-The parity of S in three degrees of freedom and more (`sweeps.is_even`) is a guess from held-out
-residuals, made where terms are scarce: the second piece has it tested, always assumed and never
-assumed, on even and other laws.
+The parity of S in three degrees of freedom and more (`generating_functions/parity.py`) is a guess
+from held-out residuals, made where terms are scarce: the second piece has it tested, always assumed
+and never assumed, on even and other laws.
 
     python benchmarks/constants.py [--only halved-and-doubled,parity]
 """
@@ -293,8 +293,8 @@ def parity(quick: bool) -> harness.Numbers:
             row = {}
             # with_odd ≥ gain × without: of 0 it always holds, of infinity never.
             for rule, gain in (("tested", None), ("always", 0.0), ("never", np.inf)):
-                value = value_of(f"{S}.sweeps", "_NO_GAIN") if gain is None else gain
-                with set_to(f"{S}.sweeps", "_NO_GAIN", value):
+                value = value_of(f"{S}.parity", "OPTIONS.no_gain") if gain is None else gain
+                with set_to(f"{S}.parity", "OPTIONS.no_gain", value):
                     out = learned(
                         system, pairs_of(system, count), learn="map", family="polynomial",
                         tolerance=1e-7,
