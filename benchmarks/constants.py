@@ -167,7 +167,7 @@ CONSTANTS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("search.search", "_WORTHWHILE", ("clean", "noisy")),
     ("search.search", "_STALLED", ("noisy",)),
     ("search.search", "_NO_WORSE", ("noisy",)),
-    ("search.search", "AS_FAR", ("noisy",)),
+    ("search.search", "COMPARABLE", ("noisy",)),
     ("search.search", "_FAR", ("clean", "few")),
     ("search.extrapolate", "_GAINED", ("clean", "noisy")),
     ("search.extrapolate", "_FARTHEST", ("clean", "two")),

@@ -65,7 +65,7 @@ class Size:
 
     family: Any
     group: Any  # the largest family that is judged from the same factor
-    extent: float  # the logarithm of the error falls in proportion: a degree, or log₂ of a number
+    order: float  # the logarithm of the error falls in proportion: a degree, or log₂ of a number
 
     @property
     def operations(self) -> float:
@@ -266,13 +266,13 @@ class LinearSweep(Generates):
         seconds = judged.fit_seconds + time.perf_counter() - started
         return dataclasses.replace(candidate, fit_seconds=seconds)
 
-    def at(self, extent: float) -> str:
-        """Describe the size of this extent: its terms, and how many pairs they take."""
+    def at(self, order: float) -> str:
+        """Describe the size of this order: its terms, and how many pairs they take."""
         family = self.sizes[0].family
         if not hasattr(family, "degree"):
-            label = f"{family.name} {(terms := round(2**extent))}"
+            label = f"{family.name} {(terms := round(2**order))}"
         else:
-            degree = round(extent)
+            degree = round(order)
             label = f"{self._prefix}{family.name} {degree}"
             terms = family.terms_of(degree)
         fitted = len(self._train[0]) + len(self.data.test)
@@ -327,7 +327,7 @@ class LinearSweep(Generates):
         images = data.whole_image(np.where(known[:, None], images, np.nan), rows)
         return to_user(data.coordinates, images)
 
-    def left_over(self, size: Size) -> np.ndarray:
+    def residuals(self, size: Size) -> np.ndarray:
         """(N, 2d): what the size leaves of ∇S of every pair, unit-free as train_rms."""
         _, params = self.solve(size, Budget(), lambda message: None)
         (w, target, *args), weight = rows_of(self.data, self.chart, slice(None))
