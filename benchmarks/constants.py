@@ -275,12 +275,15 @@ def halved_and_doubled(quick: bool) -> harness.Numbers:
 
 
 def shown(row: dict[str, Any]) -> str:
-    """What changed, in words."""
-    moves = [
-        f"{case} error {r['error']:.2g}, cost {r['cost']:.2g}"
-        for case, r in row.items()
-        if isinstance(r, dict) and not (0.99 < r["error"] < 1.01 and 0.99 < r["cost"] < 1.01)
-    ]
+    """What changed, in words; a file holds None for a number that is not finite."""
+    moves = []
+    for case, found in row.items():
+        if not isinstance(found, dict):
+            continue
+        if found["error"] is None or not np.isfinite(found["error"]):
+            moves.append(f"{case} fails")
+        elif not all(0.99 < found[what] < 1.01 for what in ("error", "cost")):
+            moves.append(f"{case} error {found['error']:.2g}, cost {found['cost']:.2g}")
     return "; ".join(moves) or "nothing changes"
 
 
