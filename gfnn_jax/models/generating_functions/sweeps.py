@@ -206,7 +206,7 @@ class LinearSweep(Generates):
         self._groups, self._determining = groups, rows
         self.sizes = [
             Size(family, group[-1], _extent(family))
-            for group in _determined(groups(), rows) for family in group
+            for group in _determined(groups(), rows, _ROWS_PER_TERM) for family in group
         ]  # fmt: skip
         # Else the last size is the largest there is, or the most terms are reached.
         self.short_of_pairs = len(self.sizes) < known and rows < _ROWS_PER_TERM * _MOST_TERMS
@@ -591,7 +591,8 @@ def trial_residual(data: Dataset) -> float:
         w, angles=tuple(a for a in coordinates.angles if a < data.dim),
         cyclic=coordinates.cyclic,
     )  # fmt: skip
-    groups = list(_determined(([Products(inputs, degree)] for degree in _TRIAL), w.size // 2))
+    trials = ([Products(inputs, degree)] for degree in _TRIAL)
+    groups = list(_determined(trials, w.size // 2, _ROWS_PER_TERM))
     family = groups[-1][0] if groups else Products(inputs, 1)
     train, held = (
         least_squares.reduce(family, [(w[rows], target[rows])], weight)
@@ -605,9 +606,7 @@ def _of_time_step(inputs, degree: int, signs=None) -> OfTimeStep:
     return OfTimeStep(Products(inputs, degree, signs))
 
 
-def _determined(
-    groups: Iterable[Iterable[Any]], rows: int, each: float = _ROWS_PER_TERM
-) -> Iterator[list[Any]]:
+def _determined(groups: Iterable[Iterable[Any]], rows: int, each: float) -> Iterator[list[Any]]:
     """The families, group by group, whose terms so many rows determine, ``each`` for a term.
 
     Sizes rise, so the first that is too large is the last that is looked at: in many dimensions the
