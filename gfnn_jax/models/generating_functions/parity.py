@@ -1,4 +1,4 @@
-"""Whether S is even, S(−w) = S(w), as the S of a law that is even in (q, p) is.
+"""The parity of S: S(−w) = S(w) for the S of a law that is even in (q, p).
 
 An even S has half the terms. Where terms are scarce that is guessed from held-out residuals.
 """
