@@ -22,11 +22,11 @@ from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.phase_space import sizes, split, symplectic_form
+from gfnn_jax.phase_space import sizes, split
 
 _STAGES, _SUBSTEPS = (3, 4, 6, 8), (1, 2, 4, 8, 16, 32)  # that are tried, by rising order
 # h × the fastest rate of a substep: of what fixed-point iterations solve, and Newton's method.
-_CONTRACTING, _STIFFEST = 1.0, 30.0
+_CONTRACTING, STIFFEST = 1.0, 30.0
 _JUDGED = 64  # states whose step tells the error of these
 _NEARLY = 0.95  # of them, whose steps are to be within the tolerance
 
@@ -103,6 +103,15 @@ def conformal(law: Lagrangian, covariance: np.ndarray) -> tuple[Lagrangian, np.n
     return even, by[:, None] * covariance * by
 
 
+def stiffness(law: Lagrangian, q: np.ndarray) -> float:
+    """The fastest rate at which dry friction brings bodies to rest at positions q (n, d), 1/time;
+    0 without dry friction."""
+    if not np.any(law.friction.kinds == DRY):
+        return 0.0
+    rates = np.linalg.solve(law.masses(q), law.losses_by_v(0 * q))
+    return float(np.abs(np.linalg.eigvals(rates)).max())
+
+
 def law_of_map(map_: SymplecticMap) -> Lagrangian:
     """The law whose flow the map is. Raises ValueError for any other map."""
     piece = map_.pieces[0]
@@ -128,14 +137,8 @@ def _steps(law: Lagrangian, family, params, z, dt: float, scale, args, tolerance
     """The cheapest steps whose own error is within the tolerance at nearly all of these states;
     and whether Newton's method is to solve them: where dry friction is stiff, whose force turns
     over within ε, and no more than Newton's method bears in a substep."""
-    stiffness = 0.0
-    if np.any(law.friction.kinds == DRY):
-        q = split(z)[0]
-        resting = np.concatenate([q, law.momentum(q, 0 * q)], axis=1)
-        slopes = family.gradient_and_hessian(params, resting, args)[1]
-        turned = symplectic_form(law.dim) @ slopes
-        stiffness = dt * np.abs(np.linalg.eigvals(turned)).max()
-    fewest, stiff = stiffness / _STIFFEST, bool(stiffness > _CONTRACTING)
+    turned = dt * stiffness(law, split(z)[0])
+    fewest, stiff = turned / STIFFEST, bool(turned > _CONTRACTING)
     finest = Steps(_STAGES[-1], 2 * _SUBSTEPS[-1])
     reference = images(family, params, z, dt, finest, args=args).states
     steps = Steps(_STAGES[-1], _SUBSTEPS[-1], stiff)
