@@ -393,6 +393,8 @@ def _summarise(ran: Any, out: Path) -> None:
     )
     if report["hamiltonian"] is not None:
         print(law_line(report))
+        for note in report["hamiltonian"]["notes"]:
+            print(note)
         for loss in report["hamiltonian"]["friction"]:
             print(f"{loss['term']}: {loss['coefficient']:.6g} ± {loss['std']:.1g}")
     print(fit["ended"])

@@ -10,7 +10,15 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, Friction, Lagrangian, Terms
+from gfnn_jax.families.lagrangian import (
+    DRY,
+    LINEAR,
+    QUADRATIC,
+    UNIFORM,
+    Friction,
+    Lagrangian,
+    Terms,
+)
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import at_stages, interpolate
 from gfnn_jax.jobs.forecast import forecast_recording
@@ -29,17 +37,18 @@ def pendulum(gamma=0.05, noise=1e-3, end=40.0, dt=0.05, amplitude=1.2):
     return t, found.y[0] + noise * np.random.default_rng(0).normal(size=len(t))
 
 
-def chain(noise=1e-3, runs=3, end=12.0, dt=0.02):
-    """A double pendulum with linear friction, by SciPy from its own equations of motion."""
+def chain(noise=1e-3, runs=3, end=12.0, dt=0.02, uniform=0.0):
+    """A double pendulum with linear friction, or with uniform friction, by SciPy from its own
+    equations of motion."""
+    linear = np.array([0.03, 0.02]) if uniform == 0 else np.zeros(2)
     tables, rng = [], np.random.default_rng(1)
 
     def rate(_, x):
         (q1, q2), v = x[:2], x[2:]
         c, s = np.cos(q1 - q2), np.sin(q1 - q2)
         M = np.array([[1.0, 0.4 * c], [0.4 * c, 0.5]])
-        force = [-0.4 * s * v[1] ** 2 - 20 * np.sin(q1) - 0.03 * v[0],
-                 0.4 * s * v[0] ** 2 - 8 * np.sin(q2) - 0.02 * v[1]]  # fmt: skip
-        return [*v, *np.linalg.solve(M, force)]
+        force = [-0.4 * s * v[1] ** 2 - 20 * np.sin(q1), 0.4 * s * v[0] ** 2 - 8 * np.sin(q2)]
+        return [*v, *np.linalg.solve(M, force - linear * v - uniform * M @ v)]
 
     t = np.arange(0, end, dt)
     for run in range(runs):
@@ -107,9 +116,11 @@ def test_steps_have_the_derivatives_of_finite_differences():
     rows = [((2, 0), (0, 0), (0, 0), 0.0), ((1, 1), (0, 0), (1, -1), 0.0),
             ((0, 2), (1, 1), (0, 0), 0.0), ((0, 2), (0, 0), (0, 0), 0.0),
             ((0, 0), (0, 0), (1, 0), 0.2)]  # fmt: skip
-    friction = Friction.of([((1, 0), LINEAR, 0), ((-1, 1), QUADRATIC, 0), ((0, 1), DRY, 0.2)], 2)
+    friction = [((1, 0), LINEAR, 0), ((-1, 1), QUADRATIC, 0), ((0, 1), DRY, 0.2),
+                ((0, 0), UNIFORM, 0)]  # fmt: skip
+    friction = Friction.of(friction, 2)
     form = Form(Terms.of(rows, 2), np.zeros(5), np.eye(5), friction, 1)
-    p = np.array([0.5, 0.2, 0.02, 0.4, 2.0, 0.1, 0.05, 0.1, 1.0, -0.5])
+    p = np.array([0.5, 0.2, 0.02, 0.4, 2.0, 0.1, 0.05, 0.1, 0.05, 1.0, -0.5])
     rng = np.random.default_rng(0)
     x, u, h = rng.normal(size=(3, 4)), rng.normal(size=(3, 2, 6, 1)), np.full(3, 0.1)
     step = form.step(p, x, h, u)
@@ -210,6 +221,32 @@ def test_the_friction_that_a_record_shows(swing):
     assert max(without.which_friction.limits.values()) < 1e-3
     dry = gfnn.fit(recording, friction="dry+linear")  # told to, it takes what dissipates
     assert all(term.coefficient > 0 for term in dry.friction.terms)
+
+
+def test_linear_friction_of_one_mass_is_uniform(swing):
+    """The map keeps a multiple of the symplectic form."""
+    _, fit = swing
+    (loss,) = fit.friction.terms
+    multiplier = float(fit.map.multiplier())
+    assert multiplier == pytest.approx(np.exp(-2 * loss.coefficient * float(fit.map.dt)), rel=1e-9)
+    assert float(fit.map.defect(np.array([0.3, 0.5]))) < 1e-14
+
+
+@pytest.mark.slow
+def test_uniform_friction_of_a_double_pendulum(tmp_path):
+    fit = gfnn.fit(chain(runs=2, end=8.0, uniform=0.04))
+    assert fit.which_friction.kinds == ("uniform",)
+    (term,) = fit.friction.terms
+    assert abs(term.coefficient - 0.04) < 4 * term.std < 4e-3
+    assert "cos(theta1 - theta2)" in term.term
+    assert fit.map.multiplier() == pytest.approx(np.exp(-term.coefficient * 0.02))
+    assert abs(fit.energy["closure"]) < 0.02 * fit.energy["lost"][term.term]
+    fit.map.save(tmp_path / "model")
+    again = gfnn.load(tmp_path / "model")
+    assert again.multiplier() == fit.map.multiplier()
+    past = chain(runs=1, end=3.0, uniform=0.04)
+    values = [map_.forecast(past, np.array([3.5])).values["theta1"] for map_ in (fit.map, again)]
+    np.testing.assert_array_equal(*values)
 
 
 def test_energy_that_no_input_explains_is_named():

@@ -1,5 +1,6 @@
 """Maps that are learned from positions alone: discrete Lagrangians and the maps they generate."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from gfnn_jax.coordinates import Coordinates, nearest_image
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.structures import structure_of
 from gfnn_jax.errors import InputError
+from gfnn_jax.evaluate.gauge import beside_flow
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
@@ -102,6 +104,11 @@ def test_it_is_saved_and_loaded(wrapped, tmp_path):
 
 def henon_heiles(number, steps, seed):
     """x, y (number, steps + 1, 2) below E = 1/12 at dt 0.5."""
+    return flow_of_henon_heiles(number, steps, seed)[..., :2]
+
+
+def flow_of_henon_heiles(number, steps, seed):
+    """z = (q, p) (number, steps + 1, 4) of the same."""
     rng, starts = np.random.default_rng(seed), []
     while len(starts) < number:
         q, energy, angle = rng.uniform(-0.5, 0.5, 2), rng.uniform(0, 1 / 12), rng.uniform(0, 7)
@@ -118,7 +125,24 @@ def henon_heiles(number, steps, seed):
         field, (0, 0.5 * steps), np.array(starts).T.ravel(), method="DOP853", rtol=1e-13,
         atol=1e-15, t_eval=0.5 * np.arange(steps + 1),
     )  # fmt: skip
-    return solution.y.reshape(4, number, -1).transpose(1, 2, 0)[..., :2]
+    return solution.y.reshape(4, number, -1).transpose(1, 2, 0)
+
+
+def test_where_a_flow_exists_the_map_is_the_flow_but_for_a_factor_of_momenta():
+    """A symmetric S leaves no f(Q) − f(q); the kicks of half a step make c unlike 1."""
+    recording = recorded(henon_heiles(1_200, 2, 0), ["x", "y"], dt=0.5)
+    learned = gfnn.fit(recording, learn="map", tolerance=1e-6)
+    assert learned.met
+    z = flow_of_henon_heiles(200, 1, 1)
+    found = beside_flow(learned.map, gfnn.Pairs(z[:, 0], z[:, 1], 0.5))
+    assert max(found.momenta, found.positions, found.images) < 1e-5
+    assert found.gauge < 1e-5
+    assert 0.001 < abs(found.factor - 1) < 0.1
+    off = dataclasses.replace(learned.map.pieces[0], params=1.01 * learned.map.pieces[0].params)
+    other = dataclasses.replace(learned.map, pieces=(off,))  # S → cS: the factor, nothing else
+    scaled = beside_flow(other, gfnn.Pairs(z[:, 0], z[:, 1], 0.5))
+    assert abs(scaled.factor / found.factor - 1.01) < 1e-9
+    assert scaled.images < 1e-5
 
 
 @pytest.mark.slow  # nine seconds of fitting

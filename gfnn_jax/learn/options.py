@@ -205,7 +205,8 @@ class FitOptions:
     ))  # fmt: skip
     friction: str = field(default="auto", metadata=_about(
         _TEXT,
-        "of a recording: auto, none, linear, quadratic, dry, or some joined by +", "KIND", FIT,
+        "of a recording: auto, none, linear, quadratic, dry, uniform, several joined by +", "KIND",
+        FIT,
     ))  # fmt: skip
     input_hold: str = field(default="auto", metadata=_about(
         _one_of("auto", "hold", "linear", "band"),

@@ -51,6 +51,7 @@ from gfnn_jax.models.hamiltonians.libraries import (
     modes_of,
     own_terms,
 )
+from gfnn_jax.models.hamiltonians.noisy_textbook import law_of_sequences
 from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
 from gfnn_jax.models.hamiltonians.starts import starts
 from gfnn_jax.models.hamiltonians.textbook import law_of_physics
@@ -97,6 +98,20 @@ def learn_hamiltonian(
     started = time.perf_counter()
     if terms and data.structure is None:
         check_finite(own_terms(data, terms), data, data.training)
+    most = options.max_operations if basis is None else options.mode_operations
+    if not terms and scene is None:
+        problem = Problem(
+            data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
+        )
+        own = LawWork(problem, budget, most, dearest)
+        whole = law_of_sequences(problem, own, data, tolerance, say)
+        if whole is not None:
+            seconds = time.perf_counter() - started
+            problem.allowance = UNBOUNDED
+            found = learned_from(whole, problem, data, tolerance, seconds, options, None)
+            for note in found.notes:
+                say(note)
+            return found
     of_steps, arcs = data, arcs_of(data)
     if arcs is not None:
         say(f"H: arcs of {arcs.length} steps, in which the states move far against their noise")
@@ -104,7 +119,6 @@ def learn_hamiltonian(
     problem = Problem(
         data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
     )
-    most = options.max_operations if basis is None else options.mode_operations
     work = LawWork(problem, budget, most, dearest)
     everywhere, free = data, (*data.coordinates.cyclic, *data.whole)
     if data.structure is None:

@@ -191,7 +191,7 @@ def hamiltonian_of(terms: Terms, lagrangian: Expression, names: tuple[str, ...])
 
 def in_columns(fit: LawFit) -> tuple[Lagrangian, np.ndarray]:
     """The law in the measured coordinates (zeros of angles inside the phases of its terms), and the
-    covariance of (θ, ρ, G row by row)."""
+    covariance of (θ, ρ, G row by row), and of γ where there is uniform friction."""
     form, structure = fit.form, fit.structure
     law = form.lagrangian(fit.p[: form.count])
     zeros = np.zeros(form.dim)
@@ -201,7 +201,11 @@ def in_columns(fit: LawFit) -> tuple[Lagrangian, np.ndarray]:
     rest = form.count - form.basis.shape[1]
     turn = np.zeros((terms.count + rest, len(fit.p)))
     turn[: terms.count, : form.basis.shape[1]] = form.basis
-    turn[terms.count :, form.basis.shape[1] : form.count] = np.eye(rest)
+    others = np.arange(form.basis.shape[1], form.count)
+    if law.friction.count < form.friction.count:  # γ, the last of the friction, goes behind G
+        last = form.friction.count - 1
+        others = np.append(np.delete(others, last), others[last])
+    turn[np.arange(terms.count, terms.count + rest), others] = 1.0
     covariance = turn @ fit.covariance() @ turn.T
     return dataclasses.replace(law, terms=moved), covariance
 
@@ -212,4 +216,6 @@ def scaled(law: Lagrangian, covariance: np.ndarray, factor: float) -> tuple[Lagr
         law, coefficients=factor * law.coefficients, losses=factor * law.losses,
         gains=factor * law.gains,
     )  # fmt: skip
-    return law, factor**2 * covariance
+    by = np.full(len(covariance), factor)
+    by[law.terms.count + law.friction.count + law.gains.size :] = 1.0  # γ is a rate
+    return law, by[:, None] * covariance * by

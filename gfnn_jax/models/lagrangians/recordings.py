@@ -22,7 +22,7 @@ from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
 from gfnn_jax.flows.motion import WEIGHTS
 from gfnn_jax.maps.estimates import law_in_use
 from gfnn_jax.maps.inputs import HOLDS, Signals
-from gfnn_jax.maps.laws import map_of_law
+from gfnn_jax.maps.laws import conformal, map_of_law
 from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
@@ -44,6 +44,7 @@ from gfnn_jax.models.lagrangians.residuals import Trace, whiteness
 from gfnn_jax.models.lagrangians.search import SearchOptions, describe, search
 from gfnn_jax.models.lagrangians.text import (
     Expression,
+    Term,
     friction_of,
     speed_names,
     terms_of,
@@ -143,7 +144,8 @@ def fit_recording(
     zeros = np.zeros(d)
     zeros[list(fit.structure.zeros)] = fit.p[fit.form.count : first]
     q, v = x[:, :d] + zeros, x[:, d:]
-    root = _root(covariance)
+    moving, of_moving = conformal(law, covariance)
+    root = _root(of_moving)
     noise = np.where(given > 0, given, np.minimum(scales.sigma, fit.rms()))
     sensors = Sensors(
         names, recording.inputs, recording.angles, noise, scales.omega, scales.period, acting.hold,
@@ -154,12 +156,18 @@ def fit_recording(
     told("bands: forecasts from windows of the record")
     spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
     thirds = _thirds(bench, nodes, fit, sensors, found)
-    used, horizons = calibrated(law_in_use(law, root, sensors), thirds, found, scales, spread)
+    used, horizons = calibrated(law_in_use(moving, root, sensors), thirds, found, scales, spread)
     z = np.concatenate([q, law.momentum(q, v)], axis=1)
     u = np.concatenate([n.stretch.u[n.at] for n in nodes])
     signals = Signals(recording.inputs, acting.hold, acting.delay) if recording.inputs else None
     map_ = map_of_law(
-        law, z, scales.dt, angles=angles, signals=signals, inputs=u if signals else None, root=root
+        moving,
+        z,
+        scales.dt,
+        angles=angles,
+        signals=signals,
+        inputs=u if signals else None,
+        root=root,
     )
     map_ = _with_sensors(map_, used.sensors)
     traces = _traces(recording, seen.channels, fit, law, nodes, zeros, inputs_of)
@@ -296,7 +304,13 @@ def _described(
     count, lost = law.terms.count, law.friction.count
     lagrangian = terms_of(law.terms, law.coefficients, std[:count], codes, of_speeds)
     friction = friction_of(law.friction, law.losses, std[count : count + lost], of_speeds)
-    of_gains = std[count + lost :].reshape(law.gains.shape)
+    if law.uniform != 0:
+        kinetic = [
+            t for t, row in zip(lagrangian.terms, law.terms.rows(), strict=True) if any(row[0])
+        ]
+        energy = f"({Expression(tuple(kinetic)).formula})"
+        friction = Expression((*friction.terms, Term(energy, float(law.uniform), float(std[-1]))))
+    of_gains = std[count + lost :][: law.gains.size].reshape(law.gains.shape)
     gains = {
         u: {q: (float(law.gains[i, j]), float(of_gains[i, j])) for i, q in enumerate(names)}
         for j, u in enumerate(recording.inputs)
@@ -384,7 +398,7 @@ def _traces(
         n, stretch = b - a, nodes[i].stretch
         t, y, x = arcs.t[k, :n], arcs.y[k, :n], fit.fitted.x[k, :n]
         q, v = x[:, :d] + zeros, x[:, d:]
-        rate = law.power(q, v)[0][:, :-1]  # the last is uniform friction
+        rate = law.power(q, v)[0][:, : law.friction.count + (law.uniform != 0)]
         lost = 0.5 * np.diff(t)[:, None] * (rate[1:] + rate[:-1])
         supplied = acting[k, : n - 1] * (np.diff(q, axis=0) @ law.gains)
         found.append(
@@ -424,10 +438,8 @@ def _energy(
     input, and what these leave unexplained."""
     total = sum(trace.t[-1] - trace.t[0] for trace in traces)
     stored = float(sum(trace.energy[-1] - trace.energy[0] for trace in traces) / total)
-    lost, supplied = (
-        sum(of[-1] for of in parts) / total
-        for parts in ([one.lost for one in traces], [one.supplied for one in traces])
-    )
+    lost = np.sum([trace.lost[-1] for trace in traces], axis=0) / total
+    supplied = np.sum([trace.supplied[-1] for trace in traces], axis=0) / total
     return {
         "stored": stored,
         "lost": dict(zip((t.term for t in friction.terms), map(float, lost), strict=True)),

@@ -16,7 +16,7 @@ import numpy as np
 
 from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of, with_states
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
@@ -299,6 +299,8 @@ def choose_friction(
 def frictions_tried(dim: int, scales: Scales, options: SearchOptions) -> tuple[Loss, ...]:
     """Friction of all the kinds that are asked for, in every direction."""
     kinds = tuple(libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions)
+    if dim == 1 and len(kinds) > 1:  # linear friction is uniform there
+        kinds = tuple(kind for kind in kinds if kind != UNIFORM)
     rows = libraries.losses(dim, kinds, options.dry_width * float(np.mean(scales.speed)))
-    turned = (libraries.opposite(row) for row in rows)
-    return (*rows, *(row for row in turned if row is not None))
+    turned = [one for one in map(libraries.opposite, rows) if one is not None]
+    return tuple(sorted((*rows, *turned), key=lambda row: row[1] == UNIFORM))
