@@ -47,7 +47,7 @@ def test_a_fit_without_a_third_is_that_of_the_other_two():
     options = SearchOptions(frictions=("linear",), choose_friction=False)
     result = search(nodes, scales, (0, 1), 0, {"hold": inputs}, seen, options=options)
     gauge = np.concatenate([n.x[:, :2] for n in nodes])
-    bench, fit = Workbench(gauge, inputs, scales.omega, seen), result.fit
+    bench, fit = Workbench(gauge, inputs, scales.omega, seen), result.acting.fit
     arcs, third = in_thirds(result.nodes, fit)
     error = np.sqrt(np.diag(fit.covariance()))
     without = bench.without_thirds(result.nodes, fit)
