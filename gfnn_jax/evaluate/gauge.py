@@ -24,7 +24,7 @@ _DEGREE = 6  # of f
 
 
 class BesideFlow(NamedTuple):
-    """What a map of positions has of a flow.
+    """Parts of a map of positions that are those of a flow.
 
     factor: c. gauge: root mean square of ∇f ÷ that of p'. momenta: of p' − c p − ∇f, ÷ that of p'.
     positions, images: root mean squares of the differences of a step, of its positions and of its

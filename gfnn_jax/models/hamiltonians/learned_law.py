@@ -46,7 +46,7 @@ from gfnn_jax.phase_space import apply_j, symplectic_form
 FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
 _NEAR_ROUNDOFF = 3e-15  # of the spread
 _NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
-_FEWEST_SAMPLED = 2_000  # pairs that tell noise from misfit
+_FEWEST_SAMPLED = 2_000  # pairs that tell noise from misfit; of many sites, numbers
 _NAMED = 5  # terms in a message
 
 
@@ -326,12 +326,13 @@ def _cheapest(
 
 def covariance_root(found: FittedLaw, problem: Problem, data: Dataset, steps: Steps) -> np.ndarray:
     """(m, m): rootᵀ root is the covariance of the coefficients. What is noise, a generator of
-    polynomials tells, which does not explain it; what it explains is misfit, of these steps too."""
+    polynomials tells, which does not explain it, of sites the terms of a larger library; what they
+    explain is misfit, of these steps too."""
     fit, count = found.fit, found.family.num_parameters
     most = max(_FEWEST_SAMPLED, OPTIONS.sampled_rows * count // data.y0.shape[1])
     structure = data.structure
     if structure is not None:
-        most = structure.fewest(data.y0.shape[1])
+        most = max(structure.fewest(data.y0.shape[1]), _FEWEST_SAMPLED // data.y0.shape[1])
     places, goes_on = looked_at(data.pairs, fit.used, most)
     rows = fit.used[places]
     unit, scale = problem.unit(rows), problem.scale
@@ -352,10 +353,39 @@ def covariance_root(found: FittedLaw, problem: Problem, data: Dataset, steps: St
             states = first, second, goes_on
         degree = int(np.max(np.sum(family.powers, axis=1)))
         noise = unexplained(data, rows, residual, count, degree, states)
+    elif structure is not None and isinstance(family, Sums):
+        noise = _unexplained_of_sites(found, problem, data, rows, steps, slopes, left)
     return uncertainty.root(
         fit.triangle, count, slopes.reshape(-1, count), np.hypot(left, _NEAR_ROUNDOFF).ravel(),
         noise=noise, scores=scores,
     )  # fmt: skip
+
+
+def _unexplained_of_sites(
+    found: FittedLaw, problem: Problem, data: Dataset, rows, steps: Steps, slopes, left
+) -> float | None:  # fmt: skip
+    """The part that `unexplained` tells, of a structure: what the next library's terms, small
+    beside the law's, do not explain. slopes (n, 2d, terms), left (n, 2d): of the law."""
+    assert data.structure is not None
+    family, count, unit = found.family, found.family.num_parameters, problem.unit(rows)
+    libraries = (f for f in data.structure.libraries(data.dim) if f.num_parameters > count)
+    larger = next(libraries, None)
+    if larger is None or OPTIONS.sampled_rows * (count + larger.num_parameters) > left.size:
+        return None
+    further = (
+        problem.images(
+            family, found.fit.coefficients, rows, steps, derivatives=True, along=larger
+        ).by_coefficient
+        / unit[..., None]
+    )
+    columns = np.concatenate([slopes, further], axis=-1).reshape(left.size, -1)
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(size > 0, size, 1.0)
+    solved, _, rank, _ = np.linalg.lstsq(columns, left.ravel(), rcond=1e-10)
+    over = np.sum((left.ravel() - columns @ solved) ** 2) / max(left.size - rank, 1)
+    total = np.sum(left**2) / max(left.size - count, 1)
+    part = float(over / total) if total > 0 else 1.0
+    return part if part < 1 - OPTIONS.explained * np.sqrt(2 * rank) / left.size else 1.0
 
 
 def unexplained(

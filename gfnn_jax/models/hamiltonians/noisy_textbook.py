@@ -10,6 +10,7 @@ states together. Among the laws within the noise the one of least description le
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -136,8 +137,9 @@ def _chosen(
         return None
     told: list[_Told] = []
     for tried, formula in enumerate(_worth(formulas)):
-        found = _told(sequences, train, formula)
-        told += [] if found is None else [found]
+        with contextlib.suppress(np.linalg.LinAlgError, InputError):  # constants have run away
+            found = _told(sequences, train, formula)
+            told += [] if found is None else [found]
         if tried and not told:  # none of the likeliest two can be followed along its arcs
             return None
     if not told:
