@@ -149,7 +149,7 @@ def noisy(name: str, quick: bool) -> Numbers:
     size = law.size or len(law.terms)
     exact = true is not None and true[1] <= EXACT and len(found.terms) <= size
     off = None
-    if exact:
+    if found is not None and true is not None and exact:
         told = [*found.terms, *found.constants]
         off = [(t.coefficient - x) / t.std for t, x in zip(told, true[0], strict=True)]
     return {

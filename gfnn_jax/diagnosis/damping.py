@@ -245,7 +245,9 @@ class _Problem:
         if factor.shape[1] == 1:
             factor, std, b = factor[:, 0], std[:, 0], b[:, 0]
         if len(factor) == 1:
-            return LearnedDamping(*map(np.asarray, (factor[0], std[0], found.shift[0])))
+            return LearnedDamping(
+                np.asarray(factor[0]), np.asarray(std[0]), np.asarray(found.shift[0])
+            )
         return LearnedDamping(
             factor, std, found.shift, found.functions, self.data.parameters,
             (np.asarray(b.min(axis=0)), np.asarray(b.max(axis=0))),

@@ -25,7 +25,7 @@ from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.generating_functions.sweeps import OF_SOLVE, OF_STEPS, LinearSweep
 from gfnn_jax.models.hamiltonians.choose_law import long_step
 from gfnn_jax.models.hamiltonians.white import leaves_white
-from gfnn_jax.search.search import AS_FAR, MET, Entry
+from gfnn_jax.search.search import COMPARABLE, MET, Entry
 
 _NO_MORE = {
     False: "no larger library of terms promised to meet it",
@@ -168,7 +168,7 @@ def _stalled(candidate: Candidate, entry: Entry | None, searched: Searched) -> b
         return searched.of_terms.stalled
     if entry is None and not found.ranking:
         return searched.law is not None and searched.law.stalled
-    limit = AS_FAR * candidate.validation_relative
+    limit = COMPARABLE * candidate.validation_relative
     return any(
         (e.candidate.chart, e.candidate.family) in found.stalled
         and e.candidate.validation_relative <= limit

@@ -295,7 +295,7 @@ def _with_stops(
     lanes = np.flatnonzero(stops.resting(lagrangian, orbit, ends, sensors.omega))
     if not len(lanes):
         return orbit[:, 1:]
-    some, orbit = [windows[i] for i in lanes], orbit.copy()
+    some, orbit = [windows[i] for i in lanes.tolist()], orbit.copy()
     noise = float(np.min(sensors.seen.state_sigma(orbit[:, 0], sensors.sigma)))
 
     def inputs(k: int, parts: int) -> np.ndarray:

@@ -99,12 +99,9 @@ def latent_readings(
 
 
 def _families(family: Any) -> Iterator[Any]:
-    """Families by rising degree; one that has none alone."""
-    if not isinstance(family, Products):
-        yield family
-        return
-    for degree in range(2, _LARGEST + 1):
-        yield dataclasses.replace(family, degree=degree)
+    """Families by rising degree; none where S has no degree."""
+    if isinstance(family, Products):
+        yield from (dataclasses.replace(family, degree=n) for n in range(2, _LARGEST + 1))
 
 
 def _fitted(
@@ -112,8 +109,8 @@ def _fitted(
 ) -> LatentReadings:  # fmt: skip
     """S of this family by Gauss–Newton over arcs (A, L, 2d)."""
     num, length, width = arcs.shape
-    moves = np.full((num, length - 1), True)
-    model = GeneratedOnArcs(family, piece.chart, piece.dt, moves, ends, family, joint=True)
+    moves, dt = np.full((num, length - 1), True), float(np.asarray(piece.dt))
+    model = GeneratedOnArcs(family, piece.chart, dt, moves, ends, family, joint=True)
     p, left = _start(piece, family, ends, arcs)
     equations = num * (length - 1) * width
     found = fit_arcs(model, p, arcs.copy(), arcs, left, left, least=np.zeros(width))

@@ -300,6 +300,7 @@ def _larger(family: Terms | Sums, data: Dataset) -> Terms | Sums | None:
         return next(
             (f for f in data.structure.libraries(data.dim) if f.num_parameters > count), None
         )
+    assert isinstance(family, Terms)  # sums are of structures
     units = tuple(tuple(row) for row in np.eye(len(family.variables), dtype=int).tolist())
     variables = Terms(family.dim, family.variables, units, family.parameters)
     return joined(family, multiplied(family, variables))

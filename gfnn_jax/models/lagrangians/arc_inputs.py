@@ -17,7 +17,9 @@ class ArcInputs:
     def __init__(self, nodes: Sequence[Nodes], substeps: int, hold: str, delay: float = 0.0):
         self.hold, self.delay = hold, delay
         self._nodes, self._substeps = nodes, substeps
-        if hold == "hold":  # a substep for each sample between nodes, so that none is averaged away
+        if (
+            hold == "hold" and nodes[0].stretch.u.shape[1]
+        ):  # a substep for each: none is lost
             apart = max(int(np.max(np.diff(n.at), initial=1)) for n in nodes)
             substeps = apart * -(-substeps // apart)
         self._of_nodes = [

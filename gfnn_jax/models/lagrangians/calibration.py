@@ -135,7 +135,7 @@ def _forecasts(
     for number, law in enumerate(thirds.laws):
         own = np.flatnonzero(third == number)
         if len(own):
-            some = [(*starts[n], windows[n]) for n in own]
+            some = [(*starts[n], windows[n]) for n in own.tolist()]
             errors[own], deviations[own] = _forecasts_of(law, found, some, leads)
     return errors, deviations
 

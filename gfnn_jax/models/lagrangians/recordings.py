@@ -438,10 +438,8 @@ def _energy(
     input, and what these leave unexplained."""
     total = sum(trace.t[-1] - trace.t[0] for trace in traces)
     stored = float(sum(trace.energy[-1] - trace.energy[0] for trace in traces) / total)
-    lost, supplied = (
-        sum(of[-1] for of in parts) / total
-        for parts in ([one.lost for one in traces], [one.supplied for one in traces])
-    )
+    lost = np.sum([trace.lost[-1] for trace in traces], axis=0) / total
+    supplied = np.sum([trace.supplied[-1] for trace in traces], axis=0) / total
     return {
         "stored": stored,
         "lost": dict(zip((t.term for t in friction.terms), map(float, lost), strict=True)),

@@ -192,8 +192,21 @@ def prune(
 
 def told_apart(bench: Workbench, fit: LawFit, told: Callable) -> LawFit:
     """The fit without the first term, kinetic ones before others, of each combination that moves
-    nothing; which costs nothing."""
+    nothing; which costs nothing. Masses that couple two coordinates give way to a spring that
+    does as well."""
     fixed = protected(fit.structure)
+    for row in fit.structure.terms:
+        spring = ((0,) * len(row[0]), row[0], *row[2:])
+        if (
+            max(row[0]) == 1
+            and not any(row[1])
+            and not any(row[2])
+            and (spring not in fit.structure.terms)
+        ):
+            arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+            larger = fit.structure.plus([("term", spring)])
+            with_it = bench.fit(larger, fit.values, arcs, fit.sigma, rescale=False)
+            fit = with_it if with_it.untold() else fit
     while untold := [k for k in fit.untold() if k[0] == "term" and k not in fixed]:
         smaller = fit.structure.without({untold[0]})
         arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)

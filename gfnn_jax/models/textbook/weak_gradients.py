@@ -91,8 +91,8 @@ def weak_gradients(
 def _smoothed(sequence: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The sequence (L, 2d) smoothed as far as its orbit allows, and the noise (2d,) left on it."""
     for size in _SMOOTHED:
-        kept = savgol_coeffs(size, _DEGREE)[size // 2]  # of a state's own noise
-        smooth = savgol_filter(sequence, size, _DEGREE, axis=0)
+        kept = float(savgol_coeffs(size, _DEGREE)[size // 2])  # of a state's own noise
+        smooth = np.asarray(savgol_filter(sequence, size, _DEGREE, axis=0))
         left = np.sqrt(np.mean((sequence - smooth) ** 2, axis=0))
         if (left <= _BIASED * np.sqrt(1 - kept) * noise).all():
             return smooth, np.sqrt(kept) * noise
