@@ -77,7 +77,7 @@ def test_a_size_too_large_to_count_is_never_looked_at():
         return Products(inputs, degree)
 
     groups = (map(family, group) for group in sweeps._DEGREES)
-    kept = list(itertools.chain(*sweeps._determined(groups, 10**6)))
+    kept = list(itertools.chain(*sweeps._determined(groups, 10**6, sweeps._ROWS_PER_TERM)))
     assert [f.degree for f in kept] == [2, 3, 4]
     assert looked_at == [2, 3, 4, 5]
 

@@ -110,7 +110,7 @@ def test_few_pairs_are_cross_validated(pairs):
     ("options", "message"),
     [
         ({"model": object()}, "a model with a name, sizes"),
-        ({"model": own_module.Kicks(), "learn": "map"}, "a model of one's own is all"),
+        ({"model": own_module.Kicks(), "learn": "map"}, "nothing else is learned"),
         ({"family": lambda inputs: [inputs]}, "Inputs has no name"),
         ({"family": 3}, "expected one of auto, .* as family"),
     ],
