@@ -30,6 +30,8 @@ def without_each(
     c: (terms,) of a fit to the rows of the parts, or to most of them. parts: rows, none in two.
     Where one step from c does not reach the optimum, the fit is made.
     """
+    if len(parts) > 1 and _is_rounding(problem, family, c, steps, parts):
+        return [c] * len(parts)
     triangles = [problem.linearised(family, c, steps, part) for part in parts]
     found = []
     for i in range(len(parts)):
@@ -44,6 +46,14 @@ def without_each(
     return found
 
 
+def _is_rounding(problem: Problem, family, c, steps: Steps, parts: Sequence[np.ndarray]) -> bool:
+    """Return whether the residual at c is rounding, which no fit to most of the rows lowers."""
+    largest = max(len(part) for part in parts)
+    rows = np.sort(np.concatenate(parts))
+    norm = np.linalg.norm(problem.residuals(family, c, steps, rows))
+    return bool(norm <= ROUNDOFF * np.sqrt((len(rows) - largest) * problem.z0.shape[1]))
+
+
 def _one_step(
     problem: Problem, family, c: np.ndarray, steps: Steps, rows: np.ndarray, here: Triangle
 ) -> np.ndarray | None:
@@ -51,8 +61,6 @@ def _one_step(
     where rounding leaves nothing to gain; None where the step is not what was foretold."""
     if not np.isfinite(here.norm) or here.rows < family.num_parameters:
         return None
-    if here.norm <= ROUNDOFF * np.sqrt(here.rows):
-        return c
     spectrum = here.spectrum()
     tried, foretold = c - step(spectrum, 0.0), spectrum.residual_norm
     norm = float(np.linalg.norm(problem.residuals(family, tried, steps, rows)))
