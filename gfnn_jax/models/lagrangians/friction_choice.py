@@ -1,10 +1,11 @@
 """Choice of the friction that a record shows: held-out arcs say, and with what odds.
 
 Close to a fit its residuals are linear in small changes of the coefficients, so that one evaluation
-of the arcs serves every set of frictions: of each set the coefficients are found from some of the
-arcs by least squares with ρ ≥ 0, and judged by the others, on which all but the friction is found
-anew. A third of the record is held out at a time: where motion dies down, friction of a wrong kind
-that fits large swings misses the small ones.
+of the arcs serves every set of frictions: of each set all coefficients of the law are found from
+some of the arcs by least squares with ρ ≥ 0, and judged by the others, of which the states alone
+are found anew: a friction of a wrong kind spoils the masses and forces that are fitted with it. A
+third of the record is held out at a time: where motion dies down, friction of a wrong kind that
+fits large swings misses the small ones.
 
 Two sets A and B are compared by their held-out sums of squares S. The scale of the residuals is
 found from them as well, so that the odds of B, residuals being normal, are
@@ -37,6 +38,7 @@ _DECIDED = 20.0  # odds, below which two sets are as good
 _NEEDED = 3.0  # odds, below which a direction is left out
 _SURE = 20.0  # the logarithm of the largest odds that are told
 _GAINS = 5.0  # standard errors below zero, at which friction would have to drive
+_RCOND = 1e-10  # of coefficients that a record tells only together
 _LIMIT = 2.0  # standard errors of a coefficient, above its value: its upper limit
 
 
@@ -167,19 +169,6 @@ class _Table:
         flat = [self.rows[keep].reshape(-1, self.rows.shape[-1]) for keep in kept]
         return [np.asarray(np.linalg.qr(part, mode="r")) for part in flat]
 
-    @functools.cached_property
-    def held(self) -> list[np.ndarray]:
-        """Rows (held arcs, L, k, candidates + 1) of each third, where what is not friction was
-        projected out."""
-        parts = []
-        for held in self.folds:
-            rows = self.rows[held]
-            flat = rows.reshape(-1, rows.shape[-1])
-            Q = np.linalg.qr(flat[:, : self.width])[0]
-            own = flat[:, self.width :]
-            parts.append((own - Q @ (Q.T @ own)).reshape(*rows.shape[:3], -1))
-        return parts
-
     def solve(self, triangle: np.ndarray, subset: Sequence[int]) -> np.ndarray:
         """ρ of all candidates, of these at least 0, of the others 0."""
         own = triangle[self.width :, self.width :]
@@ -190,10 +179,13 @@ class _Table:
         return losses
 
     def judged(self, subset: Sequence[int]) -> _Judged:
-        """Residuals of these candidates on the thirds that their coefficients are not from."""
-        residuals = np.zeros(self.rows.shape[:3])
-        for triangle, held, rows in zip(self.triangles[:-1], self.folds, self.held, strict=True):
-            residuals[held] = rows @ np.append(-self.solve(triangle, subset), 1.0)
+        """Residuals of these candidates on the thirds that no coefficient is from."""
+        residuals, f = np.zeros(self.rows.shape[:3]), self.width
+        for triangle, held in zip(self.triangles[:-1], self.folds, strict=True):
+            losses = self.solve(triangle, subset)
+            aim = triangle[:f, -1] - triangle[:f, f:-1] @ losses
+            others = np.linalg.lstsq(triangle[:f, :f], aim, rcond=_RCOND)[0]
+            residuals[held] = self.rows[held] @ np.concatenate([-others, -losses, [1.0]])
         rows = tuple(self.candidates[k] for k in subset)
         return _Judged(rows, residuals)
 
