@@ -9,7 +9,6 @@ amplitudes of the others.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -30,6 +29,7 @@ from gfnn_jax.dataset.measured_error import (
 )
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.fitting.left_out import without_each
 from gfnn_jax.flows.collocation import Steps, truncation
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.searches import Searched
@@ -153,13 +153,12 @@ def _by_folds(
     out = [rows[np.isin(cluster[rows], fold)] for fold in folds if len(fold)]
     try:
         with budget.last(_WHAT, model.kind, len(out) * model.work):
-            parts = [model.predicts(np.setdiff1d(rows, part), part) for part in out]
+            images = np.concatenate(model.predicts(out))
     except OutOfTime:  # told with what else was left out
         return None
     except (FitError, np.linalg.LinAlgError) as error:
         budget.leave_out(_WHAT, str(error))
         return None
-    images = np.concatenate(parts)
     return _stated(chosen, found, "cross-validation", np.concatenate(out), images)
 
 
@@ -184,11 +183,11 @@ def _images_of(chosen: Chosen, found: Searched, rows: np.ndarray) -> np.ndarray:
 
 
 class _Refits(NamedTuple):
-    """The chosen model, to be fitted to other rows. predicts: rows that it is fitted to and rows
-    that it predicts -> images (n, 2d) of these in the user's coordinates, NaN where a step fails.
-    kind, work: of the operations that a fit takes."""
+    """The chosen model, to be fitted to other rows. predicts: parts of the rows -> images (n, 2d)
+    of each in the user's coordinates, by a fit to all the others, NaN where a step fails.
+    kind, work: of the operations that a fit takes at most."""
 
-    predicts: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    predicts: Callable[[list[np.ndarray]], list[np.ndarray]]
     kind: str
     work: float
 
@@ -200,7 +199,12 @@ def _refits(chosen: Chosen, found: Searched) -> _Refits | None:
         sweep, size = entry.sweep, entry.size
         if isinstance(sweep, NetworkSweep) or sweep.data.pairs is not found.data.pairs:
             return None
-        return _Refits(partial(sweep.predicted, size), ROWS, sweep.work_of_refit(size))
+
+        def predicts(parts: list[np.ndarray]) -> list[np.ndarray]:
+            rows = np.concatenate(parts)
+            return [sweep.predicted(size, np.setdiff1d(rows, part), part) for part in parts]
+
+        return _Refits(predicts, ROWS, sweep.work_of_refit(size))
     flow = law is not None and chosen.candidate.learns == "hamiltonian" and law.terms
     return _of_law(found) if flow else None
 
@@ -215,9 +219,12 @@ def _of_law(found: Searched) -> _Refits:
     steps = Steps(flow.stages, flow.over(np.max(data.each_dt)).substeps)
     coefficients = np.asarray(flow.params)
 
-    def predicts(others: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        fit = problem.fit(flow.family, coefficients, others, rounds=False, steps=steps)
-        images = problem.images(flow.family, fit.coefficients, rows, steps)
-        return to_user(data.coordinates, images.states)
+    def predicts(parts: list[np.ndarray]) -> list[np.ndarray]:
+        without = without_each(problem, flow.family, coefficients, steps, parts)
+        images = (
+            problem.images(flow.family, c, part, steps).states
+            for c, part in zip(without, parts, strict=True)
+        )
+        return [to_user(data.coordinates, states) for states in images]
 
     return _Refits(predicts, FLOW, work_of_refit(flow.family, len(data), data.dim, steps))

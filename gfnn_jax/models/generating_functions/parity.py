@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from itertools import takewhile
 
 import numpy as np
 
@@ -56,7 +57,7 @@ def is_even(data: Dataset, degrees: Sequence[int], most_terms: int, rows_per_ter
     """Return whether S(−w) = S(w) as far as any size of a sweep could tell: odd terms beside the
     even ones of the highest degree that a sweep has do not make the held-out residual smaller.
 
-    degrees, most_terms, rows_per_term: of the sweep of even polynomials.
+    degrees, rising, most_terms, rows_per_term: of the sweep of even polynomials.
     False where terms are not scarce, where angles or args are, or where the test would take too
     much.
     """
@@ -69,13 +70,11 @@ def is_even(data: Dataset, degrees: Sequence[int], most_terms: int, rows_per_ter
     inputs = box_inputs(w, cyclic=data.coordinates.cyclic, reversor=flip)
     signs = variable_signs(inputs, flip, w)
     most = min(most_terms, w.size // rows_per_term)
-    degrees = [
-        degree for degree in degrees
-        if number_of_terms(inputs.is_angle, degree, signs) <= most
-    ]  # fmt: skip
-    if not degrees:
+    # Counting takes long where variables are many, and a higher degree has more terms.
+    few = list(takewhile(lambda n: number_of_terms(inputs.is_angle, n, signs) <= most, degrees))
+    if not few:
         return False
-    even = Products(inputs, degrees[-1], signs)
+    even = Products(inputs, few[-1], signs)
     odd = number_of_terms(inputs.is_angle, OPTIONS.odd_degree) - even.terms_of(OPTIONS.odd_degree)
     if even.num_parameters + odd > most_terms:
         return False

@@ -65,6 +65,8 @@ _HOPELESS = 10.0  # times the tolerance, of an error that is known before a libr
 # Libraries in a row that do not help end the search; with given terms; of a structure, whose
 # libraries differ in kind.
 _POOR, _POOR_GIVEN, _POOR_STRUCTURED = 2, 3, 5
+_SMALL = 35  # terms of the libraries that are tried before laws of physics: 0.3 s of two bodies
+_EXACT = 1e-13  # of the spread: a polynomial that errs by no more is no approximation
 _TURNING = 2_000  # pairs that tell how far a step turns the states
 _FIRST_ROUND = 5e8  # operations that the first round of growth is expected to take
 _EXPLAINED = 0.05  # of the spread: an error below it is that of the right branch of the turns
@@ -126,15 +128,19 @@ def learn_hamiltonian(
     else:  # a state of many sites is in the middle and far out at once
         outer = np.zeros(len(data.training), bool)
     data = everywhere.trained_on(everywhere.training[~outer])
-    with_masses, best = None, None
+    with_masses, best, early = None, None, list[FittedLaw]()
     if not terms and scene is None:
-        best = law_of_physics(problem, work, data, tolerance, say)
+        if basis is None and data.args is None and data.structure is None:
+            early = _small_polynomials(problem, work, data, tolerance, options, say)
+            best = early[-1] if early and _is_exact(early[-1], tolerance) else None
+        if best is None:
+            best = law_of_physics(problem, work, data, tolerance, say)
         if best is None:
             best = with_masses = mechanical(problem, work, data, tolerance)
     if best is None or not best.error.bound <= tolerance.bound:
         try:
             best, options = _of_libraries(
-                problem, work, basis, data, tolerance, scene, terms, options, say
+                problem, work, basis, data, tolerance, scene, terms, options, say, early
             )
         except (OutOfTime, FitError):
             if best is None:
@@ -193,14 +199,48 @@ def learn_hamiltonian(
     return dataclasses.replace(learned, candidate=candidate, ended=work.ended)
 
 
+def _small_polynomials(
+    problem, work: LawWork, data: Dataset, tolerance: Tolerance, options: Options, say
+) -> list[FittedLaw]:
+    """The smallest polynomials that a search for H begins with, up to the first that is exact.
+
+    They are soon fitted, at steps too long for the matching of atoms too, and the search goes on
+    from them.
+    """
+    fitted: list[FittedLaw] = []
+    libraries, _ = _libraries(data, tolerance, None, (), options)
+    for family in libraries:
+        if family.num_parameters > _SMALL:
+            break
+        last = fitted[-1] if fitted else None
+        if last is not None and too_dear(problem, family, last, data, tolerance, work.dearest):
+            break
+        say(f"H: {family.num_parameters} terms")
+        try:
+            fitted.append(_fitted(problem, work, family, data, tolerance, last, options, say))
+        except OutOfTime:  # whatever follows finds no time either
+            break
+        if _is_exact(fitted[-1], tolerance):
+            break
+    return fitted
+
+
+def _is_exact(found: FittedLaw, tolerance: Tolerance) -> bool:
+    return found.error.bound <= tolerance.bound and found.error.relative <= _EXACT
+
+
 def _of_libraries(
     problem, work: LawWork, basis: Modes | None, data: Dataset, tolerance: Tolerance, scene, terms,
-    options: Options, say,
+    options: Options, say, early: Sequence[FittedLaw],
 ) -> tuple[FittedLaw, Options]:  # fmt: skip
-    """The best library of terms of H, without friction or with it, and the options for fewer."""
+    """The best library of terms of H, without friction or with it, and the options for fewer.
+
+    early: the first libraries without friction, where these are fitted already.
+    """
 
     def search(forces: Forces | None = None) -> tuple[FittedLaw, Options]:
-        return _searched(problem, work, data, tolerance, scene, terms, options, say, forces)
+        known = early if forces is None else ()
+        return _searched(problem, work, data, tolerance, scene, terms, options, say, forces, known)
 
     if data.args is not None:
         found = _walked(problem, work, data, tolerance, scene, terms, options, say), options
@@ -223,31 +263,29 @@ def _searched(
     options: Options,
     say,
     forces: Forces | None = None,
+    early: Sequence[FittedLaw] = (),
 ) -> tuple[FittedLaw, Options]:
     """The smallest library that meets the tolerance, else the best; and the options, which try no
-    fewer terms where the tolerance is out of reach. forces: friction, that libraries have too."""
+    fewer terms where the tolerance is out of reach. forces: friction, that libraries have too.
+    early: the first libraries, where these are fitted already."""
     bound = tolerance.bound
     best: FittedLaw | None = None
     structured = data.structure is not None
     most_poor = _POOR_STRUCTURED if structured else _POOR_GIVEN if terms else _POOR
     tried: list[FittedLaw] = []
-    poor, errors = 0, []
-    known = libraries_of if forces is None else partial(libraries_with, forces)
-    libraries = list(known(data, scene, terms, options))
-    if len(libraries) > 1 and libraries[0].quadratic and not data.varied:
-        affine = affine_error(data, tolerance).bound
-        if affine > _HOPELESS * bound:
-            errors.append(affine)
-            del libraries[0]
+    poor = 0
+    libraries, errors = _libraries(data, tolerance, scene, terms, options, forces)
     try:
-        for family in libraries:
+        for i, family in enumerate(libraries):
             if tried and too_dear(problem, family, tried[-1], data, tolerance, work.dearest):
                 say(f"H: {family.num_parameters} terms would cost more than the map at hand")
                 continue
-            say(f"H: {family.num_parameters} terms")
-            found = _fitted(
-                problem, work, family, data, tolerance, tried[-1] if tried else None, options, say
-            )
+            if i < len(early):
+                found = early[i]
+            else:
+                say(f"H: {family.num_parameters} terms")
+                last = tried[-1] if tried else None
+                found = _fitted(problem, work, family, data, tolerance, last, options, say)
             better = best is None or found.error.relative < options.gained * best.error.relative
             poor = 0 if better else poor + 1
             if best is None or found.error.relative < best.error.relative:
@@ -256,7 +294,7 @@ def _searched(
             errors.append(found.error.bound)
             if best.error.bound <= bound or poor == most_poor:
                 break
-            left = len(libraries) - 1 - libraries.index(family)
+            left = len(libraries) - 1 - i
             if not structured and options.only_within and _out_of_reach(errors, left, bound):
                 options = dataclasses.replace(options, thresholds=())  # no law: nothing to read
                 break
@@ -271,6 +309,21 @@ def _searched(
         best = near[0]._replace(noisy=True, larger=near[-1])
         stalled, options = True, dataclasses.replace(options, thresholds=(options.certain,))
     return best._replace(stalled=stalled), options
+
+
+def _libraries(
+    data: Dataset, tolerance: Tolerance, scene, terms, options: Options,
+    forces: Forces | None = None,
+) -> tuple[list[Any], list[float]]:  # fmt: skip
+    """Libraries by rising size, and the errors of those before them that are known to be hopeless
+    without a fit."""
+    known = libraries_of if forces is None else partial(libraries_with, forces)
+    libraries = list(known(data, scene, terms, options))
+    if len(libraries) > 1 and libraries[0].quadratic and not data.varied:
+        affine = affine_error(data, tolerance).bound
+        if affine > _HOPELESS * tolerance.bound:
+            return libraries[1:], [affine]
+    return libraries, []
 
 
 def _beside_centrifugal(

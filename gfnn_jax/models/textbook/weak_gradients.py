@@ -16,7 +16,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import savgol_coeffs, savgol_filter
 
 from gfnn_jax.phase_space import apply_j
 
@@ -90,6 +89,8 @@ def weak_gradients(
 
 def _smoothed(sequence: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The sequence (L, 2d) smoothed as far as its orbit allows, and the noise (2d,) left on it."""
+    from scipy.signal import savgol_coeffs, savgol_filter  # takes a second: loaded when first used
+
     for size in _SMOOTHED:
         kept = float(savgol_coeffs(size, _DEGREE)[size // 2])  # of a state's own noise
         smooth = np.asarray(savgol_filter(sequence, size, _DEGREE, axis=0))
