@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
+from gfnn_jax.candidates.assemble import Assembled
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.diagnosis.local_jacobians import local_jacobians, look_symplectic
 from gfnn_jax.learn import choose
@@ -527,3 +528,17 @@ def test_where_steps_do_not_bear_the_search_out_a_larger_map_is_taken(monkeypatc
     assert fit.met
     assert (fit.chosen.chart, fit.chosen.family) == (refused[0].chart, refused[0].family)
     assert fit.chosen.num_parameters > refused[0].num_parameters
+
+
+def test_where_every_map_has_failing_steps_the_one_with_the_fewest_is_taken(monkeypatch):
+    seen = []
+
+    def second_fails_least(candidate, map_, *rest):
+        seen.append(candidate)
+        failing = dataclasses.replace(candidate, map=map_, validation_bound=np.inf)
+        return Assembled(failing, 0.0, failed=1 if len(seen) == 2 else 9)
+
+    monkeypatch.setattr(choose, "measured", second_fails_least)
+    fit = quiet_fit(pendulum_pairs(), learn="map", tolerance=1e-20)
+    assert len(seen) > 2
+    assert (fit.chosen.chart, fit.chosen.label) == (seen[1].chart, seen[1].label)

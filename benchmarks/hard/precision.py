@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 # Sets float64, so it comes before all of JAX.
 from harness import HERE, RESULTS, Numbers, angles_of, drawn, fitted, in_float32
@@ -14,6 +15,7 @@ from harness import HERE, RESULTS, Numbers, angles_of, drawn, fitted, in_float32
 import jax
 import jax.numpy as jnp
 import numpy as np
+from current import code_of
 from hard.cases import Case, counts, digits_of, tried
 
 import gfnn_jax as gfnn
@@ -34,6 +36,7 @@ def fingerprint(quick: bool) -> Numbers:
         "image": np.asarray(states)[:, 1].tolist(),
         "after 100 steps": np.asarray(states)[:, -1].tolist(),
         "label": fit.chosen.label,
+        "code": code_of(Path(__file__)),
     }
 
 
@@ -70,6 +73,8 @@ def precision(quick: bool) -> tuple[list[Case], Numbers]:
     before = RESULTS / "hard-precision.json"
     others = json.loads(before.read_text("utf-8"))["measured"] if before.exists() else {}
     others.pop("cases", None)
+    # Another code learns from other rows: what differs then is not the version's.
+    others = {v: found for v, found in others.items() if found.get("code") == mine["code"]}
     for other, theirs in others.items():
         if other == version:
             continue

@@ -32,11 +32,13 @@ _REPEATS = 5  # of a timed block; the best counts
 
 class Assembled(NamedTuple):
     """The candidate as its own steps show it, with its map, and the seconds that compiling took;
-    compiled: whether there was room for that in the budget, else the error is the search's."""
+    compiled: whether there was room for that in the budget, else the error is the search's. failed:
+    the number of steps that were not solved."""
 
     candidate: Candidate
     compile_seconds: float
     compiled: bool = True
+    failed: int = 0
 
 
 def measured(
@@ -57,7 +59,7 @@ def measured(
         newton_iterations_max=int(steps.iterations.max()),
         microseconds_per_step=steps.microseconds_per_step,
     )  # fmt: skip
-    return Assembled(candidate, steps.compile_seconds)
+    return Assembled(candidate, steps.compile_seconds, failed=int(steps.failed.sum()))
 
 
 def with_predictor(generated: Generated, data: Dataset, rows) -> Generated:

@@ -57,7 +57,8 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     """The first whose own steps bear out what the search measured, else the best.
 
     Where the steps of a map that was to meet the tolerance do not, larger ones of its sweep are
-    looked at before others.
+    looked at before others. Errors are infinite where a step fails: of such maps the one is taken
+    of which the fewest do.
     """
     budget, say, bound = request.budget, request.say, request.tolerance.bound
     compile_seconds, tried = 0.0, []
@@ -69,12 +70,12 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
         map_ = composed(sweep.piece(entry.size), sweep.data)
         assembled = measured(entry.candidate, map_, sweep.data, request.tolerance, budget)
         compile_seconds += assembled.compile_seconds
-        tried.append((assembled.candidate, entry))
+        tried.append((assembled.candidate, assembled.failed, entry))
         expected = max(bound, _CONFIRMED * entry.candidate.validation_bound)
         if assembled.candidate.validation_bound <= expected or not assembled.compiled:
             break
-    candidate, entry = min(
-        tried, key=lambda t: (t[0].validation_bound > bound, t[0].validation_bound)
+    candidate, _, entry = min(
+        tried, key=lambda t: (t[0].validation_bound > bound, t[0].validation_bound, t[1])
     )
     return Chosen(candidate, entry.sweep.data, compile_seconds, entry)
 

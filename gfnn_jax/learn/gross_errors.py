@@ -2,7 +2,8 @@
 
 Neighbours tell an outlier where states are dense (`diagnosis.local_jacobians.outliers`); a map that
 all pairs agree on tells it anywhere. What a map cannot represent is smooth: its residual is as
-large at the neighbours. A gross error of measurement stands alone.
+large at the neighbours. A gross error of measurement stands alone. So may a state at the rim of the
+data, as of the closest passages: the message names both.
 """
 
 from __future__ import annotations
@@ -83,8 +84,8 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
     rows = ", ".join(map(str, left_out[:5]))
     rows += ", …" if gone > 5 else ""
     return Cleaned(seen, found, [
-        f"{gone} of {count} pairs (rows {rows}) are gross errors beside the map of the others: "
-        "they were given no weight"
+        f"{gone} of {count} pairs (rows {rows}) are gross errors beside the map of the others, or "
+        "lie at the rim of the data where it cannot follow: they were given no weight"
     ])  # fmt: skip
 
 
