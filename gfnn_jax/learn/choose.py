@@ -39,14 +39,14 @@ def choose(searched: Searched, request: Request) -> Chosen:
         return Chosen(searched.linear, data, 0.0)
     of_terms = searched.of_terms
     if of_terms is not None:
-        candidate, seconds, _ = map_assembled(of_terms, request.tolerance, request.budget)
+        candidate, seconds, *_ = map_assembled(of_terms, request.tolerance, request.budget)
         return Chosen(candidate, of_terms.data, seconds)
     ranking, bound = searched.found.ranking, request.tolerance.bound
     best = ranking[0].candidate if ranking else None
     if law is None or not (best is None or preferred(law.candidate, best, bound)):
         return _of_ranking(ranking, request)
     request.say(f"compiling the flow of {law.candidate.label}")
-    candidate, seconds, _ = flow_assembled(law, *given)
+    candidate, seconds, *_ = flow_assembled(law, *given)
     expected = max(bound, _CONFIRMED * law.candidate.validation_bound)
     if best is not None and not candidate.validation_bound <= expected:
         return _of_ranking(ranking, request)
