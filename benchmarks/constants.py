@@ -207,11 +207,12 @@ def set_to(module: str, name: str, value: Any) -> Iterator[None]:
     undo: list[Callable[[], None]] = []
     if isinstance(held, type):  # a class of options: its default
         names = [f.name for f in dataclasses.fields(held)]
-        before = held.__init__.__defaults__
+        made: Any = held.__init__
+        before = made.__defaults__
         after = list(before)
         after[names.index(field) - len(names)] = value
-        held.__init__.__defaults__ = tuple(after)
-        undo.append(lambda: setattr(held.__init__, "__defaults__", before))
+        made.__defaults__ = tuple(after)
+        undo.append(lambda: setattr(made, "__defaults__", before))
     elif field:
         alike = {id(o): o for m in _modules() for o in vars(m).values() if type(o) is type(held)}
         for options in alike.values():

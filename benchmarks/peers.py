@@ -184,7 +184,7 @@ def estimated(
             better = jnp.sum(residual(new) ** 2) < jnp.sum(r**2)
             return (jnp.where(better, new, x), damping * jnp.where(better, 0.1, 10.0)), None
 
-        return jax.lax.scan(iterate, (x0, 1e-3), None, length=12)[0][0]
+        return jax.lax.scan(iterate, (x0, jnp.asarray(1e-3)), None, length=12)[0][0]
 
     return jax.vmap(one)(x0, t, y)
 

@@ -3,14 +3,13 @@
     python benchmarks/textbook.py                   every law that has no result yet
     python benchmarks/textbook.py --only kepler     one of them
     python benchmarks/textbook.py --quick           four of them, into runs/
-    python benchmarks/textbook.py --noise           every law again, of noisy sequences
 
 Each law of `textbook_laws` is learned from 1,000 clean pairs, told nothing but which coordinates
 are angles and the period of a drive. A law is found where ∇H agrees with the true one to 1e-8 at
 states of a box that is a fifth wider than that of the pairs, with no more terms than the truth has.
 Of the laws outside of every library, a formula that is chosen is counted as false.
 
-With ``--noise`` each is learned from 40 sequences of 50 states with normal noise of 1e-3 of the
+`textbook_noise.py` learns each from 40 sequences of 50 states with normal noise of 1e-3 of the
 spread. Its structure is exact where its own terms, with other coefficients and constants, are the
 true H: those numbers are fitted to the true gradients, where they must leave no more than 1e-8, and
 are what the law's own are held against, in units of their standard errors.
@@ -19,7 +18,6 @@ are what the law's own are held against, in units of their standard errors.
 from __future__ import annotations
 
 import dataclasses
-import sys
 import time
 import warnings
 from functools import partial
@@ -147,7 +145,7 @@ def noisy(name: str, quick: bool) -> Numbers:
     found = fit.hamiltonian
     true = None if found is None else true_numbers(found, law)
     size = law.size or len(law.terms)
-    exact = true is not None and true[1] <= EXACT and len(found.terms) <= size
+    exact = bool(found and true and true[1] <= EXACT and len(found.terms) <= size)
     off = None
     if found is not None and true is not None and exact:
         told = [*found.terms, *found.constants]
@@ -269,9 +267,4 @@ def tables() -> None:
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:]
-    if "--noise" in given:
-        given.remove("--noise")
-        main(__doc__ or "", NOISY, "textbook-noise", noisy_tables, given, QUICK[:3])
-    else:
-        main(__doc__ or "", PIECES, "textbook", tables, given, QUICK)
+    main(__doc__ or "", PIECES, "textbook", tables, None, QUICK)

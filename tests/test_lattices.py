@@ -427,7 +427,7 @@ def test_kicked_sites_of_plain_coordinates():
         ({"structure": "ring:0"}, "expected a structure among"),
         ({"structure": "ring:3"}, "expected 3 q of every site; got 20"),
         ({"structure": "chain:10"}, "at least 5 sites, got 2"),
-        ({"structure": "ring:2", "angles": tuple(range(20))}, "no angles of 2 fields"),
+        ({"structure": "ring:2", "angles": tuple(range(20))}, "no angles where a site has 2 q"),
         ({"structure": "ring:2", "terms": ["exp(q9)"]}, "q9"),
         ({"structure": "ring", "family": "sines"}, "its own terms"),
         ({"structure": "ring", "chart": "type1"}, "another chart"),
