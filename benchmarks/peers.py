@@ -1,0 +1,402 @@
+"""Measured records and peers: the same training parts, forecasts of the same held-out thirds.
+
+    python benchmarks/peers.py                     pendulum, two_carts, double_pendulum
+    python benchmarks/peers.py --only pendulum --overwrite
+    python benchmarks/peers.py --quick             the pendulum, little training, into runs/
+
+Each peer ends in an acceleration q̈ = a(q, v) that JAX integrates (diffrax): a rigid body whose
+equations are written by hand, its constants fitted by SciPy; a neural ODE (flax, optax, diffrax);
+PySINDy, its library given by hand (pip install '.[peers]'; left out where it is not installed). All
+see positions only. The state before a forecast is estimated by least squares from 20 samples
+through the peer's own equations, as `benchmarks/measured.py` does through ours; its results stand
+beside them in the table. Seconds are of the processor, compilation included.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+# Sets float64, so it comes before all of JAX.
+from harness import (
+    RESULTS,
+    SEED,
+    TABLES,
+    Numbers,
+    between_markers,
+    main,
+    markdown,
+    provenance,
+    read,
+)
+from measured import RECORDS, SAMPLES, held_windows, split
+
+import diffrax  # isort: skip
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from scipy.optimize import least_squares
+
+import gfnn_jax as gfnn
+from gfnn_jax.dataset.stretches import stretches
+from gfnn_jax.signals.local_cubics import choose_half, smooth
+
+Acceleration = Callable[[Any, jax.Array, jax.Array], jax.Array]  # (params, q, v) -> q̈, (d,) each
+LENGTH = 24  # samples of an arc that a peer is fitted to
+THRESHOLDS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3)  # of PySINDy's sparse regression, tried in turn
+
+
+class System(NamedTuple):
+    """What peers are told of a record: the equations with their constants, a library, features
+    of a network, the largest step of an integrator (s), and these in words."""
+
+    body: Acceleration
+    constants: tuple[float, ...]
+    library: Callable[[Any, Any], tuple[Any, ...]]
+    features: Callable[[jax.Array], jax.Array]
+    step: float
+    told: str
+
+
+class Arcs(NamedTuple):
+    """Arcs of samples: times from the first sample on t (n, length) in s, positions y (n, length,
+    d), and states x0 (n, 2d) at the first sample by local cubics."""
+
+    t: np.ndarray
+    y: np.ndarray
+    x0: np.ndarray
+
+
+# The systems, and what a person would write of them
+
+
+def pendulum(c: Any, q: jax.Array, v: jax.Array) -> jax.Array:
+    """θ̈ = −k sin(θ + θ₀) − c θ̇."""
+    return -c[0] * jnp.sin(q + c[2]) - c[1] * v
+
+
+def carts(c: Any, q: jax.Array, v: jax.Array) -> jax.Array:
+    """Two masses between three springs, with linear friction."""
+    first = -c[0] * q[0] + c[1] * q[1] + c[2] - c[3] * v[0]
+    second = c[4] * q[0] - c[5] * q[1] + c[6] - c[7] * v[1]
+    return jnp.array([first, second])
+
+
+def double_pendulum(c: Any, q: jax.Array, v: jax.Array) -> jax.Array:
+    """L = ½ω₁² + a ω₂² + b ω₁ω₂ cos(θ₁ − θ₂) + g₁ cos θ₁ + g₂ cos θ₂, linear friction at both axes."""
+    a, b, g1, g2, c1, c2 = c
+    difference = q[0] - q[1]
+    cross = b * jnp.cos(difference)
+    mass = jnp.array([[1.0, cross], [cross, 2 * a]])
+    relative = c2 * (v[1] - v[0])
+    force = jnp.array([
+        -b * v[1] ** 2 * jnp.sin(difference) - g1 * jnp.sin(q[0]) - c1 * v[0] + relative,
+        b * v[0] ** 2 * jnp.sin(difference) - g2 * jnp.sin(q[1]) - relative,
+    ])  # fmt: skip
+    return jnp.linalg.solve(mass, force)
+
+
+def _pendulum_library(q: Any, v: Any) -> tuple[Any, ...]:
+    return (jnp.sin(q[0]), jnp.cos(q[0]), jnp.sin(2 * q[0]), v[0], v[0] * jnp.abs(v[0]))
+
+
+def _cart_library(q: Any, v: Any) -> tuple[Any, ...]:
+    return (q[0], q[1], v[0], v[1], jnp.ones_like(q[0]))
+
+
+def _double_pendulum_library(q: Any, v: Any) -> tuple[Any, ...]:
+    """The terms of the solved equations; 1/(1 − k cos² Δ), k unknown, by its harmonics of Δ."""
+    d = q[0] - q[1]
+    terms = (
+        jnp.sin(q[0]), jnp.sin(q[1]), jnp.sin(q[0] - 2 * q[1]), jnp.sin(2 * q[0] - q[1]),
+        v[0] ** 2 * jnp.sin(d), v[1] ** 2 * jnp.sin(d),
+        v[0] ** 2 * jnp.sin(2 * d), v[1] ** 2 * jnp.sin(2 * d), v[0], v[1],
+    )  # fmt: skip
+    return tuple(term * jnp.cos(2 * k * d) for k in range(4) for term in terms)
+
+
+def _angles(q: jax.Array) -> jax.Array:
+    return jnp.concatenate([jnp.sin(q), jnp.cos(q)])
+
+
+SYSTEMS = {
+    "pendulum": System(
+        pendulum, (5.0, 0.01, 0.0), _pendulum_library, _angles, 0.06,
+        "θ̈ = −k sin θ − c θ̇; sin, cos, ω, ω|ω|",
+    ),
+    "two_carts": System(
+        carts, (10.0, 5.0, 0.0, 0.1, 5.0, 10.0, 0.0, 0.1), _cart_library, lambda q: q / 50, 0.034,
+        "two masses, three springs, linear friction; 1, x, v",
+    ),
+    "double_pendulum": System(
+        double_pendulum, (0.2, 0.4, 60.0, 20.0, 0.01, 0.01), _double_pendulum_library, _angles,
+        0.011, "the textbook's Lagrangian; the 40 terms of its solved equations",
+    ),
+}  # fmt: skip
+
+
+# Integration, shared by all
+
+
+@functools.partial(jax.jit, static_argnums=(0, 4, 5))
+def positions(
+    a: Acceleration, params: Any, x0: jax.Array, t: jax.Array, step: float, forward: bool = True
+) -> jax.Array:
+    """Positions (n, m, d) at times t (n, m), rising from 0, from states x0 (n, 2d); infinite where
+    the equations run away. Differentiated in forward mode, else in reverse."""
+    adjoint = diffrax.ForwardMode() if forward else diffrax.RecursiveCheckpointAdjoint()
+    dim = x0.shape[-1] // 2
+
+    def field(_: Any, x: jax.Array, params: Any) -> jax.Array:
+        return jnp.concatenate([x[dim:], a(params, x[:dim], x[dim:])])
+
+    def one(x0: jax.Array, t: jax.Array) -> jax.Array:
+        solved = diffrax.diffeqsolve(
+            diffrax.ODETerm(field), diffrax.Tsit5(), 0.0, t[-1], step, x0, params,
+            saveat=diffrax.SaveAt(ts=t), adjoint=adjoint, throw=False, max_steps=4096,
+        )  # fmt: skip
+        assert solved.ys is not None  # times were asked for
+        return solved.ys[:, :dim]
+
+    return jax.vmap(one)(x0, t)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 5))
+def estimated(
+    a: Acceleration, params: Any, x0: jax.Array, t: jax.Array, y: jax.Array, step: float
+) -> jax.Array:
+    """States (n, 2d) at the first samples: least squares to the positions y (n, m, d) at t (n, m),
+    12 damped Gauss–Newton iterations from x0 (n, 2d)."""
+
+    def one(x0: jax.Array, t: jax.Array, y: jax.Array) -> jax.Array:
+        def residual(x: jax.Array) -> jax.Array:
+            return (positions(a, params, x[None], t[None], step)[0] - y).ravel()
+
+        def iterate(state: tuple[jax.Array, jax.Array], _: None) -> Any:
+            x, damping = state
+            r, j = residual(x), jax.jacfwd(residual)(x)
+            normal = j.T @ j
+            new = x - jnp.linalg.solve(normal + damping * jnp.diag(jnp.diag(normal)), j.T @ r)
+            better = jnp.sum(residual(new) ** 2) < jnp.sum(r**2)
+            return (jnp.where(better, new, x), damping * jnp.where(better, 0.1, 10.0)), None
+
+        return jax.lax.scan(iterate, (x0, 1e-3), None, length=12)[0][0]
+
+    return jax.vmap(one)(x0, t, y)
+
+
+# The peers: each turns training arcs into an acceleration and its parameters
+
+
+def by_hand(system: System, arcs: Arcs, quick: bool) -> tuple[Acceleration, Any]:
+    """The equations' constants and the state at the start of each arc, by SciPy's least squares."""
+    spread = arcs.y.std(axis=(0, 1))
+    num = len(system.constants)
+
+    def residual(unknown: Any) -> Any:
+        x0 = unknown[num:].reshape(arcs.x0.shape)
+        found = positions(system.body, unknown[:num], x0, arcs.t, system.step)
+        return ((found - arcs.y) / spread).ravel()
+
+    jacobian = jax.jit(jax.jacfwd(residual))
+    start = np.concatenate([system.constants, arcs.x0.ravel()])
+    found = least_squares(
+        residual, start, jac=lambda x: np.asarray(jacobian(x)), x_scale="jac", loss="soft_l1",
+        f_scale=0.01, max_nfev=10 if quick else 60,
+    )  # fmt: skip
+    return system.body, jnp.asarray(found.x[:num])
+
+
+class Network(nn.Module):
+    """Two hidden layers of 48: (features of q, v) -> q̈ ÷ its size."""
+
+    dim: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        for _ in range(2):
+            x = nn.tanh(nn.Dense(48, param_dtype=float)(x))
+        return nn.Dense(self.dim, param_dtype=float)(x)
+
+
+def neural_ode(system: System, arcs: Arcs, quick: bool) -> tuple[Acceleration, Any]:
+    """A network for q̈, and the states at the start of the arcs, by Adam through diffrax."""
+    n, _, dim = arcs.y.shape
+    spread = arcs.y.std(axis=(0, 1))
+    speed = arcs.x0[:, dim:].std(axis=0)
+    size = speed**2 / spread  # of an acceleration
+    network = Network(dim)
+
+    def acceleration(params: Any, q: jax.Array, v: jax.Array) -> jax.Array:
+        return size * network.apply(params, jnp.concatenate([system.features(q), v / speed]))
+
+    key = jax.random.key(SEED)
+    features = jax.eval_shape(system.features, jnp.zeros(dim)).shape[0]
+    weights = network.init(key, jnp.zeros(features + dim))
+    scale = np.concatenate([spread, speed])
+    unknown = (weights, jnp.zeros((n, 2 * dim)))  # what is added to the states, in their scales
+    steps = 40 if quick else 2_000
+    schedule = optax.cosine_decay_schedule(5e-3, steps)
+    optimizer = optax.adam(schedule)
+
+    def loss(unknown: Any, rows: jax.Array) -> jax.Array:
+        weights, shift = unknown
+        x0 = jnp.asarray(arcs.x0)[rows] + 0.1 * scale * shift[rows]
+        found = positions(acceleration, weights, x0, jnp.asarray(arcs.t)[rows], system.step, False)
+        return jnp.mean(((found - jnp.asarray(arcs.y)[rows]) / spread) ** 2)
+
+    @jax.jit
+    def train(unknown: Any, state: Any, key: jax.Array) -> Any:
+        rows = jax.random.choice(key, n, (min(16, n),), replace=False)
+        updates, state = optimizer.update(jax.grad(loss)(unknown, rows), state)
+        return optax.apply_updates(unknown, updates), state
+
+    state = optimizer.init(unknown)
+    for k in range(steps):
+        unknown, state = train(unknown, state, jax.random.fold_in(key, k))
+    return acceleration, unknown[0]
+
+
+def pysindy_sparse(system: System, arcs: Arcs, quick: bool) -> tuple[Acceleration, Any]:
+    """Sparse regression of q̈, from smoothed positions, on the library; the threshold whose
+    equations follow the last quarter of the arcs best."""
+    import pysindy as ps
+
+    dim = arcs.y.shape[-1]
+    half = choose_half([(t, y) for t, y in zip(arcs.t, arcs.y, strict=True)])[0]
+    smoothed = [smooth(t, y, half)[0] for t, y in zip(arcs.t, arcs.y, strict=True)]
+    inner = slice(2, -2)  # cubics are poor at the ends of an arc
+    states = [np.hstack([s.q, s.v])[inner] for s in smoothed]
+    rates = [s.a[inner] for s in smoothed]
+    few = slice(None, -max(1, len(states) // 4))
+    check = slice(few.stop, None)
+    columns = [
+        np.stack(np.broadcast_arrays(*system.library(x[:, :dim].T, x[:, dim:].T)), axis=1)
+        for x in states
+    ]
+
+    def acceleration(params: Any, q: jax.Array, v: jax.Array) -> jax.Array:
+        return params @ jnp.stack(system.library(q, v))
+
+    best, kept = np.inf, None
+    for threshold in THRESHOLDS[:2] if quick else THRESHOLDS:
+        sparse = ps.STLSQ(threshold=threshold, alpha=1e-6, normalize_columns=True)
+        sparse.fit(np.concatenate(columns[few]), np.concatenate(rates[few]))
+        params = jnp.asarray(sparse.coef_)
+        x0, t, y = arcs.x0[check], arcs.t[check], arcs.y[check]
+        x0 = estimated(acceleration, params, x0, t, y, system.step)
+        error = float(jnp.mean((positions(acceleration, params, x0, t, system.step) - y) ** 2))
+        if error < best:
+            best, kept = error, params
+    if kept is None:
+        raise RuntimeError("PySINDy's equations run away along every arc, at each threshold")
+    return acceleration, kept
+
+
+PEERS = {
+    "rigid body by hand": by_hand,
+    "neural ODE": neural_ode,
+    "PySINDy": pysindy_sparse,
+}
+
+
+# Measuring
+
+
+def arcs_of(parts: Sequence[Any], length: int = LENGTH) -> Arcs:
+    """Arcs of ``length`` samples, half of each shared with the next, of stretches without gaps."""
+    half = choose_half([(s.t, s.y) for s in parts])[0]
+    t, y, x0 = [], [], []
+    for s in parts:
+        local = smooth(s.t, s.y, half)[0]
+        for k in range(0, len(s.t) - length + 1, length // 2):
+            t.append(s.t[k : k + length] - s.t[k])
+            y.append(s.y[k : k + length])
+            x0.append(np.concatenate([local.q[k], local.v[k]]))
+    return Arcs(np.array(t), np.array(y), np.array(x0))
+
+
+def judged(name: str, a: Acceleration, params: Any, held: Any) -> dict[str, float | None]:
+    """Median error of the worst coordinate at the times ahead of `measured.py`, in its unit."""
+    times, unit, _, _ = RECORDS[name]
+    system = SYSTEMS[name]
+    ends, ahead, seen = held_windows(held, times)
+    t, y, x0, later = [], [], [], []
+    half = choose_half([(s.t, s.y) for s, _ in ends])[0]
+    for (s, k), to in zip(ends, ahead, strict=True):
+        rows = slice(k - SAMPLES + 1, k + 1)
+        local = smooth(s.t[rows], s.y[rows], min(half, SAMPLES // 2))[0]
+        t.append(s.t[rows] - s.t[rows.start])
+        y.append(s.y[rows])
+        x0.append(np.concatenate([local.q[0], local.v[0]]))
+        later.append(to - s.t[rows.start])
+    start = estimated(a, params, np.array(x0), np.array(t), np.array(y), system.step)
+    error = np.abs(np.asarray(positions(a, params, start, np.array(later), system.step)) - seen)
+    found: dict[str, float | None] = {}
+    for n, time_ahead in enumerate(times):
+        there = np.isfinite(seen[:, n]).all(axis=1)
+        some = np.where(np.isfinite(error[there, n]), error[there, n], np.inf)
+        worst = float(np.median(some, axis=0).max()) if there.any() else np.nan
+        found[str(time_ahead)] = worst * unit if np.isfinite(worst) else None
+    return found
+
+
+def measure(name: str, quick: bool) -> Numbers:
+    """Fit each peer to the first two thirds of a record, and judge its forecasts of the last."""
+    recording = gfnn.read(gfnn.records.path(name), positions=list(RECORD_POSITIONS[name]),
+                          angles=list(RECORD_ANGLES[name]))  # fmt: skip
+    training, held = split(recording, 2)
+    system = SYSTEMS[name]
+    arcs = arcs_of(list(stretches(training)))
+    found: Numbers = {"told": system.told, "num_arcs": len(arcs.t)}
+    for peer, fit in PEERS.items():
+        started = time.process_time()
+        try:
+            a, params = fit(system, arcs, quick)
+        except ImportError:
+            print(f"{peer} is not installed", flush=True)
+            continue
+        seconds = time.process_time() - started
+        found[peer] = {"median": judged(name, a, params, held), "seconds": seconds,
+                       "num_parameters": sum(p.size for p in jax.tree.leaves(params))}  # fmt: skip
+        print(f"{name}, {peer}: {found[peer]}", flush=True)
+    return found
+
+
+RECORD_POSITIONS = {"pendulum": ("theta",), "two_carts": ("x1", "x2"),
+                    "double_pendulum": ("theta1", "theta2")}  # fmt: skip
+RECORD_ANGLES = RECORD_POSITIONS | {"two_carts": ()}
+PIECES = {name: functools.partial(measure, name) for name in SYSTEMS}
+
+
+def tables() -> None:
+    """The table of RESULTS.md: ours from `measured.py`'s results, and the peers."""
+    found = read({name: RESULTS / f"peers-{name}.json" for name in SYSTEMS})
+    ours = read({name: RESULTS / f"measured-{name}.json" for name in SYSTEMS})
+    if not found:
+        return
+    rows = []
+    for name, result in found.items():
+        m = ours.get(name, {}).get("measured", {}).get("2")
+        if m:
+            rows.append([name, "gfnn_jax", "which columns are angles", *_cells(m)])
+        for peer in PEERS:
+            if peer in result["measured"]:
+                told = result["measured"]["told"].split("; ")
+                told = {"rigid body by hand": told[0], "PySINDy": told[-1]}.get(peer, "angles")
+                rows.append([name, peer, told, *_cells(result["measured"][peer])])
+    heads = ("record", "method", "told", "median error ahead", "CPU s")
+    between_markers(TABLES, "peers", f"{markdown(heads, rows)}\n\n{provenance(found)}")
+
+
+def _cells(m: Numbers) -> tuple[str, str]:
+    ahead = "; ".join(f"{t} s {e:.3g}" for t, e in m["median"].items() if e is not None)
+    return ahead or "runs away", f"{m['seconds']:.0f}"
+
+
+if __name__ == "__main__":
+    main(__doc__ or "", PIECES, "peers", tables, None, quick_pieces=("pendulum",))
