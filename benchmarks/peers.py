@@ -87,7 +87,7 @@ def carts(c: Any, q: jax.Array, v: jax.Array) -> jax.Array:
 
 
 def double_pendulum(c: Any, q: jax.Array, v: jax.Array) -> jax.Array:
-    """L = ½ω₁² + a ω₂² + b ω₁ω₂ cos(θ₁ − θ₂) + g₁ cos θ₁ + g₂ cos θ₂, linear friction at both axes."""
+    """L = ½ω₁² + a ω₂² + b ω₁ω₂ cos(θ₁ − θ₂) + g₁ cos θ₁ + g₂ cos θ₂, with linear friction."""
     a, b, g1, g2, c1, c2 = c
     difference = q[0] - q[1]
     cross = b * jnp.cos(difference)
