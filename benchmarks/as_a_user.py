@@ -52,10 +52,10 @@ from users.refused import REFUSED
 from users.tried import TRIED
 
 import gfnn_jax as gfnn
+from gfnn_jax.candidates.assemble import stepped
 from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.errors import FitError, InputError, WorkError
 from gfnn_jax.families.terms import given_terms
-from gfnn_jax.learn.assemble import stepped
 from gfnn_jax.phase_space import sizes
 
 # Factors by which claims may differ from the truth: errors of exact data, and the map's own error
@@ -172,7 +172,7 @@ def untruths(case: Case, learned: Learned, error: float) -> list[str]:
 def unreadable(case: Case, learned: Learned) -> list[str]:
     """A formula that sympy or ``terms`` does not read."""
     text, names = learned.formula, tuple(case.pairs.args or ())
-    if text is None or case.options.get("structure") or text.startswith("Legendre"):
+    if text is None or text.startswith("Legendre"):
         return []
     try:
         sympy.sympify(text)
@@ -196,7 +196,7 @@ def wrong_claims(case: Case, learned: Learned, error: float) -> list[str]:
 
 def wrong_noise(case: Case, learned: Learned, error: float, said: str) -> list[str]:
     """List differences between reported noise and error and the true ones."""
-    if not case.sigma:
+    if not case.sigma or not (case.noise_measured or learned.noise):
         return []
     ratios, told = noise_ratio(case, learned), re.search(r"own error is then about (\S+) of", said)
     if ratios is None:

@@ -70,6 +70,7 @@ def _modules_of(study: Path) -> set[Path]:
     return found
 
 
+@functools.cache  # of the package's modules for every study
 def _meaning(path: Path) -> str:
     """A module without comments, docstrings and layout."""
     tree = ast.parse(path.read_text(encoding="utf-8"))

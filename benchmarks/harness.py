@@ -1,6 +1,8 @@
 """Tools of all benchmarks: data and fits, times, results as JSON, tables between markers.
 
-The import sets float64, so it comes before all of JAX.
+The import sets float64, so it comes before all of JAX. With ``--processor-time`` among a study's
+arguments it also puts the processor's clock in place of the wall's, before the package binds one:
+seconds and budgets then do not depend on what else the machine does.
 """
 
 from __future__ import annotations
@@ -17,8 +19,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
-from current import code_of
+PROCESSOR_TIME = "--processor-time"
+if PROCESSOR_TIME in sys.argv:
+    time.perf_counter = time.monotonic = time.process_time
+
+import jax  # noqa: E402
+from current import code_of  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
@@ -193,6 +199,7 @@ def circumstances() -> Numbers:
             "cores": cores(),
             "load": os.getloadavg()[0],
         },
+        "clock": "processor" if time.perf_counter is time.process_time else "wall",
         "python": platform.python_version(),
         "versions": versions(),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
@@ -234,6 +241,8 @@ def main(
     parser.add_argument("--quick", action="store_true", help="small sizes; writes no tables")
     parser.add_argument("--overwrite", action="store_true", help="measure finished pieces again")
     parser.add_argument("--tables", action="store_true", help="only make tables and figures again")
+    parser.add_argument(PROCESSOR_TIME, action="store_true",
+                        help="seconds of the processor in place of the wall's")  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
     arguments = parser.parse_args(argv)
     every = quick_pieces if arguments.quick and quick_pieces else pieces
@@ -297,8 +306,10 @@ def provenance(found: Mapping[str, Numbers]) -> str:
     jaxes = sorted({r["versions"]["jax"] for r in found.values()})
     loads = [r["machine"]["load"] for r in found.values()]
     span = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
+    by_processor = sum(r.get("clock") == "processor" for r in found.values())
+    clock = f"; {by_processor} of {len(found)} timed in processor seconds" if by_processor else ""
     return (
         f"Measured {span} on {' and '.join(sorted(machines))}, jax {', '.join(jaxes)}, float64, "
         f"seed {SEED}; other work on the machine at the time: load average {min(loads):.1f} to "
-        f"{max(loads):.1f}."
+        f"{max(loads):.1f}{clock}."
     )

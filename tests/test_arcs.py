@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
+from gfnn_jax.budget import Allowance, Counted
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.runs import identified
@@ -13,9 +14,9 @@ from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.learn import choose_law, flows
-from gfnn_jax.learn.arcs import arcs_of
-from gfnn_jax.learn.clock import Counted
+from gfnn_jax.models.hamiltonians import choose_law
+from gfnn_jax.models.hamiltonians import search as flows
+from gfnn_jax.models.hamiltonians.arcs import arcs_of
 
 LAW, TRUE = given_terms(1, ["p**2", "q**2", "q**4"]), np.array([0.5, 0.5, 0.25])
 QUIETLY = pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")
@@ -104,11 +105,11 @@ def test_arcs_tell_the_law_better_than_steps(monkeypatch):
 def test_a_counted_budget_ends_where_it_is_spent():
     pairs = sequences(0.3, 0.0)
     counted = Counted(np.inf)
-    problem = Problem(pairs.z0, pairs.z1, 0.3, np.ones(2), spend=counted.spend)
+    problem = Problem(pairs.z0, pairs.z1, 0.3, np.ones(2), allowance=Allowance(cap=counted))
     first = problem.fit(LAW, TRUE + 0.1)
     spent = counted.spent
     assert spent > 0
-    problem.spend = (again := Counted(0.5 * spent)).spend
+    problem.allowance = Allowance(cap=(again := Counted(0.5 * spent)))
     with pytest.raises(OutOfTime):
         problem.fit(LAW, TRUE + 0.1)
     assert 0.5 * spent < again.spent < spent

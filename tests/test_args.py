@@ -11,11 +11,11 @@ import pytest
 import gfnn_jax as gfnn
 from gfnn_jax import cli
 from gfnn_jax.data.files import read_trajectories
+from gfnn_jax.dataset.varied import as_varied
 from gfnn_jax.families.terms import Terms, given_terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.learn.parameters import functions_of_parameters, walked
-from gfnn_jax.learn.varied import as_varied
+from gfnn_jax.models.parameters import functions_of_parameters, walked
 
 LENGTH = given_terms(1, ["p**2/(2*l**2) - 9.81*l*cos(q)"], ("l",))
 FINE = Steps(8, 4)

@@ -14,8 +14,8 @@ from gfnn_jax.fitting import shared_noise, uncertainty
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.jobs.predict import predict
-from gfnn_jax.learn.sweeps import LinearSweep
 from gfnn_jax.maps.bands import bands, horizon
+from gfnn_jax.models.generating_functions.sweeps import LinearSweep
 from gfnn_jax.scenes import henon_heiles
 
 NOISE = 1e-3

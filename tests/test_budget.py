@@ -11,11 +11,11 @@ import pytest
 import scipy.linalg
 
 import gfnn_jax as gfnn
+from gfnn_jax.budget import COMPILE, FLOW, ROWS, Budget
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.learn import searches
-from gfnn_jax.learn.clock import COMPILE, FLOW, ROWS, Budget
 
 QUIETLY = pytest.mark.filterwarnings("ignore::gfnn_jax.FitWarning")
 LARGE = 10**10  # operations whose time tells the rate of their kind: a second, by default

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from gfnn_jax.budget import Budget
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, measured_error, one_step_error
@@ -13,10 +14,9 @@ from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
-from gfnn_jax.learn import sweeps
-from gfnn_jax.learn.clock import Budget
-from gfnn_jax.learn.search import search
+from gfnn_jax.models.generating_functions import sweeps
 from gfnn_jax.phase_space import Pairs
+from gfnn_jax.search.search import search
 from gfnn_jax.storage.factors import KeptFactors
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from gfnn_jax import cli, scenes
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitWarning
@@ -30,7 +31,6 @@ from gfnn_jax.jobs import predict as predict_job
 from gfnn_jax.jobs import progress, search
 from gfnn_jax.learn import check
 from gfnn_jax.learn import fit as learn_fit
-from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.options import OPTIONS
 from gfnn_jax.maps import saved as models
 from gfnn_jax.maps.domain import covering
@@ -826,7 +826,7 @@ TRAINING = """
 import sys
 from gfnn_jax import cli
 from gfnn_jax.jobs import progress
-from gfnn_jax.learn import network_sweep
+from gfnn_jax.models.generating_functions import network_sweep
 
 network_sweep._CHECKPOINT_SECONDS = progress.BETWEEN = 0.0
 sys.exit(cli.main(sys.argv[1:]))

@@ -10,6 +10,7 @@ from scipy.linalg import expm
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.evaluate.orbits import periodic_orbit, rotation_number
+from gfnn_jax.evaluate.report import assemble
 from gfnn_jax.phase_space import Pairs, symplectic_form
 
 B, K, DRIFT = 0.9, 0.6, 0.2
@@ -89,6 +90,86 @@ def test_oscillators_of_different_friction_keep_no_multiple_of_the_form():
     fresh = np.random.default_rng(1).normal(size=(50, 4))
     error = np.asarray(learned.map.step(fresh)[0]) - fresh @ expm(0.5 * field).T
     assert np.abs(error).max() < 1e-12
+
+
+# A factor that depends on a parameter
+
+
+def damped_by(parameter, z):
+    """The damped standard map of this b in every pair."""
+    q, p = np.asarray(z).T
+    p = parameter * p + DRIFT + K * np.sin(q)
+    return np.stack([q + p, p], axis=-1)
+
+
+def pairs_by(number, seed):
+    z, rng = states_of(number, seed), np.random.default_rng([seed, 1])
+    decay = rng.uniform(0.05, 0.3, number)
+    return Pairs(z, damped_by(np.exp(-decay), z), 1.0, args={"decay": decay})
+
+
+@pytest.fixture(scope="module")
+def of_decay():
+    return gfnn.fit(pairs_by(900, 0), angles=(0,), tolerance=1e-9)
+
+
+def test_a_factor_that_depends_on_a_parameter_is_learned(of_decay):
+    assert of_decay.met
+    given = np.array([0.07, 0.15, 0.28])
+    found = of_decay.map.multiplier({"decay": given})
+    assert np.abs(found - np.exp(-given)).max() < 1e-9
+    assert abs(of_decay.map.multiplier({"decay": 0.15}) - found[1]) < 1e-15
+    assert of_decay.map.multiplier() is None  # of no parameter in particular
+    assert "by decay, the same everywhere" in str(of_decay.damping)
+    test = pairs_by(200, 1)
+    error = np.asarray(of_decay.map.step(test.z0, test.args)[0]) - test.z1
+    assert np.abs(nearest_image(error, (0,))).max() < 1e-7
+    assert of_decay.symplecticity_defect < 1e-14
+
+
+def test_a_map_of_such_a_factor_goes_back_and_is_saved(of_decay, tmp_path):
+    test = pairs_by(50, 2)
+    image = of_decay.map.step(test.z0, test.args)[0]
+    back = np.asarray(of_decay.map.inverse(image, test.args)[0])
+    assert np.abs(nearest_image(back - test.z0, (0,))).max() < 1e-11
+    of_decay.map.save(tmp_path / "model")
+    assert np.array_equal(gfnn.load(tmp_path / "model").step(test.z0, test.args)[0], image)
+    report = assemble(of_decay, scene=None, dt=1.0, seed=0, data={}, rollout=None)["map"]
+    assert report["multiplier"] is None
+    assert report["damping"]["parameters"] == ("decay",)
+    low, high = report["damping"]["low"], report["damping"]["high"]
+    assert abs(low - np.exp(-0.3)) < 1e-3
+    assert abs(high - np.exp(-0.05)) < 1e-3
+
+
+def test_a_factor_that_no_parameter_changes_is_one_number():
+    """K is the parameter: b is the same for all, and told as one."""
+    z, rng = states_of(900, 3), np.random.default_rng(4)
+    strength = rng.uniform(0.3, 0.9, 900)
+    p = B * z[:, 1] + DRIFT + strength * np.sin(z[:, 0])
+    pairs = Pairs(z, np.stack([z[:, 0] + p, p], 1), 1.0, args={"strength": strength})
+    learned = gfnn.fit(pairs, angles=(0,), tolerance=1e-10)
+    assert learned.met
+    assert learned.damping.functions is None
+    assert abs(learned.damping.factor - B) < 1e-12
+    assert learned.map.multiplier({"strength": 0.5}) == learned.damping.factor
+
+
+def test_two_factors_that_depend_on_a_parameter():
+    """Two oscillators whose frictions are of a parameter: none of them has a multiple of J."""
+    rng = np.random.default_rng(0)
+    z, rate = rng.normal(size=(600, 4)), rng.uniform(0.05, 0.1, 600)
+
+    def image(z, rate):
+        p = np.stack([(1 - rate) * z[:, 2], (1 - 2 * rate) * z[:, 3]], 1) - 0.3 * z[:, :2]
+        return np.concatenate([z[:, :2] + p, p], axis=1)
+
+    learned = gfnn.fit(Pairs(z, image(z, rate), 1.0, args={"rate": rate}), tolerance=1e-6)
+    assert learned.met
+    assert learned.map.multiplier({"rate": 0.08}) is None
+    piece = learned.damping.piece
+    assert np.abs(piece.of(np.array([0.08]))[0] - [0.92, 0.84]).max() < 1e-6
+    assert "each degree of freedom by its own" in str(learned.damping)
 
 
 def test_friction_that_differs_over_phase_space_is_said_to():

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from gfnn_jax.generating.charts import CHARTS
-from gfnn_jax.learn.diagnose import (
+from gfnn_jax.diagnosis.local_jacobians import (
     data_defect,
     differs_between_sequences,
     judge_chart,
@@ -13,6 +12,7 @@ from gfnn_jax.learn.diagnose import (
     outliers,
     volume_change,
 )
+from gfnn_jax.generating.charts import CHARTS
 
 
 def turned(z, angle=0.5):

@@ -14,14 +14,14 @@ import gfnn_jax as gfnn
 from gfnn_jax import cli
 from gfnn_jax.data.files import read_initial, read_trajectories
 from gfnn_jax.data.sample import read_sample
+from gfnn_jax.dataset.varied import as_varied
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.parameters import functions_of_parameters, state_libraries, walked
-from gfnn_jax.learn.varied import as_varied
 from gfnn_jax.maps.parameters import Parameters, sampled
+from gfnn_jax.models.parameters import functions_of_parameters, state_libraries, walked
 from gfnn_jax.scenes.trajectories import sample_t0
 
 PERIOD = 5.0

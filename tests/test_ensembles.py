@@ -15,8 +15,8 @@ from gfnn_jax.fitting.training import LMState
 from gfnn_jax.jobs.predict import predict
 from gfnn_jax.jobs.progress import Progress
 from gfnn_jax.jobs.search import search
-from gfnn_jax.learn import network_sweep
 from gfnn_jax.learn.options import FitOptions
+from gfnn_jax.models.generating_functions import network_sweep
 
 DT = 0.5
 

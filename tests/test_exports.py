@@ -32,7 +32,7 @@ from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE1, TYPE2, TYPE3
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import fit_predictors
 from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.damping import Damping
+from gfnn_jax.maps.damping import Damping, DampingOfArgs, FunctionsOfArgs
 from gfnn_jax.maps.laws import map_of_law
 from gfnn_jax.maps.parameters import sampled
 from gfnn_jax.phase_space import symplectic_form
@@ -238,11 +238,16 @@ def with_length(kind):
         piece = dataclasses.replace(piece, predictor=found[-1].predictor)
         turned = Affine(expm(0.2 * symplectic_form(1)), np.zeros(2), np.zeros(2))
         map_ = dataclasses.replace(map_, pieces=(turned, piece, turned))
+    if kind == "damped":
+        functions = FunctionsOfArgs.within(lengths, 3)
+        of_length = np.array([[0.8], [0.05], [0.01], [-0.02]])
+        damping = DampingOfArgs(of_length, 0.1 * of_length, functions)
+        map_ = dataclasses.replace(map_, pieces=(piece, damping))
     return map_, z, lengths
 
 
 @needs_cc
-@pytest.mark.parametrize("kind", ["law", "midpoint", "type 2"])
+@pytest.mark.parametrize("kind", ["law", "midpoint", "type 2", "damped"])
 def test_c_of_a_map_with_parameters(kind, tmp_path):
     map_, z, args = with_length(kind)
     z = np.concatenate([z, z[:20], z[:2]])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
+from gfnn_jax.budget import Allowance, Counted
 from gfnn_jax.cli import main
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.inputs import box_inputs
@@ -19,7 +20,6 @@ from gfnn_jax.families.sines import Sines
 from gfnn_jax.fitting import accelerated, gauss_newton, least_squares, row_blocks
 from gfnn_jax.fitting.triangle import folded
 from gfnn_jax.flows.collocation import Steps
-from gfnn_jax.learn.clock import Counted
 
 FITS = """
 import sys
@@ -172,7 +172,7 @@ def test_operations_are_spent_as_by_one(count, sharing):
     for devices in (0, 1, count):
         budget = Counted(np.inf)
         problem = gauss_newton.Problem(
-            pairs.z0, pairs.z1, DT, np.ones(2), spend=budget.spend,
+            pairs.z0, pairs.z1, DT, np.ones(2), allowance=Allowance(cap=budget),
             options=gauss_newton.Options(block_bytes=2**20, part_bytes=2**20),
         )  # fmt: skip
         with sharing(devices):

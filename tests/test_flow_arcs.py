@@ -12,7 +12,7 @@ from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting import least_squares
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.models.flow_arcs import FlowOnArcs, fit_flow, longest_arc
+from gfnn_jax.models.hamiltonians.flow_arcs import FlowOnArcs, fit_flow, longest_arc
 from gfnn_jax.scenes import henon_heiles
 from gfnn_jax.solve.latent_arcs import OUTLYING
 

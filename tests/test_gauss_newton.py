@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gfnn_jax.budget import Budget
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
@@ -13,10 +14,9 @@ from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.linear_starts import log_start, midpoint_start
 from gfnn_jax.fitting.significance import null_terms
 from gfnn_jax.flows.collocation import Steps, images, truncation
-from gfnn_jax.learn.clock import Budget
-from gfnn_jax.learn.flows import learn_hamiltonian
-from gfnn_jax.learn.formula import Term, formula
-from gfnn_jax.learn.learned_law import assembled
+from gfnn_jax.models.hamiltonians.formula import Term, formula
+from gfnn_jax.models.hamiltonians.learned_law import assembled
+from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.phase_space import Pairs
 
 HENON_HEILES = Terms(

@@ -15,7 +15,7 @@ from gfnn_jax.families.terms import Terms, given_terms, multiplied
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.growth import grow
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.learn.flows import learn_hamiltonian
+from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.phase_space import Pairs
 
 BASIS = Modes(2, (0, 1), ("p1", "p2"))

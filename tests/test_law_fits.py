@@ -13,7 +13,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, Friction, Lagrangian, Terms
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import interpolate
-from gfnn_jax.models.law_text import speed_names, terms_of
+from gfnn_jax.models.lagrangians.text import speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
 from gfnn_jax.solve.latent_arcs import Observed, Steps, fit_arcs, rows_of_arcs
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
+from gfnn_jax.budget import Budget
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.arcs import arcs_of_pairs
 from gfnn_jax.dataset.dataset import Dataset
@@ -19,11 +20,10 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn import noisy_sweeps
-from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.noisy_sweeps import NoisySweep, best_size
-from gfnn_jax.learn.sweeps import LinearSweep, Size
 from gfnn_jax.maps.affine import Affine
-from gfnn_jax.models.map_arcs import GeneratedOnArcs, NearestArcs
+from gfnn_jax.models.generating_functions.map_arcs import GeneratedOnArcs, NearestArcs
+from gfnn_jax.models.generating_functions.sweeps import LinearSweep, Size
 
 SIGMA, DT = 0.03, 0.5
 

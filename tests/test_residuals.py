@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gfnn_jax.models.residuals import Trace, whiteness
+from gfnn_jax.models.lagrangians.residuals import Trace, whiteness
 
 STEP = 0.05
 

@@ -10,10 +10,10 @@ from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.dataset.arcs import arcs_of_pairs
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.runs import identified, steps_between
+from gfnn_jax.diagnosis.clean import clean
+from gfnn_jax.diagnosis.screening import gross_errors
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.learn.clean import clean
-from gfnn_jax.learn.screening import gross_errors
 
 NOISE, DT = 1e-3, 0.5
 HENON_HEILES = given_terms(2, ("q1**2 + q2**2 + p1**2 + p2**2", "q1**2*q2 - q2**3/3"))

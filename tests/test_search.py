@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from gfnn_jax.learn.candidates import Candidate
-from gfnn_jax.learn.clock import Budget
-from gfnn_jax.learn.search import Search, search
+from gfnn_jax.budget import Budget
+from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.search.search import Search, search
 
 WORK = 1_000  # operations that a made-up size takes, and its steps
 

@@ -14,9 +14,9 @@ from gfnn_jax.families.expressions import parse, plain, to_text
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
 from gfnn_jax.families.traced import traced
-from gfnn_jax.learn.formula import Term, formula
-from gfnn_jax.models.law_text import Term as LawTerm
-from gfnn_jax.models.learned_law import Hamiltonian
+from gfnn_jax.models.hamiltonians.formula import Term, formula
+from gfnn_jax.models.lagrangians.learned_law import Hamiltonian
+from gfnn_jax.models.lagrangians.text import Term as LawTerm
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.pcr3bp import features
 
@@ -126,7 +126,7 @@ def test_functions_are_traced(function):
         ("q1 +", "is no expression"),
         ("'a'", "expected numbers"),
         ("9.0**9**9*q1", "is no expression"),
-        ("q1 + " * 400 + "q1", "at most"),
+        ("q1 + " * 4_000 + "q1", "at most"),
         ("-" * 200 + "q1", "levels"),
         ("", "is no expression"),
         ("1e999*q1", "a number that is beyond float64"),

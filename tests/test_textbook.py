@@ -10,11 +10,11 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting.gauss_newton import Problem
-from gfnn_jax.models.arguments import arguments_of
-from gfnn_jax.models.atoms import Factor, atom_text, dictionary_of, gradient_of, powers_of
-from gfnn_jax.models.matching import Matching, orthonormal
-from gfnn_jax.models.shapes import constants_for, has_constant, kinds_for, values
-from gfnn_jax.models.textbook import Textbook
+from gfnn_jax.models.textbook.arguments import arguments_of
+from gfnn_jax.models.textbook.atoms import Factor, atom_text, dictionary_of, gradient_of, powers_of
+from gfnn_jax.models.textbook.matching import Matching, orthonormal
+from gfnn_jax.models.textbook.search import Textbook
+from gfnn_jax.models.textbook.shapes import constants_for, has_constant, kinds_for, values
 from gfnn_jax.phase_space import apply_j, sizes
 
 

@@ -20,11 +20,11 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.damping import Damping
+from gfnn_jax.maps.damping import Damping, DampingOfArgs
 from gfnn_jax.maps.domain import Domain, Ranges, covering
 from gfnn_jax.phase_space import Pairs, sizes
 
-Factored = Affine | Damping | Flow  # pieces that can be factored out of pairs
+Factored = Affine | Damping | DampingOfArgs | Flow  # pieces that can be factored out of pairs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -221,18 +221,20 @@ class Dataset:
         found = self
         if before is not None:
             found = dataclasses.replace(
-                found, y0=before.image(found.y0), before=(*found.before, before)
+                found, y0=before.image(found.y0, found.args), before=(*found.before, before)
             )
         if after is not None:
             found = dataclasses.replace(
-                found, y1=after.inverse().image(found.y1), after=(after, *found.after)
+                found,
+                y1=after.inverse().image(found.y1, found.args),
+                after=(after, *found.after),
             )
         return found
 
-    def whole_image(self, y: np.ndarray) -> np.ndarray:
-        """The images of what is learned, y (N, 2d), as those of the map."""
+    def whole_image(self, y: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """The images of what is learned, y (n, 2d) of these rows, as those of the map."""
         for piece in self.after:
-            y = piece.image(y)
+            y = piece.image(y, of_lanes(self.args, rows))
         return y
 
     def _measured(self) -> Dataset:

@@ -10,7 +10,7 @@ import numpy as np
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
-from gfnn_jax.models.learned_law import LearnedLaw
+from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 
 _AHEAD = 2 / 3  # of the longest run that a forecast is shown for
 _MOST_TIMES = 600

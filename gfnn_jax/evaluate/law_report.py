@@ -9,7 +9,7 @@ import numpy as np
 
 from gfnn_jax.evaluate.report import device
 from gfnn_jax.maps.saved import versions
-from gfnn_jax.models.learned_law import LearnedLaw
+from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 
 
 def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:

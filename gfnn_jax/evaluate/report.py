@@ -114,10 +114,20 @@ def assemble(
 
 def _damping(fit: Fit) -> dict[str, Any] | None:
     """The factor of areas, one or each degree of freedom's, with its standard error, and the drift
-    of the momenta; of a map that keeps areas none."""
-    if fit.damping is None:
+    of the momenta; where they depend on args, the coefficients of which functions, and the range of
+    the factor. Of a map that keeps areas none."""
+    damping = fit.damping
+    if damping is None:
         return None
-    return {name: values.tolist() for name, values in vars(fit.damping).items()}
+    names = ("factor", "std", "shift")
+    found: dict[str, Any] = {name: getattr(damping, name).tolist() for name in names}
+    if damping.functions is not None:
+        low, high = (values.tolist() for values in damping.extremes)
+        found |= {
+            "parameters": damping.names, "degrees": damping.functions.degrees, "low": low,
+            "high": high,
+        }  # fmt: skip
+    return found
 
 
 def _hamiltonian(fit: Fit) -> dict[str, Any] | None:

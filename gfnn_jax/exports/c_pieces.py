@@ -21,13 +21,15 @@ from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.generating.generated import Generated, ImplicitStep
 from gfnn_jax.generating.predictor import PolynomialModel
 from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.damping import Damping
+from gfnn_jax.maps.damping import Damping, DampingOfArgs
 from gfnn_jax.solve.linear import COFACTORS_UP_TO, by_cofactors
+
+_EXPLICIT = (Affine, Damping, DampingOfArgs)  # pieces whose image is a formula
 
 
 def why_not_piece(piece: Any) -> str | None:
     """Reason why a piece cannot be written in C; None where it can."""
-    if isinstance(piece, (Affine, Damping)):
+    if isinstance(piece, _EXPLICIT):
         return None
     if not isinstance(piece, (Generated, Flow)):
         return f"the map has a piece {type(piece).__name__}"
@@ -55,8 +57,9 @@ def unknowns(piece: Generated, dim: int) -> int:
 def piece_functions(name: str, piece: Any, back: Any, width: int, more: int = 0) -> list[str]:
     """The functions of a piece and of its inverse ``back``, for states (width,), which ``more``
     args follow."""
-    if isinstance(piece, (Affine, Damping)):
-        return [*_affine(f"{name}_step", piece, width), *_affine(f"{name}_back", back, width)]
+    if isinstance(piece, _EXPLICIT):
+        ways = (("step", piece), ("back", back))
+        return [part for way, one in ways for part in _explicit(f"{name}_{way}", one, width, more)]
     family, params = on_symbols(piece.family), np.asarray(piece.params)
     tape = Tape()
     w, args = _with_args(tape, "w", width, more)
@@ -78,9 +81,11 @@ def _with_args(tape: Tape, name: str, width: int, more: int) -> tuple[np.ndarray
     return both[:, :width], both[:, width:] if more else None
 
 
-def _affine(name: str, piece: Affine | Damping, width: int) -> list[str]:
+def _explicit(name: str, piece: Any, width: int, more: int) -> list[str]:
+    """Write the step of a piece that solves nothing."""
     tape = Tape()
-    image = tape.function(f"{name}_image", {"Z": piece.image(tape.inputs("z", width))})
+    z, args = _with_args(tape, "z", width, more)
+    image = tape.function(f"{name}_image", {"Z": piece.image(z, args)[0]})
     return [image, f"""\
 static int {name}(double *z)
 {{

@@ -18,8 +18,9 @@ from typing import Any
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.functions import CHEBYSHEV, FUNCTIONS
+from gfnn_jax.families.site_sums import balanced, of_a_window, written_out
 
-_LONGEST_TEXT, _DEEPEST = 2_000, 60
+_LONGEST_TEXT, _DEEPEST = 20_000, 60
 _OTHER_NAMES = {"atan": "arctan", "ln": "log"}
 _CONSTANTS = {"pi": math.pi, "e": math.e}
 
@@ -185,14 +186,24 @@ def parse(text: str, dim: int, parameters: tuple[str, ...] = ()) -> Expression:
     """Parse an expression in q1..qd, p1..pd (q, p where d = 1) and the parameters into a tree,
     written as code, "p1**2*q1", or as a formula is shown, "p1² q1".
 
-    Raises InputError, in one line, for anything but numbers, + - * / **, the coordinates, the
-    parameters and the functions of `FUNCTIONS`.
+    Sums over sites are written as `site_sums` has them. Raises InputError, in one line, for
+    anything else but numbers, + - * / **, the coordinates, the parameters and the functions of
+    `FUNCTIONS`.
     """
     names = {name: coordinate(i) for i, name in enumerate(coordinate_names(dim))}
     if dim == 1:
         names.update(q=coordinate(0), p=coordinate(1))
     names.update({name: parameter(i) for i, name in enumerate(parameters)})
-    return _read(text, lambda tree: _parsed(tree, names, text, 0))
+    return _read(text, lambda tree: _parsed(written_out(tree, dim), names, text, 0))
+
+
+def window_terms(text: str) -> list[str]:
+    """The summands of sums over sites, each in the q1, p1, q2, … of a site and the next ones; of
+    any other term its text alone.
+
+    Raises InputError as `parse` does.
+    """
+    return _read(text, lambda tree: [ast.unparse(part) for part in of_a_window(tree)])
 
 
 def parse_named(text: str, names: Sequence[str]) -> Expression:
@@ -259,6 +270,9 @@ def _parsed(node, names, text, depth) -> Expression:
             raise refuse(f"a call of '{ast.unparse(node.func)}' with {len(node.args)} arguments")
         return call(name, inner(node.args[0]))
     if isinstance(node, ast.BinOp):
+        addends = _addends(node)
+        if len(addends) > _DEEPEST:
+            return inner(balanced(addends))
         left, right = inner(node.left), inner(node.right)
         match node.op:
             case ast.Add():
@@ -276,6 +290,16 @@ def _parsed(node, names, text, depth) -> Expression:
             case ast.BitXor():
                 raise refuse("a ^, where a power is written **")
     raise refuse(f"'{ast.unparse(node)}'")
+
+
+def _addends(node: ast.expr) -> list[ast.expr]:
+    """Addends of a sum that is written without brackets."""
+    found = []
+    while isinstance(node, ast.BinOp) and isinstance(node.op, (ast.Add, ast.Sub)):
+        minus = isinstance(node.op, ast.Sub)
+        found.append(ast.UnaryOp(ast.USub(), node.right) if minus else node.right)
+        node = node.left
+    return [node, *reversed(found)]
 
 
 _SUM, _PRODUCT, _POWER, _ATOM = range(4)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from itertools import combinations, product
 from typing import Any
@@ -20,7 +20,8 @@ import jax
 import numpy as np
 
 from gfnn_jax.arrays import as_row, matmul, namespace
-from gfnn_jax.families.expressions import depends_on, parse
+from gfnn_jax.families.expressions import depends_on, parse, window_terms
+from gfnn_jax.families.site_sums import site_sum
 from gfnn_jax.families.terms import Terms, exponents, given_terms, joined
 from gfnn_jax.phase_space import split
 
@@ -104,6 +105,10 @@ class Windows:
 
         return re.sub(r"\b([qp])([0-9]+)", of_site, text)
 
+    def as_code(self, text: str, dim: int) -> str:
+        """Sum over all windows of a text in the window's q1, p1, q2, …, as `parse` reads it."""
+        return site_sum(text, dim, self.ends, self.reach, self.fields)
+
 
 @dataclasses.dataclass(frozen=True)
 class Groups:
@@ -157,6 +162,19 @@ class Groups:
             text = text.replace(written, short)
         text = re.sub(r"\(1/(\|[^|]*\|)\)", r"1/\1", text)
         return text if one else f"{self._every} {text}"
+
+    def as_code(self, text: str, dim: int) -> str:
+        """Sum over all groups of a text in a group's q1, p1, q2, …, written out in q1..qd, p1..pd,
+        as `parse` reads it."""
+
+        def of_bodies(group: tuple[int, ...]) -> str:
+            def name(found) -> str:
+                member, axis = divmod(int(found[2]) - 1, self.space)
+                return f"{found[1]}{group[member] * self.space + axis + 1}"
+
+            return re.sub(r"\b([qp])([0-9]+)\b", name, text)
+
+        return added(map(of_bodies, self.members))
 
     @property
     def _every(self) -> str:
@@ -226,6 +244,11 @@ class Sums:
     def term_names(self) -> tuple[str, ...]:
         """Text of each term in the formula of a general neighbourhood."""
         return tuple(part.over.named(n) for part in self.parts for n in part.terms.term_names)
+
+    def as_code(self, texts: Sequence[str]) -> str:
+        """The sum as text that `parse` reads, of a text for each part, in the q1, p1, q2, … of a
+        neighbourhood."""
+        return added(p.over.as_code(t, self.dim) for p, t in zip(self.parts, texts, strict=True))
 
     @property
     def operations(self) -> tuple[int, int]:
@@ -310,6 +333,11 @@ class Sums:
             first = last
 
 
+def added(texts: Iterable[str]) -> str:
+    """Sum of expressions as text."""
+    return " + ".join(texts).replace("+ -", "- ")
+
+
 def matrix_free(family) -> bool:
     """Return whether solvers shall use no (2d, 2d) matrices of this family."""
     return bool(getattr(family, "matrix_free", False))
@@ -331,6 +359,7 @@ def site_terms(
     variables = (*(f"q{k}" for k in own), *(f"p{k}" for k in own), *ahead)
     rows = exponents(len(variables), degree)
     rows.sort(key=lambda row: sum(a > 0 for a in row) > 1)
+    functions = [term for text in functions for term in window_terms(text)]
     reaches = [_reach_of(text, fields) for text in functions]
     parts = []
     for near in range(max([reach, *reaches]) + 1):

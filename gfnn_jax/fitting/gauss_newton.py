@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import UNBOUNDED, Allowance
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.fitting.descent import ROUNDOFF, descended, step
@@ -92,16 +93,16 @@ class Problem:
 
     dt: a number, or one of each pair (N,). args: of each pair (N, k), or None.
     scale: (2d,) sizes of the coordinates, by which residuals are divided.
-    check: called between blocks; it may raise to stop. spend: called with the floating-point
-    operations of each evaluation of the flow before it is made; it may too.
+    allowance: the time and the operations that an evaluation of the flow may take: checked between
+    its blocks, spent before it is made.
     """
 
     def __init__(
         self, z0, z1, dt, scale, *, args=None, options: Options = OPTIONS,
-        check: Callable[[], Any] = lambda: None, spend: Callable[[float], Any] = lambda _: None,
+        allowance: Allowance = UNBOUNDED,
     ):  # fmt: skip
         self.z0, self.z1, self.dt, self.scale, self.args = z0, z1, dt, scale, args
-        self.options, self.check, self.spend = options, check, spend
+        self.options, self.allowance = options, allowance
 
     def given(self, rows) -> tuple[Any, Any]:
         """(dt, args) of these rows."""
@@ -111,10 +112,10 @@ class Problem:
         """`flows.collocation.images` of the states z0 of these rows, each after its own dt."""
         dt, args = self.given(rows)
         along = (options.get("along") or family) if options.get("derivatives") else None
-        self.spend(len(rows) * operations(family, self.z0.shape[1], steps, along))
+        self.allowance.spend(len(rows) * operations(family, self.z0.shape[1], steps, along))
         return images(
-            family, coefficients, self.z0[rows], dt, steps, args=args, on_substep=self.check,
-            **options,
+            family, coefficients, self.z0[rows], dt, steps, args=args, scale=self.scale,
+            on_substep=self.allowance.check, **options,
         )  # fmt: skip
 
     def residuals(self, family, coefficients, steps: Steps, rows) -> np.ndarray:
@@ -167,11 +168,11 @@ class Problem:
     def _unpaid(self) -> Problem:
         """The problem whose operations are spent already."""
         problem = copy.copy(self)
-        problem.spend = lambda operations: None
+        problem.allowance = dataclasses.replace(self.allowance, cap=None)
         return problem
 
     def _paid(self, block, family, steps: Steps, along=None):
-        self.spend(len(block) * operations(family, self.z0.shape[1], steps, along))
+        self.allowance.spend(len(block) * operations(family, self.z0.shape[1], steps, along))
         return block
 
     def _parts(self, blocks, family, steps: Steps):
@@ -192,7 +193,7 @@ class Problem:
         most = self.options.part_bytes if row_blocks.devices() else self.options.block_bytes
         size = max(1 if free else 16, most // pair)
         for first in range(0, len(rows), size):
-            self.check()
+            self.allowance.check()
             yield rows[first : first + size]
 
     def fit(
@@ -280,8 +281,9 @@ class Problem:
         def own_error(block) -> np.ndarray:
             dt, args = self.given(block)
             return truncation(
-                family, c, self.z0[block], dt, steps, args=args, on_substep=self.check
-            )
+                family, c, self.z0[block], dt, steps, args=args, scale=self.scale,
+                on_substep=self.allowance.check,
+            )  # fmt: skip
 
         if row_blocks.devices() and len(rows):
             blocks = self._blocks(rows, 0, matrix_free(family))

@@ -175,7 +175,7 @@ class _Look:
 
     def _images(self, along: Terms):
         p = self._problem
-        p.check()
+        p.allowance.check()
         return p.images(
             self.family, self.coefficients, self._rows, self._steps, along=along, derivatives=True
         )

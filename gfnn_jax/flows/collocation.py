@@ -58,7 +58,7 @@ def of_lanes(value, lanes):
 
 def images(
     family, params, z, dt, steps: Steps, *, args=None, derivatives: bool = False,
-    along: Any = None, on_substep: Callable[[], Any] = lambda: None,
+    along: Any = None, scale=None, on_substep: Callable[[], Any] = lambda: None,
 ):  # fmt: skip
     """Images of the states z (B, 2d) after dt, in NumPy. Lanes that fail are not finite.
 
@@ -66,7 +66,8 @@ def images(
     them is that of z.
     derivatives: the exact ones of the collocation, in the state and in the coefficients of a
     linear family. along: another one, in whose coefficients they are instead, these 0.
-    on_substep: called before each substep; it may raise to stop.
+    scale: (2d,) sizes of the coordinates, of whose parts stages are solved to roundoff; None: the
+    coordinates are of one size. on_substep: called before each substep; it may raise to stop.
     """
     rule, h = gauss(steps.stages), dt / steps.substeps
     h = h[:, None] if np.ndim(h) else h  # (B, 1) beside coordinates
@@ -81,7 +82,9 @@ def images(
             newton = steps.newton and not free
             damped = isinstance(family, Uniform)
             stepped, own = family.begun(args, z) if damped else (family, args)
-            slopes, done = solve_stages(stepped, params, z, h, rule, own, newton=newton)
+            slopes, done = solve_stages(
+                stepped, params, z, h, rule, own, newton=newton, scale=scale
+            )
             solved = solved & done
             inside = z + h * _summed(rule.matrix, slopes) if derivatives else z
             moved = h * _summed(rule.weights[None, :], slopes)[0]
@@ -126,13 +129,13 @@ def at_stages(family, args, h, rule):
     return at_time(family, args, np.multiply.outer(rule.nodes, np.reshape(after, -1)))
 
 
-def solve_stages(family, params, z, h, rule, args=None, *, newton: bool = True):
+def solve_stages(family, params, z, h, rule, args=None, *, newton: bool = True, scale=None):
     """The slopes K (s, B, 2d) at states z (B, 2d), and which lanes were solved to roundoff (B,).
 
     h: a number or (B, 1). By fixed point; with ``newton``, lanes in which that hardly contracts by
-    Newton's method.
+    Newton's method. scale: as of `images`.
     """
-    size = np.abs(z) + np.abs(z).mean(axis=1, keepdims=True)  # of each coordinate's lane
+    size = np.abs(z) + (np.abs(z).mean(axis=1, keepdims=True) if scale is None else scale)
     slopes = np.repeat(apply_j(family.gradient(params, z, args))[None], len(rule.weights), axis=0)
     change, earlier = np.full((2, len(z)), np.inf)
     free = matrix_free(family)
@@ -236,14 +239,14 @@ def solve(matrix, rhs):
 
 
 def truncation(
-    family, params, z, dt, steps: Steps, *, args=None,
+    family, params, z, dt, steps: Steps, *, args=None, scale=None,
     on_substep: Callable[[], Any] = lambda: None,
 ) -> np.ndarray:  # fmt: skip
     """Differences of the images of states z (B, 2d) from those of twice the substeps, (B, 2d): not
     finite where one of them fails."""
     finer = dataclasses.replace(steps, substeps=2 * steps.substeps)
     one, other = (
-        images(family, params, z, dt, s, args=args, on_substep=on_substep).states
+        images(family, params, z, dt, s, args=args, scale=scale, on_substep=on_substep).states
         for s in (steps, finer)
     )
     return one - other

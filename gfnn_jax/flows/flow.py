@@ -144,7 +144,8 @@ class Flow:
         or None."""
         steps = Steps(self.stages, self.substeps)
         params, dt = jax.tree.map(np.asarray, self.params), float(np.asarray(self.dt))
-        return images(self.family, params, z, dt, steps, args=args).states
+        scale = np.asarray(self.scale)
+        return images(self.family, params, z, dt, steps, args=args, scale=scale).states
 
     def over(self, dt) -> Flow:
         """The flow over another dt, a number or (B,), in substeps that are no longer than those of

@@ -16,7 +16,7 @@ from gfnn_jax.jobs.written import REPORT
 from gfnn_jax.learn.fit import fit as learn_fit
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps import saved
-from gfnn_jax.models.learned_law import LearnedLaw
+from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.storage.outputs import atomic_folder
 
 FIGURE = "law.png"

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.structures import Bodies, structure_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import figures, figures_of_many, metrics, report
@@ -17,7 +18,6 @@ from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.rollouts import NUM_STEPS, NUM_TRAJECTORIES, map_rollouts
 from gfnn_jax.jobs.search import refusals, scene_named, search
 from gfnn_jax.jobs.written import MODEL, Ran, already_done, pairs_digest, write
-from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.fit import Fit
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps.bands import bands

@@ -10,11 +10,12 @@ import numpy as np
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.structures import fields_of
+from gfnn_jax.dataset.varied import check_varied
+from gfnn_jax.diagnosis.local_jacobians import check_number
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.sums import site_terms
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.learn.options import FitOptions
-from gfnn_jax.learn.varied import check_varied
 from gfnn_jax.phase_space import Pairs, sizes, split
 from gfnn_jax.scenes.scene import AroundOrbit, Scene
 from gfnn_jax.scenes.trajectories import sample_states
@@ -101,16 +102,6 @@ def check_moves(pairs: Pairs) -> None:
         raise FitError(
             "expected states that move, got z1 = z0 in every pair: H = 0, or the same columns "
             "twice?"
-        )
-
-
-def check_number(pairs: Pairs) -> None:
-    """Raises FitError where there are fewer pairs than a local Jacobian needs."""
-    if len(pairs) < 8 * pairs.dim:
-        turned = 8 * len(pairs) < 2 * pairs.dim
-        raise FitError(
-            f"expected at least {8 * pairs.dim} different pairs for d = {pairs.dim}, "
-            f"got {len(pairs)}" + turned * ": a row is a state; are the arrays transposed?"
         )
 
 

@@ -6,17 +6,17 @@ import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from gfnn_jax.budget import ROWS, Budget
+from gfnn_jax.candidates.assemble import composed, measured
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import OutOfTime
-from gfnn_jax.learn.assemble import composed, measured
-from gfnn_jax.learn.candidates import Candidate
-from gfnn_jax.learn.choose_law import preferred
-from gfnn_jax.learn.clock import ROWS, Budget
-from gfnn_jax.learn.learned_law import assembled as flow_assembled
-from gfnn_jax.learn.map_of_terms import assembled as map_assembled
 from gfnn_jax.learn.request import Request
-from gfnn_jax.learn.search import Entry
 from gfnn_jax.learn.searches import Searched
+from gfnn_jax.models.generating_functions.map_of_terms import assembled as map_assembled
+from gfnn_jax.models.hamiltonians.choose_law import preferred
+from gfnn_jax.models.hamiltonians.learned_law import assembled as flow_assembled
+from gfnn_jax.search.search import Entry
 
 _CONFIRMED = 1.1  # of the error that the search measured
 
@@ -37,9 +37,10 @@ def choose(searched: Searched, request: Request) -> Chosen:
     given = data, request.tolerance, request.budget
     if searched.linear is not None:
         return Chosen(searched.linear, data, 0.0)
-    if searched.of_terms is not None:
-        candidate, seconds, _ = map_assembled(searched.of_terms, *given)
-        return Chosen(candidate, data, seconds)
+    of_terms = searched.of_terms
+    if of_terms is not None:
+        candidate, seconds, _ = map_assembled(of_terms, request.tolerance, request.budget)
+        return Chosen(candidate, of_terms.data, seconds)
     ranking, bound = searched.found.ranking, request.tolerance.bound
     best = ranking[0].candidate if ranking else None
     if law is None or not (best is None or preferred(law.candidate, best, bound)):

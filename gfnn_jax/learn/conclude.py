@@ -6,31 +6,32 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import SOLVE, Budget
+from gfnn_jax.candidates.assemble import stepped
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.diagnosis.hidden_friction import hidden_friction
+from gfnn_jax.diagnosis.local_jacobians import differs_between_sequences, volume_change
+from gfnn_jax.diagnosis.neighbours import is_noise
+from gfnn_jax.diagnosis.noise import noise_of_sites, state_noise
 from gfnn_jax.errors import OutOfTime
-from gfnn_jax.learn.assemble import stepped
-from gfnn_jax.learn.candidates import Candidate
 from gfnn_jax.learn.check import not_radians, wrapped
 from gfnn_jax.learn.choose import Chosen
-from gfnn_jax.learn.choose_law import long_step
-from gfnn_jax.learn.clock import SOLVE, Budget
-from gfnn_jax.learn.diagnose import differs_between_sequences, volume_change
-from gfnn_jax.learn.hidden_friction import hidden_friction
-from gfnn_jax.learn.neighbours import is_noise
-from gfnn_jax.learn.noise import noise_of_sites, state_noise
 from gfnn_jax.learn.propose import proposed
 from gfnn_jax.learn.request import Request
-from gfnn_jax.learn.search import AS_FAR, MET, Entry
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.learn.sweeps import OF_SOLVE, OF_STEPS, LinearSweep
-from gfnn_jax.learn.white import leaves_white
+from gfnn_jax.models.generating_functions.sweeps import OF_SOLVE, OF_STEPS, LinearSweep
+from gfnn_jax.models.hamiltonians.choose_law import long_step
+from gfnn_jax.models.hamiltonians.white import leaves_white
+from gfnn_jax.search.search import AS_FAR, MET, Entry
 
 _NO_MORE = {
     False: "no larger library of terms promised to meet it",
     True: "the training of the network gained no more",
 }
+_LOOK = "a look whether what the map leaves over is noise of the pairs"
 _RIGHT = "H is right, as far as these pairs tell, and what it leaves over is noise"
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _SHARE = 0.1  # of the residual, that a change of volume must explain
@@ -89,7 +90,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         left = _left_of_sites if structured else _what_is_left
         work = _work(chosen.entry or next(iter(found.ranking), None))
         try:
-            with request.budget.last("a look at what the map leaves over", SOLVE, work):
+            with request.budget.last(_LOOK, SOLVE, work):
                 noise, diagnosis, reason = left(chosen, searched, stalled)
         except OutOfTime:
             pass  # told with what else was left out

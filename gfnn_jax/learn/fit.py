@@ -18,36 +18,37 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.budget import COMPILE, MAX_SECONDS, ROWS, Budget
+from gfnn_jax.candidates.assemble import block_of
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
+from gfnn_jax.diagnosis.clean import clean
+from gfnn_jax.diagnosis.damping import LearnedDamping
+from gfnn_jax.diagnosis.local_jacobians import ChartJudgement, looked_for_errors
 from gfnn_jax.errors import FitError, FitWarning, InputError, OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.assemble import block_of
-from gfnn_jax.learn.candidates import Candidate
+from gfnn_jax.learn.all_rows import with_test_rows
 from gfnn_jax.learn.choose import Chosen, choose
-from gfnn_jax.learn.clean import clean
-from gfnn_jax.learn.clock import COMPILE, MAX_SECONDS, ROWS, Budget
 from gfnn_jax.learn.conclude import conclude
-from gfnn_jax.learn.damping import LearnedDamping
-from gfnn_jax.learn.diagnose import ChartJudgement, looked_for_errors
-from gfnn_jax.learn.diagnosed import diagnose_request
-from gfnn_jax.learn.draw import NUM_PAIRS, drawn
+from gfnn_jax.learn.diagnose import diagnose_request
 from gfnn_jax.learn.gross_errors import without_gross_errors
-from gfnn_jax.learn.learned_law import LearnedHamiltonian
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.options import FitOptions, with_options
 from gfnn_jax.learn.positions import OfPositions, learn_positions
 from gfnn_jax.learn.posterior import with_posterior, work_of_posterior
 from gfnn_jax.learn.propose import structures_to_try
-from gfnn_jax.learn.recordings import fit_recording
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.learn.stated import stated
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
+from gfnn_jax.models.lagrangians.recordings import fit_recording
+from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS, drawn
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.scenes.scene import Scene
 
@@ -71,7 +72,8 @@ class Fit:
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
     scene: as given. damping: of a map that loses area, by how much of it in a step. positions: of a
     map that was learned from positions alone, what its S is like; num_pairs are then triples.
-    stated_by: the pairs by which the chosen candidate's error was measured.
+    stated_by: the pairs by which the chosen candidate's error was measured, and whether the map was
+    fitted to them afterwards.
     validation_pairs, test_pairs: that chose, and that stated the error; None where the pairs were
     too few for these. operations: of the search, as counted; as ``max_operations`` they give this
     map again, whatever the clock. budget: what is left of it. tells_defect: whether there is
@@ -271,10 +273,10 @@ def fit(
     """Learn the map of these pairs: the cheapest candidate within the tolerance, else the best.
 
     Of a `Recording` learn its law, a Lagrangian with friction and inputs, from its positions: a
-    `models.learned_law.LearnedLaw`; of the options ``learn`` ("auto" or "lagrangian"),
-    ``friction``, ``input_hold``, ``mass`` and ``on_progress`` apply (`learn.recordings`). With
-    learn="map" learn the map of its positions instead, a `Fit`: see `fit_positions`. Of pairs a
-    `Fit`.
+    `models.lagrangians.learned_law.LearnedLaw`; of the options ``learn`` ("auto" or "lagrangian"),
+    ``friction``, ``input_hold``, ``mass`` and ``on_progress`` apply
+    (`models.lagrangians.recordings`). With learn="map" learn the map of its positions instead, a
+    `Fit`: see `fit_positions`. Of pairs a `Fit`.
 
     pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order.
                Of different dt, S is a function of dt too, in the midpoint chart. With parameters
@@ -344,7 +346,7 @@ def fit(
         chosen = with_posterior(choose(found, request), found)
         on_progress("the error that is stated, of pairs that chose nothing")
         error = stated(chosen, found, budget)
-        chosen = chosen._replace(candidate=error.candidate)
+        chosen, stated_by = with_test_rows(chosen, error, found, budget)
         conclusion = conclude(chosen, found, request)
         warn(conclusion.messages)
     judged = min(_JUDGED, block_of(2 * data.dim))
@@ -370,7 +372,7 @@ def fit(
         pairs=data.pairs,
         scene=scene,
         damping=seen.damping if chosen.candidate.learns == "map" else None,
-        stated_by=error.words,
+        stated_by=stated_by,
         test_pairs=data.pairs.take(data.test) if len(data.test) else None,
         operations=budget.operations,
         budget=budget,
@@ -402,8 +404,8 @@ def fit_positions(
 
     The map acts on z = (q, p), p = −h ∂S/∂q: ``map.from_positions`` and
     ``map.rollout(positions=(q, Q), …)`` start it. Positions of one place tell p but for a factor
-    and a gauge, which `models.discrete_lagrangian` fixes: frequencies, positions and stability do
-    not depend on them, the size of p, energies and areas do.
+    and a gauge, which `models.positions.discrete_lagrangian` fixes: frequencies, positions and
+    stability do not depend on them, the size of p, energies and areas do.
     Raises FitError where the recording has no positions at even times, or too few.
     """
     require_x64("a fit")

@@ -1,8 +1,8 @@
 """Pairs that the map found contradicts by far more than it does the pairs around them.
 
-Neighbours tell an outlier where states are dense (`learn.diagnose.outliers`); a map that all pairs
-agree on tells it anywhere. What a map cannot represent is smooth: its residual is as large at the
-neighbours. A gross error of measurement stands alone.
+Neighbours tell an outlier where states are dense (`diagnosis.local_jacobians.outliers`); a map that
+all pairs agree on tells it anywhere. What a map cannot represent is smooth: its residual is as
+large at the neighbours. A gross error of measurement stands alone.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.learn.diagnosed import Diagnosis, diagnose_request
+from gfnn_jax.diagnosis.diagnosis import Diagnosis
+from gfnn_jax.learn.diagnose import diagnose_request
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched, searched
-from gfnn_jax.learn.sweeps import LinearSweep
+from gfnn_jax.models.generating_functions.sweeps import LinearSweep
 
 # A residual beyond so many times what all but two of its neighbours stay below, and the median of
 # all. Of normal noise and d = 1 it is four times the median in one of 60,000 pairs.
@@ -25,6 +26,9 @@ _BEYOND, _NEIGHBOURS, _BUT = 5.0, 10, 2
 # Those neighbours' residuals are ordinary, below so many times the median: a map that cannot follow
 # a close passage errs around it too.
 _ORDINARY = 2.5
+# Where they are not: of a search without them, the RMS residual of the others over that before. A
+# map is spoilt around a gross error; without a close passage it is hardly better elsewhere.
+_MENDED = 0.1
 # Gross errors are apart from the others: residuals between so many times the median and _BEYOND are
 # fewer by this factor than they. What a map cannot represent has a tail without a gap.
 _TAIL, _APART = 3.0, 0.5
@@ -57,7 +61,9 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
         size = _residuals(found)
         if size is None:
             break
-        rows = _standing_alone(found.data, size)
+        rows, rise = _standing_alone(found.data, size, _ORDINARY), _RISE
+        if not len(rows):
+            rows, rise = _standing_alone(found.data, size, np.inf), _MENDED
         if not len(rows) or gone + len(rows) > _MOST * count or request.budget.over:
             break
         others = np.setdiff1d(np.arange(len(size)), rows)
@@ -68,7 +74,7 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
         diagnosis = diagnose_request(request, data)
         again = searched(request, data, diagnosis, None)
         left = _residuals(again)
-        if left is not None and not _rms(left) <= _RISE * _rms(size[others]):
+        if left is not None and not _rms(left) <= rise * _rms(size[others]):
             break
         seen, found, gone = diagnosis, again, gone + len(rows)
     if not gone:
@@ -113,9 +119,12 @@ def _same(sweep: LinearSweep, data: Dataset) -> bool:
     return sweep.data.pairs is data.pairs
 
 
-def _standing_alone(data: Dataset, size) -> np.ndarray:
+def _standing_alone(data: Dataset, size, ordinary: float) -> np.ndarray:
     """The rows whose residual is far beyond those of all but a few of the neighbours, of the state
-    or of the image: a state that is a gross error has no neighbours but its like."""
+    or of the image: a state that is a gross error has no neighbours but its like.
+
+    ordinary: times the median of all, that those neighbours' residuals stay below.
+    """
     if len(size) <= _NEIGHBOURS:
         return np.zeros(0, int)
     middle = np.median(size)
@@ -126,7 +135,7 @@ def _standing_alone(data: Dataset, size) -> np.ndarray:
     for y in (data.y0 / data.scale, data.y1 / data.scale):
         near = cKDTree(y).query(y[rows], k=_NEIGHBOURS + 1)[1][:, 1:]
         around = np.minimum(around, np.sort(size[near], axis=1)[:, -1 - _BUT])
-    alone = rows[(size[rows] > _BEYOND * around) & (around < _ORDINARY * middle)]
+    alone = rows[(size[rows] > _BEYOND * around) & (around < ordinary * middle)]
     between = np.sum((size > _TAIL * middle) & (size <= _BEYOND * middle))
     if between < _APART * len(alone):
         return alone

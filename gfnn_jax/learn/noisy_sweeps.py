@@ -2,9 +2,10 @@
 
 A search judges sizes by residuals that are nearly all noise, and fits at measured points. Where
 that is what stopped it, the sweeps that came as far as the best are fitted again to the states that
-the pairs most likely had (`models.map_arcs`). In these rows the residual is a distance from the
-map's graph in units of the noise, whatever the chart, and the expected error of every size on
-fresh pairs follows from one factor, as Mallows' C_p does (Technometrics 15 (1973) 661).
+the pairs most likely had (`models.generating_functions.map_arcs`). In these rows the residual is a
+distance from the map's graph in units of the noise, whatever the chart, and the expected error of
+every size on fresh pairs follows from one factor, as Mallows' C_p does (Technometrics 15 (1973)
+661).
 """
 
 from __future__ import annotations
@@ -15,21 +16,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import ROWS, Budget
+from gfnn_jax.candidates.candidate import Candidate, validated
 from gfnn_jax.dataset.arcs import arcs_of_pairs, onward
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import uncertainty
 from gfnn_jax.fitting.triangle import Triangle
-from gfnn_jax.learn.candidates import Candidate, validated
-from gfnn_jax.learn.choose_law import preferred
-from gfnn_jax.learn.clock import ROWS, Budget
 from gfnn_jax.learn.conclude import only_noise
 from gfnn_jax.learn.request import Request
-from gfnn_jax.learn.search import AS_FAR, Entry
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.learn.sweeps import SAMPLE_ROWS, Factors, LinearSweep, Size, part_of_noise
-from gfnn_jax.models.map_arcs import LONGEST, GeneratedOnArcs, NearestArcs
+from gfnn_jax.models.generating_functions.map_arcs import LONGEST, GeneratedOnArcs, NearestArcs
+from gfnn_jax.models.generating_functions.sweeps import (
+    SAMPLE_ROWS,
+    Factors,
+    LinearSweep,
+    Size,
+    part_of_noise,
+)
+from gfnn_jax.models.hamiltonians.choose_law import preferred
+from gfnn_jax.search.search import AS_FAR, Entry
 
 _MOST_SWEEPS = 3
 _WHAT = "the fit of S to the states that noisy pairs most likely had"
@@ -232,6 +239,10 @@ class NoisySweep(LinearSweep):
         fitted_to, held = self._along(others).triangle(of), self._nearest_held.triangle(of)
         return self._predicted(size, fitted_to, held, rows)
 
+    def work_of_test_rows(self, size: Size) -> float:
+        """Zero: noise falls with the root of the rows, by a twentieth."""
+        return 0.0
+
     def own_error(self, size: Size) -> float:
         """Own error of the measured points."""
         return self.plain.own_error(size)
@@ -263,7 +274,7 @@ class NoisySweep(LinearSweep):
 def _chained(data: Dataset, rows) -> tuple[np.ndarray, np.ndarray, int, Any]:
     """Arguments of `arcs_of_pairs` for these rows: inner coordinates without a base map, angles
     lifted along an arc. A p of period 2π is none to S: its pairs are arcs of their own."""
-    z0, z1 = data.y0[rows], data.whole_image(data.y1[rows])
+    z0, z1 = data.y0[rows], data.whole_image(data.y1[rows], rows)
     for piece in reversed(data.before):
         z0 = piece.inverse().image(z0)
     steps, angles = onward(data.pairs, rows), list(data.coordinates.angles)

@@ -14,9 +14,9 @@ from dataclasses import field
 from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple
 
+from gfnn_jax.budget import Budget, seconds_allowed
 from gfnn_jax.dataset.structure_names import EXPECTED, STRUCTURES, names_structure
 from gfnn_jax.errors import FitError
-from gfnn_jax.learn.clock import Budget, seconds_allowed
 
 RUN, FIT = ("gfnn run", "gfnn fit"), ("gfnn fit",)
 

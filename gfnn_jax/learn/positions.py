@@ -14,6 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import ROWS, Budget
+from gfnn_jax.candidates.assemble import stepped
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import Coordinates, nearest_image
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, one_step_error
@@ -26,18 +29,15 @@ from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import TYPE1
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.assemble import stepped
-from gfnn_jax.learn.candidates import Candidate
-from gfnn_jax.learn.clock import ROWS, Budget
-from gfnn_jax.learn.noisy_positions import without_noise
-from gfnn_jax.learn.position_maps import images_of, map_of, states_of
-from gfnn_jax.learn.search import MET
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.discrete_lagrangian import displacement, residuals, solve
-from gfnn_jax.models.latent_positions import starting_noise
-from gfnn_jax.models.triples import Triples, triples_of
+from gfnn_jax.models.positions.discrete_lagrangian import displacement, residuals, solve
+from gfnn_jax.models.positions.latent_positions import starting_noise
+from gfnn_jax.models.positions.noisy_positions import without_noise
+from gfnn_jax.models.positions.position_maps import images_of, map_of, states_of
+from gfnn_jax.models.positions.triples import Triples, triples_of
 from gfnn_jax.phase_space import Pairs, sizes
+from gfnn_jax.search.search import MET
 
 _DEGREES = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)
 _ROWS_PER_TERM, _MOST_OPERATIONS = 3, 2e10  # of one solve: a few seconds on one core

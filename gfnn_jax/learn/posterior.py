@@ -8,10 +8,10 @@ from functools import partial
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.choose import Chosen
-from gfnn_jax.learn.ensembles import EnsembleSweep
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.learn.sweeps import LinearSweep
 from gfnn_jax.maps.posterior import Posterior
+from gfnn_jax.models.generating_functions.ensembles import EnsembleSweep
+from gfnn_jax.models.generating_functions.sweeps import LinearSweep
 
 # Operations of a root of m terms, ÷ m³: nearly all of them make the factor of a size two further,
 # of twice as many terms and twelve times as many rows, which tells noise from misfit.

@@ -16,8 +16,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gfnn_jax.candidates.assemble import stepped
+from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_inner, whole_turns
 from gfnn_jax.dataset.measured_error import Tolerance, one_step_error
+from gfnn_jax.dataset.rows import of_rows, residual_weight
 from gfnn_jax.errors import FitWarning
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.time_step import OfTimeStep
@@ -28,16 +31,13 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.assemble import stepped
-from gfnn_jax.learn.candidates import Candidate, with_error
 from gfnn_jax.learn.conclude import not_met
 from gfnn_jax.learn.fit import Fit
-from gfnn_jax.learn.formula import Term, formula
-from gfnn_jax.learn.learned_law import LearnedHamiltonian
-from gfnn_jax.learn.rows import of_rows, residual_weight
 from gfnn_jax.learn.stated import FEWEST_TESTED
 from gfnn_jax.maps.saved import packed, unpacked
 from gfnn_jax.maps.symplectic_map import SymplecticMap, serves_any_dt
+from gfnn_jax.models.hamiltonians.formula import Term, formula
+from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.processes import Group
 from gfnn_jax.scenes import Scene
@@ -427,12 +427,12 @@ class _Refit:
         turns = whole_turns(y0[:, angles] - np.asarray(self.map.angle_centre))
         y0[:, angles] -= turns
         y1[:, angles] -= turns
-        for piece in self.before:
-            y0 = piece.image(y0)
-        for piece in reversed(self.after):
-            y1 = piece.inverse().image(y1)
         args = self._args(pairs)
         columns = None if args is None else np.stack([*args.values()], axis=-1)
+        for piece in self.before:
+            y0 = piece.image(y0, columns)
+        for piece in reversed(self.after):
+            y1 = piece.inverse().image(y1, columns)
         return _Rows(y0, y1, self._own_dt(pairs), columns)
 
 

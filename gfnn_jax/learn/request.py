@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.budget import Budget
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.structures import Structure, structure_of
-from gfnn_jax.learn.candidates import Candidate
+from gfnn_jax.dataset.varied import as_varied
 from gfnn_jax.learn.check import (
     check_moves,
     check_request,
@@ -19,9 +21,7 @@ from gfnn_jax.learn.check import (
     unlike_the_scene,
     unnamed_angles,
 )
-from gfnn_jax.learn.clock import Budget
 from gfnn_jax.learn.options import FitOptions
-from gfnn_jax.learn.varied import as_varied
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
 

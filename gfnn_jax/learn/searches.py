@@ -7,34 +7,34 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import Budget
+from gfnn_jax.candidates.assemble import composed
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.structures import Sites
+from gfnn_jax.diagnosis.charts import Charts
+from gfnn_jax.diagnosis.diagnosis import Diagnosis, diagnosed
 from gfnn_jax.errors import FitError
-from gfnn_jax.learn.assemble import composed
-from gfnn_jax.learn.candidates import Candidate
-from gfnn_jax.learn.choose_charts import Charts
-from gfnn_jax.learn.choose_law import MAX_COST_RATIO, law_of
-from gfnn_jax.learn.clock import Budget
-from gfnn_jax.learn.diagnosed import Diagnosis, diagnosed
-from gfnn_jax.learn.ensembles import EnsembleSweep
-from gfnn_jax.learn.law_maps import (
+from gfnn_jax.learn.request import Request
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.generating_functions.ensembles import EnsembleSweep
+from gfnn_jax.models.generating_functions.linear_map import linear_map
+from gfnn_jax.models.generating_functions.map_of_terms import LearnedMap, map_of
+from gfnn_jax.models.generating_functions.model_sweep import ModelSweep
+from gfnn_jax.models.generating_functions.network_sweep import NetworkSweep
+from gfnn_jax.models.generating_functions.sweeps import sweep_of_dt, sweeps_for
+from gfnn_jax.models.hamiltonians.choose_law import MAX_COST_RATIO, law_of
+from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
+from gfnn_jax.models.hamiltonians.networks import learn_network
+from gfnn_jax.models.maps_of_laws.law_maps import (
     better_than,
     law_explains_most,
     more_pairs_would_help,
     search_around,
     search_of_law,
 )
-from gfnn_jax.learn.learned_law import LearnedHamiltonian
-from gfnn_jax.learn.linear_map import linear_map
-from gfnn_jax.learn.map_of_terms import LearnedMap, map_of
-from gfnn_jax.learn.model_sweep import ModelSweep
-from gfnn_jax.learn.network_sweep import NetworkSweep
-from gfnn_jax.learn.networks import learn_network
-from gfnn_jax.learn.request import Request
-from gfnn_jax.learn.search import Entry, Found, Search
-from gfnn_jax.learn.sweeps import sweep_of_dt, sweeps_for
-from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.search.search import Entry, Found, Search
 
 # Operations of a size of S that is judged before H is looked for: a fifth of a second.
 _SMALL = 2e9
@@ -73,7 +73,11 @@ def searched(
     early = not _of_terms(data) or options.model is not None
     climb = Search(_sweeps(request, data, seen) if early else [], *given)
     climb.climb(most=_SMALL)
-    law = _law(request, data, better, MAX_COST_RATIO * climb.cheapest)
+    # H with friction that depends on args is not learned.
+    lossy_by_args = seen.damping is not None and data.args is not None
+    law = None
+    if not lossy_by_args:
+        law = _law(request, data, better, MAX_COST_RATIO * climb.cheapest)
     of_terms, failed = None, None
     met_by_law = law is not None and tolerance.met_by(law.candidate)
     wanted = not early and options.learn != "hamiltonian" and not met_by_law
@@ -84,7 +88,7 @@ def searched(
             failed = error
     if wanted and data.args is not None and not _met(of_terms, tolerance):
         try:
-            seen = diagnosed(data, options.chart, request.reversor, options.seed)
+            seen = diagnosed(seen.data, options.chart, request.reversor, options.seed)
         except FitError as error:
             failed = failed or error
         charts = seen.charts

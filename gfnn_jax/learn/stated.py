@@ -15,18 +15,18 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from gfnn_jax.budget import FLOW, ROWS, Budget
+from gfnn_jax.candidates.assemble import stepped
+from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.measured_error import FEWEST_RUNS, clusters, count_of_runs, measured_error
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps
-from gfnn_jax.learn.assemble import stepped
-from gfnn_jax.learn.candidates import Candidate, with_error
 from gfnn_jax.learn.choose import Chosen
-from gfnn_jax.learn.clock import FLOW, ROWS, Budget
-from gfnn_jax.learn.law_work import work_of_refit
-from gfnn_jax.learn.network_sweep import NetworkSweep
 from gfnn_jax.learn.searches import Searched
+from gfnn_jax.models.generating_functions.network_sweep import NetworkSweep
+from gfnn_jax.models.hamiltonians.work import work_of_refit
 
 _FOLDS = 5
 FEWEST_TESTED = 10  # runs that state the error for all others
@@ -123,7 +123,7 @@ def _images_of(chosen: Chosen, found: Searched, rows: np.ndarray) -> np.ndarray:
     own = sweep is not None and sweep.data.pairs is found.data.pairs
     if candidate.microseconds_per_step is None and entry is not None and own:
         images, solved = entry.sweep.images(entry.size, rows)
-        images = data.whole_image(np.where(solved[:, None], images, np.nan))
+        images = data.whole_image(np.where(solved[:, None], images, np.nan), rows)
         return to_user(data.coordinates, images)
     steps = stepped(candidate.map, np.asarray(pairs.z0), pairs.dt, pairs.args, timed=False)
     return np.where(steps.failed[:, None], np.nan, steps.images)

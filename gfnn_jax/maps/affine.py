@@ -28,7 +28,7 @@ class Affine:
     centre: Any
     shift: Any
 
-    def image(self, z):
+    def image(self, z, args=None):
         """Compute the images of states z (..., 2d), NumPy or JAX."""
         moved = matmul(z - as_row(self.centre, z), self.matrix.T)
         return as_row(self.centre + self.shift, z) + moved

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from functools import partial, wraps
 from numbers import Integral
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -288,7 +289,13 @@ class SymplecticMap:
     def multiplier(self, args=None):
         """μ of AᵀJA = μJ, which holds for the derivative A of every step: the product of those of
         the pieces. 1.0 where the map is symplectic, e^(−γ dt) with uniform friction γ, None where
-        the map keeps no multiple of the form: with other friction, or with inputs."""
+        the map keeps no multiple of the form: with other friction, or with inputs; and where μ
+        depends on the args (name -> a number or (B,)) and none are given."""
+        if isinstance(args, Mapping):
+            lanes = np.broadcast_shapes(*(np.shape(value) for value in args.values()))
+            dtype = np.dtype(self.scale.dtype)
+            args = as_args(self.parameters, args, (*lanes, 2 * self.dim), dtype)
+            return jax.tree.map(np.asarray, self).multiplier(np.asarray(args))
         factors = [piece.multiplier(args) for piece in self.pieces]
         return None if any(factor is None for factor in factors) else math.prod(factors, start=1.0)
 

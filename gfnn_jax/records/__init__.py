@@ -2,8 +2,11 @@
 
     recording = gfnn.read(gfnn.records.path("double_pendulum"), angles=["theta1", "theta2"])
 
-All are of M. Schmidt and H. Lipson, *Distilling free-form natural laws from experimental data*,
-Science 324 (2009) 81, supplementary data. Their velocities were estimated by the authors.
+arm2 is of K. Kaheman, U. Fasel, J. J. Bramburger, B. Strom, J. N. Kutz and S. L. Brunton, *The
+experimental multi-arm pendulum on a cart*, arXiv 2205.06231 (MIT licence), free swings cut into
+runs, every tenth of its samples. The others are of M. Schmidt and H. Lipson, *Distilling free-form
+natural laws from experimental data*, Science 324 (2009) 81, supplementary data; their velocities
+were estimated by the authors.
 """
 
 from __future__ import annotations
@@ -28,6 +31,10 @@ RECORDS = {
     "two_carts": Record("two carts between three springs", ("x1", "x2"), ()),
     "double_pendulum": Record(
         "a double pendulum, chaotic, with gaps of up to 0.19 s; angles from hanging down",
+        ("theta1", "theta2"), ("theta1", "theta2"),
+    ),
+    "arm2": Record(
+        "an arm of two links on bearings, free swings in runs; angles from the upright",
         ("theta1", "theta2"), ("theta1", "theta2"),
     ),
 }  # fmt: skip

@@ -1,0 +1,215 @@
+"""Budget of a fit: operations, counted in units of work. A clock only says how many fit.
+
+A unit is a size of a sweep, a library of H, a block of a network's iterations. Its operations are
+predicted before it starts, its time from those of its kind that this process has done. The first
+unit that does not fit ends the search, and nothing smaller is tried in its stead: the number of
+operations that were done then says which units they were, and gives the same model again whatever
+the clock. Without a budget nothing looks at the clock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from typing import Literal
+
+from gfnn_jax.errors import OutOfTime
+
+MAX_SECONDS = 120.0  # of a fit that is told of no budget
+
+# Operations a second of a quiet core by kind of work, until units of a kind have been measured:
+# rows folded into a factor, singular values, flows and their derivatives in NumPy, atoms of laws
+# matched to gradients, iterations of a network. What is compiled is counted in seconds.
+ROWS, SOLVE, FLOW, NETWORK, COMPILE = "rows", "solve", "flow", "network", "compile"
+MATCHING = "matching"
+_RATES = {ROWS: 1e10, SOLVE: 2e10, FLOW: 5e8, MATCHING: 1e8, NETWORK: 5e9, COMPILE: 1.0}
+# Seconds, at these rates, of a unit that tells its kind's own: of shorter ones most is overhead.
+_TELLING = 0.1
+# Seconds that compiling a step takes, by 2d: small eliminations are unrolled, and larger ones call
+# the library (`solve.linear`). Processor time of polynomials, jax 0.10.2; other work on the machine
+# makes them longer.
+_COMPILING = {2: 3.0, 4: 5.0, 6: 9.0, 8: 10.0}
+_COMPILING_MORE = 9.0
+_MOST_RESERVED = 1 / 5  # of a budget
+
+
+def seconds_allowed(
+    max_seconds: float | Literal["auto"] | None, max_operations: int | None
+) -> float | None:
+    """The seconds that "auto" stands for, or what else was asked for: where operations are bounded
+    the clock decides nothing, so that they give the same map again."""
+    if max_seconds != "auto":
+        return max_seconds
+    return MAX_SECONDS if max_operations is None else None
+
+
+class Counted:
+    """A cap on the operations of one search, counted as they are made: what else the machine does
+    neither shortens nor lengthens it. ``spend`` raises OutOfTime once it is spent."""
+
+    def __init__(self, most: float):
+        self.most, self.spent = most, 0.0
+
+    def spend(self, operations: float) -> None:
+        if self.spent > self.most:
+            raise OutOfTime
+        self.spent += operations
+
+
+_NO_TIME = "there was no time for"
+
+
+class Budget:
+    """The units that a fit has done, and whether the next one fits.
+
+    max_seconds: since its making; None: the clock decides nothing. max_operations: of all units,
+    as predicted; None: no bound. clock: gives seconds. dim: of the map whose step is compiled in
+    the end: the time for that is reserved. None: nothing is.
+
+    compiling: seconds that compiling the step takes, about.
+    ended: why a unit did not fit, "" as long as all do. operations: of the units that were done.
+    left_out: what was not done, or not kept, each with its reason.
+    """
+
+    def __init__(
+        self, max_seconds: float | None = None, max_operations: int | None = None,
+        clock: Callable[[], float] = time.perf_counter, dim: int | None = None,
+    ):  # fmt: skip
+        self.max_seconds, self.max_operations = max_seconds, max_operations
+        self.ended, self.operations, self.left_out = "", 0, list[str]()
+        self._clock, self._started = clock, clock()
+        self._done, self._last, self._closed = 0, "", False
+        self._measured: dict[str, tuple[float, float]] = {}  # kind -> operations, seconds
+        self._reserved: dict[str, float] = {}  # kind -> operations that follow the search
+        self.compiling = 0.0 if dim is None else _COMPILING.get(2 * dim, _COMPILING_MORE)
+
+    @property
+    def seconds(self) -> float:
+        """Since its making."""
+        return self._clock() - self._started
+
+    @property
+    def over(self) -> bool:
+        """Return whether a unit did not fit, so that no further one is begun."""
+        return bool(self.ended)
+
+    @contextlib.contextmanager
+    def unit(
+        self, name: str, kind: str, operations: float, *, then: tuple[str, float] | None = None
+    ) -> Iterator[None]:
+        """One unit of work of the search. Raises OutOfTime where it does not fit.
+
+        operations: that it is predicted to take. then: kind and operations of what must follow
+        should this be the last unit; the time for it is reserved.
+        """
+        count = max(1, int(operations))
+        if self.over:
+            raise OutOfTime
+        if then is not None:
+            self._reserved[then[0]] = max(self._reserved.get(then[0], 0.0), then[1])
+        most = self.max_operations
+        if most is not None and self.operations + count > most:
+            left = max(most - self.operations, 0)
+            needed = f"{name} would take {count:.1e}, and {left:.1e} of {most:,} are left"
+            self._end("there were no operations for", needed)
+        if self.max_seconds is not None:
+            seconds, now = self._foretold(kind, count) + self._set_apart, self.seconds
+            if now + seconds > self.max_seconds:
+                left = max(self.max_seconds - now, 0.0)
+                needed = f"{name} and what follows would take about {seconds:.2g} s"
+                self._end(_NO_TIME, f"{needed}, and {left:.2g} of {self.max_seconds:g} s are left")
+        with self._timed(kind, count):
+            yield
+        self.operations += count
+        self._done, self._last = self._done + 1, name
+
+    @contextlib.contextmanager
+    def last(
+        self, name: str, kind: str, operations: float, *, decides: bool = False
+    ) -> Iterator[None]:
+        """A unit after the search, which the search's end is no reason to leave out. Raises
+        OutOfTime where there is no time for it, and then for those after it too.
+
+        decides: whether the choice depends on it. It counts as one operation then: none of the
+        search's units could be done in its stead.
+        """
+        if self.max_seconds is not None:
+            late = self.seconds + self._foretold(kind, operations) > self.max_seconds
+            self._closed = self._closed or late
+        spent = self.max_operations is not None and self.operations >= self.max_operations
+        if self._closed or (decides and spent):
+            self.leave_out(name, _NO_TIME)
+            raise OutOfTime
+        with self._timed(kind, operations):
+            yield
+        self.operations += decides
+
+    def free(self, kind: str, operations: float) -> contextlib.AbstractContextManager[None]:
+        """Work that is done in any case, and counts as no operation; its time is measured."""
+        return self._timed(kind, operations)
+
+    def leave_out(self, what: str, why: str) -> None:
+        """Have it told in the end; what the clock ended is told at length once, in ``ended``."""
+        why = "no time" if why.startswith(_NO_TIME) else why
+        self.left_out.append(f"left out: {what} ({why})")
+
+    def check(self) -> None:
+        """Check between the parts of a unit: raises OutOfTime where it takes longer than foretold
+        and the time is over. The unit is then as though it had never begun."""
+        if self.over:
+            raise OutOfTime
+        if self.max_seconds is not None and self.seconds + self._set_apart > self.max_seconds:
+            self.ended = f"{_NO_TIME}{self._after}: {self.max_seconds:g} s are over"
+            raise OutOfTime
+
+    def _end(self, spent: str, needed: str) -> None:
+        self.ended = f"{spent}{self._after}: {needed}"
+        raise OutOfTime
+
+    @property
+    def _after(self) -> str:
+        return f" more after unit {self._done} ({self._last})" if self._done else " one unit"
+
+    @property
+    def _set_apart(self) -> float:
+        """Seconds for what follows the search."""
+        assert self.max_seconds is not None
+        compiling = min(self.compiling, _MOST_RESERVED * self.max_seconds)
+        return compiling + sum(self._foretold(*each) for each in self._reserved.items())
+
+    def _foretold(self, kind: str, operations: float) -> float:
+        """Seconds of so many operations."""
+        done, seconds = self._measured.get(kind, (_RATES[kind], 1.0))
+        return operations * seconds / done
+
+    @contextlib.contextmanager
+    def _timed(self, kind: str, operations: float) -> Iterator[None]:
+        started = self._clock()
+        yield
+        if operations >= _TELLING * _RATES[kind]:
+            done, seconds = self._measured.get(kind, (0.0, 0.0))
+            self._measured[kind] = done + operations, seconds + self._clock() - started
+
+
+@dataclasses.dataclass(frozen=True)
+class Allowance:
+    """Bounds of the parts of a unit of work: the time of its budget, and a cap on what
+    its search may make. None: no bound."""
+
+    budget: Budget | None = None
+    cap: Counted | None = None
+
+    def check(self) -> None:
+        """Check the time: `Budget.check`."""
+        if self.budget is not None:
+            self.budget.check()
+
+    def spend(self, operations: float) -> None:
+        """Count operations before they are made: `Counted.spend`."""
+        if self.cap is not None:
+            self.cap.spend(operations)
+
+
+UNBOUNDED = Allowance()

@@ -1,0 +1,169 @@
+"""The chosen candidate made a map: predictors for its solves, and a last look at its own steps."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from gfnn_jax.budget import COMPILE, Budget
+from gfnn_jax.candidates.candidate import Candidate, refined_images, with_error
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance, measured_error
+from gfnn_jax.errors import OutOfTime
+from gfnn_jax.fitting import row_blocks
+from gfnn_jax.flows.collocation import of_lanes
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.generating.predictor import affordable, fit_predictors
+from gfnn_jax.maps.parameters import Parameters, sampled
+from gfnn_jax.maps.symplectic_map import Piece, SymplecticMap
+from gfnn_jax.solve.status import LEFT_DOMAIN
+
+_TIMING = "the time of a step, and the error of compiled ones"
+_PREDICTOR_PAIRS = 2_000
+# States are stepped in blocks of one shape, whatever their number: compiled once for a kind of map.
+# A block of wide states is of so many numbers.
+_BLOCK, _BLOCK_NUMBERS = 512, 2**16
+_REPEATS = 5  # of a timed block; the best counts
+
+
+class Assembled(NamedTuple):
+    """The candidate as its own steps show it, with its map, and the seconds that compiling took;
+    compiled: whether there was room for that in the budget, else the error is the search's."""
+
+    candidate: Candidate
+    compile_seconds: float
+    compiled: bool = True
+
+
+def measured(
+    candidate: Candidate, map_: SymplecticMap, data: Dataset, tolerance: Tolerance, budget: Budget
+) -> Assembled:
+    """The candidate with this map, its error and its time per step measured by the steps that users
+    run, as long as compiling them fits into the budget."""
+    held, compiling = data.pairs.take(data.validation), budget.compiling
+    try:
+        with budget.last(_TIMING, COMPILE, compiling, decides=True):
+            steps = stepped(map_, np.asarray(held.z0), held.dt, held.args)
+    except OutOfTime:
+        return Assembled(dataclasses.replace(candidate, map=map_), 0.0, compiled=False)
+    images = np.where(steps.failed[:, None], np.nan, steps.images)
+    error = measured_error(data, tolerance, images)
+    candidate = dataclasses.replace(
+        with_error(candidate, error), map=map_,
+        newton_iterations_max=int(steps.iterations.max()),
+        microseconds_per_step=steps.microseconds_per_step,
+    )  # fmt: skip
+    return Assembled(candidate, steps.compile_seconds)
+
+
+def with_predictor(generated: Generated, data: Dataset, rows) -> Generated:
+    """The piece with predictors fitted to its own images of the data's states: where S is coarse,
+    the data are no closer to its roots than S is to the data."""
+    rows = rows[:_PREDICTOR_PAIRS]
+    images, solved = refined_images(data, generated.chart, generated.family, generated.params, rows)
+    if solved.sum() < 2:  # nothing to learn from: the data's own images
+        images, solved = data.y1[rows], np.ones(len(rows), bool)
+    coordinates, args = data.coordinates, data.given(rows[solved])[1]
+    features = getattr(getattr(generated.family, "inputs", None), "features", None)
+    fitted = fit_predictors(
+        generated.chart, data.y0[rows][solved], images[solved],
+        of_lanes(data.given(rows)[0], solved),
+        angles=coordinates.angles, cyclic=coordinates.cyclic, features=features, args=args,
+    )  # fmt: skip
+    chosen = affordable(fitted, generated.family)
+    return dataclasses.replace(generated, predictor=chosen.predictor)
+
+
+def composed(piece: Piece, data: Dataset) -> SymplecticMap:
+    """The piece between those that were factored out, in the scene's coordinates: leaves of JAX."""
+    map_ = SymplecticMap(
+        pieces=(*data.before, piece, *data.after),
+        coordinates=data.coordinates,
+        domain=data.domain,
+        scale=data.spread,
+        angle_centre=data.angle_centre,
+        dt=data.dt,
+        parameters=_sampled(data),
+        dt_range=_dt_range(piece, data),
+    )
+    # Not jnp.asarray, which compiles a copy for every new shape.
+    return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_)
+
+
+def _sampled(data: Dataset) -> Parameters | None:
+    """Args that the map depends on beside the state, and where they were sampled."""
+    if data.args is None:
+        return None
+    return sampled(data.parameters, data.args, data.each_dt, data.period)
+
+
+def _dt_range(piece: Piece, data: Dataset) -> np.ndarray | None:
+    """Range in which dt was sampled, of an S that was learned with it."""
+    if data.own_dt is None or not isinstance(piece, Generated):
+        return None
+    return np.array([data.own_dt.min(), data.own_dt.max()])
+
+
+def in_block(z: np.ndarray) -> np.ndarray:
+    """States z (N, 2d), N no more than a block holds, repeated so that they fill it: for them the
+    step is compiled."""
+    return np.resize(z, (block_of(z.shape[1]), z.shape[1]))
+
+
+def block_of(width: int) -> int:
+    """The number of states (2d,) of this width that are stepped together."""
+    return max(1, min(_BLOCK, _BLOCK_NUMBERS // width))
+
+
+class Steps(NamedTuple):
+    """Images (N, 2d) of states, Newton's iterations and whether a step failed (N,), the time of a
+    step in a block, and the seconds that compiling took."""
+
+    images: np.ndarray
+    iterations: np.ndarray
+    failed: np.ndarray
+    microseconds_per_step: float
+    compile_seconds: float
+
+
+def stepped(
+    map_: SymplecticMap, z: np.ndarray, dt: Any = None, args=None, *, timed: bool = True
+) -> Steps:
+    """One step of the states z (N, 2d), in blocks of one shape; times are 0 unless ``timed``, and
+    blocks are then shared out among the devices of the fit. dt: of each state (N,), or that of the
+    map. args: name -> (N,), as those of `Pairs`."""
+    size = block_of(z.shape[1])
+    rows = np.resize(np.arange(len(z)), -(-len(z) // size) * size).reshape(-1, size)
+    longest = map_.over(np.max(dt)) if np.ndim(dt) else map_  # as many substeps in every block
+
+    placed: dict[Any, Any] = {}  # the map on each device, which one thread at a time has
+
+    def run(block, device: Any = None) -> tuple[Any, float]:
+        own, given = longest, args and {name: values[block] for name, values in args.items()}
+        if device is not None:
+            own = placed[device] = placed.get(device) or jax.device_put(longest, device)
+        if np.ndim(dt):
+            piece = dataclasses.replace(own.pieces[0], dt=dt[block])
+            own = dataclasses.replace(own, pieces=(piece,), dt=dt[block])
+        started = time.perf_counter()
+        out = jax.block_until_ready(own.step(z[block], given))
+        return jax.tree.map(np.asarray, out), time.perf_counter() - started
+
+    if row_blocks.devices() and not timed:
+        found, seconds, compiling = row_blocks.each(run, rows), 0.0, 0.0
+    else:
+        found, seconds = [run(rows[0])], 0.0
+        if timed:
+            seconds = min(run(rows[0])[1] for _ in range(_REPEATS))
+        compiling = found[0][1] - seconds if timed else 0.0
+        found += [run(block) for block in rows[1:]]
+    blocks = [out for out, _ in found]
+    images, status, iterations = (
+        np.concatenate(parts)[: len(z)]
+        for parts in zip(*((i, f.status, f.iterations) for i, f in blocks), strict=True)
+    )
+    return Steps(images, iterations, status > LEFT_DOMAIN, 1e6 * seconds / size, compiling)

@@ -1,0 +1,312 @@
+"""Learn S as a sum of terms: of maps that differ in parameters, and of equal sites.
+
+For kicked maps and return maps, which have no flow, and wherever no H is found. S = Σ c_jm φ_j(w)
+f_m(parameters), or Σ_sites Σ_j c_j φ_j(w), is linear in its coefficients; its libraries are those
+of an H, its data those of any S: target gradients at evaluation points.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.budget import ROWS, Budget
+from gfnn_jax.candidates.assemble import Assembled, composed, measured
+from gfnn_jax.candidates.candidate import Candidate, with_error
+from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
+from gfnn_jax.diagnosis.local_jacobians import SINGULAR
+from gfnn_jax.errors import FitError, OutOfTime
+from gfnn_jax.families.expressions import coordinate_names
+from gfnn_jax.families.family import at_time
+from gfnn_jax.families.sums import Sums, matrix_free
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.fitting import least_squares, uncertainty
+from gfnn_jax.fitting.linear_starts import fitted_gradients
+from gfnn_jax.fitting.significance import null_terms, significant
+from gfnn_jax.fitting.triangle import Triangle
+from gfnn_jax.generating.charts import CHARTS, AnyChart
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.models.parameters import functions_of_parameters, state_libraries, walked
+
+_CHARTS = ("type2", "midpoint", "type3")  # that are tried, in this order
+_MOST_TERMS, _ROWS_PER_TERM = 500, 3
+_THRESHOLDS = (1e4, 1e3, 100.0, 30.0, 10.0)  # standard errors below which terms go, tried in turn
+_RISE, _ROUNDING = 1.1, 1e-15  # of the held-out error that this may cost
+_STRUCTURED_ROWS = 50_000  # numbers of training pairs that sites are fitted to: no more are needed
+_NULL_ROWS = 4_000  # of them, which tell whose gradients are combinations of others
+_FEWER_TERMS = "dropping the terms of S that the pairs do not ask for"
+_BETTER = 0.5  # of the error of an H, that S of a structure must have to be taken in its stead
+_FLAT = 1.2  # libraries whose errors differ by less have met the pairs' noise
+_SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved
+
+
+class LearnedMap(NamedTuple):
+    """The candidate, its error measured by steps in NumPy, the piece that S generates, and the data
+    set that it was fitted to, of which a loss of area may be factored out.
+    covariance: gives (m, m), rootᵀ root is that of the coefficients. stalled: whether another
+    library of the chart was no less accurate, and the tolerance is missed."""
+
+    candidate: Candidate
+    piece: Generated
+    data: Dataset
+    covariance: Callable[[], np.ndarray]
+    stalled: bool
+
+
+class _Tried(NamedTuple):
+    piece: Generated
+    error: OneStepError
+    train_rms: float
+
+
+def learn_map(
+    data: Dataset, tolerance: Tolerance, scene: Any = None, *, chart: str = "auto",
+    budget: Budget | None = None, say: Callable[[str], Any] = lambda message: None,
+    needed: bool = True,
+) -> LearnedMap:  # fmt: skip
+    """The map of these pairs of one dt and several systems, or of many sites: of the first chart
+    that meets the tolerance, else of the best. needed: whether the first library is fitted whatever
+    the budget, because nothing else would be left.
+
+    Raises FitError where no chart covers the data, or the pairs are too few.
+    """
+    budget, started, given = budget or Budget(), time.perf_counter(), data
+    best: _Tried | None = None
+    tried: list[_Tried] = []
+    try:
+        for name in _CHARTS if chart == "auto" else (chart,):
+            attempts = _Attempts(CHARTS[name], data, tolerance, budget, say, needed)
+            for found in _of_chart(attempts, scene):
+                tried.append(found)
+                needed = False
+                if best is None or found.error.bound < best.error.bound:
+                    best = found
+            if best is not None and best.error.bound <= tolerance.bound:
+                break
+    except OutOfTime:
+        if best is None:
+            raise
+    if best is None or not np.isfinite(best.error.bound):
+        raise FitError(
+            "expected pairs that tell an S of such terms: they are too few, or no chart covers "
+            f"them{' for all values of the parameters' if data.args is not None else ''}"
+        )
+    rivals = [
+        f for f in tried
+        if f.piece.chart is best.piece.chart and f.error.relative <= _FLAT * best.error.relative
+    ]  # fmt: skip
+    stalled = len(rivals) > 1 and best.error.bound > tolerance.bound
+    if data.structure is not None:
+        data = _fewer(data)
+    try:
+        with budget.unit(_FEWER_TERMS, ROWS, len(_THRESHOLDS) * _work(best.piece.family, data)):
+            best = _sparse(best, data, tolerance)
+    except OutOfTime:
+        budget.leave_out(_FEWER_TERMS, budget.ended)
+    piece = best.piece
+    gradient, with_hessian = piece.family.operations
+    candidate = Candidate(
+        label=f"S, {piece.family.num_parameters} terms", family=piece.family.name,
+        chart=piece.chart.name, num_parameters=piece.family.num_parameters,
+        operations=float(gradient + with_hessian), validation_rms=best.error.rms,
+        validation_relative=best.error.relative, validation_bound=best.error.bound,
+        deviations=best.error.deviations, train_rms=best.train_rms,
+        fit_seconds=time.perf_counter() - started,
+    )  # fmt: skip
+    covariance = partial(_root, piece, data)
+    return LearnedMap(with_error(candidate, best.error), piece, given, covariance, stalled)
+
+
+def map_of(
+    data: Dataset, tolerance: Tolerance, scene: Any, chart: str, law: Any, budget: Budget,
+    say: Callable[[str], Any],
+) -> LearnedMap | None:  # fmt: skip
+    """Learn by `learn_map`; None where it finds none, or none that is better than the law that
+    was."""
+    try:
+        with np.errstate(all="ignore"):
+            found = learn_map(
+                data, tolerance, scene, chart=chart, budget=budget, say=say, needed=law is None
+            )
+    except (FitError, OutOfTime):
+        if law is None:
+            raise
+        return None
+    better = 1.0 if data.structure is None else _BETTER
+    error = found.candidate.validation_bound
+    if law is not None and not error < better * law.candidate.validation_bound:
+        return None
+    return found
+
+
+def assembled(learned: LearnedMap, tolerance: Tolerance, budget: Budget) -> Assembled:
+    """The candidate's map, measured."""
+    map_ = composed(learned.piece, learned.data)
+    return measured(learned.candidate, map_, learned.data, tolerance, budget)
+
+
+@dataclasses.dataclass
+class _Attempts:
+    """Libraries fitted in a chart, each a unit of the budget; the first of them in any case where
+    it is ``needed``."""
+
+    chart: AnyChart
+    data: Dataset
+    tolerance: Tolerance
+    budget: Budget
+    say: Callable[[str], Any]
+    needed: bool
+
+    def __post_init__(self) -> None:
+        if self.data.structure is not None:
+            self.data = _fewer(self.data)
+
+    def __call__(self, family: Any) -> _Tried:
+        name = f"S in {self.chart.name}: {family.num_parameters} terms"
+        work = _work(family, self.data)
+        self.say(name)
+        first, self.needed = self.needed, False
+        unit = self.budget.free(ROWS, work) if first else self.budget.unit(name, ROWS, work)
+        with unit:
+            return _fitted(self.chart, family, self.data, self.tolerance)
+
+
+def _work(family: Any, data: Dataset) -> float:
+    """Operations of a least-squares fit of the family's terms."""
+    rows = len(data.training) * data.spread.size
+    return 2.0 * rows * family.num_parameters**2
+
+
+def _of_chart(attempt: _Attempts, scene) -> Iterator[_Tried]:
+    """Iterate over what is tried in a chart."""
+    data, tolerance = attempt.data, attempt.tolerance
+    if data.structure is not None:
+        yield from _of_sites(data, tolerance, attempt)
+        return
+    coordinates, dim = data.coordinates, data.dim
+    angles = tuple(i for i in coordinates.angles if i < dim and i not in coordinates.cyclic)
+    plain = tuple(
+        name
+        for i, name in enumerate(coordinate_names(dim))
+        if i not in angles and i not in coordinates.cyclic
+    )
+    states = state_libraries(
+        dim, data.parameters, angles=angles, cyclic=coordinates.cyclic, plain=plain,
+        features=scene.features if scene is not None else None, reversor=None, own=None,
+    )  # fmt: skip
+    _, args = data.given(data.training)
+    functions = functions_of_parameters(dim, data.parameters, args, own=False, period=data.period)
+
+    yield from walked(
+        states, functions, attempt, lambda tried: tried.error.bound,
+        bound=tolerance.bound,
+        most=min(len(data.training) * 2 * dim / _ROWS_PER_TERM, _MOST_TERMS),
+    )  # fmt: skip
+
+
+def _fewer(data: Dataset) -> Dataset:
+    """Take as many training pairs as the terms of a site need."""
+    most = max(1, _STRUCTURED_ROWS // data.y0.shape[1])
+    return data.trained_on(data.training[:most])
+
+
+def _of_sites(data: Dataset, tolerance: Tolerance, attempt) -> Iterator[_Tried]:
+    """The libraries of a structure by rising size, until one meets the tolerance."""
+    assert data.structure is not None
+    width = data.y0.shape[1]
+    rows = data.training[: max(1, _NULL_ROWS // width)]
+    most = min(len(data.training) * width / _ROWS_PER_TERM, _MOST_TERMS)
+    for library in data.structure.libraries(data.dim):
+        family = library.take(null_terms(library, data.y0[rows])[0])
+        if family.num_parameters <= most:
+            tried = attempt(family)
+            yield tried
+            if tried.error.bound <= tolerance.bound:
+                return
+
+
+def _data(chart: AnyChart, family: Terms | Sums, data: Dataset, rows):
+    """(w, target gradient, args in the middle of the step) of these rows."""
+    y0, y1 = data.y0[rows], data.y1[rows]
+    w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, data.dt)
+    return w, target, at_time(family, data.given(rows)[1], 0.5 * data.dt)
+
+
+def _fitted(chart: AnyChart, family: Terms | Sums, data: Dataset, tolerance: Tolerance) -> _Tried:
+    """The library's S by least squares, and the error of its steps on the held-out pairs."""
+    w, target, args = _data(chart, family, data, data.training)
+    c = fitted_gradients(family, w, target, data.scale, args)
+    return _judged(Generated(family, c, chart, data.dt, data.scale), data, tolerance)
+
+
+def _judged(piece: Generated, data: Dataset, tolerance: Tolerance) -> _Tried:
+    """Measure the errors of its steps; infinite where the chart folds over the held-out pairs."""
+    rows, family, params = data.validation, piece.family, piece.params
+    w = piece.chart.evaluation_point(data.y0[rows], data.y1[rows])
+    args = data.given(rows)[1]
+    images, off = piece.refined_step(data.y0[rows], w, args)
+    folds = False  # a fixed point that contracts is none
+    if not matrix_free(family):
+        determinant = piece.determinant(data.y0[rows], data.y1[rows], args)
+        folds = not (determinant > SINGULAR).all() and not (determinant < -SINGULAR).all()
+    bad = ~(off < _SOLVED) | folds
+    images = np.where(bad[:, None], np.nan, images)
+    images = data.whole_image(images, rows)
+    error = measured_error(data, tolerance, to_user(data.coordinates, images))
+    w, target, args = _data(piece.chart, family, data, data.training)
+    left = (family.gradient(params, w, args) - target) * _weight(data)
+    return _Tried(piece, error, float(np.sqrt(np.mean(left**2))))
+
+
+def _weight(data: Dataset) -> np.ndarray:
+    """h over the scale of what each entry of ∇S changes (2d,)."""
+    return data.dt / np.roll(data.scale, data.dim)
+
+
+def _root(piece: Generated, data: Dataset) -> np.ndarray:
+    """Root of the covariance. The next library tells the noise in the residual, which it leaves;
+    without a structure all of it may be misfit."""
+    family, count = piece.family, piece.family.num_parameters
+    w, target, args = _data(piece.chart, family, data, data.training)
+    weight = _weight(data)
+    aim = (target * weight).ravel()
+    slopes = (family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
+    residual, noise = slopes @ np.asarray(piece.params) - aim, None
+    if data.structure is not None:
+        larger = (f for f in data.structure.libraries(data.dim) if f.num_parameters > count)
+        found = next(larger, None)
+        if found is not None and _ROWS_PER_TERM * found.num_parameters <= target.size:
+            known = found.take(null_terms(found, w[: max(1, _NULL_ROWS // w.shape[1])])[0])
+            both = least_squares.reduce(known, [(w, target)], weight)
+            part = uncertainty.variance(both, known.num_parameters)
+            left = float(np.sum(residual**2)) / max(target.size - count, 1)
+            noise = min(part / left, 1.0) if left > 0 else 1.0
+    train = Triangle.of(np.column_stack([slopes, aim]))
+    return uncertainty.root(train, count, slopes, residual, noise=noise)
+
+
+def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance) -> _Tried:
+    """Drop the terms that the pairs do not ask for, as far as the held-out error allows."""
+    piece = full.piece
+    w, target, args = _data(piece.chart, piece.family, data, data.training)
+    weight = _weight(data)
+    terms = (piece.family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
+    residual = terms @ piece.params - (target * weight).ravel()
+    triangle = Triangle.of(np.column_stack([terms, residual]))
+    tried: set[int] = set()
+    for threshold in _THRESHOLDS:
+        kept, _ = significant(triangle, piece.params, threshold)
+        if not 0 < len(kept) < piece.family.num_parameters or len(kept) in tried:
+            continue
+        tried.add(len(kept))
+        found = _fitted(piece.chart, piece.family.take(kept.tolist()), data, tolerance)
+        if found.error.relative <= max(_RISE * full.error.relative, _ROUNDING):
+            return found
+    return full

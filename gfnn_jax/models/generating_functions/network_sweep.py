@@ -1,0 +1,131 @@
+"""A sweep of one size: S as a network, trained by Levenberg–Marquardt."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from gfnn_jax.budget import NETWORK, Budget
+from gfnn_jax.candidates.candidate import Candidate, validated
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
+from gfnn_jax.dataset.rows import rows_of
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.mlp import Mlp, amplitude_of
+from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
+from gfnn_jax.fitting.training import LMResult, LMState
+from gfnn_jax.models.generating_functions.sweeps import OF_STEPS, Generates, Size
+
+# The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
+_MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
+_CHECKPOINT_SECONDS = 10.0
+
+
+class NetworkSweep(Generates):
+    """The one size of a network, trained by Levenberg–Marquardt."""
+
+    kind = "mlp"
+    short_of_pairs = False  # its one size is trained on any number of pairs
+
+    def __init__(
+        self, data: Dataset, tolerance: Tolerance, chart, max_iterations, seed, checkpoints
+    ):
+        self.data, self.tolerance, self.chart = data, tolerance, chart
+        self._max_iterations, self._seed, self._checkpoints = max_iterations, seed, checkpoints
+        (w, target), self._weight = rows_of(data, chart, data.training[:_MLP_PAIRS])
+        coordinates = data.coordinates
+        inputs = box_inputs(
+            w, angles=tuple(a for a in coordinates.angles if a < data.dim),
+            cyclic=coordinates.cyclic,
+        )  # fmt: skip
+        family = Mlp(inputs, _MLP_HIDDEN, _MLP_ACTIVATION, amplitude_of(w, target))
+        self._train, self.sizes = (w, target), [Size(family, family, 0.0)]
+        self._params: Any = None
+
+    def named(self, size: Size) -> str:
+        """Name of the unit that judges the size."""
+        return f"{self.chart.name} {size.family.label}"
+
+    def work(self, size: Size) -> float:
+        """The training's own units are counted block by block."""
+        return 1.0
+
+    def work_of_steps(self, size: Size) -> float:
+        """Operations that validating the judged size takes."""
+        return OF_STEPS * len(self.data.validation) * size.operations
+
+    @property
+    def _work_of_iteration(self) -> float:
+        """Operations of an iteration of the training."""
+        w, parameters = self._train[0], self.sizes[0].family.num_parameters
+        return 2.0 * w.size * parameters**2
+
+    def judge(self, size: Size, budget: Budget, say: Callable[[str], Any]) -> Candidate:
+        """Train the network."""
+        family = size.family
+        held, _ = rows_of(self.data, self.chart, self.data.validation)
+
+        def report(state: LMState) -> None:
+            say(
+                f"{self.chart.name} {family.label}: iteration {state.iteration}, "
+                f"validation {state.validation_rms:.2e} of the data's spread"
+            )
+
+        resume = self._checkpoints.latest(self._like()) if self._checkpoints else None
+        result = self._trained(
+            validation=held, weight=self._weight, max_iterations=self._max_iterations,
+            block=lambda count: budget.unit(
+                f"{count} iterations of {family.label}", NETWORK, count * self._work_of_iteration
+            ),
+            target_rms=0.5 * self.tolerance.bound,
+            on_progress=report, checkpoint=_every_few_seconds(self._checkpoints),
+            resume=resume[1] if resume else None,
+        )  # fmt: skip
+        error = estimated_error(self.data, self.tolerance, result.validation_rms)
+        return Candidate(
+            label=family.label, family=self.kind, chart=self.chart.name,
+            num_parameters=family.num_parameters, operations=size.operations,
+            validation_rms=error.rms, validation_relative=error.relative,
+            validation_bound=error.bound, deviations=error.deviations,
+            train_rms=result.train_rms, fit_seconds=result.seconds,
+        )  # fmt: skip
+
+    def _like(self) -> LMState:
+        """A state whose structure is that of this training's."""
+        theta = np.zeros(self.sizes[0].family.num_parameters)
+        return LMState(theta, theta, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0, 0.0)
+
+    def _trained(self, **options: Any) -> LMResult:
+        """The training; its params are then those of the sweep."""
+        family = self.sizes[0].family
+        start = family.init(jax.random.key(self._seed), np.float64)
+        result = levenberg_marquardt(family, start, *self._train, **options)
+        self._params = jax.tree.map(np.asarray, result.params)
+        return result
+
+    def validate(self, size: Size, judged: Candidate, budget: Budget, say) -> Candidate:
+        """The trained network with its error measured by steps."""
+        return validated(judged, self.data, self.tolerance, self.chart, size.family, self._params)
+
+    def solve(self, size: Size, budget: Budget, say) -> tuple[Any, Any]:
+        """The params of the trained network."""
+        return None, self._params
+
+
+def _every_few_seconds(checkpoints) -> Callable | None:
+    """A checkpoint callback that saves when ten seconds have passed since it last did."""
+    if checkpoints is None:
+        return None
+    last = time.monotonic()
+
+    def save(state: LMState) -> None:
+        nonlocal last
+        if time.monotonic() - last > _CHECKPOINT_SECONDS:
+            checkpoints.save(state.iteration, state)
+            last = time.monotonic()
+
+    return save

@@ -1,0 +1,677 @@
+"""Size sweeps: the sizes of one family in one chart, judged from a factor that they share."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.budget import Budget
+from gfnn_jax.candidates.assemble import with_predictor
+from gfnn_jax.candidates.candidate import Candidate, refined_images, validated
+from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
+from gfnn_jax.dataset.noise import of_pairs
+from gfnn_jax.dataset.rows import of_rows, rows_of
+from gfnn_jax.dataset.runs import looked_at
+from gfnn_jax.dataset.split import outermost
+from gfnn_jax.families.inputs import Inputs, box_inputs, variable_signs
+from gfnn_jax.families.own import own_families
+from gfnn_jax.families.products import Products, number_of_terms
+from gfnn_jax.families.sines import Sines
+from gfnn_jax.families.time_step import OfTimeStep
+from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
+from gfnn_jax.fitting.triangle import Triangle
+from gfnn_jax.generating.charts import MIDPOINT, AnyChart
+from gfnn_jax.generating.generated import Generated
+from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.damping import Damping
+
+# Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
+# judged from one factor of the rows of its largest.
+_DEGREES = ((2, 3), (4, 5, 6), (7, 8), (9, 10), (12, 14), (16, 18, 20), (24, 28, 32))
+_TRIAL = (2, 3, 4, 5, 6)
+_EVEN_DEGREES = tuple((degree,) for degree in (2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 24, 28, 32))
+_SINES = (100, 200, 400, 800, 1_600)
+# Products of degree 14 in four variables: benchmarks/storage_ring.py.
+_MOST_TERMS = 3_100
+_ROWS_PER_TERM = 3
+# Enough to tell misfit from noise by a size, though not to choose it.
+_ROWS_THAT_TELL = 1.5
+# Rows per term up to which the test rows, an eighth as many, make the coefficients much better.
+_SCARCE = 6
+# Rows × terms² of one factor: about half a minute on one core. 2,000 terms take 80,000 rows.
+_MOST_OPERATIONS = 3.2e11
+# Whether S is even is tested where terms are scarce, from so many rows for each term, by odd terms
+# up to a degree. Those of an even S bring nothing: the held-out residual becomes 0.98 … 1.09 of
+# what it was (FPUT chains, a Penning trap, a satellite); to leave them out costs no more than that.
+_SCARCE_FROM_DIM, _PARITY_ROWS, _ODD_DEGREE, _NO_GAIN = 3, 6, 3, 0.98
+_WORTH_KEEPING = 1.0  # seconds
+# Operations of singular values, ÷ terms³; and of a step in NumPy, in units that take as long.
+OF_SOLVE, OF_STEPS = 22.0, 20.0
+# Pairs of a block that goes to one of two halves: long beside the noise that neighbours share.
+_HALVES_BLOCK = 50
+# Rows per term of a larger size, by which noise is told from misfit.
+SAMPLE_ROWS = 6
+_NOISE_PAIRS = 4_096  # that tell the noise of each coordinate
+
+
+@dataclasses.dataclass(frozen=True)
+class Size:
+    """One size of a sweep: what a search needs to know before it is judged."""
+
+    family: Any
+    group: Any  # the largest family that is judged from the same factor
+    extent: float  # the logarithm of the error falls in proportion: a degree, or log₂ of a number
+
+    @property
+    def operations(self) -> float:
+        """Floating-point operations per predicted step: one update, which takes ∇S with its
+        Hessian, and ∇S where it leads."""
+        gradient, with_hessian = self.family.operations
+        return float(gradient + with_hessian)
+
+
+def sweeps_for(
+    request: Any,
+    charts: Sequence[AnyChart],
+    data: Dataset,
+    tolerance: Tolerance,
+    scene,
+    factors=None,
+) -> Iterator:
+    """The sweeps of the families that apply, chart by chart.
+
+    request: "auto", "polynomial", "features" (the scene's), "sines", or a user's own; with "auto"
+    random sines are tried where polynomials have too many terms. factors: as ``LinearSweep`` takes
+    them.
+    """
+    if not isinstance(request, str):
+        for chart in charts:
+            yield LinearSweep(
+                data, tolerance, chart, "own", None, None, own=lambda i: own_families(request, i)
+            )  # fmt: skip
+        return
+    features = scene.features if scene is not None else None
+    polynomials = request in ("auto", "polynomial")
+    even = polynomials and (scene is None or scene.reversor is None) and is_even(data)
+    for chart in charts:
+        # Only the midpoint S inherits the parity.
+        reversor = scene.reversor if scene is not None and chart == MIDPOINT else None
+        if polynomials:
+            yield LinearSweep(
+                data, tolerance, chart, "polynomial", None, reversor, factors, even
+            )  # fmt: skip
+        if request in ("auto", "features") and features is not None:
+            yield LinearSweep(data, tolerance, chart, "features", features, reversor, factors)
+        if request == "sines" or (request == "auto" and data.dim > 2):
+            yield LinearSweep(data, tolerance, chart, "sines", None, None, factors)
+
+
+def sweep_of_dt(data: Dataset, tolerance: Tolerance, scene, factors=None) -> LinearSweep:
+    """The sweep of S(w; dt²), where each pair has its own dt."""
+    reversor = scene.reversor if scene is not None else None
+    return LinearSweep(data, tolerance, MIDPOINT, "polynomial", None, reversor, factors)
+
+
+class Factors(NamedTuple):
+    """Factors of the training rows, of those held out, and of the training rows without the
+    outermost twentieth and of that twentieth alone."""
+
+    train: Triangle
+    held: Triangle
+    inner: Triangle
+    outer: Triangle
+
+    @classmethod
+    def of(cls, inner: Triangle, outer: Triangle, held: Triangle) -> Factors:
+        """The rows of the outermost twentieth are appended to the others by their own triangle."""
+        return cls(inner.append(outer.factor, outer.rows), held, inner, outer)
+
+
+class Generates:
+    """Base of the sweeps of S: a solved size makes a piece."""
+
+    data: Dataset
+    chart: AnyChart
+    tolerance: Tolerance
+
+    def solve(self, size: Size, budget: Budget, say) -> tuple[Any, Any]:
+        """Solve for the params of the size's family; with them what is known of the solution."""
+        raise NotImplementedError
+
+    def piece(self, size: Size) -> Generated:
+        """The piece that the size's S generates, with its predictor."""
+        data, params = self.data, self._params_of(size)
+        piece = Generated(size.family, params, self.chart, data.dt, data.scale)
+        return with_predictor(piece, data, data.training)
+
+    def images(self, size: Size, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Images of these rows (n, 2d), inner ones, and which steps were solved (n,)."""
+        params = self._params_of(size)
+        return refined_images(self.data, self.chart, size.family, params, rows)
+
+    def _params_of(self, size: Size) -> Any:
+        return self.solve(size, Budget(), lambda message: None)[1]
+
+
+class LinearSweep(Generates):
+    """The sizes of one linear family in one chart.
+
+    factors: a ``KeptFactors``, where factors that took long are kept for a fit that goes on. even:
+    whether S(−w) = S(w), and has even terms only. own: a user's families, of the inputs, by rising
+    number of terms.
+    """
+
+    def __init__(
+        self, data: Dataset, tolerance: Tolerance, chart: AnyChart, kind: str, features, reversor,
+        factors=None, even=False, own: Callable[[Inputs], Iterable[Any]] | None = None,
+    ):  # fmt: skip
+        reversor = (-1,) * 2 * data.dim if even else reversor
+        self._kept, self._prefix = factors, "even " if even else ""
+        self.data, self.tolerance, self.chart, self.kind = data, tolerance, chart, kind
+        self._train, self._weight = rows_of(data, chart, data.training)
+        self._held, _ = rows_of(data, chart, data.validation)
+        free = (*data.coordinates.cyclic, *data.whole)
+        self._outermost = outermost(data.y0[data.training], free)
+        coordinates = data.coordinates
+        w, of, args = self._train[0], Products, data.given(data.training)[1]
+        if data.own_dt is not None:
+            of, args = _of_time_step, data.own_dt[data.training, None] ** 2
+        inputs = box_inputs(
+            w, angles=tuple(a for a in coordinates.angles if a < data.dim),
+            cyclic=coordinates.cyclic, features=features, reversor=reversor,
+            args=args,
+        )  # fmt: skip
+        degrees = _EVEN_DEGREES if even else _DEGREES
+        signs = None
+        if kind != "sines" and own is None and reversor is not None:
+            signs = variable_signs(inputs, reversor, w)
+
+        def groups() -> Iterator[Iterable[Any]]:
+            if own is not None:
+                return ([family] for family in own(inputs))
+            if kind == "sines":
+                return ([Sines(inputs, count)] for count in _SINES)
+            return ((of(inputs, degree, signs) for degree in g) for g in degrees)
+
+        known = len(_SINES) if kind == "sines" or own is not None else sum(map(len, degrees))
+        # Test rows determine a size too: once they have stated its error, it is fitted to them.
+        rows = self._train[1].size + len(data.test) * self._width
+        self._groups, self._determining = groups, rows
+        self.sizes = [
+            Size(family, group[-1], _extent(family))
+            for group in _determined(groups(), rows) for family in group
+        ]  # fmt: skip
+        # Else the last size is the largest there is, or the most terms are reached.
+        self.short_of_pairs = len(self.sizes) < known and rows < _ROWS_PER_TERM * _MOST_TERMS
+        self._factors: dict[Any, Factors] = {}
+        self._solved: dict[int, least_squares.LeastSquaresFit] = {}  # by the number of terms
+
+    def named(self, size: Size) -> str:
+        """Name of the unit that judges the size."""
+        return f"{self.chart.name} {self._prefix}{size.family.label}"
+
+    def work(self, size: Size) -> float:
+        """Operations that judging the size takes: its group's factor, if that is not there yet."""
+        solved = size.family.num_parameters**2
+        return solved if size.group in self._factors else solved + self.work_of_factor(size)
+
+    def work_of_factor(self, size: Size) -> float:
+        """Operations of the factor that the size is judged from."""
+        count, width = self._rows_of(size.group)
+        return 2 * (count + len(self._held[1])) * width * (size.group.num_parameters + 1) ** 2
+
+    def work_of_steps(self, size: Size) -> float:
+        """Operations that validating the judged size takes, those of the steps as those that the
+        solution makes in their time."""
+        steps = len(self.data.validation) * size.operations
+        return OF_SOLVE * size.family.num_parameters**3 + OF_STEPS * steps
+
+    def work_of_refit(self, size: Size) -> float:
+        """Operations that a fit of the size to other rows takes."""
+        count, width = size.family.num_parameters, self._train[1].shape[1]
+        return 2.0 * len(self.data) * width * (count + 1) ** 2 + OF_SOLVE * count**3
+
+    def judge(self, size: Size, budget: Budget, say: Callable[[str], Any]) -> Candidate:
+        """The size with its error estimated from the held-out residual of the gradient."""
+        started = time.perf_counter()
+        train, held = self.factors(size.group, budget, say)[:2]
+        count = size.family.num_parameters
+        ((train_rms, held_rms),) = least_squares.residuals(train, held, [count])
+        return self._candidate(size, train_rms, held_rms, time.perf_counter() - started)
+
+    def validate(self, size: Size, judged: Candidate, budget: Budget, say) -> Candidate:
+        """The judged size solved, and its error measured by steps."""
+        budget.check()
+        say(f"{judged.chart} {judged.label}: steps of the held-out pairs")
+        started = time.perf_counter()
+        solved, params = self.solve(size, budget, say)
+        factors = self.factors(size.group, budget, say)
+        outside = None
+        if factors.outer.rows:  # none where every coordinate covers its circle
+            ((_, outside),) = least_squares.residuals(
+                factors.inner, factors.outer, [size.family.num_parameters]
+            )
+        candidate = dataclasses.replace(
+            judged, train_rms=solved.train_rms, condition=solved.condition, rank=solved.rank,
+            outside=outside,
+        )  # fmt: skip
+        candidate = validated(candidate, self.data, self.tolerance, self.chart, size.family, params)
+        seconds = judged.fit_seconds + time.perf_counter() - started
+        return dataclasses.replace(candidate, fit_seconds=seconds)
+
+    def at(self, extent: float) -> str:
+        """Describe the size of this extent: its terms, and how many pairs they take."""
+        family = self.sizes[0].family
+        if not hasattr(family, "degree"):
+            label = f"{family.name} {(terms := round(2**extent))}"
+        else:
+            degree = round(extent)
+            label = f"{self._prefix}{family.name} {degree}"
+            terms = family.terms_of(degree)
+        fitted = len(self._train[0]) + len(self.data.test)
+        share = fitted / (fitted + len(self.data.validation))
+        pairs = int(np.ceil(_ROWS_PER_TERM * terms / self._width / share))
+        most = f", more than the {_MOST_TERMS:,} that are tried" if terms > _MOST_TERMS else ""
+        return f"{label} ({terms:,} terms{most}; about {pairs:,} pairs)"
+
+    def solve(self, size: Size, budget: Budget, say) -> tuple[least_squares.LeastSquaresFit, Any]:
+        """The coefficients of this size, and the params of its family: solved for once."""
+        count = size.family.num_parameters
+        if count not in self._solved:
+            train, held = self.factors(size.group, budget, say)[:2]
+            self._solved[count] = least_squares.solve(train, held, count)
+        solved = self._solved[count]
+        return solved, size.family.unflatten(solved.coefficients)
+
+    def work_of_test_rows(self, size: Size) -> float:
+        """Operations that `with_test_rows` takes; 0 where rows are not scarce."""
+        rows, count = self._train[1].size, size.family.num_parameters
+        if not len(self.data.test) or rows > _SCARCE * count:
+            return 0.0
+        more = len(self.data.test) * self._width
+        return 2.0 * more * (size.group.num_parameters + 1) ** 2 + OF_SOLVE * count**3
+
+    def with_test_rows(self, size: Size) -> least_squares.LeastSquaresFit:
+        """Solution of this size with the test rows among those that train. The validation rows
+        choose the ridge, as before."""
+        quiet = Budget(), lambda message: None
+        train, held = self.factors(size.group, *quiet)[:2]
+        test, _ = rows_of(self.data, self.chart, self.data.test)
+        more = least_squares.reduce(self.in_rows(size.group), [test], self._weight)
+        return least_squares.solve(train.merge(more), held, size.family.num_parameters)
+
+    def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Images (n, 2d) of these rows, in the user's coordinates, by a fit to other rows; NaN
+        where a step is not solved."""
+        family, given = self.in_rows(size.family), rows_of(self.data, self.chart, others)[0]
+        train, held = (
+            least_squares.reduce(family, [of], self._weight) for of in (given, self._held)
+        )
+        return self._predicted(size, train, held, rows)
+
+    def _predicted(
+        self, size: Size, train: Triangle, held: Triangle, rows: np.ndarray
+    ) -> np.ndarray:  # fmt: skip
+        data = self.data
+        solved = least_squares.solve(train, held, size.family.num_parameters)
+        params = size.family.unflatten(solved.coefficients)
+        images, known = refined_images(data, self.chart, size.family, params, rows)
+        images = data.whole_image(np.where(known[:, None], images, np.nan), rows)
+        return to_user(data.coordinates, images)
+
+    def left_over(self, size: Size) -> np.ndarray:
+        """(N, 2d): what the size leaves of ∇S of every pair, unit-free as train_rms."""
+        _, params = self.solve(size, Budget(), lambda message: None)
+        (w, target, *args), weight = rows_of(self.data, self.chart, slice(None))
+        gradient = np.asarray(size.family.gradient(params, w, *args))
+        if self.data.own_dt is not None:
+            gradient = args[0] * gradient
+        return weight * (gradient - target)
+
+    def own_error(self, size: Size) -> float:
+        """Error of the size's ∇S by noise, in the measure of train_rms: half of the
+        difference between the fits to either half of the training pairs, blocks in time."""
+        half = self.data.training // _HALVES_BLOCK % 2
+        train, held = self.factors(size.group, Budget(), lambda message: None)[:2]
+        count = size.family.num_parameters
+        one, other = (
+            least_squares.solve(
+                least_squares.reduce(
+                    self.in_rows(size.family), [tuple(a[half == i] for a in self._train)],
+                    self._weight,
+                ),
+                held, count,
+            ).coefficients
+            for i in (0, 1)
+        )  # fmt: skip
+        return train.image_norm(one - other) / (2 * np.sqrt(train.rows))
+
+    def root(self, size: Size) -> np.ndarray:
+        """(m, m): rootᵀ root is the covariance of the size's coefficients.
+
+        What of the residual is noise, a larger size tells: it leaves that too.
+        """
+        train = self.factors(size.group, Budget(), lambda message: None).train
+        family, solved = size.family, self.solve(size, Budget(), lambda message: None)[0]
+        larger = self._larger(size)
+        most = family if larger is None else larger.family
+        data, goes_on = self._sample(-(-SAMPLE_ROWS * most.num_parameters // self._width))
+        w, target, *args = data
+        params = family.unflatten(solved.coefficients)
+        slopes = self._slopes(family, w, *args)
+        residual = slopes @ solved.coefficients - target * self._weight
+        states = None
+        if goes_on.any() and self.moved_by_states:
+            states = (residual, *self.by_states(family, params, w, *args), goes_on)
+        scores = shared_noise.scores(slopes, *states) if states else None
+        noise = self._noise(size, larger, data, states) if larger is not None else None
+        return uncertainty.root(
+            train, family.num_parameters, slopes.reshape(-1, family.num_parameters),
+            residual.ravel(), noise=noise, ridge=solved.ridge, scores=scores,
+        )  # fmt: skip
+
+    def _slopes(self, family, w, *args) -> np.ndarray:
+        return self.in_rows(family).term_gradients(w, *args) * self._weight[:, None]
+
+    def in_rows(self, family: Any) -> Any:
+        """The family whose terms make the rows of this sweep."""
+        return of_rows(family)
+
+    def by_states(self, family, params, w, *args) -> tuple[np.ndarray, np.ndarray]:
+        """The residual's derivatives in z₀ and z₁ (n, 2d, 2d), those ÷ their scale."""
+        hessian = family.gradient_and_hessian(params, w, *args)[1]
+        if self.data.own_dt is not None:
+            hessian = args[0][..., None] * hessian
+        of_point, of_target = self.of_states
+        by = self._weight[:, None] * (hessian @ of_point - of_target)
+        return by[..., : len(of_point)], by[..., len(of_point) :]
+
+    @cached_property
+    def of_states(self) -> tuple[np.ndarray, np.ndarray]:
+        """(2d, 4d) each: what the numbers of z₀ and z₁, ÷ their scale, add to w and to the target.
+        An affine base map is counted, the flow of a law is not."""
+        data, chart = self.data, self.chart
+        dt = 1.0 if data.own_dt is not None else data.dt
+        eye = np.eye(2 * data.dim)
+        first, second, none = eye, eye, np.zeros_like(eye)
+        for piece in data.before:
+            first = getattr(piece, "matrix", eye) @ first
+        for piece in data.after:
+            second = getattr(piece, "matrix", eye) @ second
+        ends = ((first.T, none), (none, np.linalg.inv(second).T))
+        of_point = [chart.evaluation_point(*of).T * data.scale for of in ends]
+        of_target = [chart.target_gradient(*of, dt).T * data.scale for of in ends]
+        return np.concatenate(of_point, axis=1), np.concatenate(of_target, axis=1)
+
+    @property
+    def moved_by_states(self) -> bool:
+        """Return whether ``of_states`` is all that states' noise does: not behind the flow of a
+        law."""
+        return all(isinstance(p, (Affine, Damping)) for p in (*self.data.before, *self.data.after))
+
+    @property
+    def alike(self) -> float:
+        """The weight of misfit beside noise, where a size is chosen by its expected error."""
+        return uncertainty.ALIKE
+
+    @property
+    def largest_known(self) -> Size:
+        """The largest size that a factor answers for."""
+        return [size for size in self.sizes if size.group in self._factors][-1]
+
+    def state_deviations(self, size: Size) -> np.ndarray:
+        """(2d,) standard deviation of each coordinate's noise, ÷ its scale, from what this size
+        leaves of a sample of the training pairs."""
+        (w, target, *args), goes_on = self._sample(_NOISE_PAIRS)
+        solved, params = self.solve(size, Budget(), lambda message: None)
+        slopes = self._slopes(size.family, w, *args)
+        residual = slopes @ solved.coefficients - target * self._weight
+        first, second = self.by_states(size.family, params, w, *args)
+        step = np.linalg.solve(second, np.concatenate([residual[..., None], -first], axis=-1))
+        return of_pairs(step[..., 0], step[..., 1:], np.flatnonzero(goes_on))
+
+    def freedoms(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
+        """Degrees of freedom that noise takes of a fit of so many of the leading terms of a size:
+        as many, where no state stands in two pairs. near: whose residuals tell the noise; it may
+        be the larger one, whose terms begin with those of the other."""
+        (w, target, *args), goes_on = self._sample(-(-SAMPLE_ROWS * max(counts) // self._width))
+        if not goes_on.any() or not self.moved_by_states:
+            return [float(count) for count in counts]
+        solved, params = self.solve(near, Budget(), lambda message: None)
+        larger = max(near, most, key=lambda size: size.family.num_parameters)
+        slopes = self._slopes(larger.family, w, *args)
+        residual = slopes[..., : len(solved.coefficients)] @ solved.coefficients
+        residual = residual - target * self._weight
+        states = residual, *self.by_states(near.family, params, w, *args), goes_on
+        scores = shared_noise.scores(slopes, *states)
+        return [
+            shared_noise.degrees_of_freedom(slopes[..., :count], residual, scores[:, :count])
+            for count in counts
+        ]
+
+    @property
+    def _width(self) -> int:
+        return self._train[0].shape[1]
+
+    def _rows_of(self, group) -> tuple[int, int]:
+        """Pairs that a group's factor is made of, and rows of each. They are shuffled: the first of
+        them are a sample, where all would take too long."""
+        count, width = self._train[1].shape
+        return min(count, max(1, int(_MOST_OPERATIONS / (group.num_parameters**2 * width)))), width
+
+    def _sample(self, pairs: int) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+        """Rows of about so many training pairs, and which of them go on with the next."""
+        places, goes_on = looked_at(self.data.pairs, self.data.training, pairs)
+        return tuple(a[places] for a in self._train), goes_on
+
+    def _noise(self, size: Size, larger: Size, data, states) -> float:
+        """The part of the residual's mean square that is noise, by what a larger size explains of
+        it: of all rows where that one was judged by all of them, else of these. states: residual,
+        its derivatives and which pairs go on, as `shared_noise.scores` takes them, or None."""
+
+        def left(of: Size) -> tuple[float, float, int]:
+            """Mean square, the degrees of freedom that noise takes, and the rows."""
+            count = of.family.num_parameters
+            reduced = (
+                self._factors[of.group].train if larger.group in self._factors
+                else least_squares.reduce(self.in_rows(of.family), [data], self._weight)
+            )  # fmt: skip
+            degrees = float(count)
+            if states is not None:
+                slopes = self._slopes(of.family, data[0], *data[2:])
+                scores = shared_noise.scores(slopes, *states)
+                degrees = shared_noise.degrees_of_freedom(slopes, states[0], scores)
+            square = reduced.residual_norm(count) ** 2 / max(reduced.rows, 1)
+            return square, degrees, reduced.rows
+
+        return part_of_noise(size, larger, left(size), left(larger))
+
+    def _larger(self, size: Size) -> Size | None:
+        """The size two further, as a symmetric map gains nothing from the odd degrees; the next, or
+        None, where there is none. Of few pairs, one that they tell, if too badly to be chosen."""
+        place = self.sizes.index(size)
+        further = self.sizes[place + 1 : place + 3]
+        if len(further) < 2:
+            rows = self._determining
+            families = (f for g in _determined(self._groups(), rows, _ROWS_THAT_TELL) for f in g)
+            beyond = (f for f in families if f.num_parameters > rows // _ROWS_PER_TERM)
+            further += [Size(f, f, _extent(f)) for f in itertools.islice(beyond, 2 - len(further))]
+        return further[-1] if further else None
+
+    def factors(self, group, budget: Budget, say) -> Factors:
+        """Factors of a group's largest family, which answer for all of its sizes."""
+        if group not in self._factors:
+            self._factors[group] = self._known(group) or self._computed(group, budget, say)
+        return self._factors[group]
+
+    def _known(self, group) -> Factors | None:
+        """The factors that an interrupted fit of the same pairs has kept."""
+        stored = self._kept.load(self._named(group)) if self._kept is not None else None
+        if stored is None:
+            return None
+        inner, outer, held = (
+            Triangle(stored[part], int(stored[f"{part}_rows"]))
+            for part in ("inner", "outer", "held")
+        )
+        return Factors.of(inner, outer, held)
+
+    def _computed(self, group, budget: Budget, say) -> Factors:
+        taken, _ = self._rows_of(group)
+        say(f"{self.chart.name}: {group.num_parameters} terms of {group.label}, {taken} pairs")
+        started = time.perf_counter()
+        train, outermost = tuple(a[:taken] for a in self._train), self._outermost[:taken]
+        inner, outer, held = (
+            least_squares.reduce(self.in_rows(group), [rows], self._weight, on_block=budget.check)
+            for rows in (
+                tuple(a[~outermost] for a in train), tuple(a[outermost] for a in train), self._held
+            )
+        )  # fmt: skip
+        if self._kept is not None and time.perf_counter() - started > _WORTH_KEEPING:
+            self._kept.save(
+                self._named(group), inner=inner.factor, inner_rows=inner.rows, outer=outer.factor,
+                outer_rows=outer.rows, held=held.factor, held_rows=held.rows,
+            )  # fmt: skip
+        return Factors.of(inner, outer, held)
+
+    def _named(self, group) -> str:
+        return f"{self.chart.name} {self.kind} {group.num_parameters}"
+
+    def _candidate(self, size: Size, train_rms, held_rms, seconds) -> Candidate:
+        error = estimated_error(self.data, self.tolerance, held_rms)
+        return Candidate(
+            label=f"{self._prefix}{size.family.label}", family=self.kind, chart=self.chart.name,
+            num_parameters=size.family.num_parameters, operations=size.operations,
+            validation_rms=error.rms, validation_relative=error.relative,
+            validation_bound=error.bound, deviations=error.deviations, train_rms=train_rms,
+            fit_seconds=seconds,
+        )  # fmt: skip
+
+
+def part_of_noise(
+    size: Size, larger: Size, left: tuple[float, float, int], rest: tuple[float, float, int]
+) -> float:
+    """The part of what a size leaves over that is noise, by what a larger one explains of it: the
+    mean square that either leaves, the degrees of freedom that noise takes, and the rows."""
+    (of_all, taken, _), (of_rest, more, rows) = left, rest
+    noise = of_rest / max(1.0 - more / rows, 1.0 / rows)
+    if not noise > 0:
+        return 1.0 if not of_all > 0 else 0.0
+    further = larger.family.num_parameters - size.family.num_parameters
+    each = noise * max(more - taken, 0.0) / further  # of noise, in what a further term explains
+    explained = rows * max(of_all - of_rest, 0.0)
+    return noise / (noise + uncertainty.misfit(explained, further, each) / rows)
+
+
+def _extent(family) -> float:
+    """The degree of products, or log₂ of the number of terms."""
+    degree = getattr(family, "degree", None)
+    return float(np.log2(family.num_parameters) if degree is None else degree)
+
+
+class _WithOdd:
+    """The terms of an even family, and after them the odd ones up to a degree."""
+
+    def __init__(self, even: Products):
+        self._even, self._all = even, Products(even.inputs, _ODD_DEGREE)
+        self._odd = np.flatnonzero(self._all.basis.term_orders % 2)
+        self.num_parameters = even.num_parameters + len(self._odd)
+
+    def term_gradients(self, w):
+        odd = self._all.term_gradients(w)[..., self._odd]
+        return np.concatenate([self._even.term_gradients(w), odd], axis=-1)
+
+
+def is_even(data: Dataset) -> bool:
+    """Return whether S(−w) = S(w) as far as any size of a sweep could tell: odd terms beside the
+    even ones of the highest degree that a sweep has do not make the held-out residual smaller.
+
+    False where terms are not scarce, where angles or args are, or where the test would take too
+    much.
+    """
+    dim = data.dim
+    if dim < _SCARCE_FROM_DIM or data.coordinates.angles or data.args is not None:
+        return False
+    (w, target), weight = rows_of(data, MIDPOINT, data.training)
+    held, _ = rows_of(data, MIDPOINT, data.validation)
+    flip = (-1,) * 2 * dim
+    inputs = box_inputs(w, cyclic=data.coordinates.cyclic, reversor=flip)
+    signs = variable_signs(inputs, flip, w)
+    most = min(_MOST_TERMS, w.size // _ROWS_PER_TERM)
+    degrees = [
+        degree for (degree,) in _EVEN_DEGREES
+        if number_of_terms(inputs.is_angle, degree, signs) <= most
+    ]  # fmt: skip
+    if not degrees:
+        return False
+    even = Products(inputs, degrees[-1], signs)
+    odd = number_of_terms(inputs.is_angle, _ODD_DEGREE) - even.terms_of(_ODD_DEGREE)
+    if even.num_parameters + odd > _MOST_TERMS:
+        return False
+    family = _WithOdd(even)
+    pairs = -(-_PARITY_ROWS * family.num_parameters // w.shape[1])
+    if pairs > len(w):
+        return False
+    train, held = (
+        least_squares.reduce(family, [tuple(a[:pairs] for a in rows)], weight)
+        for rows in ((w, target), held)
+    )
+    sizes = [even.num_parameters, family.num_parameters]
+    (_, without), (_, with_odd) = least_squares.residuals(train, held, sizes)
+    return with_odd >= _NO_GAIN * without
+
+
+def trial_residual(data: Dataset) -> float:
+    """The held-out residual of ∇S, ÷ scale, of polynomials of a low degree in the midpoint chart:
+    how near these pairs are to a map that a small S generates. Infinite where some are missing."""
+    half = len(data.y0) // 2
+    (w, target), weight = rows_of(data, MIDPOINT, slice(None))
+    if not np.isfinite(w + target).all():
+        return float("inf")
+    coordinates = data.coordinates
+    inputs = box_inputs(
+        w, angles=tuple(a for a in coordinates.angles if a < data.dim),
+        cyclic=coordinates.cyclic,
+    )  # fmt: skip
+    groups = list(_determined(([Products(inputs, degree)] for degree in _TRIAL), w.size // 2))
+    family = groups[-1][0] if groups else Products(inputs, 1)
+    train, held = (
+        least_squares.reduce(family, [(w[rows], target[rows])], weight)
+        for rows in (slice(half), slice(half, None))
+    )
+    ((_, residual),) = least_squares.residuals(train, held, [family.num_parameters])
+    return residual
+
+
+def _of_time_step(inputs, degree: int, signs=None) -> OfTimeStep:
+    return OfTimeStep(Products(inputs, degree, signs))
+
+
+def _determined(
+    groups: Iterable[Iterable[Any]], rows: int, each: float = _ROWS_PER_TERM
+) -> Iterator[list[Any]]:
+    """The families, group by group, whose terms so many rows determine, ``each`` for a term.
+
+    Sizes rise, so the first that is too large is the last that is looked at: in many dimensions the
+    terms of a high degree could not even be counted.
+    """
+    most = min(_MOST_TERMS, int(rows / each))
+    for group in groups:
+        kept = []
+        for family in group:
+            if family.num_parameters > most:
+                break
+            kept.append(family)
+        else:
+            yield kept
+            continue
+        if kept:
+            yield kept
+        return

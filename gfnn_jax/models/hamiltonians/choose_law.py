@@ -1,0 +1,123 @@
+"""Choice between H and a map: whether H is learned beside the map, and when it is preferred."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.budget import Budget, OutOfTime
+from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.errors import FitError
+from gfnn_jax.fitting.turns import backwards, tangent, turns
+from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
+from gfnn_jax.models.hamiltonians.options import OPTIONS
+from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
+from gfnn_jax.scenes.scene import Scene
+
+# Beside a map only a law of few terms is looked for: a larger one is no shorter to say than S. Its
+# budget is counted, so that a busy machine chooses no other candidate: 20 and 30 seconds of a quiet
+# core, which makes 5e8 of these operations a second, of modes 7e8 (two bodies, PCR3BP, pendulums).
+_BESIDE = dataclasses.replace(
+    OPTIONS, most_terms=60, most_modes=150, max_operations=1e10, mode_operations=2e10
+)
+# A law holds outside the data and at any time step: so much dearer a step it may be.
+MAX_COST_RATIO = 4.0
+# Where none meets the tolerance, errors that the noise of held-out pairs does not tell apart.
+_AS_GOOD = 1.01
+# Of the error that a library must leave to have helped, where noise hides what it brings.
+_GAINED_ALONE = 0.8
+_TURNED = 0.2  # radians backwards that are worth a word
+
+
+def law_of(
+    data: Dataset,
+    tolerance: Tolerance,
+    scene: Scene | None,
+    learn: str,
+    terms: Sequence[str | Callable],
+    budget: Budget,
+    say: Callable[[str], Any],
+    dearest: float = np.inf,
+) -> LearnedHamiltonian | None:
+    """The Hamiltonian of these pairs, or None where "auto" finds none, or the budget ends before
+    the first.
+
+    data: without a base map. dearest: operations of a step of H that is chosen beside a map that
+    meets the tolerance; of use where H is not asked for. Raises FitError where a Hamiltonian is
+    asked for and there is none to learn.
+    """
+    unfit = unfit_for_law(data, scene)
+    if unfit is not None:
+        if learn == "hamiltonian":
+            raise FitError(f"expected data of an autonomous flow to learn H from: {unfit}")
+        return None
+    # S of a driven system, or of one with parameters or several dt, needs more terms than H: no map
+    # to wait for.
+    structured = data.structure is not None
+    foremost = learn == "hamiltonian" or terms or data.varied or structured
+    options = OPTIONS if foremost else _BESIDE
+    if learn == "hamiltonian":  # no map stands in for a law that misses the tolerance
+        options = dataclasses.replace(options, only_within=False, gained=_GAINED_ALONE)
+    if structured:  # nothing else is learned of bodies, and of sites S in a few seconds
+        options = dataclasses.replace(options, max_operations=np.inf)
+    try:
+        with np.errstate(all="ignore"):  # starts that run away are part of the search
+            return learn_hamiltonian(
+                data, tolerance, scene, terms=terms, budget=budget, say=say, options=options,
+                dearest=np.inf if foremost else dearest,
+            )  # fmt: skip
+    except OutOfTime:
+        budget.leave_out("H", "no library of terms was fitted within the budget")
+    except (FitError, np.linalg.LinAlgError) as error:
+        if learn == "hamiltonian" or terms:
+            raise FitError(str(error)) from error
+        if isinstance(error, np.linalg.LinAlgError):
+            budget.leave_out("H", f"the arithmetic failed ({error})")
+    return None
+
+
+def long_step(data: Dataset, scene: Scene | None) -> list[str]:
+    """A warning where no H was found and the states turn backwards around their centre.
+
+    data: without a base map.
+    """
+    if data.varied or data.coordinates.angles or unfit_for_law(data, scene) is not None:
+        return []
+    _, _, jacobian = tangent(data.y0, data.y1, data.scale)
+    angle = backwards(turns(jacobian, data.scale)[0])
+    if angle < _TURNED:
+        return []
+    return [
+        f"around their centre a step of {data.dt:g} turns the states by {angle:.2g} radians "
+        f"backwards, or by {2 * np.pi - angle:.2g} forwards (ωh > π): pairs of one dt may then not "
+        "determine H; sample with a smaller dt, or with several"
+    ]
+
+
+def unfit_for_law(data: Dataset, scene: Scene | None) -> str | None:
+    """Reason why the pairs are not those of an autonomous flow, where that is known."""
+    if scene is not None and scene.timeless:
+        return f"the scene {scene.name} is a map without time"
+    if scene is not None and scene.period is not None and data.period is None:
+        return f"the Hamiltonian of the scene {scene.name} depends on time"
+    if any(a >= data.dim for a in data.coordinates.angles):
+        return "a momentum is an angle"
+    return None
+
+
+def preferred(law: Candidate, chosen: Candidate, bound: float) -> bool:
+    """Return whether the law is taken instead of the map that was chosen: where it alone meets the
+    tolerance, or meets it and is not four times dearer, or none meets it and it is as good."""
+    if law.validation_bound <= bound:
+        return (
+            not chosen.validation_bound <= bound
+            or law.operations <= MAX_COST_RATIO * chosen.operations
+        )
+    if chosen.validation_bound <= bound or not np.isfinite(law.validation_relative):
+        return False
+    return law.validation_relative <= _AS_GOOD * chosen.validation_relative

@@ -1,0 +1,174 @@
+"""H together with friction: uniform, ṗ = −∂H/∂q − γp, or linear in each velocity, R = Σ ½ρ_i v_i².
+
+Friction is looked for where H alone misses the tolerance and friction would explain a certain part
+of what it leaves over, and is kept where it lowers the held-out error by half: a system that keeps
+its energy gets no spurious loss. Uniform friction comes first, because its flow keeps a multiple of
+J; it is claimed where it meets the tolerance, or where rates of their own for the degrees of
+freedom would explain no more. A constant determinant of local Jacobians is no sign of it, which two
+oscillators of different friction have too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.errors import FitError, OutOfTime
+from gfnn_jax.families.lagrangian import LINEAR, Friction
+from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.flows.forces import Forced
+from gfnn_jax.flows.uniform import Uniform, without_forces
+from gfnn_jax.models.hamiltonians.learned_law import FittedLaw
+from gfnn_jax.models.hamiltonians.legendre import lagrangian_of
+from gfnn_jax.models.hamiltonians.libraries import libraries_of, modes_of
+from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
+from gfnn_jax.models.hamiltonians.work import LawWork
+from gfnn_jax.phase_space import split
+
+_CERTAIN = 5.0  # standard errors of a coefficient of friction
+_GAINED = 0.5  # of the held-out error of H alone: what friction must lower it to
+_ALIKE = 0.7  # of what uniform friction leaves over: what rates of their own must lower it to
+_LOOKED_AT = 600  # pairs that tell whether friction explains anything
+_BOXES = ((1, 1), (1, 2), (2, 2))  # (order, degree) of the modes of angles that are tried
+
+Searched = tuple[FittedLaw, Options]
+Forces = Callable[[Any], Any]  # what makes a family with friction of one of H
+
+
+def linear_in_velocities(family) -> Forced:
+    """H of ``family`` with friction R = Σ ½ρ_i v_i²."""
+    rows = [(tuple(row), LINEAR, 0.0) for row in np.eye(family.dim, dtype=int)]
+    return Forced(family, Friction.of(rows, family.dim))
+
+
+def beside_friction(
+    problem: Problem, work: LawWork, before: Searched, data: Dataset, tolerance: Tolerance,
+    search: Callable[[Forces], Searched],
+) -> Searched:  # fmt: skip
+    """The best that ``search`` finds with friction, where H alone, ``before``, misses the tolerance
+    and friction is certain and worth it; else ``before``."""
+    best, bound, rows = before, tolerance.bound, data.training[:_LOOKED_AT]
+    simple = data.args is None and data.structure is None
+    if not simple or best[0].error.bound <= bound:
+        return before
+    work.capped(before[1].max_operations)
+    try:
+        with work.again("whether friction explains anything", best[0].family, len(rows)):
+            if not _explains(problem, best[0], rows):
+                return before
+    except OutOfTime:
+        work.budget.leave_out("H with friction", work.ended)
+        return before
+    for forces in (Uniform, linear_in_velocities)[: 1 if data.dim == 1 else 2]:
+        try:
+            found = search(forces)
+        except OutOfTime:
+            work.budget.leave_out("H with friction", work.ended)
+            break
+        except (FitError, np.linalg.LinAlgError):
+            continue
+        law = found[0]
+        met = law.error.bound <= bound
+        if not _certain(law) or not law.error.relative < _GAINED * best[0].error.relative:
+            continue
+        if forces is Uniform and not met and not _alike(problem, law, rows):
+            continue
+        best = found
+        if met:
+            break
+    return best
+
+
+def mechanical(
+    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance
+) -> FittedLaw | None:
+    """The law of a Lagrangian, without friction or with it, as `beside_friction` would have it;
+    None where the pairs are of no such system."""
+    try:
+        alone = lagrangian_of(problem, work, data, tolerance)
+    except OutOfTime:
+        work.budget.leave_out("the Lagrangian", work.ended)
+        return None
+    except np.linalg.LinAlgError:
+        return None
+    if alone is None:
+        return None
+
+    def search(forces: Forces) -> Searched:
+        found = lagrangian_of(problem, work, data, tolerance, forces)
+        assert found is not None
+        return found, OPTIONS
+
+    return beside_friction(problem, work, (alone, OPTIONS), data, tolerance, search)[0]
+
+
+def libraries_with(forces: Forces, data: Dataset, scene, terms, options: Options) -> Iterator[Any]:
+    """The families of H by rising size, each with these forces; of angles their shortest modes."""
+    basis = modes_of(data, scene, terms)
+    if basis is None:
+        yield from map(forces, libraries_of(data, scene, terms, options))
+        return
+    most = len(data.training) * 2 * data.dim / options.rows_per_term
+    for size in _BOXES:
+        family = basis.terms(basis.box(*size))
+        if family.num_parameters < most:
+            yield forces(family)
+
+
+def _certain(law: FittedLaw) -> bool:
+    """Return whether there is friction, all of it certain and above 0."""
+    of_h = without_forces(law.family).num_parameters
+    rates, errors = law.fit.coefficients[of_h:], law.fit.standard_errors[of_h:]
+    return bool(len(rates) and (rates > _CERTAIN * errors).all())
+
+
+def _explains(problem: Problem, alone: FittedLaw, rows) -> bool:
+    """Return whether γ, in the problem linearised about H alone, is certain to be above 0."""
+    family = Uniform(alone.family)
+    c = np.append(alone.fit.coefficients, 0.0)
+    found = problem.linearised(family, c, alone.fit.steps, rows)
+    if not found.finite:
+        return False
+    # The last row of R but one is what γ alone explains, the last what nothing does.
+    size, along, left = found.factor[-2, -2], found.factor[-2, -1], found.factor[-1, -1]
+    noise = abs(left) / np.sqrt(max(found.rows - len(c), 1))
+    return bool(-along / size > _CERTAIN * noise / abs(size))
+
+
+def _alike(problem: Problem, law: FittedLaw, rows) -> bool:
+    """Return whether rates of their own for the degrees of freedom would explain no more than γ
+    does."""
+    if not isinstance(law.family, Uniform) or law.family.dim == 1:
+        return True
+    c, steps = law.fit.coefficients, law.fit.steps
+    found = problem.images(law.family, c, rows, steps, derivatives=True)
+    own = problem.images(law.family, c, rows, steps, derivatives=True, along=_Rates(law.family.dim))
+    residual = ((found.states - problem.z1[rows]) / problem.scale).ravel()
+    columns = [f.by_coefficient / problem.scale[:, None] for f in (found, own)]
+    if not all(np.isfinite(a).all() for a in (residual, *columns)):
+        return True
+
+    def left(*columns) -> float:
+        matrix = np.concatenate([a.reshape(len(residual), -1) for a in columns], axis=1)
+        size = np.linalg.norm(matrix, axis=0)
+        scaled = matrix / np.where(size > 0, size, 1.0)
+        return float(np.linalg.norm(scaled @ np.linalg.lstsq(scaled, residual)[0] - residual))
+
+    return left(*columns) > _ALIKE * left(columns[0])
+
+
+class _Rates:
+    """The fields (p_i, 0) of every degree of freedom, as the terms of a linear family."""
+
+    def __init__(self, dim: int):
+        self.num_parameters = dim
+
+    def term_gradients(self, w, args=None):
+        """(..., 2d, d)."""
+        p = split(w)[1]
+        rates = p[..., None] * np.eye(p.shape[-1])
+        return np.concatenate([rates, np.zeros_like(rates)], axis=-2)

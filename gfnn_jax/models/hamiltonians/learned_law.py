@@ -1,0 +1,422 @@
+"""A learned H as a candidate: its flow with the cheapest steps, errors, covariance, messages."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from functools import cached_property, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.budget import Budget
+from gfnn_jax.candidates.assemble import Assembled, composed, measured
+from gfnn_jax.candidates.candidate import Candidate, with_error
+from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
+from gfnn_jax.dataset.runs import looked_at
+from gfnn_jax.exports.symbolic import as_latex, as_sympy
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.products import Products
+from gfnn_jax.families.sums import Sums, matrix_free
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
+from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
+from gfnn_jax.flows.collocation import Steps, images, truncation
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.legendre import Legendre
+from gfnn_jax.flows.rates import MOST_SUBSTEPS, rates
+from gfnn_jax.flows.uniform import without_forces
+from gfnn_jax.models.hamiltonians.cost_of_flow import (
+    CONTRACTING,
+    FREQUENCY_STATES,
+    contraction_of,
+    omega_h_of,
+    operations_of,
+)
+from gfnn_jax.models.hamiltonians.formula import Term, as_code, formula
+from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
+from gfnn_jax.models.hamiltonians.whole_sequences import Whole
+from gfnn_jax.phase_space import apply_j, symplectic_form
+
+FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
+_NEAR_ROUNDOFF = 3e-15  # of the spread
+_NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
+_FEWEST_SAMPLED = 2_000  # pairs that tell noise from misfit
+_NAMED = 5  # terms in a message
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnedHamiltonian:
+    """H as learned, in the inner coordinates.
+
+    candidate: as the others of a fit, its error measured by steps in NumPy. flow: the piece.
+    terms, shown: what H is, as people read it; () and None of a network. truncation: largest error
+    of the flow's own steps on the held-out states, ÷ scale. omega_h: the fastest oscillation of the
+    linearised flow, times dt, in the median over the data; beyond π pairs of one dt may not tell H.
+    contraction: the fixed point's factor where it is largest. condition: of the terms' columns.
+    null_terms: that the data do not tell from the others. left_out: pairs that the flow does not
+    resolve. stalled: whether larger libraries were no more accurate. covariance: makes ``root``;
+    None of a network. unmet: that the tolerance is missed, and what that may be from; "" where it
+    is met. ended: what cut the search for it short, "" where nothing did. dropped: terms that went
+    in the end. friction: γ where that is uniform, else the terms of Rayleigh's R; of a system
+    without, ().
+    """
+
+    candidate: Candidate
+    flow: Flow
+    terms: tuple[Term, ...]
+    shown: str | None
+    truncation: float
+    omega_h: float
+    contraction: float
+    condition: float
+    null_terms: tuple[str, ...]
+    left_out: int
+    messages: tuple[str, ...]
+    stalled: bool
+    covariance: Callable[[], np.ndarray] | None
+    noise: np.ndarray | None = None
+    arcs: int = 0
+    unmet: str = ""
+    ended: str = ""
+    dropped: Dropped | None = None
+    friction: tuple[Term, ...] = ()
+
+    @cached_property
+    def root(self) -> np.ndarray | None:
+        """(m, m): rootᵀ root is the coefficients' covariance; None of a network. Computed when it
+        is first asked for."""
+        return None if self.covariance is None else self.covariance()
+
+    @property
+    def formula(self) -> str | None:
+        """H as ``terms`` and sympy read it: "0.5*p1**2 - cos(q1)" (`learn.formula.as_code`). None
+        of a network; of a Lagrangian, which is no expression in q and p, as it is shown."""
+        family = without_forces(self.flow.family)
+        return as_code(family, self.terms) if isinstance(family, Terms | Sums) else self.shown
+
+    def __str__(self) -> str:
+        """H as people read it: "0.5 p1² - cos(q1)"."""
+        return self.shown or "a network"
+
+    def sympy(self) -> Any:
+        """H as a sympy expression. Raises ValueError of a network and a Lagrangian."""
+        return as_sympy(self._expression)
+
+    def latex(self) -> str:
+        """H in LaTeX's notation. Raises ValueError as ``sympy`` does."""
+        return as_latex(self._expression)
+
+    @property
+    def _expression(self) -> str:
+        if self.formula is None or self.formula.startswith(Legendre.prefix):
+            raise ValueError(
+                "expected an H that is an expression in q and p, got a network or a Lagrangian"
+            )
+        return self.formula
+
+    @property
+    def fast(self) -> bool:
+        """Return whether H oscillates so fast that other laws are not far from the same pairs."""
+        return self.omega_h > FAST
+
+
+class Dropped(NamedTuple):
+    """Terms that went because the pairs do not ask for them, and what that cost: the held-out error
+    ÷ spread with them and without."""
+
+    terms: int
+    error_with: float
+    error_without: float
+
+
+class FittedLaw(NamedTuple):
+    """rows: that the fit was given; it has left out those that the flow does not resolve.
+    undetermined: of the null terms, those that other states would tell from the rest. ended: why a
+    library that grew did so no longer. stalled: whether larger libraries were no better. noisy:
+    whether their errors were the same, which is that of the pairs; larger: the largest
+    of those. dropped: terms that went in the end. whole:
+    what whole sequences tell, where they were fitted."""
+
+    family: Any  # of terms of H, or of L, with friction or without
+    fit: FlowFit
+    rows: np.ndarray
+    error: OneStepError
+    null: tuple[str, ...]
+    undetermined: tuple[str, ...] = ()
+    ended: str = ""
+    stalled: bool = False
+    noisy: bool = False
+    larger: FittedLaw | None = None
+    dropped: Dropped | None = None
+    whole: Whole | None = None
+
+
+def learned_from(
+    found: FittedLaw, problem, data: Dataset, tolerance: Tolerance, seconds: float,
+    options: Options, of_arcs: Callable[[], np.ndarray] | None,
+) -> LearnedHamiltonian:  # fmt: skip
+    """of_arcs: makes the root, where the fit was not to these pairs but to arcs of them."""
+    family, fit, whole = found.family, found.fit, found.whole
+    rows = data.validation
+    z, args = data.y0[rows], data.given(rows)[1]
+    some = slice(FREQUENCY_STATES)
+    fastest = rates(family, fit.coefficients, data.y0[some], data.given(some)[1])
+    by_row = problem  # each at its own dt
+    if data.own_dt is not None:  # the map's own dt, from which others follow
+        problem = Problem(data.y0, data.y1, data.dt, data.scale, args=data.args)
+    steps = _cheapest(problem, family, fit, fastest, data, tolerance, options)
+    steps = _resolving(family, fit.coefficients, steps, data, tolerance)
+    contraction = contraction_of(fastest, data.dt, steps)
+    by_newton = contraction > CONTRACTING and not matrix_free(family)
+    scale = data.scale
+    off = truncation(family, fit.coefficients, z, data.dt, steps, args=args, scale=scale) / scale
+    flow = Flow(
+        family, fit.coefficients, data.dt, data.scale, steps.stages, steps.substeps,
+        by_newton,
+    )  # fmt: skip
+    longest = flow.over(np.max(data.each_dt)).substeps
+    of_all = dataclasses.replace(steps, substeps=longest)
+    error = error_of_steps(family, fit.coefficients, of_all, data, tolerance)
+    candidate = Candidate(
+        label=_label(family), family=family.name, chart="flow",
+        num_parameters=family.num_parameters,
+        operations=operations_of(family, 2 * family.dim, fastest, data.dt, steps),
+        validation_rms=error.rms, validation_relative=error.relative,
+        validation_bound=error.bound, deviations=error.deviations, train_rms=fit.rms,
+        fit_seconds=seconds, condition=fit.condition, rank=family.num_parameters,
+        learns="hamiltonian",
+    )  # fmt: skip
+    terms = tuple(
+        Term(*entry)
+        for entry in zip(
+            family.term_names, fit.coefficients.tolist(), fit.standard_errors.tolist(), strict=True
+        )
+    )
+    of_h = without_forces(family).num_parameters
+    terms, friction = terms[:of_h], terms[of_h:]
+    omega_h = omega_h_of(family, fit.coefficients, data, fastest)
+    left_out = len(np.setdiff1d(found.rows, fit.used))
+    resolved = np.abs(off).max(axis=1) <= bound_of(tolerance, data.scale)
+    of_rows = steps if data.own_dt is None else of_all
+    covariance = of_arcs or partial(covariance_root, found, by_row, data, of_rows)
+    if whole is not None:
+        covariance = partial(np.asarray, whole.root)
+    return LearnedHamiltonian(
+        with_error(candidate, error), flow, terms,
+        getattr(without_forces(family), "prefix", "") + formula(terms),
+        float(np.abs(off).max()),
+        omega_h, contraction, fit.condition, found.null, left_out,
+        tuple(_messages(error, omega_h, data, tolerance, found, left_out, int((~resolved).sum()))),
+        stalled=found.stalled,
+        covariance=covariance, noise=None if whole is None else whole.noise,
+        arcs=0 if whole is None else whole.arcs,
+        dropped=found.dropped, unmet=_unmet(error, omega_h, tolerance, found),
+        friction=friction,
+    )  # fmt: skip
+
+
+def _label(family) -> str:
+    of_h = without_forces(family)
+    what = "L" if isinstance(of_h, Legendre) else "H"
+    return f"{what}, {of_h.num_parameters} terms" + (", friction" if of_h is not family else "")
+
+
+def validation_error(family, fit: FlowFit, data: Dataset, tolerance: Tolerance) -> OneStepError:
+    """Error by steps that resolve the held-out pairs: an unresolved passage says nothing of the
+    law."""
+    steps = _resolving(family, fit.coefficients, fit.steps, data, tolerance)
+    return error_of_steps(family, fit.coefficients, steps, data, tolerance)
+
+
+def error_of_steps(
+    family, coefficients, steps: Steps, data: Dataset, tolerance: Tolerance
+) -> OneStepError:
+    states, (dt, args) = data.y0[data.validation], data.given(data.validation)
+    found = images(family, coefficients, states, dt, steps, args=args, scale=data.scale).states
+    return measured_error(data, tolerance, to_user(data.coordinates, found))
+
+
+def bound_of(tolerance: Tolerance, scale) -> float:
+    """The tolerance as a part of the coordinates' scale."""
+    bound = tolerance.bound
+    return bound if tolerance.relative else bound / float(scale.max())
+
+
+def _resolving(family, coefficients, steps: Steps, data: Dataset, tolerance: Tolerance) -> Steps:
+    """Keep these steps, or, where the law misses the tolerance by them, take finer ones: halved
+    until they resolve the held-out pairs, or there are as many as a flow may have."""
+    bound, states = bound_of(tolerance, data.scale), data.y0[data.validation]
+    if error_of_steps(family, coefficients, steps, data, tolerance).bound <= tolerance.bound:
+        return steps
+    (dt, args), scale = data.given(data.validation), data.scale
+    while 2 * steps.substeps <= MOST_SUBSTEPS:
+        off = truncation(family, coefficients, states, dt, steps, args=args, scale=scale) / scale
+        if np.sqrt(np.mean(off**2)) <= OPTIONS.truncation * bound:
+            break
+        steps = dataclasses.replace(steps, substeps=2 * steps.substeps)
+    return steps
+
+
+def _cheapest(
+    problem, family, fit: FlowFit, fastest, data: Dataset, tolerance: Tolerance, options: Options
+) -> Steps:
+    """Steps whose own error is a tenth of the tolerance; near roundoff, or at it, where that is not
+    twice as dear."""
+
+    def cost(steps: Steps) -> float:
+        return operations_of(family, 2 * family.dim, fastest, problem.dt, steps)
+
+    bound = max(options.truncation * bound_of(tolerance, problem.scale), 0.3 * fit.rms)
+    tolerances = (bound, min(bound, _NEAR_ROUNDOFF), None)
+    found = problem.fine_steps(family, fit.coefficients, data.training, tolerances)
+    return next(s for s in reversed(found) if s == found[0] or cost(s) < 2 * cost(found[0]))
+
+
+def covariance_root(found: FittedLaw, problem: Problem, data: Dataset, steps: Steps) -> np.ndarray:
+    """(m, m): rootᵀ root is the covariance of the coefficients. What is noise, a generator of
+    polynomials tells, which does not explain it; what it explains is misfit, of these steps too."""
+    fit, count = found.fit, found.family.num_parameters
+    most = max(_FEWEST_SAMPLED, OPTIONS.sampled_rows * count // data.y0.shape[1])
+    structure = data.structure
+    if structure is not None:
+        most = structure.fewest(data.y0.shape[1])
+    places, goes_on = looked_at(data.pairs, fit.used, most)
+    rows, scale = fit.used[places], problem.scale
+    images = problem.images(found.family, fit.coefficients, rows, steps, derivatives=True)
+    residual = images.states - data.y1[rows]
+    if not np.isfinite(residual).all():  # of a flow that runs away from some of the states
+        return np.full((count, count), np.nan)
+    slopes = images.by_coefficient / scale[:, None]
+    left, scores, states, noise = residual / scale, None, None, None
+    family = without_forces(found.family)
+    if isinstance(family, Terms):  # of many coordinates both would take too much
+        if goes_on.any():
+            first = images.by_state * scale
+            second = np.broadcast_to(-np.diag(scale), first.shape)
+            scores = shared_noise.scores(
+                slopes, left, first / scale[:, None], second / scale[:, None], goes_on
+            )
+            states = first, second, goes_on
+        degree = int(np.max(np.sum(family.powers, axis=1)))
+        noise = unexplained(data, rows, residual, count, degree, states)
+    return uncertainty.root(
+        fit.triangle, count, slopes.reshape(-1, count), np.hypot(left, _NEAR_ROUNDOFF).ravel(),
+        noise=noise, scores=scores,
+    )  # fmt: skip
+
+
+def unexplained(
+    data: Dataset, rows, residual, taken: int, degree: int, states
+) -> float | None:  # fmt: skip
+    """Part of the mean square of a law's residuals (n, 2d) on these rows that no generator K
+    explains, residual = J∇K at the images: K of as high a degree as the rows tell.
+    taken: coefficients that the law itself was given, degree: its own. states: the residual's
+    derivatives and which pairs go on, as `shared_noise.scores` takes them, or None. None where the
+    rows are too few.
+
+    1 where K explains no more than it would of noise, by ``explained`` standard errors: an F test.
+    """
+    z, coordinates, width = data.y1[rows], data.coordinates, residual.shape[1]
+    inputs = box_inputs(
+        z, angles=tuple(a for a in coordinates.angles if a < data.dim),
+        cyclic=coordinates.cyclic,
+    )  # fmt: skip
+    degrees = sorted({*OPTIONS.generators, degree + OPTIONS.beyond})
+    sizes = [Products(inputs, n) for n in degrees]
+    most = min(len(rows) * width // OPTIONS.sampled_rows, OPTIONS.most_terms)
+    known = [family for family in sizes if family.num_parameters <= most]
+    if not known:
+        return None
+    family, weight = known[-1], 1.0 / np.roll(data.scale, data.dim)
+    target = -apply_j(residual)
+    reduced = least_squares.reduce(family, [(z, target)], weight)
+    count, freedom = family.num_parameters, None
+    if states is not None:
+        to_target = -weight[:, None] * symplectic_form(data.dim)
+        slopes, (first, second, goes_on) = family.term_gradients(z) * weight[:, None], states
+        scores = shared_noise.scores(
+            slopes, weight * target, to_target @ first, to_target @ second, goes_on
+        )
+        freedom = shared_noise.degrees_of_freedom(slopes, weight * target, scores)
+    left = reduced.norm**2 / max(reduced.rows - taken, 1)
+    if left == 0:
+        return 1.0
+    part = float(uncertainty.variance(reduced, count, freedom) / left)
+    by_chance = OPTIONS.explained * np.sqrt(2 * count) / reduced.rows
+    return part if part < 1 - by_chance else 1.0
+
+
+def _unmet(error: OneStepError, omega_h: float, tolerance, found: FittedLaw) -> str:
+    if error.bound <= tolerance.bound:
+        return ""
+    why = "; terms that you know would help (terms)"
+    if omega_h > FAST:
+        why = (
+            f"; it oscillates by {omega_h:.2g} radians in a step, and beyond π one dt does not "
+            "tell H: sample with a shorter one"
+        )
+    elif found.ended:
+        why = f"; modes were added until {found.ended}"
+    return (
+        "no H of the terms tried meets the tolerance: the best misses the images by "
+        f"{error.relative:.2e} of the spread{why}"
+    )
+
+
+def _messages(
+    error: OneStepError, omega_h: float, data, tolerance, found: FittedLaw, left_out: int,
+    unresolved: int,
+) -> Iterator[str]:  # fmt: skip
+    if error.bound <= tolerance.bound and omega_h > FAST:
+        yield (
+            f"H oscillates by {omega_h:.2g} radians in a step (ωh, its median over the states"
+            f"{', beyond π' if omega_h > np.pi else ''}): an H whose frequencies differ by 2π per "
+            "step gives the same pairs, or nearly; this is the "
+            + (
+                "simplest; a smaller dt, or several, would settle it"
+                if omega_h > np.pi
+                else "slowest"
+            )
+        )
+    if found.whole is not None:
+        yield from found.whole.messages
+    if found.undetermined:
+        names = found.undetermined
+        some = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
+        yield (
+            f"the pairs do not determine {len(names)} terms of H ({some}): they are left "
+            "out, and H is known only where the pairs are"
+        )
+    if left_out:
+        yield (
+            f"the steps of the fit are too coarse for {left_out} of {len(found.rows)} pairs, as of "
+            "close passages: it goes without them"
+        )
+    if unresolved:
+        yield (
+            f"the steps of the flow are too coarse for {unresolved} of {len(data.validation)} "
+            "held-out pairs: there the map errs, and not H"
+        )
+
+
+def assembled(
+    learned: LearnedHamiltonian, data: Dataset, tolerance: Tolerance, budget: Budget
+) -> Assembled:
+    """The candidate's map, measured."""
+    data = _in_relative_domain(learned.flow, data)
+    map_ = composed(learned.flow, data)
+    return measured(learned.candidate, map_, data, tolerance, budget)
+
+
+def _in_relative_domain(flow: Flow, data: Dataset) -> Dataset:
+    """Take a domain that leaves out where the whole is, if no force depends on that."""
+    if data.structure is None:
+        return data
+    force = flow.family.gradient(flow.params, data.y0)[:, : data.dim]
+    moves = np.abs(force.sum(axis=1)).max() > _NO_FORCE * np.abs(force).sum(axis=1).max()
+    return dataclasses.replace(
+        data, domain=data.structure.domain(data.y0, uses_positions=bool(moves))
+    )

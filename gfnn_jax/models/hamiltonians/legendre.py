@@ -1,0 +1,96 @@
+"""H as the Legendre transform of a Lagrangian of few terms: mechanical systems whose masses depend
+on angles, of which H itself is rational (a double pendulum: five terms of L).
+
+    p = ∂L/∂v,      ṗ = ∂L/∂q − γ p
+
+Both are linear in the coefficients of L, with v the difference of positions over dt, at the middle
+of a pair: to O(dt²) that is where the fit through the flow starts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations_with_replacement, product
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.families.lagrangian import Terms
+from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.flows.legendre import Legendre
+from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
+from gfnn_jax.models.hamiltonians.work import LawWork
+from gfnn_jax.phase_space import split
+
+_SHORTEST = 2  # Σ|m_i| of the modes of angles; degree of the powers of lengths in a mass
+_POTENTIAL = 4  # degree of the powers of lengths in a potential
+_SINE = -np.pi / 2
+_ROWS_PER_TERM = 2.0
+_NULL = 1e-8  # of the largest singular value of the linear start
+
+
+def lagrangian_of(
+    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance,
+    forces: Callable[[Any], Any] | None = None,
+) -> FittedLaw | None:  # fmt: skip
+    """The law of all terms, with these forces, fitted to the training pairs; None where there are
+    not several degrees of freedom with an angle among them, or the pairs are too few."""
+    coordinates, dim = data.coordinates, data.dim
+    angles = tuple(a for a in coordinates.angles if a < dim)
+    mechanical = coordinates.forward is CARTESIAN.forward and len(angles) == len(coordinates.angles)
+    if not (angles and dim > 1 and mechanical) or coordinates.cyclic or data.varied:
+        return None
+    family, rows = Legendre(library(dim, angles)), data.training
+    if _ROWS_PER_TERM * family.num_parameters > len(rows) * dim:
+        return None
+    start = _start(family, problem, rows)
+    if forces is not None:
+        family = forces(family)
+        start = np.concatenate([start, np.zeros(family.num_parameters - len(start))])
+    with work.library(family.label, family, len(rows)), np.errstate(all="ignore"):
+        fit = problem.fit(family, start, rows)
+    return FittedLaw(family, fit, rows, validation_error(family, fit, data, tolerance), ())
+
+
+def library(dim: int, angles: tuple[int, ...]) -> Terms:
+    """Masses of modes of the angles and powers of the lengths, potentials of both."""
+    none, lengths = (0,) * dim, [i for i in range(dim) if i not in angles]
+    waves = [none]
+    for mode in product(range(-_SHORTEST, _SHORTEST + 1), repeat=len(angles)):
+        first = next((m for m in mode if m), 0)
+        if first > 0 and sum(map(abs, mode)) <= _SHORTEST:
+            wave = [0] * dim
+            for angle, m in zip(angles, mode, strict=True):
+                wave[angle] = m
+            waves.append(tuple(wave))
+
+    def functions(degree: int) -> list[tuple]:
+        powers = [tuple(chosen.count(i) for i in range(dim)) for n in range(degree + 1)
+                  for chosen in combinations_with_replacement(lengths, n)]  # fmt: skip
+        return [(power, wave, phase) for power in powers for wave in waves
+                for phase in ((0.0, _SINE) if any(wave) else (0.0,))]  # fmt: skip
+
+    pairs = combinations_with_replacement(range(dim), 2)
+    speeds = [tuple((i == a) + (i == b) for i in range(dim)) for a, b in pairs]
+    masses = [(speed, *rest) for speed in speeds for rest in functions(_SHORTEST)]
+    potentials = [(none, *rest) for rest in functions(_POTENTIAL)]
+    return Terms.of([*masses, *(row for row in potentials if any(row[1]) or any(row[2]))], dim)
+
+
+def _start(family: Legendre, problem: Problem, rows) -> np.ndarray:
+    """Coefficients of L from p = ∂L/∂v and ṗ = ∂L/∂q in the middle of these pairs."""
+    z0, z1, (dt, _) = problem.z0[rows], problem.z1[rows], problem.given(rows)
+    q, p = split(0.5 * (z0 + z1))
+    v, force = split((z1 - z0) / dt)
+    value, slope, _ = family.terms.potentials(q, order=1)
+    motion, by_motion = family.terms.motion(v)
+    columns = [value[..., None] * by_motion, slope * motion[..., None]]  # (n, P, d) each
+    sizes = [np.sqrt(np.mean(wanted**2)) for wanted in (p, force)]
+    design = np.concatenate([c / s for c, s in zip(columns, sizes, strict=True)], axis=0)
+    matrix = np.moveaxis(design, 1, 2).reshape(-1, family.num_parameters)
+    target = np.concatenate([p / sizes[0], force / sizes[1]]).ravel()
+    size = np.linalg.norm(matrix, axis=0)
+    return np.linalg.lstsq(matrix / size, target, rcond=_NULL)[0] / size

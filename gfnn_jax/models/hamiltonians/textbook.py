@@ -1,0 +1,80 @@
+"""Laws of physics, tried before libraries of terms: see `models.textbook.search`.
+
+What the search finds is fitted through its flow as any library is, and taken where held-out pairs
+bear it out to the tolerance: an H of few terms, with the constants inside them, or none at all.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.budget import MATCHING
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.errors import OutOfTime
+from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
+from gfnn_jax.models.hamiltonians.work import LawWork
+from gfnn_jax.models.textbook.search import OPTIONS, Law, Textbook
+
+# Operations of a search by degrees of freedom from 1, without products and with them: about the
+# longest of the laws of benchmarks/textbook.py.
+_OPERATIONS = {False: (1e8, 1.5e8, 3e8, 5e8), True: (2e8, 3e8, 4e8, 5e8)}
+_FEWEST = 60  # pairs
+_NOTHING = 1e-9  # of the largest term: a term so small is roundoff
+_EXACT = 1e-9  # of the spread: the error of a law that is no approximation
+
+
+def law_of_physics(
+    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance, say: Callable[[str], Any]
+) -> FittedLaw | None:
+    """The law, or None where none is found, or the pairs are of no autonomous flow of a few degrees
+    of freedom in plain coordinates and angles."""
+    simple = data.args is None and data.structure is None
+    if not simple or data.dim > OPTIONS.most_dim or len(data.training) < _FEWEST:
+        return None
+    rows, coordinates = data.training, data.coordinates
+    own = copy.copy(problem)  # its flows are no part of what libraries may take
+    own.allowance = dataclasses.replace(problem.allowance, cap=None)
+    search = Textbook(
+        own, rows, angles=tuple(a for a in coordinates.angles if a < data.dim),
+        cyclic=coordinates.cyclic, say=say,
+    )  # fmt: skip
+    law = None
+    for products, name in ((False, "laws of physics"), (True, "laws of physics with products")):
+        if law is not None:
+            break
+        try:
+            with work.budget.unit(name, MATCHING, _OPERATIONS[products][data.dim - 1]):
+                law = search.law(products=products)
+        except OutOfTime:
+            work.budget.leave_out(name, work.ended)
+            return None
+        except np.linalg.LinAlgError:
+            return None
+    if law is None:
+        return None
+    family, start = _without_nothing(law, data.y0[rows], data.scale)
+    try:
+        with work.library(f"H of {family.num_parameters} terms", family, len(rows)):
+            fit = problem.fit(family, start, rows, rounds=False)
+            error = validation_error(family, fit, data, tolerance)
+    except OutOfTime:
+        work.budget.leave_out("the law of physics that was found", work.ended)
+        return None
+    if not (error.bound <= tolerance.bound and error.relative <= _EXACT):
+        return None
+    return FittedLaw(family, fit, rows, error, search.null, search.null)
+
+
+def _without_nothing(law: Law, z: np.ndarray, scale: np.ndarray):
+    """(family, coefficients) of the terms whose part in the gradients is not roundoff."""
+    gradients = law.family.term_gradients(z) * scale[:, None]
+    part = np.abs(law.coefficients) * np.sqrt(np.mean(gradients**2, axis=(0, 1)))
+    kept = np.flatnonzero(part > _NOTHING * part.max())
+    return law.family.take(kept.tolist()), law.coefficients[kept]

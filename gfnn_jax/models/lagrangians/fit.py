@@ -1,0 +1,162 @@
+"""One structure of a law fitted to arcs: coefficients, latent states, noise, errors, held-out
+cost."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from gfnn_jax.dataset.stretches import Arcs, Nodes, arcs_of, with_states
+from gfnn_jax.flows.motion import Form
+from gfnn_jax.maps.observation import Observation
+from gfnn_jax.models.lagrangians.arcs import LawOnArcs
+from gfnn_jax.models.lagrangians.structure import Key, Structure
+from gfnn_jax.solve.latent_arcs import SOFT_L1, Fitted, fit_arcs, sensitivities
+
+_SETTLED = 1.15  # a noise scale that changed by less needs no second fit
+FOLDS = 3
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LawFit:
+    """A structure fitted to arcs, in the gauge of ``form``; σ (k,) is the scale of the residuals of
+    each channel, τ their correlation time in nodes."""
+
+    structure: Structure
+    form: Form
+    arcs: Arcs
+    fitted: Fitted
+    sigma: np.ndarray
+    correlation: float
+
+    @property
+    def p(self) -> np.ndarray:
+        return self.fitted.p
+
+    @property
+    def values(self) -> dict[Key, float]:
+        return dict(zip(self.structure.keys(), map(float, self.p), strict=True))
+
+    def covariance(self) -> np.ndarray:
+        """Covariance of p: that of white residuals, times their correlation time."""
+        return self.fitted.covariance() * self.correlation
+
+    def rms(self) -> np.ndarray:
+        """Root mean square residual (k,), in units of the channels."""
+        left = self.fitted.residuals * self.arcs.noise
+        return np.sqrt(np.nanmean(left**2, axis=(0, 1))) * self.sigma
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Workbench:
+    """Basis that all fits of one recording share: positions of the gauge, the inputs of arcs, the
+    fastest frequency ω, and how states are seen."""
+
+    gauge: np.ndarray
+    inputs: Callable[[Arcs], np.ndarray]
+    omega: float
+    seen: Observation
+
+    def model(self, structure: Structure, arcs: Arcs, given: np.ndarray, free: np.ndarray):
+        form = structure.form(self.gauge)
+        u = self.inputs(arcs)
+        h = np.diff(arcs.t, axis=1)
+        return LawOnArcs(form, self.seen, structure.zeros, h, u, given, free)
+
+    def state_scale(self, sigma: np.ndarray) -> np.ndarray:
+        """The defect (2d,) that counts as one standard deviation of the channels."""
+        own = self.seen.state_sigma(self._states, sigma)
+        return np.concatenate([own, own * self.omega])
+
+    @property
+    def _states(self) -> np.ndarray:
+        return np.concatenate([self.gauge, 0 * self.gauge], axis=1)
+
+    def fit(
+        self,
+        structure: Structure,
+        known: Mapping[Key, float],
+        arcs: Arcs,
+        sigma: np.ndarray,
+        rescale: bool = True,
+    ) -> LawFit:
+        """Fit coefficients from those ``known``; σ is made that of the residuals if ``rescale``."""
+        p = structure.start(known)
+        x = arcs.x
+        model = self.model(structure, arcs, p, np.arange(len(p)))
+        for _ in range(3 if rescale else 1):
+            noise, scale = sigma * arcs.noise, self.state_scale(sigma)
+            found = fit_arcs(model, p, x, arcs.y, noise, scale, tolerance=1e-4 if rescale else 1e-3)
+            p, x = found.p, found.x
+            change = np.nanmedian(np.abs(found.residuals), axis=(0, 1)) / 0.6745
+            change = np.maximum(change, 1e-3)
+            if not rescale or np.max(np.abs(np.log(change))) < np.log(_SETTLED):
+                break
+            sigma = sigma * change
+        return LawFit(structure, model.form, arcs, found, sigma, correlation_time(found.residuals))
+
+    def held_out(self, fit: LawFit, arcs: Arcs) -> np.ndarray:
+        """The cost (A,) of arcs that the fit has not seen, with their own states."""
+        model = self.model(fit.structure, arcs, fit.p, np.arange(0))
+        noise, scale = fit.sigma * arcs.noise, self.state_scale(fit.sigma)
+        found = fit_arcs(model, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, 1e-3)
+        if not np.isfinite(found.cost):
+            return np.full(len(arcs.home), np.inf)
+        return np.nansum(SOFT_L1.of(found.residuals), axis=(1, 2))
+
+    def cross_validate(
+        self, nodes: Sequence[Nodes], fit: LawFit, structure: Structure, known: Mapping[Key, float]
+    ) -> np.ndarray:
+        """Held-out cost (A,) of each arc: of three blocks of arcs, each left out of a fit. All in
+        the noise scale of ``fit``; infinite where a fit fails. Arcs are as long as those of the
+        fit, or as long as three of them can be."""
+        total = sum(len(n.t) for n in nodes)
+        length = min(fit.arcs.t.shape[1], total // FOLDS)
+        arcs = arcs_of(with_states(nodes, fit.arcs, fit.fitted.x), length)
+        fold = np.arange(len(arcs.home)) * FOLDS // len(arcs.home)
+        costs = np.full(len(arcs.home), np.inf)
+        for k in range(FOLDS):
+            some = self.fit(structure, known, arcs.take(fold != k), fit.sigma, rescale=False)
+            costs[fold == k] = self.held_out(some, arcs.take(fold == k))
+        return costs
+
+    def scores(self, fit: LawFit, candidates: Structure) -> dict[Key, float]:
+        """Distance from zero, in standard errors, of each coefficient of ``candidates`` that the
+        fit lacks, were it alone added; 0 for those that the others imitate."""
+        known = fit.values
+        new = [k for k in candidates.keys() if k not in known]  # noqa: SIM118
+        larger = fit.structure.plus(new)
+        keys = larger.keys()
+        p = larger.start(known)
+        model = self.model(larger, fit.arcs, p, np.arange(len(p)))
+        noise = fit.sigma * fit.arcs.noise
+        R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise)
+        old = [keys.index(k) for k in known]
+        own = [keys.index(k) for k in new]
+        Q = np.linalg.qr(R[:, old])[0] if old else np.zeros((len(R), 0))
+        rest = R - Q @ (Q.T @ R)
+        length = np.linalg.norm(R, axis=0)
+        scores = {}
+        for key, k in zip(new, own, strict=True):
+            size = np.linalg.norm(rest[:, k])
+            told_apart = size > 0.03 * length[k] and size > 0
+            z = rest[:, k] @ rest[:, -1] / size / np.sqrt(fit.correlation) if told_apart else 0.0
+            scores[key] = float(abs(z))
+        return scores
+
+
+def correlation_time(residuals: np.ndarray) -> float:
+    """1 + 2 Σ ρ_k of residuals (A, L, d) along arcs, until ρ_k falls below 0.05; at least 1."""
+    r = np.where(np.isfinite(residuals), residuals, 0.0)
+    seen = np.isfinite(residuals).astype(float)
+    power = np.sum(r * r) / max(np.sum(seen), 1.0)
+    total = 1.0
+    for k in range(1, r.shape[1]):
+        pairs = np.sum(seen[:, k:] * seen[:, :-k])
+        rho = np.sum(r[:, k:] * r[:, :-k]) / max(pairs, 1.0) / max(power, 1e-300)
+        if rho < 0.05:
+            break
+        total += 2 * rho
+    return total

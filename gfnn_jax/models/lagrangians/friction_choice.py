@@ -1,0 +1,229 @@
+"""Choice of the friction that a record shows: held-out arcs say, and with what odds.
+
+Close to a fit its residuals are linear in small changes of the coefficients, so that one evaluation
+of the arcs serves every set of frictions: of each set the coefficients are found from some of the
+arcs by least squares with ρ ≥ 0, and judged by the others, on which all but the friction is found
+anew. A third of the record is held out at a time: where motion dies down, friction of a wrong kind
+that fits large swings misses the small ones.
+
+Two sets A and B are compared by their held-out sums of squares S. The scale of the residuals is
+found from them as well, so that the odds of B, residuals being normal, are
+
+    (S_A / S_B)^(N / 2τ),
+
+where of N residuals those that are correlated, over τ samples, count once. Of the sets against
+which the best has odds of less than 20 the one with the fewest kinds is taken, linear friction
+before quadratic, and that before dry friction.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import nnls
+
+from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench, correlation_time
+from gfnn_jax.models.lagrangians.structure import Loss
+from gfnn_jax.solve.latent_arcs import rows_of_arcs
+
+_DECIDED = 20.0  # odds, below which two sets are as good
+_NEEDED = 3.0  # odds, below which a direction is left out
+_SURE = 20.0  # the logarithm of the largest odds that are told
+_GAINS = 5.0  # standard errors below zero, at which friction would have to drive
+_LIMIT = 2.0  # standard errors of a coefficient, above its value: its upper limit
+
+
+class FrictionChoice(NamedTuple):
+    """The frictions that were taken; the odds that they forecast better than other sets of
+    kinds; upper limits of ρ of those not taken; and whether the record gains energy: none was
+    taken, and one alone would be below zero."""
+
+    rows: tuple[Loss, ...]
+    odds: dict[tuple[int, ...], float]
+    limits: dict[Loss, float]
+    gains: bool
+
+    @property
+    def kinds(self) -> tuple[int, ...]:
+        return kinds_of(self.rows)
+
+
+def kinds_of(rows: Sequence[Loss]) -> tuple[int, ...]:
+    """The kinds of friction among these, in their order."""
+    return tuple(sorted({row[1] for row in rows}))
+
+
+class _Judged(NamedTuple):
+    """A set of frictions and its held-out residuals (A, L, k)."""
+
+    rows: tuple[Loss, ...]
+    residuals: np.ndarray
+
+    @property
+    def kinds(self) -> tuple[int, ...]:
+        return kinds_of(self.rows)
+
+    @property
+    def cost(self) -> float:
+        return float(np.sum(self.residuals**2))
+
+
+def which_friction(
+    bench: Workbench,
+    fit: LawFit,
+    candidates: Sequence[Loss],
+    choose: bool = True,
+    before: FrictionChoice | None = None,
+) -> FrictionChoice:
+    """The choice among sets of the candidates' kinds, each with the directions that it needs; not
+    to ``choose`` is to take as many of the kinds as there are. Among equals the kinds chosen
+    ``before`` stay."""
+    table = _Table.of(bench, fit, candidates)
+    kinds = sorted({row[1] for row in candidates})
+    every = (chosen for n in range(len(kinds) + 1) for chosen in combinations(kinds, n))
+    sets = [judged for judged in map(table.leanest, every) if judged is not None]
+    if not choose:
+        sets = sets[-1:]
+    best = min(sets, key=lambda s: s.cost)
+    evidence = _Evidence(best)
+    tied = [s for s in sets if evidence.odds(best, s) < _DECIDED]
+    known = before.kinds if before else ()
+    taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, s.kinds))
+    odds = {s.kinds: evidence.odds(taken, s) for s in sets if s is not taken}
+    others = table.others(taken.rows)
+    limits = {row: max(rho, 0.0) + _LIMIT * error for row, (rho, error) in others.items()}
+    gains = not taken.rows and any(rho < -_GAINS * error for rho, error in others.values())
+    return FrictionChoice(taken.rows, odds, limits, gains)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Evidence:
+    """Odds between sets, by the correlation time of the residuals of the ``best`` of them."""
+
+    best: _Judged
+
+    @functools.cached_property
+    def count(self) -> float:
+        """Residuals that are independent."""
+        residuals = self.best.residuals
+        return np.count_nonzero(residuals) / correlation_time(residuals)
+
+    def odds(self, one: _Judged, other: _Judged) -> float:
+        """Odds that the first forecasts better than the other."""
+        log = 0.5 * self.count * np.log(max(other.cost, 1e-300) / max(one.cost, 1e-300))
+        return float(np.exp(np.clip(log, -_SURE, _SURE)))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Table:
+    """Rows (A, L, k, n + 1) of the arcs, the candidates' columns last but the residuals, which are
+    those without friction; the arcs of each third (thirds, A); the correlation of residuals."""
+
+    candidates: tuple[Loss, ...]
+    rows: np.ndarray
+    folds: np.ndarray
+    correlation: float
+
+    @staticmethod
+    def of(bench: Workbench, fit: LawFit, candidates: Sequence[Loss]) -> _Table:
+        structure = fit.structure
+        others = tuple(row for row in candidates if row not in structure.friction)
+        larger = structure.plus([("loss", row) for row in others])
+        p = larger.start(fit.values)
+        model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
+        rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, fit.sigma * fit.arcs.noise)
+        keys = larger.keys()
+        own = [keys.index(("loss", row)) for row in candidates]
+        rest = [k for k in range(len(keys)) if k not in own]
+        rows = rows[..., [*rest, *own, len(keys)]]
+        rows[..., -1] += rows[..., len(rest) : -1] @ p[own]  # as if there were no friction
+        place = np.arange(len(rows)) * FOLDS // len(rows)
+        folds = place == np.unique(place)[:, None]
+        return _Table(tuple(candidates), rows, folds, fit.correlation)
+
+    @property
+    def width(self) -> int:
+        """The number of coefficients that are not friction."""
+        return self.rows.shape[-1] - 1 - len(self.candidates)
+
+    @functools.cached_property
+    def triangles(self) -> list[np.ndarray]:
+        """Triangles of the arcs without each third, and of all."""
+        kept = [*~self.folds, np.ones(self.folds.shape[1], bool)]
+        flat = [self.rows[keep].reshape(-1, self.rows.shape[-1]) for keep in kept]
+        return [np.asarray(np.linalg.qr(part, mode="r")) for part in flat]
+
+    @functools.cached_property
+    def held(self) -> list[np.ndarray]:
+        """Rows (held arcs, L, k, candidates + 1) of each third, where what is not friction was
+        projected out."""
+        parts = []
+        for held in self.folds:
+            rows = self.rows[held]
+            flat = rows.reshape(-1, rows.shape[-1])
+            Q = np.linalg.qr(flat[:, : self.width])[0]
+            own = flat[:, self.width :]
+            parts.append((own - Q @ (Q.T @ own)).reshape(*rows.shape[:3], -1))
+        return parts
+
+    def solve(self, triangle: np.ndarray, subset: Sequence[int]) -> np.ndarray:
+        """ρ of all candidates, of these at least 0, of the others 0."""
+        own = triangle[self.width :, self.width :]
+        losses, columns = np.zeros(len(self.candidates)), list(subset)
+        if columns and len(own):  # a single arc leaves nothing to find them from
+            scale = np.maximum(np.linalg.norm(own[:, columns], axis=0), 1e-300)
+            losses[columns] = nnls(own[:, columns] / scale, own[:, -1])[0] / scale
+        return losses
+
+    def judged(self, subset: Sequence[int]) -> _Judged:
+        """Residuals of these candidates on the thirds that their coefficients are not from."""
+        residuals = np.zeros(self.rows.shape[:3])
+        for triangle, held, rows in zip(self.triangles[:-1], self.folds, self.held, strict=True):
+            residuals[held] = rows @ np.append(-self.solve(triangle, subset), 1.0)
+        rows = tuple(self.candidates[k] for k in subset)
+        return _Judged(rows, residuals)
+
+    def leanest(self, kinds: tuple[int, ...]) -> _Judged | None:
+        """The set of all these kinds without the directions that held-out arcs do not miss; None
+        where the record has no friction of one of the kinds."""
+        subset = [k for k, row in enumerate(self.candidates) if row[1] in kinds]
+        found = self.solve(self.triangles[-1], subset)
+        subset = [k for k in subset if found[k] > 0]
+        here = self.judged(subset)
+        if here.kinds != kinds:
+            return None
+        evidence = _Evidence(here)
+        while True:
+            fewer = [self.judged([k for k in subset if k != gone]) for gone in subset]
+            fewer = [s for s in fewer if s.kinds == kinds]
+            least = min(fewer, key=lambda s: s.cost, default=here)
+            if not fewer or evidence.odds(here, least) > _NEEDED:
+                return here
+            here, subset = least, [self.candidates.index(row) for row in least.rows]
+
+    def others(self, taken: tuple[Loss, ...]) -> dict[Loss, tuple[float, float]]:
+        """ρ, of either sign, and its standard error of the candidates that were not taken, each
+        alone beside those that were."""
+        f, triangle = self.width, self.triangles[-1]
+        base = [*range(f), *(f + k for k, row in enumerate(self.candidates) if row in taken)]
+        found = {}
+        for k, row in enumerate(self.candidates):
+            if row in taken:
+                continue
+            R = np.asarray(np.linalg.qr(triangle[:, [*base, f + k, -1]], mode="r"))
+            size = abs(R[-2, -2])
+            if size < 1e-3 * np.linalg.norm(triangle[:, f + k]):
+                continue  # the others imitate it: the record sets no limit
+            error = np.sqrt(self.correlation * self._variance(R[-1, -1])) / size
+            found[row] = float(R[-2, -1] / R[-2, -2]), float(error)
+        return found
+
+    def _variance(self, rest: float) -> float:
+        """Variance of the residuals, by their norm."""
+        count = np.count_nonzero(self.rows[..., -1]) - self.rows.shape[-1]
+        return float(rest**2 / max(count, 1))

@@ -1,0 +1,66 @@
+"""The fit of a law whose terms are given: no search, but for the friction where none was named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of, with_states
+from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.maps.observation import Observation
+from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
+from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
+from gfnn_jax.models.lagrangians.given_terms import Given
+from gfnn_jax.models.lagrangians.search import (
+    Found,
+    SearchOptions,
+    choose_friction,
+    describe,
+    frictions_tried,
+)
+from gfnn_jax.models.lagrangians.structure import Structure
+from gfnn_jax.models.lagrangians.weak_start import weak_start
+
+
+def fit_given(
+    given: Given, nodes: Sequence[Nodes], scales: Scales, angles: tuple[int, ...], num_inputs: int,
+    inputs: Mapping[str, Callable], seen: Observation, told: Callable[[str], object],
+    options: SearchOptions,
+) -> Found:  # fmt: skip
+    """Fit exactly the terms that are given, with the result of `law_search.search`."""
+    d = seen.dim
+    gauge = np.concatenate([n.x[:, :d] for n in nodes])
+    benches = {hold: Workbench(gauge, u, scales.omega, seen) for hold, u in inputs.items()}
+    sensors = tuple(zip(seen.parameters, map(float, seen.values), strict=True))
+    linear = tuple(libraries.losses(d, (LINEAR,), 0.0)[:d])
+    friction = linear if given.friction is None else given.friction
+    structure = Structure(d, given.terms, friction, (), num_inputs, sensors)
+    structure, known = weak_start(structure, nodes, scales, prune=False)
+    plain = all(row[3] == 0 for row in given.terms)  # a sine or a phase says where zero is
+    turned = [i for i in angles if i in seen.direct and i not in seen.shifts()]
+    zeros = [i for i in turned if plain and any(row[2][i] for row in given.terms)]
+    structure = structure.plus([("zero", i) for i in zeros])
+    fits: dict[str, LawFit] = {}
+    for periods in options.periods:
+        arcs = arcs_of(nodes, max(6, round(periods * scales.per_period)))
+        if fits and arcs.t.shape == next(iter(fits.values())).arcs.t.shape:
+            break  # no run is longer
+        for hold, bench in benches.items():
+            before = fits.get(hold)
+            if before is None:
+                fits[hold] = bench.fit(structure, known, arcs, scales.sigma)
+            else:
+                fits[hold] = bench.fit(structure, before.values, arcs, before.sigma)
+        hold = min(fits, key=lambda one: float(np.max(fits[one].rms() / scales.sigma)))
+        benches, fits = {hold: benches[hold]}, {hold: fits[hold]}
+        nodes = with_states(nodes, fits[hold].arcs, fits[hold].fitted.x)
+        told(f"{periods:g} periods: {describe(fits[hold])}")
+    ((hold, fit),) = fits.items()
+    if given.friction is None:
+        tried = frictions_tried(d, scales, options)
+        fit, choice = choose_friction(benches[hold], nodes, fit, tried, told, options)
+    else:
+        choice = FrictionChoice(given.friction, {}, {}, gains=False)
+    return Found(fit, choice, hold, with_states(nodes, fit.arcs, fit.fitted.x))

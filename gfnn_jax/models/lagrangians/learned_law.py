@@ -1,0 +1,187 @@
+"""Law that was learned from a recording: the law in words and numbers, and its map."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.exports import symbolic
+from gfnn_jax.families.lagrangian import Lagrangian, Terms
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.lagrangians.calibration import Horizon
+from gfnn_jax.models.lagrangians.fit import LawFit
+from gfnn_jax.models.lagrangians.residuals import Trace, Whiteness
+from gfnn_jax.models.lagrangians.text import Expression, Term, WhichFriction, measured, terms_of
+from gfnn_jax.models.lagrangians.velocities import Velocity
+
+
+class NextMotion(NamedTuple):
+    """A motion to record: where to let go, at rest, and by how much that makes the standard errors
+    of terms smaller, the most improved first."""
+
+    start: dict[str, float]
+    gains: dict[str, float]
+
+    def __str__(self) -> str:
+        at = ", ".join(f"{name} = {q:.3g}" for name, q in self.start.items())
+        best = ", ".join(f"{t} {min(g, 1000):.2g}" for t, g in [*self.gains.items()][:3])
+        return f"let go at {at}: standard errors smaller by factors, {best}"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LearnedLaw:
+    """A law that was learned from a recording.
+
+    map: its flow, which estimates and forecasts. lagrangian: L, and friction: Rayleigh's R, by the
+    names of columns, with standard errors. which_friction: its kinds, with what odds, and limits of
+    those that were not seen. gains: input -> force on each position, with its
+    standard error. hamiltonian: H in words, its terms as of L. zeros: angle -> (where it is zero,
+    standard error), already inside the formula. observe: column -> what its sensor shows, where
+    that is not the coordinate; sensors: the parameters in it, fitted, with standard errors. noise:
+    column -> σ of its samples; residual: of the fit's arcs, both in the file's unit. velocities:
+    columns of these against the law of the positions, and whether they were used. whiteness: of
+    the residuals, column by column; traces: the arcs that were fitted. gauge: what fixes the scale
+    of L. alike: coefficients that the record cannot tell apart. next_motions: those that
+    would tell the most, the best first. horizon: for how long a forecast
+    can be trusted. energy: stored, lost, supplied per second, means over the record. messages:
+    warnings. steps: what the search did, line by line.
+    num_samples, seconds (of the processor). ended: why the search ended.
+    """
+
+    map: SymplecticMap
+    lagrangian: Expression
+    friction: Expression
+    which_friction: WhichFriction
+    gains: dict[str, dict[str, tuple[float, float]]]
+    hamiltonian: Hamiltonian
+    zeros: dict[str, tuple[float, float]]
+    observe: dict[str, str]
+    sensors: dict[str, tuple[float, float]]
+    noise: dict[str, float]
+    residual: dict[str, float]
+    velocities: dict[str, Velocity]
+    whiteness: dict[str, Whiteness]
+    traces: tuple[Trace, ...]
+    gauge: str
+    alike: tuple[str, ...]
+    next_motions: tuple[NextMotion, ...]
+    horizon: tuple[Horizon, ...]
+    energy: dict[str, Any]
+    messages: tuple[str, ...]
+    steps: tuple[str, ...]
+    num_samples: int
+    seconds: float
+    ended: str
+
+    @property
+    def formula(self) -> str:
+        """L as Python writes it."""
+        return self.lagrangian.formula
+
+    @property
+    def table(self) -> str:
+        """The law, its errors and its horizon, a line each."""
+        lines = [f"L = {self.lagrangian}", f"R = {self.friction}"]
+        lines += [f"friction: {self.which_friction}", f"gauge: {self.gauge}"]
+        lines += [
+            f"{name}: zero at {zero:.5f}({std:.5f})" for name, (zero, std) in self.zeros.items()
+        ]
+        lines += [f"{column} shows {formula}" for column, formula in self.observe.items()]
+        lines += [f"{name} = {measured(value, std)}" for name, (value, std) in self.sensors.items()]
+        lines += [f"{name}: {one.text}" for name, one in self.velocities.items()]
+        for name, forces in self.gains.items():
+            told = ", ".join(f"{q} {g:.6g} ± {s:.2g}" for q, (g, s) in forces.items())
+            lines.append(f"force of {name}: {told}")
+        for name, sigma in self.noise.items():
+            lines.append(
+                f"{name}: noise {sigma:.3g}, residual of the law {self.residual[name]:.3g}, "
+                f"{self.whiteness[name].text}"
+            )
+        for fraction, seconds, predicted in self.horizon:
+            lines.append(
+                f"forecasts within {fraction:.0%} of the spread for {seconds:.3g} s (by the bands "
+                f"{predicted:.3g} s)"
+            )
+        lines += [f"to record next: {motion}" for motion in self.next_motions[:1]]
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return f"LearnedLaw(L = {self.lagrangian}; R = {self.friction})"
+
+
+@dataclasses.dataclass(frozen=True)
+class Hamiltonian:
+    """H = ½ pᵀ M(q)⁻¹ p + V(q) of a law: the entries of M and the terms of V, as fitted."""
+
+    terms: tuple[Term, ...]
+
+    @property
+    def formula(self) -> str:
+        """V as code, and the entries of M."""
+        mass = ", ".join(f"{t} {c:.6g}" for t, c, _ in self.terms if t.startswith("M"))
+        return f"p·M⁻¹p/2 + {self._potential.formula}, {mass}"
+
+    def sympy(self) -> Any:
+        """H in the positions' names and p1, …, pd, as a sympy expression."""
+        entries: dict[tuple[int, int], list[str]] = {}
+        for name, coefficient, _ in self.terms:
+            if name.startswith("M"):
+                place, _, factor = name.partition(": ")
+                i, j = (int(digit) - 1 for digit in place[1:])
+                entries.setdefault((i, j), []).append(f"{coefficient!r}*({factor})")
+        dim = 1 + max(j for _, j in entries)
+        return symbolic.hamiltonian(entries, self._potential.formula, dim)
+
+    def latex(self) -> str:
+        """H in LaTeX's notation, M as a matrix of its own."""
+        return rf"\tfrac12 p^\top M(q)^{{-1}} p + {self._potential.latex()}"
+
+    @property
+    def _potential(self) -> Expression:
+        return Expression(tuple(t for t in self.terms if not t.term.startswith("M")))
+
+
+def hamiltonian_of(terms: Terms, lagrangian: Expression, names: tuple[str, ...]) -> Hamiltonian:
+    """The entries of M as "M12: factor", and V = −(the terms of L without v)."""
+    coefficients = np.array([t.coefficient for t in lagrangian.terms])
+    std = np.array([t.std for t in lagrangian.terms])
+    still = dataclasses.replace(terms, speeds=np.zeros_like(terms.speeds))
+    factors = terms_of(still, coefficients, std, names, names).terms
+    listed = []
+    for row, (factor, c, error) in zip(terms.rows(), factors, strict=True):
+        axes = [i for i, k in enumerate(row[0]) for _ in range(k)]
+        if len(axes) == 2:
+            double = 2.0 if axes[0] == axes[1] else 1.0
+            name = f"M{axes[0] + 1}{axes[1] + 1}: {factor}"
+            listed.append(Term(name, double * c, double * error))
+        elif not axes:
+            listed.append(Term(factor, -c, error))
+    return Hamiltonian(tuple(listed))
+
+
+def in_columns(fit: LawFit) -> tuple[Lagrangian, np.ndarray]:
+    """The law in the measured coordinates (zeros of angles inside the phases of its terms), and the
+    covariance of (θ, ρ, G row by row)."""
+    form, structure = fit.form, fit.structure
+    law = form.lagrangian(fit.p[: form.count])
+    zeros = np.zeros(form.dim)
+    zeros[list(structure.zeros)] = fit.p[form.count : form.count + len(structure.zeros)]
+    terms = law.terms
+    moved = dataclasses.replace(terms, phases=terms.phases - terms.modes @ zeros)
+    rest = form.count - form.basis.shape[1]
+    turn = np.zeros((terms.count + rest, len(fit.p)))
+    turn[: terms.count, : form.basis.shape[1]] = form.basis
+    turn[terms.count :, form.basis.shape[1] : form.count] = np.eye(rest)
+    covariance = turn @ fit.covariance() @ turn.T
+    return dataclasses.replace(law, terms=moved), covariance
+
+
+def scaled(law: Lagrangian, covariance: np.ndarray, factor: float) -> tuple[Lagrangian, np.ndarray]:
+    """The law with L, R and G times a factor, which moves nothing: the scale of a known mass."""
+    law = dataclasses.replace(
+        law, coefficients=factor * law.coefficients, losses=factor * law.losses,
+        gains=factor * law.gains,
+    )  # fmt: skip
+    return law, factor**2 * covariance

@@ -1,0 +1,148 @@
+"""Candidates for the terms of a law, by what its coordinates are: angles come in modes, lengths in
+powers.
+
+The first library is that of textbooks: masses that are constant or depend on one angle, a sum or a
+difference of two, potentials of the same modes, and potentials of lengths to degree 2. One degree
+of freedom has T = ½v². `more` are the next orders, of which a fit takes only those that the record
+asks for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations, combinations_with_replacement
+
+import numpy as np
+
+from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC
+from gfnn_jax.models.lagrangians.structure import Loss, Row
+
+SINE = -np.pi / 2
+KINDS = (LINEAR, QUADRATIC, DRY)
+FRICTIONS = ("linear", "quadratic", "dry")  # their names
+
+
+def unit(dim: int, *axes: int) -> tuple[int, ...]:
+    """Ones (or counts) at these axes."""
+    return tuple(axes.count(i) for i in range(dim))
+
+
+def textbook(dim: int, angles: tuple[int, ...]) -> list[Row]:
+    """Pendulums in a chain, bodies on springs: masses, v_i v_j cos(q_i − q_j), cos q_i; lengths to
+    degree 2. Where it explains a record as well as more does, small swings cannot imitate it."""
+    pairs = [p for p in combinations(range(dim), 2) if p[0] in angles and p[1] in angles]
+    differences = {tuple(int(k == i) - int(k == j) for k in range(dim)) for i, j in pairs}
+    coupled = {unit(dim, *p) for p in pairs}
+    kept = []
+    for row in first(dim, angles):
+        speeds, powers, wave, _ = row
+        if max(speeds) == 2 or (sum(speeds) == 2 and speeds not in coupled):
+            wanted = not any(wave)
+        elif sum(speeds) == 2:
+            wanted = wave in differences and all(
+                a == abs(b) for a, b in zip(speeds, wave, strict=True)
+            )
+        else:
+            wanted = any(powers) or sum(map(abs, wave)) == 1
+        kept += [row] if wanted else []
+    return kept
+
+
+def relative(dim: int, angles: tuple[int, ...]) -> list[Row]:
+    """The same chain where each angle is measured from the link before it: with φ_i = q_1 + … + q_i
+    masses v_k v_l, v_k v_l cos(φ_j − φ_i), and cos φ_i."""
+    none = (0,) * dim
+
+    def link(a: int, b: int) -> tuple[int, ...]:
+        return tuple(int(a < k <= b) for k in range(dim))
+
+    masses = [
+        (unit(dim, k, j), none, link(i, e), 0.0)
+        for i in range(dim)
+        for e in range(i, dim)
+        for k in range(i + 1)
+        for j in range(k, e + 1)
+    ]
+    potentials = [(none, none, link(-1, i), 0.0) for i in range(dim)]
+    start = (unit(dim, 0, 0), none, none, 0.0)
+    return list(dict.fromkeys([start, *masses, *potentials]))
+
+
+def first(dim: int, angles: tuple[int, ...]) -> list[Row]:
+    """The first library; its first term is v₁²."""
+    none = (0,) * dim
+    lengths = [i for i in range(dim) if i not in angles]
+    waves = modes(dim, angles, 1)
+    rows: list[Row] = []
+    for pair in combinations_with_replacement(range(dim), 2):
+        speeds = unit(dim, *pair)
+        rows.append((speeds, none, none, 0.0))
+        rows += [(speeds, none, m, 0.0) for m in waves if dim > 1]
+    rows += [(none, none, m, 0.0) for m in waves]
+    for degree in (1, 2):
+        for axes in combinations_with_replacement(lengths, degree):
+            rows.append((none, unit(dim, *axes), none, 0.0))
+    return rows
+
+
+def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
+    """Modes up to |m| = 3 and their sines in V, up to 2 in T; powers of lengths up to 6 in V, 2 in
+    T."""
+    none = (0,) * dim
+    lengths = [i for i in range(dim) if i not in angles]
+    rows: list[Row] = []
+    for pair in combinations_with_replacement(range(dim), 2) if dim > 1 else ():
+        speeds = unit(dim, *pair)
+        for m in modes(dim, angles, 2):
+            rows += [(speeds, none, m, 0.0), (speeds, none, m, SINE)]
+        for i in lengths:
+            rows += [(speeds, unit(dim, *[i] * n), none, 0.0) for n in (1, 2)]
+    for m in modes(dim, angles, 3):
+        rows += [(none, none, m, 0.0), (none, none, m, SINE)]
+    for degree in (3, 4, 5, 6):
+        for axes in combinations_with_replacement(lengths, degree):
+            rows.append((none, unit(dim, *axes), none, 0.0))
+    for i in lengths:
+        for m in modes(dim, angles, 1):
+            rows += [(none, unit(dim, i), m, 0.0), (none, unit(dim, i), m, SINE)]
+    return rows
+
+
+def without_forces(rows: Sequence[Row], axes: Sequence[int]) -> tuple[Row, ...]:
+    """The rows without constant forces along these axes, whose zero is where the force is none."""
+    dim = len(rows[0][0])
+    forces = [((0,) * dim, unit(dim, i), (0,) * dim, 0.0) for i in axes]
+    return tuple(row for row in rows if row not in forces)
+
+
+def modes(dim: int, angles: tuple[int, ...], order: int) -> list[tuple[int, ...]]:
+    """Multiples up to ``order`` of one angle, and sums and differences of two with |m_i| up to
+    order − 1 (at least 1), each up to its sign."""
+    found = [tuple(n * e for e in unit(dim, i)) for n in range(1, order + 1) for i in angles]
+    top = max(1, order - 1)
+    for i, j in combinations(angles, 2):
+        for a in range(1, top + 1):
+            for b in (*range(-top, 0), *range(1, top + 1)):
+                wave = [0] * dim
+                wave[i], wave[j] = a, b
+                found.append(tuple(wave))
+    return found
+
+
+def losses(dim: int, kinds: tuple[int, ...], width: float) -> list[Loss]:
+    """Friction of each coordinate, and of the relative speed of neighbours (a joint)."""
+    directions = [unit(dim, i) for i in range(dim)]
+    for i in range(dim - 1):
+        wave = [0] * dim
+        wave[i], wave[i + 1] = -1, 1
+        directions.append(tuple(wave))
+    return [(c, kind, width if kind == DRY else 0.0) for kind in kinds for c in directions]
+
+
+def opposite(row: Loss) -> Loss | None:
+    """Friction of the sum of two speeds for that of their difference: the drag on an arm that hangs
+    from another, and what a negative coefficient of the difference stands for. Else None."""
+    direction, kind, width = row
+    if min(direction) >= 0:
+        return None
+    return tuple(map(abs, direction)), kind, width

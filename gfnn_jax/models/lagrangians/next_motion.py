@@ -1,0 +1,121 @@
+"""Motion to record next: one that would tell the coefficients that this record hardly does.
+
+A motion from rest is followed by the law. With J its sensitivities, its own first state eliminated,
+a record of it turns the information RᵀR of the coefficients into RᵀR + JᵀJ (Fedorov, Theory of
+Optimal Experiments, 1972). Beside the law's own coefficients count those of terms that it lacks and
+that its own imitate where the record was.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.dataset.stretches import Arcs
+from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
+from gfnn_jax.models.lagrangians.structure import Key
+from gfnn_jax.solve.latent_arcs import sensitivities
+
+_FURTHER = (0.5, 1.0, 1.5, 2.0, 4.0)  # of the largest deflections of the record
+_NEARLY_OVER = 3.0  # radians: an angle is let go no higher
+_IMITATED = 0.1  # share of what a term does that others do not, below which it is hardly told
+_MOST_TERMS = 40  # that are looked at: of larger libraries the first alone
+_MOST = 3
+
+
+class Motion(NamedTuple):
+    """A start from rest (d,), and by how much it makes the standard errors of coefficients (by
+    their keys) smaller, the most improved first."""
+
+    start: np.ndarray
+    gains: dict[Key, float]
+
+
+def next_motions(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[Motion]:
+    """The best motions to record next, the best first; each as long as an arc of the fit."""
+    structure, d = fit.structure, fit.form.dim
+    known = {key for key in structure.keys() if key[0] != "sensor"}  # noqa: SIM118
+    rows, more = (library(d, tuple(angles)) for library in (libraries.first, libraries.more))
+    rows = [*rows, *more] if len(rows) + len(more) <= _MOST_TERMS else rows
+    library = libraries.without_forces(rows, bench.seen.shifts())
+    lacking = [("term", row) for row in library if row not in structure.terms]
+    larger = structure.plus(lacking)
+    keys = larger.keys()
+    p, noise = larger.start(fit.values), fit.sigma * fit.arcs.noise
+    model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
+    R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise)[:, :-1]
+    own = [k for k, key in enumerate(keys) if key in known]
+    Q = np.linalg.qr(R[:, own])[0]
+    rest = np.linalg.norm(R - Q @ (Q.T @ R), axis=0)
+    hardly = rest < _IMITATED * np.linalg.norm(R, axis=0)
+    kept = [k for k, key in enumerate(keys) if k in own or (key in lacking and hardly[k])]
+    scale = np.linalg.norm(R[:, kept], axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    before = _information(R[:, kept] / scale)
+    found = []
+    for start in _starts(bench, fit, angles):
+        arcs = _followed(bench, fit, start)
+        if arcs is None:
+            continue
+        model = bench.model(larger, arcs, p, np.arange(len(p)))
+        model = dataclasses.replace(model, u=np.zeros_like(model.u))
+        J = sensitivities(model, p, arcs.x, arcs.y, fit.sigma * arcs.noise)[:, :-1]
+        after = before + _information(J[:, kept] / scale)
+        less = np.sqrt(np.diag(_inverse(before)) / np.diag(_inverse(after)))
+        order = np.argsort(-less)
+        found.append(Motion(start, {keys[kept[k]]: float(less[k]) for k in order}))
+    found.sort(key=lambda motion: -sum(np.log(list(motion.gains.values()))))
+    return found[:_MOST]
+
+
+def _starts(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[np.ndarray]:
+    """One coordinate, or all of them with either sign, let go from rest at some deflections."""
+    d = fit.form.dim
+    middle = np.median(bench.gauge, axis=0)
+    reach = np.max(np.abs(bench.gauge - middle), axis=0)
+    shapes = [np.eye(d)[i] for i in range(d)]
+    if d > 1:
+        shapes += [np.array((1.0, *signs)) for signs in product((1.0, -1.0), repeat=d - 1)]
+    starts = []
+    for shape, further in product(shapes, _FURTHER):
+        q = middle + further * reach * shape
+        q[list(angles)] = np.clip(q[list(angles)], -_NEARLY_OVER, _NEARLY_OVER)
+        if not any(np.allclose(q, other) for other in starts):
+            starts.append(q)
+    return starts
+
+
+def _followed(bench: Workbench, fit: LawFit, start: np.ndarray) -> Arcs | None:
+    """The motion as an arc, without inputs; None where it leaves for far away."""
+    d, length = fit.form.dim, fit.arcs.t.shape[1]
+    steps = np.diff(fit.arcs.t, axis=1)
+    h = float(np.median(steps[steps > 0]))
+    inputs = bench.inputs(fit.arcs)
+    still = np.zeros((1, *inputs.shape[2:]))
+    coefficients = fit.p[: fit.form.count]
+    x = [np.concatenate([start, np.zeros(d)])]
+    for _ in range(length - 1):
+        with np.errstate(all="ignore"):
+            x.append(fit.form.advance(coefficients, x[-1][None], np.full(1, h), still)[0])
+    states = np.array(x)
+    far = 10 * (np.ptp(bench.gauge, axis=0) + np.abs(start))
+    if not np.all(np.abs(states[:, :d] - start) < far):  # NaN too
+        return None
+    y = bench.seen(states[None]).values
+    home = ((fit.arcs.home[0][0], 0, length),)
+    return Arcs(h * np.arange(length)[None], y, states[None], np.ones(y.shape), home)
+
+
+def _information(R: np.ndarray) -> np.ndarray:
+    return R.T @ R
+
+
+def _inverse(information: np.ndarray) -> np.ndarray:
+    """The inverse, where nothing is told that of a billionth of the most."""
+    top = np.linalg.eigvalsh(information)[-1]
+    return np.linalg.inv(information + 1e-9 * top * np.eye(len(information)))

@@ -1,0 +1,401 @@
+"""``gfnn.fit`` of a recording: from positions to the law behind them, with friction and inputs.
+
+stretches → nodes → search (`models.lagrangians.search`) → the law in the recording's words → map →
+bands
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.roles import symbols
+from gfnn_jax.dataset.stretches import Nodes, Stretch, measure, nodes_of, stretches
+from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.lagrangian import Friction, Terms
+from gfnn_jax.maps.estimates import law_in_use
+from gfnn_jax.maps.inputs import HOLDS, Signals
+from gfnn_jax.maps.laws import map_of_law
+from gfnn_jax.maps.observation import Observation, observed
+from gfnn_jax.maps.sensors import Sensors
+from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
+from gfnn_jax.models.lagrangians.calibration import calibrated
+from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
+from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
+from gfnn_jax.models.lagrangians.given_law import fit_given
+from gfnn_jax.models.lagrangians.given_terms import Given, given_terms
+from gfnn_jax.models.lagrangians.learned_law import (
+    LearnedLaw,
+    NextMotion,
+    hamiltonian_of,
+    in_columns,
+    scaled,
+)
+from gfnn_jax.models.lagrangians.libraries import FRICTIONS
+from gfnn_jax.models.lagrangians.next_motion import Motion, next_motions
+from gfnn_jax.models.lagrangians.residuals import Trace, whiteness
+from gfnn_jax.models.lagrangians.search import SearchOptions, search
+from gfnn_jax.models.lagrangians.text import (
+    Expression,
+    friction_of,
+    speed_names,
+    terms_of,
+    which_friction_told,
+)
+from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels
+
+_IMITATED = 1e-4  # of what a sensor's parameter changes, that no coefficient of the law does
+_SEEN = 3.0  # standard errors of a gain, below which its input is not seen to act
+_ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apart
+
+
+def fit_recording(
+    recording: Recording, *, friction: str = "auto", input_hold: str = "auto",
+    mass: Mapping[str, float] | None = None, terms: Sequence[Any] = (),
+    on_progress: Callable[[str], Any] = lambda message: None,
+) -> LearnedLaw:  # fmt: skip
+    """The law of a recording, from its positions and inputs.
+
+    friction: "auto", "none", "linear", "quadratic", "dry", or several of them, as
+    "linear+dry". input_hold: "auto", or how inputs go on between samples: "hold", "linear" or
+    "band". mass: the known mass (or moment of inertia) of one position, which fixes the scale of L.
+    terms: those of L, V and R, as text in the names of columns (`models.lagrangians.given_terms`),
+    which are then all that is fitted.
+    Raises InputError for bad options or a recording without positions, FitError where no law is
+    found.
+    """
+    started = time.process_time()
+    options = _options(friction)
+    _check(recording, input_hold, mass)
+    steps: list[str] = []
+
+    def told(line: str) -> None:
+        steps.append(line)
+        on_progress(line)
+
+    seen, angles = _observation(recording)
+    found = _stretches(recording, seen, angles)
+    far = [i for i in seen.shifts() if i not in angles]
+    if far and not recording.guess:
+        middle = np.mean(np.concatenate([s.q for s in found]), axis=0)
+        seen = seen.shifted(np.where(np.isin(range(seen.dim), far), middle, 0.0))
+        found = _stretches(recording, seen, angles)
+    scales = measure(found)
+    given = np.array([recording.std[name] or np.nan for name in seen.channels])
+    scales = dataclasses.replace(scales, sigma=np.where(given > 0, given, scales.sigma))
+    asked = _asked(terms, seen, options.dry_width * float(np.mean(scales.speed)))
+    nodes = nodes_of(found, scales)
+    if not recording.inputs:
+        holds: tuple[str, ...] = ("hold",)
+    else:
+        holds = HOLDS if input_hold == "auto" else (input_hold,)
+    inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
+    record = (nodes, scales, angles, len(recording.inputs), inputs, seen, told, options)
+    gauge_of = np.concatenate([n.x[:, : seen.dim] for n in nodes])
+    fit, choice, hold, nodes = search(*record) if asked is None else fit_given(asked, *record)
+    if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
+        raise FitError("no law of the library follows this recording: its arcs could not be closed")
+    speeds = velocities(recording, fit, nodes)
+    honest = tuple(name for name, one in speeds.items() if one.used)
+    for name, one in speeds.items():
+        told(f"{name}: {one.text}")
+    if honest:
+        own = np.array([speeds[name].sigma for name in honest])
+        seen = seen.beside({n: recording.velocities.index(n) for n in honest})
+        nodes, arcs = with_channels(recording, nodes, fit.arcs, fit.fitted.x, honest)
+        bench = Workbench(gauge_of, inputs[hold], scales.omega, seen)
+        fit = bench.fit(fit.structure, fit.values, arcs, np.concatenate([fit.sigma, own]))
+        scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, own]))
+        given = np.array([recording.std[name] or np.nan for name in seen.channels])
+        found = _stretches(recording, seen, angles)
+    first = fit.form.count + len(fit.structure.zeros)
+    fitted = dataclasses.replace(seen, values=fit.p[first:])
+    _check_told(fit, fitted)
+    law, covariance = in_columns(fit)
+    names = recording.coordinates
+    gauge = f"the mean of M11 over the data is 1 ({names[0]})"
+    scale = 1.0
+    if mass:
+        (name, value), i = next(iter(mass.items())), names.index(next(iter(mass)))
+        masses = law.masses(np.concatenate([n.x[:, : fit.form.dim] for n in nodes]))
+        scale = value / float(np.mean(masses[:, i, i]))
+        law, covariance = scaled(law, covariance, scale)
+        gauge = f"the mean mass of {name} over the data is {value:g}"
+    x = np.concatenate([n.x for n in nodes])
+    d = fit.form.dim
+    zeros = np.zeros(d)
+    zeros[list(fit.structure.zeros)] = fit.p[fit.form.count : first]
+    q, v = x[:, :d] + zeros, x[:, d:]
+    root = _root(covariance)
+    noise = np.where(given > 0, given, np.minimum(scales.sigma, fit.rms()))
+    sensors = Sensors(
+        names, recording.inputs, recording.angles, noise, scales.omega, scales.period, hold, 0.0,
+        np.array([scales.period]), np.zeros((1, len(noise))), None if seen.is_plain else fitted,
+    )  # fmt: skip
+    told("bands: forecasts from windows of the record")
+    spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
+    used, horizons = calibrated(law_in_use(law, root, sensors), found, scales, spread)
+    z = np.concatenate([q, law.momentum(q, v)], axis=1)
+    u = np.concatenate([n.stretch.u[n.at] for n in nodes])
+    signals = Signals(recording.inputs, hold) if recording.inputs else None
+    map_ = map_of_law(
+        law, z, scales.dt, angles=angles, signals=signals, inputs=u if signals else None, root=root
+    )
+    map_ = _with_sensors(map_, used.sensors)
+    traces = _traces(recording, seen.channels, fit, law, nodes, zeros)
+    told("which motion to record next")
+    bench = Workbench(gauge_of, inputs[hold], scales.omega, seen)
+    motions = next_motions(bench, fit, angles)
+    return _described(
+        recording, fit, map_, law, covariance, (choice, scale), horizons, gauge, tuple(steps),
+        traces, motions, (q, v, u), [n.t for n in nodes], time.process_time() - started, speeds,
+    )  # fmt: skip
+
+
+def _options(friction: str) -> SearchOptions:
+    if friction == "auto":
+        return SearchOptions()
+    kinds = () if friction == "none" else tuple(friction.split("+"))
+    if not set(kinds) <= set(FRICTIONS):
+        raise InputError(
+            f"expected friction auto, none or some of {', '.join(FRICTIONS)} joined by +, got "
+            f"{friction!r}"
+        )
+    return SearchOptions(frictions=kinds, choose_friction=False)
+
+
+def _check(recording: Recording, input_hold: str, mass: Mapping[str, float] | None) -> None:
+    if not recording.coordinates:
+        raise InputError(f"{recording.source}: expected positions, found none (--positions)")
+    if input_hold not in ("auto", *HOLDS):
+        raise InputError(f"expected input_hold auto, {', '.join(HOLDS)}, got {input_hold!r}")
+    for name, value in (mass or {}).items():
+        if name not in recording.coordinates:
+            raise InputError(f"mass: no position {name} among {', '.join(recording.coordinates)}")
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"mass: expected {name} above 0, got {value}")
+    if len(mass or {}) > 1:
+        raise InputError("mass: one known mass fixes the scale of L; got several")
+
+
+def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
+    """Observation of the coordinates by the columns, and the angles among them.
+
+    Raises InputError where a sensor's parameter is one that every law has.
+    """
+    names = recording.coordinates
+    angles = tuple(i for i, name in enumerate(names) if name in recording.angles)
+    seen = observed(
+        recording.observe, names, speed_names(names, recording.velocities), recording.guess,
+        offsets=recording.offsets, scales=recording.scales, columns=recording.columns,
+    )  # fmt: skip
+    lengths = [i for i in range(len(names)) if i not in angles]
+    open_ = seen.undetermined(lengths)
+    if open_:
+        shown = ", ".join(names[i] for i in lengths)
+        raise InputError(
+            f"{', '.join(open_)}: every scale of {shown} has a law of the same terms: leave it "
+            "out, or observe a velocity of known scale beside"
+        )
+    return seen, angles
+
+
+def _stretches(recording: Recording, seen: Observation, angles: tuple[int, ...]) -> list[Stretch]:
+    """The stretches of a recording, as the parameters of ``seen`` show its coordinates."""
+    if seen.is_plain:
+        return stretches(recording)
+    return stretches(recording, seen.channels, partial(seen.coordinates_of, angles=angles))
+
+
+def _check_told(fit: LawFit, seen: Observation) -> None:
+    """Raises FitError where the record does not tell a sensor's parameters from the law."""
+    count = len(seen.parameters)
+    R = fit.fitted.triangle
+    size = np.linalg.norm(R, axis=0)
+    for name, k in zip(seen.parameters, range(len(fit.p) - count, len(fit.p)), strict=True):
+        others = np.delete(R, k, axis=1)
+        left = R[:, k] - others @ np.linalg.lstsq(others, R[:, k], rcond=None)[0]
+        if not np.linalg.norm(left) > _IMITATED * size[k]:
+            raise FitError(
+                f"{name}: the record does not tell it from the coefficients of the law: leave it "
+                "out, or give it as a number"
+            )
+
+
+def _asked(terms: Sequence[Any], seen: Observation, width: float) -> Given | None:
+    """The terms that were given, by the names of formulas."""
+    names = symbols((*seen.coordinates, *seen.speeds))
+    return given_terms(terms, names[: seen.dim], names[seen.dim :], width) if terms else None
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """rootᵀ root = covariance, of its eigenvalues above roundoff."""
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > 1e-14 * max(float(values.max(initial=0.0)), 1e-300)
+    return np.sqrt(values[kept])[:, None] * vectors[:, kept].T
+
+
+def _with_sensors(map_: Any, sensors: Sensors) -> Any:
+    return dataclasses.replace(map_, sensors=sensors)
+
+
+def _described(
+    recording: Recording, fit: LawFit, map_: Any, law: Any, covariance: np.ndarray,
+    chosen: tuple[FrictionChoice, float], horizons: Any, gauge: str, steps: tuple[str, ...],
+    traces: tuple[Trace, ...], motions: list[Motion], states: Any, times: list[np.ndarray],
+    seconds: float, told_of: dict[str, Velocity],
+) -> LearnedLaw:  # fmt: skip
+    """The law in the words of the recording."""
+    names = recording.coordinates
+    speeds = speed_names(names, recording.velocities)
+    in_formulas = symbols((*names, *speeds))
+    codes, of_speeds = in_formulas[: len(names)], in_formulas[len(names) :]
+    channels = map_.sensors.seen.channels
+    factors = np.array([recording.factors[name] for name in channels])
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    count, lost = law.terms.count, law.friction.count
+    lagrangian = terms_of(law.terms, law.coefficients, std[:count], codes, of_speeds)
+    friction = friction_of(law.friction, law.losses, std[count : count + lost], of_speeds)
+    of_gains = std[count + lost :].reshape(law.gains.shape)
+    gains = {
+        u: {q: (float(law.gains[i, j]), float(of_gains[i, j])) for i, q in enumerate(names)}
+        for j, u in enumerate(recording.inputs)
+    }
+    zero_std = np.sqrt(np.diag(fit.covariance()))[fit.form.count :]
+    sensors = {
+        name: (float(value), float(error))
+        for (_, name), value, error in zip(
+            fit.structure.keys()[fit.form.count + len(fit.structure.zeros) :],
+            fit.p[fit.form.count + len(fit.structure.zeros) :],
+            zero_std[len(fit.structure.zeros) :],
+            strict=True,
+        )
+    }
+    formulas = dict(zip(channels, map_.sensors.seen.formulas, strict=True))
+    zeros = {
+        names[i]: (float(fit.p[fit.form.count + k]), float(zero_std[k]))
+        for k, i in enumerate(fit.structure.zeros)
+    }
+    messages = [] if fit.fitted.converged else ["the last fit had not converged"]
+    if chosen[0].gains:
+        messages.append(
+            "the record gains energy that no input explains: is a drive missing among the inputs?"
+        )
+    messages += [
+        f"no force of input {u} is seen: it hardly varies, or moves nothing"
+        for u, forces in gains.items()
+        if all(abs(gain) < _SEEN * error for gain, error in forces.values())
+    ]
+    return LearnedLaw(
+        map=map_, lagrangian=lagrangian, friction=friction, gains=gains,
+        which_friction=which_friction_told(*chosen, law.dim, of_speeds),
+        hamiltonian=hamiltonian_of(law.terms, lagrangian, codes), zeros=zeros,
+        noise=dict(zip(channels, map(float, map_.sensors.sigma / factors), strict=True)),
+        residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)), gauge=gauge,
+        velocities={n: one.scaled(1 / recording.factors[n]) for n, one in told_of.items()},
+        whiteness=whiteness(traces, channels, recording.inputs), traces=traces,
+        next_motions=_in_words(motions, fit, recording, codes, of_speeds),
+        observe={n: f for n, f in formulas.items() if n != f}, sensors=sensors,
+        alike=_alike(fit, lagrangian, friction), horizon=tuple(horizons),
+        energy=_energy(law, friction, recording.inputs, states, times),
+        messages=tuple(messages), steps=steps, num_samples=len(recording), seconds=seconds,
+        ended="every length of arcs was fitted",
+    )  # fmt: skip
+
+
+def _in_words(
+    motions: list[Motion], fit: LawFit, recording: Recording, codes: Sequence[str],
+    speeds: Sequence[str],
+) -> tuple[NextMotion, ...]:  # fmt: skip
+    """Motions to record, in the file's units where a column shows the coordinate."""
+    named = []
+    for motion in motions:
+        start = {
+            name: float(q / recording.factors.get(name, 1.0))
+            for name, q in zip(recording.coordinates, motion.start, strict=True)
+        }
+        told = {_word(key, codes, speeds): gain for key, gain in motion.gains.items()}
+        named.append(NextMotion(start, told))
+    return tuple(named)
+
+
+def _word(key: Any, codes: Sequence[str], speeds: Sequence[str]) -> str:
+    """A coefficient by its term."""
+    kind, *rest = key
+    one, none = np.ones(1), np.zeros(1)
+    if kind == "term":
+        return terms_of(Terms.of(rest, len(codes)), one, none, codes, speeds).terms[0].term
+    if kind == "loss":
+        return "R: " + friction_of(Friction.of(rest, len(codes)), one, none, speeds).terms[0].term
+    return f"{'gain' if kind == 'gain' else 'zero'} of {codes[rest[0]]}"
+
+
+def _traces(
+    recording: Recording,
+    channels: tuple[str, ...],
+    fit: LawFit,
+    law: Any,
+    nodes: list[Nodes],
+    zeros: np.ndarray,
+) -> tuple[Trace, ...]:
+    """The arcs of a fit, channels in the file's units."""
+    arcs, found, d = fit.arcs, [], fit.form.dim
+    factors = np.array([recording.factors[name] for name in channels])
+    left = fit.fitted.residuals * fit.sigma * arcs.noise
+    for k, (i, a, b) in enumerate(arcs.home):
+        n, stretch = b - a, nodes[i].stretch
+        y, x = arcs.y[k, :n], fit.fitted.x[k, :n]
+        energy = law.energy(x[:, :d] + zeros, x[:, d:])
+        found.append(
+            Trace(
+                stretch.run, arcs.t[k, :n], y / factors, (y - left[k, :n]) / factors,
+                fit.fitted.residuals[k, :n], energy, stretch.u[nodes[i].at[a:b]],
+            )
+        )  # fmt: skip
+    return tuple(found)
+
+
+def _alike(fit: LawFit, lagrangian: Expression, friction: Expression) -> tuple[str, ...]:
+    """Pairs of coefficients that the record cannot tell apart."""
+    covariance = fit.covariance()
+    scale = np.sqrt(np.diag(covariance))
+    with np.errstate(all="ignore"):
+        correlation = covariance / scale / scale[:, None]
+    texts = dict(zip(fit.structure.terms, (t.term for t in lagrangian.terms), strict=True))
+    texts |= dict(zip(fit.structure.friction, (t.term for t in friction.terms), strict=True))
+    names = [texts.get(key[1], " ".join(map(str, key))) for key in fit.values]
+    return tuple(
+        f"{names[i]} and {names[j]} ({correlation[i, j]:+.3f})"
+        for i, j in zip(*np.nonzero(np.triu(np.abs(correlation) > _ALIKE, 1)), strict=True)
+    )
+
+
+def _energy(
+    law: Any, friction: Expression, inputs: tuple[str, ...], states: Any, times: list[np.ndarray]
+) -> dict[str, Any]:
+    """Energy per second, means over the record: stored, lost by each friction, supplied by each
+    input, and what these leave unexplained."""
+    q, v, u = states
+    energy = law.energy(q, v)
+    lost, supplied = law.power(q, v, u)
+    ends = np.cumsum([0, *map(len, times)])
+    total = sum(t[-1] - t[0] for t in times)
+
+    def mean(rate: np.ndarray) -> float:
+        parts = zip(times, ends[:-1], ends[1:], strict=True)
+        return float(sum(np.trapezoid(rate[a:b], t) for t, a, b in parts) / total)
+
+    stored = float(sum(energy[b - 1] - energy[a] for a, b in pairwise(ends)))
+    by_friction = {t.term: mean(lost[:, k]) for k, t in enumerate(friction.terms)}
+    by_input = {name: mean(supplied[:, k]) for k, name in enumerate(inputs)}
+    closure = stored / total - sum(by_input.values()) + sum(by_friction.values())
+    return {
+        "stored": stored / total, "lost": by_friction, "supplied": by_input, "closure": closure,
+    }  # fmt: skip

@@ -1,0 +1,264 @@
+"""The search for a law: a linear start, arcs of growing length, terms dropped and added.
+
+Half a period, one, two and four periods: short arcs find the law from afar, long ones tell small
+forces. At each length terms that are not seen at four standard errors are dropped, and of those
+that the law lacks the one with the largest score is tried; it stays where arcs that the fit has
+not seen gain. Which friction there is, held-out arcs say in the end.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of, with_states
+from gfnn_jax.errors import FitError
+from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.maps.observation import Observation
+from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
+from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, which_friction
+from gfnn_jax.models.lagrangians.libraries import FRICTIONS
+from gfnn_jax.models.lagrangians.structure import Key, Loss, Structure
+from gfnn_jax.models.lagrangians.weak_start import protected, weak_start
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchOptions:
+    """Constants of the search, the same for all records (`python benchmarks/measured.py DIR`)."""
+
+    periods: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)  # lengths of arcs
+    significant: float = 4.0  # standard errors, below which a term may be dropped
+    nothing: float = 1.0  # standard errors, below which it is, without asking held-out arcs
+    asked_for: float = 5.0  # standard errors, above which a term is tried
+    tries: int = 3  # terms tried in a row
+    plain_is_enough: float = (
+        1.5  # times the residual of the larger library, the textbook's may have
+    )
+    gain: float = 0.05  # of the held-out cost, that a term has to bring
+    choices: int = 3  # of the friction, each close to the fit with the one before
+    dry_width: float = 0.05  # ε of dry friction, in rms speeds
+    frictions: tuple[str, ...] = FRICTIONS
+    choose_friction: bool = True  # by held-out arcs; else all of these
+
+
+class Found(NamedTuple):
+    """Findings of a search: the fit to the longest arcs, which friction and how sure that is, the
+    rule of the inputs between samples, and the nodes with their states."""
+
+    fit: LawFit
+    choice: FrictionChoice
+    hold: str
+    nodes: list[Nodes]
+
+
+def search(
+    nodes: Sequence[Nodes],
+    scales: Scales,
+    angles: tuple[int, ...],
+    num_inputs: int,
+    inputs: Mapping[str, Callable],
+    seen: Observation,
+    told: Callable[[str], object] = lambda line: None,
+    options: SearchOptions = SearchOptions(),
+) -> Found:
+    """The law of these nodes, by the best of the rules between samples of the ``inputs`` (hold ->
+    inputs of arcs). ``seen`` says how states are observed."""
+    d = seen.dim
+    gauge = np.concatenate([n.x[:, :d] for n in nodes])
+    benches = {hold: Workbench(gauge, u, scales.omega, seen) for hold, u in inputs.items()}
+    sensors = tuple(zip(seen.parameters, map(float, seen.values), strict=True))
+    shifted = seen.shifts()
+    turned = tuple(i for i in angles if i in seen.direct and i not in shifted)  # with a zero
+
+    def length(periods: float) -> int:
+        return max(6, round(periods * scales.per_period))
+
+    linear = libraries.losses(d, (LINEAR,), 0.0)
+    starts = []
+    plain = [libraries.textbook(d, angles)]
+    if d > 1 and len(angles) == d:
+        plain.append(libraries.relative(d, angles))
+    plain_terms = []
+    for rows in (*plain, libraries.first(d, angles)):
+        terms = libraries.without_forces(rows, shifted)
+        library = Structure(d, terms, tuple(linear), (), num_inputs, sensors)
+        try:
+            structure, known = weak_start(library, nodes, scales)
+        except FitError:
+            continue
+        if rows in plain:
+            plain_terms.append(structure.terms)
+        zeros = tuple(i for i in turned if any(row[2][i] for row in structure.terms))
+        structure = structure.plus(
+            [("loss", row) for row in linear[:d]] + [("zero", i) for i in zeros]
+        )
+        if all(structure.terms != other.structure.terms for other in starts):
+            arcs = arcs_of(nodes, length(options.periods[0]))
+            fits = {
+                hold: bench.fit(structure, known, arcs, scales.sigma)
+                for hold, bench in benches.items()
+            }
+            hold = min(fits, key=lambda hold: float(np.max(fits[hold].rms() / scales.sigma)))
+            benches = {hold: benches[hold]}  # inputs go on between samples as fits best
+            starts.append(fits[hold])
+            told(f"{options.periods[0]:g} periods: {describe(starts[-1])}")
+    if not starts:
+        raise FitError("no library of terms follows this recording: do its positions move freely?")
+    (hold, bench), *_ = benches.items()
+    misfit = [
+        float(np.max(start.rms() / scales.sigma)) if np.isfinite(start.fitted.cost) else np.inf
+        for start in starts
+    ]
+    best = min(range(len(starts)), key=lambda k: misfit[k])
+    simple = [k for k, start in enumerate(starts) if start.structure.terms in plain_terms]
+    simple = [k for k in simple if misfit[k] <= options.plain_is_enough * misfit[best]]
+    fit = starts[min(simple, key=lambda k: misfit[k]) if simple else best]
+    every = Structure(
+        d, libraries.without_forces(
+            (*libraries.first(d, angles), *libraries.more(d, angles)), shifted
+        ),
+        frictions_tried(d, scales, options), turned, num_inputs, sensors,
+    )  # fmt: skip
+    frictions = dataclasses.replace(every, terms=every.terms[:1])
+    nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+    for periods in options.periods[1:]:
+        arcs = arcs_of(nodes, length(periods))
+        if arcs.t.shape == fit.arcs.t.shape:
+            break  # no run is longer
+        fit = bench.fit(fit.structure, fit.values, arcs, fit.sigma)
+        if periods == 1:
+            fit = grow(bench, nodes, fit, frictions, told, options)
+            fit = prune(bench, nodes, fit, told, options)
+            fit = grow(bench, nodes, fit, every, told, options)
+        nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+        told(f"{periods:g} periods: {describe(fit)}")
+    fit, choice = choose_friction(bench, nodes, fit, every.friction, told, options)
+    terms = dataclasses.replace(every, friction=())
+    before = fit.structure
+    fit = prune(bench, nodes, fit, told, options, friction=False)
+    fit = grow(bench, nodes, fit, terms, told, options)
+    fit = prune(bench, nodes, fit, told, options, friction=False)
+    if fit.structure != before:
+        fit, choice = choose_friction(bench, nodes, fit, every.friction, told, options)
+    return Found(fit, choice, hold, with_states(nodes, fit.arcs, fit.fitted.x))
+
+
+def describe(fit: LawFit) -> str:
+    rms = " ".join(f"{r:.3g}" for r in fit.rms())
+    return (
+        f"{len(fit.p)} coefficients, residual {rms}, correlated over {fit.correlation:.1f} nodes, "
+        f"{fit.fitted.iterations} iterations" + ("" if fit.fitted.converged else ", not converged")
+    )
+
+
+def prune(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, told: Callable, options: SearchOptions,
+    friction: bool = True,
+) -> LawFit:  # fmt: skip
+    """The fit without terms that are not seen, the least seen first, as long as held-out arcs do
+    not lose; and, unless ``friction`` has been chosen, without that which would drive."""
+    refused: set[Key] = set()
+    costs = None
+    while True:
+        z = significance(fit)
+        stays = {k for k in z if k[0] in ("gain", "sensor")}
+        stays |= set() if friction else {k for k in z if k[0] == "loss"}
+        fixed = protected(fit.structure) | refused | stays
+        z = {k: size for k, size in z.items() if k not in fixed and size < options.significant}
+        if not z:
+            return fit
+        key: Key = min(z.items(), key=lambda item: item[1])[0]
+        smaller = fit.structure.without({key})
+        if z[key] > options.nothing or (key[0] == "loss" and z[key] >= 0):
+            if costs is None:
+                costs = bench.cross_validate(nodes, fit, fit.structure, fit.values)
+            without = bench.cross_validate(nodes, fit, smaller, fit.values)
+            if gains(without, costs, options.gain):
+                refused.add(key)
+                continue
+        told(f"  without {key}: {z[key]:.1f} standard errors")
+        arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+        fit, costs = bench.fit(smaller, fit.values, arcs, fit.sigma), None
+
+
+def significance(fit: LawFit) -> dict[Key, float]:
+    """Coefficients in units of their standard errors; friction that drives is below 0."""
+    error = np.sqrt(np.diag(fit.covariance()))
+    z = np.where(error > 0, np.abs(fit.p) / error, 0.0)
+    keys = fit.structure.keys()
+    drives = [k[0] == "loss" and p < 0 for k, p in zip(keys, fit.p, strict=True)]
+    return dict(zip(keys, np.where(drives, -z, z).tolist(), strict=True))
+
+
+def gains(costs: np.ndarray, others: np.ndarray, share: float) -> bool:
+    """Return whether ``others`` are lower in all than these held-out costs (A,), by this share of
+    them."""
+    return bool(np.sum(others) < np.sum(costs) * (1 - share))
+
+
+def grow(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, every: Structure, told: Callable,
+    options: SearchOptions,
+) -> LawFit:  # fmt: skip
+    """The fit with terms that the residuals ask for, each kept where held-out arcs gain."""
+    refused: set[Key] = set()
+    costs = None
+    for _ in range(options.tries):
+        scores = bench.scores(fit, every)
+        scores = {k: z for k, z in scores.items() if k not in refused and z > options.asked_for}
+        if not scores:
+            break
+        key = max(scores, key=lambda k: scores[k])
+        if costs is None:
+            costs = bench.cross_validate(nodes, fit, fit.structure, fit.values)
+        larger = fit.structure.plus([key])
+        with_it = bench.cross_validate(nodes, fit, larger, fit.values)
+        kept = gains(costs, with_it, options.gain)
+        told(
+            f"  {'with' if kept else 'not'} {key}: score {scores[key]:.1f}, held-out "
+            f"{np.sum(costs):.5g} → {np.sum(with_it):.5g}"
+        )
+        if not kept:
+            refused.add(key)
+            continue
+        arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+        fit = bench.fit(larger, fit.values, arcs, fit.sigma)
+        costs = None
+    return fit
+
+
+def choose_friction(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, candidates: Sequence[Loss],
+    told: Callable, options: SearchOptions,
+) -> tuple[LawFit, FrictionChoice]:  # fmt: skip
+    """The fit with the friction that held-out arcs choose, and how sure that is. Arcs are as long
+    as those of the fit, or as long as three of them can be. A choice holds close to its fit, so
+    that it is made again until it stands."""
+    whole, sigma = dataclasses.replace(fit.arcs, x=fit.fitted.x), fit.sigma
+    length = max(6, min(whole.t.shape[1], sum(len(n.t) for n in nodes) // FOLDS))
+    arcs = arcs_of(with_states(nodes, whole, whole.x), length)
+    if arcs.t.shape != whole.t.shape:
+        fit = bench.fit(fit.structure, fit.values, arcs, sigma)
+    choice = which_friction(bench, fit, candidates, options.choose_friction)
+    for _ in range(options.choices):
+        told(f"  friction: {choice.rows}")
+        if set(choice.rows) == set(fit.structure.friction):
+            break
+        structure = dataclasses.replace(fit.structure, friction=choice.rows)
+        arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+        fit = bench.fit(structure, fit.values, arcs, fit.sigma)
+        choice = which_friction(bench, fit, candidates, options.choose_friction, choice)
+    choice = choice._replace(rows=fit.structure.friction)
+    return bench.fit(fit.structure, fit.values, whole, sigma), choice
+
+
+def frictions_tried(dim: int, scales: Scales, options: SearchOptions) -> tuple[Loss, ...]:
+    """Friction of all the kinds that are asked for, in every direction."""
+    kinds = tuple(libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions)
+    rows = libraries.losses(dim, kinds, options.dry_width * float(np.mean(scales.speed)))
+    turned = (libraries.opposite(row) for row in rows)
+    return (*rows, *(row for row in turned if row is not None))

@@ -1,0 +1,151 @@
+"""Test of measured velocities against a law found from positions alone.
+
+Most velocities in files are filtered differences of the positions: their scale is a little low,
+they come late, and neighbouring values share their noise. Against the velocities v of a law, which
+is far smoother than either,
+
+    measured − v  =  a v + τ dv/dt + b + noise
+
+tells the scale 1 + a, the lag −τ and the bias b. Only velocities of which this is next to nothing,
+and whose noise is white, tell a fit something that positions did not.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.data.channels import channels_of
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.dataset.stretches import Arcs, Nodes, Stretch
+from gfnn_jax.models.lagrangians.fit import LawFit, correlation_time
+from gfnn_jax.signals.derivatives import difference
+
+_WRONG = 0.2  # of the noise, that scale, lag and bias may make up
+_CHANCE = 3.0  # standard deviations of what they make up by accident
+_COLOURED, _NEAR = 0.2, 8  # correlation of noise, of so many neighbours, that is no accident
+
+
+class Velocity(NamedTuple):
+    """A column against the law: scale, lag (s) and bias with the standard errors that its own noise
+    makes, σ of that, whether it is white, and whether the column is used."""
+
+    scale: tuple[float, float]
+    lag: tuple[float, float]
+    bias: tuple[float, float]
+    sigma: float
+    white: bool
+    used: bool
+
+    def scaled(self, factor: float) -> Velocity:
+        """Convert to a unit of which ``factor`` make one."""
+        bias = self.bias[0] * factor, self.bias[1] * factor
+        return self._replace(bias=bias, sigma=self.sigma * factor)
+
+    @property
+    def text(self) -> str:
+        """A line for people."""
+        why = "used" if self.used else "not used"
+        colour = "white" if self.white else "coloured"
+        return (
+            f"{why}: scale {self.scale[0]:.4f} ± {self.scale[1]:.1g}, lag "
+            f"{1e3 * self.lag[0]:.2g} ± {1e3 * self.lag[1]:.1g} ms, {colour} noise {self.sigma:.3g}"
+        )
+
+
+def velocities(recording: Recording, fit: LawFit, nodes: Sequence[Nodes]) -> dict[str, Velocity]:
+    """Each column of velocities that no sensor explains, against the law of the positions."""
+    d, arcs, x = fit.form.dim, fit.arcs, fit.fitted.x
+    if recording.coordinates != recording.positions:
+        return {}
+    law = fit.form.lagrangian(fit.p[: fit.form.count])
+    u = _at_nodes(arcs, nodes, [node.stretch.u for node in nodes])
+    flat = x.reshape(-1, 2 * d)
+    a = law.acceleration(flat[:, :d], flat[:, d:], u.reshape(len(flat), -1))
+    a = a.reshape(*x.shape[:2], d)
+    found = {}
+    for i, name in enumerate(recording.velocities):
+        if name in recording.explained:
+            continue
+        columns = [_column(recording, node.stretch, name) for node in nodes]
+        measured = _at_nodes(arcs, nodes, columns)[..., 0]
+        seen = np.isfinite(measured) & np.isfinite(arcs.y[..., i])
+        if seen.sum() < 10:
+            continue
+        v = x[..., d + i]
+        X = np.stack([v, a[..., i], np.ones_like(v)], axis=-1)[seen]
+        r = (measured - v)[seen]
+        sizes = np.linalg.norm(X, axis=0)
+        inverse = np.linalg.pinv(X / sizes) / sizes[:, None]
+        beta = inverse @ r
+        left = np.where(seen, measured - v - np.stack([v, a[..., i], 1 + 0 * v], -1) @ beta, np.nan)
+        sigma = float(np.sqrt(np.nanmean(left**2)))
+        tau = correlation_time(left[..., None] / sigma)
+        error = sigma * np.sqrt(tau) * np.linalg.norm(inverse, axis=1)
+        share = float(np.sqrt(np.mean((X @ beta) ** 2))) / sigma
+        chance = _CHANCE / np.sqrt(len(r))
+        white = _colour(left) < max(_COLOURED, chance) and not _copied(recording, i, name)
+        allowed = max(_WRONG, chance * np.sqrt(3 * tau))
+        found[name] = Velocity(
+            (1 + float(beta[0]), float(error[0])), (-float(beta[1]), float(error[1])),
+            (float(beta[2]), float(error[2])), sigma, bool(white), bool(white and share < allowed),
+        )  # fmt: skip
+    return found
+
+
+def _colour(left: np.ndarray) -> float:
+    """The largest correlation of noise (A, L) with that of near nodes, of either sign."""
+    power = np.nanmean(left**2)
+    near = range(1, min(_NEAR, left.shape[1] - 1) + 1)
+    return max(abs(float(np.nanmean(left[:, k:] * left[:, :-k]) / power)) for k in near)
+
+
+def _copied(recording: Recording, place: int, name: str) -> bool:
+    """Return whether a velocity is a mere difference of its position."""
+    times = [recording.times(run) for run in recording.runs]
+    x, v = (
+        np.concatenate([recording.unwrapped(n, run) for run in recording.runs])
+        for n in (recording.positions[place], name)
+    )
+    return difference(times, x, v) is not None
+
+
+def with_channels(
+    recording: Recording, nodes: Sequence[Nodes], arcs: Arcs, x: np.ndarray, names: Sequence[str]
+) -> tuple[list[Nodes], Arcs]:
+    """Nodes and arcs, at the states x, that show these columns too."""
+    wider: dict[int, Stretch] = {}
+    extended = []
+    for node in nodes:
+        s = node.stretch
+        if id(s) not in wider:
+            y, noise = (
+                np.concatenate([own, *(_column(recording, s, n, k) for n in names)], axis=1)
+                for k, own in enumerate((s.y, s.noise))
+            )
+            wider[id(s)] = dataclasses.replace(s, y=y, noise=noise)
+        extended.append(dataclasses.replace(node, stretch=wider[id(s)], y=wider[id(s)].y[node.at]))
+    y = _at_nodes(arcs, extended, [node.stretch.y for node in extended])
+    y = np.where(np.isfinite(arcs.y).any(axis=-1, keepdims=True), y, np.nan)
+    noise = _at_nodes(arcs, extended, [node.stretch.noise for node in extended])
+    return extended, dataclasses.replace(arcs, y=y, noise=noise, x=x)
+
+
+def _column(recording: Recording, s: Stretch, name: str, which: int = 0) -> np.ndarray:
+    """(n, 1) of a column, or of its relative noise, at the samples of a stretch."""
+    at = np.searchsorted(recording.times(s.run), s.t)
+    return channels_of(recording, [name], s.run)[which][at]
+
+
+def _at_nodes(
+    arcs: Arcs, nodes: Sequence[Nodes], columns: Sequence[np.ndarray]
+) -> np.ndarray:  # fmt: skip
+    """(A, L, k) of columns (n, k) of each node's stretch, as `arcs_of` lays nodes out."""
+    length, found = arcs.t.shape[1], []
+    for i, a, b in arcs.home:
+        index = np.minimum(np.arange(a, a + length), b - 1)
+        found.append(columns[i][nodes[i].at[index]])
+    return np.array(found)

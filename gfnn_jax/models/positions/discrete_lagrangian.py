@@ -1,0 +1,125 @@
+"""S(q, Q) from positions alone: a discrete Lagrangian, by one linear least-squares problem.
+
+A type-1 generating function gives p = −h ∂S/∂q and P = h ∂S/∂Q. The momentum between two steps is
+the same from either side, so that three positions in a row obey the discrete Euler–Lagrange
+equations (Marsden & West, Acta Numerica 10 (2001) 357, eq. (1.3.3))
+
+    ∂₂S(q₋, q) + ∂₁S(q, q₊) = 0,
+
+which are linear in S and hold no momenta. Positions leave S open by a factor, by a constant and by
+f(Q) − f(q). The factor is fixed by the mixed term: the mean of −h² ∂²S/∂q_i∂Q_i over the data is 1,
+in the mean over the coordinates, each weighed by its mean square displacement. Of what is left
+open, S is the one nearest to that of free motion, ½ |Q − q|² / h², in its coefficients: a symmetric
+S has no f(Q) − f(q), but systems of one degree of freedom, or of several without coupling, leave
+more open.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.models.positions.triples import Triples
+from gfnn_jax.threads import one_thread
+
+_SAMPLED = 2_000  # positions by which the mixed term is taken
+_NULL = 1e-13  # of the largest singular value: a smaller one is a combination that nothing tells
+_ROWS = 4_096  # of a part that is folded, and four for each term
+_DIFFERENCE = 1e-4  # of a displacement, by which mixed derivatives of terms are differences
+
+
+class Solved(NamedTuple):
+    """The coefficients of S (m,), how many of their combinations the data tell, and the condition
+    number of these.
+
+    All S of this mixed term that the data can tell apart are ``free`` (m,), free motion, plus
+    combinations of the columns of ``told`` (m, n), which are orthonormal. root: (n, m), rootᵀ root
+    the covariance of the coefficients where what is left of the equations, in units of
+    displacements, has standard deviation 1.
+    """
+
+    coefficients: np.ndarray
+    rank: int
+    condition: float
+    free: np.ndarray
+    told: np.ndarray
+    root: np.ndarray
+
+
+def equations(family: Any, triples: Triples, size: np.ndarray) -> np.ndarray:
+    """Contribution of each term to the Euler–Lagrange equations, h² ÷ the coordinates' sizes (d,)
+    times: (N, d, m)."""
+    count, dim = len(triples), triples.dim
+    gradients = family.term_gradients(triples.ends)
+    left = gradients[:count, dim:] + gradients[count:, :dim]
+    return left * (triples.dt**2 / size)[:, None]
+
+
+def displacement(triples: Triples) -> np.ndarray:
+    """(d,) roots of the mean square displacements."""
+    size = np.sqrt(np.mean(triples.moves**2, axis=0))
+    return np.where(size > 0, size, 1.0)
+
+
+def solve(family: Any, triples: Triples) -> Solved:
+    """S of these triples: least squares among the S of this mixed term, nearest to free motion."""
+    with one_thread():
+        triangle = _folded(family, triples)
+        free, mixed = _free_motion(family, triples), _mixed_terms(family, triples)
+        free = free / (mixed @ free)
+        # The changes of S that leave the mixed term as it is: all but the first column of Q.
+        others = np.linalg.qr(np.column_stack([mixed, np.eye(len(mixed))]))[0][:, 1 : len(mixed)]
+        u, values, v = np.linalg.svd(triangle @ others, full_matrices=False)
+    told = values > _NULL * values[0]
+    along = u[:, told].T @ (triangle @ free)
+    coefficients = free - others @ (v[told].T @ (along / values[told]))
+    condition = float(values[0] / values[told][-1])
+    directions = others @ v[told].T
+    root = (directions / values[told]).T
+    return Solved(coefficients, 1 + int(told.sum()), condition, free, directions, root)
+
+
+def residuals(family: Any, params: Any, triples: Triples) -> np.ndarray:
+    """(N, d): h² times what S leaves of the equations, in units of the positions: about the error
+    of q₊, where the mixed term is about 1 everywhere."""
+    count, dim = len(triples), triples.dim
+    gradient = np.asarray(family.gradient(params, triples.ends))
+    return triples.dt**2 * (gradient[:count, dim:] + gradient[count:, :dim])
+
+
+def _mixed_terms(family: Any, triples: Triples) -> np.ndarray:
+    """Mean of −h² ∂²/∂q_i∂Q_i of every term of S, weighed as above: (m,)."""
+    dim, w, size = triples.dim, _sample(triples), displacement(triples)
+    total = np.zeros(family.num_parameters)
+    for i, step in enumerate(_DIFFERENCE * size):
+        off = np.zeros(2 * dim)
+        off[i] = step
+        ahead, behind = (family.term_gradients(v)[:, dim + i] for v in (w + off, w - off))
+        total += size[i] ** 2 * np.mean(ahead - behind, axis=0) / (2 * step)
+    return -(triples.dt**2) * total / np.sum(size**2)
+
+
+def _free_motion(family: Any, triples: Triples) -> np.ndarray:
+    """Coefficients of ½ |Q − q|² / h²: (m,)."""
+    w = _sample(triples)
+    moves = (w[:, triples.dim :] - w[:, : triples.dim]) / triples.dt**2
+    gradients = family.term_gradients(w)
+    target = np.concatenate([-moves, moves], axis=1)
+    return np.linalg.lstsq(gradients.reshape(target.size, -1), target.ravel(), rcond=_NULL)[0]
+
+
+def _sample(triples: Triples) -> np.ndarray:
+    """Sample of the points w = (q, Q)."""
+    return triples.ends[:: max(1, 2 * len(triples) * triples.dim // _SAMPLED)]
+
+
+def _folded(family: Any, triples: Triples) -> np.ndarray:
+    """The triangular factor (m, m) of all equations, part by part: memory stays that of a part."""
+    m, size = family.num_parameters, displacement(triples)
+    part = max(1, (4 * m + _ROWS) // triples.dim)
+    rows = np.empty((0, m))
+    for first in range(0, len(triples), part):
+        new = equations(family, triples.take(slice(first, first + part)), size)
+        rows = np.asarray(np.linalg.qr(np.concatenate([rows, new.reshape(-1, m)]), mode="r"))
+    return rows

@@ -1,0 +1,118 @@
+"""S(q, Q) from noisy readings of positions: true positions are unknowns beside its coefficients.
+
+Least squares in the discrete Euler–Lagrange equations takes readings for positions, and the noise
+of readings in its own columns biases it. Here arcs of readings are compared, in units of their
+noise σ, with orbits of S, whose positions are latent (`solve.latent_arcs`); σ is that of the
+residuals. Least squares only starts it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.generating.position_arcs import PositionArcs, nodes_of
+from gfnn_jax.models.positions.discrete_lagrangian import Solved, residuals
+from gfnn_jax.models.positions.triples import Triples
+from gfnn_jax.solve.latent_arcs import SOFT_L1, fit_arcs
+from gfnn_jax.threads import one_thread
+
+_LONGEST = 24  # nodes of an arc: its own two positions cost a twelfth of what it tells
+_MOST_NODES = 20_000  # of all arcs: a minute and a quarter of a gigabyte at a hundred terms
+_SETTLED = 1.05  # a noise scale that changed by less needs no further fit
+_SCALES = 4  # fits, at most, that find it
+_GROSS = 5.0  # standard deviations: of what is not noise
+_OF_EQUATION = np.sqrt(3)  # noise of an equation, in that of a reading, about
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LatentFit:
+    """Coefficients (m,) of S, a root (k, m) of their covariance (rootᵀ root), the noise σ (d,) of
+    the readings, the number of equations ∂₂S + ∂₁S = 0 along the arcs, one for each coordinate, and
+    whether the iteration converged."""
+
+    coefficients: np.ndarray
+    root: np.ndarray
+    sigma: np.ndarray
+    num_equations: int
+    converged: bool
+
+    @property
+    def criterion(self) -> float:
+        """Akaike's, −2 log likelihood + 2 × the number of coefficients, up to a constant: σ² is the
+        sum of squares ÷ what unknowns leave of the readings, which has one of the two in it."""
+        return self.num_equations * float(np.mean(np.log(self.sigma**2))) + len(self.root)
+
+
+def arcs_of(triples: Triples) -> np.ndarray:
+    """Readings (A, L + 1, d) as arcs of one length, that which leaves fewest equations out; of very
+    many every so many."""
+    stretches = triples.stretches()
+    sizes = np.array([len(s) for s in stretches])
+    longest = min(int(sizes.max()) - 1, _LONGEST)
+    used = [np.sum(sizes // (nodes + 1)) * (nodes - 1) for nodes in range(2, longest + 1)]
+    span = 3 + int(np.argmax(used))
+    cut = [
+        s[first : first + span]
+        for s in stretches
+        for first in range(0, len(s) - span + 1, span)
+    ]  # fmt: skip
+    return np.array(cut[:: -(-len(cut) * span // _MOST_NODES)])
+
+
+def starting_noise(family: Any, coefficients: np.ndarray, triples: Triples) -> np.ndarray:
+    """σ (d,) as large as what S leaves of the equations suggests."""
+    left = residuals(family, family.unflatten(coefficients), triples)
+    return np.maximum(np.median(np.abs(left), axis=0) / 0.6745 / _OF_EQUATION, np.finfo(float).tiny)
+
+
+def fit_latent(
+    family: Any, solved: Solved, triples: Triples, sigma: np.ndarray, arcs: np.ndarray
+) -> LatentFit:
+    """S of this family by Gauss–Newton over arcs (A, L + 1, d) with latent positions.
+
+    solved: least squares, which starts it and says which S there are. sigma: (d,) the first guess
+    of the noise, which becomes that of the residuals.
+    """
+    dim, told = triples.dim, solved.told.shape[1]
+    model = PositionArcs(family, triples.dt, family.unflatten(solved.free), solved.told)
+    p = solved.told.T @ (solved.coefficients - solved.free)
+    x, y = nodes_of(arcs)
+    equations = len(arcs) * (arcs.shape[1] - 2) * dim
+    # Residuals of readings are smaller than the noise by what the unknowns take of them.
+    left = np.sqrt(arcs.size / max(equations - told, 1))
+    for _ in range(_SCALES):
+        scale = np.tile(sigma, 2)
+        with one_thread():
+            found = fit_arcs(model, p, x, y, scale, scale)
+        p, x = found.p, found.x
+        change = _size(found.residuals, dim) * left
+        sigma = sigma * change
+        if np.all(np.abs(np.log(change)) < np.log(_SETTLED)):
+            break
+    root = np.linalg.pinv(found.triangle).T @ solved.told.T * np.exp(np.mean(np.log(change)))
+    coefficients = solved.free + solved.told @ p
+    return LatentFit(coefficients, root, sigma, equations, found.converged)
+
+
+def held_out_cost(
+    family: Any, coefficients: np.ndarray, triples: Triples, sigma: np.ndarray, arcs: np.ndarray
+) -> np.ndarray:
+    """Cost (A,) of arcs that the fit has not seen, whose positions are fitted to S as it is."""
+    params, none = family.unflatten(coefficients), np.zeros((len(coefficients), 0))
+    model = PositionArcs(family, triples.dt, params, none)
+    x, y = nodes_of(arcs)
+    scale = np.tile(sigma, 2)
+    found = fit_arcs(model, np.zeros(0), x, y, scale, scale)
+    if not np.isfinite(found.cost):
+        return np.full(len(arcs), np.inf)
+    return np.nansum(SOFT_L1.of(found.residuals), axis=(1, 2))
+
+
+def _size(residuals: np.ndarray, dim: int) -> np.ndarray:
+    """(d,) root mean square of residuals (A, L, 2d) of each coordinate, gross ones left out."""
+    r = residuals.reshape(-1, 2, dim)
+    gross = np.abs(r) > _GROSS * np.nanmedian(np.abs(r), axis=(0, 1)) / 0.6745
+    return np.sqrt(np.nanmean(np.where(gross, np.nan, r) ** 2, axis=(0, 1)))

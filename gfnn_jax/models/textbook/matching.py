@@ -1,0 +1,254 @@
+"""Orthogonal matching: the few atoms of a dictionary whose gradients add up to given ones.
+
+Columns are gradients at all states, each component in its unit, as one vector. What the chosen
+columns span is projected out of the dictionary; the next atom, or pair of atoms, is the one that
+explains most of what is left. A few states of the search go on side by side (a beam), because two
+atoms may explain together what neither explains alone. Constants inside atoms are then refined by
+Gauss–Newton with the coefficients projected out (variable projection; Golub & Pereyra 1973).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from gfnn_jax.models.textbook.arguments import Argument
+from gfnn_jax.models.textbook.atoms import Atom, Dictionary, gradient_of, weight_of
+
+_BEAM = 4  # states that go on
+_PAIRED = 160  # atoms, those that explain most, whose pairs are tried
+_BRANCHES = 4  # atoms, and pairs of them, that each state is continued by
+_INDEPENDENT = 1e-5  # of a column, that those before it do not span
+_HARDLY = 4.0  # times what a match leaves over, that a plainer one may leave
+_REFINEMENTS = 8  # Gauss–Newton steps of inner constants
+_FLOOR = 1e-13  # of what is left over: below it is roundoff
+SAID = 0.5  # halvings of what is left over that a unit of complexity must bring, of clean pairs
+
+
+@dataclasses.dataclass(frozen=True)
+class Match:
+    """Atoms beside the base and what they leave over: the RMS, as a part of the target's."""
+
+    atoms: tuple[Atom, ...]
+    left: float
+
+
+class Matching:
+    """The search for atoms that, beside a base, have the gradient ``target`` (rows,).
+
+    base: (rows, n) orthonormal columns that are always there. weight: (2d,) by which gradients are
+    multiplied. arguments: at the states of the rows. said: halvings of what is left over that a
+    unit of complexity must bring.
+    """
+
+    def __init__(
+        self, base: np.ndarray, target: np.ndarray, weight: np.ndarray, arguments: list[Argument],
+        said: float = SAID,
+    ):  # fmt: skip
+        self.weight, self.arguments, self._said = weight, arguments, said
+        self.base, self.target = base, target
+        self.size = float(np.linalg.norm(target))
+
+    def columns(self, atoms: Sequence[Atom]) -> np.ndarray:
+        """(rows, atoms): the weighted gradients."""
+        return np.stack([self._flat(gradient_of(a, self.arguments)) for a in atoms], axis=1)
+
+    def left_over(self, atoms: Sequence[Atom]) -> float:
+        """The part of the target that base and atoms do not explain."""
+        return float(np.linalg.norm(self._residual(atoms)[0])) / self.size
+
+    def best(self, dictionary: Dictionary, most: int) -> list[Match]:
+        """The matches of each number of atoms up to ``most`` that the search went on with, the
+        cheapest to say for what they leave over first."""
+        beam = [Match((), self.left_over(()))]
+        found = {frozenset[Atom](): beam[0]}
+        for _ in range(most):
+            grown: dict[frozenset[Atom], Match] = {}
+            for match in beam:
+                if len(match.atoms) < most:
+                    for more in self._continued(match, dictionary, most):
+                        refined = self.refined(match.atoms + more)
+                        grown.setdefault(frozenset(refined.atoms), refined)
+            if not grown:
+                break
+            beam = sorted(grown.values(), key=self.cost)[:_BEAM]
+            found.update({frozenset(m.atoms): m for m in beam})
+        return sorted(found.values(), key=self.cost)
+
+    def cost(self, match: Match) -> float:
+        """The logarithm of what is left over, and what there is to say of the atoms."""
+        return float(np.log2(max(match.left, _FLOOR)) + self._said * weight_of(match.atoms))
+
+    def plainer(self, match: Match, dictionary: Dictionary) -> Match:
+        """The match with each atom, in turn, in a plainer shape of the same argument, where that
+        leaves hardly more: what is left over is not yet that of the pairs."""
+        for i, atom in enumerate(match.atoms):
+            others = match.atoms[:i] + match.atoms[i + 1 :]
+            places = [f.place for f in atom]
+            said = weight_of((atom,))
+            own = [
+                j for j, a in enumerate(dictionary.atoms)
+                if [f.place for f in a] == places and weight_of((a,)) < said
+            ]  # fmt: skip
+            residual, basis, _ = self._residual(others)
+            if not own or not np.isfinite(residual).all():
+                continue
+            columns = dictionary.columns[:, own]
+            columns = columns - basis @ (basis.T @ columns)
+            size = np.linalg.norm(columns, axis=0)
+            part = np.where(size > _INDEPENDENT, residual @ columns, 0.0) / np.maximum(size, 1e-300)
+            first = _apart(np.argsort(-(part**2)), [dictionary.atoms[j] for j in own], _BRANCHES)
+            tried = [self.refined((*others, dictionary.atoms[own[k]])) for k in first]
+            best = min(tried, key=self.cost)
+            if best.left < _HARDLY * match.left:
+                match = best
+        return match
+
+    def refined(self, atoms: tuple[Atom, ...]) -> Match:
+        """The match with the inner constants that leave least."""
+        inner = [
+            (i, k) for i, atom in enumerate(atoms) for k, f in enumerate(atom)
+            if f.theta is not None
+        ]  # fmt: skip
+        left = self.left_over(atoms)
+        if not inner:
+            return Match(atoms, left)
+        damping = 0.0
+        for _ in range(_REFINEMENTS):
+            residual, basis, coefficients = self._residual(atoms)
+            slopes = np.stack(
+                [
+                    coefficients[i] * self._flat(gradient_of(atoms[i], self.arguments, along=k))
+                    for i, k in inner
+                ],
+                axis=1,
+            )
+            slopes = slopes - basis @ (basis.T @ slopes)
+            if not (np.isfinite(slopes).all() and np.isfinite(residual).all()):
+                break
+            size = np.linalg.norm(slopes, axis=0)
+            if not (size > 0).all():
+                break
+            better = None
+            for _ in range(4):
+                rows = np.vstack([slopes / size, damping * np.eye(len(inner))])
+                step = np.linalg.lstsq(rows, np.append(residual, np.zeros(len(inner))), rcond=1e-12)
+                tried = _moved(atoms, inner, step[0] / size)
+                there = self.left_over(tried)
+                if there < left:
+                    better = tried, there
+                    break
+                damping = max(10 * damping, 1e-2)
+            if better is None:
+                break
+            gained, damping = 1 - better[1] / left, 0.1 * damping if damping > 1e-3 else 0.0
+            atoms, left = better
+            if gained < 1e-3:
+                break
+        return Match(atoms, left)
+
+    def _residual(self, atoms: Sequence[Atom]):
+        """(what is left over, an orthonormal basis of base and atoms, the atoms' coefficients)."""
+        if not atoms:
+            return self.target - self.base @ (self.base.T @ self.target), self.base, np.zeros(0)
+        with np.errstate(all="ignore"):
+            columns = self.columns(atoms)
+        if not np.isfinite(columns).all():
+            return np.full_like(self.target, np.inf), self.base, np.zeros(len(atoms))
+        size = np.linalg.norm(columns, axis=0)
+        size = np.where(size > 0, size, 1.0)
+        part = columns / size
+        for _ in range(2):
+            part = part - self.base @ (self.base.T @ part)
+        q, r = np.linalg.qr(part)
+        good = np.abs(np.diag(r)) > 1e-12
+        basis = np.hstack([self.base, q[:, good]])
+        residual = self.target - self.base @ (self.base.T @ self.target)
+        coefficients = np.linalg.lstsq(part, residual, rcond=1e-13)[0] / size
+        for _ in range(2):
+            residual = residual - basis @ (basis.T @ residual)
+        return residual, basis, coefficients
+
+    def _continued(self, match: Match, dictionary: Dictionary, most: int) -> list[tuple[Atom, ...]]:
+        """The atoms, and pairs of atoms, that explain most of what a match leaves over."""
+        residual, basis, _ = self._residual(match.atoms)
+        if not np.isfinite(residual).all():
+            return []
+        own, columns = basis[:, self.base.shape[1] :], dictionary.columns
+        part, size = self._parts(residual, own, columns)
+        independent, gain = size > _INDEPENDENT, part**2
+        singles = _apart(np.argsort(-gain), dictionary.atoms, _BRANCHES)
+        found: list[tuple[Atom, ...]] = [(dictionary.atoms[i],) for i in singles]
+        if len(match.atoms) + 2 > most:
+            return found
+        top = np.argsort(-gain)[:_PAIRED]
+        top = top[independent[top]]
+        unit = (columns[:, top] - own @ (own.T @ columns[:, top])) / size[top]
+        gram = unit.T @ unit
+        a, b = part[top][:, None], part[top][None, :]
+        free = 1 - gram**2
+        with np.errstate(all="ignore"):
+            both = (a * a + b * b - 2 * gram * a * b) / free
+        both = np.where(free > 1e-7, both, 0.0)
+        order = np.argsort(-np.triu(both, 1), axis=None)[: 40 * _BRANCHES]
+        seen: set[tuple] = set()
+        for k in order:
+            i, j = divmod(int(k), len(top))
+            pair = dictionary.atoms[top[i]], dictionary.atoms[top[j]]
+            kind = tuple(tuple((f.place, f.kind) for f in atom) for atom in pair)
+            if kind not in seen:
+                seen.add(kind)
+                found.append(pair)
+            if len(seen) == _BRANCHES:
+                break
+        return found
+
+    def gains(self, match: Match, dictionary: Dictionary) -> np.ndarray:
+        """(atoms,): the part of the square of what a match leaves over that each atom explains."""
+        residual, basis, _ = self._residual(match.atoms)
+        part, _ = self._parts(residual, basis[:, self.base.shape[1] :], dictionary.columns)
+        return part**2 / max(float(residual @ residual), 1e-300)
+
+    @staticmethod
+    def _parts(residual, own: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(what of the residual lies along each column without what ``own`` spans of it, 0 where
+        little of it is left; the length of that). Columns are without the base already."""
+        size = np.sqrt(np.maximum(1 - np.sum((own.T @ columns) ** 2, axis=0), 0.0))
+        told = size > _INDEPENDENT
+        return np.where(told, residual @ columns / np.where(told, size, 1.0), 0.0), size
+
+    def _flat(self, gradient: np.ndarray) -> np.ndarray:
+        return (gradient * self.weight).ravel()
+
+
+def _apart(order: np.ndarray, atoms: list[Atom], count: int) -> list[int]:
+    """The first of each kind of atom, whatever its constant."""
+    seen: dict[tuple, int] = {}
+    for i in order[: 60 * count]:
+        kind = tuple((f.place, f.kind) for f in atoms[i])
+        seen.setdefault(kind, int(i))
+        if len(seen) == count:
+            break
+    return list(seen.values())
+
+
+def _moved(atoms, inner: list[tuple[int, int]], step) -> tuple[Atom, ...]:
+    moved = [list(atom) for atom in atoms]
+    for (i, k), change in zip(inner, step, strict=True):
+        factor = moved[i][k]
+        assert factor.theta is not None
+        # No constant more than doubles, or changes its sign, in a step.
+        change = float(np.clip(change, -0.7 * abs(factor.theta), abs(factor.theta)))
+        moved[i][k] = dataclasses.replace(factor, theta=factor.theta + change)
+    return tuple(map(tuple, moved))
+
+
+def orthonormal(columns: np.ndarray) -> np.ndarray:
+    """A basis of what the columns span."""
+    if not columns.shape[1]:
+        return columns
+    size = np.linalg.norm(columns, axis=0)
+    u, s, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
+    return u[:, s > 1e-12 * s[0]]
