@@ -25,6 +25,7 @@ from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import nearest_image
+from gfnn_jax.evaluate.gauge import beside_flow
 
 KICK, COUPLING_KICK, COUPLING, SITES = 0.6, 0.5, 0.1, 64
 NOISE = 1e-4
@@ -55,6 +56,11 @@ def ring(number: int, steps: int, seed: int) -> np.ndarray:
 
 def henon_heiles(number: int, steps: int, seed: int) -> np.ndarray:
     """x, y (number, steps + 1, 2) below E = 1/12, dt 0.5."""
+    return flow_of_henon_heiles(number, steps, seed)[..., :2]
+
+
+def flow_of_henon_heiles(number: int, steps: int, seed: int) -> np.ndarray:
+    """z = (q, p) (number, steps + 1, 4) of the same."""
     rng, starts = np.random.default_rng(seed), []
     while len(starts) < number:
         q, energy, angle = rng.uniform(-0.5, 0.5, 2), rng.uniform(0, 1 / 12), rng.uniform(0, 7)
@@ -71,7 +77,7 @@ def henon_heiles(number: int, steps: int, seed: int) -> np.ndarray:
         field, (0, 0.5 * steps), np.array(starts).T.ravel(), method="DOP853", rtol=1e-13,
         atol=1e-15, t_eval=0.5 * np.arange(steps + 1),
     )  # fmt: skip
-    return solution.y.reshape(4, number, -1).transpose(1, 2, 0)[..., :2]
+    return solution.y.reshape(4, number, -1).transpose(1, 2, 0)
 
 
 def recorded(q: np.ndarray, dt: float, angles: bool) -> gfnn.Recording:
@@ -113,7 +119,9 @@ def measured(
         "cpu_seconds": seconds,
     }  # fmt: skip
     if test.shape[2] == 2:
-        found["mass_ratio"] = mass_ratio(fit)
+        z = flow_of_henon_heiles(400, 1, SEED + 2)
+        beside = beside_flow(fit.map, gfnn.Pairs(z[:, 0], z[:, 1], dt))
+        found |= {"mass_ratio": mass_ratio(fit), "beside_flow": beside._asdict()}
     return found
 
 
@@ -249,6 +257,15 @@ def tables() -> None:
     heads = ("from positions alone", "triples", "terms of S", "one step, RMS", "median error",
              "‖MᵀJM − J‖", "mass ratio", "CPU s")  # fmt: skip
     text = markdown(heads, rows)
+    beside = found.get("henon-heiles", {}).get("measured", {}).get("beside_flow")
+    if beside is not None:
+        text += (
+            f"\n\nHénon–Heiles beside its flow, whose momenta no fit saw: p' = c p with c = "
+            f"{beside['factor']:.12f}, what is left of p' {number(beside['momenta'])}, ∇f "
+            f"{number(beside['gauge'])} of it (S is symmetric); a step's positions differ by "
+            f"{number(beside['positions'])} of their spread, its momenta by "
+            f"{number(beside['images'])}."
+        )
     if "henon-heiles-noise" in found:
         m = found["henon-heiles-noise"]["measured"]
         rows = [

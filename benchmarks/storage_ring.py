@@ -24,7 +24,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from harness import (
-    FIGURES,
     SEED,
     TABLES,
     Numbers,
@@ -251,6 +250,18 @@ def tune(signal, near: float | None = None) -> float:
     return float(found.x % 1.0)
 
 
+def followed(signals, linear) -> np.ndarray:
+    """Tunes (N, 2) of orbits (turns, N, 2) of rising amplitude, each by the line of its own plane:
+    the one next to where the tunes before lead, from the ``linear`` ones on."""
+    found = np.empty(signals.shape[1:])
+    for k, first in enumerate(linear):
+        near = first
+        for i in range(len(found)):
+            found[i, k] = tune(signals[:, i, k], near)
+            near = 2 * found[i, k] - found[i - 1, k] if i else found[i, k]
+    return found
+
+
 def tunes(quick: bool) -> Numbers:
     """Tunes against amplitude, of the map in one piece and of the tracking code."""
     err = ring("err.mat")
@@ -267,7 +278,9 @@ def tunes(quick: bool) -> Numbers:
 
     def found(states) -> np.ndarray:
         signals = err.normalised(states)  # (turns + 1, N, 2)
-        return np.array([[tune(signals[:, i, k]) for k in (0, 1)] for i in range(len(start))])
+        along_x, along_y = np.split(signals, 2, axis=1)
+        linear = tune(along_x[:, 0, 0]), tune(along_y[:, 0, 1])
+        return np.concatenate([followed(part, linear) for part in (along_x, along_y)])
 
     theirs, rows = found(orbits), {}
     for cuts in ((0, 4),) if quick else ((0, 4), (0, 2, 4)):
@@ -480,7 +493,9 @@ PIECES = {
 
 
 def tables() -> None:
-    """The tables of RESULTS.md and the figure."""
+    """The tables of RESULTS.md and the figures."""
+    from ring_figures import maps_of_frequencies, tunes_and_aperture
+
     found = results(PIECES, "ring")
     text = []
     if "turn" in found:
@@ -555,65 +570,11 @@ def tables() -> None:
     if text:
         between_markers(TABLES, "ring", "\n\n".join([*text, provenance(found)]))
     if {"tunes", "aperture"} <= set(found):
-        figure(found["tunes"]["measured"], found["aperture"]["measured"])
+        tunes_and_aperture(found["tunes"]["measured"], found["aperture"]["measured"])
     if {"deviation", "frequencies"} <= set(found):
-        second_figure(found["deviation"]["measured"], found["frequencies"]["measured"])
-
-
-def figure(tunes_: Numbers, aperture_: Numbers) -> None:
-    """Tunes against amplitude, and the dynamic aperture, of map and tracking."""
-    import matplotlib.pyplot as plt
-
-    drawn, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-    amplitudes = 1e3 * np.asarray(tunes_["amplitudes"])
-    theirs = np.asarray(tunes_["tracked"])
-    ours = np.asarray(next(iter(tunes_["learned"].values())))
-    for plane, (name, colour) in enumerate((("x", "C0"), ("y", "C1"))):
-        rows = slice(plane * len(amplitudes), (plane + 1) * len(amplitudes))
-        for k, style in enumerate(("-", "--")):
-            label = f"$\\nu_{'xy'[k]}$ against {name}"
-            shift = theirs[rows, k] - theirs[rows, k][0]
-            left.plot(amplitudes, 1e3 * shift, style, color=colour, label=label)
-            left.plot(amplitudes, 1e3 * (ours[rows, k] - theirs[rows, k][0]), ".", color=colour)
-    left.set(xlabel="amplitude [mm]", ylabel="tune shift × 1,000", title="tracking, and map (dots)")
-    left.legend(fontsize=8)
-    angles = np.asarray(aperture_["angles"])
-    for name, style in (("tracking", "-"), ("map", "o")):
-        radii = 1e3 * np.asarray(aperture_[name], float)
-        right.plot(radii * np.cos(angles), radii * np.sin(angles), style, label=name)
-    right.set(xlabel="x [mm]", ylabel="y [mm]", title="dynamic aperture of a cell")
-    right.legend(fontsize=8)
-    drawn.savefig(FIGURES / "storage-ring.png", dpi=150)
-
-
-def second_figure(deviation_: Numbers, frequencies_: Numbers) -> None:
-    """Frequency maps of map and tracking, sections, and the tunes against δ."""
-    import matplotlib.pyplot as plt
-
-    drawn, axes = plt.subplots(2, 2, figsize=(9, 6.6), layout="constrained")
-    side = frequencies_["side"]
-    x, y = (1e3 * np.linspace(0.04, 1, side) * size for size in REGION)
-    for axis, name in zip(axes[0], ("tracking", "map"), strict=True):
-        values = np.array(frequencies_[name], float).reshape(side, side)
-        shown = axis.pcolormesh(x, y, values, vmin=-10, vmax=-2, cmap="viridis", rasterized=True)
-        axis.set(xlabel="x [mm]", ylabel="y [mm]", title=f"frequency map of a cell, {name}")
-    drawn.colorbar(shown, ax=axes[0], label="log₁₀ of the tunes' change")
-    section, of_delta = axes[1]
-    for name, colour, size in (("tracking", "k", 3.0), ("map", "C1", 0.8)):  # the map on top
-        points = 1e-3 * np.array(frequencies_["sections_micro"][name])  # (turns, orbits, 2)
-        x, y = points[..., 0].ravel(), points[..., 1].ravel()
-        section.plot(x, y, f"{colour}o", markersize=size, markeredgewidth=0)
-        section.plot([], [], f"{colour}o", markersize=3, label=name)
-    section.set(xlabel="x [mm]", ylabel="$p_x$ [10⁻³]", title="section of a cell, y = 0")
-    section.legend(fontsize=8, loc="upper right")
-    delta = 100 * np.asarray(deviation_["delta"])
-    for k, colour in enumerate(("C0", "C1")):
-        theirs, ours = (np.asarray(deviation_[name])[:, k] for name in ("tracked", "learned"))
-        of_delta.plot(delta, theirs, colour, label=f"$\\nu_{'xy'[k]}$")
-        of_delta.plot(delta, ours, f"{colour}o", markersize=4)
-    of_delta.set(xlabel="δ [%]", ylabel="tune", title="a ring with errors: tracking, map (dots)")
-    of_delta.legend(fontsize=8)
-    drawn.savefig(FIGURES / "storage-ring-frequencies.png", dpi=150)
+        maps_of_frequencies(
+            found["deviation"]["measured"], found["frequencies"]["measured"], REGION
+        )
 
 
 if __name__ == "__main__":

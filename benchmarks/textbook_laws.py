@@ -8,6 +8,7 @@ system makes round (1, ½) the values are odd, so that none is met by chance.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 
 import numpy as np
@@ -19,6 +20,8 @@ from gfnn_jax.phase_space import TIME, apply_j
 
 _PRECISE = 1e-13
 _TOGETHER = 50  # pairs that share the steps of one integration
+_DRAWS = 40  # of so many orbits as are wanted, among which enough are bound
+_SUBSTEPS = 8  # of a step of a noisy orbit
 # What a law consists of, by which the results are counted.
 POLYNOMIAL, CONSTANTS, MASSES, LATTICE, DRIVEN, MODES = (
     "polynomial", "constants or roots", "mass matrix", "lattice or bodies", "driven", "modes"
@@ -71,7 +74,7 @@ class Law:
 
     def gradient(self, z, t=None) -> np.ndarray:
         """∇H (n, 2d) at states z (n, 2d), of a drive at the times t (n,)."""
-        family = given_terms(self.dim, list(self.terms), self.parameters)
+        family = _family(self.dim, tuple(self.terms), self.parameters)
         args = None if t is None else np.reshape(t, (-1, 1))
         return family.gradient(np.array(list(self.terms.values())), z, args)
 
@@ -104,6 +107,62 @@ class Law:
         ]  # fmt: skip
         return np.stack([s.y[:, -1] for s in solved])
 
+    def sequences(self, count: int, states: int, noise: float, seed: int) -> gfnn.Pairs:
+        """The pairs of so many orbits of so many measured states, with normal noise of this part of
+        each coordinate's spread. Orbits stay within what H allows and a box twice as wide."""
+        rng = np.random.default_rng(seed)
+        middle = 0.5 * (np.array(self.low) + np.array(self.high))
+        half = 0.5 * (np.array(self.high) - np.array(self.low))
+        bounded = [i for i in range(2 * self.dim) if i not in self.angles]
+        limits = given_terms(self.dim, list(self.within)) if self.within else None
+        orbits, times = np.zeros((0, states, 2 * self.dim)), np.zeros(0)
+        for _ in range(_DRAWS):
+            z = self.states(count, rng)
+            t0 = np.zeros(count) if self.period is None else rng.uniform(0, self.period, count)
+            drawn = np.empty((count, states, 2 * self.dim))
+            drawn[:, 0] = z
+            with np.errstate(all="ignore"):
+                for k in range(1, states):
+                    t = None if self.period is None else t0 + (k - 1) * self.dt
+                    drawn[:, k] = self._stepped(drawn[:, k - 1], t)
+            inside = (np.abs(drawn - middle) <= 2 * half)[..., bounded].all(axis=(1, 2))
+            if limits is not None:
+                for j, (least, most) in enumerate(self.within.values()):
+                    value = limits.take((j,)).value(np.ones(1), drawn)
+                    inside &= ((value >= least) & (value <= most)).all(axis=1)
+            orbits, times = np.concatenate([orbits, drawn[inside]]), np.append(times, t0[inside])
+            if len(orbits) >= count:
+                break
+        else:
+            raise ValueError(f"expected a box of more bound orbits, found {len(orbits)}")
+        orbits, times = orbits[:count], times[:count]
+        spread = orbits.reshape(-1, 2 * self.dim).std(axis=0)
+        orbits = orbits + noise * spread * rng.normal(size=orbits.shape)
+        run = np.repeat(np.arange(count), states - 1)
+        drive = {}
+        if self.period is not None:
+            drive = {"t0": (times[:, None] + self.dt * np.arange(states - 1)).ravel(),
+                     "period": self.period}  # fmt: skip
+        return gfnn.Pairs(
+            orbits[:, :-1].reshape(-1, 2 * self.dim), orbits[:, 1:].reshape(-1, 2 * self.dim),
+            self.dt, run=run, place=np.tile(np.arange(states - 1), count), **drive,
+        )  # fmt: skip
+
+    def _stepped(self, z, t=None) -> np.ndarray:
+        """The states (n, 2d) after dt by the classical Runge–Kutta method, to far below 1e-3."""
+        h = self.dt / _SUBSTEPS
+
+        def field(z, after):
+            return apply_j(self.gradient(z, None if t is None else t + after))
+
+        for k in range(_SUBSTEPS):
+            k1 = field(z, k * h)
+            k2 = field(z + 0.5 * h * k1, (k + 0.5) * h)
+            k3 = field(z + 0.5 * h * k2, (k + 0.5) * h)
+            k4 = field(z + h * k3, (k + 1) * h)
+            z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return z
+
     def pairs(self, count: int, seed: int) -> gfnn.Pairs:
         """Pairs drawn with this seed."""
         rng = np.random.default_rng(seed)
@@ -112,6 +171,11 @@ class Law:
             return gfnn.Pairs(z, self.images(z), self.dt)
         t0 = rng.uniform(0, self.period, count)
         return gfnn.Pairs(z, self.images(z, t0), self.dt, t0=t0, period=self.period)
+
+
+@functools.lru_cache(4)
+def _family(dim: int, terms: tuple[str, ...], parameters: tuple[str, ...]):
+    return given_terms(dim, terms, parameters)
 
 
 def _kinetic(dim: int) -> dict[str, float]:

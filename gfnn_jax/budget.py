@@ -21,10 +21,18 @@ MAX_SECONDS = 120.0  # of a fit that is told of no budget
 
 # Operations a second of a quiet core by kind of work, until units of a kind have been measured:
 # rows folded into a factor, singular values, flows and their derivatives in NumPy, atoms of laws
-# matched to gradients, iterations of a network. What is compiled is counted in seconds.
+# matched to gradients, iterations of a network. Compiling and reading are counted in seconds.
 ROWS, SOLVE, FLOW, NETWORK, COMPILE = "rows", "solve", "flow", "network", "compile"
-MATCHING = "matching"
-_RATES = {ROWS: 1e10, SOLVE: 2e10, FLOW: 5e8, MATCHING: 1e8, NETWORK: 5e9, COMPILE: 1.0}
+MATCHING, READING = "matching", "reading"
+RATES = {
+    ROWS: 1e10,
+    SOLVE: 2e10,
+    FLOW: 5e8,
+    MATCHING: 1e8,
+    NETWORK: 5e9,
+    COMPILE: 1.0,
+    READING: 1.0,
+}
 # Seconds, at these rates, of a unit that tells its kind's own: of shorter ones most is overhead.
 _TELLING = 0.1
 # Seconds that compiling a step takes, by 2d: small eliminations are unrolled, and larger ones call
@@ -64,9 +72,10 @@ _NO_TIME = "there was no time for"
 class Budget:
     """The units that a fit has done, and whether the next one fits.
 
-    max_seconds: since its making; None: the clock decides nothing. max_operations: of all units,
-    as predicted; None: no bound. clock: gives seconds. dim: of the map whose step is compiled in
-    the end: the time for that is reserved. None: nothing is.
+    max_seconds: since its making, with those ``spent`` before it, as on reading files; None: the
+    clock decides nothing. max_operations: of all units, as predicted; None: no bound. clock: gives
+    seconds. dim: of the map whose step is compiled in the end: the time for that is reserved. None:
+    nothing is.
 
     compiling: seconds that compiling the step takes, about.
     ended: why a unit did not fit, "" as long as all do. operations: of the units that were done.
@@ -76,10 +85,11 @@ class Budget:
     def __init__(
         self, max_seconds: float | None = None, max_operations: int | None = None,
         clock: Callable[[], float] = time.perf_counter, dim: int | None = None,
+        spent: float = 0.0,
     ):  # fmt: skip
         self.max_seconds, self.max_operations = max_seconds, max_operations
         self.ended, self.operations, self.left_out = "", 0, list[str]()
-        self._clock, self._started = clock, clock()
+        self._clock, self._started = clock, clock() - spent
         self._done, self._last, self._closed = 0, "", False
         self._measured: dict[str, tuple[float, float]] = {}  # kind -> operations, seconds
         self._reserved: dict[str, float] = {}  # kind -> operations that follow the search
@@ -87,7 +97,7 @@ class Budget:
 
     @property
     def seconds(self) -> float:
-        """Since its making."""
+        """Since its making, with those spent before it."""
         return self._clock() - self._started
 
     @property
@@ -181,14 +191,14 @@ class Budget:
 
     def _foretold(self, kind: str, operations: float) -> float:
         """Seconds of so many operations."""
-        done, seconds = self._measured.get(kind, (_RATES[kind], 1.0))
+        done, seconds = self._measured.get(kind, (RATES[kind], 1.0))
         return operations * seconds / done
 
     @contextlib.contextmanager
     def _timed(self, kind: str, operations: float) -> Iterator[None]:
         started = self._clock()
         yield
-        if operations >= _TELLING * _RATES[kind]:
+        if operations >= _TELLING * RATES[kind]:
             done, seconds = self._measured.get(kind, (0.0, 0.0))
             self._measured[kind] = done + operations, seconds + self._clock() - started
 

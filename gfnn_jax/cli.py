@@ -142,7 +142,7 @@ def _look(arguments: argparse.Namespace) -> None:
         print(f"figure: {figure}")
     wrong = sum(fault.wrong for fault in summary.faults)
     if arguments.strict and wrong:
-        raise WorkError(f"{arguments.data[0]}: wrong in {wrong} ways (--strict)")
+        raise WorkError(f"{arguments.data[0]}: mistakes found: {wrong} (--strict)")
 
 
 def _fit(arguments: argparse.Namespace) -> None:
@@ -393,6 +393,8 @@ def _summarise(ran: Any, out: Path) -> None:
     )
     if report["hamiltonian"] is not None:
         print(law_line(report))
+        for note in report["hamiltonian"]["notes"]:
+            print(note)
         for loss in report["hamiltonian"]["friction"]:
             print(f"{loss['term']}: {loss['coefficient']:.6g} ± {loss['std']:.1g}")
     print(fit["ended"])

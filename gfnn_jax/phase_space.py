@@ -132,7 +132,8 @@ class Pairs:
     along its run, (N,) integers. A fit sorts pairs that have a run by run and place. Where places
     are missing, it finds them by the images that are states of other pairs.
     std: standard deviation of the noise on each measured coordinate, (2d,), or on each value of
-    both states of a pair, (N, 2d), in the user's units. With None it is estimated.
+    both states of a pair, (N, 2d), in the user's units: the fits of S and H weight pairs by those
+    of each value. With None it is estimated.
 
     Raises FitError where the arrays do not have these shapes.
     """

@@ -140,3 +140,29 @@ class Kicks:
         force = np.linalg.lstsq(design, p1 - p0, rcond=None)[0]
         piece = Verlet(force, float(data.dt))
         return gfnn.Fitted(piece, f"kicks {size}", size + 1, 8.0 * size)
+
+
+@gfnn.register
+@dataclasses.dataclass(frozen=True)
+class HeavyTails:
+    """ν log(1 + r²/ν): noise of Student's t with ν degrees of freedom."""
+
+    nu: float = 2.0
+
+    def of(self, residuals):
+        return self.nu * np.log1p(residuals**2 / self.nu)
+
+    def weights(self, residuals):
+        return 1 / (1 + residuals**2 / self.nu)
+
+
+@gfnn.register
+@dataclasses.dataclass(frozen=True)
+class Normal:
+    """r²: normal noise, least squares."""
+
+    def of(self, residuals):
+        return residuals**2
+
+    def weights(self, residuals):
+        return np.ones_like(residuals)

@@ -15,6 +15,7 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.jobs.predict import predict
 from gfnn_jax.maps.bands import bands, horizon
+from gfnn_jax.models.generating_functions.map_of_terms import learn_map
 from gfnn_jax.models.generating_functions.sweeps import LinearSweep
 from gfnn_jax.scenes import henon_heiles
 
@@ -282,3 +283,41 @@ def test_what_is_no_noise_of_initial_states_is_refused(noisy, tmp_path):
     noisy[1].map.save(tmp_path / "model")
     with pytest.raises(InputError, match="--horizon needs --samples"):
         predict(tmp_path / "model", path, num_steps=2, out=tmp_path / "out.npz", horizon_size=1.0)
+
+
+def strong_kicks(z, k):
+    """Images of states (N, 2) under standard maps of strengths k (N,)."""
+    p = z[:, 1] + k * np.sin(z[:, 0])
+    return np.stack([z[:, 0] + p, p], axis=1)
+
+
+@pytest.fixture(scope="module")
+def kicked():
+    """600 pairs with noise of standard maps of several strengths, which are told."""
+    rng = np.random.default_rng(0)
+    z, k = rng.uniform(-1, 1, (600, 2)), rng.uniform(0.5, 1.0, 600)
+    noisy = (x + 1e-3 * rng.normal(size=x.shape) for x in (z, strong_kicks(z, k)))
+    return gfnn.Pairs(*noisy, 1.0, args={"k": k})
+
+
+def test_the_posterior_of_s_with_parameters_tells_noise_from_misfit(kicked):
+    data, rng = Dataset.of(kicked, CARTESIAN), np.random.default_rng(1)
+    data = data.trained_on(np.arange(500)).validated_on(np.arange(500, 600))
+    found = learn_map(data, Tolerance(1e-8), chart="type2")
+    z, args = rng.uniform(-0.8, 0.8, (200, 2)), rng.uniform(0.6, 0.9, (200, 1))
+    image, piece = strong_kicks(z, args[:, 0]), found.piece
+    point, aim = TYPE2.evaluation_point(z, image), TYPE2.target_gradient(z, image, 1.0)
+    error = piece.family.gradient(np.asarray(piece.params), point, args) - aim
+    slopes = piece.family.term_gradients(point, args)
+    std = np.linalg.norm(slopes @ found.covariance().T, axis=-1)
+    assert 0.5 < np.sqrt(np.mean(std**2) / np.mean(error**2)) < 2
+
+
+def test_bands_of_a_polynomial_with_parameters(kicked):
+    with pytest.warns(gfnn.FitWarning):
+        fit = gfnn.fit(kicked, angles=(0,), family="polynomial", chart="type2", tolerance=1e-8)
+    rng = np.random.default_rng(1)
+    z, k = rng.uniform(-0.8, 0.8, (40, 2)), rng.uniform(0.6, 0.9, 40)
+    states, info = fit.map.rollout(z, 1, params=k[:, None], samples=30, key=jax.random.key(0))
+    error = np.asarray(states)[:, 1] - strong_kicks(z, k)
+    assert 0.7 < np.median(2 * info.bands.std[:, 1]) / np.sqrt(np.mean(error**2)) < 4

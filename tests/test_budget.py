@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import time
+import warnings
 from functools import partial
 
 import jax
@@ -323,6 +324,19 @@ def test_a_fit_leaves_some_map_whatever_its_budget():
         assert "there was no time" in fit.ended
         moved = np.asarray(pairs.z1) - np.asarray(pairs.z0)
         assert fit.chosen.validation_rms < 0.5 * np.sqrt(np.mean(moved**2))
+
+
+def test_seconds_that_are_gone_already_count():
+    hand = Hand()
+    budget = Budget(max_seconds=10.0, clock=hand, spent=9.5)
+    assert budget.seconds == 9.5
+    with pytest.raises(OutOfTime):
+        moved(budget, hand, LARGE, 1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)
+        fit = gfnn.fit(kepler(), max_seconds=10.0, clock=hand, spent=9.9)
+    assert fit.chosen.family == "linear"
+    assert "there was no time for one unit" in fit.ended
 
 
 @QUIETLY

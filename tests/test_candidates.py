@@ -15,6 +15,7 @@ from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.models.generating_functions import sweeps
+from gfnn_jax.models.generating_functions.parity import is_even
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.search.search import search
 from gfnn_jax.storage.factors import KeptFactors
@@ -76,7 +77,7 @@ def test_a_size_too_large_to_count_is_never_looked_at():
         return Products(inputs, degree)
 
     groups = (map(family, group) for group in sweeps._DEGREES)
-    kept = list(itertools.chain(*sweeps._determined(groups, 10**6)))
+    kept = list(itertools.chain(*sweeps._determined(groups, 10**6, sweeps._ROWS_PER_TERM)))
     assert [f.degree for f in kept] == [2, 3, 4]
     assert looked_at == [2, 3, 4, 5]
 
@@ -164,7 +165,7 @@ def test_an_even_generating_function_is_known_by_its_pairs(odd, even, monkeypatc
     p = p - 0.1 * (q + q**3 / 2 + odd * q**2)
     pairs = Pairs(z, np.concatenate([q + 0.1 * p, p], axis=1), 0.1)
     data = Dataset.of(identified(pairs).pairs, Coordinates("cartesian")).divided(0)
-    assert sweeps.is_even(data) == even
+    assert is_even(data, (2, 4, 6), 300, 3) == even
     (found,) = sweeps.sweeps_for("polynomial", [MIDPOINT], data, Tolerance(1e-6), None)
     assert [size.family.degree for size in found.sizes] == ([2, 4] if even else [2, 3, 4])
     if even:

@@ -8,7 +8,9 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import gfnn_jax as gfnn
-from gfnn_jax.coordinates import nearest_image
+from gfnn_jax.coordinates import CARTESIAN, nearest_image
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.diagnosis import damping
 from gfnn_jax.evaluate.orbits import periodic_orbit, rotation_number
 from gfnn_jax.evaluate.report import assemble
 from gfnn_jax.phase_space import Pairs, symplectic_form
@@ -233,3 +235,30 @@ def test_a_periodic_orbit_closes_and_loses_area(learned):
     assert (np.abs(orbit.eigenvalues) < 1).all()
     with pytest.raises(ValueError, match="found none"):
         periodic_orbit(fit.map, np.array([np.nan, 0.0]), 1)
+
+
+@pytest.mark.parametrize("b", [1.0, 0.99])
+def test_of_many_pairs_a_sample_tells_whether_areas_are_lost(b, monkeypatch):
+    """Jacobians that are certain of a change, by their own error, do not make a fit look at all
+    pairs; what is lost indeed is learned from all of them."""
+    looked_at = []
+    fitted = damping._Problem.fitted
+
+    def counted(self, *given):
+        looked_at.append(len(self.data.training))
+        return fitted(self, *given)
+
+    monkeypatch.setattr(damping._Problem, "fitted", counted)
+    monkeypatch.setattr(damping, "_SAMPLE", 100)
+    z = np.random.default_rng(0).uniform(-1, 1, (3_000, 2))
+    p = z[:, 1] - 0.4 * np.sin(z[:, 0])
+    image = np.stack([z[:, 0] + 0.4 * p, b * p], axis=1)
+    data = Dataset.of(Pairs(z, image, 0.4), CARTESIAN).divided(0)
+    jacobians = np.tile(np.sqrt(min(b, 1 - 1e-6)) * np.eye(2), (400, 1, 1))
+    found = damping.learn_damping(data, jacobians, 0.0, "auto", None)
+    if b == 1:
+        assert found is None
+        assert set(looked_at) == {100}
+    else:
+        np.testing.assert_allclose(found.factor, b, rtol=1e-6)
+        assert max(looked_at) == len(data.training)

@@ -1,6 +1,7 @@
 """Runs keep their identity from the file to the report; who trains, who chooses, who states."""
 
 import itertools
+import re
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ from gfnn_jax.data.files import read_trajectories
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.dataset.bounds import bound_of_mean
 from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified, next_of, steps_between
 from gfnn_jax.dataset.split import correlation_time, split_rows
+from gfnn_jax.learn.stated import of_few
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.processes import Group
 
@@ -352,3 +355,15 @@ def test_noise_of_each_value_stays_with_its_row():
     few = data.take(np.array([3, 8]))
     np.testing.assert_array_equal(few.noise, std[[3, 8]])
     np.testing.assert_allclose(few.noise_of_channels, np.sqrt(np.mean(std[[3, 8]] ** 2, axis=0)))
+
+
+def test_errors_that_few_states_make_are_told():
+    """Those of a tail without a variance, and not those of noise; nor where they do not matter."""
+    rng, tolerance = np.random.default_rng(0), Tolerance(1e-6)
+    normal = np.abs(1e-4 * rng.normal(size=400))
+    heavy = 1e-5 * rng.pareto(0.5, 400)
+    assert of_few(normal, tolerance) == ""
+    told = of_few(heavy, tolerance)
+    limit = float(re.search(r"less than (\S+) of the spread", told)[1])
+    assert np.mean(1e-5 * rng.pareto(0.5, 100_000) > limit) < 0.1
+    assert of_few(1e-13 * heavy, tolerance) == ""

@@ -197,6 +197,20 @@ def test_the_same_sample_of_any_number_of_processes(num_pairs, tmp_path, in_thre
     assert read_sample(names[0], num_pairs=50, group=Group()).digest != found[0].digest
 
 
+def test_a_sample_of_any_number_of_processes_keeps_runs_and_places(tmp_path, in_threads):
+    """Each row says of which sequence of the file it is, and where along it."""
+    states, path = np.random.default_rng(0).normal(size=(4, 300, 2)), tmp_path / "runs.npz"
+    np.savez(path, trajectories=states, dt=DT)
+    for count in (1, 2, 3):
+        sample = in_threads(count, lambda g: read_sample(path, num_pairs=400, group=g))[0]
+        run, place, rows = sample.run, sample.place, sample.states.reshape(-1, 2, 2)
+        assert 350 <= len(rows) <= 400
+        np.testing.assert_array_equal(rows[:, 0], states[run, place])
+        np.testing.assert_array_equal(rows[:, 1], states[run, place + 1])
+        assert len(np.unique(run)) > 1
+        assert np.sum((np.diff(run) == 0) & (np.diff(place) == 1)) > 0.9 * len(rows)
+
+
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_a_process_may_have_no_pair(order, tmp_path, in_threads):
     """Sequences of one state."""

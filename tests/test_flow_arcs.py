@@ -13,6 +13,7 @@ from gfnn_jax.fitting import least_squares
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.models.hamiltonians.flow_arcs import FlowOnArcs, fit_flow, longest_arc
+from gfnn_jax.models.hamiltonians.whole_sequences import about_outliers
 from gfnn_jax.scenes import henon_heiles
 from gfnn_jax.solve.latent_arcs import OUTLYING
 
@@ -207,3 +208,14 @@ def test_maps_are_drawn_of_an_s_of_sites():
     off = (drawn.mean(axis=0) - np.asarray(clean)) / drawn.std(axis=0)
     assert np.all(np.abs(off) < 4)
     assert np.all(drawn.std(axis=0) < 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("beside", "says"), [(0.0, "outliers"), (4.0, "the law misses 2 of 100 measured states")]
+)
+def test_states_in_a_row_are_no_outliers(beside, says):
+    residuals = np.random.default_rng(0).uniform(-1, 1, (5, 20, 2))
+    residuals[[1, 3], [4, 19], 0] = 6.0
+    residuals[[1, 3], [5, 18], 1] = beside
+    (told,) = about_outliers(residuals)
+    assert says in told

@@ -152,3 +152,13 @@ def test_energy_does_not_drift():
     assert (info.status <= LEFT_DOMAIN).all()
     energy = FAMILY.value(C, np.asarray(states))
     assert np.abs(energy / energy[:, :1] - 1).max() < 5e-14
+
+
+def test_coordinates_of_very_different_sizes_keep_all_digits():
+    """A pendulum in units of 1e6 and 1e-3 has the images of the pendulum in plain units."""
+    units, steps = np.array([1e6, 1e-3]), Steps(8, 2)
+    z = np.random.default_rng(0).uniform(-1, 1, (50, 2))
+    plain = images(given_terms(1, ["p1**2/2 - cos(q1)"]), np.ones(1), z, 0.2, steps).states
+    family = given_terms(1, ["5e8*p1**2 - 1000*cos(1e-6*q1)"])
+    found = images(family, np.ones(1), z * units, 0.2, steps, scale=units).states
+    np.testing.assert_allclose(found / units, plain, atol=2e-15)

@@ -33,6 +33,11 @@ def test_a_sample_knows_precision_and_units_as_the_whole_does(tmp_path):
     assert read_sample(tmp_path / "z.csv").units == {"q1": "km", "p1": "km/s"}
 
 
+def test_a_sample_knows_of_how_many_pairs_it_is(file):
+    assert read_sample(file, num_pairs=500).sampled == 3_000
+    assert read_trajectories(file).sampled is None
+
+
 def test_a_sample_is_of_the_files_own_pairs_each_once(file):
     whole = read_trajectories(file).pairs()
     sample = read_sample(file, num_pairs=500, seed=1)
@@ -69,6 +74,18 @@ def test_all_pairs_fit_better_than_the_sample(file, tmp_path, monkeypatch):
 
     # 15 times the pairs: the error that the noise leaves falls by about √15.
     assert error(ran.fit.map) < 0.6 * error(sample.map)
+
+
+@pytest.mark.slow
+def test_a_refit_that_does_not_fit_into_the_budget_is_left_out(file, tmp_path, monkeypatch):
+    monkeypatch.setattr(fit_job, "_LARGE_BYTES", 0)
+    monkeypatch.setattr(fit_job, "read_sample", functools.partial(read_sample, num_pairs=200))
+    monkeypatch.setattr(fit_job, "work_of_refit", lambda *given: 1e6)
+    with pytest.warns(gfnn.FitWarning, match="a sample of 200 pairs, not to all of them: no time"):
+        ran = fit_job.fit(file, out=tmp_path / "m", scene_name="standard-map-regular",
+                          tolerance=1e-3, chart="type2", max_seconds=600.0)  # fmt: skip
+    assert ran is not None
+    assert ran.report["data"]["num_pairs"] == 200
 
 
 def test_chunks_of_a_file_are_its_pairs(file):

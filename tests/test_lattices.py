@@ -526,3 +526,16 @@ def test_too_few_sites_or_pairs_are_refused():
         gfnn.fit(gfnn.Pairs(*(RNG.normal(size=(2, 20, 4))), 0.1), structure="ring")
     with pytest.raises(gfnn.FitError, match="at least 8 pairs, got 3"):
         gfnn.fit(gfnn.Pairs(*(RNG.normal(size=(2, 3, 40))), 0.1), structure="ring")
+
+
+@pytest.mark.slow
+def test_the_posterior_of_sites_tells_noise_from_misfit():
+    """A larger library leaves the noise too: standard errors are those of independent noise."""
+    family, params = springs(8)
+    clean = drawn(8, 60, family, params, 0.2)
+    noisy = (np.asarray(z) + 1e-3 * RNG.normal(size=z.shape) for z in (clean.z0, clean.z1))
+    with pytest.warns(gfnn.FitWarning):
+        fit = gfnn.fit(gfnn.Pairs(*noisy, 0.2), structure="ring", learn="hamiltonian")
+    alike = np.array([term.std for term in fit.hamiltonian.terms])
+    ratio = np.linalg.norm(fit.hamiltonian.root, axis=0) / alike
+    assert np.all((ratio > 0.5) & (ratio < 2))

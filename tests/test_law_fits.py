@@ -10,9 +10,18 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, Friction, Lagrangian, Terms
+from gfnn_jax.families.lagrangian import (
+    DRY,
+    LINEAR,
+    QUADRATIC,
+    UNIFORM,
+    Friction,
+    Lagrangian,
+    Terms,
+)
 from gfnn_jax.flows.motion import Form
-from gfnn_jax.flows.schedules import interpolate
+from gfnn_jax.flows.schedules import at_stages, interpolate
+from gfnn_jax.jobs.forecast import forecast_recording
 from gfnn_jax.models.lagrangians.text import speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
 from gfnn_jax.solve.latent_arcs import Observed, Steps, fit_arcs, rows_of_arcs
@@ -28,17 +37,18 @@ def pendulum(gamma=0.05, noise=1e-3, end=40.0, dt=0.05, amplitude=1.2):
     return t, found.y[0] + noise * np.random.default_rng(0).normal(size=len(t))
 
 
-def chain(noise=1e-3, runs=3, end=12.0, dt=0.02):
-    """A double pendulum with linear friction, by SciPy from its own equations of motion."""
+def chain(noise=1e-3, runs=3, end=12.0, dt=0.02, uniform=0.0):
+    """A double pendulum with linear friction, or with uniform friction, by SciPy from its own
+    equations of motion."""
+    linear = np.array([0.03, 0.02]) if uniform == 0 else np.zeros(2)
     tables, rng = [], np.random.default_rng(1)
 
     def rate(_, x):
         (q1, q2), v = x[:2], x[2:]
         c, s = np.cos(q1 - q2), np.sin(q1 - q2)
         M = np.array([[1.0, 0.4 * c], [0.4 * c, 0.5]])
-        force = [-0.4 * s * v[1] ** 2 - 20 * np.sin(q1) - 0.03 * v[0],
-                 0.4 * s * v[0] ** 2 - 8 * np.sin(q2) - 0.02 * v[1]]  # fmt: skip
-        return [*v, *np.linalg.solve(M, force)]
+        force = [-0.4 * s * v[1] ** 2 - 20 * np.sin(q1), 0.4 * s * v[0] ** 2 - 8 * np.sin(q2)]
+        return [*v, *np.linalg.solve(M, force - linear * v - uniform * M @ v)]
 
     t = np.arange(0, end, dt)
     for run in range(runs):
@@ -106,9 +116,11 @@ def test_steps_have_the_derivatives_of_finite_differences():
     rows = [((2, 0), (0, 0), (0, 0), 0.0), ((1, 1), (0, 0), (1, -1), 0.0),
             ((0, 2), (1, 1), (0, 0), 0.0), ((0, 2), (0, 0), (0, 0), 0.0),
             ((0, 0), (0, 0), (1, 0), 0.2)]  # fmt: skip
-    friction = Friction.of([((1, 0), LINEAR, 0), ((-1, 1), QUADRATIC, 0), ((0, 1), DRY, 0.2)], 2)
+    friction = [((1, 0), LINEAR, 0), ((-1, 1), QUADRATIC, 0), ((0, 1), DRY, 0.2),
+                ((0, 0), UNIFORM, 0)]  # fmt: skip
+    friction = Friction.of(friction, 2)
     form = Form(Terms.of(rows, 2), np.zeros(5), np.eye(5), friction, 1)
-    p = np.array([0.5, 0.2, 0.02, 0.4, 2.0, 0.1, 0.05, 0.1, 1.0, -0.5])
+    p = np.array([0.5, 0.2, 0.02, 0.4, 2.0, 0.1, 0.05, 0.1, 0.05, 1.0, -0.5])
     rng = np.random.default_rng(0)
     x, u, h = rng.normal(size=(3, 4)), rng.normal(size=(3, 2, 6, 1)), np.full(3, 0.1)
     step = form.step(p, x, h, u)
@@ -150,7 +162,11 @@ def test_inputs_between_samples():
     at = np.linspace(4, 6, 41)
     assert np.abs(interpolate(t, u, at, "band")[:, 0] - np.sin(3 * at)).max() < 1e-3
     assert np.abs(interpolate(t, u, at, "linear")[:, 0] - np.sin(3 * at)).max() < 0.02
-    np.testing.assert_array_equal(interpolate(t, u, np.array([4.05]), "hold")[0], u[40])
+    held = at_stages(t, u, np.array([4.0, 4.1, 4.3, 4.3]), 1, "hold", delay=0.03)
+    for step, mean in enumerate((0.3 * u[39] + 0.7 * u[40], 0.15 * u[40] + 0.5 * u[41])):
+        mean = mean + (0.35 * u[42] if step else 0.0)
+        np.testing.assert_allclose(held[step, 0], np.tile(mean, (6, 1)), atol=1e-12)
+    np.testing.assert_array_equal(held[2, 0], np.tile(u[42], (6, 1)))  # no time: the value there
 
 
 def test_text_of_a_law():
@@ -205,6 +221,32 @@ def test_the_friction_that_a_record_shows(swing):
     assert max(without.which_friction.limits.values()) < 1e-3
     dry = gfnn.fit(recording, friction="dry+linear")  # told to, it takes what dissipates
     assert all(term.coefficient > 0 for term in dry.friction.terms)
+
+
+def test_linear_friction_of_one_mass_is_uniform(swing):
+    """The map keeps a multiple of the symplectic form."""
+    _, fit = swing
+    (loss,) = fit.friction.terms
+    multiplier = float(fit.map.multiplier())
+    assert multiplier == pytest.approx(np.exp(-2 * loss.coefficient * float(fit.map.dt)), rel=1e-9)
+    assert float(fit.map.defect(np.array([0.3, 0.5]))) < 1e-14
+
+
+@pytest.mark.slow
+def test_uniform_friction_of_a_double_pendulum(tmp_path):
+    fit = gfnn.fit(chain(runs=2, end=8.0, uniform=0.04))
+    assert fit.which_friction.kinds == ("uniform",)
+    (term,) = fit.friction.terms
+    assert abs(term.coefficient - 0.04) < 4 * term.std < 4e-3
+    assert "cos(theta1 - theta2)" in term.term
+    assert fit.map.multiplier() == pytest.approx(np.exp(-term.coefficient * 0.02))
+    assert abs(fit.energy["closure"]) < 0.02 * fit.energy["lost"][term.term]
+    fit.map.save(tmp_path / "model")
+    again = gfnn.load(tmp_path / "model")
+    assert again.multiplier() == fit.map.multiplier()
+    past = chain(runs=1, end=3.0, uniform=0.04)
+    values = [map_.forecast(past, np.array([3.5])).values["theta1"] for map_ in (fit.map, again)]
+    np.testing.assert_array_equal(*values)
 
 
 def test_energy_that_no_input_explains_is_named():
@@ -315,14 +357,14 @@ def test_the_command_line_learns_and_forecasts(tmp_path, capsys):
     assert "--num-steps" in capsys.readouterr().err
 
 
-def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs():
-    """ẍ = −4 x − 0.2 ẋ + 3 u, and an input that does nothing."""
+def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs(tmp_path):
+    """ẍ = −4 x − 0.2 ẋ + 3 u(t − 0.017), and an input that does nothing."""
     t = np.arange(0, 30, 0.05)
     rng = np.random.default_rng(0)
     wave = np.sin(0.7 * t) + 0.7 * np.sin(1.9 * t + 1) + 0.5 * np.sin(3.1 * t + 2)
 
     def rate(s, x):
-        return [x[1], -4 * x[0] - 0.2 * x[1] + 3 * np.interp(s, t, wave)]
+        return [x[1], -4 * x[0] - 0.2 * x[1] + 3 * np.interp(s - 0.017, t, wave)]
 
     x = solve_ivp(rate, (0, t[-1]), [0.5, 0.0], t_eval=t, rtol=1e-9, max_step=0.05).y[0]
     table = {
@@ -344,3 +386,24 @@ def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs():
                            inputs=["u", "w"])  # fmt: skip
     found = fit.map.forecast(recording.slice(20.0, 24.95), t[501:], ahead)
     assert np.abs(found.values["x"][0] - x[501:]).max() < 0.02
+    delay, std = fit.delay
+    assert abs(delay - 0.017) < 4 * std < 2e-3
+    assert "linear between samples, acting 0.01" in fit.table
+    book = fit.energy
+    assert abs(book["closure"]) < 5e-3 * book["supplied"]["u"]
+    assert book["lost"]["v**2"] == pytest.approx(book["supplied"]["u"] - book["stored"], rel=0.01)
+    fit.map.save(tmp_path / "model")
+    for name, rows in (("past", slice(500)), ("ahead", slice(490, None))):
+        columns = ["t", "x", "u", "w"] if name == "past" else ["t", "u", "w"]
+        lines = [
+            ",".join(columns),
+            *(",".join(f"{table[c][i]:.9g}" for c in columns) for i in range(len(t))[rows]),
+        ]
+        (tmp_path / f"{name}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    out = tmp_path / "out.csv"
+    forecast_recording(
+        tmp_path / "model", tmp_path / "past.csv", inputs=tmp_path / "ahead.csv", num_steps=99,
+        out=out,
+    )  # fmt: skip
+    rows = np.genfromtxt(out, delimiter=",", names=True)
+    assert np.abs(rows["x"] - x[500:599]).max() < 0.02

@@ -8,6 +8,7 @@ import scipy.integrate
 
 import gfnn_jax as gfnn
 from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Lagrangian, Terms
+from gfnn_jax.maps import stops
 from gfnn_jax.maps.energy import ledger
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.laws import law_of_map, map_of_law, states_of, sticking, velocities_of
@@ -65,6 +66,22 @@ def test_inputs_between_their_samples(hold, input_at):
         none, _ = MAP.rollout(Z[:2], STEPS)
         np.testing.assert_array_equal(each[1], none[1])
         np.testing.assert_allclose(each[0, :-1], states[0, :-1], atol=1e-14)
+
+
+@pytest.mark.parametrize(("hold", "delay"), [("hold", 0.3), ("linear", 1.4), ("band", 0.6)])
+def test_delayed_inputs_keep_their_momentum(hold, delay):
+    """The integral of a step's polynomial is that of the input, moved by the delay."""
+    u = np.cos(0.4 * np.arange(200) + 1)[:, None]
+    coefficients = Signals(("u",), hold, 0.1 * delay).coefficients(u, 0.1)
+    powers = np.arange(coefficients.shape[-1])
+    found = coefficients @ (0.1 ** (powers + 1) / (powers + 1))
+    fine = np.arange(0, 200, 0.01) + 0.005 - delay
+    inside = {
+        "hold": u[np.clip(np.floor(fine).astype(int), 0, 199), 0],
+        "linear": np.interp(fine, np.arange(200), u[:, 0]), "band": np.cos(0.4 * fine + 1),
+    }  # fmt: skip
+    expected = 0.1 * inside[hold].reshape(200, 100).mean(axis=1)
+    np.testing.assert_allclose(found[40:-40], expected[40:-40], atol=1e-5)
 
 
 def test_band_limited_inputs():
@@ -158,26 +175,64 @@ def test_signals_that_are_not_the_laws():
         Signals(("u",), "cubic")
 
 
-@pytest.mark.slow
-def test_a_forecast_across_a_stop():
-    """A block on a spring, held by dry friction: half turns about ±μ until it sticks (exact)."""
-    friction, dt, count = 0.05, 0.1, 300
-    spring = Terms.of([((2,), (0,), (0,), 0.0), ((0,), (2,), (0,), 0.0)], 1)
-    wide = Lagrangian(
-        spring, np.array([0.5, -0.5]), Friction.of([((1,), DRY, 0.05)], 1), np.array([friction]),
-        0.0, np.zeros((1, 0)),
-    )  # fmt: skip
-    law = sticking(wide, noise=1e-3, duration=dt * count)
-    z = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
-    map_ = map_of_law(law, z, dt)
-    found, info = map_.rollout(np.array([0.52, 0.0]), count)
-    time, turn, expected = dt * np.arange(count + 1), 0.52, np.zeros(count + 1)
+SPRING = Terms.of([((2,), (0,), (0,), 0.0), ((0,), (2,), (0,), 0.0)], 1)
+
+
+def block(turn, friction, time):
+    """A block on a spring, ẍ = −x, let go at ``turn``: half turns about ±μ until dry friction holds
+    it (exact). Its positions, and where it stops."""
+    expected = np.zeros(len(time))
     for n, t in enumerate(time):
         if n and int(t // np.pi) > int(time[n - 1] // np.pi) and abs(turn) > friction:
             turn = 2 * friction * np.sign(turn) - turn
         centre = friction * np.sign(turn)
         moving = abs(turn) > friction
         expected[n] = centre + (turn - centre) * np.cos(t % np.pi) if moving else turn
+    return expected, turn
+
+
+def test_a_stop_is_located():
+    """Orbits that dry friction brings to rest are seen, and followed to where they stop."""
+    time, sizes = 0.1 * np.arange(201), (0.42, -0.33, 9.0)
+    orbits = [
+        scipy.integrate.solve_ivp(
+            lambda _, x: [x[1], -x[0] - 0.05 * x[1] / np.hypot(x[1], 0.05)], (0, 20), [a, 0.0],
+            t_eval=time, rtol=1e-8, atol=1e-10,
+        ).y.T
+        for a in sizes
+    ]  # fmt: skip
+    law = Lagrangian(
+        SPRING, np.array([0.5, -0.5]), Friction.of([((1,), DRY, 0.05)], 1), np.array([0.05]), 0.0,
+        np.zeros((1, 0)),
+    )  # fmt: skip
+    orbit, ends = np.stack(orbits), np.tile(time, (3, 1))
+    rests = stops.resting(law, orbit, ends, 1.0)
+    np.testing.assert_array_equal(rests, [True, True, False])
+
+    def no_inputs(step, parts):
+        return np.zeros((2, parts, 6, 0))
+
+    found = stops.stopped(law, orbit[:2], ends[:2], 1e-3, 1, no_inputs)
+    for k in range(2):
+        expected, stop = block(sizes[k], 0.05, time)
+        assert abs(stop) < 0.05  # it has stopped, and not where the spring is slack
+        np.testing.assert_allclose(found[k, :, 0], expected[1:], atol=1e-3)
+        assert abs(orbit[k, -1, 0] - stop) > 1e-2  # where the smooth law has it creep to
+
+
+@pytest.mark.slow
+def test_a_forecast_across_a_stop():
+    """Against the exact motion, with the map of the narrow law."""
+    friction, dt, count = 0.05, 0.1, 300
+    wide = Lagrangian(
+        SPRING, np.array([0.5, -0.5]), Friction.of([((1,), DRY, 0.05)], 1), np.array([friction]),
+        0.0, np.zeros((1, 0)),
+    )  # fmt: skip
+    law = sticking(wide, noise=1e-3, duration=dt * count)
+    z = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
+    map_ = map_of_law(law, z, dt)
+    found, info = map_.rollout(np.array([0.52, 0.0]), count)
+    expected, turn = block(0.52, friction, dt * np.arange(count + 1))
     assert int(info.status) == 0
     assert abs(turn) < friction  # it has stopped, and not where the spring is slack
     np.testing.assert_allclose(found[:, 0], expected, atol=1e-3)

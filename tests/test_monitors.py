@@ -1,11 +1,14 @@
 """Two monitors to either side of a known stretch: momenta in their own unit, a map per place."""
 
+import warnings
+
+import jax
 import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
 
-LENGTH, KICK = 2.0, 0.4
+LENGTH, KICK, NOISE = 2.0, 0.4, 1e-3
 # A turn of both planes, of tunes 0.23 and 0.31 and beta functions 5 and 3 metres, at a sextupole.
 ANGLE, BETA = 2 * np.pi * np.array([0.23, 0.31]), np.array([5.0, 3.0])
 PLACES = [("x1", "y1"), ("x2", "y2")]
@@ -88,6 +91,48 @@ def test_one_monitor_tells_momenta_but_for_their_scale(ring):
     p = np.asarray(alone.map.from_positions(true[:, 0, :2], true[:, 1, :2]))[:, 2:]
     factor = np.sum(p * true[:, 0, 2:]) / np.sum(true[:, 0, 2:] ** 2)
     assert abs(factor - 1) > 0.1
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """Readings of 1 mm noise, of orbits of some 35 mm: momenta as they are read have 0.7 mrad of
+    it, of some 6 mrad."""
+    rng = np.random.default_rng(5)
+    states = [z.copy() for z in read(50, 30, 0)]
+    for z in states:
+        z[..., :2] += NOISE * rng.normal(size=z[..., :2].shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)
+        return gfnn.fit_monitors(recorded(*states), PLACES, [LENGTH, None], tolerance=1e-3)
+
+
+def test_the_noise_of_both_monitors_is_told(noisy):
+    assert np.abs(np.array(noisy.noise) / NOISE - 1).max() < 0.06
+
+
+def test_latent_readings_tell_more_than_momenta_as_they_are_read(noisy):
+    first, second = read(200, 2, 1)
+    as_read, latent = (
+        np.asarray(map_.step(second[:, 0])[0]) - first[:, 1]
+        for map_ in (noisy.fits[1].map, noisy.maps[1])
+    )
+    unit = np.std(first[:, 1], axis=0)
+    as_read, latent = (np.sqrt(np.mean((error / unit) ** 2)) for error in (as_read, latent))
+    assert latent < as_read
+    assert latent < 0.3 * np.sqrt(np.mean((NOISE / unit[:2]) ** 2))
+    assert np.max(np.asarray(noisy.turn().defect(first[:, 0]))) < 1e-13
+
+
+def test_its_posterior_is_as_wide_as_its_errors(noisy):
+    """A bias by noise, of which more turns take nothing, would stand out of it."""
+    first, second = read(100, 2, 1)
+    states, info = noisy.maps[1].rollout(
+        second[:, 0], num_steps=1, samples=40, key=jax.random.key(0)
+    )
+    error = np.asarray(states)[:, 1] - first[:, 1]
+    std = np.asarray(info.bands.std)[:, 1]
+    ratio = np.sqrt(np.mean((error / std) ** 2, axis=0))
+    assert ((ratio > 0.4) & (ratio < 2)).all()  # a few coefficients make the errors of all states
 
 
 def test_what_does_not_fit_is_refused():

@@ -153,7 +153,7 @@ def test_what_a_law_has_anyway_is_refused():
         ({"observe": {"z": "theta"}}, "no column z"),
         ({"observe": {"theta": "b +* theta"}}, "no expression that can be read"),
         ({"observe": {"theta": "theta + f(b)"}}, "a call of 'f'"),
-        ({"observe": {"u": "g*theta"}}, r"g: where do they start\? guess={'g'"),
+        ({"observe": {"u": "g*theta"}}, r"g: expected a first guess, guess={'g'"),
         ({"observe": {"theta": "b + theta"}, "offset": "theta"}, "has a formula already"),
         ({"observe": {"theta": "b + theta"}, "guess": {"c": 1.0}}, "no parameter c among b"),
         ({"observe": {"theta": np.sin}}, "function of named arguments"),

@@ -59,6 +59,48 @@ def test_a_model_and_its_piece(pairs, fresh, tmp_path):
     np.testing.assert_allclose(back, states[:, -2], rtol=0, atol=1e-14)
 
 
+def swinging(seed, num=400, dt=0.03):
+    """A record of q̈ = −9 q − q³ with noise of heavy tails, and the positions themselves."""
+    state, seconds = [np.array([1.0, 0.0])], 0.001
+    for _ in range(num - 1):
+        q, v = state[-1]
+        for _ in range(round(dt / seconds)):
+            v -= seconds / 2 * (9 * q + q**3)
+            q += seconds * v
+            v -= seconds / 2 * (9 * q + q**3)
+        state.append(np.array([q, v]))
+    q, rng = np.array(state)[:, 0], np.random.default_rng(seed)
+    noise = 5e-3 * rng.standard_t(1.2, num)
+    return gfnn.Recording({"t": dt * np.arange(num), "x": q + noise}, positions=["x"]), q
+
+
+def test_a_noise_model(tmp_path):
+    recording, q = swinging(0)
+    law = dict(terms=["v**2", "V: x**2", "V: x**4"], friction="none")
+    part, ahead = recording.slice(0, 6), 0.03 * np.arange(201, 231)
+    maps, errors = [], []
+    for loss in (own_module.HeavyTails(1.2), own_module.Normal()):
+        maps.append(gfnn.fit(recording, loss=loss, **law).map)
+        values = maps[-1].forecast(part, ahead).values["x"][0]
+        errors.append(np.abs(values - q[201:231]).max())
+    assert errors[0] < 3e-3  # the noise has a median of 4e-3
+    assert errors[0] < errors[1] / 2
+    again = kept(maps[0], tmp_path / "m")
+    assert again.sensors.seen.loss == own_module.HeavyTails(1.2)
+    found, same = (map_.forecast(part, ahead) for map_ in (maps[0], again))
+    np.testing.assert_array_equal(found.values["x"], same.values["x"])
+    np.testing.assert_array_equal(found.std["x"], same.std["x"])
+    states, _ = again.sample(jax.random.key(0), 3).rollout(again.estimate(part)[0], 5)
+    assert np.isfinite(states).all()
+    assert np.ptp(states[:, 0, -1, 0]) > 0
+
+
+@pytest.mark.parametrize("learn", ["map", "hamiltonian"])
+def test_a_noise_model_is_of_recordings(pairs, learn):
+    with pytest.raises(gfnn.FitError, match="of a recording"):
+        gfnn.fit(pairs, SCENE, learn=learn, loss=own_module.Normal())
+
+
 def test_few_pairs_are_cross_validated(pairs):
     fit = gfnn.fit(pairs.take(slice(40)), SCENE, model=own_module.Kicks(), tolerance=2e-2)
     assert "cross-validation" in fit.stated_by
@@ -68,7 +110,7 @@ def test_few_pairs_are_cross_validated(pairs):
     ("options", "message"),
     [
         ({"model": object()}, "a model with a name, sizes"),
-        ({"model": own_module.Kicks(), "learn": "map"}, "a model of one's own is all"),
+        ({"model": own_module.Kicks(), "learn": "map"}, "nothing else is learned"),
         ({"family": lambda inputs: [inputs]}, "Inputs has no name"),
         ({"family": 3}, "expected one of auto, .* as family"),
     ],

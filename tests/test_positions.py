@@ -1,5 +1,6 @@
 """Maps that are learned from positions alone: discrete Lagrangians and the maps they generate."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -10,9 +11,11 @@ from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax import cli
-from gfnn_jax.coordinates import nearest_image
+from gfnn_jax.coordinates import Coordinates, nearest_image
 from gfnn_jax.data.recording import Recording
+from gfnn_jax.dataset.structures import structure_of
 from gfnn_jax.errors import InputError
+from gfnn_jax.evaluate.gauge import beside_flow
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
@@ -101,6 +104,11 @@ def test_it_is_saved_and_loaded(wrapped, tmp_path):
 
 def henon_heiles(number, steps, seed):
     """x, y (number, steps + 1, 2) below E = 1/12 at dt 0.5."""
+    return flow_of_henon_heiles(number, steps, seed)[..., :2]
+
+
+def flow_of_henon_heiles(number, steps, seed):
+    """z = (q, p) (number, steps + 1, 4) of the same."""
     rng, starts = np.random.default_rng(seed), []
     while len(starts) < number:
         q, energy, angle = rng.uniform(-0.5, 0.5, 2), rng.uniform(0, 1 / 12), rng.uniform(0, 7)
@@ -117,7 +125,24 @@ def henon_heiles(number, steps, seed):
         field, (0, 0.5 * steps), np.array(starts).T.ravel(), method="DOP853", rtol=1e-13,
         atol=1e-15, t_eval=0.5 * np.arange(steps + 1),
     )  # fmt: skip
-    return solution.y.reshape(4, number, -1).transpose(1, 2, 0)[..., :2]
+    return solution.y.reshape(4, number, -1).transpose(1, 2, 0)
+
+
+def test_where_a_flow_exists_the_map_is_the_flow_but_for_a_factor_of_momenta():
+    """A symmetric S leaves no f(Q) − f(q); the kicks of half a step make c unlike 1."""
+    recording = recorded(henon_heiles(1_200, 2, 0), ["x", "y"], dt=0.5)
+    learned = gfnn.fit(recording, learn="map", tolerance=1e-6)
+    assert learned.met
+    z = flow_of_henon_heiles(200, 1, 1)
+    found = beside_flow(learned.map, gfnn.Pairs(z[:, 0], z[:, 1], 0.5))
+    assert max(found.momenta, found.positions, found.images) < 1e-5
+    assert found.gauge < 1e-5
+    assert 0.001 < abs(found.factor - 1) < 0.1
+    off = dataclasses.replace(learned.map.pieces[0], params=1.01 * learned.map.pieces[0].params)
+    other = dataclasses.replace(learned.map, pieces=(off,))  # S → cS: the factor, nothing else
+    scaled = beside_flow(other, gfnn.Pairs(z[:, 0], z[:, 1], 0.5))
+    assert abs(scaled.factor / found.factor - 1.01) < 1e-9
+    assert scaled.images < 1e-5
 
 
 @pytest.mark.slow  # nine seconds of fitting
@@ -274,6 +299,36 @@ def test_bands_of_forecasts_hold(of_noisy):
     inside = (off < 2 * np.sqrt(std**2 - sigma**2)).mean(axis=0)
     assert ((inside > 0.9) & (inside < 0.99)).all()
     assert np.median(off[:, 0]) < 0.6e-3  # a reading's own error is 0.67e-3 in the median
+
+
+def test_forecasts_of_wrapped_readings_go_on_over_whole_turns(of_noisy):
+    """Moves of a kicked map reach beyond half a turn: each reading is lifted to where S leads."""
+    read = noisy(np.mod(turns(150, 12, 0), 2 * np.pi), 1e-3, 50)
+    learned = gfnn.fit(recorded(read, ["theta"], ["theta"]), learn="map", tolerance=1e-2)
+    true = turns(200, 14, 1)
+    begun = noisy(np.mod(true[:, :11], 2 * np.pi), 1e-3, 51)
+    found = learned.map.forecast(recorded(begun, ["theta"], ["theta"]), 10.0 + np.array([1, 2, 4]))
+    off = nearest_image(found.values["theta"] - true[:, [11, 12, 14], 0], (0, 1, 2))
+    own = np.sqrt(found.std["theta"] ** 2 - learned.positions.noise[0] ** 2)
+    assert ((np.abs(off) < 2 * own).mean(axis=0) > 0.9).all()
+    assert np.median(np.abs(off[:, 0])) < 1e-3
+
+
+def test_latent_positions_of_a_ring_of_equal_sites():
+    """The coupling of a ring of six from noisy angles, told that it is a ring."""
+    names = [f"theta{i}" for i in range(1, 7)]
+    recording = recorded(noisy(ring(60, 12, 6, 0), 1e-3, 5), names, names)
+    triples = triples_of(recording, sites=True)
+    sites = structure_of("ring", 6, Coordinates("positions", triples.angles))
+    family = OfDisplacement(next(iter(sites.libraries(6))), 0.0, True)
+    solved = solve(family, triples)
+    sigma = starting_noise(family, solved.coefficients, triples)
+    found = fit_latent(family, solved, triples, sigma, arcs_of(triples))
+    assert found.converged
+    assert np.abs(found.sigma / 1e-3 - 1).max() < 0.15
+    coupling = family.family.term_names.index("cos(q_{i+1} - q_i)")
+    std = np.linalg.norm(found.root[:, coupling])
+    assert abs(found.coefficients[coupling] - 0.1) < 3 * std < 1e-3
 
 
 def test_a_state_is_estimated_from_all_readings_before_it(of_noisy):

@@ -14,7 +14,9 @@ def traces(residuals, inputs):
     law = np.sin(t)[:, None]
     parts = [slice(k, k + 50) for k in range(0, len(t), 50)]
     r, u = residuals[:, None], inputs[:, None]
-    return [Trace("0", t[p], law[p] + 0.01 * r[p], law[p], r[p], 0 * t[p], u[p]) for p in parts]
+    return [
+        Trace("0", t[p], law[p] + 0.01 * r[p], law[p], r[p], u[p], *[0 * t[p]] * 3) for p in parts
+    ]
 
 
 @pytest.fixture

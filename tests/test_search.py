@@ -18,7 +18,7 @@ class Size(NamedTuple):
     operations: float
     estimate: float
     error: float
-    extent: float
+    order: float
 
 
 class Sweep:
@@ -46,8 +46,8 @@ class Sweep:
             size.estimate, size.estimate, size.estimate, np.ones(2), size.estimate, 0.0,
         )  # fmt: skip
 
-    def at(self, extent):
-        return f"{self.family} {extent:g}"
+    def at(self, order):
+        return f"{self.family} {order:g}"
 
     def validate(self, size, judged, budget, say):
         self.validated.append(size.operations)
@@ -236,7 +236,7 @@ def test_a_sweep_that_leads_to_less_than_another_has_is_left():
     sines = Sweep(geometric(2e-1, 0.5, 8), family="sines")
     products = Sweep(geometric(1e-2, 1e-3, 3, operations=15.0, every=2), family="polynomial")
     found_in(products, sines)
-    assert len(sines.judged) == 3  # the third is where its course shows
+    assert len(sines.judged) == 3  # the third is where its decay shows
     assert len(products.judged) == 3
 
 

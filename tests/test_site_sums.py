@@ -36,7 +36,7 @@ def test_the_formula_of_a_structure_is_read_back(name):
     coefficients = RNG.normal(size=family.num_parameters).round(3)
     terms = [Term(n, c, 0.0) for n, c in zip(family.term_names, coefficients, strict=True)]
     text, z = as_code(family, terms), RNG.uniform(0.2, 1.0, (2, 2 * family.dim))
-    expected = family.value(coefficients, z)
+    expected = np.asarray(family.value(coefficients, z))
     found = given_terms(family.dim, (text,))
     np.testing.assert_allclose(found.value(np.ones(1), z), expected, rtol=1e-12)
     assert by_sympy(text, family.dim, z[0]) == pytest.approx(expected[0], rel=1e-9)

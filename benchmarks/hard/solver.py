@@ -95,8 +95,9 @@ def branch_changes(map_: SymplecticMap, num_lines: int, num_points: int) -> tupl
 def solver(quick: bool) -> tuple[list[Case], Numbers]:
     cases, measured = [], {}
     z = np.random.default_rng(SEED).standard_normal((100 if quick else 500, 4))
-    for chart in (TYPE2, MIDPOINT):
-        for strength in (1.0, 100.0) if quick else (1.0, 3.0, 10.0, 100.0):
+    strengths = ((1.0,), (100.0,)) if quick else ((1.0, 3.0, 10.0, 100.0),) * 2
+    for chart, of_chart in zip((TYPE2, MIDPOINT), strengths, strict=True):
+        for strength in of_chart:
             map_ = rough_map(strength, chart, SEED)
             image, info = map_.step(z)
             ok = np.asarray(info.status) <= 1
@@ -113,13 +114,13 @@ def solver(quick: bool) -> tuple[list[Case], Numbers]:
     data, fresh = drawn(scene, 1_000, True)
     fit, _ = fitted(data, scene, fresh, absolute_tolerance=1e-4, family="polynomial")
     good = np.asarray(gfnn.sample_test_states(scene, 200, jax.random.key(SEED)))
-    for factor in (3.0, 10.0, 1e3, 1e6, 1e150):
+    for factor in (3.0, 1e150) if quick else (3.0, 10.0, 1e3, 1e6, 1e150):
         _, info = fit.map.rollout(factor * good[:50], 20)
         cases.append(Case(f"start at {factor:g} × the data", None, None, counts(info.status),
                           wrong=int(np.sum(np.asarray(info.status) == OK))))  # fmt: skip
     mixed = np.concatenate([good, 1e3 * good[:2]])
     alone, together = (
-        timed(lambda: fit.map.rollout(z, 200, save_every=200)[0], 5)  # noqa: B023
+        timed(lambda: fit.map.rollout(z, 200, save_every=200)[0], 1 if quick else 5)  # noqa: B023
         for z in (good, mixed)
     )
     same = np.array_equal(alone.out, together.out[: len(good)])

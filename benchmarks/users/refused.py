@@ -56,7 +56,7 @@ REFUSED: dict[str, Callable[[], Refused]] = {
     "terms-as-text": lambda: Refused(fitted(terms="p1**2"), "as terms, got 'p1**2'"),
     "unknown-name": lambda: Refused(fitted(terms=["p1**2 + x**2"]), "the name 'x'"),
     "dt-backwards": lambda: Refused(
-        of_pairs(lambda p: gfnn.Pairs(p.z0, p.z1, -0.2)), "z1 are the states and z0 their images"
+        of_pairs(lambda p: gfnn.Pairs(p.z0, p.z1, -0.2)), "exchange them"
     ),
     "same-columns": lambda: Refused(
         of_pairs(lambda p: gfnn.Pairs(p.z0, p.z0, 0.2)), "states that move"

@@ -132,7 +132,8 @@ def rubbing() -> Case:
     record = sequences(partial(dry_pendulum, friction=0.01), start, 0.1, 600)
     fresh = sequences(partial(dry_pendulum, friction=0.01), np.array([[1.1, 0.0]]), 0.1, 300)
     pairs = in_sequence(record, 0.1)
-    return Case(pairs, in_sequence(fresh, 0.1), meets=None, words=("friction",), never=_NOISE,
+    return Case(pairs, in_sequence(fresh, 0.1), meets=None,
+                words=("friction .* may be of another kind, dry",), never=_NOISE,
                 max_seconds=30.0)  # fmt: skip
 
 
@@ -167,8 +168,8 @@ def velocities() -> Case:
 
     laws = drawn(of_energy(CART, 2), box([1.0, 1.5, 1.0, 1.0]), 0.2, 2_000)
     data, fresh = (changed(pairs, velocity) for pairs in laws)
-    return Case(data, fresh, max_seconds=30.0, meets=None, words=("velocities",),
-                never=("H = ", *_NOISE))  # fmt: skip
+    words = ("velocities, learn the law of a Recording",)
+    return Case(data, fresh, max_seconds=30.0, meets=None, words=words, never=("H = ", *_NOISE))
 
 
 def told_angle() -> Case:

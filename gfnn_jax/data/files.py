@@ -65,6 +65,7 @@ class TrajectoryData:
     source:    the file it came from; digest: the SHA-256 of that file.
     precision: the dtype that the file stores, "float32" say; ``states`` is float64 always.
     units:     units by column name, as a CSV header gave them.
+    sampled:   the pairs of the files that these are a sample of; None: these are all.
     """
 
     states: np.ndarray
@@ -78,6 +79,7 @@ class TrajectoryData:
     period: float | None = None
     run: np.ndarray | None = None
     place: np.ndarray | None = None
+    sampled: int | None = None
 
     @property
     def dim(self) -> int:

@@ -77,7 +77,7 @@ def read_sample(
     each = float(found["dt"][0]) if same and len(states) else found["dt"]
     return TrajectoryData(
         states, np.full(len(found["pairs"]), 2), each, named(paths), digest, precision, units,
-        args or None, period, found["run"], found["place"],
+        args or None, period, found["run"], found["place"], int(total),
     )  # fmt: skip
 
 

@@ -125,6 +125,20 @@ class Dataset:
         return np.sqrt(np.mean(self.noise**2, axis=0))
 
     @cached_property
+    def weight(self) -> np.ndarray | None:
+        """(N, 2d): the usual noise of a coordinate, its RMS over the rows, ÷ that of each value,
+        where it was given of each value and differs; else None. A row of a least-squares problem is
+        multiplied by it. Behind a change of coordinates, or what was factored out, which mix them,
+        all values of a pair have one weight.
+        """
+        if self.noise is None or self.noise.ndim == 1 or not np.ptp(self.noise, axis=0).any():
+            return None
+        relative = self.noise / self.noise_of_channels
+        if self.before or self.after or self.coordinates.forward is not CARTESIAN.forward:
+            relative = np.sqrt(np.mean(relative**2, axis=1, keepdims=True))
+        return np.broadcast_to(1.0 / relative, self.y0.shape)
+
+    @cached_property
     def spread(self) -> np.ndarray:
         """(2d,) sizes of the user's coordinates."""
         return sizes(self.pairs.z0)

@@ -74,6 +74,12 @@ def measured_error(data: Dataset, tolerance: Tolerance, images, rows=None) -> On
     return found._replace(bound=found.bound**2 / size)
 
 
+def error_of_each(data: Dataset, tolerance: Tolerance, images, rows) -> np.ndarray:
+    """(n,) the error of each of these rows' images (n, 2d), in the tolerance's measure."""
+    error = nearest_image(images - np.asarray(data.pairs.z1)[rows], data.user_angles)
+    return np.sqrt(np.mean((error / (data.spread if tolerance.relative else 1.0)) ** 2, axis=1))
+
+
 def clusters(data: Dataset, rows: np.ndarray) -> tuple[np.ndarray, bool]:
     """(n,) the cluster of each of these rows, of which each errs in its own way, and whether these
     are runs: where there are at least five, else they are stretches of a run."""

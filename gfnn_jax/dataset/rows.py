@@ -25,9 +25,22 @@ def rows_of(data: Dataset, chart: AnyChart, rows) -> tuple[Any, np.ndarray]:
     return found, residual_weight(chart, data.scale, dt)
 
 
-def of_rows(family: Any) -> Any:
-    """The family whose terms make the rows: the moves h ∇φ where pairs have a dt of their own."""
-    return _Moves(family) if isinstance(family, OfTimeStep) else family
+def weighted_rows_of(data: Dataset, chart: AnyChart, rows) -> tuple[Any, np.ndarray]:
+    """`rows_of` these rows in units of their own noise, where it is known of each value: the target
+    is multiplied by the weight of the coordinate that it changes, (n, 2d), which comes last."""
+    found, weight = rows_of(data, chart, rows)
+    if data.weight is None:
+        return found, weight
+    w, target, *args = found
+    of_row = _changed(chart, data.weight[rows])
+    return (w, of_row * target, *args, of_row), weight
+
+
+def of_rows(family: Any, *, weighted: bool = False) -> Any:
+    """The family whose terms make the rows: the moves h ∇φ where pairs have a dt of their own, and
+    those of ``weighted_rows_of``."""
+    family = _Moves(family) if isinstance(family, OfTimeStep) else family
+    return _Weighted(family) if weighted else family
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,8 +57,30 @@ class _Moves:
         return dt[..., None] * self.family.term_gradients(w, dt)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Weighted:
+    """The terms of a family, each row times its weight."""
+
+    family: Any
+
+    @property
+    def num_parameters(self) -> int:
+        return self.family.num_parameters
+
+    def term_gradients(self, w, *given):
+        *args, of_row = given
+        return of_row[..., None] * self.family.term_gradients(w, *args)
+
+
 def residual_weight(chart: AnyChart, scale, dt: float) -> np.ndarray:
     """h over the scale of what each entry of ∇S changes, (2d,): ∂S/∂q changes p and conversely; in
     type 1 both entries are momenta."""
-    dim = len(scale) // 2
-    return dt / (np.tile(scale[dim:], 2) if chart.name == "type1" else np.roll(scale, dim))
+    return dt / _changed(chart, scale)
+
+
+def _changed(chart: AnyChart, of_coordinates: np.ndarray) -> np.ndarray:
+    """(..., 2d) of the coordinate that each entry of ∇S changes, from those of the coordinates."""
+    dim = of_coordinates.shape[-1] // 2
+    if chart.name == "type1":
+        return np.concatenate(2 * [of_coordinates[..., dim:]], axis=-1)
+    return np.roll(of_coordinates, dim, axis=-1)

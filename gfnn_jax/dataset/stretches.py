@@ -21,6 +21,9 @@ from gfnn_jax.signals.local_cubics import choose_half, smooth
 GAP = 3.5  # median steps: a longer one ends a stretch
 PER_PERIOD = 40  # nodes
 MOST_STEPS = 6_000  # of a fit: more tell little more
+# Radians of a Runge–Kutta step of order 5 by the fifth root of noise ÷ spread, least and most: its
+# error in the coefficients is then a third of a standard error (`python benchmarks/twins.py`).
+_STEP, _FINEST, _COARSEST = 1.27, 0.05, 0.25
 _BLOCK = 8.0  # periods of a block, where only some blocks of a long recording are taken
 _SHORTEST = (
     9  # samples of a stretch, nodes of an arc: shorter ones tell less than their state needs
@@ -57,14 +60,15 @@ class Nodes:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scales:
     """Scales of the samples, from the samples: noise σ (k,) of the channels, rms speeds (d,), the
-    fastest frequency ω (1/s), the median step dt, and the window of the local cubics (samples to
-    either side)."""
+    fastest frequency ω (1/s), the median step dt, the window of the local cubics (samples to either
+    side), and the spread (k,) of the channels."""
 
     sigma: np.ndarray
     speed: np.ndarray
     omega: float
     dt: float
     half: int
+    spread: np.ndarray
 
     @property
     def period(self) -> float:
@@ -82,8 +86,14 @@ class Scales:
 
     @property
     def substeps(self) -> int:
-        """Runge–Kutta steps between two nodes, each at most a quarter of a radian."""
-        return max(1, int(np.ceil(2 * np.pi / self.per_period / 0.25)))
+        """Runge–Kutta steps between two nodes."""
+        return self.substeps_for(self.sigma)
+
+    def substeps_for(self, sigma: np.ndarray) -> int:
+        """Runge–Kutta steps between two nodes whose error is nothing beside this noise."""
+        share = np.min(sigma / np.maximum(self.spread, 1e-300))
+        step = np.clip(_STEP * share**0.2, _FINEST, _COARSEST)
+        return max(1, int(np.ceil(2 * np.pi / self.per_period / step)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -163,7 +173,8 @@ def measure(found: Sequence[Stretch]) -> Scales:
     resolution = np.nanmedian(np.abs(steps), axis=0)
     size = np.sqrt(np.nanmean(steps**2, axis=0))
     sigma = np.maximum(sigma, 1e-9 * np.maximum(resolution, size))  # clean data have none
-    return Scales(sigma, speed, float(np.max(acceleration / speed)), dt, half)
+    spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
+    return Scales(sigma, speed, float(np.max(acceleration / speed)), dt, half, spread)
 
 
 def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:

@@ -188,7 +188,9 @@ def structure_of(
             f"expected no angles, or all q of the sites, or all q and p; got {coordinates.angles}"
         )
     if coordinates.angles and fields > 1:
-        raise FitError(f"expected no angles of {fields} fields at a site: one q may be an angle")
+        raise FitError(
+            f"expected no angles where a site has {fields} q: only a single q may be an angle"
+        )
     return Sites(kind, sides[coordinates.angles], fields)
 
 

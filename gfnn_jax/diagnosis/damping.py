@@ -33,6 +33,10 @@ from gfnn_jax.phase_space import split, symplectic_form
 from gfnn_jax.threads import one_thread
 
 _CERTAIN = 5.0  # standard errors that make a factor other than 1 certain
+# Of many more than these training pairs, so many tell whether D_b gains anything: neighbours of a
+# million clean pairs are so close together that what their fits are off by, not friction, makes a
+# change of areas certain.
+_SAMPLE, _PLENTY = 1_000, 20
 _DEGREES = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20, 24, 28)  # of S, that are tried in turn
 _ROWS_PER_TERM = 3
 _MOST_OPERATIONS = 1e9  # rows × terms² of one solve: a quarter of a second on one core
@@ -119,6 +123,10 @@ def learn_damping(
     deviation = 1.5 * float(np.median(np.abs(factors - b))) / np.sqrt(len(factors))
     if not b > 0 or not abs(b - 1) > max(3 * error, _CERTAIN * deviation):
         return None
+    if len(data.training) > _PLENTY * _SAMPLE:
+        some = data.take(np.concatenate([data.training[:_SAMPLE], data.validation]))
+        if learn_damping(some, jacobians, error, chart, reversor) is None:
+            return None
     start = LearnedDamping(np.asarray(b), np.asarray(np.inf), np.zeros(dim))
     undamped = data.without(None, start.piece)
     try:
@@ -237,7 +245,9 @@ class _Problem:
         if factor.shape[1] == 1:
             factor, std, b = factor[:, 0], std[:, 0], b[:, 0]
         if len(factor) == 1:
-            return LearnedDamping(*map(np.asarray, (factor[0], std[0], found.shift[0])))
+            return LearnedDamping(
+                np.asarray(factor[0]), np.asarray(std[0]), np.asarray(found.shift[0])
+            )
         return LearnedDamping(
             factor, std, found.shift, found.functions, self.data.parameters,
             (np.asarray(b.min(axis=0)), np.asarray(b.max(axis=0))),

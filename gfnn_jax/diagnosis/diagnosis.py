@@ -64,8 +64,9 @@ def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = F
         differing = where_areas_differ(jacobians, at, plain.scale, plain.parameters)
         messages.append(
             f"the pairs do not look symplectic: ‖MᵀJM − J‖ is about {defect:.2g}, known to within "
-            f"{error:.1g} (0 for a symplectic map): are q and p in order, p momenta and not "
-            f"velocities, and no friction?{differing}"
+            f"{error:.1g} (0 for a symplectic map): are q and p in order, and is there friction? "
+            "If p are velocities, learn the law of a Recording of them (--positions, --velocities)."
+            f"{differing}"
         )
     charts = choose_charts(chart, data, reversor, jacobians)
     if charts.half is not None:

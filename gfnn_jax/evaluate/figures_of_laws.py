@@ -89,7 +89,18 @@ def _whiteness(axes, fit: LearnedLaw, name: str) -> None:
 
 
 def _energy(axes, fit: LearnedLaw) -> None:
-    for trace in fit.traces:
-        axes.plot(trace.t, trace.energy, lw=0.8, color="C2")
-    axes.set_ylabel("energy of the law")
+    """Draw the ledger of the longest arc: what is stored, lost, supplied, and left unexplained."""
+    trace = max(fit.traces, key=lambda one: np.ptp(one.t))
+    stored = trace.energy - trace.energy[0]
+    axes.plot(trace.t, stored, lw=1.2, color="C2", label="stored")
+    for sign, sums, names in (
+        (-1, trace.lost, ["− lost by " + term.term for term in fit.friction.terms]),
+        (1, trace.supplied, ["supplied by " + name for name in fit.gains]),
+    ):
+        for column, name in zip(sums.T, names, strict=True):
+            axes.plot(trace.t, sign * column, lw=0.8, label=name)
+    closure = stored - trace.supplied.sum(axis=1) + trace.lost.sum(axis=1)
+    axes.plot(trace.t, closure, lw=0.8, color="black", ls=":", label="unexplained")
+    axes.set_ylabel("energy since the arc began")
     axes.set_xlabel("t [s]")
+    axes.legend(fontsize=7)

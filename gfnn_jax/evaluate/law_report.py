@@ -59,6 +59,7 @@ def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:
         "inputs": {
             "hold": sensors.hold,
             "delay": sensors.delay,
+            "delay_std": None if fit.delay is None or np.isnan(fit.delay[1]) else fit.delay[1],
             "gains": {
                 name: {q: {"gain": g, "std": s} for q, (g, s) in forces.items()}
                 for name, forces in fit.gains.items()

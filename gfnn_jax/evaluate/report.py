@@ -139,6 +139,11 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
         "formula": fit.formula,
         "terms": [term._asdict() for term in law.terms],
         "friction": [term._asdict() for term in law.friction],
+        "constants": [term._asdict() for term in law.constants],
+        "symmetries": list(law.symmetries),
+        "fractions": [str(p) for p in law.proposals],
+        "rivals": [rival._asdict() for rival in law.rivals],
+        "notes": list(law.notes),
         "dropped": law.dropped._asdict() if law.dropped is not None else None,
         "search_cut_short": law.ended or None,
     }

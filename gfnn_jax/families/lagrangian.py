@@ -24,7 +24,7 @@ import numpy as np
 from gfnn_jax.arrays import as_row, matmul, namespace
 
 MAX_POWER = 8  # of one coordinate in one term; powers come from a table of this length
-LINEAR, QUADRATIC, DRY = range(3)
+LINEAR, QUADRATIC, DRY, UNIFORM = range(4)  # UNIFORM stands in a fit's `flows.motion.Form` alone
 
 
 class Potentials(NamedTuple):

@@ -200,7 +200,8 @@ class Terms:
 
     def take(self, rows: Sequence[int]) -> Terms:
         """Make the family of these terms alone, without the variables that are no longer used."""
-        kept = np.array(self.powers, dtype=int).reshape(-1, len(self.variables))[list(rows)]
+        shape = len(self.powers), len(self.variables)
+        kept = np.array(self.powers, dtype=int).reshape(shape)[list(rows)]
         used = np.flatnonzero(kept.any(axis=0)) if len(kept) else np.arange(0)
         return Terms(
             self.dim,

@@ -92,17 +92,22 @@ class Problem:
     """Pairs z0 -> z1 (N, 2d) a time dt apart, and how the flow between them is computed.
 
     dt: a number, or one of each pair (N,). args: of each pair (N, k), or None.
-    scale: (2d,) sizes of the coordinates, by which residuals are divided.
+    scale: (2d,) sizes of the coordinates, by which residuals are divided. weight: (N, 2d) that they
+    are multiplied by, where values differ in their noise; None: 1.
     allowance: the time and the operations that an evaluation of the flow may take: checked between
     its blocks, spent before it is made.
     """
 
     def __init__(
-        self, z0, z1, dt, scale, *, args=None, options: Options = OPTIONS,
+        self, z0, z1, dt, scale, *, args=None, weight=None, options: Options = OPTIONS,
         allowance: Allowance = UNBOUNDED,
     ):  # fmt: skip
         self.z0, self.z1, self.dt, self.scale, self.args = z0, z1, dt, scale, args
-        self.options, self.allowance = options, allowance
+        self.weight, self.options, self.allowance = weight, options, allowance
+
+    def unit(self, rows) -> np.ndarray:
+        """Divisors of the residuals of these rows: (2d,), or (n, 2d) of weighted ones."""
+        return self.scale if self.weight is None else self.scale / self.weight[rows]
 
     def given(self, rows) -> tuple[Any, Any]:
         """(dt, args) of these rows."""
@@ -123,7 +128,7 @@ class Problem:
 
         def of(problem: Problem, block) -> np.ndarray:
             states = problem.images(family, coefficients, block, steps).states
-            return (states - self.z1[block]) / self.scale
+            return (states - self.z1[block]) / self.unit(block)
 
         blocks = self._blocks(rows, 0, matrix_free(family))
         if row_blocks.devices():
@@ -154,8 +159,9 @@ class Problem:
         triangle = Triangle.empty(family.num_parameters)
         for block in blocks:
             found = self.images(family, coefficients, block, steps, derivatives=True)
-            residual = (found.states - self.z1[block]) / self.scale
-            slope = found.by_coefficient / self.scale[:, None]
+            unit = self.unit(block)
+            residual = (found.states - self.z1[block]) / unit
+            slope = found.by_coefficient / unit[..., None]
             rows = np.concatenate([slope, residual[..., None]], axis=-1)
             if not np.isfinite(rows).all():
                 return triangle.spoilt()

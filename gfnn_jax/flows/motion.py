@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
+from gfnn_jax.families.lagrangian import UNIFORM, Friction, Lagrangian, Terms
 
 # Dormand & Prince, J. Comput. Appl. Math. 6 (1980) 19: the solution of order 5.
 NODES = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])
@@ -28,7 +28,7 @@ _A = np.array([
     [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
     [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
 ])  # fmt: skip
-_B = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
+WEIGHTS = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
 
 
 class Step(NamedTuple):
@@ -43,7 +43,8 @@ class Step(NamedTuple):
 @dataclasses.dataclass(frozen=True, eq=False)
 class Form:
     """A law whose coefficients are free: terms with θ = ``fixed`` + ``basis`` c (the gauge),
-    friction, and gains of the inputs. Its coefficients are (c, ρ, G row by row)."""
+    friction, and gains of the inputs. Its coefficients are (c, ρ, G row by row); that of a row of
+    friction of the kind UNIFORM is γ, of the force −γ ∂L/∂v."""
 
     terms: Terms
     fixed: np.ndarray
@@ -67,8 +68,9 @@ class Form:
 
     def lagrangian(self, p: np.ndarray) -> Lagrangian:
         c, losses, gains = self.split(p)
-        theta = self.fixed + self.basis @ c
-        return Lagrangian(self.terms, theta, self.friction, losses, 0.0, gains)
+        theta, even = self.fixed + self.basis @ c, self.friction.kinds == UNIFORM
+        friction = self.friction.take(~even)
+        return Lagrangian(self.terms, theta, friction, losses[~even], losses[even].sum(), gains)
 
     def accelerate(
         self, law: Lagrangian, q: np.ndarray, v: np.ndarray, u: np.ndarray, sensitive: bool = True
@@ -80,13 +82,17 @@ class Form:
         A, _, _ = self.terms.quadratic()
         theta, d = law.coefficients, self.dim
         A = A.reshape(-1, d * d)
-        _, pull, stiffness = self.friction.tables(v)
-        directions = self.friction.directions
+        even = self.friction.kinds == UNIFORM
+        _, pull, stiffness = law.friction.tables(v)
+        directions = law.friction.directions
         along = np.einsum("npi,ni->np", df, v)
         forced, turned = theta * g, np.einsum("np,npi->ni", theta * along, dg)
         force = np.einsum("np,npi->ni", forced, df) - turned - (law.losses * pull) @ directions
         if self.num_inputs:
             force = force + u @ law.gains.T
+        if even.any():
+            momentum = np.einsum("np,npi->ni", theta * f, dg)
+            force = force - law.uniform * momentum
         inverse = np.linalg.inv(((theta * f) @ A).reshape(-1, d, d))
         a = np.einsum("nij,nj->ni", inverse, force)
         push = (a @ A.reshape(-1, d).T).reshape(df.shape)
@@ -98,11 +104,19 @@ class Form:
         outer = (directions[:, :, None] * directions[:, None, :]).reshape(-1, d * d)
         by_v = ((theta * along) @ A + (law.losses * stiffness) @ outer).reshape(-1, d, d)
         by_v = by_v + turned - turned.swapaxes(1, 2)
+        if even.any():
+            by_q += law.uniform * turned
+            by_v = by_v + law.uniform * ((theta * f) @ A).reshape(-1, d, d)
         columns = [by_q, by_v]
         if sensitive:
             rows = push * f[..., None] + dg * along[..., None] - g[..., None] * df
+            rows = rows + law.uniform * (f[..., None] * dg)
             columns.append(rows.swapaxes(1, 2) @ self.basis)
-            columns.append((pull[..., None] * directions).swapaxes(1, 2))
+            by_losses = np.empty((len(v), d, len(even)))
+            by_losses[..., ~even] = (pull[..., None] * directions).swapaxes(1, 2)
+            if even.any():
+                by_losses[..., even] = momentum[..., None]
+            columns.append(by_losses)
         if sensitive and self.num_inputs:
             pushed = -u[:, None, None, :] * np.eye(d)[:, :, None]
             columns.append(pushed.reshape(len(v), d, -1))
@@ -132,8 +146,8 @@ class Form:
                 slope[:, d:, 2 * d :] += by[..., 2 * d :]
                 rates.append(np.concatenate([xi[:, d:], a], axis=1))
                 slopes.append(slope)
-            for i in np.flatnonzero(_B):
-                x, D = x + _B[i] * h * rates[i], D + _B[i] * wide * slopes[i]
+            for i in np.flatnonzero(WEIGHTS):
+                x, D = x + WEIGHTS[i] * h * rates[i], D + WEIGHTS[i] * wide * slopes[i]
         return Step(x, D[..., : 2 * d], D[..., 2 * d :])
 
     def advance(self, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -148,6 +162,6 @@ class Form:
                     xi = xi + _A[i, j] * h * rates[j]
                 a = law.acceleration(xi[:, :d], xi[:, d:], u[:, k, i])
                 rates.append(np.concatenate([xi[:, d:], a], axis=1))
-            for i in np.flatnonzero(_B):
-                x = x + _B[i] * h * rates[i]
+            for i in np.flatnonzero(WEIGHTS):
+                x = x + WEIGHTS[i] * h * rates[i]
         return x

@@ -1,5 +1,5 @@
 """Inputs between their samples: held, linear, or band-limited, at the nodes of the Runge–Kutta
-steps."""
+steps; and inputs that act later than they were measured."""
 
 from __future__ import annotations
 
@@ -19,27 +19,47 @@ def stage_times(t: np.ndarray, substeps: int) -> np.ndarray:
     return t[..., :-1, None, None] + h * parts
 
 
-def interpolate(
-    t: np.ndarray, u: np.ndarray, at: np.ndarray, hold: str, starts: np.ndarray | None = None
+def at_stages(
+    t: np.ndarray, u: np.ndarray, ends: np.ndarray, substeps: int, hold: str, delay: float = 0.0
 ) -> np.ndarray:
-    """u (n, k), sampled at t (n,), at the times ``at`` (...): (..., k). Where it is held, stages at
-    the end of a step still see the value at its start, ``starts`` (...)."""
-    flat = at.reshape(-1)
+    """u(· − delay) (..., L − 1, substeps, 6, k) at the stages of steps between times ``ends``
+    (..., L), of samples u (n, k) at times t (n,). Where inputs are held, every stage of a substep
+    sees their mean over it, so that the substep takes up all of their momentum."""
+    at = stage_times(ends, substeps) - delay
     if u.shape[1] == 0:
         return np.zeros((*at.shape, 0))
     if hold == "hold":
-        when = (
-            flat if starts is None else np.minimum(flat, np.broadcast_to(starts, at.shape).ravel())
-        )
-        index = np.clip(
-            np.searchsorted(t, when + 1e-9 * (t[1] - t[0]), side="right") - 1, 0, len(t) - 1
-        )
-        found = u[index]
-    elif hold == "linear":
+        mean = _mean_of_held(t, u, at[..., 0], at[..., -1])
+        return np.broadcast_to(mean[..., None, :], (*at.shape, u.shape[1]))
+    return interpolate(t, u, at, hold)
+
+
+def interpolate(t: np.ndarray, u: np.ndarray, at: np.ndarray, hold: str) -> np.ndarray:
+    """u (n, k), sampled at t (n,), at the times ``at`` (...): (..., k), "linear" or "band"."""
+    flat = at.reshape(-1)
+    if hold == "linear":
         found = np.stack([np.interp(flat, t, column) for column in u.T], axis=1)
     else:
         found = _band_limited(t, u, flat)
     return found.reshape(*at.shape, u.shape[1])
+
+
+def _mean_of_held(t: np.ndarray, u: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Means (..., k) from ``start`` to ``end`` (...) of inputs that keep each sample until the
+    next; before the first sample it is that one, where no time passes the value there."""
+    index = np.clip(np.searchsorted(t, start, side="right") - 1, 0, len(t) - 1)
+    passed = (end - start)[..., None]
+    steps = np.diff(t)[:, None]
+    whole = np.concatenate([np.zeros((1, u.shape[1])), np.cumsum(u[:-1] * steps, axis=0)])
+
+    def integral(s: np.ndarray) -> np.ndarray:
+        """∫ u from t[0] to s."""
+        before, after = np.minimum(s - t[0], 0.0), np.maximum(s - t[-1], 0.0)
+        inside = np.stack([np.interp(s, t, column) for column in whole.T], axis=-1)
+        return inside + before[..., None] * u[0] + after[..., None] * u[-1]
+
+    moved = integral(end) - integral(start)
+    return np.where(passed > 0, moved / np.where(passed > 0, passed, 1.0), u[index])
 
 
 def _band_limited(t: np.ndarray, u: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gfnn_jax.budget import READING
 from gfnn_jax.data.files import iterate_pairs, read_trajectories
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.data.summary import summary
-from gfnn_jax.errors import InputError
+from gfnn_jax.errors import InputError, OutOfTime
 from gfnn_jax.evaluate import report
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.jobs.progress import SILENT, Progress
@@ -19,7 +21,7 @@ from gfnn_jax.jobs.search import BEST, failures_of_arithmetic, refusals, scene_n
 from gfnn_jax.jobs.written import Ran, already_done, publish, write
 from gfnn_jax.learn.check import FEWEST
 from gfnn_jax.learn.options import FitOptions
-from gfnn_jax.learn.refit import can_be_refitted, help_refit, not_refitted, refit
+from gfnn_jax.learn.refit import can_be_refitted, help_refit, not_refitted, refit, work_of_refit
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.processes import Group, Share
@@ -29,6 +31,7 @@ from gfnn_jax.storage.partial import unfinished
 # A larger file, or several files, are never in memory as a whole: candidates are chosen on a sample
 # of the pairs, and the chosen one is fitted to all of them chunk by chunk.
 _LARGE_BYTES, _FIT_CHUNK = 2**29, 50_000
+_TO_ALL = "the fit of the chosen candidate to all pairs"
 
 
 def fit(
@@ -64,11 +67,13 @@ def fit(
     fewest = FEWEST if structured else None
     size = sum(path.stat().st_size for path in data if path.is_file())
     large = processes is not None or len(data) > 1 or size > _LARGE_BYTES
+    started = time.perf_counter()
     trajectories = (
         read_sample(data, dt=dt, group=processes)
         if large
         else read_trajectories(data[0], dt=dt, fewest=fewest)
     )
+    reading = time.perf_counter() - started
     if not group.first:
         progress.say("waiting for the map of a sample")
         told = group.told()
@@ -89,18 +94,27 @@ def fit(
     with unfinished(out, job, what="fit", overwrite=overwrite, resume=resume) as kept_in:
         try:
             fitted = search(
-                trajectories.pairs(), scene, asked, progress=progress, kept_in=kept_in, job=job
+                trajectories.pairs(), scene, asked, progress=progress, spent=reading,
+                kept_in=kept_in, job=job,
             )  # fmt: skip
             if large and can_be_refitted(fitted.map):
-                progress.say("all pairs, for the chosen candidate")
-                with failures_of_arithmetic(), row_blocks.on_devices(own):
-                    fitted = refit(
-                        fitted, pairs, fitted.validation_pairs, test=fitted.test_pairs,
-                        scene=scene, group=group,
-                    )  # fmt: skip
+                assert trajectories.sampled is not None
+                seconds = work_of_refit(fitted, trajectories.sampled, reading)
+                try:
+                    with fitted.budget.last(_TO_ALL, READING, seconds, decides=True):
+                        progress.say("all pairs, for the chosen candidate")
+                        with failures_of_arithmetic(), row_blocks.on_devices(own):
+                            fitted = refit(
+                                fitted, pairs, fitted.validation_pairs, test=fitted.test_pairs,
+                                scene=scene, group=group,
+                            )  # fmt: skip
+                except OutOfTime:
+                    group.told({})
+                    fitted = not_refitted(fitted, f"no time, it would take about {seconds:.2g} s")
             else:
                 group.told({})
-                fitted = not_refitted(fitted) if large else fitted
+                why = "only sums of terms are (leave out --family mlp)"
+                fitted = not_refitted(fitted, why) if large else fitted
             progress.say("the report: the posterior, and the derivative of a step")
             fitted = fitted.settled()
             result = report.assemble(

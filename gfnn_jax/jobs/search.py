@@ -33,14 +33,15 @@ def search(
     options: FitOptions,
     *,
     progress: Progress,
+    spent: float = 0.0,
     kept_in: Path | None = None,
     job: dict[str, Any] | None = None,
 ) -> Fit:
     """Fit these pairs.
 
-    kept_in: folder for checkpoints of a training, factors, and the best map so far. job: the job
-    that they belong to. Raises InputError for data or a request that cannot give a map, WorkError
-    where the arithmetic fails.
+    spent: seconds of the budget that are gone already. kept_in: folder for checkpoints of a
+    training, factors, and the best map so far. job: the job that they belong to. Raises InputError
+    for data or a request that cannot give a map, WorkError where the arithmetic fails.
     """
     checkpoints = factors = on_better = None
     if kept_in is not None:
@@ -48,7 +49,7 @@ def search(
         on_better = partial(_keep, kept_in / BEST, scene, job)
     with refusals(), failures_of_arithmetic():
         return fit(
-            pairs, scene, options=options, checkpoints=checkpoints, factors=factors,
+            pairs, scene, options=options, spent=spent, checkpoints=checkpoints, factors=factors,
             on_progress=progress.say,
             on_candidate=lambda candidate: progress.tell(line(candidate)), on_better=on_better,
         )  # fmt: skip

@@ -66,11 +66,11 @@ def check_request(
     if own_dt or pairs.args or pairs.period is not None:
         check_varied(pairs)
     if pairs.period is not None and options.chart == "type1":
-        raise FitError("expected another chart than type1, which a driven map has not")
+        raise FitError("expected another chart than type1 for a driven map")
     if not own_dt and not 0 < float(pairs.dt) < np.inf:
         raise FitError(
             f"expected a time step that is finite and above 0, got {pairs.dt}"
-            + (float(pairs.dt) < 0) * ": of steps back, z1 are the states and z0 their images"
+            + (float(pairs.dt) < 0) * ": where z1 come before z0 in time, exchange them"
         )
     if structure is not None:
         _check_structured(structure, scene, options, pairs)
@@ -113,7 +113,7 @@ def _check_structured(
     if (options.family, options.base) != ("auto", None):
         raise FitError("a structure has its own terms: expected no family or base")
     if chart == "type1":
-        raise FitError("expected another chart than type1, which has no structure")
+        raise FitError("expected another chart than type1 for a structure")
     bodies = structure.startswith("bodies")
     if bodies and (learn == "map" or chart != "auto"):
         raise FitError("a structure of bodies is that of H: expected no learn='map' or chart")
@@ -178,8 +178,8 @@ def coarse_tolerance(pairs: Pairs, tolerance: Tolerance) -> list[str]:
         return []
     unit = " of the coordinates' spread" if tolerance.relative else ""
     return [
-        f"a step moves the states by {size:.1e}{unit}: maps that know little of the motion meet a "
-        f"tolerance of {tolerance.bound:g}, which is more than a hundredth of that"
+        f"a step moves the states by {size:.1e}{unit}: a tolerance of {tolerance.bound:g}, more "
+        "than a hundredth of that, is met by maps that hardly know the motion: ask for less"
     ]
 
 

@@ -25,7 +25,7 @@ from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.generating_functions.sweeps import OF_SOLVE, OF_STEPS, LinearSweep
 from gfnn_jax.models.hamiltonians.choose_law import long_step
 from gfnn_jax.models.hamiltonians.white import leaves_white
-from gfnn_jax.search.search import AS_FAR, MET, Entry
+from gfnn_jax.search.search import COMPARABLE, MET, Entry
 
 _NO_MORE = {
     False: "no larger library of terms promised to meet it",
@@ -168,7 +168,7 @@ def _stalled(candidate: Candidate, entry: Entry | None, searched: Searched) -> b
         return searched.of_terms.stalled
     if entry is None and not found.ranking:
         return searched.law is not None and searched.law.stalled
-    limit = AS_FAR * candidate.validation_relative
+    limit = COMPARABLE * candidate.validation_relative
     return any(
         (e.candidate.chart, e.candidate.family) in found.stalled
         and e.candidate.validation_relative <= limit
@@ -217,8 +217,8 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
     if differs_between_sequences(y0 / scale, residual / scale, sequence):
         message = (
             "what is left over agrees within a sequence and differs between sequences: something "
-            "that the states do not hold (a mass, a length, a field) differs between them; learn "
-            "those of one value by themselves"
+            "that the states do not hold (a mass, a length, a field) differs between them: give it "
+            "as a parameter (args), or fit the sequences of one value by themselves"
         )
         return _LeftOver(None, [message], "something that the states do not hold differs between "
                          "the sequences")  # fmt: skip
@@ -235,9 +235,8 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
         return _LeftOver(None, [message], "volumes of phase space change, as by friction")
     if np.isfinite(error) or _told_by_neighbours(sample) is False:
         message = (
-            "what is left over is a function of the states and no noise, neighbouring pairs agree "
-            "in it: a structure that these functions cannot represent, or pairs of no symplectic "
-            "map"
+            "what is left over is no noise, for neighbouring pairs agree in it: the motion has a "
+            "structure that these functions cannot represent, or it is not symplectic"
         )
         return _LeftOver(None, [message], "what is left over is a function of the states")
     return None

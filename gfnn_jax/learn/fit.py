@@ -263,6 +263,7 @@ def fit(
     *,
     options: FitOptions | None = None,
     clock: Callable[[], float] = time.perf_counter,
+    spent: float = 0.0,
     checkpoints: Any = None,
     factors: Any = None,
     on_progress: Callable[[str], Any] = lambda message: None,
@@ -284,7 +285,8 @@ def fit(
                learn="map" ask for.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
     options:   a `FitOptions`, which the keywords below change; None: its defaults.
-    clock:     gives the seconds that max_seconds is held against.
+    clock:     gives the seconds that max_seconds is held against. spent: seconds of them that are
+               gone already, as on reading files.
     checkpoints, factors: a ``TrainingCheckpoints`` and a ``KeptFactors``, which an interrupted fit
                has saved to and the same fit goes on from.
     on_progress, on_candidate: called with what is being done, and with every candidate.
@@ -303,9 +305,11 @@ def fit(
             return fit_positions(pairs, options, clock, on_progress, on_candidate)
         return fit_recording(
             pairs, friction=options.friction, input_hold=options.input_hold, mass=options.mass,
-            terms=tuple(options.terms), on_progress=on_progress,
+            terms=tuple(options.terms), loss=options.loss, on_progress=on_progress,
         )  # fmt: skip
-    budget = options.budget(clock, pairs.dim if isinstance(pairs, Pairs) else None)
+    if options.loss is not None:
+        raise FitError("a loss is of a recording whose law is learned: expected none of pairs")
+    budget = options.budget(clock, pairs.dim if isinstance(pairs, Pairs) else None, spent)
     require_x64("a fit")
     messages: list[str] = []
 
@@ -348,7 +352,7 @@ def fit(
         error = stated(chosen, found, budget)
         chosen, stated_by = with_test_rows(chosen, error, found, budget)
         conclusion = conclude(chosen, found, request)
-        warn(conclusion.messages)
+        warn([*conclusion.messages, *filter(None, [error.few])])
     judged = min(_JUDGED, block_of(2 * data.dim))
     some = chosen.data.pairs.take(chosen.data.validation[:judged])
     return Fit(
@@ -387,6 +391,8 @@ def _check_of_recording(scene: Scene | None, options: FitOptions) -> None:
         )
     if scene is not None or options.base is not None:
         raise InputError("expected no scene or base of a recording")
+    if options.learn == "map" and options.loss is not None:
+        raise InputError("a loss is of a recording whose law is learned: expected none of its map")
     if options.learn != "map" and options.structure is not None:
         raise InputError("expected no structure of a recording whose law is learned")
 

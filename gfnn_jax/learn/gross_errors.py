@@ -108,7 +108,7 @@ def _residuals(found: Searched) -> np.ndarray | None:
     if law is not None and best is law.candidate:
         left = (law.flow.image(data.y0) - data.y1) / data.scale
     elif entry is not None and isinstance(entry.sweep, LinearSweep) and _same(entry.sweep, data):
-        left = entry.sweep.left_over(entry.size)
+        left = entry.sweep.residuals(entry.size)
     else:
         return None
     size = np.linalg.norm(left, axis=1)

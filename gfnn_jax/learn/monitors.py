@@ -7,7 +7,8 @@ known and linear, a drift or lenses,
 
 two monitors tell p = B⁻¹ (Q − A q) and P, in their own unit: slopes in metres per metre across a
 drift. Every other stretch, from one place to the next, is then learned from canonical pairs, and
-the maps of all places in a row are that of a turn.
+the maps of all places in a row are that of a turn. Where the readings of two monitors have noise,
+it is learned with latent readings.
 """
 
 from __future__ import annotations
@@ -17,14 +18,18 @@ from collections.abc import Sequence
 from functools import reduce
 from typing import Any
 
+import jax
 import numpy as np
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.fit import Fit, fit
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.generating_functions.latent_monitors import Linear, latent_readings
 from gfnn_jax.phase_space import Pairs, sizes, symplectic_form
 
 _SYMPLECTIC = 1e-9  # ‖MᵀJM − J‖ of a stretch that is known
@@ -37,12 +42,15 @@ class Monitors:
     """Maps from each place to the next, the last one to the first place of the next turn.
 
     places: the columns of each monitor, d each. maps: one for each stretch, in the order of the
-    places. fits: how each was learned; None where it was known.
+    places. fits: how each was learned from momenta as they are read; None where it was known.
+    noise: σ of each place's columns, as ``places`` has them, where two places have noise: the map
+    between them is then learned with latent readings, and its posterior is that of this fit.
     """
 
     places: tuple[tuple[str, ...], ...]
     maps: tuple[SymplecticMap, ...]
     fits: tuple[Fit | None, ...]
+    noise: tuple[tuple[float, ...], ...] | None
     _known: tuple[np.ndarray | None, ...] = dataclasses.field(repr=False)
 
     def turn(self, place: int = 0) -> SymplecticMap:
@@ -114,7 +122,50 @@ def fit_monitors(
         map_ if map_ is not None else _linear(matrix, _pairs(states, k, dt), like)
         for k, (map_, matrix) in enumerate(zip(maps, known, strict=True))
     ]
-    return Monitors(places, tuple(whole), tuple(fits), known)
+    noise, unknown = None, [k for k, one in enumerate(fits) if one is not None]
+    k = unknown[0]
+    seen = fits[k]
+    if len(places) == 2 and seen is not None and not seen.met:
+        better = _of_latent_readings(whole[k], runs, known, k)
+        if better is not None:
+            whole[k], noise = better
+    return Monitors(places, tuple(whole), tuple(fits), noise, known)
+
+
+def _of_latent_readings(
+    map_: SymplecticMap, runs: list[list[np.ndarray]], known: tuple[np.ndarray | None, ...], k: int
+) -> tuple[SymplecticMap, tuple[tuple[float, ...], ...]] | None:
+    """Stretch k of two, as it was learned by least squares, learned from the same readings as
+    latent ones, and the noise of both places; None where that fails."""
+    matrix = known[1 - k]
+    assert matrix is not None
+    pieces = jax.tree.map(np.asarray, map_.pieces)
+    own = next((i for i, piece in enumerate(pieces) if isinstance(piece, Generated)), None)
+    if own is None:
+        return None
+    dim = len(matrix) // 2
+    read = np.eye(2 * dim)
+    read[dim:] = matrix[:dim]
+    ends = (
+        [Linear(matrix @ np.linalg.inv(read)), *pieces[:own]],
+        [*pieces[own + 1 :], Linear(read)],
+    )
+    turns = [run for q in runs for run in _without_gaps(np.concatenate(_ends(q, 1 - k), axis=1))]
+    found = latent_readings(pieces[own], ends, turns)
+    if found is None:
+        return None
+    first, last = (tuple(map(float, half)) for half in np.split(found.sigma, 2))
+    noise = (first, last) if k == 1 else (last, first)
+    leaves = jax.tree.map(jax.device_put, (*pieces[:own], found.piece, *pieces[own + 1 :]))
+    posterior = Posterior(own, found.root)
+    return dataclasses.replace(map_, pieces=leaves, posterior=posterior), noise
+
+
+def _without_gaps(y: np.ndarray) -> list[np.ndarray]:
+    """Stretches of rows (n, 2d) without a missing value."""
+    known = np.isfinite(y).all(axis=1)
+    cuts = np.flatnonzero(np.diff(known)) + 1
+    return [part for part in np.split(y, cuts) if np.isfinite(part).all() and len(part)]
 
 
 def _matrix(stretch: float | np.ndarray | None, dim: int) -> np.ndarray | None:
@@ -137,7 +188,9 @@ def _matrix(stretch: float | np.ndarray | None, dim: int) -> np.ndarray | None:
         raise InputError(f"expected a symplectic matrix, got one of defect {defect:.2g}")
     values = np.linalg.svd(matrix[:dim, dim:], compute_uv=False)
     if not values[-1] > _SEEN * max(values[0], 1e-300):
-        raise InputError("a known stretch maps no momenta to positions: it does not tell them")
+        raise InputError(
+            "a known stretch turns no momenta into displacements: it does not tell them"
+        )
     return matrix
 
 

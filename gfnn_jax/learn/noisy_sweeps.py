@@ -36,7 +36,7 @@ from gfnn_jax.models.generating_functions.sweeps import (
     part_of_noise,
 )
 from gfnn_jax.models.hamiltonians.choose_law import preferred
-from gfnn_jax.search.search import AS_FAR, Entry
+from gfnn_jax.search.search import COMPARABLE, Entry
 
 _MOST_SWEEPS = 3
 _WHAT = "the fit of S to the states that noisy pairs most likely had"
@@ -73,7 +73,7 @@ def without_bias(found: Searched, request: Request) -> Searched:
     except np.linalg.LinAlgError:  # a chart that is singular at some pair
         request.budget.leave_out(_WHAT, "the chart is singular at some of the pairs")
         return found
-    if not entry.candidate.validation_relative <= AS_FAR * best.candidate.validation_relative:
+    if not entry.candidate.validation_relative <= COMPARABLE * best.candidate.validation_relative:
         return found
     request.tell(entry.candidate)
     others = [e for e in found.found.entries if e.size is not entry.size]
@@ -84,7 +84,7 @@ def without_bias(found: Searched, request: Request) -> Searched:
 def _as_far(found: Searched) -> list[Entry]:
     """The best entry of every sweep that has come as far as the best one and can be corrected."""
     best: dict[int, Entry] = {}
-    limit = AS_FAR * found.found.ranking[0].candidate.validation_relative
+    limit = COMPARABLE * found.found.ranking[0].candidate.validation_relative
     for entry in found.found.entries:
         error = entry.candidate.validation_relative
         known = best.get(id(entry.sweep))
@@ -188,12 +188,20 @@ class NoisySweep(LinearSweep):
         data, coefficients = self.data, near.solve(size, Budget(), _quiet)[0].coefficients
 
         def nearest(rows) -> NearestArcs:
-            arcs = arcs_of_pairs(*_chained(data, np.sort(rows)))
+            rows = np.sort(rows)
+            z0, z1, longest, steps = _chained(data, rows)
+            arcs = arcs_of_pairs(z0, z1, longest, steps)
             assert arcs is not None
+            sigma = deviations * data.scale
+            if data.weight is not None:
+                own = sigma / data.weight[rows]
+                along = arcs_of_pairs(own, own, longest, steps)
+                assert along is not None
+                sigma = np.where(np.isfinite(along.states), along.states, sigma)
             model = GeneratedOnArcs(
                 size.family, self.chart, data.dt, arcs.moves, (data.before, data.after)
             )
-            return NearestArcs.of(model, coefficients, arcs, deviations * data.scale)
+            return NearestArcs.of(model, coefficients, arcs, sigma)
 
         self._along = nearest
         self._nearest, self._nearest_held = map(nearest, (data.training, data.validation))

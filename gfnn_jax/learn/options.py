@@ -95,6 +95,10 @@ _MODEL = Kind(
     "a model with a name, sizes(data) and fit(data, size)",
     lambda v: all(hasattr(v, name) for name in ("name", "sizes", "fit")),
 )
+_LOSS = Kind(
+    "a loss with of(residuals) and weights(residuals)",
+    lambda v: all(hasattr(v, name) for name in ("of", "weights")),
+)
 
 
 class About(NamedTuple):
@@ -201,7 +205,8 @@ class FitOptions:
     ))  # fmt: skip
     friction: str = field(default="auto", metadata=_about(
         _TEXT,
-        "of a recording: auto, none, linear, quadratic, dry, or some joined by +", "KIND", FIT,
+        "of a recording: auto, none, linear, quadratic, dry, uniform, several joined by +", "KIND",
+        FIT,
     ))  # fmt: skip
     input_hold: str = field(default="auto", metadata=_about(
         _one_of("auto", "hold", "linear", "band"),
@@ -209,6 +214,11 @@ class FitOptions:
     ))  # fmt: skip
     mass: Mapping[str, float] | None = field(default=None, metadata=_about(
         _MASSES, "of a recording: the known mass of one position", commands=()
+    ))  # fmt: skip
+    loss: Any = field(default=None, metadata=_about(
+        _LOSS,
+        "of a recording whose law is learned: the loss of residuals in units of their noise, of "
+        "one's own", commands=()
     ))  # fmt: skip
     devices: int | str | None = field(default=None, metadata=_about(
         DEVICES,
@@ -230,12 +240,12 @@ class FitOptions:
             and not self.terms and self.structure is None
         ):  # fmt: skip
             raise FitError(
-                "a model of one's own is all that is learned: expected no learn, terms, base, "
+                "with model=… nothing else is learned: expected no learn, terms, base, "
                 "structure, family or chart beside it"
             )
         if self.ensemble > 1 and (self.family != "mlp" or of_h):
             raise FitError(
-                "an ensemble is of networks S: expected family='mlp', and S to be learned"
+                "an ensemble is of networks S: expected family='mlp', and no learn='hamiltonian'"
             )
         if self.terms and (self.learn == "map" or not plain):
             raise FitError(
@@ -243,7 +253,9 @@ class FitOptions:
                 "chart"
             )
         if self.base is not None and (of_h or self.terms):
-            raise FitError("a base Hamiltonian is factored out of the map: it goes with S alone")
+            raise FitError(
+                "base is factored out of a map S: expected no terms and no learn='hamiltonian'"
+            )
         if of_h and (self.family not in ("auto", "mlp") or self.chart != "auto"):
             raise FitError(
                 "family and chart are those of S: learn='hamiltonian' has no chart, and no family "
@@ -256,10 +268,13 @@ class FitOptions:
         values = {name: getattr(self, name) for name, about in OPTIONS.items() if about.decides}
         return {n: list(v) if isinstance(v, (tuple, list)) else v for n, v in values.items()}
 
-    def budget(self, clock: Callable[[], float], dim: int | None) -> Budget:
-        """Start the budget of a fit whose map has ``dim`` degrees of freedom."""
+    def budget(
+        self, clock: Callable[[], float], dim: int | None, spent: float = 0.0
+    ) -> Budget:  # fmt: skip
+        """Start the budget of a fit whose map has ``dim`` degrees of freedom, ``spent`` seconds
+        ago."""
         seconds = seconds_allowed(self.max_seconds, self.max_operations)
-        return Budget(seconds, self.max_operations, clock, dim)
+        return Budget(seconds, self.max_operations, clock, dim, spent)
 
 
 OPTIONS: dict[str, About] = {f.name: f.metadata["about"] for f in dataclasses.fields(FitOptions)}

@@ -225,7 +225,7 @@ class _Sweep:
     def without_noise(self, best: _Found) -> _Found:
         """S with latent positions where the readings have noise, by which least squares is biased;
         else the best as it is."""
-        if self.sites is not None or not self._stalls(best):
+        if not self._stalls(best):
             return best
         self.say("larger S leave as much: the readings have noise")
         symmetric, split = best.about.symmetric, self.split

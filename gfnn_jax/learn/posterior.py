@@ -24,7 +24,7 @@ def with_posterior(chosen: Chosen, searched: Searched) -> Chosen:
     it is none of these. It is computed when it is first asked for."""
     map_, entry, law = chosen.candidate.map, chosen.entry, searched.law
     if entry is not None:
-        own = entry.sweep.data.pairs is searched.data.pairs and map_.parameters is None
+        own = entry.sweep.data.pairs is searched.data.pairs
         if not (own and isinstance(entry.sweep, (LinearSweep, EnsembleSweep))):
             return chosen
         kind, root = Generated, partial(entry.sweep.root, entry.size)

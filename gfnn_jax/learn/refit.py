@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gfnn_jax.budget import FLOW, RATES, ROWS
 from gfnn_jax.candidates.assemble import stepped
 from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_inner, whole_turns
@@ -50,6 +51,7 @@ _OF_TASK = "task "  # before the names of a task, in what processes are told
 # Pairs that are close or not, of the first those that are not resolved, and those of another dt.
 _COUNTED = ("count", "outliers", "unresolved", "other_dt")
 _SAME, _PRINTED = 1e-9, 1e-5  # of dt: two that are one, and what printed times may differ by
+_PASSES_OF_LAW = 3  # through all pairs: Gauss–Newton steps from coefficients of a sample
 _NO_WORSE = 1.1  # a refit whose error is larger by this factor than that of its sample is not kept
 
 
@@ -60,14 +62,26 @@ def can_be_refitted(map_: SymplecticMap) -> bool:
     return index is not None and hasattr(map_.pieces[index].family, "term_gradients")
 
 
-def not_refitted(fitted: Fit) -> Fit:
-    """The fit of a sample as it is, with a warning (FitWarning) that says so."""
+def not_refitted(fitted: Fit, why: str) -> Fit:
+    """The fit of a sample as it is, with a warning (FitWarning) that says so, and why."""
     message = (
         f"{fitted.chosen.label} is fitted to a sample of {fitted.num_pairs} pairs, not to all of "
-        "them: only sums of terms are (leave out --family mlp)"
+        f"them: {why}"
     )
     warnings.warn(message, FitWarning, stacklevel=2)
     return dataclasses.replace(fitted, messages=(*fitted.messages, message))
+
+
+def work_of_refit(fitted: Fit, num_pairs: int, reading: float) -> float:
+    """Seconds that `refit` takes, about: S goes through all pairs once, a law a few times.
+
+    reading: seconds that reading the pairs once takes.
+    """
+    chosen, width = fitted.chosen, 2 * fitted.map.dim
+    if chosen.learns == "map":
+        return reading + 2.0 * num_pairs * width * (chosen.num_parameters + 1) ** 2 / RATES[ROWS]
+    of_flow = num_pairs * width * chosen.operations / RATES[FLOW]
+    return _PASSES_OF_LAW * (reading + of_flow)
 
 
 def refit(

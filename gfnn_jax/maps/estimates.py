@@ -3,7 +3,7 @@
 The samples before a time are fitted by one arc of the law, its first state unknown: that gives the
 state there with its covariance. A forecast is the orbit from it. Its band holds the error of that
 state, of the law's coefficients, the noise of a sample, and the law's own misfit, as forecasts of
-the data that it was learned from have shown it.
+data that it was not learned from have shown it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ import numpy as np
 from gfnn_jax.data.channels import channels_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.lagrangian import Lagrangian
+from gfnn_jax.families.lagrangian import UNIFORM, Friction, Lagrangian
 from gfnn_jax.flows.motion import Form
-from gfnn_jax.flows.schedules import interpolate, stage_times
+from gfnn_jax.flows.schedules import at_stages
+from gfnn_jax.maps import stops
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.signals.local_cubics import smooth
@@ -61,12 +62,18 @@ class Law(NamedTuple):
 
 
 def law_in_use(law: Lagrangian, root: np.ndarray | None, sensors: Sensors) -> Law:
-    """Prepare a Lagrangian without uniform friction and the root (m, n) of the covariance of (θ, ρ,
-    G)."""
-    count = law.terms.count
-    form = Form(law.terms, np.zeros(count), np.eye(count), law.friction, law.num_inputs)
-    p = np.concatenate([law.coefficients, law.losses, np.ravel(law.gains)])
-    return Law(form, p, np.zeros((0, len(p))) if root is None else np.asarray(root), sensors)
+    """Prepare a Lagrangian and the root (m, n) of the covariance of (θ, ρ, G), and of γ where there
+    is uniform friction."""
+    count, rows, losses = law.terms.count, law.friction.rows(), law.losses
+    order = np.arange(count + law.friction.count + law.gains.size)
+    if law.uniform != 0:  # γ, the last of all, stands behind ρ in a form
+        rows, losses = [*rows, ((0,) * law.dim, UNIFORM, 0.0)], np.append(losses, law.uniform)
+        order = np.insert(order, count + law.friction.count, len(order))
+    friction = Friction.of(rows, law.dim)
+    form = Form(law.terms, np.zeros(count), np.eye(count), friction, law.num_inputs)
+    p = np.concatenate([law.coefficients, losses, np.ravel(law.gains)])
+    known = np.zeros((0, len(p))) if root is None else np.asarray(root)[:, order]
+    return Law(form, p, known, sensors)
 
 
 def law_of(map_: Any) -> Law:
@@ -224,11 +231,12 @@ def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np
         noise.append(np.concatenate([np.ones((pad, count)), own_noise]))
         x.append(np.concatenate([np.repeat(own[:1], pad, axis=0), own]))
     t, y, x = np.array(t), np.array(y), np.array(x)
-    u, _ = _inputs(law, windows, t, substeps_of(sensors, np.max(np.diff(t, axis=1), initial=0.0)))
+    u = _inputs(law, windows, t, substeps_of(sensors, np.max(np.diff(t, axis=1), initial=0.0)))
     arcs = _Windows(law, np.diff(t, axis=1), u)
     sigma = sensors.seen.state_sigma(x[:, -1], sensors.sigma)
     scale = np.concatenate([sigma, sigma * sensors.omega])
-    found = fit_arcs(arcs, np.zeros(0), x, y, sensors.sigma * np.array(noise), scale)
+    sigma = sensors.sigma * np.array(noise)
+    found = fit_arcs(arcs, np.zeros(0), x, y, sigma, scale, loss=sensors.seen.loss)
     return found.x[:, -1], found.last_covariance()
 
 
@@ -255,14 +263,15 @@ def propagate(
     """Orbits from states x (B, 2d) with their covariance at times ``last`` (B,), to times (B,
     n)."""
     d, sensors, count = law.form.dim, law.sensors, len(law.p)
-    steps = np.diff(np.concatenate([last[:, None], times], axis=1), axis=1)
+    ends, begun = np.concatenate([last[:, None], times], axis=1), x
+    steps = np.diff(ends, axis=1)
     root = np.linalg.cholesky(covariance + 1e-300 * np.eye(2 * d)) if len(x) else covariance
     spread = np.concatenate([root, np.zeros((len(x), 2 * d, law.root.shape[0]))], axis=2)
     states, covariances, now = [], [], last
     for k in range(times.shape[1]):
         parts = substeps_of(sensors, np.max(steps[:, k], initial=0.0))
         both = np.stack([now, times[:, k]], axis=1)
-        u, _ = _inputs(law, windows, both, parts)
+        u = _inputs(law, windows, both, parts)
         step = law.form.step(law.p, x, steps[:, k], u[:, 0])
         x, now = step.states, times[:, k]
         spread = step.by_state @ spread
@@ -270,10 +279,33 @@ def propagate(
         states.append(x)
         covariances.append(spread @ spread.swapaxes(1, 2))
     orbit, of_states = np.stack(states, axis=1), np.stack(covariances, axis=1)
+    orbit = _with_stops(law, windows, np.concatenate([begun[:, None], orbit], axis=1), ends)
     seen = sensors.seen(orbit)
     own = np.einsum("bnki,bnij,bnkj->bnk", seen.by_state, of_states, seen.by_state)
     own = own + sensors.sigma**2 + sensors.misfit_at(times - last[:, None]) ** 2
     return Orbits(seen.values, np.sqrt(own), orbit, of_states)
+
+
+def _with_stops(
+    law: Law, windows: Sequence[Window], orbit: np.ndarray, ends: np.ndarray
+) -> np.ndarray:
+    """Orbits (B, n, 2d) from the first states (B, n + 1, 2d) on, those that dry friction brings to
+    rest followed anew (`maps.stops`)."""
+    lagrangian, sensors = law.form.lagrangian(law.p), law.sensors
+    lanes = np.flatnonzero(stops.resting(lagrangian, orbit, ends, sensors.omega))
+    if not len(lanes):
+        return orbit[:, 1:]
+    some, orbit = [windows[i] for i in lanes.tolist()], orbit.copy()
+    noise = float(np.min(sensors.seen.state_sigma(orbit[:, 0], sensors.sigma)))
+
+    def inputs(k: int, parts: int) -> np.ndarray:
+        return _inputs(law, some, ends[lanes, k : k + 2], parts)[:, 0]
+
+    parts = substeps_of(sensors, np.max(np.diff(ends, axis=1), initial=0.0))
+    found = stops.stopped(lagrangian, orbit[lanes], ends[lanes], noise, parts, inputs)
+    solved = np.isfinite(found).all(axis=(1, 2))
+    orbit[lanes[solved], 1:] = found[solved]
+    return orbit[:, 1:]
 
 
 def substeps_of(sensors: Sensors, h: float) -> int:
@@ -281,14 +313,13 @@ def substeps_of(sensors: Sensors, h: float) -> int:
     return max(1, int(np.ceil(h * sensors.omega / _FINE)))
 
 
-def _inputs(
-    law: Law, windows: Sequence[Window], t: np.ndarray, substeps: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Inputs (B, L − 1, substeps, 6, k) of the steps between times t (B, L), and their times."""
-    at = stage_times(t, substeps) - law.sensors.delay
-    starts = np.broadcast_to(at[..., :1], at.shape)
-    u = np.stack([
-        interpolate(w.inputs_t, w.inputs, a, law.sensors.hold, s)
-        for w, a, s in zip(windows, at, starts, strict=True)
+def _inputs(law: Law, windows: Sequence[Window], t: np.ndarray, substeps: int) -> np.ndarray:
+    """Inputs (B, L − 1, substeps, 6, k) of the steps between times t (B, L)."""
+    sensors = law.sensors
+    if sensors.inputs and sensors.hold == "hold":  # a substep for each of their samples at least
+        between = min(float(np.median(np.diff(w.inputs_t))) for w in windows)
+        substeps = max(substeps, int(np.ceil(np.max(np.diff(t)) / between - 1e-6)))
+    return np.stack([
+        at_stages(w.inputs_t, w.inputs, ends, substeps, sensors.hold, sensors.delay)
+        for w, ends in zip(windows, t, strict=True)
     ])  # fmt: skip
-    return u, at

@@ -42,11 +42,13 @@ class Signals:
     """The inputs of a map by name, and the rule between their samples.
 
     hold: "hold", the value at a step's begin; "linear"; or "band", the band-limited interpolation
-    of evenly sampled values, by a windowed sinc of 64 samples.
+    of evenly sampled values, by a windowed sinc of 64 samples. delay: seconds by which an input
+    acts later than its samples say.
     """
 
     names: tuple[str, ...]
     hold: str = "hold"
+    delay: float = 0.0
 
     def __post_init__(self):
         if self.hold not in HOLDS:
@@ -93,8 +95,10 @@ class Signals:
 
     def coefficients(self, u, dt):
         """Coefficients (..., N, K), from samples u (..., N, k) a time dt apart, of the polynomials
-        in each step; beyond the ends the samples are those at the ends. NumPy or JAX."""
-        xp, (first, weights) = namespace(u, dt), _stencil(self.hold)
+        in each step; beyond the ends the samples are those at the ends. NumPy or JAX. Where there
+        is a delay, dt is a number that is known."""
+        later = self.delay / float(dt) if self.delay else 0.0
+        xp, (first, weights) = namespace(u, dt), _stencil(self.hold, later)
         count = u.shape[-2]
         places = np.arange(count)[:, None] + first + np.arange(weights.shape[1])
         near = u[..., np.clip(places, 0, count - 1), :]  # (..., N, samples, k)
@@ -108,18 +112,44 @@ class Signals:
 
 
 @cache
-def _stencil(hold: str) -> tuple[int, np.ndarray]:
+def _stencil(hold: str, delay: float) -> tuple[int, np.ndarray]:
     """(first, weights): where the samples begin that a step takes, counted from its own, and the
-    coefficients (degree + 1, samples) of their polynomial in units of dt."""
-    if hold == "hold":
-        return 0, np.ones((1, 1))
-    if hold == "linear":
-        return 0, np.array([[1.0, 0.0], [-1.0, 1.0]])
+    coefficients (degree + 1, samples) of their polynomial in units of dt, ``delay`` with them.
+
+    An input that is held or linear has a jump or a bend within a step where it is delayed by a part
+    of it: the polynomial is then the nearest in the mean square, of the same momentum.
+    """
+    whole = int(np.floor(delay))
+    reach = _TAPS if hold == "band" else 1
+    places = np.arange(1 - reach - (delay > whole), reach + 1) - whole
     count = _DEGREE[hold] + 1
-    at = 0.5 - 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / count)  # Chebyshev's
-    first = 1 - _TAPS
-    distance = at[:, None] - (first + np.arange(2 * _TAPS))
+    if hold == "band":
+        at = 0.5 - 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / count)  # Chebyshev's
+        weights = np.ones(count)
+    else:
+        at, weights = _on_either_side(delay - whole)
+    values = _shares(hold, at - delay, places)
+    root = np.sqrt(weights)[:, None]
+    powers = np.vander(at, count, increasing=True)
+    found = np.linalg.lstsq(root * powers, root * values, rcond=None)[0]
+    return int(places[0]), np.where(np.abs(found) > 1e-15, found, 0.0)
+
+
+def _on_either_side(part: float) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss's nodes and weights in a step before and after this part of it."""
+    x, w = np.polynomial.legendre.leggauss(3)
+    ends = [(0.0, part), (part, 1.0)] if part else [(0.0, 1.0)]
+    nodes = [a + (b - a) * (x + 1) / 2 for a, b in ends]
+    return np.concatenate(nodes), np.concatenate([(b - a) * w / 2 for a, b in ends])
+
+
+def _shares(hold: str, at: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """What the samples at whole numbers ``places`` contribute to the value at times ``at`` (n,)."""
+    distance = at[:, None] - places
+    if hold == "hold":
+        return ((distance >= 0) & (distance < 1)).astype(float)
+    if hold == "linear":
+        return np.maximum(0.0, 1 - np.abs(distance))
     window = np.i0(_BETA * np.sqrt(np.clip(1 - (distance / _TAPS) ** 2, 0, None)))
-    values = np.sinc(distance) * window
-    values /= values.sum(axis=1, keepdims=True)
-    return first, np.linalg.solve(np.vander(at, increasing=True), values)
+    values = np.sinc(distance) * np.where(np.abs(distance) < _TAPS, window, 0.0)
+    return values / values.sum(axis=1, keepdims=True)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.coordinates import Coordinates, lift
-from gfnn_jax.families.lagrangian import DRY, Lagrangian
+from gfnn_jax.families.lagrangian import DRY, LINEAR, Lagrangian
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre, family_of, law_of
@@ -22,11 +22,11 @@ from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.phase_space import sizes, split, symplectic_form
+from gfnn_jax.phase_space import sizes, split
 
 _STAGES, _SUBSTEPS = (3, 4, 6, 8), (1, 2, 4, 8, 16, 32)  # that are tried, by rising order
 # h × the fastest rate of a substep: of what fixed-point iterations solve, and Newton's method.
-_CONTRACTING, _STIFFEST = 1.0, 30.0
+_CONTRACTING, STIFFEST = 1.0, 30.0
 _JUDGED = 64  # states whose step tells the error of these
 _NEARLY = 0.95  # of them, whose steps are to be within the tolerance
 
@@ -84,6 +84,34 @@ def sticking(law: Lagrangian, noise: float, duration: float) -> Lagrangian:
     return dataclasses.replace(law, friction=dataclasses.replace(friction, widths=widths))
 
 
+def conformal(law: Lagrangian, covariance: np.ndarray) -> tuple[Lagrangian, np.ndarray]:
+    """The same law with its friction as uniform friction, where one degree of freedom has constant
+    mass m and R = ½ρv² alone: γ = ρ/m; and the covariance (n, n) of (θ, γ), from that of (θ, ρ).
+    Its map keeps a multiple of the symplectic form. Any other law as it is."""
+    rows = law.terms.rows()
+    moved = [(k, n, m) for k, n, m, _ in rows if any(k)]
+    plain = all(sum(k) == 2 and not any(n) and not any(m) for k, n, m in moved)
+    alone = [row[1] for row in law.friction.rows()] == [LINEAR] and law.uniform == 0
+    if law.dim > 1 or law.num_inputs or not plain or not alone:
+        return law, covariance
+    mass = 2 * sum(c for c, row in zip(law.coefficients, rows, strict=True) if any(row[0]))
+    by = np.append(np.ones(law.terms.count), 1 / mass)
+    even = dataclasses.replace(
+        law, friction=law.friction.take([]), losses=law.losses[:0],
+        uniform=float(law.losses[0]) / mass,
+    )  # fmt: skip
+    return even, by[:, None] * covariance * by
+
+
+def stiffness(law: Lagrangian, q: np.ndarray) -> float:
+    """The fastest rate at which dry friction brings bodies to rest at positions q (n, d), 1/time;
+    0 without dry friction."""
+    if not np.any(law.friction.kinds == DRY):
+        return 0.0
+    rates = np.linalg.solve(law.masses(q), law.losses_by_v(0 * q))
+    return float(np.abs(np.linalg.eigvals(rates)).max())
+
+
 def law_of_map(map_: SymplecticMap) -> Lagrangian:
     """The law whose flow the map is. Raises ValueError for any other map."""
     piece = map_.pieces[0]
@@ -109,14 +137,8 @@ def _steps(law: Lagrangian, family, params, z, dt: float, scale, args, tolerance
     """The cheapest steps whose own error is within the tolerance at nearly all of these states;
     and whether Newton's method is to solve them: where dry friction is stiff, whose force turns
     over within ε, and no more than Newton's method bears in a substep."""
-    stiffness = 0.0
-    if np.any(law.friction.kinds == DRY):
-        q = split(z)[0]
-        resting = np.concatenate([q, law.momentum(q, 0 * q)], axis=1)
-        slopes = family.gradient_and_hessian(params, resting, args)[1]
-        turned = symplectic_form(law.dim) @ slopes
-        stiffness = dt * np.abs(np.linalg.eigvals(turned)).max()
-    fewest, stiff = stiffness / _STIFFEST, bool(stiffness > _CONTRACTING)
+    turned = dt * stiffness(law, split(z)[0])
+    fewest, stiff = turned / STIFFEST, bool(turned > _CONTRACTING)
     finest = Steps(_STAGES[-1], 2 * _SUBSTEPS[-1])
     reference = images(family, params, z, dt, finest, args=args).states
     steps = Steps(_STAGES[-1], _SUBSTEPS[-1], stiff)

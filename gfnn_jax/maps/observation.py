@@ -30,7 +30,8 @@ from gfnn_jax.families.expressions import (
 )
 from gfnn_jax.families.jets import jets
 from gfnn_jax.families.traced import traced
-from gfnn_jax.solve.latent_arcs import Observed
+from gfnn_jax.solve.latent_arcs import SOFT_L1, Observed
+from gfnn_jax.solve.robust import Loss
 
 _SAME = 1e-6  # sine of the angle between changes that are the same
 _TRIED = 12  # places of an angle from which a state is looked for
@@ -43,7 +44,7 @@ class Observation:
 
     channels: names of columns. formulas: of each, in the `symbols` of ``coordinates`` and
     ``speeds`` and in ``parameters``. values: (m,) of the parameters, those to start from
-    or those that were fitted.
+    or those that were fitted. loss: of what is left of a channel in units of its noise.
     """
 
     channels: tuple[str, ...]
@@ -52,6 +53,7 @@ class Observation:
     speeds: tuple[str, ...]
     parameters: tuple[str, ...]
     values: Any
+    loss: Loss = SOFT_L1
 
     @staticmethod
     def plain(names: Sequence[str], speeds: Sequence[str] | None = None) -> Observation:
@@ -66,7 +68,8 @@ class Observation:
 
     @property
     def is_plain(self) -> bool:
-        """Return whether every channel is the coordinate of its name, and none is missing."""
+        """Return whether every channel is the coordinate of its name, and none is missing,
+        whatever its noise."""
         return self.channels == self.formulas == self.coordinates
 
     @cached_property
@@ -318,7 +321,7 @@ def _started(g: Observation) -> np.ndarray:
     missing = [g.parameters[i] for i in open_ if not told[i] or not np.isfinite(values[i])]
     if missing:
         raise InputError(
-            f"observe: {', '.join(missing)}: where do they start? guess={{{missing[0]!r}: …}} "
+            f"observe: {', '.join(missing)}: expected a first guess, guess={{{missing[0]!r}: …}} "
             f"(--guess {missing[0]}=…)"
         )
     return np.where(np.abs(values) < 1e-12, 0.0, values)

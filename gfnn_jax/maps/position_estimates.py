@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gfnn_jax.coordinates import whole_turns
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
 from gfnn_jax.generating.position_arcs import PositionArcs, nodes_of
@@ -138,4 +139,21 @@ def _window(map_: Any, piece: Any, recording: Recording, run: str) -> np.ndarray
         )
     for k in range(1, len(q)):
         q[k] = piece.family.lifted(q[k - 1], q[k])
+        if k > 1:
+            q[k] += _turns_missed(piece, q[k - 2 : k + 1])
     return q
+
+
+def _turns_missed(piece: Any, q: np.ndarray) -> np.ndarray:
+    """Whole turns (d,) by which the last of three positions (3, d) is off, where positions are
+    known modulo 2π: a move that goes on from the one before may lie beyond half a turn.
+
+    h² (∂₂S(q₋, q) + ∂₁S(q, q₊)) is about the error of q₊, with the other sign.
+    """
+    family, dim = piece.family, q.shape[1]
+    if family.moves is None:
+        return np.zeros(dim)
+    w = np.concatenate([q[:-1], q[1:]], axis=1)
+    gradient = piece.dt**2 * np.asarray(family.gradient(piece.params, w))
+    turns = whole_turns(gradient[0, dim:] + gradient[1, :dim])
+    return np.where(np.isnan(family.moves), 0.0, turns)

@@ -50,6 +50,7 @@ from gfnn_jax.maps.stroboscopic import OverPhases
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.scene import Scene
+from gfnn_jax.solve.robust import Biweight, SoftL1
 from gfnn_jax.storage.checkpoints import load_model, save_model
 from gfnn_jax.storage.outputs import ensure_new
 
@@ -59,14 +60,16 @@ _TYPES: dict[str, type] = {
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
         Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
         Windows, Groups, Ranges, OfTimeStep, Ensemble, Uniform, Forced, Legendre, Friction, Signals,
-        Sensors, Observation, Damping, DampingOfArgs, FunctionsOfArgs, OfDisplacement,
+        Sensors, Observation, SoftL1, Biweight, Damping, DampingOfArgs, FunctionsOfArgs,
+        OfDisplacement,
     )
 } | {"LagrangianTerms": lagrangian.Terms}  # fmt: skip
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 
 
 def register(kind: type) -> type:
-    """Register a dataclass of one's own, a family or a piece, for `save` and `load`, by its name.
+    """Register a dataclass of one's own, a family, a piece or a loss, for `save` and `load`, by its
+    name.
 
     It is a decorator of the class, in a module that is imported before such a map is loaded. Fields
     of the class are arrays, numbers, text, tuples of these, or of other registered types. Raises

@@ -18,8 +18,9 @@ class Sensors:
     that are seen. omega: the fastest frequency, 1/s. window: seconds before a time from which a
     state is estimated best. hold, delay: inputs between samples, and the time by which they act
     later, in seconds. leads, misfit: (n,) times ahead, and (n, k) the standard deviation there of
-    forecasts of the data that neither the noise nor the errors of state and coefficients explain:
-    the law's own. observation: how channels show a state; None where they are the positions.
+    forecasts of data that the law was not learned from, as far as neither the noise nor the errors
+    of state and coefficients explain it. observation: how channels show a state, and the loss of
+    their noise; None where they are the positions, and it is the usual one.
     """
 
     positions: tuple[str, ...]

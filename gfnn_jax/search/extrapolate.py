@@ -11,37 +11,37 @@ from typing import NamedTuple
 _RANGE = 2.0
 # A size whose error is not this much smaller than all before it has gained nothing.
 _GAINED = 0.8
-# Extrapolated over more than so many times the extents that were seen, a course means nothing.
+# Extrapolated over more than so many times the orders that were seen, a decay means nothing.
 _FARTHEST = 3.0
 
 
-class Course(NamedTuple):
-    """The logarithm of a sweep's error falls by ``rate`` per unit of extent, from ``error`` at
-    ``extent``, at extents that are ``spacing`` apart. first: the extent of the first size."""
+class Decay(NamedTuple):
+    """The logarithm of a sweep's error falls by ``rate`` per unit of order, from ``error`` at
+    ``order``, at orders that are ``spacing`` apart. first: the order of the first size."""
 
     first: float
-    extent: float
+    order: float
     error: float
     rate: float
     spacing: float
 
-    def error_at(self, extent: float) -> float:
-        """The error of the size of this extent."""
-        steps = math.floor(max(extent - self.extent, 0.0) / self.spacing + 1e-9)
+    def error_at(self, order: float) -> float:
+        """The error of the size of this order."""
+        steps = math.floor(max(order - self.order, 0.0) / self.spacing + 1e-9)
         return self.error * math.exp(-self.rate * self.spacing * steps)
 
-    def extent_for(self, bound: float) -> float | None:
-        """The smallest extent whose error is within the bound; None where it is too far to tell."""
+    def order_for(self, bound: float) -> float | None:
+        """The smallest order whose error is within the bound; None where it is too far to tell."""
         if self.rate <= 0:
             return None
         fall = max(math.log(self.error / bound), 0.0)
-        found = self.extent + self.spacing * math.ceil(fall / (self.rate * self.spacing) - 1e-9)
-        far = found - self.first > _FARTHEST * max(self.extent - self.first, self.spacing)
+        found = self.order + self.spacing * math.ceil(fall / (self.rate * self.spacing) - 1e-9)
+        far = found - self.first > _FARTHEST * max(self.order - self.first, self.spacing)
         return None if far else found
 
 
-def course(sizes: Sequence[tuple[float, float]]) -> Course | None:
-    """The course of sizes (extent, error), by rising extent; None where they are too few.
+def decay_of(sizes: Sequence[tuple[float, float]]) -> Decay | None:
+    """The decay of sizes (order, error), by rising order; None where they are too few.
 
     Only sizes count that gain: an even S gains from every other degree. The rate is the better one
     of the last two, each over two gains, so that a sweep is rather thought to be good.
@@ -50,15 +50,15 @@ def course(sizes: Sequence[tuple[float, float]]) -> Course | None:
     if not finite or finite[-1][0] - finite[0][0] < _RANGE:
         return None
     gains = finite[:1]
-    for extent, error in finite[1:]:
+    for order, error in finite[1:]:
         if error < _GAINED * gains[-1][1]:
-            gains.append((extent, error))
-    (first, _), (extent, error) = gains[0], gains[-1]
+            gains.append((order, error))
+    (first, _), (order, error) = gains[0], gains[-1]
     if len(gains) == 1:
-        return Course(first, extent, error, 0.0, 1.0)
+        return Decay(first, order, error, 0.0, 1.0)
     ends = [j for j in range(1, len(gains)) if j >= len(gains) - 2 and (j > 1 or len(gains) == 2)]
     rates = (_rate(gains[max(j - 2, 0)], gains[j]) for j in ends)
-    return Course(first, extent, error, max(rates), extent - gains[-2][0])
+    return Decay(first, order, error, max(rates), order - gains[-2][0])
 
 
 def _rate(one: tuple[float, float], other: tuple[float, float]) -> float:

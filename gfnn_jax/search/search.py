@@ -17,7 +17,7 @@ import numpy as np
 
 from gfnn_jax.budget import ROWS, SOLVE, Budget, OutOfTime
 from gfnn_jax.candidates.candidate import Candidate
-from gfnn_jax.search.extrapolate import Course, course
+from gfnn_jax.search.extrapolate import Decay, decay_of
 
 # A size that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
 # the odd degrees), and larger families only fit noise.
@@ -28,11 +28,11 @@ _FINALISTS = 3  # that are validated where none meets the tolerance
 # The ratio of a step's error to its estimate hardly changes along a sweep: it is measured once an
 # estimate is within the first factor of the tolerance, and from then on sizes are validated whose
 # estimate times the ratio is within the second.
-_CALIBRATED, _HOPEFUL = 1e3, 1.3
+_CALIBRATED, _WITHIN_REACH = 1e3, 1.3
 _NO_WORSE = 1.03  # an error larger by this factor is as good, if the map is cheaper
 MET = "the tolerance is met"
 # A sweep whose error is within this factor of the best one's has come as far.
-AS_FAR = 1.25
+COMPARABLE = 1.25
 _KEPT = 0.1  # of the last kept map's error: a map so much better is kept in its stead
 _FAR = 10.0  # times the tolerance: a sweep that leads to no smaller error misses it
 
@@ -74,11 +74,11 @@ def search(
 class Search:
     """A climb of sweeps, which may be made in parts.
 
-    A sweep has ``sizes`` with ``operations`` by rising order and an ``extent`` with which the
+    A sweep has ``sizes`` by rising ``operations``, each of an ``order`` with which the
     logarithm of the error falls in proportion, ``judge(size, budget, say)`` and ``validate(size,
     judged, budget, say)``, which give candidates, ``work(size)`` and ``work_of_steps(size)``: the
     operations that these take, ``short_of_pairs``: whether more pairs would allow larger sizes, and
-    ``at(extent)``, which says what a size of this extent is and takes.
+    ``at(order)``, which says what a size of this order is and takes.
 
     bound: the tolerance on a candidate's ``validation_bound``. tell: called with every candidate.
     on_validated: called with every entry whose steps have been looked at.
@@ -98,7 +98,7 @@ class Search:
         self._ratio = [1.0 / _CALIBRATED] * len(sweeps)  # of a step's error to its estimate
         self._beaten, self._stalled = [0] * len(sweeps), [0] * len(sweeps)
         self._left: set[int] = set()
-        # (extent, bound) of the estimates
+        # (order, bound) of the estimates
         self._seen: list[list[tuple[float, float]]] = [[] for _ in sweeps]
         self._cheapest, self._kept, self._unfinished = np.inf, np.inf, False
 
@@ -132,7 +132,7 @@ class Search:
         # Something to keep should the search be interrupted is worth a few more looks.
         keep = self._on_validated is not None and relative < _KEPT * self._kept
         self._kept = min(self._kept, relative) if keep else self._kept
-        if keep or self._ratio[i] * judged.validation_bound <= _HOPEFUL * self._bound:
+        if keep or self._ratio[i] * judged.validation_bound <= _WITHIN_REACH * self._bound:
             entry = self._validated(entry)
             error = entry.candidate.validation_relative
             if np.isfinite(error) and relative > 0:
@@ -149,7 +149,7 @@ class Search:
         self._beaten[i] += any(_beats(e.candidate, judged) for e in self._entries)
         if self._stalled[i] == _STALLED or self._beaten[i] == _BEATEN:
             self._left.add(i)
-        self._seen[i].append((size.extent, judged.validation_bound))
+        self._seen[i].append((size.order, judged.validation_bound))
         self._left |= _hopeless(self.sweeps, self._seen, self._ratios, self._left, self._bound)
 
     def _validated(self, entry: Entry) -> Entry:
@@ -210,9 +210,9 @@ def _known(ratio: float) -> float:
     return 1.0 if ratio == 1.0 / _CALIBRATED else ratio
 
 
-def _courses(seen, ratio: list[float]) -> list[Course | None]:
+def _decays(seen, ratio: list[float]) -> list[Decay | None]:
     """Extrapolate the errors of each sweep."""
-    return [course([(x, r * e) for x, e in sizes]) for sizes, r in zip(seen, ratio, strict=True)]
+    return [decay_of([(x, r * e) for x, e in sizes]) for sizes, r in zip(seen, ratio, strict=True)]
 
 
 def _hopeless(
@@ -221,8 +221,8 @@ def _hopeless(
     """The sweeps whose largest size would miss the bound by far, where another sweep has a smaller
     error already, or has come as far and leads to the bound."""
     ends = {
-        i: found.error_at(sweeps[i].sizes[-1].extent)
-        for i, found in enumerate(_courses(seen, ratio)) if found is not None
+        i: found.error_at(sweeps[i].sizes[-1].order)
+        for i, found in enumerate(_decays(seen, ratio)) if found is not None
     }  # fmt: skip
     reached = _reached(seen, ratio)
 
@@ -246,13 +246,13 @@ def _promised(
     nothing where they stall, or are too few to say."""
     reached = _reached(seen, ratio)
     i = int(np.argmin(reached)) if reached else 0
-    found = _courses(seen, ratio)[i] if reached else None
+    found = _decays(seen, ratio)[i] if reached else None
     if found is None or stalled[i] == _STALLED:
         return ""
-    extent = found.extent_for(bound)
-    if extent is None:
+    order = found.order_for(bound)
+    if order is None:
         return "; its error falls too slowly to tell which size would meet the tolerance"
-    return f"; extrapolated, {sweeps[i].at(extent)} would meet the tolerance"
+    return f"; extrapolated, {sweeps[i].at(order)} would meet the tolerance"
 
 
 def _calibrated(entry: Entry, ratio: float) -> Entry:
@@ -333,7 +333,7 @@ def _stalled_sweeps(entries: list[Entry]) -> set[tuple[str, str]]:
 def _why(sweeps: Sequence[Any], stalled: list[int], best: Sequence[float]) -> str:
     """Reason why a search that met nothing ended before its time. Sweeps far from the best one's
     error tell nothing."""
-    good = [i for i, s in enumerate(sweeps) if s.sizes and best[i] <= AS_FAR * min(best)]
+    good = [i for i, s in enumerate(sweeps) if s.sizes and best[i] <= COMPARABLE * min(best)]
     if any(stalled[i] == _STALLED for i in good):
         return "larger models are no more accurate"
     if any(sweeps[i].short_of_pairs for i in good):

@@ -89,10 +89,10 @@ class Fitted:
     """The fit of all arcs.
 
     p: (n,) coefficients. x: (A, L, m) states. residuals: (A, L, k) in units of the noise, NaN where
-    nothing was seen. sigma: the noise as given, or (k,) as estimated. factor: the triangle
-    (n + 1, n + 1) of [∂r/∂p, r] without the states. scores: (A, n) each arc's part of the gradient
-    in p. arcs: (A, m, m) triangles of each δx_0 with p fixed. transports: (A, m, m) ∂x_{L−1}/∂x_0.
-    cost: infinite where the defects could not be closed.
+    nothing was seen. sigma: the noise as given or estimated, (k,) or (A, L, k). factor: the
+    triangle (n + 1, n + 1) of [∂r/∂p, r] without the states. scores: (A, n) each arc's part of the
+    gradient in p. arcs: (A, m, m) triangles of each δx_0 with p fixed. transports: (A, m, m)
+    ∂x_{L−1}/∂x_0. cost: infinite where the defects could not be closed.
     """
 
     p: np.ndarray
@@ -142,8 +142,8 @@ def fit_arcs(
     iteration has to close them; then it has to lower the cost. Ends where it lowers it by less than
     ``tolerance`` of itself. The cost is infinite where the defects could not be closed.
 
-    least: (k,) what of the residuals is no noise; sigma (k,) is then where the noise starts from,
-    and is estimated by every iteration. None: sigma is known.
+    least: (k,) what of the residuals is no noise; sigma is then where the noise starts from, and is
+    estimated by every iteration, of (A, L, k) one factor for each of the k. None: sigma is known.
     """
     seen = np.isfinite(y)
     known = np.where(seen, y, 0.0)
@@ -156,7 +156,7 @@ def fit_arcs(
 
     here = best = evaluate(p, x, _Units(sigma, state_scale, loss))
     damping, converged, iteration = 1e-4, False, 0
-    closed = _CLOSED * np.sqrt(x.size)
+    closed = float(_CLOSED * np.sqrt(x.size))
     while iteration < max_iterations:
         iteration += 1
         if not np.isfinite(here.cost):
@@ -220,21 +220,23 @@ def last_by_coefficients(
 
 
 def rows_of_arcs(
-    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
-) -> np.ndarray:
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
+    loss: Loss = SOFT_L1,
+) -> np.ndarray:  # fmt: skip
     """Rows (A, L, k, n + 1) of the coefficients and the residuals, weighted as robust loss has it,
     after each arc's own δx_0 was projected out: residuals − rows · δp are those of any other
     coefficients near p, each arc with the state that suits them best."""
-    (J, _), m = _linearised_at(model, p, x, y, sigma, SOFT_L1), x.shape[-1]
+    (J, _), m = _linearised_at(model, p, x, y, sigma, loss), x.shape[-1]
     Q = np.linalg.qr(J[..., :m])[0]
     return (J[..., m:] - Q @ (Q.swapaxes(1, 2) @ J[..., m:])).reshape(*y.shape, -1)
 
 
 def sensitivities(
-    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
-) -> np.ndarray:
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
+    loss: Loss = SOFT_L1,
+) -> np.ndarray:  # fmt: skip
     """The triangle (n + 1, n + 1) of `eliminated_rows`: what a test of coefficients needs."""
-    factor = np.asarray(np.linalg.qr(eliminated_rows(model, p, x, y, sigma), mode="r"))
+    factor = np.asarray(np.linalg.qr(eliminated_rows(model, p, x, y, sigma, loss), mode="r"))
     return np.concatenate([factor, np.zeros((factor.shape[1] - len(factor), factor.shape[1]))])
 
 
@@ -288,12 +290,19 @@ class _Iterate(NamedTuple):
     def rescaled(self, rows: _Rows, least: np.ndarray) -> _Iterate:
         """Iterate in units of the noise that these residuals tell: of each number as much is left
         as the latent state of its arc, and the coefficients, do not follow."""
-        off = self.residuals * self.units.sigma
+        before = self.units.sigma
+        off = self.residuals * before
         free = np.where(self.seen, 1.0 - rows.leverage, 0.0)
         free *= max(1.0 - len(self.p) / free.sum(), 1e-3)
-        sigma = np.hypot(of_residuals(np.where(self.seen, off, np.nan), free, OUTLYING), least)
+        if before.ndim == 1:
+            sigma = np.hypot(of_residuals(np.where(self.seen, off, np.nan), free, OUTLYING), least)
+            moved = sigma / before
+        else:
+            left = np.where(self.seen, self.residuals, np.nan)
+            moved = of_residuals(left, free, OUTLYING)
+            sigma = np.hypot(moved * before, least)
         # Of a state (q, v) whose positions are seen, velocities change as they do.
-        state = self.units.state * np.resize(sigma / self.units.sigma, self.units.state.shape)
+        state = self.units.state * np.resize(moved, self.units.state.shape)
         units = _Units(sigma, state, self.units.loss)
         return self.at(self.p, self.x, self.steps, self.observed, self.seen, off, units)
 

@@ -8,7 +8,7 @@ least squares; Huber, Robust Statistics, 1981).
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -60,8 +60,9 @@ class Biweight:
         return np.minimum(np.abs(residuals) / self.k, 1.0)
 
 
-def robust(values: np.ndarray, axis: int | None = None) -> np.ndarray:
-    """The deviation of normal noise around 0, from the median of its size along the axis."""
+def robust(values: np.ndarray, axis: int | None = None) -> Any:
+    """The deviation of normal noise around 0, from the median of its size along the axis, of all
+    values without one."""
     return _NORMAL * np.median(np.abs(values), axis=axis)
 
 

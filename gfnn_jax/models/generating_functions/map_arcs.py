@@ -49,7 +49,8 @@ class GeneratedOnArcs:
 
     ends: affine pieces (before, after) around what S generates. along: a family whose rows are
     wanted: F is then that of S = 0, its derivatives in the states stay those of S, and Γ is in the
-    coefficients of this family. None: no coefficient is free.
+    coefficients of this family. None: no coefficient is free. joint: F is that of S all the same,
+    where ``along`` is its own family: `fit_arcs` then moves states and coefficients together.
     """
 
     family: Any
@@ -58,6 +59,7 @@ class GeneratedOnArcs:
     moves: np.ndarray
     ends: tuple[Sequence[Any], Sequence[Any]] = ((), ())
     along: Any = None
+    joint: bool = False
 
     def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
         width, free = x.shape[-1], 0 if self.along is None else self.along.num_parameters
@@ -78,7 +80,7 @@ class GeneratedOnArcs:
             y1 = piece.inverse().image(y1)
         w, target = self.chart.evaluation_point(y0, y1), self.chart.target_gradient(y0, y1, self.dt)
         gradient, hessian = self.family.gradient_and_hessian(self.family.unflatten(p), w)
-        miss = -target if self.along is not None else gradient - target
+        miss = -target if self.along is not None and not self.joint else gradient - target
         parts = [miss[..., None], hessian @ before[0] - before[1]]
         if self.along is not None:
             parts.append(self.along.term_gradients(w))
@@ -105,7 +107,7 @@ class GeneratedOnArcs:
 @dataclasses.dataclass(frozen=True, eq=False)
 class NearestArcs:
     """Arcs and the states x (A, L, 2d) that ``model`` with coefficients p finds nearest to them.
-    sigma: (2d,) noise of the measured states."""
+    sigma: noise of the measured states, (2d,) or of each value (A, L, 2d)."""
 
     model: GeneratedOnArcs
     p: np.ndarray
@@ -120,8 +122,9 @@ class NearestArcs:
         x = arcs.states.copy()
         for n in range(1, x.shape[1]):  # one that is missing starts from the one before
             x[:, n] = np.where(np.isfinite(x[:, n]), x[:, n], x[:, n - 1])
+        usual = sigma if sigma.ndim == 1 else np.sqrt(np.mean(sigma**2, axis=(0, 1)))
         found = fit_arcs(
-            Known(model, p), p[:0], x, arcs.states, sigma, sigma, tolerance=_SETTLED, loss=BIWEIGHT
+            Known(model, p), p[:0], x, arcs.states, sigma, usual, tolerance=_SETTLED, loss=BIWEIGHT
         )
         if not np.isfinite(found.cost):
             raise np.linalg.LinAlgError("expected states near the measured ones")
@@ -136,8 +139,8 @@ class NearestArcs:
         for first in range(0, arcs, size):
             some = slice(first, first + size)
             model = dataclasses.replace(self.model, moves=self.arcs.moves[some], along=along)
-            y = self.arcs.states[some]
-            rows = eliminated_rows(model, self.p, self.x[some], y, self.sigma, BIWEIGHT)
+            y, sigma = self.arcs.states[some], _of_arcs(self.sigma, some)
+            rows = eliminated_rows(model, self.p, self.x[some], y, sigma, BIWEIGHT)
             yield rows, int(np.isfinite(y).sum()) - len(y) * width
 
     def triangle(self, along: Any, on_block: Callable[[], Any] = lambda: None) -> Triangle:
@@ -155,4 +158,9 @@ class NearestArcs:
         """Keep these arcs alone."""
         model = dataclasses.replace(self.model, moves=self.model.moves[arcs])
         chosen = Arcs(self.arcs.states[arcs], self.arcs.moves[arcs])
-        return NearestArcs(model, self.p, chosen, self.x[arcs], self.sigma)
+        return NearestArcs(model, self.p, chosen, self.x[arcs], _of_arcs(self.sigma, arcs))
+
+
+def _of_arcs(sigma: np.ndarray, arcs) -> np.ndarray:
+    """The noise of these arcs."""
+    return sigma if sigma.ndim == 1 else sigma[arcs]

@@ -26,7 +26,7 @@ from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import Sums, matrix_free
-from gfnn_jax.families.terms import Terms
+from gfnn_jax.families.terms import Terms, joined, multiplied
 from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.linear_starts import fitted_gradients
 from gfnn_jax.fitting.significance import null_terms, significant
@@ -271,25 +271,39 @@ def _weight(data: Dataset) -> np.ndarray:
 
 
 def _root(piece: Generated, data: Dataset) -> np.ndarray:
-    """Root of the covariance. The next library tells the noise in the residual, which it leaves;
-    without a structure all of it may be misfit."""
+    """Root of the covariance. A larger library tells the noise in the residual, which it leaves."""
     family, count = piece.family, piece.family.num_parameters
     w, target, args = _data(piece.chart, family, data, data.training)
     weight = _weight(data)
     aim = (target * weight).ravel()
     slopes = (family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
     residual, noise = slopes @ np.asarray(piece.params) - aim, None
-    if data.structure is not None:
-        larger = (f for f in data.structure.libraries(data.dim) if f.num_parameters > count)
-        found = next(larger, None)
-        if found is not None and _ROWS_PER_TERM * found.num_parameters <= target.size:
-            known = found.take(null_terms(found, w[: max(1, _NULL_ROWS // w.shape[1])])[0])
-            both = least_squares.reduce(known, [(w, target)], weight)
-            part = uncertainty.variance(both, known.num_parameters)
-            left = float(np.sum(residual**2)) / max(target.size - count, 1)
-            noise = min(part / left, 1.0) if left > 0 else 1.0
+    found = _larger(family, data)
+    if found is not None and _ROWS_PER_TERM * found.num_parameters <= target.size:
+        some = slice(max(1, _NULL_ROWS // w.shape[1]))
+        given = () if args is None else (args,)
+        few = null_terms(found, w[some], args=None if args is None else args[some])[0]
+        known = found.take(few)
+        both = least_squares.reduce(known, [(w, target, *given)], weight)
+        part = uncertainty.variance(both, known.num_parameters)
+        left = float(np.sum(residual**2)) / max(target.size - count, 1)
+        noise = min(part / left, 1.0) if left > 0 else 1.0
     train = Triangle.of(np.column_stack([slopes, aim]))
     return uncertainty.root(train, count, slopes, residual, noise=noise)
+
+
+def _larger(family: Terms | Sums, data: Dataset) -> Terms | Sums | None:
+    """The next library of a structure; of other terms they and their products with each variable of
+    theirs, coordinates and parameters."""
+    if data.structure is not None:
+        count = family.num_parameters
+        return next(
+            (f for f in data.structure.libraries(data.dim) if f.num_parameters > count), None
+        )
+    assert isinstance(family, Terms)  # sums are of structures
+    units = tuple(tuple(row) for row in np.eye(len(family.variables), dtype=int).tolist())
+    variables = Terms(family.dim, family.variables, units, family.parameters)
+    return joined(family, multiplied(family, variables))
 
 
 def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance) -> _Tried:

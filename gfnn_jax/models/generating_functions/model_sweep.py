@@ -30,7 +30,7 @@ class ModelSize:
         return float(self.number)
 
     @property
-    def extent(self) -> float:
+    def order(self) -> float:
         return float(self.number)
 
 
@@ -81,9 +81,9 @@ class ModelSweep:
         """The judged size as it is: its steps have been made."""
         return judged
 
-    def at(self, extent: float) -> str:
+    def at(self, order: float) -> str:
         """Name of the size of this number."""
-        return f"size {round(extent)} of {self.model.name}"
+        return f"size {round(order)} of {self.model.name}"
 
     def piece(self, size: ModelSize) -> Any:
         """The fitted piece."""

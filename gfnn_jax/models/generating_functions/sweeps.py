@@ -18,12 +18,12 @@ from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
 from gfnn_jax.dataset.noise import of_pairs
-from gfnn_jax.dataset.rows import of_rows, rows_of
+from gfnn_jax.dataset.rows import of_rows, rows_of, weighted_rows_of
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.dataset.split import outermost
 from gfnn_jax.families.inputs import Inputs, box_inputs, variable_signs
 from gfnn_jax.families.own import own_families
-from gfnn_jax.families.products import Products, number_of_terms
+from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
@@ -32,6 +32,7 @@ from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping
+from gfnn_jax.models.generating_functions.parity import is_even
 
 # Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
 # judged from one factor of the rows of its largest.
@@ -48,10 +49,6 @@ _ROWS_THAT_TELL = 1.5
 _SCARCE = 6
 # Rows × terms² of one factor: about half a minute on one core. 2,000 terms take 80,000 rows.
 _MOST_OPERATIONS = 3.2e11
-# Whether S is even is tested where terms are scarce, from so many rows for each term, by odd terms
-# up to a degree. Those of an even S bring nothing: the held-out residual becomes 0.98 … 1.09 of
-# what it was (FPUT chains, a Penning trap, a satellite); to leave them out costs no more than that.
-_SCARCE_FROM_DIM, _PARITY_ROWS, _ODD_DEGREE, _NO_GAIN = 3, 6, 3, 0.98
 _WORTH_KEEPING = 1.0  # seconds
 # Operations of singular values, ÷ terms³; and of a step in NumPy, in units that take as long.
 OF_SOLVE, OF_STEPS = 22.0, 20.0
@@ -68,7 +65,7 @@ class Size:
 
     family: Any
     group: Any  # the largest family that is judged from the same factor
-    extent: float  # the logarithm of the error falls in proportion: a degree, or log₂ of a number
+    order: float  # the logarithm of the error falls in proportion: a degree, or log₂ of a number
 
     @property
     def operations(self) -> float:
@@ -100,7 +97,9 @@ def sweeps_for(
         return
     features = scene.features if scene is not None else None
     polynomials = request in ("auto", "polynomial")
-    even = polynomials and (scene is None or scene.reversor is None) and is_even(data)
+    free = polynomials and (scene is None or scene.reversor is None)
+    degrees = [degree for (degree,) in _EVEN_DEGREES]
+    even = free and is_even(data, degrees, _MOST_TERMS, _ROWS_PER_TERM)
     for chart in charts:
         # Only the midpoint S inherits the parity.
         reversor = scene.reversor if scene is not None and chart == MIDPOINT else None
@@ -176,8 +175,8 @@ class LinearSweep(Generates):
         reversor = (-1,) * 2 * data.dim if even else reversor
         self._kept, self._prefix = factors, "even " if even else ""
         self.data, self.tolerance, self.chart, self.kind = data, tolerance, chart, kind
-        self._train, self._weight = rows_of(data, chart, data.training)
-        self._held, _ = rows_of(data, chart, data.validation)
+        self._train, self._weight = weighted_rows_of(data, chart, data.training)
+        self._held, _ = weighted_rows_of(data, chart, data.validation)
         free = (*data.coordinates.cyclic, *data.whole)
         self._outermost = outermost(data.y0[data.training], free)
         coordinates = data.coordinates
@@ -207,7 +206,7 @@ class LinearSweep(Generates):
         self._groups, self._determining = groups, rows
         self.sizes = [
             Size(family, group[-1], _extent(family))
-            for group in _determined(groups(), rows) for family in group
+            for group in _determined(groups(), rows, _ROWS_PER_TERM) for family in group
         ]  # fmt: skip
         # Else the last size is the largest there is, or the most terms are reached.
         self.short_of_pairs = len(self.sizes) < known and rows < _ROWS_PER_TERM * _MOST_TERMS
@@ -267,13 +266,13 @@ class LinearSweep(Generates):
         seconds = judged.fit_seconds + time.perf_counter() - started
         return dataclasses.replace(candidate, fit_seconds=seconds)
 
-    def at(self, extent: float) -> str:
-        """Describe the size of this extent: its terms, and how many pairs they take."""
+    def at(self, order: float) -> str:
+        """Describe the size of this order: its terms, and how many pairs they take."""
         family = self.sizes[0].family
         if not hasattr(family, "degree"):
-            label = f"{family.name} {(terms := round(2**extent))}"
+            label = f"{family.name} {(terms := round(2**order))}"
         else:
-            degree = round(extent)
+            degree = round(order)
             label = f"{self._prefix}{family.name} {degree}"
             terms = family.terms_of(degree)
         fitted = len(self._train[0]) + len(self.data.test)
@@ -304,14 +303,15 @@ class LinearSweep(Generates):
         choose the ridge, as before."""
         quiet = Budget(), lambda message: None
         train, held = self.factors(size.group, *quiet)[:2]
-        test, _ = rows_of(self.data, self.chart, self.data.test)
+        test, _ = weighted_rows_of(self.data, self.chart, self.data.test)
         more = least_squares.reduce(self.in_rows(size.group), [test], self._weight)
         return least_squares.solve(train.merge(more), held, size.family.num_parameters)
 
     def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Images (n, 2d) of these rows, in the user's coordinates, by a fit to other rows; NaN
         where a step is not solved."""
-        family, given = self.in_rows(size.family), rows_of(self.data, self.chart, others)[0]
+        family = self.in_rows(size.family)
+        given, _ = weighted_rows_of(self.data, self.chart, others)
         train, held = (
             least_squares.reduce(family, [of], self._weight) for of in (given, self._held)
         )
@@ -327,7 +327,7 @@ class LinearSweep(Generates):
         images = data.whole_image(np.where(known[:, None], images, np.nan), rows)
         return to_user(data.coordinates, images)
 
-    def left_over(self, size: Size) -> np.ndarray:
+    def residuals(self, size: Size) -> np.ndarray:
         """(N, 2d): what the size leaves of ∇S of every pair, unit-free as train_rms."""
         _, params = self.solve(size, Budget(), lambda message: None)
         (w, target, *args), weight = rows_of(self.data, self.chart, slice(None))
@@ -383,15 +383,18 @@ class LinearSweep(Generates):
 
     def in_rows(self, family: Any) -> Any:
         """The family whose terms make the rows of this sweep."""
-        return of_rows(family)
+        return of_rows(family, weighted=self.data.weight is not None)
 
     def by_states(self, family, params, w, *args) -> tuple[np.ndarray, np.ndarray]:
         """The residual's derivatives in z₀ and z₁ (n, 2d, 2d), those ÷ their scale."""
+        of_row = 1.0
+        if self.data.weight is not None:
+            *args, of_row = (*args[:-1], args[-1][..., None])
         hessian = family.gradient_and_hessian(params, w, *args)[1]
         if self.data.own_dt is not None:
             hessian = args[0][..., None] * hessian
         of_point, of_target = self.of_states
-        by = self._weight[:, None] * (hessian @ of_point - of_target)
+        by = of_row * self._weight[:, None] * (hessian @ of_point - of_target)
         return by[..., : len(of_point)], by[..., len(of_point) :]
 
     @cached_property
@@ -576,58 +579,6 @@ def _extent(family) -> float:
     return float(np.log2(family.num_parameters) if degree is None else degree)
 
 
-class _WithOdd:
-    """The terms of an even family, and after them the odd ones up to a degree."""
-
-    def __init__(self, even: Products):
-        self._even, self._all = even, Products(even.inputs, _ODD_DEGREE)
-        self._odd = np.flatnonzero(self._all.basis.term_orders % 2)
-        self.num_parameters = even.num_parameters + len(self._odd)
-
-    def term_gradients(self, w):
-        odd = self._all.term_gradients(w)[..., self._odd]
-        return np.concatenate([self._even.term_gradients(w), odd], axis=-1)
-
-
-def is_even(data: Dataset) -> bool:
-    """Return whether S(−w) = S(w) as far as any size of a sweep could tell: odd terms beside the
-    even ones of the highest degree that a sweep has do not make the held-out residual smaller.
-
-    False where terms are not scarce, where angles or args are, or where the test would take too
-    much.
-    """
-    dim = data.dim
-    if dim < _SCARCE_FROM_DIM or data.coordinates.angles or data.args is not None:
-        return False
-    (w, target), weight = rows_of(data, MIDPOINT, data.training)
-    held, _ = rows_of(data, MIDPOINT, data.validation)
-    flip = (-1,) * 2 * dim
-    inputs = box_inputs(w, cyclic=data.coordinates.cyclic, reversor=flip)
-    signs = variable_signs(inputs, flip, w)
-    most = min(_MOST_TERMS, w.size // _ROWS_PER_TERM)
-    degrees = [
-        degree for (degree,) in _EVEN_DEGREES
-        if number_of_terms(inputs.is_angle, degree, signs) <= most
-    ]  # fmt: skip
-    if not degrees:
-        return False
-    even = Products(inputs, degrees[-1], signs)
-    odd = number_of_terms(inputs.is_angle, _ODD_DEGREE) - even.terms_of(_ODD_DEGREE)
-    if even.num_parameters + odd > _MOST_TERMS:
-        return False
-    family = _WithOdd(even)
-    pairs = -(-_PARITY_ROWS * family.num_parameters // w.shape[1])
-    if pairs > len(w):
-        return False
-    train, held = (
-        least_squares.reduce(family, [tuple(a[:pairs] for a in rows)], weight)
-        for rows in ((w, target), held)
-    )
-    sizes = [even.num_parameters, family.num_parameters]
-    (_, without), (_, with_odd) = least_squares.residuals(train, held, sizes)
-    return with_odd >= _NO_GAIN * without
-
-
 def trial_residual(data: Dataset) -> float:
     """The held-out residual of ∇S, ÷ scale, of polynomials of a low degree in the midpoint chart:
     how near these pairs are to a map that a small S generates. Infinite where some are missing."""
@@ -640,7 +591,8 @@ def trial_residual(data: Dataset) -> float:
         w, angles=tuple(a for a in coordinates.angles if a < data.dim),
         cyclic=coordinates.cyclic,
     )  # fmt: skip
-    groups = list(_determined(([Products(inputs, degree)] for degree in _TRIAL), w.size // 2))
+    trials = ([Products(inputs, degree)] for degree in _TRIAL)
+    groups = list(_determined(trials, w.size // 2, _ROWS_PER_TERM))
     family = groups[-1][0] if groups else Products(inputs, 1)
     train, held = (
         least_squares.reduce(family, [(w[rows], target[rows])], weight)
@@ -654,9 +606,7 @@ def _of_time_step(inputs, degree: int, signs=None) -> OfTimeStep:
     return OfTimeStep(Products(inputs, degree, signs))
 
 
-def _determined(
-    groups: Iterable[Iterable[Any]], rows: int, each: float = _ROWS_PER_TERM
-) -> Iterator[list[Any]]:
+def _determined(groups: Iterable[Iterable[Any]], rows: int, each: float) -> Iterator[list[Any]]:
     """The families, group by group, whose terms so many rows determine, ``each`` for a term.
 
     Sizes rise, so the first that is too large is the last that is looked at: in many dimensions the

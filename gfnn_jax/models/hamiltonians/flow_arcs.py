@@ -15,6 +15,7 @@ import numpy as np
 
 from gfnn_jax.budget import UNBOUNDED, Allowance
 from gfnn_jax.dataset.arcs import Arcs
+from gfnn_jax.errors import InputError
 from gfnn_jax.flows.collocation import Steps as FlowSteps
 from gfnn_jax.flows.collocation import images
 from gfnn_jax.solve.latent_arcs import Fitted, Known, Observed, Steps, fit_arcs, observed_whole
@@ -39,6 +40,7 @@ class Options:
 
 
 OPTIONS, BIWEIGHT = Options(), Biweight()
+_FORWARD = 1e-6  # of a constant: a forward difference, whose error is as large a part of it
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -78,13 +80,14 @@ class FlowOnArcs:
 
 def fit_flow(
     model: FlowOnArcs, coefficients, arcs: Arcs, least, angles: tuple[int, ...] = (), *,
-    only_states: bool = False,
+    only_states: bool = False, relative: np.ndarray | float = 1.0,
+    gained: float = OPTIONS.gained, iterations: int = 30,
 ) -> Fitted | None:  # fmt: skip
     """Coefficients, states and noise, from coefficients that are close, or with these as they are
-    (``only_states``). None where the flow fails.
+    (``only_states``). None where the flow fails. gained: as of the options; iterations: at most.
 
     least: (2d,) of what is left over, what is no noise. angles: coordinates that are measured
-    modulo 2π.
+    modulo 2π. relative: (A, L, 2d) the noise of each value, in parts of the usual one.
     """
     c = np.array(coefficients, float)
     y = _lifted(model, c, arcs, angles)
@@ -94,8 +97,9 @@ def fit_flow(
         return None
     given, free = (Known(model, c), c[:0]) if only_states else (model, c)
     found = fit_arcs(
-        given, free, x, y, noise, noise, tolerance=OPTIONS.gained, loss=BIWEIGHT, least=least
-    )
+        given, free, x, y, noise * relative, noise, max_iterations=iterations,
+        tolerance=gained, loss=BIWEIGHT, least=least,
+    )  # fmt: skip
     if not np.isfinite(found.cost):
         return None
     return dataclasses.replace(found, p=c) if only_states else found
@@ -164,3 +168,35 @@ def longest_arc(family, c, z, dt: float, how: FlowSteps, noise) -> int:
         if not size_at_end < OPTIONS.grown:
             return max(k - 1, 1)
     return OPTIONS.longest
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FlowWithConstants(FlowOnArcs):
+    """The flow of H = Σ c_j φ_j(z; θ) on arcs, p = (c, θ). family: θ (k,) -> that of the terms,
+    which are so many. Raises nothing for θ without terms: the steps are then not finite."""
+
+    terms: int = 0
+
+    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
+        c, constants = p[: self.terms], p[self.terms :]
+        try:
+            found = self._at(constants).steps(c, x)
+            by_constant = []
+            for k, theta in enumerate(constants):
+                moved, slope = constants.copy(), np.zeros(found.closing.shape)
+                moved[k] += _FORWARD * abs(theta)
+                ends = self._at(moved).images(c, x[:, :-1][self.moves])
+                slope[self.moves] = ends - (found.closing + x[:, 1:])[self.moves]
+                by_constant.append(slope / (_FORWARD * abs(theta)))
+        except InputError:
+            arcs, length, width = x.shape
+            lost = np.full((arcs, length - 1, width, max(width, len(p))), np.nan)
+            return Steps(lost[..., 0], lost[..., :width], lost[..., : len(p)])
+        slopes = np.stack([*np.moveaxis(found.by_coefficients, -1, 0), *by_constant], axis=-1)
+        return Steps(found.closing, found.by_state, slopes)
+
+    def images(self, p: np.ndarray, z: np.ndarray, direction: int = 1) -> np.ndarray:
+        return self._at(p[self.terms :]).images(p[: self.terms], z, direction)
+
+    def _at(self, constants: np.ndarray) -> FlowOnArcs:
+        return FlowOnArcs(self.family(constants), self.dt, self.how, self.moves, self.allowance)

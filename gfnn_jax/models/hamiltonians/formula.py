@@ -21,6 +21,13 @@ class Term(NamedTuple):
     std: float
 
 
+class Rival(NamedTuple):
+    """Another law that the pairs allow, and the odds of the one that was taken against it."""
+
+    formula: str
+    odds: float
+
+
 def formula(terms: Sequence[Term]) -> str:
     """H as text: "0.5 p1² + 0.5 p2² - 0.333333333333 q2³"."""
     text = ""

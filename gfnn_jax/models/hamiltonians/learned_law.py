@@ -35,15 +35,18 @@ from gfnn_jax.models.hamiltonians.cost_of_flow import (
     omega_h_of,
     operations_of,
 )
-from gfnn_jax.models.hamiltonians.formula import Term, as_code, formula
+from gfnn_jax.models.hamiltonians.formula import Rival, Term, as_code, formula
+from gfnn_jax.models.hamiltonians.fractions import Proposal
 from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
+from gfnn_jax.models.hamiltonians.symmetries import symmetries_of
 from gfnn_jax.models.hamiltonians.whole_sequences import Whole
+from gfnn_jax.models.lagrangians.text import odds_text
 from gfnn_jax.phase_space import apply_j, symplectic_form
 
 FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
 _NEAR_ROUNDOFF = 3e-15  # of the spread
 _NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
-_FEWEST_SAMPLED = 2_000  # pairs that tell noise from misfit
+_FEWEST_SAMPLED = 2_000  # pairs that tell noise from misfit; of many sites, numbers
 _NAMED = 5  # terms in a message
 
 
@@ -61,7 +64,9 @@ class LearnedHamiltonian:
     None of a network. unmet: that the tolerance is missed, and what that may be from; "" where it
     is met. ended: what cut the search for it short, "" where nothing did. dropped: terms that went
     in the end. friction: γ where that is uniform, else the terms of Rayleigh's R; of a system
-    without, ().
+    without, (). constants: numbers inside terms that noisy sequences told, each with its term and
+    its standard error. symmetries: that H has to roundoff. proposals: simple fractions near its
+    numbers, which noisy sequences allow. rivals: the next two laws that they allow.
     """
 
     candidate: Candidate
@@ -83,6 +88,10 @@ class LearnedHamiltonian:
     ended: str = ""
     dropped: Dropped | None = None
     friction: tuple[Term, ...] = ()
+    constants: tuple[Term, ...] = ()
+    symmetries: tuple[str, ...] = ()
+    proposals: tuple[Proposal, ...] = ()
+    rivals: tuple[Rival, ...] = ()
 
     @cached_property
     def root(self) -> np.ndarray | None:
@@ -108,6 +117,37 @@ class LearnedHamiltonian:
     def latex(self) -> str:
         """H in LaTeX's notation. Raises ValueError as ``sympy`` does."""
         return as_latex(self._expression)
+
+    def _repr_latex_(self) -> str | None:
+        """H as a notebook shows it; None where it is no short expression."""
+        short = isinstance(without_forces(self.flow.family), Terms)
+        return f"$H = {self.latex()}$" if short else None
+
+    def vector_field(self, t: Any, z: Any, args: Any = None) -> Any:
+        """ż = J∇H(z), as `diffrax.ODETerm` takes it. args: of H, (k,) or None.
+
+        Raises ValueError of a law with friction.
+        """
+        if self.friction:
+            raise ValueError("expected a law without friction, got one whose field is not J∇H")
+        return apply_j(self.flow.family.gradient(self.flow.params, z, args))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Lines about H beside its formula: constants inside, symmetries, fractions, rivals."""
+        found = []
+        if self.constants:
+            text = ", ".join(f"{c.coefficient:g} ± {c.std:.0e} in {c.term}" for c in self.constants)
+            found.append(f"constants inside: {text}")
+        if self.symmetries:
+            found.append(f"symmetries: {'; '.join(self.symmetries)}")
+        if self.proposals:
+            text = ", ".join(map(str, self.proposals))
+            found.append(f"near simple fractions, which are not taken: {text}")
+        if self.rivals:
+            text = "; ".join(f"{odds_text(r.odds)} against {r.formula}" for r in self.rivals)
+            found.append(f"odds by description length: {text}")
+        return tuple(found)
 
     @property
     def _expression(self) -> str:
@@ -138,7 +178,8 @@ class FittedLaw(NamedTuple):
     library that grew did so no longer. stalled: whether larger libraries were no better. noisy:
     whether their errors were the same, which is that of the pairs; larger: the largest
     of those. dropped: terms that went in the end. whole:
-    what whole sequences tell, where they were fitted."""
+    what whole sequences tell, where they were fitted. constants: numbers inside terms that were
+    fitted with them. symmetries, proposals, rivals: as of `LearnedHamiltonian`."""
 
     family: Any  # of terms of H, or of L, with friction or without
     fit: FlowFit
@@ -152,6 +193,10 @@ class FittedLaw(NamedTuple):
     larger: FittedLaw | None = None
     dropped: Dropped | None = None
     whole: Whole | None = None
+    constants: tuple[Term, ...] = ()
+    symmetries: tuple[str, ...] = ()
+    proposals: tuple[Proposal, ...] = ()
+    rivals: tuple[Rival, ...] = ()
 
 
 def learned_from(
@@ -166,7 +211,7 @@ def learned_from(
     fastest = rates(family, fit.coefficients, data.y0[some], data.given(some)[1])
     by_row = problem  # each at its own dt
     if data.own_dt is not None:  # the map's own dt, from which others follow
-        problem = Problem(data.y0, data.y1, data.dt, data.scale, args=data.args)
+        problem = Problem(data.y0, data.y1, data.dt, data.scale, args=data.args, weight=data.weight)
     steps = _cheapest(problem, family, fit, fastest, data, tolerance, options)
     steps = _resolving(family, fit.coefficients, steps, data, tolerance)
     contraction = contraction_of(fastest, data.dt, steps)
@@ -198,6 +243,9 @@ def learned_from(
     of_h = without_forces(family).num_parameters
     terms, friction = terms[:of_h], terms[of_h:]
     omega_h = omega_h_of(family, fit.coefficients, data, fastest)
+    symmetries = found.symmetries
+    if not symmetries and isinstance(family, Terms) and data.args is None:
+        symmetries = symmetries_of(family, fit.coefficients, z, data.coordinates.angles)
     left_out = len(np.setdiff1d(found.rows, fit.used))
     resolved = np.abs(off).max(axis=1) <= bound_of(tolerance, data.scale)
     of_rows = steps if data.own_dt is None else of_all
@@ -214,7 +262,8 @@ def learned_from(
         covariance=covariance, noise=None if whole is None else whole.noise,
         arcs=0 if whole is None else whole.arcs,
         dropped=found.dropped, unmet=_unmet(error, omega_h, tolerance, found),
-        friction=friction,
+        friction=friction, constants=found.constants, symmetries=symmetries,
+        proposals=found.proposals, rivals=found.rivals,
     )  # fmt: skip
 
 
@@ -277,35 +326,66 @@ def _cheapest(
 
 def covariance_root(found: FittedLaw, problem: Problem, data: Dataset, steps: Steps) -> np.ndarray:
     """(m, m): rootᵀ root is the covariance of the coefficients. What is noise, a generator of
-    polynomials tells, which does not explain it; what it explains is misfit, of these steps too."""
+    polynomials tells, which does not explain it, of sites the terms of a larger library; what they
+    explain is misfit, of these steps too."""
     fit, count = found.fit, found.family.num_parameters
     most = max(_FEWEST_SAMPLED, OPTIONS.sampled_rows * count // data.y0.shape[1])
     structure = data.structure
     if structure is not None:
-        most = structure.fewest(data.y0.shape[1])
+        most = max(structure.fewest(data.y0.shape[1]), _FEWEST_SAMPLED // data.y0.shape[1])
     places, goes_on = looked_at(data.pairs, fit.used, most)
-    rows, scale = fit.used[places], problem.scale
+    rows = fit.used[places]
+    unit, scale = problem.unit(rows), problem.scale
     images = problem.images(found.family, fit.coefficients, rows, steps, derivatives=True)
     residual = images.states - data.y1[rows]
     if not np.isfinite(residual).all():  # of a flow that runs away from some of the states
         return np.full((count, count), np.nan)
-    slopes = images.by_coefficient / scale[:, None]
-    left, scores, states, noise = residual / scale, None, None, None
+    slopes = images.by_coefficient / unit[..., None]
+    left, scores, states, noise = residual / unit, None, None, None
     family = without_forces(found.family)
     if isinstance(family, Terms):  # of many coordinates both would take too much
         if goes_on.any():
             first = images.by_state * scale
             second = np.broadcast_to(-np.diag(scale), first.shape)
             scores = shared_noise.scores(
-                slopes, left, first / scale[:, None], second / scale[:, None], goes_on
+                slopes, left, first / unit[..., None], second / unit[..., None], goes_on
             )
             states = first, second, goes_on
         degree = int(np.max(np.sum(family.powers, axis=1)))
         noise = unexplained(data, rows, residual, count, degree, states)
+    elif structure is not None and isinstance(family, Sums):
+        noise = _unexplained_of_sites(found, problem, data, rows, steps, slopes, left)
     return uncertainty.root(
         fit.triangle, count, slopes.reshape(-1, count), np.hypot(left, _NEAR_ROUNDOFF).ravel(),
         noise=noise, scores=scores,
     )  # fmt: skip
+
+
+def _unexplained_of_sites(
+    found: FittedLaw, problem: Problem, data: Dataset, rows, steps: Steps, slopes, left
+) -> float | None:  # fmt: skip
+    """The part that `unexplained` tells, of a structure: what the next library's terms, small
+    beside the law's, do not explain. slopes (n, 2d, terms), left (n, 2d): of the law."""
+    assert data.structure is not None
+    family, count, unit = found.family, found.family.num_parameters, problem.unit(rows)
+    libraries = (f for f in data.structure.libraries(data.dim) if f.num_parameters > count)
+    larger = next(libraries, None)
+    if larger is None or OPTIONS.sampled_rows * (count + larger.num_parameters) > left.size:
+        return None
+    further = (
+        problem.images(
+            family, found.fit.coefficients, rows, steps, derivatives=True, along=larger
+        ).by_coefficient
+        / unit[..., None]
+    )
+    columns = np.concatenate([slopes, further], axis=-1).reshape(left.size, -1)
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(size > 0, size, 1.0)
+    solved, _, rank, _ = np.linalg.lstsq(columns, left.ravel(), rcond=1e-10)
+    over = np.sum((left.ravel() - columns @ solved) ** 2) / max(left.size - rank, 1)
+    total = np.sum(left**2) / max(left.size - count, 1)
+    part = float(over / total) if total > 0 else 1.0
+    return part if part < 1 - OPTIONS.explained * np.sqrt(2 * rank) / left.size else 1.0
 
 
 def unexplained(
@@ -358,6 +438,11 @@ def _unmet(error: OneStepError, omega_h: float, tolerance, found: FittedLaw) -> 
             f"; it oscillates by {omega_h:.2g} radians in a step, and beyond π one dt does not "
             "tell H: sample with a shorter one"
         )
+    elif without_forces(found.family) is not found.family:
+        why = (
+            "; its friction is linear in the velocities, and may be of another kind, dry or "
+            "quadratic: the law of a Recording of the positions tells which"
+        )
     elif found.ended:
         why = f"; modes were added until {found.ended}"
     return (
@@ -387,18 +472,18 @@ def _messages(
         names = found.undetermined
         some = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
         yield (
-            f"the pairs do not determine {len(names)} terms of H ({some}): they are left "
-            "out, and H is known only where the pairs are"
+            f"the pairs do not determine {len(names)} terms of H ({some}): these terms are left "
+            "out, and H is known only near the pairs"
         )
     if left_out:
         yield (
-            f"the steps of the fit are too coarse for {left_out} of {len(found.rows)} pairs, as of "
-            "close passages: it goes without them"
+            f"{left_out} of {len(found.rows)} pairs move too fast for the steps by which H was "
+            "fitted, as in close passages: they were left out"
         )
     if unresolved:
         yield (
-            f"the steps of the flow are too coarse for {unresolved} of {len(data.validation)} "
-            "held-out pairs: there the map errs, and not H"
+            f"{unresolved} of {len(data.validation)} held-out pairs move too fast for the map's "
+            "steps, as in close passages: there the map errs, and not H"
         )
 
 

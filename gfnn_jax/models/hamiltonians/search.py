@@ -51,6 +51,7 @@ from gfnn_jax.models.hamiltonians.libraries import (
     modes_of,
     own_terms,
 )
+from gfnn_jax.models.hamiltonians.noisy_textbook import law_of_sequences
 from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
 from gfnn_jax.models.hamiltonians.starts import starts
 from gfnn_jax.models.hamiltonians.textbook import law_of_physics
@@ -97,12 +98,27 @@ def learn_hamiltonian(
     started = time.perf_counter()
     if terms and data.structure is None:
         check_finite(own_terms(data, terms), data, data.training)
+    most = options.max_operations if basis is None else options.mode_operations
+    if not terms and scene is None:
+        problem = Problem(
+            data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
+        )
+        own = LawWork(problem, budget, most, dearest)
+        whole = law_of_sequences(problem, own, data, tolerance, say)
+        if whole is not None:
+            seconds = time.perf_counter() - started
+            problem.allowance = UNBOUNDED
+            found = learned_from(whole, problem, data, tolerance, seconds, options, None)
+            for note in found.notes:
+                say(note)
+            return found
     of_steps, arcs = data, arcs_of(data)
     if arcs is not None:
         say(f"H: arcs of {arcs.length} steps, in which the states move far against their noise")
         data = arcs.data
-    problem = Problem(data.y0, data.y1, data.each_dt, data.scale, args=data.args)
-    most = options.max_operations if basis is None else options.mode_operations
+    problem = Problem(
+        data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
+    )
     work = LawWork(problem, budget, most, dearest)
     everywhere, free = data, (*data.coordinates.cyclic, *data.whole)
     if data.structure is None:
@@ -127,7 +143,9 @@ def learn_hamiltonian(
             best = with_masses._replace(noisy=True)
     everyone = np.arange(len(data))
     if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
-        raise FitError("expected pairs of a flow: that of the H that was found varies too fast")
+        raise FitError(
+            "expected pairs of a flow: the H that was found moves faster than its steps follow"
+        )
     outside, what = None, ""
     try:
         if best.noisy:
@@ -154,7 +172,9 @@ def learn_hamiltonian(
     if arcs is not None:
         of_arcs = partial(covariance_root, best, problem, everywhere, best.fit.steps)
         everywhere = of_steps
-        problem = Problem(of_steps.y0, of_steps.y1, of_steps.dt, of_steps.scale)
+        problem = Problem(
+            of_steps.y0, of_steps.y1, of_steps.dt, of_steps.scale, weight=of_steps.weight
+        )
         best = best._replace(error=validation_error(best.family, best.fit, of_steps, tolerance))
     noisy = best.noisy or arcs is not None
     if noisy and best.error.bound > tolerance.bound:

@@ -18,6 +18,7 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.models.hamiltonians.formula import Term, formula
 from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
 from gfnn_jax.models.hamiltonians.work import LawWork
 from gfnn_jax.models.textbook.search import OPTIONS, Law, Textbook
@@ -58,6 +59,12 @@ def law_of_physics(
         except np.linalg.LinAlgError:
             return None
     if law is None:
+        for partial in search.partial:
+            family, c = _without_nothing(partial, data.y0[rows], data.scale)
+            shown = formula(
+                [Term(*t, 0.0) for t in zip(family.term_names, c.tolist(), strict=True)]
+            )
+            say(f"H: a partial law leaves {partial.left:.1e} of the spread over: {shown}")
         return None
     family, start = _without_nothing(law, data.y0[rows], data.scale)
     try:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +16,7 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
 from gfnn_jax.fitting.significance import significant
 from gfnn_jax.fitting.triangle import Triangle
+from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.models.hamiltonians.flow_arcs import BIWEIGHT, FlowOnArcs, fit_flow, longest_arc
 from gfnn_jax.solve.latent_arcs import OUTLYING, Fitted
 from gfnn_jax.solve.robust import robust
@@ -25,6 +29,7 @@ _RISE = 1.01  # of the held-out arcs' noise, by chance
 _ROWS_PER_TERM = 200
 _STATES = 100  # from which the noise and its growth along an arc are measured
 _STEP_ERROR = 0.01  # of a step's own error ÷ the noise
+_IN_A_ROW = 2.5  # times the noise: neighbours of a state that stands alone stay below
 _IN_A_ROW = 2.5  # times the noise: neighbours of a state that stands alone stay below
 
 
@@ -41,6 +46,70 @@ class Whole(NamedTuple):
     messages: tuple[str, ...]
 
 
+class Measured(NamedTuple):
+    """Arcs of measured states, and the noise of each value in parts of the usual one, (A, L, 2d) or
+    1."""
+
+    arcs: Arcs
+    relative: np.ndarray | float
+
+
+@dataclasses.dataclass(frozen=True)
+class Sequences:
+    """The sequences of a data set, cut into arcs of at most ``longest`` steps, along which noise
+    stays linear. steps: of a flow, whose own error is far below the noise. least: (2d,) of what is
+    left over, what is no noise. allowance: checked before each block of lanes."""
+
+    data: Dataset
+    steps: Steps
+    longest: int
+    least: np.ndarray
+    allowance: Allowance
+
+    @classmethod
+    def along(
+        cls, problem: Problem, family, c: np.ndarray, how: Steps, data: Dataset,
+        allowance: Allowance,
+    ) -> Sequences | None:  # fmt: skip
+        """Cut them as long as a law with coefficients c that are close allows, by steps that
+        resolve it. None where there are none of one dt in plain coordinates."""
+        plain = data.coordinates.forward is CARTESIAN.forward and data.structure is None
+        if not plain or data.varied:
+            return None
+        some = data.training[:_STATES]
+        rms = float(robust(problem.residuals(family, c, how, some)))
+        if not 0 < rms < np.inf:
+            return None
+        resolved = _STEP_ERROR * rms
+        steps = problem.fine_steps(family, c, data.training, (resolved,))[0]
+        longest = longest_arc(family, c, data.y0[some], data.dt, steps, rms)
+        least = max(resolved, float(np.finfo(float).eps)) * problem.scale
+        return cls(data, steps, longest, least, allowance)
+
+    def arcs(self, rows: np.ndarray) -> Measured | None:
+        """Arcs of these rows; None where they say no more than their pairs do."""
+        rows, pairs, weight = np.sort(rows), self.data.pairs, self.data.weight
+        onto = self.longest, onward(pairs, rows)
+        arcs = arcs_of_pairs(np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows], *onto)
+        if arcs is None or np.median(arcs.measured.sum(axis=1)) <= _SHORTEST:
+            return None
+        if weight is None:
+            return Measured(arcs, 1.0)
+        each = 1.0 / weight[rows]
+        of_values = arcs_of_pairs(each, each, *onto)
+        assert of_values is not None
+        return Measured(arcs, np.nan_to_num(of_values.states, nan=1.0))
+
+    def fitted(
+        self, of: Measured, law: Callable[..., FlowOnArcs], p: np.ndarray, **options: Any
+    ) -> Fitted | None:
+        """The law with its numbers near p; law: makes the model of dt, steps, moves and allowance.
+        options: of `flow_arcs.fit_flow`."""
+        arcs, angles = of.arcs, self.data.coordinates.angles
+        model = law(dt=self.data.dt, how=self.steps, moves=arcs.moves, allowance=self.allowance)
+        return fit_flow(model, p, arcs, self.least, angles, relative=of.relative, **options)
+
+
 def fitted_to_sequences(
     problem: Problem, family, fit: FlowFit, data: Dataset,
     allowance: Allowance,
@@ -48,65 +117,61 @@ def fitted_to_sequences(
     """The law of these pairs' fit, fitted to their sequences. None where they are none of one dt in
     plain coordinates, where noise soon grows beyond the linear, or where held-out sequences do not
     bear the law out."""
-    coordinates = data.coordinates
-    plain = coordinates.forward is CARTESIAN.forward and data.structure is None
-    if not plain or data.varied:
+    sequences = Sequences.along(problem, family, fit.coefficients, fit.steps, data, allowance)
+    if sequences is None:
         return None
-    c = fit.coefficients
-    some = data.training[:_STATES]
-    rms = float(robust(problem.residuals(family, c, fit.steps, some)))
-    if not 0 < rms < np.inf:
-        return None
-    resolved = _STEP_ERROR * rms
-    steps = problem.fine_steps(family, c, data.training, (resolved,))[0]
-    longest = longest_arc(family, c, data.y0[some], data.dt, steps, rms)
-
-    def along(rows) -> Arcs | None:
-        rows, pairs = np.sort(rows), data.pairs
-        z0, z1 = np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows]
-        arcs = arcs_of_pairs(z0, z1, longest, onward(pairs, rows))
-        if arcs is None or np.median(arcs.measured.sum(axis=1)) <= _SHORTEST:
-            return None
-        return arcs
-
-    train, held = along(data.training), along(data.validation)
+    train, held = sequences.arcs(data.training), sequences.arcs(data.validation)
     if train is None or held is None:
         return None
-    least = max(resolved, float(np.finfo(float).eps)) * problem.scale
 
-    def fitted(arcs: Arcs, terms, coefficients, **options) -> Fitted | None:
-        model = FlowOnArcs(terms, data.dt, steps, arcs.moves, allowance)
-        return fit_flow(model, coefficients, arcs, least, coordinates.angles, **options)
+    def fitted(of: Measured, terms, coefficients) -> Fitted | None:
+        return sequences.fitted(of, partial(FlowOnArcs, terms), coefficients)
 
     def left(terms, coefficients) -> float:
         """Noise of the held-out arcs, each from the state that suits it."""
-        found = fitted(held, terms, coefficients, only_states=True)
-        return np.inf if found is None else float(np.linalg.norm(found.sigma / problem.scale))
+        found = sequences.fitted(held, partial(FlowOnArcs, terms), coefficients, only_states=True)
+        return np.inf if found is None else float(np.linalg.norm(noise_of(found) / problem.scale))
 
+    c = fit.coefficients
     before, found = left(family, c), fitted(train, family, c)
     if found is None or not left(family, found.p) <= _RISE * before:
         return None
-    kept = tuple(range(len(c)))
-    few = significant(_triangle(found), found.p, _CERTAIN)[0]
+    kept, widened = tuple(range(len(c))), 1.0
+    few = significant(triangle_of(found), found.p, _CERTAIN)[0]
     if 0 < len(few) < len(c):
         fewer = family.take(tuple(few.tolist()))
         again = fitted(train, fewer, found.p[few])
         if again is not None and left(fewer, again.p) <= _RISE * before:
+            widened = _of_selection(triangle_of(found), found.p, few)
             kept, found, family = tuple(few.tolist()), again, fewer
-    if _ROWS_PER_TERM * len(kept) <= _triangle(found).rows:
-        everyone = along(np.arange(len(data.y0)))
+    if tells(found, len(kept)):
+        everyone = sequences.arcs(np.arange(len(data.y0)))
         again = fitted(everyone, family, found.p) if everyone is not None else None
         if again is not None:
             found = again
-    root = _root(found)
+    root = widened * root_of(found)
     return Whole(
         kept,
         fit._replace(coefficients=found.p, standard_errors=np.linalg.norm(root, axis=0)),
-        root, found.sigma, len(found.x), _messages(found),
+        root, noise_of(found), len(found.x), about_outliers(found.residuals),
     )  # fmt: skip
 
 
-def _triangle(found: Fitted) -> Triangle:
+def tells(found: Fitted, numbers: int) -> bool:
+    """Return whether the arcs are so many for so many numbers of a law that it may be fitted to
+    the held-out sequences too."""
+    return _ROWS_PER_TERM * numbers <= triangle_of(found).rows
+
+
+def noise_of(found: Fitted) -> np.ndarray:
+    """(2d,): of noise of each value the root of the mean square over what was measured."""
+    if found.sigma.ndim == 1:
+        return found.sigma
+    return np.sqrt(np.nanmean(np.where(np.isfinite(found.residuals), found.sigma, np.nan) ** 2,
+                              axis=(0, 1)))  # fmt: skip
+
+
+def triangle_of(found: Fitted) -> Triangle:
     """Triangle of [∂r/∂c, r] without the latent states, r predicted less measured, for the numbers
     that have weight."""
     factor = found.factor.copy()
@@ -114,20 +179,38 @@ def _triangle(found: Fitted) -> Triangle:
     return Triangle(factor, int((np.abs(found.residuals) < BIWEIGHT.k).sum()))
 
 
-def _root(found: Fitted) -> np.ndarray:
+def _of_selection(triangle: Triangle, c: np.ndarray, few: np.ndarray) -> float:
+    """Factor of the standard errors of these terms that stands for the others, which were dropped.
+
+    Terms that are no more than noise each may be more together: without them the sum of squares
+    rises by Δ, of mean n for n terms that are truly zero, with variance 2 n. What it exceeds n by,
+    and a standard deviation more, is a bias beside the k squares of the k coefficients' own error.
+    """
+    dropped = len(c) - len(few)
+    squares = triangle.rebased(c).pruned(few).spectrum().residual_norm ** 2
+    rise = squares - triangle.residual_norm(len(c)) ** 2
+    bias = max(rise - dropped, 0.0) + np.sqrt(2 * dropped)
+    return float(np.sqrt(1 + bias / len(few)))
+
+
+def root_of(found: Fitted) -> np.ndarray:
     """(m, m), rootᵀ root the covariance: that of independent noise, widened where the arcs' own
     gradients vary by more than noise makes them: misfit is alike along an arc."""
-    root, (arcs, count) = _triangle(found).spectrum().root().T, found.scores.shape
+    root, (arcs, count) = triangle_of(found).spectrum().root().T, found.scores.shape
     vary = np.sum((found.scores @ root.T) ** 2) / count / max(1 - count / arcs, 1 / arcs)
     return root * np.sqrt(max(vary, 1.0))
 
 
-def _messages(found: Fitted) -> tuple[str, ...]:
-    measured = np.isfinite(found.residuals).all(axis=-1)
-    outlying = np.any(np.abs(found.residuals) > OUTLYING, axis=-1)
+def about_outliers(residuals: np.ndarray) -> tuple[str, ...]:
+    """Message about measured states that the law misses by far: gross errors stand alone.
+
+    residuals: (arcs, L, 2d) in units of the noise.
+    """
+    measured = np.isfinite(residuals).all(axis=-1)
+    outlying = np.any(np.abs(residuals) > OUTLYING, axis=-1)
     if not outlying.any():
         return ()
-    beside = np.any(np.abs(found.residuals) > _IN_A_ROW, axis=-1)
+    beside = np.any(np.abs(residuals) > _IN_A_ROW, axis=-1)
     beside = np.pad(beside, ((0, 0), (1, 1)))
     alone = outlying & ~(beside[:, :-2] | beside[:, 2:])
     if 2 * alone.sum() < outlying.sum():

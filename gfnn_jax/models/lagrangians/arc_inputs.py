@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs, Nodes
-from gfnn_jax.flows.schedules import interpolate, stage_times
+from gfnn_jax.flows.schedules import at_stages
 
 
 class ArcInputs:
@@ -15,12 +15,18 @@ class ArcInputs:
     inputs an array without columns. ``delay``: seconds by which an input acts later."""
 
     def __init__(self, nodes: Sequence[Nodes], substeps: int, hold: str, delay: float = 0.0):
-        self.substeps, self._of_nodes = substeps, []
-        for node in nodes:
-            at = stage_times(node.t, substeps) - delay
-            starts = np.broadcast_to(at[..., :1], at.shape)
-            s = node.stretch
-            self._of_nodes.append(interpolate(s.t, s.u, at, hold, starts))
+        self.hold, self.delay = hold, delay
+        self._nodes, self._substeps = nodes, substeps
+        if hold == "hold" and nodes[0].stretch.u.shape[1]:  # a substep for each: none is lost
+            apart = max(int(np.max(np.diff(n.at), initial=1)) for n in nodes)
+            substeps = apart * -(-substeps // apart)
+        self._of_nodes = [
+            at_stages(n.stretch.t, n.stretch.u, n.t, substeps, hold, delay) for n in nodes
+        ]
+
+    def delayed(self, delay: float) -> ArcInputs:
+        """Make those of another delay."""
+        return ArcInputs(self._nodes, self._substeps, self.hold, delay)
 
     def __call__(self, arcs: Arcs) -> np.ndarray:
         steps = arcs.t.shape[1] - 1

@@ -1,14 +1,18 @@
-"""Calibration of a law's forecasts by the data that it was learned from: bands and the horizon.
+"""Calibration of a law's forecasts by data that it was not learned from: bands and the horizon.
 
-From many samples of the record the state is estimated and the orbit followed. What the forecasts
-miss, beyond what noise and the errors of state and coefficients explain, is the law's own misfit,
-by the time ahead; the time when the median error passes 1 %, 5 % and 20 % of the spread is the
-horizon.
+Each third of the record is forecast by the law that the other two thirds give. From many samples
+the state is estimated, now from the window that does so best and now from a short one, and the
+orbit followed. What has to be added to the variance that noise, state and coefficients explain so
+that two standard deviations hold 95 % of the errors is the misfit, by the time ahead (conformal
+prediction: Lei et al., J. Am. Stat. Assoc. 113 (2018) 1094). The colour of the noise is in it, and
+what is wrong with the law. The time until which 95 % of the errors are below 1 %, 5 % and 20 % of
+the spread is the horizon.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from bisect import bisect
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,77 +21,97 @@ import numpy as np
 from gfnn_jax.dataset.stretches import Scales, Stretch
 from gfnn_jax.maps.estimates import Law, Window, estimate_states, propagate, thinned
 
-_WINDOWS, _TRIED = 48, 16  # starts of forecasts; of those that choose the window
+_WINDOWS, _TRIED = 96, 16  # starts of forecasts; of those that choose the window
 _CHOICES = (0.25, 0.5, 1.0, 2.0)  # periods from which a state may be estimated
-_PERIODS, _PER_PERIOD = 8, 8  # times ahead: how far, and how many to a period
+_FIRST, _LAST, _LEADS = 1 / 32, 8.0, 24  # periods ahead, and how many times between these
+_NEAR = 2  # leads to either side that share their errors
 _SHORT = 20  # samples, at least, of the shortest window
+_FEWEST = 20  # errors that tell a quantile of 95 %
+_INSIDE = 0.95  # of the errors, within two standard deviations
 FRACTIONS = (0.01, 0.05, 0.20)  # of the spread, that horizons are told for
 
 
 class Horizon(NamedTuple):
-    """Seconds for which the median error stays within a fraction of the spread (rms position about
-    its mean): measured on the record, and as the bands say; infinite where it was not passed."""
+    """Seconds for which 95 % of forecasts, read by a sensor, stay within a fraction of the spread
+    (rms position about its mean): measured on data that the law was not learned from, and as bands
+    of two standard deviations say; 0 where the noise alone is larger, infinite where the fraction
+    was not passed in eight periods."""
 
     fraction: float
     measured: float
     predicted: float
 
 
+class Thirds(NamedTuple):
+    """The laws learned without each third of a record, and (stretch, time) where these begin."""
+
+    laws: tuple[Law, ...]
+    begins: tuple[tuple[int, float], ...]
+
+    def of(self, stretch: int, t: float) -> int:
+        """The third that a sample lies in."""
+        return max(0, bisect(self.begins, (stretch, t)) - 1)
+
+
 def calibrated(
-    law: Law, found: Sequence[Stretch], scales: Scales, spread: np.ndarray
+    law: Law, thirds: Thirds, found: Sequence[Stretch], scales: Scales, spread: np.ndarray
 ) -> tuple[Law, list[Horizon]]:
     """The law with the best window for its estimates and the misfit of its forecasts, and its
     horizons. ``spread`` (k,) of the channels."""
     starts = _starts(found, scales)
     if not starts:
         return law, []
+    short = (_SHORT - 1) * scales.dt
     choices = []
     for periods in _CHOICES:
-        window = max(periods * scales.period, (_SHORT - 1) * scales.dt)
+        window = max(periods * scales.period, short)
         if choices and window <= choices[-1][0]:
             continue
         some = starts[:: -(-len(starts) // _TRIED)]
-        errors = _forecasts(law, found, some, window, np.array([0.5, 1.0]) * scales.period)[0]
+        leads = np.array([0.5, 1.0]) * scales.period
+        errors, _ = _forecasts(thirds, found, some, np.full(len(some), window), leads)
         with np.errstate(all="ignore"):
             choices.append((window, np.nanmedian(np.abs(errors) / spread)))
     best = min((c for c in choices if np.isfinite(c[1])), key=lambda c: c[1], default=choices[0])
-    leads = np.arange(1, _PERIODS * _PER_PERIOD + 1) / _PER_PERIOD * scales.period
     longest = max(s.t[-1] - s.t[0] for s in found)
+    leads = np.geomspace(max(_FIRST * scales.period, scales.dt), _LAST * scales.period, _LEADS)
     leads = leads[leads <= 0.9 * longest]
-    errors, deviations = _forecasts(law, found, starts, best[0], leads)
-    misfit, kept = [], []
-    for k in range(len(leads)):
-        near = slice(max(0, k - 1), k + 2)  # neighbours in time ahead share their windows' scatter
-        e, s = (a[:, near].reshape(-1, a.shape[-1]) for a in (errors, deviations))
-        seen = np.isfinite(e).all(axis=1)
-        if seen.sum() < 8:
-            break
-        excess = np.quantile(e[seen] ** 2 / 4 - s[seen] ** 2, 0.95, axis=0)
-        misfit.append(np.sqrt(np.maximum(excess, 0.0)))
-        kept.append(leads[k])
-    if not kept:
+    windows = np.where(np.arange(len(starts)) % 2, short, best[0])
+    errors, deviations = _forecasts(thirds, found, starts, windows, leads)
+    errors, deviations = _shared(errors), _shared(deviations)
+    told = np.isfinite(errors).all(axis=-1).sum(axis=0) >= _FEWEST
+    leads, errors, deviations = leads[told], errors[:, told], deviations[:, told]
+    if not len(leads):
         return law, []
-    table = np.maximum.accumulate(np.array(misfit), axis=0)
-    kept = np.array(kept)
-    sensors = dataclasses.replace(law.sensors, window=best[0], leads=kept, misfit=table)
-    errors, deviations = errors[:, : len(kept)], deviations[:, : len(kept)]
-    total = np.sqrt(deviations**2 + table**2)
-    with np.errstate(all="ignore"):
-        measured = np.max(np.nanmedian(np.abs(errors), axis=0) / spread, axis=1)
-        predicted = 0.6745 * np.max(np.nanmedian(total, axis=0) / spread, axis=1)
+    missed = np.nanquantile(errors**2 / 4 - deviations**2, _INSIDE, axis=0)
+    misfit = np.sqrt(np.maximum(missed, 0.0))
+    sensors = dataclasses.replace(law.sensors, window=best[0], leads=leads, misfit=misfit)
+    bands = np.where(np.isfinite(errors), 2 * np.hypot(deviations, misfit), np.nan)
+    measured = np.max(np.nanquantile(np.abs(errors), _INSIDE, axis=0) / spread, axis=1)
+    predicted = np.max(np.nanmedian(bands, axis=0) / spread, axis=1)
     horizons = [
-        Horizon(f, _passed(measured, kept, f), _passed(predicted, kept, f)) for f in FRACTIONS
+        Horizon(f, _passed(measured, leads, f), _passed(predicted, leads, f)) for f in FRACTIONS
     ]
     return law._replace(sensors=sensors), horizons
 
 
-def _window(s: Stretch, begin: int, end: int) -> Window:
-    return Window(s.t[begin:end], s.y[begin:end], s.t, s.u, s.noise[begin:end])
+def _shared(values: np.ndarray) -> np.ndarray:
+    """Values (B, n, k) together with those of near leads (B (2 near + 1), n, k)."""
+    far = np.pad(values, ((0, 0), (_NEAR, _NEAR), (0, 0)), constant_values=np.nan)
+    return np.concatenate([far[:, k : k + values.shape[1]] for k in range(2 * _NEAR + 1)])
 
 
 def _passed(error: np.ndarray, leads: np.ndarray, fraction: float) -> float:
+    """The first time at which the error passes the fraction, between leads by a straight line."""
     above = np.flatnonzero(error > fraction)
-    return float(leads[above[0]]) if len(above) else float("inf")
+    if not len(above):
+        return float("inf")
+    k = int(above[0])
+    return float(np.interp(fraction, error[k - 1 : k + 1], leads[k - 1 : k + 1])) if k else 0.0
+
+
+def _window(s: Stretch, begin: int, end: int) -> Window:
+    return Window(s.t[begin:end], s.y[begin:end], s.t, s.u, s.noise[begin:end])
 
 
 def _starts(found: Sequence[Stretch], scales: Scales) -> list[tuple[int, int]]:
@@ -99,13 +123,30 @@ def _starts(found: Sequence[Stretch], scales: Scales) -> list[tuple[int, int]]:
 
 
 def _forecasts(
-    law: Law, found: Sequence[Stretch], starts: Sequence[tuple[int, int]], window: float,
+    thirds: Thirds, found: Sequence[Stretch], starts: Sequence[tuple[int, int]],
+    windows: np.ndarray, leads: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Errors (B, n, k) of forecasts by the law without the third in which they start, NaN where the
+    record ends before, and their standard deviations; times are those of the samples nearest to the
+    leads. windows: (B,) seconds from which each state is estimated."""
+    shape = (len(starts), len(leads), found[0].y.shape[1])
+    errors, deviations = np.full(shape, np.nan), np.full(shape, np.nan)
+    third = np.array([thirds.of(i, found[i].t[k]) for i, k in starts])
+    for number, law in enumerate(thirds.laws):
+        own = np.flatnonzero(third == number)
+        if len(own):
+            some = [(*starts[n], windows[n]) for n in own.tolist()]
+            errors[own], deviations[own] = _forecasts_of(law, found, some, leads)
+    return errors, deviations
+
+
+def _forecasts_of(
+    law: Law, found: Sequence[Stretch], starts: Sequence[tuple[int, int, float]],
     leads: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Errors (B, n, k) of forecasts, NaN where the record ends before, and their standard
-    deviations without a misfit; times are those of the samples nearest to the leads."""
+    """`_forecasts` of one law."""
     windows, times, measured = [], [], []
-    for i, k in starts:
+    for i, k, window in starts:
         s = found[i]
         first = min(int(np.searchsorted(s.t, s.t[k] - window)), max(0, k - _SHORT + 1))
         windows.append(thinned(_window(s, first, k + 1)))
@@ -113,10 +154,7 @@ def _forecasts(
         inside = s.t[k] + leads <= s.t[-1]
         times.append(np.where(inside, s.t[at], s.t[at[inside][-1]] if inside.any() else s.t[k]))
         measured.append(np.where(inside[:, None], s.y[at], np.nan))
-    bare = law._replace(
-        sensors=dataclasses.replace(law.sensors, misfit=np.zeros_like(law.sensors.misfit))
-    )
-    x, covariance = estimate_states(bare, windows)
+    x, covariance = estimate_states(law, windows)
     last = np.array([w.t[-1] for w in windows])
-    orbits = propagate(bare, windows, x, covariance, last, np.array(times))
+    orbits = propagate(law, windows, x, covariance, last, np.array(times))
     return orbits.values - np.array(measured), orbits.std

@@ -4,7 +4,8 @@ cost."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,9 +14,11 @@ from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.arcs import LawOnArcs
 from gfnn_jax.models.lagrangians.structure import Key, Structure
-from gfnn_jax.solve.latent_arcs import SOFT_L1, Fitted, fit_arcs, sensitivities
+from gfnn_jax.solve.latent_arcs import Fitted, fit_arcs, rows_of_arcs, sensitivities
 
 _SETTLED = 1.15  # a noise scale that changed by less needs no second fit
+_NOTHING = 1e-9  # of the largest singular value of scaled columns: a combination that does nothing
+_PART = 1e-3  # of the largest coefficient of a combination, that is part of it
 FOLDS = 3
 
 
@@ -43,10 +46,31 @@ class LawFit:
         """Covariance of p: that of white residuals, times their correlation time."""
         return self.fitted.covariance() * self.correlation
 
+    def untold(self) -> dict[Key, float]:
+        """The combination of coefficients that moves nothing, where there is one: as any two
+        springs without friction follow from Lagrangians of a whole family."""
+        R = self.fitted.triangle
+        size = np.linalg.norm(R, axis=0)
+        _, singular, across = np.linalg.svd(R / np.where(size > 0, size, 1.0))
+        if not len(singular) or singular[-1] > _NOTHING * singular[0]:
+            return {}
+        part = np.abs(across[-1])
+        step = across[-1] / np.where(size > 0, size, 1.0)
+        keys = self.structure.keys()
+        return {keys[k]: float(step[k]) for k in np.flatnonzero(part > _PART * part.max())}
+
     def rms(self) -> np.ndarray:
         """Root mean square residual (k,), in units of the channels."""
         left = self.fitted.residuals * self.arcs.noise
         return np.sqrt(np.nanmean(left**2, axis=(0, 1))) * self.sigma
+
+
+class Without(NamedTuple):
+    """A fit without a third of the record, and the run and the time at which that third begins."""
+
+    fit: LawFit
+    run: str
+    begins: float
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -55,7 +79,7 @@ class Workbench:
     fastest frequency ω, and how states are seen."""
 
     gauge: np.ndarray
-    inputs: Callable[[Arcs], np.ndarray]
+    inputs: Any  # of arcs: ArcInputs, or a function in its place
     omega: float
     seen: Observation
 
@@ -88,7 +112,10 @@ class Workbench:
         model = self.model(structure, arcs, p, np.arange(len(p)))
         for _ in range(3 if rescale else 1):
             noise, scale = sigma * arcs.noise, self.state_scale(sigma)
-            found = fit_arcs(model, p, x, arcs.y, noise, scale, tolerance=1e-4 if rescale else 1e-3)
+            found = fit_arcs(
+                model, p, x, arcs.y, noise, scale, tolerance=1e-4 if rescale else 1e-3,
+                loss=self.seen.loss,
+            )  # fmt: skip
             p, x = found.p, found.x
             change = np.nanmedian(np.abs(found.residuals), axis=(0, 1)) / 0.6745
             change = np.maximum(change, 1e-3)
@@ -101,26 +128,43 @@ class Workbench:
         """The cost (A,) of arcs that the fit has not seen, with their own states."""
         model = self.model(fit.structure, arcs, fit.p, np.arange(0))
         noise, scale = fit.sigma * arcs.noise, self.state_scale(fit.sigma)
-        found = fit_arcs(model, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, 1e-3)
+        loss = self.seen.loss
+        found = fit_arcs(model, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, 1e-3, loss)
         if not np.isfinite(found.cost):
             return np.full(len(arcs.home), np.inf)
-        return np.nansum(SOFT_L1.of(found.residuals), axis=(1, 2))
+        return np.nansum(loss.of(found.residuals), axis=(1, 2))
 
     def cross_validate(
         self, nodes: Sequence[Nodes], fit: LawFit, structure: Structure, known: Mapping[Key, float]
     ) -> np.ndarray:
         """Held-out cost (A,) of each arc: of three blocks of arcs, each left out of a fit. All in
-        the noise scale of ``fit``; infinite where a fit fails. Arcs are as long as those of the
-        fit, or as long as three of them can be."""
-        total = sum(len(n.t) for n in nodes)
-        length = min(fit.arcs.t.shape[1], total // FOLDS)
-        arcs = arcs_of(with_states(nodes, fit.arcs, fit.fitted.x), length)
-        fold = np.arange(len(arcs.home)) * FOLDS // len(arcs.home)
+        the noise scale of ``fit``; infinite where a fit fails."""
+        arcs, third = in_thirds(nodes, fit)
         costs = np.full(len(arcs.home), np.inf)
         for k in range(FOLDS):
-            some = self.fit(structure, known, arcs.take(fold != k), fit.sigma, rescale=False)
-            costs[fold == k] = self.held_out(some, arcs.take(fold == k))
+            some = self.fit(structure, known, arcs.take(third != k), fit.sigma, rescale=False)
+            costs[third == k] = self.held_out(some, arcs.take(third == k))
         return costs
+
+    def without_thirds(self, nodes: Sequence[Nodes], fit: LawFit) -> list[Without]:
+        """The fit without each third of the record, by one Gauss–Newton step from that to all of
+        it: close to a fit its residuals are linear in the coefficients."""
+        arcs, third = in_thirds(nodes, fit)
+        noise, scale, loss = fit.sigma * arcs.noise, self.state_scale(fit.sigma), self.seen.loss
+        known = self.model(fit.structure, arcs, fit.p, np.arange(0))
+        own = fit_arcs(known, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, loss=loss)
+        model = self.model(fit.structure, arcs, fit.p, np.arange(len(fit.p)))
+        rows = rows_of_arcs(model, fit.p, own.x, arcs.y, noise, loss)
+        found = []
+        for k in np.unique(third):
+            i, first, _ = arcs.home[int(np.argmax(third == k))]
+            others = rows[third != k].reshape(-1, rows.shape[-1])
+            size = np.maximum(np.linalg.norm(others[:, :-1], axis=0), 1e-300)
+            change = np.linalg.lstsq(others[:, :-1] / size, others[:, -1], rcond=1e-10)[0] / size
+            fitted = dataclasses.replace(fit.fitted, p=fit.p + change)
+            moved = dataclasses.replace(fit, fitted=fitted)
+            found.append(Without(moved, nodes[i].stretch.run, float(nodes[i].t[first])))
+        return found
 
     def scores(self, fit: LawFit, candidates: Structure) -> dict[Key, float]:
         """Distance from zero, in standard errors, of each coefficient of ``candidates`` that the
@@ -132,7 +176,7 @@ class Workbench:
         p = larger.start(known)
         model = self.model(larger, fit.arcs, p, np.arange(len(p)))
         noise = fit.sigma * fit.arcs.noise
-        R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise)
+        R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, self.seen.loss)
         old = [keys.index(k) for k in known]
         own = [keys.index(k) for k in new]
         Q = np.linalg.qr(R[:, old])[0] if old else np.zeros((len(R), 0))
@@ -145,6 +189,14 @@ class Workbench:
             z = rest[:, k] @ rest[:, -1] / size / np.sqrt(fit.correlation) if told_apart else 0.0
             scores[key] = float(abs(z))
         return scores
+
+
+def in_thirds(nodes: Sequence[Nodes], fit: LawFit) -> tuple[Arcs, np.ndarray]:
+    """Arcs of the nodes, and the third of the record (A,) that each lies in. They are as long as
+    those of the fit, or as long as three of them can be."""
+    length = min(fit.arcs.t.shape[1], sum(len(n.t) for n in nodes) // FOLDS)
+    arcs = arcs_of(with_states(nodes, fit.arcs, fit.fitted.x), length)
+    return arcs, np.arange(len(arcs.home)) * FOLDS // len(arcs.home)
 
 
 def correlation_time(residuals: np.ndarray) -> float:

@@ -12,8 +12,9 @@ found from them as well, so that the odds of B, residuals being normal, are
     (S_A / S_B)^(N / 2τ),
 
 where of N residuals those that are correlated, over τ samples, count once. Of the sets against
-which the best has odds of less than 20 the one with the fewest kinds is taken, linear friction
-before quadratic, and that before dry friction.
+which the best has odds of less than 20 the one with the fewest kinds is taken: uniform friction,
+which has one coefficient and keeps a multiple of the symplectic form, before linear friction, and
+that before quadratic and dry friction. Uniform friction is not tried beside linear friction.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import nnls
 
+from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench, correlation_time
 from gfnn_jax.models.lagrangians.structure import Loss
 from gfnn_jax.solve.latent_arcs import rows_of_arcs
@@ -58,6 +60,11 @@ def kinds_of(rows: Sequence[Loss]) -> tuple[int, ...]:
     return tuple(sorted({row[1] for row in rows}))
 
 
+def _plainness(kinds: tuple[int, ...]) -> tuple[int, ...]:
+    """The rank of kinds among as many others, uniform friction first."""
+    return tuple(sorted(-1 if kind == UNIFORM else kind for kind in kinds))
+
+
 class _Judged(NamedTuple):
     """A set of frictions and its held-out residuals (A, L, k)."""
 
@@ -86,6 +93,7 @@ def which_friction(
     table = _Table.of(bench, fit, candidates)
     kinds = sorted({row[1] for row in candidates})
     every = (chosen for n in range(len(kinds) + 1) for chosen in combinations(kinds, n))
+    every = (chosen for chosen in every if not {LINEAR, UNIFORM} <= set(chosen))
     sets = [judged for judged in map(table.leanest, every) if judged is not None]
     if not choose:
         sets = sets[-1:]
@@ -93,7 +101,7 @@ def which_friction(
     evidence = _Evidence(best)
     tied = [s for s in sets if evidence.odds(best, s) < _DECIDED]
     known = before.kinds if before else ()
-    taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, s.kinds))
+    taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, _plainness(s.kinds)))
     odds = {s.kinds: evidence.odds(taken, s) for s in sets if s is not taken}
     others = table.others(taken.rows)
     limits = {row: max(rho, 0.0) + _LIMIT * error for row, (rho, error) in others.items()}
@@ -136,7 +144,8 @@ class _Table:
         larger = structure.plus([("loss", row) for row in others])
         p = larger.start(fit.values)
         model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
-        rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, fit.sigma * fit.arcs.noise)
+        noise, loss = fit.sigma * fit.arcs.noise, bench.seen.loss
+        rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, noise, loss)
         keys = larger.keys()
         own = [keys.index(("loss", row)) for row in candidates]
         rest = [k for k in range(len(keys)) if k not in own]

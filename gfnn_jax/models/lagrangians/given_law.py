@@ -10,9 +10,11 @@ from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of, with_states
 from gfnn_jax.families.lagrangian import LINEAR
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians import libraries
-from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
+from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
+from gfnn_jax.models.lagrangians.fit import Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_terms import Given
+from gfnn_jax.models.lagrangians.input_rules import choose_rule, with_delay
 from gfnn_jax.models.lagrangians.search import (
     Found,
     SearchOptions,
@@ -26,7 +28,7 @@ from gfnn_jax.models.lagrangians.weak_start import weak_start
 
 def fit_given(
     given: Given, nodes: Sequence[Nodes], scales: Scales, angles: tuple[int, ...], num_inputs: int,
-    inputs: Mapping[str, Callable], seen: Observation, told: Callable[[str], object],
+    inputs: Mapping[str, ArcInputs], seen: Observation, told: Callable[[str], object],
     options: SearchOptions,
 ) -> Found:  # fmt: skip
     """Fit exactly the terms that are given, with the result of `law_search.search`."""
@@ -42,25 +44,21 @@ def fit_given(
     turned = [i for i in angles if i in seen.direct and i not in seen.shifts()]
     zeros = [i for i in turned if plain and any(row[2][i] for row in given.terms)]
     structure = structure.plus([("zero", i) for i in zeros])
-    fits: dict[str, LawFit] = {}
-    for periods in options.periods:
+    arcs = arcs_of(nodes, max(6, round(options.periods[0] * scales.per_period)))
+    fit, bench, _ = choose_rule(benches, nodes, structure, known, arcs, scales.sigma, scales.dt)
+    told(f"{options.periods[0]:g} periods: {describe(fit)}")
+    nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+    for periods in options.periods[1:]:
         arcs = arcs_of(nodes, max(6, round(periods * scales.per_period)))
-        if fits and arcs.t.shape == next(iter(fits.values())).arcs.t.shape:
+        if arcs.t.shape == fit.arcs.t.shape:
             break  # no run is longer
-        for hold, bench in benches.items():
-            before = fits.get(hold)
-            if before is None:
-                fits[hold] = bench.fit(structure, known, arcs, scales.sigma)
-            else:
-                fits[hold] = bench.fit(structure, before.values, arcs, before.sigma)
-        hold = min(fits, key=lambda one: float(np.max(fits[one].rms() / scales.sigma)))
-        benches, fits = {hold: benches[hold]}, {hold: fits[hold]}
-        nodes = with_states(nodes, fits[hold].arcs, fits[hold].fitted.x)
-        told(f"{periods:g} periods: {describe(fits[hold])}")
-    ((hold, fit),) = fits.items()
+        fit = bench.fit(structure, fit.values, arcs, fit.sigma)
+        nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+        told(f"{periods:g} periods: {describe(fit)}")
     if given.friction is None:
         tried = frictions_tried(d, scales, options)
-        fit, choice = choose_friction(benches[hold], nodes, fit, tried, told, options)
+        fit, choice = choose_friction(bench, nodes, fit, tried, told, options)
     else:
         choice = FrictionChoice(given.friction, {}, {}, gains=False)
-    return Found(fit, choice, hold, with_states(nodes, fit.arcs, fit.fitted.x))
+    nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+    return Found(with_delay(bench, nodes, fit, scales.dt), choice, nodes)

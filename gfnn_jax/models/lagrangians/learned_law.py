@@ -16,6 +16,12 @@ from gfnn_jax.models.lagrangians.residuals import Trace, Whiteness
 from gfnn_jax.models.lagrangians.text import Expression, Term, WhichFriction, measured, terms_of
 from gfnn_jax.models.lagrangians.velocities import Velocity
 
+_RULES = {
+    "hold": "held from sample to sample",
+    "linear": "linear between samples",
+    "band": "band-limited between samples",
+}
+
 
 class NextMotion(NamedTuple):
     """A motion to record: where to let go, at rest, and by how much that makes the standard errors
@@ -36,17 +42,18 @@ class LearnedLaw:
 
     map: its flow, which estimates and forecasts. lagrangian: L, and friction: Rayleigh's R, by the
     names of columns, with standard errors. which_friction: its kinds, with what odds, and limits of
-    those that were not seen. gains: input -> force on each position, with its
-    standard error. hamiltonian: H in words, its terms as of L. zeros: angle -> (where it is zero,
-    standard error), already inside the formula. observe: column -> what its sensor shows, where
-    that is not the coordinate; sensors: the parameters in it, fitted, with standard errors. noise:
-    column -> σ of its samples; residual: of the fit's arcs, both in the file's unit. velocities:
-    columns of these against the law of the positions, and whether they were used. whiteness: of
-    the residuals, column by column; traces: the arcs that were fitted. gauge: what fixes the scale
-    of L. alike: coefficients that the record cannot tell apart. next_motions: those that
-    would tell the most, the best first. horizon: for how long a forecast
-    can be trusted. energy: stored, lost, supplied per second, means over the record. messages:
-    warnings. steps: what the search did, line by line.
+    those that were not seen. gains: input -> force on each position, with its standard error.
+    delay: how much later than measured inputs act, in seconds, with its standard error (NaN where
+    the record does not tell it); None without inputs. hamiltonian: H in words, its terms as of L.
+    zeros: angle -> (where it is zero, standard error), already inside the formula. observe: column
+    -> what its sensor shows, where that is not the coordinate; sensors: the parameters in it,
+    fitted, with standard errors. noise: column -> σ of its samples; residual: of the fit's arcs,
+    both in the file's unit. velocities: columns of these against the law of the positions, and
+    whether they were used. whiteness: of the residuals, column by column; traces: the arcs that
+    were fitted. gauge: what fixes the scale of L. alike: coefficients that the record cannot tell
+    apart. next_motions: those that would tell the most, the best first. horizon: for how long a
+    forecast can be trusted. energy: stored, lost, supplied per second, means over the record.
+    messages: warnings. steps: what the search did, line by line.
     num_samples, seconds (of the processor). ended: why the search ended.
     """
 
@@ -55,6 +62,7 @@ class LearnedLaw:
     friction: Expression
     which_friction: WhichFriction
     gains: dict[str, dict[str, tuple[float, float]]]
+    delay: tuple[float, float] | None
     hamiltonian: Hamiltonian
     zeros: dict[str, tuple[float, float]]
     observe: dict[str, str]
@@ -94,6 +102,13 @@ class LearnedLaw:
         for name, forces in self.gains.items():
             told = ", ".join(f"{q} {g:.6g} ± {s:.2g}" for q, (g, s) in forces.items())
             lines.append(f"force of {name}: {told}")
+        lines += [self._inputs_told] if self.delay is not None else []
+        energy = self.energy
+        lines.append(
+            f"energy per second: stored {energy['stored']:.3g}, lost "
+            f"{sum(energy['lost'].values()):.3g}, supplied {sum(energy['supplied'].values()):.3g}, "
+            f"unexplained {energy['closure']:.1g}"
+        )
         for name, sigma in self.noise.items():
             lines.append(
                 f"{name}: noise {sigma:.3g}, residual of the law {self.residual[name]:.3g}, "
@@ -101,11 +116,24 @@ class LearnedLaw:
             )
         for fraction, seconds, predicted in self.horizon:
             lines.append(
-                f"forecasts within {fraction:.0%} of the spread for {seconds:.3g} s (by the bands "
-                f"{predicted:.3g} s)"
+                f"95 % of forecasts within {fraction:.0%} of the spread for {seconds:.3g} s (by "
+                f"the bands {predicted:.3g} s)"
             )
         lines += [f"to record next: {motion}" for motion in self.next_motions[:1]]
         return "\n".join(lines)
+
+    @property
+    def _inputs_told(self) -> str:
+        """How inputs act, in words."""
+        assert self.map.sensors is not None
+        assert self.delay is not None
+        delay, error = self.delay
+        rule = _RULES[self.map.sensors.hold]
+        if not np.isfinite(error):
+            return f"inputs: {rule}; what they do later the record does not tell"
+        if delay == 0:
+            return f"inputs: {rule}, no delay seen (standard error {error:.2g} s)"
+        return f"inputs: {rule}, acting {measured(delay, error)} s later"
 
     def __repr__(self) -> str:
         return f"LearnedLaw(L = {self.lagrangian}; R = {self.friction})"
@@ -163,7 +191,7 @@ def hamiltonian_of(terms: Terms, lagrangian: Expression, names: tuple[str, ...])
 
 def in_columns(fit: LawFit) -> tuple[Lagrangian, np.ndarray]:
     """The law in the measured coordinates (zeros of angles inside the phases of its terms), and the
-    covariance of (θ, ρ, G row by row)."""
+    covariance of (θ, ρ, G row by row), and of γ where there is uniform friction."""
     form, structure = fit.form, fit.structure
     law = form.lagrangian(fit.p[: form.count])
     zeros = np.zeros(form.dim)
@@ -173,7 +201,11 @@ def in_columns(fit: LawFit) -> tuple[Lagrangian, np.ndarray]:
     rest = form.count - form.basis.shape[1]
     turn = np.zeros((terms.count + rest, len(fit.p)))
     turn[: terms.count, : form.basis.shape[1]] = form.basis
-    turn[terms.count :, form.basis.shape[1] : form.count] = np.eye(rest)
+    others = np.arange(form.basis.shape[1], form.count)
+    if law.friction.count < form.friction.count:  # γ, the last of the friction, goes behind G
+        last = form.friction.count - 1
+        others = np.append(np.delete(others, last), others[last])
+    turn[np.arange(terms.count, terms.count + rest), others] = 1.0
     covariance = turn @ fit.covariance() @ turn.T
     return dataclasses.replace(law, terms=moved), covariance
 
@@ -184,4 +216,6 @@ def scaled(law: Lagrangian, covariance: np.ndarray, factor: float) -> tuple[Lagr
         law, coefficients=factor * law.coefficients, losses=factor * law.losses,
         gains=factor * law.gains,
     )  # fmt: skip
-    return law, factor**2 * covariance
+    by = np.full(len(covariance), factor)
+    by[law.terms.count + law.friction.count + law.gains.size :] = 1.0  # γ is a rate
+    return law, by[:, None] * covariance * by

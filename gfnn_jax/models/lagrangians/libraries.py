@@ -14,12 +14,12 @@ from itertools import combinations, combinations_with_replacement
 
 import numpy as np
 
-from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC
+from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM
 from gfnn_jax.models.lagrangians.structure import Loss, Row
 
 SINE = -np.pi / 2
-KINDS = (LINEAR, QUADRATIC, DRY)
-FRICTIONS = ("linear", "quadratic", "dry")  # their names
+KINDS = (LINEAR, QUADRATIC, DRY, UNIFORM)
+FRICTIONS = ("linear", "quadratic", "dry", "uniform")  # their names
 
 
 def unit(dim: int, *axes: int) -> tuple[int, ...]:
@@ -130,13 +130,18 @@ def modes(dim: int, angles: tuple[int, ...], order: int) -> list[tuple[int, ...]
 
 
 def losses(dim: int, kinds: tuple[int, ...], width: float) -> list[Loss]:
-    """Friction of each coordinate, and of the relative speed of neighbours (a joint)."""
+    """Friction of each coordinate, and of the relative speed of neighbours (a joint); uniform
+    friction has no direction."""
     directions = [unit(dim, i) for i in range(dim)]
     for i in range(dim - 1):
         wave = [0] * dim
         wave[i], wave[i + 1] = -1, 1
         directions.append(tuple(wave))
-    return [(c, kind, width if kind == DRY else 0.0) for kind in kinds for c in directions]
+    rows = [
+        (c, kind, width if kind == DRY else 0.0)
+        for kind in kinds if kind != UNIFORM for c in directions
+    ]  # fmt: skip
+    return rows + [((0,) * dim, UNIFORM, 0.0)] * (UNIFORM in kinds)
 
 
 def opposite(row: Loss) -> Loss | None:

@@ -48,7 +48,7 @@ def next_motions(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[M
     keys = larger.keys()
     p, noise = larger.start(fit.values), fit.sigma * fit.arcs.noise
     model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
-    R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise)[:, :-1]
+    R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, bench.seen.loss)[:, :-1]
     own = [k for k, key in enumerate(keys) if key in known]
     Q = np.linalg.qr(R[:, own])[0]
     rest = np.linalg.norm(R - Q @ (Q.T @ R), axis=0)
@@ -58,17 +58,14 @@ def next_motions(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[M
     scale = np.where(scale > 0, scale, 1.0)
     before = _information(R[:, kept] / scale)
     found = []
-    for start in _starts(bench, fit, angles):
-        arcs = _followed(bench, fit, start)
-        if arcs is None:
-            continue
+    for arcs in _followed(bench, fit, _starts(bench, fit, angles)):
         model = bench.model(larger, arcs, p, np.arange(len(p)))
         model = dataclasses.replace(model, u=np.zeros_like(model.u))
         J = sensitivities(model, p, arcs.x, arcs.y, fit.sigma * arcs.noise)[:, :-1]
         after = before + _information(J[:, kept] / scale)
         less = np.sqrt(np.diag(_inverse(before)) / np.diag(_inverse(after)))
         order = np.argsort(-less)
-        found.append(Motion(start, {keys[kept[k]]: float(less[k]) for k in order}))
+        found.append(Motion(arcs.x[0, 0, :d], {keys[kept[k]]: float(less[k]) for k in order}))
     found.sort(key=lambda motion: -sum(np.log(list(motion.gains.values()))))
     return found[:_MOST]
 
@@ -90,25 +87,28 @@ def _starts(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[np.nda
     return starts
 
 
-def _followed(bench: Workbench, fit: LawFit, start: np.ndarray) -> Arcs | None:
-    """The motion as an arc, without inputs; None where it leaves for far away."""
+def _followed(bench: Workbench, fit: LawFit, starts: Sequence[np.ndarray]) -> list[Arcs]:
+    """The motions from these starts as arcs, without inputs; those that leave for far away are left
+    out."""
     d, length = fit.form.dim, fit.arcs.t.shape[1]
     steps = np.diff(fit.arcs.t, axis=1)
-    h = float(np.median(steps[steps > 0]))
-    inputs = bench.inputs(fit.arcs)
-    still = np.zeros((1, *inputs.shape[2:]))
+    h = np.full(len(starts), np.median(steps[steps > 0]))
+    still = np.zeros((len(starts), *bench.inputs(fit.arcs).shape[2:]))
     coefficients = fit.p[: fit.form.count]
-    x = [np.concatenate([start, np.zeros(d)])]
+    first = np.array(starts)
+    x = [np.concatenate([first, np.zeros((len(starts), d))], axis=1)]
     for _ in range(length - 1):
         with np.errstate(all="ignore"):
-            x.append(fit.form.advance(coefficients, x[-1][None], np.full(1, h), still)[0])
-    states = np.array(x)
-    far = 10 * (np.ptp(bench.gauge, axis=0) + np.abs(start))
-    if not np.all(np.abs(states[:, :d] - start) < far):  # NaN too
-        return None
-    y = bench.seen(states[None]).values
-    home = ((fit.arcs.home[0][0], 0, length),)
-    return Arcs(h * np.arange(length)[None], y, states[None], np.ones(y.shape), home)
+            x.append(fit.form.advance(coefficients, x[-1], h, still))
+    states = np.stack(x, axis=1)
+    off = np.abs(states[..., :d] - first[:, None])
+    far = 10 * (np.ptp(bench.gauge, axis=0) + np.abs(first))
+    home, t = ((fit.arcs.home[0][0], 0, length),), h[0] * np.arange(length)[None]
+    arcs = []
+    for lane in states[np.all(off < far[:, None], axis=(1, 2))]:  # no NaN either
+        y = bench.seen(lane[None]).values
+        arcs.append(Arcs(t, y, lane[None], np.ones(y.shape), home))
+    return arcs
 
 
 def _information(R: np.ndarray) -> np.ndarray:

@@ -10,7 +10,6 @@ import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,15 +18,16 @@ from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.dataset.stretches import Nodes, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.lagrangian import Friction, Terms
+from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
+from gfnn_jax.flows.motion import WEIGHTS
 from gfnn_jax.maps.estimates import law_in_use
 from gfnn_jax.maps.inputs import HOLDS, Signals
-from gfnn_jax.maps.laws import map_of_law
+from gfnn_jax.maps.laws import conformal, map_of_law
 from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.calibration import calibrated
-from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
+from gfnn_jax.models.lagrangians.calibration import Thirds, calibrated
+from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_law import fit_given
 from gfnn_jax.models.lagrangians.given_terms import Given, given_terms
@@ -41,15 +41,17 @@ from gfnn_jax.models.lagrangians.learned_law import (
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.next_motion import Motion, next_motions
 from gfnn_jax.models.lagrangians.residuals import Trace, whiteness
-from gfnn_jax.models.lagrangians.search import SearchOptions, search
+from gfnn_jax.models.lagrangians.search import SearchOptions, describe, search
 from gfnn_jax.models.lagrangians.text import (
     Expression,
+    Term,
     friction_of,
     speed_names,
     terms_of,
     which_friction_told,
 )
 from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels
+from gfnn_jax.solve.robust import Loss
 
 _IMITATED = 1e-4  # of what a sensor's parameter changes, that no coefficient of the law does
 _SEEN = 3.0  # standard errors of a gain, below which its input is not seen to act
@@ -58,7 +60,7 @@ _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apa
 
 def fit_recording(
     recording: Recording, *, friction: str = "auto", input_hold: str = "auto",
-    mass: Mapping[str, float] | None = None, terms: Sequence[Any] = (),
+    mass: Mapping[str, float] | None = None, terms: Sequence[Any] = (), loss: Loss | None = None,
     on_progress: Callable[[str], Any] = lambda message: None,
 ) -> LearnedLaw:  # fmt: skip
     """The law of a recording, from its positions and inputs.
@@ -67,7 +69,8 @@ def fit_recording(
     "linear+dry". input_hold: "auto", or how inputs go on between samples: "hold", "linear" or
     "band". mass: the known mass (or moment of inertia) of one position, which fixes the scale of L.
     terms: those of L, V and R, as text in the names of columns (`models.lagrangians.given_terms`),
-    which are then all that is fitted.
+    which are then all that is fitted. loss: of residuals in units of their noise; None: the soft L1
+    of `solve.robust`.
     Raises InputError for bad options or a recording without positions, FitError where no law is
     found.
     """
@@ -81,6 +84,7 @@ def fit_recording(
         on_progress(line)
 
     seen, angles = _observation(recording)
+    seen = seen if loss is None else dataclasses.replace(seen, loss=loss)
     found = _stretches(recording, seen, angles)
     far = [i for i in seen.shifts() if i not in angles]
     if far and not recording.guess:
@@ -99,9 +103,16 @@ def fit_recording(
     inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
     record = (nodes, scales, angles, len(recording.inputs), inputs, seen, told, options)
     gauge_of = np.concatenate([n.x[:, : seen.dim] for n in nodes])
-    fit, choice, hold, nodes = search(*record) if asked is None else fit_given(asked, *record)
+    acting, choice, nodes = search(*record) if asked is None else fit_given(asked, *record)
+    fit, inputs_of = acting.fit, acting.bench.inputs
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
-        raise FitError("no law of the library follows this recording: its arcs could not be closed")
+        raise FitError("no law of the terms tried follows this recording from sample to sample")
+    finer = scales.substeps_for(fit.sigma)  # local cubics may have seen more noise than there is
+    if finer > scales.substeps:
+        inputs_of = ArcInputs(nodes, finer, acting.hold, acting.delay)
+        bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
+        fit = bench.fit(fit.structure, fit.values, fit.arcs, fit.sigma)
+        told(f"{finer} steps between nodes: {describe(fit)}")
     speeds = velocities(recording, fit, nodes)
     honest = tuple(name for name, one in speeds.items() if one.used)
     for name, one in speeds.items():
@@ -110,7 +121,7 @@ def fit_recording(
         own = np.array([speeds[name].sigma for name in honest])
         seen = seen.beside({n: recording.velocities.index(n) for n in honest})
         nodes, arcs = with_channels(recording, nodes, fit.arcs, fit.fitted.x, honest)
-        bench = Workbench(gauge_of, inputs[hold], scales.omega, seen)
+        bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
         fit = bench.fit(fit.structure, fit.values, arcs, np.concatenate([fit.sigma, own]))
         scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, own]))
         given = np.array([recording.std[name] or np.nan for name in seen.channels])
@@ -133,29 +144,39 @@ def fit_recording(
     zeros = np.zeros(d)
     zeros[list(fit.structure.zeros)] = fit.p[fit.form.count : first]
     q, v = x[:, :d] + zeros, x[:, d:]
-    root = _root(covariance)
+    moving, of_moving = conformal(law, covariance)
+    root = _root(of_moving)
     noise = np.where(given > 0, given, np.minimum(scales.sigma, fit.rms()))
     sensors = Sensors(
-        names, recording.inputs, recording.angles, noise, scales.omega, scales.period, hold, 0.0,
-        np.array([scales.period]), np.zeros((1, len(noise))), None if seen.is_plain else fitted,
+        names, recording.inputs, recording.angles, noise, scales.omega, scales.period, acting.hold,
+        acting.delay, np.array([scales.period]), np.zeros((1, len(noise))),
+        None if seen.is_plain and loss is None else fitted,
     )  # fmt: skip
+    bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
     told("bands: forecasts from windows of the record")
     spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
-    used, horizons = calibrated(law_in_use(law, root, sensors), found, scales, spread)
+    thirds = _thirds(bench, nodes, fit, sensors, found)
+    used, horizons = calibrated(law_in_use(moving, root, sensors), thirds, found, scales, spread)
     z = np.concatenate([q, law.momentum(q, v)], axis=1)
     u = np.concatenate([n.stretch.u[n.at] for n in nodes])
-    signals = Signals(recording.inputs, hold) if recording.inputs else None
+    signals = Signals(recording.inputs, acting.hold, acting.delay) if recording.inputs else None
     map_ = map_of_law(
-        law, z, scales.dt, angles=angles, signals=signals, inputs=u if signals else None, root=root
+        moving,
+        z,
+        scales.dt,
+        angles=angles,
+        signals=signals,
+        inputs=u if signals else None,
+        root=root,
     )
     map_ = _with_sensors(map_, used.sensors)
-    traces = _traces(recording, seen.channels, fit, law, nodes, zeros)
+    traces = _traces(recording, seen.channels, fit, law, nodes, zeros, inputs_of)
     told("which motion to record next")
-    bench = Workbench(gauge_of, inputs[hold], scales.omega, seen)
     motions = next_motions(bench, fit, angles)
     return _described(
         recording, fit, map_, law, covariance, (choice, scale), horizons, gauge, tuple(steps),
-        traces, motions, (q, v, u), [n.t for n in nodes], time.process_time() - started, speeds,
+        traces, motions, time.process_time() - started, speeds,
+        (acting.delay, acting.error) if recording.inputs else None,
     )  # fmt: skip
 
 
@@ -242,6 +263,26 @@ def _root(covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(values[kept])[:, None] * vectors[:, kept].T
 
 
+def _thirds(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, sensors: Sensors,
+    found: Sequence[Stretch],
+) -> Thirds:  # fmt: skip
+    """The laws of the record without each third, of which less data tell less."""
+    fewer, laws, begins = np.sqrt(FOLDS / (FOLDS - 1)), [], []
+    for other, run, t in bench.without_thirds(nodes, fit):
+        law, covariance = in_columns(other)
+        own = sensors
+        if sensors.observation is not None:
+            first = fit.form.count + len(fit.structure.zeros)
+            shown = dataclasses.replace(sensors.observation, values=other.p[first:])
+            own = dataclasses.replace(sensors, observation=shown)
+        laws.append(law_in_use(law, fewer * _root(covariance), own))
+        begins.append(
+            next((i, t) for i, s in enumerate(found) if s.run == run and s.t[0] <= t <= s.t[-1])
+        )
+    return Thirds(tuple(laws), tuple(begins))
+
+
 def _with_sensors(map_: Any, sensors: Sensors) -> Any:
     return dataclasses.replace(map_, sensors=sensors)
 
@@ -249,8 +290,8 @@ def _with_sensors(map_: Any, sensors: Sensors) -> Any:
 def _described(
     recording: Recording, fit: LawFit, map_: Any, law: Any, covariance: np.ndarray,
     chosen: tuple[FrictionChoice, float], horizons: Any, gauge: str, steps: tuple[str, ...],
-    traces: tuple[Trace, ...], motions: list[Motion], states: Any, times: list[np.ndarray],
-    seconds: float, told_of: dict[str, Velocity],
+    traces: tuple[Trace, ...], motions: list[Motion],
+    seconds: float, told_of: dict[str, Velocity], delay: tuple[float, float] | None,
 ) -> LearnedLaw:  # fmt: skip
     """The law in the words of the recording."""
     names = recording.coordinates
@@ -263,7 +304,13 @@ def _described(
     count, lost = law.terms.count, law.friction.count
     lagrangian = terms_of(law.terms, law.coefficients, std[:count], codes, of_speeds)
     friction = friction_of(law.friction, law.losses, std[count : count + lost], of_speeds)
-    of_gains = std[count + lost :].reshape(law.gains.shape)
+    if law.uniform != 0:
+        kinetic = [
+            t for t, row in zip(lagrangian.terms, law.terms.rows(), strict=True) if any(row[0])
+        ]
+        energy = f"({Expression(tuple(kinetic)).formula})"
+        friction = Expression((*friction.terms, Term(energy, float(law.uniform), float(std[-1]))))
+    of_gains = std[count + lost :][: law.gains.size].reshape(law.gains.shape)
     gains = {
         u: {q: (float(law.gains[i, j]), float(of_gains[i, j])) for i, q in enumerate(names)}
         for j, u in enumerate(recording.inputs)
@@ -294,7 +341,7 @@ def _described(
         if all(abs(gain) < _SEEN * error for gain, error in forces.values())
     ]
     return LearnedLaw(
-        map=map_, lagrangian=lagrangian, friction=friction, gains=gains,
+        map=map_, lagrangian=lagrangian, friction=friction, gains=gains, delay=delay,
         which_friction=which_friction_told(*chosen, law.dim, of_speeds),
         hamiltonian=hamiltonian_of(law.terms, lagrangian, codes), zeros=zeros,
         noise=dict(zip(channels, map(float, map_.sensors.sigma / factors), strict=True)),
@@ -304,7 +351,7 @@ def _described(
         next_motions=_in_words(motions, fit, recording, codes, of_speeds),
         observe={n: f for n, f in formulas.items() if n != f}, sensors=sensors,
         alike=_alike(fit, lagrangian, friction), horizon=tuple(horizons),
-        energy=_energy(law, friction, recording.inputs, states, times),
+        energy=_energy(traces, friction, recording.inputs),
         messages=tuple(messages), steps=steps, num_samples=len(recording), seconds=seconds,
         ended="every length of arcs was fitted",
     )  # fmt: skip
@@ -338,28 +385,35 @@ def _word(key: Any, codes: Sequence[str], speeds: Sequence[str]) -> str:
 
 
 def _traces(
-    recording: Recording,
-    channels: tuple[str, ...],
-    fit: LawFit,
-    law: Any,
-    nodes: list[Nodes],
-    zeros: np.ndarray,
-) -> tuple[Trace, ...]:
-    """The arcs of a fit, channels in the file's units."""
+    recording: Recording, channels: tuple[str, ...], fit: LawFit, law: Lagrangian,
+    nodes: list[Nodes], zeros: np.ndarray, inputs: ArcInputs,
+) -> tuple[Trace, ...]:  # fmt: skip
+    """The arcs of a fit, channels in the file's units. An input supplies the mean of its force over
+    a step times the way; friction takes the mean of its power at the ends."""
     arcs, found, d = fit.arcs, [], fit.form.dim
     factors = np.array([recording.factors[name] for name in channels])
     left = fit.fitted.residuals * fit.sigma * arcs.noise
+    acting = np.tensordot(inputs(arcs), WEIGHTS, axes=(3, 0)).mean(axis=2)  # (A, L − 1, m)
     for k, (i, a, b) in enumerate(arcs.home):
         n, stretch = b - a, nodes[i].stretch
-        y, x = arcs.y[k, :n], fit.fitted.x[k, :n]
-        energy = law.energy(x[:, :d] + zeros, x[:, d:])
+        t, y, x = arcs.t[k, :n], arcs.y[k, :n], fit.fitted.x[k, :n]
+        q, v = x[:, :d] + zeros, x[:, d:]
+        rate = law.power(q, v)[0][:, : law.friction.count + (law.uniform != 0)]
+        lost = 0.5 * np.diff(t)[:, None] * (rate[1:] + rate[:-1])
+        supplied = acting[k, : n - 1] * (np.diff(q, axis=0) @ law.gains)
         found.append(
             Trace(
-                stretch.run, arcs.t[k, :n], y / factors, (y - left[k, :n]) / factors,
-                fit.fitted.residuals[k, :n], energy, stretch.u[nodes[i].at[a:b]],
+                stretch.run, t, y / factors, (y - left[k, :n]) / factors,
+                fit.fitted.residuals[k, :n], stretch.u[nodes[i].at[a:b]], law.energy(q, v),
+                _summed(lost), _summed(supplied),
             )
         )  # fmt: skip
     return tuple(found)
+
+
+def _summed(steps: np.ndarray) -> np.ndarray:
+    """Sums (n, ...) of steps (n − 1, ...) since the first."""
+    return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
 
 
 def _alike(fit: LawFit, lagrangian: Expression, friction: Expression) -> tuple[str, ...]:
@@ -370,32 +424,25 @@ def _alike(fit: LawFit, lagrangian: Expression, friction: Expression) -> tuple[s
         correlation = covariance / scale / scale[:, None]
     texts = dict(zip(fit.structure.terms, (t.term for t in lagrangian.terms), strict=True))
     texts |= dict(zip(fit.structure.friction, (t.term for t in friction.terms), strict=True))
-    names = [texts.get(key[1], " ".join(map(str, key))) for key in fit.values]
-    return tuple(
-        f"{names[i]} and {names[j]} ({correlation[i, j]:+.3f})"
-        for i, j in zip(*np.nonzero(np.triu(np.abs(correlation) > _ALIKE, 1)), strict=True)
-    )
+    names = {key: texts.get(key[1], " ".join(map(str, key))) for key in fit.values}
+    listed, together = list(names.values()), [names[key] for key in fit.untold()]
+    pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > _ALIKE, 1)), strict=True)
+    only = (f"{', '.join(together)}: only together",) if together else ()
+    return only + tuple(f"{listed[i]} and {listed[j]} ({correlation[i, j]:+.3f})" for i, j in pairs)
 
 
 def _energy(
-    law: Any, friction: Expression, inputs: tuple[str, ...], states: Any, times: list[np.ndarray]
+    traces: Sequence[Trace], friction: Expression, inputs: tuple[str, ...]
 ) -> dict[str, Any]:
-    """Energy per second, means over the record: stored, lost by each friction, supplied by each
+    """Energy per second, means over the arcs: stored, lost by each friction, supplied by each
     input, and what these leave unexplained."""
-    q, v, u = states
-    energy = law.energy(q, v)
-    lost, supplied = law.power(q, v, u)
-    ends = np.cumsum([0, *map(len, times)])
-    total = sum(t[-1] - t[0] for t in times)
-
-    def mean(rate: np.ndarray) -> float:
-        parts = zip(times, ends[:-1], ends[1:], strict=True)
-        return float(sum(np.trapezoid(rate[a:b], t) for t, a, b in parts) / total)
-
-    stored = float(sum(energy[b - 1] - energy[a] for a, b in pairwise(ends)))
-    by_friction = {t.term: mean(lost[:, k]) for k, t in enumerate(friction.terms)}
-    by_input = {name: mean(supplied[:, k]) for k, name in enumerate(inputs)}
-    closure = stored / total - sum(by_input.values()) + sum(by_friction.values())
+    total = sum(trace.t[-1] - trace.t[0] for trace in traces)
+    stored = float(sum(trace.energy[-1] - trace.energy[0] for trace in traces) / total)
+    lost = np.sum([trace.lost[-1] for trace in traces], axis=0) / total
+    supplied = np.sum([trace.supplied[-1] for trace in traces], axis=0) / total
     return {
-        "stored": stored / total, "lost": by_friction, "supplied": by_input, "closure": closure,
-    }  # fmt: skip
+        "stored": stored,
+        "lost": dict(zip((t.term for t in friction.terms), map(float, lost), strict=True)),
+        "supplied": dict(zip(inputs, map(float, supplied), strict=True)),
+        "closure": float(stored - np.sum(supplied) + np.sum(lost)),
+    }

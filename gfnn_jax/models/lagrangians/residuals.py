@@ -21,16 +21,19 @@ _BEYOND = 3.0  # standard deviations of a correlation that is no accident, of th
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trace:
     """One arc: its run, times t (n,) in s, channels as measured and as the law has them (n, k),
-    residuals (n, k) in units of their scale, NaN where nothing was seen, energy (n,) of the law,
-    inputs (n, m)."""
+    residuals (n, k) in units of their scale, NaN where nothing was seen, inputs (n, m), energy (n,)
+    of the law, and how much of it each friction has taken (n, F) and each input has brought (n, m)
+    since the arc began."""
 
     run: str
     t: np.ndarray
     measured: np.ndarray
     fitted: np.ndarray
     residuals: np.ndarray
-    energy: np.ndarray
     inputs: np.ndarray
+    energy: np.ndarray
+    lost: np.ndarray
+    supplied: np.ndarray
 
 
 class OfInput(NamedTuple):

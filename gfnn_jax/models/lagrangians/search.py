@@ -16,14 +16,18 @@ import numpy as np
 
 from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of, with_states
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, which_friction
+from gfnn_jax.models.lagrangians.input_rules import Acting, choose_rule, with_delay
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.structure import Key, Loss, Structure
 from gfnn_jax.models.lagrangians.weak_start import protected, weak_start
+
+_AS_WELL = 1.01  # times the cost, with which a law follows the record as well
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,12 +50,11 @@ class SearchOptions:
 
 
 class Found(NamedTuple):
-    """Findings of a search: the fit to the longest arcs, which friction and how sure that is, the
-    rule of the inputs between samples, and the nodes with their states."""
+    """Findings of a search: the fit to the longest arcs with the inputs as they act, which friction
+    and how sure that is, and the nodes with their states."""
 
-    fit: LawFit
+    acting: Acting
     choice: FrictionChoice
-    hold: str
     nodes: list[Nodes]
 
 
@@ -60,7 +63,7 @@ def search(
     scales: Scales,
     angles: tuple[int, ...],
     num_inputs: int,
-    inputs: Mapping[str, Callable],
+    inputs: Mapping[str, ArcInputs],
     seen: Observation,
     told: Callable[[str], object] = lambda line: None,
     options: SearchOptions = SearchOptions(),
@@ -98,17 +101,16 @@ def search(
         )
         if all(structure.terms != other.structure.terms for other in starts):
             arcs = arcs_of(nodes, length(options.periods[0]))
-            fits = {
-                hold: bench.fit(structure, known, arcs, scales.sigma)
-                for hold, bench in benches.items()
-            }
-            hold = min(fits, key=lambda hold: float(np.max(fits[hold].rms() / scales.sigma)))
-            benches = {hold: benches[hold]}  # inputs go on between samples as fits best
-            starts.append(fits[hold])
+            rule = choose_rule(benches, nodes, structure, known, arcs, scales.sigma, scales.dt)
+            benches = {rule.hold: rule.bench}  # inputs act so in the other libraries too
+            starts.append(rule.fit)
             told(f"{options.periods[0]:g} periods: {describe(starts[-1])}")
     if not starts:
-        raise FitError("no library of terms follows this recording: do its positions move freely?")
-    (hold, bench), *_ = benches.items()
+        raise FitError(
+            "no law of the terms tried follows this recording: is something missing that moves its "
+            "positions (an input, another position), or that stops them?"
+        )
+    (bench,) = benches.values()
     misfit = [
         float(np.max(start.rms() / scales.sigma)) if np.isfinite(start.fitted.cost) else np.inf
         for start in starts
@@ -144,7 +146,8 @@ def search(
     fit = prune(bench, nodes, fit, told, options, friction=False)
     if fit.structure != before:
         fit, choice = choose_friction(bench, nodes, fit, every.friction, told, options)
-    return Found(fit, choice, hold, with_states(nodes, fit.arcs, fit.fitted.x))
+    nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+    return Found(with_delay(bench, nodes, fit, scales.dt), choice, nodes)
 
 
 def describe(fit: LawFit) -> str:
@@ -160,8 +163,10 @@ def prune(
     friction: bool = True,
 ) -> LawFit:  # fmt: skip
     """The fit without terms that are not seen, the least seen first, as long as held-out arcs do
-    not lose; and, unless ``friction`` has been chosen, without that which would drive."""
+    not lose; and, unless ``friction`` has been chosen, without that which would drive. First, of
+    terms that the record tells only together, without one."""
     refused: set[Key] = set()
+    fit = told_apart(bench, fit, told)
     costs = None
     while True:
         z = significance(fit)
@@ -183,6 +188,41 @@ def prune(
         told(f"  without {key}: {z[key]:.1f} standard errors")
         arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
         fit, costs = bench.fit(smaller, fit.values, arcs, fit.sigma), None
+
+
+def told_apart(bench: Workbench, fit: LawFit, told: Callable) -> LawFit:
+    """The fit without the first term, kinetic ones before others, of each combination that moves
+    nothing; which costs nothing. Masses that couple two coordinates give way to a spring that
+    does as well."""
+    fixed = protected(fit.structure)
+    for row in fit.structure.terms:
+        spring = ((0,) * len(row[0]), row[0], *row[2:])
+        if (
+            max(row[0]) == 1
+            and not any(row[1])
+            and not any(row[2])
+            and (spring not in fit.structure.terms)
+        ):
+            arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+            larger = fit.structure.plus([("term", spring)])
+            with_it = bench.fit(larger, fit.values, arcs, fit.sigma, rescale=False)
+            fit = with_it if with_it.untold() else fit
+    while True:
+        step = fit.untold()
+        open_ = [key for key in step if key[0] == "term" and key not in fixed]
+        if not open_:
+            return fit
+        values, gone = fit.values, open_[0]
+        along = values[gone] / step[gone]
+        moved = {key: value - along * step.get(key, 0.0) for key, value in values.items()}
+        smaller = fit.structure.without({gone})
+        arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+        without = bench.fit(smaller, moved, arcs, fit.sigma, rescale=False)
+        if without.fitted.cost > _AS_WELL * fit.fitted.cost:  # its zero is out of reach
+            fixed = fixed | {gone}
+            continue
+        told(f"  without {gone}: told only together with {open_[1:]}")
+        fit = without
 
 
 def significance(fit: LawFit) -> dict[Key, float]:
@@ -259,6 +299,8 @@ def choose_friction(
 def frictions_tried(dim: int, scales: Scales, options: SearchOptions) -> tuple[Loss, ...]:
     """Friction of all the kinds that are asked for, in every direction."""
     kinds = tuple(libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions)
+    if dim == 1 and len(kinds) > 1:  # linear friction is uniform there
+        kinds = tuple(kind for kind in kinds if kind != UNIFORM)
     rows = libraries.losses(dim, kinds, options.dry_width * float(np.mean(scales.speed)))
-    turned = (libraries.opposite(row) for row in rows)
-    return (*rows, *(row for row in turned if row is not None))
+    turned = [one for one in map(libraries.opposite, rows) if one is not None]
+    return tuple(sorted((*rows, *turned), key=lambda row: row[1] == UNIFORM))

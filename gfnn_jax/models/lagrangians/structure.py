@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.families.lagrangian import Friction, Terms
+from gfnn_jax.families.lagrangian import UNIFORM, Friction, Terms
 from gfnn_jax.flows.motion import Form
 
 Row = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...], float]
@@ -71,10 +71,15 @@ class Structure:
         )
 
     def plus(self, keys: list[Key]) -> Structure:
+        """The structure with these terms, frictions and zeros; uniform friction stays last."""
         new = {kind: tuple(k[1] for k in keys if k[0] == kind) for kind in ("term", "loss", "zero")}
         return dataclasses.replace(
             self,
             terms=self.terms + tuple(r for r in new["term"] if r not in self.terms),
-            friction=self.friction + tuple(r for r in new["loss"] if r not in self.friction),
+            friction=tuple(
+                sorted(
+                    dict.fromkeys((*self.friction, *new["loss"])), key=lambda row: row[1] == UNIFORM
+                )
+            ),
             zeros=tuple(sorted({*self.zeros, *new["zero"]})),
         )

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.exports.symbolic import as_sympy
-from gfnn_jax.families.lagrangian import LINEAR, QUADRATIC, Friction, Terms
+from gfnn_jax.families.lagrangian import LINEAR, QUADRATIC, UNIFORM, Friction, Terms
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, losses
 
@@ -70,9 +70,12 @@ def terms_of(
 def friction_of(
     friction: Friction, losses: np.ndarray, std: np.ndarray, speeds: Sequence[str]
 ) -> Expression:
-    """Rayleigh's R."""
+    """Rayleigh's R; uniform friction, a row without a direction, is γ T."""
     listed = []
     for (c, kind, width), rho, s in zip(friction.rows(), losses, std, strict=True):
+        if kind == UNIFORM:
+            listed.append(Term("T", float(rho), float(s)))
+            continue
         parts = zip(reversed(c), reversed(list(speeds)), strict=True)
         speed = _sum(("-" if e < 0 else "") + _times(abs(e), v) for e, v in parts if e)
         if kind == QUADRATIC:
@@ -100,7 +103,7 @@ class WhichFriction:
         text = "+".join(self.kinds) or "none"
         if self.odds:
             rival = min(self.odds, key=lambda name: self.odds[name])
-            text += f", odds {_odds(self.odds[rival])} against {rival}"
+            text += f", odds {odds_text(self.odds[rival])} against {rival}"
         seen = [f"{_pretty(term)} < {limit:.2g}" for term, limit in self.limits.items()]
         return text + (f"; not seen: {', '.join(seen)}" if seen else "")
 
@@ -165,7 +168,7 @@ def _sum(parts: Any) -> str:
     return text
 
 
-def _odds(odds: float) -> str:
+def odds_text(odds: float) -> str:
     """12 : 1, 1 : 3; those above a million are not told apart."""
     if odds >= 1e6:
         return "> 10⁶ : 1"

@@ -21,6 +21,7 @@ from gfnn_jax.threads import one_thread
 
 _LONGEST = 24  # nodes of an arc: its own two positions cost a twelfth of what it tells
 _MOST_NODES = 20_000  # of all arcs: a minute and a quarter of a gigabyte at a hundred terms
+_MOST_NUMBERS = 3e7  # of all Jacobians (2d, 2d) along the arcs, a quarter of a gigabyte
 _SETTLED = 1.05  # a noise scale that changed by less needs no further fit
 _SCALES = 4  # fits, at most, that find it
 _GROSS = 5.0  # standard deviations: of what is not noise
@@ -48,7 +49,7 @@ class LatentFit:
 
 def arcs_of(triples: Triples) -> np.ndarray:
     """Readings (A, L + 1, d) as arcs of one length, that which leaves fewest equations out; of very
-    many every so many."""
+    many, or of many degrees of freedom, every so many."""
     stretches = triples.stretches()
     sizes = np.array([len(s) for s in stretches])
     longest = min(int(sizes.max()) - 1, _LONGEST)
@@ -59,7 +60,8 @@ def arcs_of(triples: Triples) -> np.ndarray:
         for s in stretches
         for first in range(0, len(s) - span + 1, span)
     ]  # fmt: skip
-    return np.array(cut[:: -(-len(cut) * span // _MOST_NODES)])
+    most = max(span, min(_MOST_NODES, int(_MOST_NUMBERS / (2 * triples.dim) ** 2)))
+    return np.array(cut[:: -(-len(cut) * span // most)])
 
 
 def starting_noise(family: Any, coefficients: np.ndarray, triples: Triples) -> np.ndarray:

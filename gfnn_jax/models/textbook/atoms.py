@@ -7,7 +7,7 @@ are a few products of arrays.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import combinations_with_replacement
 from typing import NamedTuple
 
@@ -42,6 +42,7 @@ class Factor:
 
 
 Atom = tuple[Factor, ...]
+Average = Callable[[np.ndarray], np.ndarray]  # rows (…, R, 2d) of gradients (…, N, 2d)
 
 
 def gradient_of(atom: Atom, arguments: Sequence[Argument], along: int | None = None) -> np.ndarray:
@@ -106,14 +107,15 @@ class _Singles(NamedTuple):
 
 def dictionary_of(
     arguments: Sequence[Argument], weight: np.ndarray, base: np.ndarray, *, degree: int,
-    products: bool,
+    products: bool, average: Average = np.asarray,
 ) -> Dictionary:  # fmt: skip
-    """The atoms that are tried. weight (2d,): by which gradients are multiplied. base: orthonormal
-    columns (rows, n), beside which atoms are looked for.
+    """The atoms that are tried. weight (2d,), or of each row: by which gradients are multiplied.
+    base: orthonormal columns (rows, n), beside which atoms are looked for.
 
     Shapes of one argument, and products of coordinates from the third to this degree, without the
     coordinates and products of two, which are in every law. products: of a coordinate, a product
-    of two or a sine or cosine with a shape of another argument too.
+    of two or a sine or cosine with a shape of another argument too. average: makes the rows of
+    gradients at the states.
     """
     atoms: list[Atom] = []
     gradients: list[np.ndarray] = []
@@ -121,12 +123,12 @@ def dictionary_of(
         singles = [_singles(place, argument, 1) for place, argument in enumerate(arguments)]
         for argument, single in zip(arguments, singles, strict=True):
             atoms += [(factor,) for factor in single.factors]
-            gradients.append(single.slope[:, :, None] * argument.gradient)
+            gradients.append(average(single.slope[:, :, None] * argument.gradient))
         mixed = _monomials(arguments, degree)
         atoms += mixed
-        gradients += [gradient_of(atom, arguments)[None] for atom in mixed]
+        gradients += [average(gradient_of(atom, arguments))[None] for atom in mixed]
         if products:
-            every = _COARSE if len(weight) <= _SMALL else None
+            every = _COARSE if weight.shape[-1] <= _SMALL else None
             coarse = [_singles(p, argument, every) for p, argument in enumerate(arguments)]
             for multiplier in _multipliers(arguments):
                 used = {index for f in multiplier for index in _entering(arguments[f.place])}
@@ -139,7 +141,7 @@ def dictionary_of(
                         continue
                     atoms += [(*multiplier, factor) for factor in single.factors]
                     along = (single.slope * value)[:, :, None] * argument.gradient
-                    gradients.append(along + single.value[:, :, None] * gradient)
+                    gradients.append(average(along + single.value[:, :, None] * gradient))
         rows = (np.concatenate(gradients) * weight).reshape(len(atoms), -1)
         size = np.linalg.norm(rows, axis=1)
     kept = np.flatnonzero(np.isfinite(size) & (size > 0))

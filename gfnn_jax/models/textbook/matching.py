@@ -10,12 +10,12 @@ Gauss–Newton with the coefficients projected out (variable projection; Golub &
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from gfnn_jax.models.textbook.arguments import Argument
-from gfnn_jax.models.textbook.atoms import Atom, Dictionary, gradient_of, weight_of
+from gfnn_jax.models.textbook.atoms import Atom, Average, Dictionary, gradient_of, weight_of
 
 _BEAM = 4  # states that go on
 _PAIRED = 160  # atoms, those that explain most, whose pairs are tried
@@ -38,16 +38,17 @@ class Match:
 class Matching:
     """The search for atoms that, beside a base, have the gradient ``target`` (rows,).
 
-    base: (rows, n) orthonormal columns that are always there. weight: (2d,) by which gradients are
-    multiplied. arguments: at the states of the rows. said: halvings of what is left over that a
-    unit of complexity must bring.
+    base: (rows, n) orthonormal columns that are always there. weight: (2d,), or of each row, by
+    which gradients are multiplied. arguments: at the states. said: halvings of what is left over
+    that a unit of complexity must bring. average: makes the rows of gradients at the states, where
+    they are not these themselves.
     """
 
     def __init__(
         self, base: np.ndarray, target: np.ndarray, weight: np.ndarray, arguments: list[Argument],
-        said: float = SAID,
+        said: float = SAID, average: Average = np.asarray,
     ):  # fmt: skip
-        self.weight, self.arguments, self._said = weight, arguments, said
+        self.weight, self.arguments, self._said, self._average = weight, arguments, said, average
         self.base, self.target = base, target
         self.size = float(np.linalg.norm(target))
 
@@ -84,27 +85,47 @@ class Matching:
     def plainer(self, match: Match, dictionary: Dictionary) -> Match:
         """The match with each atom, in turn, in a plainer shape of the same argument, where that
         leaves hardly more: what is left over is not yet that of the pairs."""
-        for i, atom in enumerate(match.atoms):
-            others = match.atoms[:i] + match.atoms[i + 1 :]
-            places = [f.place for f in atom]
-            said = weight_of((atom,))
-            own = [
-                j for j, a in enumerate(dictionary.atoms)
-                if [f.place for f in a] == places and weight_of((a,)) < said
-            ]  # fmt: skip
-            residual, basis, _ = self._residual(others)
-            if not own or not np.isfinite(residual).all():
-                continue
-            columns = dictionary.columns[:, own]
-            columns = columns - basis @ (basis.T @ columns)
-            size = np.linalg.norm(columns, axis=0)
-            part = np.where(size > _INDEPENDENT, residual @ columns, 0.0) / np.maximum(size, 1e-300)
-            first = _apart(np.argsort(-(part**2)), [dictionary.atoms[j] for j in own], _BRANCHES)
-            tried = [self.refined((*others, dictionary.atoms[own[k]])) for k in first]
-            best = min(tried, key=self.cost)
-            if best.left < _HARDLY * match.left:
-                match = best
+        for i in range(len(match.atoms)):
+            said = weight_of(match.atoms[i : i + 1])
+            tried = self._exchanged(match, i, dictionary, lambda a, s=said: weight_of((a,)) < s)
+            if tried:
+                best = min(tried, key=self.cost)
+                match = best if best.left < _HARDLY * match.left else match
         return match
+
+    def exchanged(self, match: Match, dictionary: Dictionary) -> list[Match]:
+        """The match with each of its atoms, in turn, in other shapes of the same argument that are
+        no longer to say: what is next to a law that is as likely."""
+        found = []
+        for i in range(len(match.atoms)):
+            said = weight_of(match.atoms[i : i + 1])
+            own = tuple(f.kind for f in match.atoms[i])
+
+            def allowed(atom: Atom, own=own, said=said) -> bool:
+                return tuple(f.kind for f in atom) != own and weight_of((atom,)) <= said
+
+            found += self._exchanged(match, i, dictionary, allowed)
+        return found
+
+    def _exchanged(
+        self, match: Match, i: int, dictionary: Dictionary, allowed: Callable[[Atom], bool]
+    ) -> list[Match]:
+        """The match with another shape of the i-th atom's argument: the few that explain most."""
+        others = match.atoms[:i] + match.atoms[i + 1 :]
+        places = [f.place for f in match.atoms[i]]
+        own = [
+            j for j, a in enumerate(dictionary.atoms)
+            if [f.place for f in a] == places and allowed(a)
+        ]  # fmt: skip
+        residual, basis, _ = self._residual(others)
+        if not own or not np.isfinite(residual).all():
+            return []
+        columns = dictionary.columns[:, own]
+        columns = columns - basis @ (basis.T @ columns)
+        size = np.linalg.norm(columns, axis=0)
+        part = np.where(size > _INDEPENDENT, residual @ columns, 0.0) / np.maximum(size, 1e-300)
+        first = _apart(np.argsort(-(part**2)), [dictionary.atoms[j] for j in own], _BRANCHES)
+        return [self.refined((*others, dictionary.atoms[own[k]])) for k in first]
 
     def refined(self, atoms: tuple[Atom, ...]) -> Match:
         """The match with the inner constants that leave least."""
@@ -220,7 +241,7 @@ class Matching:
         return np.where(told, residual @ columns / np.where(told, size, 1.0), 0.0), size
 
     def _flat(self, gradient: np.ndarray) -> np.ndarray:
-        return (gradient * self.weight).ravel()
+        return (self._average(gradient) * self.weight).ravel()
 
 
 def _apart(order: np.ndarray, atoms: list[Atom], count: int) -> list[int]:

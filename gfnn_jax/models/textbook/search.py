@@ -128,6 +128,7 @@ class Textbook:
         self._spanned = orthonormal(columns.reshape(-1, columns.shape[-1]))
         self._target = -apply_j(z1 - z0) / self._h
         self._closest: _State | None = None  # of the laws that were not exact
+        self._partial: list[_State] = []
 
     def law(self, *, products: bool) -> Law | None:
         """The plainest law whose flow takes z₀ to z₁, of a dictionary without products of shapes or
@@ -135,6 +136,15 @@ class Textbook:
         with np.errstate(all="ignore"):
             found = self._found(products)
             return None if found is None else self._simplified(found).law
+
+    @property
+    def partial(self) -> list[Law]:
+        """The three laws that came closest where none is exact, each of other terms."""
+        kinds: dict[tuple, _State] = {}
+        for state in sorted(self._partial, key=lambda s: s.law.left):
+            kind = tuple(sorted(tuple((f.place, f.kind) for f in a) for a in state.match.atoms))
+            kinds.setdefault(kind, state)
+        return [state.law for state in list(kinds.values())[:3]]
 
     @property
     def _degree(self) -> int:
@@ -173,6 +183,7 @@ class Textbook:
                 return min(exact, key=lambda s: weight_of(s.match.atoms))
             if not states:
                 return None
+            self._partial += states
             best = min(states, key=lambda s: s.law.left)
             if not best.law.left < options.contracted * last:
                 break

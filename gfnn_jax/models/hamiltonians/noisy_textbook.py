@@ -1,0 +1,311 @@
+"""Laws of physics behind noisy sequences: see `models.textbook.noisy_search`.
+
+What matching hands on is fitted to whole sequences: coefficients, constants inside and latent
+states together. Among the laws within the noise the one of least description length is taken,
+
+    Σ_i n_i ln σ_i + ½ k ln n + what there is to say of its atoms,
+
+σ_i what it leaves over of each coordinate (n_i numbers), k its own numbers (Rissanen 1978).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.budget import MATCHING, Allowance
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.dataset.noise import of_differences
+from gfnn_jax.dataset.runs import next_of
+from gfnn_jax.errors import InputError, OutOfTime
+from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.flows.collocation import Steps
+from gfnn_jax.models.hamiltonians.flow_arcs import FlowWithConstants
+from gfnn_jax.models.hamiltonians.formula import Rival, Term
+from gfnn_jax.models.hamiltonians.formula import formula as formula_of
+from gfnn_jax.models.hamiltonians.fractions import proposals
+from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
+from gfnn_jax.models.hamiltonians.symmetries import restricted
+from gfnn_jax.models.hamiltonians.whole_sequences import (
+    Measured,
+    Sequences,
+    Whole,
+    about_outliers,
+    noise_of,
+    root_of,
+    tells,
+    triangle_of,
+)
+from gfnn_jax.models.hamiltonians.work import LawWork
+from gfnn_jax.models.textbook.noisy_search import OPTIONS, Formula, NoisyTextbook
+from gfnn_jax.models.textbook.weak_gradients import weak_gradients
+from gfnn_jax.solve.latent_arcs import Fitted
+
+_OPERATIONS = (2e8, 4e8, 8e8, 1.6e9)  # of a search, by degrees of freedom from 1
+_ORDER, _ALIKE = 6, 1.5  # of the differences that tell the noise, see `arcs`
+_LEAST = 3e-6  # of the spread: less noise than that is not what weak gradients leave over
+_LOOKED_AT = 20_000  # rows by which laws are compared
+_CERTAIN = 4.0  # standard errors below which a term is noise
+_BEHIND = 40.0  # natural logarithms of likelihood by which a law is behind that is not fitted
+_BROUGHT = 3.0  # of it, that further terms must bring
+_FITTED = 4  # laws
+_SCREENED, _ITERATIONS = 3e-4, 12  # of the cost, and iterations, while laws are compared
+_AS_NOISE = 1.1  # times the noise, that a law may leave over
+_STEPS = Steps(6, 1)
+_SURE = 40.0  # logarithm of the largest odds that are told
+
+
+class _Told(NamedTuple):
+    """A law as whole sequences tell it, and its description length."""
+
+    formula: Formula
+    fitted: Fitted
+    length: float
+
+
+def law_of_sequences(
+    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance, say: Callable[[str], Any]
+) -> FittedLaw | None:
+    """The law, or None where the pairs are no noisy sequences of one dt, or nothing in the
+    dictionary leaves no more than their noise."""
+    if data.varied or data.structure is not None or data.dim > len(_OPERATIONS):
+        return None
+    stretches = _stretches(data)
+    noise = _noise_of(stretches, data.scale)
+    weak = None if noise is None else weak_gradients(stretches, data.dt, noise)
+    if noise is None or weak is None:
+        return None
+    angles = tuple(a for a in data.coordinates.angles if a < data.dim)
+    search = NoisyTextbook(weak, angles=angles, cyclic=data.coordinates.cyclic, say=say)
+    name = "laws of physics behind noise"
+    try:
+        with work.budget.unit(name, MATCHING, _OPERATIONS[data.dim - 1]):
+            formulas = search.formulas()
+        family = formulas[0].family(formulas[0].constants)
+        with work.library(name, family, len(formulas) * len(data.training)):
+            return _chosen(problem, formulas, data, tolerance, noise, Allowance(work.budget), say)
+    except OutOfTime:
+        work.budget.leave_out(name, work.ended)
+    except (np.linalg.LinAlgError, InputError):
+        pass
+    return None
+
+
+def _stretches(data: Dataset) -> list[np.ndarray]:
+    """States (L, 2d) of the training sequences without gaps, their angles going on over turns."""
+    rows = np.sort(data.training)[:_LOOKED_AT]
+    breaks = np.flatnonzero(~next_of(data.pairs, rows)) + 1
+    moved = data.y1 - data.y0
+    return [
+        np.concatenate([data.y0[own[:1]], data.y0[own[0]] + np.cumsum(moved[own], axis=0)])
+        for own in np.split(rows, breaks)
+    ]
+
+
+def _noise_of(stretches: list[np.ndarray], scale: np.ndarray) -> np.ndarray | None:
+    """(2d,) the noise of each coordinate; None where differences of the states do not tell it."""
+    found = []
+    for i, size in enumerate(scale):
+        moves = [np.diff(own[:, i : i + 1], axis=0) / size for own in stretches]
+        if not any(len(own) > _ORDER for own in moves):
+            return None
+        found.append(of_differences(moves, _ORDER, _ALIKE))
+    if None in found or min(found) < _LEAST:
+        return None
+    return np.array(found, float) * scale
+
+
+def _chosen(
+    problem: Problem, formulas: list[Formula], data: Dataset, tolerance: Tolerance,
+    noise: np.ndarray, allowance: Allowance, say: Callable[[str], Any],
+) -> FittedLaw | None:  # fmt: skip
+    """The law of least description length, where it leaves no more than noise."""
+    first = formulas[0]
+    sequences = Sequences.along(
+        problem, first.family(first.constants), first.coefficients, _STEPS, data, allowance
+    )
+    if sequences is None:
+        return None
+    train = sequences.arcs(np.sort(data.training)[:_LOOKED_AT])
+    held = sequences.arcs(np.sort(data.validation)[:_LOOKED_AT])
+    if train is None or held is None:
+        return None
+    told: list[_Told] = []
+    for tried, formula in enumerate(_worth(formulas)):
+        with contextlib.suppress(np.linalg.LinAlgError, InputError):  # constants have run away
+            found = _told(sequences, train, formula)
+            told += [] if found is None else [found]
+        if tried and not told:  # none of the likeliest two can be followed along its arcs
+            return None
+    if not told:
+        return None
+    best = min(told, key=lambda law: law.length)
+    judged = _fitted(sequences, held, best.formula, best.fitted.p, only_states=True)
+    for found in (best.fitted, judged):
+        if found is None or not _rms(noise_of(found) / noise) <= _AS_NOISE:
+            for law in sorted(told, key=lambda law: law.length)[:3]:
+                left = _rms(noise_of(law.fitted) / noise)
+                say(f"H: a partial law leaves {left:.2g} times the noise over: {_shown(law)}")
+            return None
+    formula, fitted = best.formula, best.fitted
+    if tells(fitted, len(fitted.p)):
+        everyone = sequences.arcs(np.arange(len(data.y0)))
+        again = None if everyone is None else _fitted(sequences, everyone, formula, fitted.p)
+        fitted = again or fitted
+    found = _law(problem, formula, fitted, data, tolerance)
+    return found._replace(rivals=_rivals(best, told))
+
+
+def _rivals(best: _Told, told: list[_Told]) -> tuple[Rival, ...]:
+    """The next two laws of least description length, with the odds of the best against them."""
+    others: dict[frozenset, _Told] = {}
+    for law in sorted(told, key=lambda law: law.length):
+        if law.formula.kind != best.formula.kind:
+            others.setdefault(law.formula.kind, law)
+    return tuple(
+        Rival(_shown(law), float(np.exp(min(law.length - best.length, _SURE))))
+        for law in list(others.values())[:2]
+    )
+
+
+def _shown(law: _Told) -> str:
+    """The law as people read it."""
+    formula, p = law.formula, law.fitted.p
+    terms = len(formula.coefficients)
+    deviations = np.linalg.norm(root_of(law.fitted), axis=0)
+    inside = map(_readable, p[terms:].tolist(), deviations[terms:].tolist())
+    names = formula.family(np.array(list(inside))).term_names
+    return formula_of(list(map(Term, names, p[:terms].tolist(), deviations[:terms].tolist())))
+
+
+def _worth(formulas: list[Formula]) -> list[Formula]:
+    """The laws that are not far behind the first, nor one before them with terms that bring
+    nothing."""
+
+    def behind(formula: Formula, other: Formula) -> float:
+        """Logarithm of the odds by which the other law's weak residuals are likelier."""
+        return formula.rows * float(np.log(formula.left / other.left))
+
+    kept: list[Formula] = []
+    for formula in formulas:
+        if behind(formula, formulas[0]) > _BEHIND:
+            continue
+        if any(o.kind < formula.kind and behind(formula, o) > -_BROUGHT for o in kept):
+            continue
+        kept.append(formula)
+    return kept[:_FITTED]
+
+
+def _told(sequences: Sequences, arcs: Measured, formula: Formula) -> _Told | None:
+    """The terms of a law that whole sequences tell from noise, fitted to them."""
+    p = np.concatenate([formula.coefficients, formula.constants])
+    while True:
+        found = _fitted(sequences, arcs, formula, p, gained=_SCREENED, iterations=_ITERATIONS)
+        if found is None:
+            return None
+        kept = _certain(found, formula)
+        if len(kept) == len(formula.coefficients):
+            break
+        if not kept:
+            return None
+        c = found.p[: len(formula.coefficients)]
+        formula = formula.with_constants(found.p[len(c) :]).take(kept, c[kept])
+        p = np.concatenate([formula.coefficients, formula.constants])
+    formula = formula.with_constants(found.p[len(formula.coefficients) :])
+    count = np.isfinite(found.residuals).sum(axis=(0, 1))
+    length = float(
+        np.sum(count * np.log(noise_of(found)))
+        + 0.5 * np.log(count.sum()) * len(found.p) + OPTIONS.said * formula.said
+    )  # fmt: skip
+    return _Told(formula, found, length)
+
+
+def _fitted(
+    sequences: Sequences, arcs: Measured, formula: Formula, p: np.ndarray, **options: Any
+) -> Fitted | None:
+    law = partial(FlowWithConstants, formula.family, terms=len(p) - len(formula.constants))
+    return sequences.fitted(arcs, law, p, **options)
+
+
+def _certain(found: Fitted, formula: Formula) -> list[int]:
+    """The terms that are left when those below four standard errors go, the weakest half of them
+    at a time, each with the constants inside it, in the linearised problem."""
+    triangle, own = triangle_of(found), formula.numbers
+    problem = triangle.rebased(found.p)
+    rows, count = triangle.rows, len(found.p)
+    noise = triangle.residual_norm(count) / np.sqrt(max(rows - count, 1))
+    kept = list(range(len(own)))
+    while kept:
+        columns = kept + [k for j in kept for k in own[j]]
+        spectrum = problem.pruned(np.array(columns)).spectrum()
+        p = spectrum.solution(spectrum.inverse)
+        told = np.abs(p / (noise * spectrum.deviations()))[: len(kept)]
+        weak = int((told < _CERTAIN).sum())
+        if not weak:
+            break
+        gone = np.argsort(told)[: (weak + 1) // 2]
+        kept = [j for place, j in enumerate(kept) if place not in gone]
+    return kept
+
+
+def _law(
+    problem: Problem, formula: Formula, fitted: Fitted, data: Dataset, tolerance: Tolerance
+) -> FittedLaw:
+    """The law as any other that was fitted to pairs, with what its sequences tell.
+
+    Standard errors are marginal: those of the constants inside widen them. A sample of the
+    posterior has the constants as they are; its covariance is that of the coefficients alone,
+    times (m + k)/m for k constants beside m coefficients, which leaves the mean variance of the
+    images at the states as it is.
+    """
+    root, terms = root_of(fitted), len(formula.coefficients)
+    coordinates, rows = data.coordinates, triangle_of(fitted).rows
+    family = formula.family(fitted.p[terms:])
+    known = restricted(
+        family, fitted.p, root.T @ root, data.y0[data.training], coordinates.angles, rows
+    )
+    c, covariance = known.numbers[:terms], known.covariance
+    deviations = np.sqrt(np.diag(covariance).clip(0.0))
+    constants = list(map(_readable, known.numbers[terms:].tolist(), deviations[terms:].tolist()))
+    family = formula.family(np.array(constants))
+    inside = [j for j, places in enumerate(formula.numbers) for _ in places]
+    names = [family.term_names[j] for j in inside]
+    told = tuple(map(Term, names, constants, deviations[terms:].tolist()))
+    coefficients = map(Term, family.term_names, c.tolist(), deviations.tolist())
+    near = proposals([*coefficients, *told], covariance, len(told))
+    fit = problem.fit(family, c, data.training, rounds=False)
+    fit = fit._replace(coefficients=c, standard_errors=deviations[:terms])
+    whole = Whole(
+        tuple(range(terms)), fit, _root_of_coefficients(covariance, terms), noise_of(fitted),
+        len(fitted.x), about_outliers(fitted.residuals),
+    )  # fmt: skip
+    error = validation_error(family, fit, data, tolerance)
+    return FittedLaw(
+        family, fit, data.training, error, (), noisy=True, stalled=True, whole=whole,
+        constants=told, symmetries=known.symmetries, proposals=near,
+    )  # fmt: skip
+
+
+def _root_of_coefficients(covariance: np.ndarray, terms: int) -> np.ndarray:
+    """(terms, terms), rootᵀ root that of the coefficients with the constants as they are, times
+    (m + k)/m. The covariance may be singular."""
+    own, across = covariance[:terms, :terms], covariance[:terms, terms:]
+    inverse = np.linalg.pinv(covariance[terms:, terms:], hermitian=True)
+    values, vectors = np.linalg.eigh(own - across @ inverse @ across.T)
+    more = len(covariance) / terms
+    return np.sqrt(more * values.clip(0.0))[:, None] * vectors.T
+
+
+def _readable(constant: float, deviation: float) -> float:
+    """The constant to a hundredth of its standard error."""
+    digits = int(np.clip(np.ceil(np.log10(abs(constant) / deviation)) + 2, 2, 16))
+    return float(f"{constant:.{digits}g}")
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

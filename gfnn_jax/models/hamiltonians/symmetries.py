@@ -1,0 +1,157 @@
+"""Symmetries of a law: what leaves H as it is, and what is conserved by that (Noether).
+
+Of a family that is linear in its coefficients a symmetry is a restriction Σ_j B_j c_j = 0 at every
+state: the Poisson bracket {φ_j, I} of each term with the generator I of a continuous symmetry, or
+∇φ_j − Rᵀ∇φ_j(R z) of a discrete one, z → R z. Coefficients that are known with their errors are
+restricted where these allow it; a law then has the symmetry to roundoff, and conserves I.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.phase_space import symplectic_form
+
+_HOLDS = 1e-10  # of the restriction's parts, that a symmetry leaves over
+_STATES = 200
+_KNOWN = 1e-12  # of a number's size, or of the largest variance: an error below it is none
+_NULL = 1e-8  # of the largest restriction: below it a combination of terms has the symmetry
+
+
+class Symmetry(NamedTuple):
+    """text: as it is told. rows: (n, terms) the restriction, B c = 0."""
+
+    text: str
+    rows: np.ndarray
+
+
+class Restricted(NamedTuple):
+    """Numbers p (n,) that have the symmetries, their covariance, and which these are."""
+
+    numbers: np.ndarray
+    covariance: np.ndarray
+    symmetries: tuple[str, ...]
+
+
+def symmetries_of(family: Terms, c: np.ndarray, z: np.ndarray, angles: Sequence[int] = ()):
+    """Texts of the symmetries that H = Σ c_j φ_j has to roundoff at states z (N, 2d)."""
+    return tuple(
+        s.text for s in _candidates(family, z[:_STATES], tuple(angles))
+        if np.abs(s.rows @ c).max() <= _HOLDS * (np.abs(s.rows) @ np.abs(c)).max()
+    )  # fmt: skip
+
+
+def restricted(
+    family: Terms, p: np.ndarray, covariance: np.ndarray, z: np.ndarray, angles: Sequence[int],
+    rows: int,
+) -> Restricted:  # fmt: skip
+    """The numbers p (n,), coefficients first, with every symmetry that shortens the description.
+
+    A restriction of r coefficients raises half the misfit by ½χ² and saves ½ r ln(rows). It is the
+    linear problem of the least change of p in units of its covariance.
+    """
+    terms, told = family.num_parameters, []
+    for symmetry in _candidates(family, z[:_STATES], tuple(angles)):
+        a = np.zeros((terms, len(p)))
+        a[:, :terms] = _independent(symmetry.rows, p[:terms])
+        deviation = np.sqrt(np.einsum("ij,jk,ik->i", a, covariance, a).clip(0.0))
+        parts = np.linalg.norm(a * p, axis=1)
+        known = deviation <= _KNOWN * parts  # these terms have it, or those before imply it
+        if np.any(np.abs(a @ p)[known] > _HOLDS * parts[known]) or (~known).sum() == terms:
+            continue
+        if known.all():
+            told.append(symmetry.text)
+            continue
+        a = a[~known]
+        of_rows = a @ covariance @ a.T
+        values, vectors = np.linalg.eigh(of_rows)
+        free = values > _KNOWN * values.max()
+        inverse = (vectors[:, free] / values[free]) @ vectors[:, free].T
+        off = a @ p
+        if off @ inverse @ off > free.sum() * np.log(rows):
+            continue
+        gain = covariance @ a.T @ inverse
+        p, covariance = p - gain @ off, covariance - gain @ a @ covariance
+        told.append(symmetry.text)
+    return Restricted(p, covariance, tuple(told))
+
+
+def _independent(rows: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """(terms, terms) independent rows of a restriction of coefficients of about these sizes, those
+    that are none 0."""
+    size = np.where(c != 0, np.abs(c), 1.0)
+    triangle = np.linalg.qr(rows * size, mode="r")
+    _, singular, across = np.linalg.svd(triangle)
+    parts = np.abs(rows * size).max(initial=0.0) * np.sqrt(len(rows))
+    kept = np.zeros(len(c))
+    kept[: len(singular)] = singular > _NULL * parts
+    return kept[:, None] * across / size
+
+
+def _candidates(family: Terms, z: np.ndarray, angles: tuple[int, ...]) -> Iterator[Symmetry]:
+    """Those that are looked for, at states z where every term is finite."""
+    dim = family.dim
+    with np.errstate(all="ignore"):
+        gradients = family.term_gradients(z)
+        for text, generator in _generators(dim, angles):
+            # {φ, I} = ∇φᵀ J ∇I, of a quadratic or linear I with ∇I = A z + b.
+            moved = (z @ generator[:, :-1].T + generator[:, -1]) @ symplectic_form(dim).T
+            yield Symmetry(text, np.einsum("nij,ni->nj", gradients, moved))
+        for text, matrix in _reflections(dim, angles):
+            there = np.einsum("ki,nkj->nij", matrix, family.term_gradients(z @ matrix.T))
+            rows = (gradients - there).reshape(-1, gradients.shape[-1])
+            if np.isfinite(rows).all():
+                yield Symmetry(text, rows)
+
+
+def _generators(dim: int, angles: tuple[int, ...]) -> Iterator[tuple[str, np.ndarray]]:
+    """(text, [A b] (2d, 2d + 1)) of the generators I = ½ zᵀA z + bᵀz."""
+    one = dim == 1
+    plain = [i for i in range(dim) if i not in angles]
+    for i in range(dim):
+        yield (
+            f"translation of q{i + 1}: p{i + 1} conserved",
+            _generator(dim, linear={i + dim: 1.0}),
+        )
+    if not one:
+        yield (
+            "translation of all positions: the sum of all momenta conserved",
+            _generator(dim, linear={i + dim: 1.0 for i in range(dim)}),
+        )
+    for i, j in combinations(plain, 2):
+        yield (
+            f"rotation in (q{i + 1}, q{j + 1}): angular momentum "
+            f"q{i + 1} p{j + 1} − q{j + 1} p{i + 1} conserved",
+            _generator(dim, {(i, j + dim): 1.0, (j, i + dim): -1.0}),
+        )
+    if len(plain) == dim:
+        squares = "q1² + p1²" if one else "the sum of all q² + p²"
+        yield (
+            f"rotation of every (q, p): {squares} conserved",
+            _generator(dim, {(i, i): 1.0 for i in range(2 * dim)}),
+        )
+
+
+def _generator(dim: int, quadratic=None, linear=None) -> np.ndarray:
+    found = np.zeros((2 * dim, 2 * dim + 1))
+    for (i, j), value in (quadratic or {}).items():
+        found[i, j] = found[j, i] = value
+    for i, value in (linear or {}).items():
+        found[i, -1] = value
+    return found
+
+
+def _reflections(dim: int, angles: tuple[int, ...]) -> Iterator[tuple[str, np.ndarray]]:
+    """(text, R (2d, 2d)) of the linear maps under which H may be the same."""
+    yield "reversal of time", np.diag(np.repeat([1.0, -1.0], dim))
+    yield "reflection of all coordinates", -np.eye(2 * dim)
+    for i, j in combinations(range(dim), 2):
+        if (i in angles) == (j in angles):
+            order = np.arange(2 * dim)
+            order[[i, j, i + dim, j + dim]] = order[[j, i, j + dim, i + dim]]
+            yield f"exchange of degrees of freedom {i + 1} and {j + 1}", np.eye(2 * dim)[order]

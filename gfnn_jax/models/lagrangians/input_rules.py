@@ -1,0 +1,121 @@
+"""Actions of the inputs of a record: what they do between their samples, and how much later than
+they were measured.
+
+A fit's residuals are linear in a small delay τ as they are in the coefficients:
+
+    r(p, τ + δ) = r(p, τ) + Σ_ij G_ij ∂r/∂G'_ij δ,
+
+with G' the gains of further inputs ∂u(t − τ)/∂τ. So one evaluation of the arcs tells the delay that
+fits best, with its standard error, and how far the coefficients imitate it. It is taken where it is
+significant and held-out arcs gain by it. The rule between samples is that of which held-out arcs
+cost least, each with its own delay.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.dataset.stretches import Arcs, Nodes
+from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
+from gfnn_jax.models.lagrangians.structure import Key, Structure
+from gfnn_jax.solve.latent_arcs import sensitivities
+
+_SIGNIFICANT = 4.0  # standard errors of a delay
+_APART = 0.05  # of a sample: the change of a delay by which inputs are differentiated
+_SETTLED = 0.1  # standard errors, within which a delay is found
+_MOST = 4  # corrections of a delay
+_FURTHEST = 1.0  # samples, of a correction
+_IMITATED = 0.03  # of what a delay changes, that no coefficient does: less is not told apart
+
+
+class Acting(NamedTuple):
+    """A fit, the workbench with the inputs as they act, and the standard error of their delay, in
+    seconds: NaN where the record does not tell it."""
+
+    fit: LawFit
+    bench: Workbench
+    error: float
+
+    @property
+    def hold(self) -> str:
+        return self.bench.inputs.hold
+
+    @property
+    def delay(self) -> float:
+        return self.bench.inputs.delay
+
+
+def choose_rule(
+    benches: Mapping[str, Workbench], nodes: Sequence[Nodes], structure: Structure,
+    known: Mapping[Key, float], arcs: Arcs, sigma: np.ndarray, interval: float,
+) -> Acting:  # fmt: skip
+    """The fit of these arcs by the rule between samples (of ``benches``: rule -> workbench) and the
+    delay that held-out arcs choose. interval: between samples, in seconds."""
+    found = []
+    for bench in benches.values():
+        fit = bench.fit(structure, known, arcs, sigma)
+        found.append(with_delay(bench, nodes, fit, interval))
+    if len(found) == 1:
+        return found[0]
+    return min(found, key=lambda one: _held_out(one, nodes, sigma))
+
+
+def with_delay(bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, interval: float) -> Acting:
+    """The fit with its delay corrected, where held-out arcs gain by that."""
+    if not fit.structure.num_inputs or not np.isfinite(fit.fitted.cost):
+        return Acting(fit, bench, np.nan)
+    begun = Acting(fit, bench, np.nan)
+    here = begun
+    for _ in range(_MOST):
+        change, error = _correction(here, interval)
+        here = here._replace(error=error)
+        delay = here.delay + np.clip(change, -_FURTHEST * interval, _FURTHEST * interval)
+        if not abs(change) > _SETTLED * error or not abs(delay) > _SIGNIFICANT * error:
+            break
+        later = dataclasses.replace(here.bench, inputs=here.bench.inputs.delayed(delay))
+        arcs = dataclasses.replace(fit.arcs, x=here.fit.fitted.x)
+        here = Acting(later.fit(fit.structure, here.fit.values, arcs, here.fit.sigma), later, error)
+    if here.bench is bench:
+        return here
+    gains = _held_out(here, nodes, fit.sigma) < _held_out(begun, nodes, fit.sigma)
+    return here if gains else begun._replace(error=here.error)
+
+
+def _held_out(one: Acting, nodes: Sequence[Nodes], sigma: np.ndarray) -> float:
+    """The held-out cost of a fit's structure, in units of σ, the same for all that are compared."""
+    fit = dataclasses.replace(one.fit, sigma=sigma)
+    return float(np.sum(one.bench.cross_validate(nodes, fit, fit.structure, fit.values)))
+
+
+def _correction(here: Acting, interval: float) -> tuple[float, float]:
+    """The change of the delay that fits best, and its standard error, both in seconds; 0 and NaN
+    where the coefficients imitate it."""
+    fit, inputs, count = here.fit, here.bench.inputs, here.fit.structure.num_inputs
+    apart = _APART * interval
+    by_delay = (
+        inputs.delayed(inputs.delay + apart)(fit.arcs)
+        - inputs.delayed(inputs.delay - apart)(fit.arcs)
+    ) / (2 * apart)
+    both = np.concatenate([inputs(fit.arcs), by_delay], axis=-1)
+    structure = dataclasses.replace(fit.structure, num_inputs=2 * count)
+    known, keys = fit.values, structure.keys()
+    bench = dataclasses.replace(here.bench, inputs=lambda arcs: both)
+    p = structure.start(known)
+    model = bench.model(structure, fit.arcs, p, np.arange(len(p)))
+    R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, fit.sigma * fit.arcs.noise)
+    own = [keys.index(key) for key in known]
+    column = sum(
+        known["gain", i, j] * R[:, keys.index(("gain", i, count + j))]
+        for i in range(fit.form.dim)
+        for j in range(count)
+    )
+    Q = np.linalg.qr(R[:, own])[0]
+    rest = column - Q @ (Q.T @ column)
+    size = np.linalg.norm(rest)
+    if not size > _IMITATED * np.linalg.norm(column):
+        return 0.0, np.nan
+    return float(rest @ R[:, -1] / size**2), float(np.sqrt(fit.correlation) / size)

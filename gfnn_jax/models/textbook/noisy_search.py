@@ -1,0 +1,252 @@
+"""The search for laws of physics behind noisy sequences: which few atoms are worth a fit.
+
+Atoms are matched, as in `models.textbook.search`, to the gradients of H along sequences. These are
+known in weak form (`weak_gradients`), without the error of a midpoint: one round is enough. The
+noise of the states is known too: columns are in its units, and an atom has to bring as much
+likelihood as there is to say of it. Noise does not tell the right law from one that is within it,
+so that several are handed on; whole sequences choose.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
+from gfnn_jax.fitting.significance import null_terms
+from gfnn_jax.models.textbook.arguments import Argument, arguments_of
+from gfnn_jax.models.textbook.atoms import (
+    Atom,
+    atom_text,
+    blocks_of,
+    dictionary_of,
+    powers_of,
+    weight_of,
+)
+from gfnn_jax.models.textbook.matching import Match, Matching, orthonormal
+from gfnn_jax.models.textbook.weak_gradients import WeakGradients
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Tuned on the laws of benchmarks/textbook.py with noise of 1e-3 of the spread.
+
+    degrees: of products of coordinates, by degrees of freedom from 1. atoms: of a law, beside the
+    coordinates and products of two. said: natural logarithms of likelihood that a unit of
+    complexity must bring. finalists: laws that are handed on. explained: RMS of what a match leaves
+    over, in units of the noise, from which on products of shapes are looked at too. kept: standard
+    errors of a coordinate, or a product of two, that a law is handed on with. exchanged:
+    matches whose atoms are tried in other shapes.
+    """
+
+    degrees: tuple[int, ...] = (6, 4, 4)
+    atoms: int = 5
+    said: float = 5.0
+    finalists: int = 6
+    explained: float = 1.5
+    kept: float = 2.0
+    exchanged: int = 4
+
+
+OPTIONS = Options()
+_LOOKED_AT = 30  # matches that are read as laws
+_FAR = 3.0  # deviations, beyond which a row has less weight
+
+
+class Formula(NamedTuple):
+    """H = Σ c_j φ_j: terms without constants inside, and atoms with them.
+
+    left: RMS of what it leaves over of the weak gradients, in units of their noise; rows: so many
+    numbers. said: what there is to say of its atoms.
+    """
+
+    plain: Terms
+    atoms: tuple[Atom, ...]
+    arguments: list[Argument]
+    coefficients: np.ndarray
+    left: float
+    rows: int
+    said: float
+
+    @property
+    def constants(self) -> np.ndarray:
+        """(k,): the constants inside the atoms."""
+        return np.array([f.theta for atom in self.atoms for f in atom if f.theta is not None])
+
+    @property
+    def numbers(self) -> list[list[int]]:
+        """Places among coefficients and constants of the constants of each term."""
+        found: list[list[int]] = [[] for _ in range(self.plain.num_parameters)]
+        place = len(self.coefficients)
+        for atom in self.atoms:
+            inside = sum(f.theta is not None for f in atom)
+            found.append(list(range(place, place + inside)))
+            place += inside
+        return found
+
+    def with_constants(self, constants: np.ndarray) -> Formula:
+        """The same with these constants inside."""
+        return self._replace(atoms=_with(self.atoms, constants))
+
+    def family(self, constants: np.ndarray) -> Terms:
+        """The terms, with these constants inside. Raises InputError for one that has run away."""
+        texts = [atom_text(atom, self.arguments) for atom in _with(self.atoms, constants)]
+        dim = self.plain.dim
+        return joined(self.plain, given_terms(dim, texts)) if texts else self.plain
+
+    @property
+    def kind(self) -> frozenset:
+        """The terms without their constants."""
+        shapes = [tuple(sorted((f.place, f.kind) for f in atom)) for atom in self.atoms]
+        return frozenset([*self.plain.term_names, *((s, shapes.count(s)) for s in shapes)])
+
+    def take(self, kept: Sequence[int], coefficients: np.ndarray) -> Formula:
+        """Take these terms alone."""
+        count = self.plain.num_parameters
+        atoms = tuple(self.atoms[j - count] for j in kept if j >= count)
+        plain = self.plain.take([j for j in kept if j < count])
+        return self._replace(
+            plain=plain, atoms=atoms, coefficients=coefficients, said=said_of(plain, atoms)
+        )
+
+
+def _with(atoms: Sequence[Atom], constants: np.ndarray) -> tuple[Atom, ...]:
+    """The atoms with these constants (k,) inside."""
+    given = iter(constants.tolist())
+    return tuple(
+        tuple(
+            f if f.theta is None else dataclasses.replace(f, theta=next(given)) for f in atom
+        )
+        for atom in atoms
+    )  # fmt: skip
+
+
+def said_of(plain: Terms, atoms: Sequence[Atom]) -> float:
+    """Complexity of a law, in units of `shapes.complexity`: its atoms, and products of coordinates
+    beyond those of two."""
+    beyond = [row for row in plain.powers if sum(row) > 2]
+    return weight_of(atoms) + sum(1.0 + 0.1 * n for row in beyond for n in row if n)
+
+
+class NoisyTextbook:
+    """The search among the windows of noisy sequences. angles, cyclic: indices of z."""
+
+    def __init__(
+        self, weak: WeakGradients, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
+        options: Options = OPTIONS, say: Callable[[str], Any] = lambda message: None,
+    ):  # fmt: skip
+        self._weak, self._options, self._say = weak, options, say
+        self._dim = dim = weak.states.shape[1] // 2
+        self._arguments = arguments_of(weak.states, tuple(angles), tuple(cyclic))
+        every = polynomial_terms(dim, 2, cyclic=(*angles, *cyclic))
+        kept, _ = null_terms(every, weak.states)
+        self._base = every.take(kept)
+        self._weigh(weak.deviation)
+        degrees = options.degrees
+        self._degree = degrees[dim - 1] if dim <= len(degrees) else 3
+
+    def formulas(self) -> list[Formula]:
+        """The laws that are worth a fit, the likeliest for what there is to say of them first."""
+        with np.errstate(all="ignore"):
+            found: list[Formula] = []
+            for products in (False, True):
+                self._weigh(self._weak.deviation)
+                first = self._searched(products)[0]
+                self._weigh(self._deviations(first))
+                found = self._searched(products)
+                if found[0].left <= self._options.explained:
+                    break
+            return found[: self._options.finalists]
+
+    def _searched(self, products: bool) -> list[Formula]:
+        """The laws of each kind, by rising length."""
+        found: dict[frozenset, Formula] = {}
+        for match in sorted(self._matches(products), key=self._length_of_match)[:_LOOKED_AT]:
+            formula = self._formula(match)
+            if found.setdefault(formula.kind, formula).left > formula.left:
+                found[formula.kind] = formula
+        return sorted(found.values(), key=self._length)
+
+    def _weigh(self, deviations: np.ndarray) -> None:
+        """Weigh the rows by their noise (2d,) or (R, 2d)."""
+        self._weight = 1.0 / deviations
+        self._target = (self._weak.target * self._weight).ravel()
+        self._spanned = orthonormal(self._columns(self._base))
+
+    def _deviations(self, formula: Formula) -> np.ndarray:
+        """(R, 2d) of the noise of the rows, as far as this law tells how states move them; more
+        of those that it misses by far, as where an orbit turns too fast for a window's sums."""
+        family, c = formula.family(formula.constants), formula.coefficients
+        gradient, hessian = family.gradient_and_hessian(c, self._weak.states)
+        found = self._weak.deviations(hessian)
+        off = np.abs(self._weak.average(gradient) - self._weak.target) / found
+        return found * np.maximum(1.0, np.where(np.isfinite(off), off, np.inf) / _FAR)
+
+    def _matches(self, products: bool) -> list[Match]:
+        options = self._options
+        dictionary = dictionary_of(
+            self._arguments, self._weight, self._spanned, degree=self._degree, products=products,
+            average=self._weak.average,
+        )  # fmt: skip
+        self._say(f"H: {len(dictionary.atoms)} atoms of laws of physics")
+        said = options.said / (len(self._target) * np.log(2))
+        matching = Matching(
+            self._spanned, self._target, self._weight, self._arguments, said, self._weak.average
+        )
+        found = matching.best(dictionary, options.atoms)
+        if not products:
+            most = len(self._target) / 4 - self._base.num_parameters
+            blocks = [b for b in blocks_of(self._arguments, self._degree) if len(b) < most]
+            found += [matching.refined(block) for block in blocks]
+        likeliest = sorted(found, key=self._length_of_match)[: options.exchanged]
+        return found + [m for best in likeliest for m in matching.exchanged(best, dictionary)]
+
+    def _length_of_match(self, match: Match) -> float:
+        said = self._options.said * weight_of(match.atoms)
+        return len(self._target) * np.log(match.left) + said
+
+    def _length(self, formula: Formula) -> float:
+        """Description length: natural logarithms."""
+        told = np.log(len(self._target))
+        numbers = len(formula.coefficients) + len(formula.constants)
+        said = self._options.said * formula.said + 0.5 * told * numbers
+        return len(self._target) * np.log(formula.left) + said
+
+    def _formula(self, match: Match) -> Formula:
+        """The law of a match, without the coordinates and products that it does not ask for."""
+        rows, others = [], []
+        for atom in match.atoms:
+            row = powers_of(atom, self._arguments, 2 * self._dim)
+            others.append(atom) if row is None else rows.append(row)
+        plain = self._base
+        if rows:
+            names = polynomial_terms(self._dim, 1).variables
+            plain = joined(plain, Terms(self._dim, names, tuple(dict.fromkeys(rows))))
+        atoms = tuple(others)
+        whole = Formula(
+            plain, atoms, self._arguments, np.zeros(0), np.inf, len(self._target),
+            said_of(plain, atoms),
+        )  # fmt: skip
+        columns = self._columns(whole.family(whole.constants))
+        kept = np.arange(columns.shape[1])
+        while True:
+            own = columns[:, kept]
+            size = np.linalg.norm(own, axis=0)
+            own = own / size
+            c = np.linalg.lstsq(own, self._target, rcond=1e-13)[0]
+            left = np.linalg.norm(self._target - own @ c) / np.sqrt(len(own) - len(kept))
+            deviation = left * np.linalg.norm(np.linalg.pinv(own), axis=1)
+            told = np.abs(c) / deviation
+            worst = int(np.argmin(told))
+            if told[worst] >= self._options.kept or len(kept) == 1:
+                return whole.take(kept.tolist(), c / size)._replace(left=float(left))
+            kept = np.delete(kept, worst)
+
+    def _columns(self, family: Terms) -> np.ndarray:
+        """(rows, terms): the weighted weak gradients."""
+        gradients = np.moveaxis(family.term_gradients(self._weak.states), -1, 0)
+        rows = self._weak.average(gradients) * self._weight
+        return rows.reshape(len(rows), -1).T

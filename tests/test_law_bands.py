@@ -1,0 +1,92 @@
+"""Bands of forecasts from recordings: their misfit, by laws without a third of the record."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from test_law_fits import chain, pendulum
+
+import gfnn_jax as gfnn
+from gfnn_jax.dataset.stretches import measure, nodes_of, stretches
+from gfnn_jax.maps.observation import Observation
+from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
+from gfnn_jax.models.lagrangians.calibration import Thirds
+from gfnn_jax.models.lagrangians.fit import Workbench, in_thirds
+from gfnn_jax.models.lagrangians.search import SearchOptions, search
+
+
+def recorded(t, theta):
+    return gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
+
+
+def covered(fit, recording, starts, ahead):
+    """Share of the samples up to ``ahead`` seconds after each start that lie within two standard
+    deviations of a forecast, and the same without the misfit."""
+    bare = dataclasses.replace(
+        fit.map.sensors, misfit=np.zeros_like(np.asarray(fit.map.sensors.misfit))
+    )
+    inside = []
+    for map_ in (fit.map, dataclasses.replace(fit.map, sensors=bare)):
+        found = []
+        for start in starts:
+            later = recording.slice(start + 1e-9, start + ahead)
+            forecast = map_.forecast(recording.slice(start - 2.0, start), later.times("0"))
+            error = forecast.values["theta"][0] - later.values("theta", "0")
+            found.append(np.abs(error) <= 2 * forecast.std["theta"][0])
+        inside.append(np.mean(np.concatenate(found)))
+    return inside
+
+
+def test_a_fit_without_a_third_is_that_of_the_other_two():
+    """One linear step against a fit of the arcs of the other thirds."""
+    recording = chain(noise=2e-3, runs=3, end=4.0)
+    found = stretches(recording)
+    scales = measure(found)
+    nodes = nodes_of(found, scales)
+    seen, inputs = Observation.plain(recording.positions), ArcInputs(nodes, scales.substeps, "hold")
+    options = SearchOptions(frictions=("linear",), choose_friction=False)
+    result = search(nodes, scales, (0, 1), 0, {"hold": inputs}, seen, options=options)
+    gauge = np.concatenate([n.x[:, :2] for n in nodes])
+    bench, fit = Workbench(gauge, inputs, scales.omega, seen), result.acting.fit
+    arcs, third = in_thirds(result.nodes, fit)
+    error = np.sqrt(np.diag(fit.covariance()))
+    without = bench.without_thirds(result.nodes, fit)
+    assert [w.run for w in without] == ["0", "1", "2"]
+    for k, (other, _, _) in enumerate(without):
+        own = bench.fit(fit.structure, fit.values, arcs.take(third != k), fit.sigma, rescale=False)
+        np.testing.assert_allclose((other.p - own.p) / error, 0.0, atol=0.3)
+    assert max(np.max(np.abs(other.p - fit.p) / error) for other, _, _ in without) > 0.5
+
+
+def test_bands_and_horizon_of_a_law_that_is_wrong_hold_what_it_misses():
+    """Friction that the fit may not have: bands without its misfit are far too narrow."""
+    t, theta = pendulum(gamma=0.01, end=60.0)
+    recording = recorded(t, theta)
+    fit = gfnn.fit(recording.slice(stop=40.0), friction="none")
+    with_misfit, without = covered(fit, recording, np.arange(42.0, 58.0, 1.3), 2.0)
+    assert with_misfit > 0.9
+    assert without < with_misfit - 0.2
+    passed = [h for h in fit.horizon if 0 < h.measured < np.inf]
+    assert passed
+    for horizon in passed:
+        assert 0.5 < horizon.predicted / horizon.measured < 2
+
+
+def test_bands_of_a_law_that_is_right_hold_no_more(swing):
+    recording, fit = swing
+    assert np.all(np.asarray(fit.map.sensors.misfit) < 1e-3)  # as large as the noise
+    with_misfit, _ = covered(fit, recording, np.arange(30.5, 38.5, 0.7), 1.5)
+    assert 0.9 < with_misfit < 0.995
+
+
+@pytest.fixture(scope="module")
+def swing():
+    t, theta = pendulum(end=40.0)
+    recording = recorded(t, theta)
+    return recording, gfnn.fit(recording.slice(stop=28.0))
+
+
+def test_thirds_begin_where_they_say():
+    thirds = Thirds((None, None, None), ((0, 0.0), (0, 5.0), (1, 2.0)))
+    places = [(0, 0.0), (0, 4.9), (0, 5.0), (1, 1.0), (1, 2.0), (2, 0.0)]
+    assert [thirds.of(*place) for place in places] == [0, 0, 1, 1, 2, 2]

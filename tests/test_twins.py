@@ -1,0 +1,38 @@
+"""Laws of simulated records come out exactly (benchmarks/twins.py holds more of them)."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+
+import twins
+
+from gfnn_jax.dataset.stretches import Scales
+
+
+@pytest.mark.parametrize(("name", "noise"), [("pendulum", 1e-6), ("two_carts", 1e-3)])
+def test_the_terms_of_a_twin_come_out_with_true_errors(name, noise):
+    """Of positions far less noisy than local cubics can tell; of a law that is one of a family,
+    all of which move two springs alike."""
+    found = twins.case(twins.TWINS[name], noise, 0)
+    assert found["same"] == {"lagrangian": True, "friction": True}
+    assert max(found["standard_errors"].values()) < 4
+
+
+def test_steps_are_finer_where_there_is_less_noise():
+    one = np.ones(1)
+    scales = Scales(1e-3 * one, one, 1.0, 2 * np.pi / 40, 3, one)
+    assert scales.substeps == 1
+    assert scales.substeps_for(1e-6 * one) == 2
+    assert scales.substeps_for(1e-12 * one) == 4
+
+
+def test_terms_lose_zeros_and_widths():
+    assert twins.plain("omega1*omega2*cos(theta1 - theta2 + 0.0065)") == (
+        "omega1*omega2*cos(theta1 - theta2)"
+    )
+    assert twins.plain("cos(theta - 7.1699e-05)") == "cos(theta)"
+    assert twins.plain("sqrt(omega**2 + 0.0903)") == "dry"
