@@ -208,29 +208,41 @@ def table(part: Any, run: str, label: str) -> dict[str, Any]:
     return {"run": np.full(len(t), label), "t": t, **{n: part.values(n, run) for n in names}}
 
 
+def held_windows(
+    held: list[Any], times: tuple[float, ...]
+) -> tuple[list[tuple[Any, int]], np.ndarray, np.ndarray]:
+    """Windows of held-out parts: the stretch and the sample (n,) where each ends, times (n, m) of
+    the samples at ``times`` (m,) s later, and what was measured there (n, m, channels), NaN where
+    the part ends before."""
+    parts = [s for recording in held for s in stretches(recording)]
+    ends = [(s, k) for s in parts for k in range(SAMPLES - 1, len(s.t) - 1)
+            if s.t[k] + times[0] <= s.t[-1]]  # fmt: skip
+    ends = ends[:: max(1, len(ends) // WINDOWS)]
+    ahead, measured = [], []
+    for s, k in ends:
+        at = np.searchsorted(s.t, s.t[k] + np.array(times) - 1e-9)
+        inside = at < len(s.t)
+        at = np.minimum(at, len(s.t) - 1)
+        ahead.append(np.where(inside, s.t[at], s.t[at[inside][-1]] if inside.any() else s.t[k]))
+        measured.append(np.where(inside[:, None], s.y[at], np.nan))
+    return ends, np.array(ahead), np.array(measured)
+
+
 def forecasts(
     map_: Any, held: list[Any], times: tuple[float, ...]
 ) -> tuple[list[float | None], list[float | None]]:
     """Median over windows of the worst coordinate's error at each time ahead, and the share within
     two standard deviations; None where no part is that long."""
     law = law_of(map_)
-    parts = [s for recording in held for s in stretches(recording)]
-    places = [(s, k) for s in parts for k in range(SAMPLES - 1, len(s.t) - 1)
-              if s.t[k] + times[0] <= s.t[-1]]  # fmt: skip
-    places = places[:: max(1, len(places) // WINDOWS)]
-    windows, ahead, measured = [], [], []
-    for s, k in places:
+    ends, ahead, measured = held_windows(held, times)
+    windows = []
+    for s, k in ends:
         rows = slice(k - SAMPLES + 1, k + 1)
         windows.append(Window(s.t[rows], s.y[rows], s.t, s.u))
-        at = np.searchsorted(s.t, s.t[k] + np.array(times) - 1e-9)
-        inside = at < len(s.t)
-        at = np.minimum(at, len(s.t) - 1)
-        ahead.append(np.where(inside, s.t[at], s.t[at[inside][-1]] if inside.any() else s.t[k]))
-        measured.append(np.where(inside[:, None], s.y[at], np.nan))
     x, covariance = estimate_states(law, windows)
     last = np.array([w.t[-1] for w in windows])
-    orbits = propagate(law, windows, x, covariance, last, np.array(ahead))
-    error = np.abs(orbits.values - np.array(measured))
+    orbits = propagate(law, windows, x, covariance, last, ahead)
+    error = np.abs(orbits.values - measured)
     seen = np.isfinite(error)
     median, share = [], []
     for n in range(len(times)):

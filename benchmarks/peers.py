@@ -205,7 +205,7 @@ def by_hand(system: System, arcs: Arcs, quick: bool) -> tuple[Acceleration, Any]
     jacobian = jax.jit(jax.jacfwd(residual))
     start = np.concatenate([_constants(system, arcs), arcs.x0.ravel()])
     found = least_squares(
-        residual, start, jac=lambda x: np.asarray(jacobian(x)), x_scale="jac", loss="soft_l1",
+        residual, start, jac=lambda x: np.asarray(jacobian(x)), x_scale="jac", loss="soft_l1",  # pyright: ignore[reportArgumentType]
         f_scale=0.01, max_nfev=10 if quick else 60,
     )  # fmt: skip
     return system.body, jnp.asarray(found.x[:num])
