@@ -34,6 +34,7 @@ def noisy():
         return scene, gfnn.fit(pairs, learn="hamiltonian")
 
 
+@pytest.mark.slow
 def test_a_law_is_fitted_to_whole_sequences(noisy):
     """Pairs alone gave 2 to 5e-5 of one step and 4 to 10e-4 of a hundred."""
     scene, fit = noisy

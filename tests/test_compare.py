@@ -35,6 +35,7 @@ def compare(out, methods=CHEAP, scene="two-body", **options):
     return comparison.compare(scene, methods=methods, out=out, quick=True, cap=0.2, **options)
 
 
+@pytest.mark.slow
 def test_an_interrupted_comparison_keeps_what_is_finished_and_reports_all(small, tmp_path):
     out = tmp_path / "out"
 

@@ -357,6 +357,7 @@ def test_the_command_line_learns_and_forecasts(tmp_path, capsys):
     assert "--num-steps" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs(tmp_path):
     """ẍ = −4 x − 0.2 ẋ + 3 u(t − 0.017), and an input that does nothing."""
     t = np.arange(0, 30, 0.05)

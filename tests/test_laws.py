@@ -159,6 +159,7 @@ def pendulum_pairs(num, reach, sigma):
     return gfnn.Pairs(*(z.T + sigma * rng.normal(size=(num, 2)) for z in (z0, found)), 0.2)
 
 
+@pytest.mark.slow
 def test_a_law_that_misses_the_tolerance_is_the_best_there_is():
     """½p² − cos(q) e^(−q²/10), which no dictionary has: the degrees of its series, whose odd ones
     bring nothing."""

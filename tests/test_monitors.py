@@ -63,6 +63,7 @@ def test_two_monitors_across_a_drift_tell_momenta_and_their_scale(ring):
         assert np.abs(found - true).max() < 1e-14
 
 
+@pytest.mark.slow
 def test_a_map_for_each_place_and_their_composition(ring):
     first, second = read(50, 3, 1)
     assert ring.fits[0] is None

@@ -16,6 +16,7 @@ def recorded(*amplitudes):
     return gfnn.Recording(runs, positions=["theta"], angles=["theta"])
 
 
+@pytest.mark.slow
 def test_a_wider_swing_tells_what_a_small_one_cannot():
     fit = gfnn.fit(recorded(0.3), terms=TERMS)
     best = fit.next_motions[0]

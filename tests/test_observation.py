@@ -97,6 +97,7 @@ def test_a_gyroscope_beside_an_angle():
     assert both.friction.terms[0].std < alone.friction.terms[0].std
 
 
+@pytest.mark.slow
 def test_a_camera_is_learned_saved_and_forecast(tmp_path):
     t, theta, _, noise = swing(end=14.0)
     px, py = 320 + 200 * np.sin(theta + 0.07), 240 - 200 * np.cos(theta + 0.07)

@@ -170,6 +170,7 @@ def ring(number, steps, dim, seed):
     return np.mod(np.stack(read, axis=1), 2 * np.pi)
 
 
+@pytest.mark.slow
 def test_a_ring_of_64_that_is_told_to_be_one():
     names = [f"theta{i}" for i in range(1, 65)]
     recording = recorded(ring(200, 2, 64, 0), names, names)

@@ -13,6 +13,7 @@ import twins
 from gfnn_jax.dataset.stretches import Scales
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "noise"), [("pendulum", 1e-6), ("two_carts", 1e-3)])
 def test_the_terms_of_a_twin_come_out_with_true_errors(name, noise):
     """Of positions far less noisy than local cubics can tell; of a law that is one of a family,
