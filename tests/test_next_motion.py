@@ -1,6 +1,7 @@
 """Which motion to record next, against the standard errors after it was recorded."""
 
 import numpy as np
+import pytest
 from test_law_fits import pendulum
 
 import gfnn_jax as gfnn
