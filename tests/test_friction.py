@@ -77,6 +77,7 @@ def test_a_pendulum_with_friction():
     assert fit.symplecticity_defect < 1e-14
 
 
+@pytest.mark.slow
 def test_rates_that_differ_are_no_uniform_friction():
     """A constant determinant, and no multiple of J."""
     pairs = pairs_of(henon_heiles([0.1, 0.3]), states(), 0.5)

@@ -86,6 +86,7 @@ def test_terms_stand_in_the_shortest_window():
     assert family.take([3, 9]).term_names == ("p_i²", "exp(q_i - q_{i+2})")
 
 
+@pytest.mark.slow
 def test_without_matrices_as_with_them():
     """Coefficients' derivatives, rates and tangents of 20 sites; matrices serve up to 16."""
     family, params = springs(20)
@@ -246,6 +247,7 @@ def test_bodies_that_are_alike_share_their_coefficients():
     assert str(fit.hamiltonian) == "0.5 Σ_i |p_i|² - Σ_{i<j} 1/|q_i - q_j|"
 
 
+@pytest.mark.slow
 def test_bodies_of_a_species_share_their_coefficients(tmp_path):
     """Two light and two heavy ones: a coefficient for each species and each pair of species, as it
     is written out; from the command line, and from a saved model."""
@@ -277,6 +279,7 @@ def test_bodies_of_a_species_share_their_coefficients(tmp_path):
     np.testing.assert_allclose(gfnn.load(model).step(z0[:5])[0], z1[:5], atol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_generated_step_without_matrices():
     """Images, derivatives and the inverse as Newton's method with matrices has them."""
     family, params = springs(20)

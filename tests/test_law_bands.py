@@ -58,6 +58,7 @@ def test_a_fit_without_a_third_is_that_of_the_other_two():
     assert max(np.max(np.abs(other.p - fit.p) / error) for other, _, _ in without) > 0.5
 
 
+@pytest.mark.slow
 def test_bands_and_horizon_of_a_law_that_is_wrong_hold_what_it_misses():
     """Friction that the fit may not have: bands without its misfit are far too narrow."""
     t, theta = pendulum(gamma=0.01, end=60.0)

@@ -108,6 +108,7 @@ def test_gradient_of_a_forecast_in_the_inputs():
         np.testing.assert_allclose(slope[n, 0], expected, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_law_beside_its_map(tmp_path):
     """Velocities, the linear map, power, bands; saved and loaded the same."""
     assert MAP.multiplier() is None

@@ -320,6 +320,7 @@ def test_a_map_that_is_far_cheaper_than_the_law_is_fitted_to_pairs_of_the_law(pa
     assert np.sqrt(np.mean(error**2)) < 1e-5 * np.std(fresh.z0)
 
 
+@pytest.mark.slow
 def test_a_known_law_leaves_little_to_learn(tmp_path):
     """A pendulum that is kicked after every step: no H has that map, and S of what the pendulum's
     flow leaves over is k cos(3q)/3h."""

@@ -86,6 +86,7 @@ def test_a_potentiometer_and_its_scale():
     assert "scale_theta = 1.2" in fit.table or "scale_theta = 1.3" in fit.table
 
 
+@pytest.mark.slow
 def test_a_gyroscope_beside_an_angle():
     t, theta, omega, noise = swing()
     table = {"t": t, "theta": theta + noise(1e-3), "omega": 0.9 * omega + 0.05 + noise(2e-3)}
@@ -130,6 +131,7 @@ def test_a_function_is_the_text_that_it_computes():
     np.testing.assert_allclose(own(x).values, text(x).values, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_zero_of_a_length_is_where_no_force_is():
     t, x, _, noise = motion(lambda q, v: -4 * q - 2 * q**3 - 0.05 * v, [1.2, 0.0])
     recording = gfnn.Recording({"t": t, "x": x + 3 + noise(1e-3)}, offset="x")

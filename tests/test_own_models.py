@@ -74,6 +74,7 @@ def swinging(seed, num=400, dt=0.03):
     return gfnn.Recording({"t": dt * np.arange(num), "x": q + noise}, positions=["x"]), q
 
 
+@pytest.mark.slow
 def test_a_noise_model(tmp_path):
     recording, q = swinging(0)
     law = dict(terms=["v**2", "V: x**2", "V: x**4"], friction="none")

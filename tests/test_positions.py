@@ -302,6 +302,7 @@ def test_bands_of_forecasts_hold(of_noisy):
     assert np.median(off[:, 0]) < 0.6e-3  # a reading's own error is 0.67e-3 in the median
 
 
+@pytest.mark.slow
 def test_forecasts_of_wrapped_readings_go_on_over_whole_turns(of_noisy):
     """Moves of a kicked map reach beyond half a turn: each reading is lifted to where S leads."""
     read = noisy(np.mod(turns(150, 12, 0), 2 * np.pi), 1e-3, 50)
