@@ -358,7 +358,7 @@ def test_ended_names_the_clock_where_the_maps_ended_by_themselves(monkeypatch):
 @QUIETLY
 def test_the_words_of_a_search_that_was_cut_off():
     fit = gfnn.fit(kepler(), learn="hamiltonian", tolerance=1e-9, max_seconds=None,
-                   max_operations=16 * 10**7)  # fmt: skip
+                   max_operations=30 * 10**7)  # fmt: skip
     said = " ".join([*fit.messages, fit.ended])
     assert "promised" not in said
     assert "no operations for more after unit" in said
