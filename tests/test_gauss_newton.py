@@ -166,6 +166,7 @@ def test_a_pendulum_of_any_angle():
     assert np.ptp(energy) < 1e-12
 
 
+@pytest.mark.slow
 def test_what_no_hamiltonian_explains_is_said():
     """Energy that comes from nowhere; what goes is friction."""
     pairs = henon_heiles(200, 0.5)

@@ -475,6 +475,7 @@ def test_the_command_line_takes_a_structure(tmp_path):
         np.testing.assert_allclose(out["trajectories"][:, 1], pairs.z1[:2], atol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_structure_is_proposed_and_not_used():
     def best_of(family, params, dt=0.1):
         pairs = drawn(6, 60, family, params, dt)

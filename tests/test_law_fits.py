@@ -326,6 +326,7 @@ def test_a_lagrangian_of_the_search_is_a_pytree():
     assert jax.tree.map(np.shape, law).coefficients == (1,)
 
 
+@pytest.mark.slow
 def test_the_command_line_learns_and_forecasts(tmp_path, capsys):
     t, theta = pendulum(end=15.0)
     clean = pendulum(end=20.0, noise=0.0)

@@ -95,6 +95,7 @@ def test_band_limited_inputs():
     np.testing.assert_allclose(found[40:-40], expected[40:-40], atol=3e-4)
 
 
+@pytest.mark.slow
 def test_gradient_of_a_forecast_in_the_inputs():
     @jax.jit
     def cost(u):

@@ -188,6 +188,7 @@ def noisy():
     return t, theta + sigma * noise(1.0), sigma
 
 
+@pytest.mark.slow
 def test_sigma_of_each_value_weights_the_fit():
     t, theta, sigma = noisy()
     table = {"t": t, "theta": theta}
