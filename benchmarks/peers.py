@@ -126,7 +126,7 @@ def _angles(q: jax.Array) -> jax.Array:
 SYSTEMS = {
     "pendulum": System(
         pendulum, (5.0, 0.01, 0.0), _pendulum_library, _angles, 0.06,
-        "θ̈ = −k sin θ − c θ̇; sin, cos, ω, ω|ω|",
+        "θ̈ = −k sin θ − c θ̇; sin, cos, ω, ω abs(ω)",
     ),
     "two_carts": System(
         carts, (10.0, 5.0, 0.0, 0.1, 5.0, 10.0, 0.0, 0.1), _cart_library, lambda q: q / 50, 0.034,
