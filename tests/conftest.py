@@ -9,6 +9,7 @@ import sys
 import types
 
 import jax
+import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401, its threads are limited too
 from threadpoolctl import threadpool_limits
@@ -72,6 +73,13 @@ def _no_more_programs_than_a_module_needs():
     """Drop compiled programs after each module: all of the suite's would fill gigabytes."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture(autouse=True)
+def _own_draws(request, monkeypatch):
+    """A test draws the same numbers, whatever ran before it in its process."""
+    if hasattr(request.module, "RNG"):
+        monkeypatch.setattr(request.module, "RNG", np.random.default_rng(0))
 
 
 @pytest.fixture
