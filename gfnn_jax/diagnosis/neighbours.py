@@ -18,16 +18,11 @@ _NOISE = 0.6
 # The same of products of two coordinates, above which neighbours are too far apart to tell: 2,000
 # pairs of four degrees of freedom have 0.2, of eight 0.45.
 _SMOOTH = 0.3
-# Variance of the logarithm of the residuals' sizes ÷ that between close neighbours, above which the
-# size is a function of the state: of noise that is the same everywhere 1, of close passages that a
-# map cannot follow, and which lie closer than neighbours, 5 and more.
-_SIZED = 3.0
 
 
 def is_noise(z, residual, run, place) -> bool | None:
     """Return whether the residuals differ between close neighbours as much as between any two; None
-    where the pairs lie too far apart for a smooth function to tell, or where only the residuals'
-    sizes are alike.
+    where the pairs lie too far apart for a smooth function to tell.
 
     z, residual: (N, 2d) in units of the coordinates' sizes. run, place: (N,) of each row: rows that
     follow each other share a state, and its noise, and are no neighbours.
@@ -37,8 +32,6 @@ def is_noise(z, residual, run, place) -> bool | None:
         return None
     if _apart(residual, one, other) < _NOISE:
         return False
-    if _sizes_agree(residual, one, other):
-        return None
     # Products of coordinates are as smooth as what may be missing is at best.
     smooth = np.asarray(z) * np.roll(z, 1, axis=1)
     return True if _apart(smooth, one, other) < _SMOOTH else None
@@ -48,14 +41,6 @@ def _apart(values, one, other) -> float:
     values = np.asarray(values)
     each = np.sum(values[one] ** 2 + values[other] ** 2)
     return float(np.sum((values[one] - values[other]) ** 2) / each) if each > 0 else 0.0
-
-
-def _sizes_agree(values, one, other) -> bool:
-    """Whether the sizes of these rows are alike between neighbours and differ elsewhere."""
-    size = np.linalg.norm(values, axis=1)
-    log = np.log(np.maximum(size, np.finfo(float).tiny))
-    between = 0.5 * np.mean((log[one] - log[other]) ** 2)
-    return bool(np.var(log[one]) > _SIZED * between)
 
 
 def _close_neighbours(z, run, place) -> tuple[np.ndarray, np.ndarray]:

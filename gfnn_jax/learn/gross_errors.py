@@ -3,8 +3,8 @@
 Neighbours tell an outlier where states are dense (`diagnosis.local_jacobians.outliers`); a map that
 all pairs agree on tells it anywhere. What a map cannot represent is smooth: its residual is as
 large at the neighbours. A gross error of measurement stands alone. So may a state at the rim of the
-data, as of the closest passages; there a smaller size of the map errs far more still, while it finds
-the same gross error. Of a law, which has no sizes, a message names both.
+data, as of the closest passages; there a smaller size of the map errs far more still, while it
+finds the same gross error. Of a law, which has no sizes, a message names both.
 """
 
 from __future__ import annotations
