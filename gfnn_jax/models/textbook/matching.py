@@ -144,7 +144,7 @@ class Matching:
         return descended(start, _DAMPING, _REFINEMENTS).problem.match
 
     def slopes(self, match: Match, inner: Sequence[tuple[int, int]]):
-        """(what is left over, its slopes (rows, n) in these constants with base and coefficients
+        """(residual, its slopes (rows, n) in these constants with base and coefficients
         projected out)."""
         residual, basis, coefficients = self._residual(match.atoms)
         columns = [
