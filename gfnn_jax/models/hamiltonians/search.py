@@ -68,6 +68,7 @@ _POOR, _POOR_GIVEN, _POOR_STRUCTURED = 2, 3, 5
 _SMALL = 35  # terms of the libraries that are tried before laws of physics: 0.3 s of two bodies
 _EXACT = 1e-13  # of the spread: a polynomial that errs by no more is no approximation
 _TURNING = 2_000  # pairs that tell how far a step turns the states
+_AFFINE_ROWS = 50_000  # training pairs that the affine map is fitted to
 _FIRST_ROUND = 5e8  # operations that the first round of growth is expected to take
 _EXPLAINED = 0.05  # of the spread: an error below it is that of the right branch of the turns
 
@@ -432,7 +433,8 @@ def affine_error(data: Dataset, tolerance: Tolerance) -> OneStepError:
         return np.column_stack([np.ones(len(z)), z])
 
     moved = data.y1 - data.y0
-    known = np.linalg.lstsq(design(data.training), moved[data.training], rcond=None)[0]
+    rows = data.training[:_AFFINE_ROWS]
+    known = np.linalg.lstsq(design(rows), moved[rows], rcond=None)[0]
     found = data.y0[data.validation] + design(data.validation) @ known
     return measured_error(data, tolerance, to_user(data.coordinates, found))
 
