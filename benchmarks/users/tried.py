@@ -142,7 +142,8 @@ def rubbing() -> Case:
 
 def rubbing_with_noise() -> Case:
     """The same record behind noise of 1e-4."""
-    case = rubbing()  # a turn takes 2 c/sin(q) of the volume, 1.8 turns in 60 steps at q near 1
+    case = rubbing()
+    # A turning point takes 2 c/sin(q) of the volume; there are two in a period of 69 steps.
     states = np.concatenate([case.pairs.z0, case.pairs.z1[-1:]])
     states = states + 1e-4 * np.random.default_rng([SEED, 15]).normal(size=states.shape)
     pairs = gfnn.Pairs(states[:-1], states[1:], 0.1)
