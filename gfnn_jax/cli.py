@@ -397,6 +397,8 @@ def _summarise(ran: Any, out: Path) -> None:
             print(note)
         for loss in report["hamiltonian"]["friction"]:
             print(f"{loss['term']}: {loss['coefficient']:.6g} ± {loss['std']:.1g}")
+    for law in ran.fit.partial_laws:
+        print(law)
     print(fit["ended"])
     rollout = report["rollout"]
     if rollout is not None:
