@@ -221,7 +221,7 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--seed", type=_seed, default=0, metavar="N")
     command.add_argument(
         "--cap", type=_positive, metavar="SECONDS",
-        help="most training time of a method (default 60)",
+        help="most training of a method, counted in operations, 4e10 a second (default 60)",
     )  # fmt: skip
     _add_output_options(command)
     return found

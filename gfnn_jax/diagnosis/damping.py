@@ -124,7 +124,7 @@ def learn_damping(
     if not b > 0 or not abs(b - 1) > max(3 * error, _CERTAIN * deviation):
         return None
     if len(data.training) > _PLENTY * _SAMPLE:
-        some = data.take(np.concatenate([data.training[:_SAMPLE], data.validation]))
+        some = data.take(np.concatenate([data.training[:_SAMPLE], data.validation[:_SAMPLE]]))
         if learn_damping(some, jacobians, error, chart, reversor) is None:
             return None
     start = LearnedDamping(np.asarray(b), np.asarray(np.inf), np.zeros(dim))
