@@ -6,6 +6,8 @@ import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from gfnn_jax.budget import ROWS, Budget
 from gfnn_jax.candidates.assemble import composed, measured
 from gfnn_jax.candidates.candidate import Candidate
@@ -75,7 +77,9 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
         compile_seconds += assembled.compile_seconds
         tried.append((assembled.candidate, assembled.failed, entry))
         expected = max(bound, _CONFIRMED * entry.candidate.validation_bound)
-        if assembled.candidate.validation_bound <= expected or not assembled.compiled:
+        if not assembled.compiled:
+            break
+        if np.isfinite(found := assembled.candidate.validation_bound) and found <= expected:
             break
     candidate, _, entry = min(
         tried, key=lambda t: (t[0].validation_bound > bound, t[0].validation_bound, t[1])
