@@ -29,6 +29,7 @@ from gfnn_jax.fitting.significance import null_terms, significant, significant_t
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.models.hamiltonians.arcs import arcs_of
 from gfnn_jax.models.hamiltonians.centrifugal import centrifugal_terms
+from gfnn_jax.models.hamiltonians.formula import OnPartial
 from gfnn_jax.models.hamiltonians.friction import (
     Forces,
     beside_friction,
@@ -84,11 +85,13 @@ def learn_hamiltonian(
     say: Callable[[str], Any] = lambda message: None,
     options: Options = OPTIONS,
     dearest: float = np.inf,
+    partly: OnPartial = lambda law: None,
 ) -> LearnedHamiltonian:
     """The Hamiltonian of these pairs: the smallest library that meets the tolerance, else the best.
 
     data: without a base map. scene: lends its features and reversor. terms: a user's own.
-    dearest: as of `LawWork`.
+    dearest: as of `LawWork`. partly: called with laws of physics that explain a part, where none
+    explains all.
 
     Raises FitError where no library can be tried, OutOfTime where the budget ends before the first.
     """
@@ -108,7 +111,7 @@ def learn_hamiltonian(
             data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
         )
         own = LawWork(problem, budget, most, dearest)
-        whole = law_of_sequences(problem, own, data, tolerance, say)
+        whole = law_of_sequences(problem, own, data, tolerance, say, partly)
         if whole is not None:
             seconds = time.perf_counter() - started
             problem.allowance = UNBOUNDED
@@ -136,7 +139,7 @@ def learn_hamiltonian(
             early = _small_polynomials(problem, work, data, tolerance, options, say)
             best = early[-1] if early and _is_exact(early[-1], tolerance) else None
         if best is None:
-            best = law_of_physics(problem, work, data, tolerance, say)
+            best = law_of_physics(problem, work, data, tolerance, say, partly)
         if best is None:
             best = with_masses = mechanical(problem, work, data, tolerance)
     if best is None or not best.error.bound <= tolerance.bound:
