@@ -182,9 +182,8 @@ def as_file(case: Case) -> Case:
 
 def partial_law() -> Case:
     """A wrapped angle as a file: terms that meet nothing are not called H."""
-    case = as_file(wrapped_angle())
-    words = (*case.words, "best partial law: ")
-    return dataclasses.replace(case, words=words, never=("H = ", *_CLEAN), max_seconds=120.0)
+    never = ("H = ", *_CLEAN)
+    return dataclasses.replace(as_file(wrapped_angle()), never=never, max_seconds=120.0)
 
 
 def velocities() -> Case:
