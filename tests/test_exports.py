@@ -410,6 +410,16 @@ def test_the_file_tells_where_it_comes_from_and_keeps_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("relative", "told"), [(True, "relative to each"), (False, "in the data's units")]
+)
+def test_the_tolerance_is_told_as_it_was_asked_for(relative, told, tmp_path):
+    plain = dataclasses.replace(map_in(MIDPOINT, 1, 3)[0], coordinates=CARTESIAN)
+    fit = {"tolerance": 1e-3, "tolerance_is_relative": relative}
+    plain.save(tmp_path / "mine", record={"fit": fit})
+    assert f"tolerance asked for, {told}" in gfnn.export(tmp_path / "mine", "c").read_text()
+
+
+@pytest.mark.parametrize(
     "kind", ["type 2", *(pytest.param(k, marks=pytest.mark.slow) for k in ("an angle", "law"))]
 )
 def test_stablehlo_is_the_maps_own_step(kind, tmp_path):

@@ -145,7 +145,10 @@ def iterate(
     before, after = first.merit, second.merit
     smaller = after < before
     done = smaller & ~_goes_on(second.error, after, before, settled)
-    begun = ~done & (smaller | (first.error > settled)) & (most > 1)
+    # A lane whose first step is no number, as of a state that a rollout has given up, would halve
+    # it in vain at every step of the batch.
+    leads_on = jnp.isfinite(before) & jnp.isfinite(largest(step))
+    begun = ~done & leads_on & (smaller | (first.error > settled)) & (most > 1)
     straight = (second.error <= settled) | (after <= RULES.straight * before)
     state = where(smaller & ~begun, second, first)._replace(
         factor=jnp.where(straight, ones, RULES.begin * ones),
