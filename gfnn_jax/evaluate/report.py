@@ -137,10 +137,19 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
     if fit.hamiltonian is None or fit.formula is None:
         return None
     law = fit.hamiltonian
+    which = law.which_friction
     return {
         "formula": fit.formula,
         "terms": [term._asdict() for term in law.terms],
         "friction": [term._asdict() for term in law.friction],
+        "which_friction": None
+        if which is None
+        else {
+            "kinds": list(which.kinds),
+            "odds": which.odds,
+            "limits": which.limits,
+            "text": str(which),
+        },
         "constants": [term._asdict() for term in law.constants],
         "symmetries": list(law.symmetries),
         "fractions": [str(p) for p in law.proposals],

@@ -302,17 +302,21 @@ def fit(
     Raises FitError, in one line, where the data are too few or not finite or a chart that was asked
     for is singular over them (naming the chart to use instead). Warns (FitWarning) where nothing
     meets the tolerance, where a chart is close to singular, where pairs contradict their neighbours
-    (a few are left out), and where the pairs do not look symplectic.
+    (a few are left out), and where the pairs do not look symplectic; of a recording where its law
+    did not converge, misses a drive, or has an input of no effect.
     """
     options = dataclasses.replace(options or FitOptions(), **changes)
     if isinstance(pairs, Recording):
         _check_of_recording(scene, options)
         if options.learn == "map":
             return fit_positions(pairs, options, clock, on_progress, on_candidate)
-        return fit_recording(
+        law = fit_recording(
             pairs, friction=options.friction, input_hold=options.input_hold, mass=options.mass,
             terms=tuple(options.terms), loss=options.loss, on_progress=on_progress,
         )  # fmt: skip
+        for message in law.messages:
+            warnings.warn(message, FitWarning, stacklevel=2)
+        return law
     if options.loss is not None:
         raise FitError("a loss is of a recording whose law is learned: expected none of pairs")
     budget = options.budget(clock, pairs.dim if isinstance(pairs, Pairs) else None, spent)

@@ -103,7 +103,10 @@ def law_of_sequences(
 def _stretches(data: Dataset) -> list[np.ndarray]:
     """States (L, 2d) of the training sequences without gaps, their angles going on over turns."""
     rows = np.sort(data.training)[:_LOOKED_AT]
-    breaks = np.flatnonzero(~next_of(data.pairs, rows)) + 1
+    goes_on = next_of(data.pairs, rows)
+    if not goes_on.any():
+        return []
+    breaks = np.flatnonzero(~goes_on) + 1
     moved = data.y1 - data.y0
     return [
         np.concatenate([data.y0[own[:1]], data.y0[own[0]] + np.cumsum(moved[own], axis=0)])

@@ -36,6 +36,7 @@ from gfnn_jax.models.hamiltonians.friction import (
     libraries_with,
     mechanical,
 )
+from gfnn_jax.models.hamiltonians.friction_kinds import is_smooth, without_turns
 from gfnn_jax.models.hamiltonians.learned_law import (
     Dropped,
     FittedLaw,
@@ -69,6 +70,7 @@ _POOR, _POOR_GIVEN, _POOR_STRUCTURED = 2, 3, 5
 _SMALL = 35  # terms of the libraries that are tried before laws of physics: 0.3 s of two bodies
 _EXACT = 1e-13  # of the spread: a polynomial that errs by no more is no approximation
 _TURNING = 2_000  # pairs that tell how far a step turns the states
+_AFFINE_ROWS = 50_000  # training pairs that the affine map is fitted to
 _FIRST_ROUND = 5e8  # operations that the first round of growth is expected to take
 _EXPLAINED = 0.05  # of the spread: an error below it is that of the right branch of the turns
 
@@ -150,12 +152,16 @@ def learn_hamiltonian(
                 raise
         if with_masses is not None and with_masses.error.relative <= best.error.relative:
             best = with_masses._replace(noisy=True)
-    everyone = np.arange(len(data))
+    everyone = np.arange(len(data)) if is_smooth(best.family) else best.rows
     if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
         raise FitError(
             "expected pairs of a flow: the H that was found moves faster than its steps follow"
         )
-    outside, what = None, ""
+    outside, what, far = None, "", everywhere.training[outer]
+    whole, law = everywhere, (best.family, best.fit.coefficients)
+    data, everywhere, there = (
+        without_turns(rows, *law) for rows in (data, whole, whole.validated_on(far))
+    )
     try:
         if best.noisy:
             what = "dropping the terms of H that are noise"
@@ -165,8 +171,7 @@ def learn_hamiltonian(
         what = "dropping the terms of H that the pairs do not ask for"
         with work.again(what, best.family, len(best.fit.used)):
             best = _sparse(problem, best, data, tolerance, options, say)
-        if outer.any():
-            there = everywhere.validated_on(everywhere.training[outer])
+        if len(there.validation) and outer.any():
             outside = validation_error(best.family, best.fit, there, tolerance).relative
         misses = best.error.bound > tolerance.bound and np.isfinite(dearest)
         few = len(best.fit.used) < len(everywhere.training)
@@ -176,7 +181,7 @@ def learn_hamiltonian(
                 best = _refitted(problem, best, everywhere.training, data, tolerance)
     except OutOfTime:  # what was found stands
         budget.leave_out(what, work.ended)
-    problem.allowance = UNBOUNDED
+    problem.allowance, everywhere = UNBOUNDED, whole
     of_arcs = None
     if arcs is not None:
         of_arcs = partial(covariance_root, best, problem, everywhere, best.fit.steps)
@@ -186,7 +191,8 @@ def learn_hamiltonian(
         )
         best = best._replace(error=validation_error(best.family, best.fit, of_steps, tolerance))
     noisy = best.noisy or arcs is not None
-    if noisy and best.error.bound > tolerance.bound:
+    smooth = is_smooth(best.family)  # |v|v and sign v, whole sequences turn in
+    if noisy and smooth and best.error.bound > tolerance.bound:
         what = "the fit of H to whole sequences"
         say("H: whole sequences")
         try:
@@ -241,7 +247,9 @@ def _of_libraries(
     early: the first libraries without friction, where these are fitted already.
     """
 
-    def search(forces: Forces | None = None) -> tuple[FittedLaw, Options]:
+    def search(
+        forces: Forces | None = None, data: Dataset = data
+    ) -> tuple[FittedLaw, Options]:  # fmt: skip
         known = early if forces is None else ()
         return _searched(problem, work, data, tolerance, scene, terms, options, say, forces, known)
 
@@ -435,7 +443,8 @@ def affine_error(data: Dataset, tolerance: Tolerance) -> OneStepError:
         return np.column_stack([np.ones(len(z)), z])
 
     moved = data.y1 - data.y0
-    known = np.linalg.lstsq(design(data.training), moved[data.training], rcond=None)[0]
+    rows = data.training[:_AFFINE_ROWS]
+    known = np.linalg.lstsq(design(rows), moved[rows], rcond=None)[0]
     found = data.y0[data.validation] + design(data.validation) @ known
     return measured_error(data, tolerance, to_user(data.coordinates, found))
 
