@@ -269,7 +269,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", metavar="SCENE-SEED", help="one of a scene's seeds")
     parser.add_argument("--quick", action="store_true", help="two bodies only, small sizes")
     parser.add_argument("--cap", type=float, metavar="SECONDS", default=CAP,
-                        help="most training time of a method (default %(default)g)")  # fmt: skip
+                        help="most training of a method (default %(default)g)")  # fmt: skip
     parser.add_argument("--work", type=Path, default=WORK, metavar="DIR",
                         help="where comparisons are made (default %(default)s)")  # fmt: skip
     parser.add_argument("--overwrite", action="store_true", help="compare again what is finished")

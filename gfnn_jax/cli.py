@@ -178,6 +178,7 @@ def _fit_law(
     arguments: argparse.Namespace, columns: dict[str, Any], options: dict[str, Any]
 ) -> None:
     """The law of a recording."""
+    _refuse_given(arguments, _OF_MAPS, "not for the law of a recording")
     _set_up_jax()
     from gfnn_jax.jobs.fit_recording import fit_recording
 
@@ -188,8 +189,11 @@ def _fit_law(
         )  # fmt: skip
     print(learned.fit.table)
     print(f"written to {arguments.out}")
-    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
-          "--out forecast.csv")  # fmt: skip
+    told = " --inputs FILE" if learned.fit.gains else ""
+    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000"
+          f"{told} --out forecast.csv")  # fmt: skip
+    if told:
+        print(f"      FILE holds {', '.join(learned.fit.gains)} at the times of the forecast")
 
 
 def _fit_positions(
@@ -250,6 +254,26 @@ def _hold_to(strict: bool, model: Path) -> None:
         raise WorkError(f"{model}: was written, but misses the tolerance (--strict)")
 
 
+# Options of `gfnn fit` that the law of a recording has not; options of `gfnn predict` for steps of
+# a map, and for the forecast of a recording.
+_OF_MAPS = (
+    "tolerance", "absolute_tolerance", "strict", "family", "chart", "ensemble", "scene", "devices",
+    "max_seconds", "max_operations", "resume", "distributed",
+)  # fmt: skip
+_OF_STEPS = ("dt", "samples", "horizon", "outside", "devices", "distributed", "resume")
+_OF_FORECAST = ("estimate_from", "inputs", "compare")
+
+
+def _refuse_given(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
+    """Raise InputError where one of these options was given."""
+    values = {name: getattr(arguments, name, None) for name in names}
+    given = [
+        f"--{n.replace('_', '-')}" for n, value in values.items() if value not in (None, False)
+    ]
+    if given:
+        raise InputError(f"{', '.join(given)}: {why}")
+
+
 def _predict(arguments: argparse.Namespace) -> None:
     if not arguments.resume:
         ensure_new(arguments.out, arguments.overwrite)
@@ -259,7 +283,9 @@ def _predict(arguments: argparse.Namespace) -> None:
     if are_recordings(arguments.initial) and (
         arguments.compare is not None or _is_law(arguments.model)
     ):  # a map of positions has no bands in its file of states: with --compare it forecasts too
+        _refuse_given(arguments, _OF_STEPS, "not for the forecast of a recording")
         return _forecast(arguments)
+    _refuse_given(arguments, _OF_FORECAST, "only for the forecast of a recording by its law")
     if arguments.num_steps is None:
         raise InputError("expected --num-steps: how many steps to predict")
     with contextlib.ExitStack() as stack:
@@ -376,6 +402,17 @@ def law_line(report: dict[str, Any]) -> str:
     return f"{'' if chosen else 'not chosen: '}H = {law['formula']}"
 
 
+def error_line(fit: dict[str, Any]) -> str:
+    """Line about the one-step error, its bound, and the tolerance that this bound is held to."""
+    unit = "of the spread" if fit["tolerance_is_relative"] else "in the data's units"
+    return (
+        f"one-step error {fit['validation_rms']:.2e} in the data's units, "
+        f"{fit['validation_relative']:.2e} of the spread; 95 % bound "
+        f"{fit['validation_bound']:.2e}, tolerance {fit['tolerance']:g} {unit}: "
+        f"{'met' if fit['tolerance_met'] else 'not met'}"
+    )
+
+
 def _summarise(ran: Any, out: Path) -> None:
     if ran is None:
         print(f"{out}: already holds the result of this job")
@@ -385,18 +422,16 @@ def _summarise(ran: Any, out: Path) -> None:
     _print_table(candidates_table(ran.fit))
     report = ran.report
     fit, defect = report["fit"], report["map"]["symplecticity_defect"]
-    print(
-        f"{report['model']['chart']} {report['model']['label']}: one-step error "
-        f"{fit['validation_rms']:.2e}, {fit['validation_relative']:.2e} of the spread (tolerance "
-        f"{fit['tolerance']:g}), symplecticity defect "
-        + (f"{defect:.1e}" if defect is not None else "not looked at")
-    )
+    print(f"{report['model']['chart']} {report['model']['label']}: {error_line(fit)}")
+    print(f"symplecticity defect {'not computed (no time)' if defect is None else f'{defect:.1e}'}")
     if report["hamiltonian"] is not None:
         print(law_line(report))
         for note in report["hamiltonian"]["notes"]:
             print(note)
         for loss in report["hamiltonian"]["friction"]:
             print(f"{loss['term']}: {loss['coefficient']:.6g} ± {loss['std']:.1g}")
+    for law in ran.fit.partial_laws:
+        print(law)
     print(fit["ended"])
     rollout = report["rollout"]
     if rollout is not None:

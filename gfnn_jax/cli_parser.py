@@ -119,7 +119,8 @@ def parser() -> argparse.ArgumentParser:
     add_column_options(command)
     command.add_argument(
         "--despite", type=_kinds, metavar="KIND", default=(),
-        help="of a recording: a mistake that gfnn look names and that is none, by its kind",
+        help="of a recording: fit although gfnn look finds these mistakes, by kind (in brackets "
+        "after the word wrong), joined by commas",
     )  # fmt: skip
     command.add_argument(
         "--distributed", action="store_true",
@@ -162,7 +163,10 @@ def parser() -> argparse.ArgumentParser:
         help="another time step than that of the data, for a model of a Hamiltonian or of pairs "
         "with several time steps",
     )  # fmt: skip
-    command.add_argument("--out", type=Path, metavar="FILE", required=True, help=".npz to write")
+    command.add_argument(
+        "--out", type=Path, metavar="FILE", required=True,
+        help="file to write: .npz, or for the forecast of a recording .npz or .csv",
+    )  # fmt: skip
     command.add_argument(
         "--samples", type=_count, metavar="N",
         help="maps drawn from the model's posterior: adds std and quantiles to FILE",
@@ -172,8 +176,8 @@ def parser() -> argparse.ArgumentParser:
         help="with --samples: adds the step at which the band of the position exceeds SIZE",
     )  # fmt: skip
     command.add_argument(
-        "--outside", choices=("continue", "stop"), default="continue",
-        help="what to do where a trajectory leaves the data's domain (default %(default)s)",
+        "--outside", choices=("continue", "stop"),
+        help="what to do where a trajectory leaves the data's domain (default continue)",
     )  # fmt: skip
     command.add_argument(
         "--devices", type=_devices, metavar="all|N",
@@ -217,7 +221,7 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--seed", type=_seed, default=0, metavar="N")
     command.add_argument(
         "--cap", type=_positive, metavar="SECONDS",
-        help="most training time of a method (default 60)",
+        help="most training of a method, counted in operations, 4e10 a second (default 60)",
     )  # fmt: skip
     _add_output_options(command)
     return found
@@ -264,7 +268,7 @@ def _reader(kind: Kind) -> Callable[[str], Any]:
         with contextlib.suppress(ValueError):
             if kind.holds(value := kind.read(text)):
                 return value
-        raise argparse.ArgumentTypeError(f"expected {kind.words}, got {text}")
+        raise argparse.ArgumentTypeError(f"expected {kind.typed or kind.words}, got {text}")
 
     return read
 

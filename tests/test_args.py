@@ -187,7 +187,7 @@ def test_a_map_without_a_flow_has_parameters_too():
     found, _ = fit.map.step(z, {"k": strength}, dt=1.0)  # its own dt
     error = np.asarray(found) - kicked(z, strength)
     assert np.abs(error - 2 * np.pi * np.round(error / (2 * np.pi))).max() < 1e-13
-    with pytest.raises(ValueError, match="a map of dt = 1 only: fit with learn='hamiltonian'"):
+    with pytest.raises(ValueError, match="this is a map of dt = 1 only"):
         fit.map.step(z, {"k": strength}, dt=0.5)
 
 
@@ -337,9 +337,11 @@ DT = np.linspace(0.1, 0.2, 40)
         (0.1, {"q1": DT}, {}, "'q1' cannot name a parameter"),
         (0.1, {"arm length": DT}, {}, "letters, digits and _ as a parameter's name"),
         (0.1, {"l": np.where(DT > 0.19, np.nan, DT)}, {}, "finite values of l, got 4 of 40"),
-        (DT, {"l": DT}, {"learn": "map"}, "the pairs differ in their dt: expected learn='auto'"),
-        (DT, {"l": DT}, {"chart": "type2"}, "the pairs differ in their dt: expected learn='auto'"),
-        (0.1, {"l": DT}, {"family": "sines"}, "the pairs differ in their parameters"),
+        (DT, {"l": DT}, {"learn": "map"}, "and in parameters: only H is learned of them"),
+        (DT, {"l": DT}, {"chart": "type2"}, "and no learn='map'; got chart='type2'"),
+        (0.1, {"l": DT}, {"family": "sines"}, "or 'polynomial' and no base, got family='sines'"),
+        (0.1, {"l": DT}, {"base": "p**2/2"}, "no base, got family='auto' and a base"),
+        (DT, None, {"family": "sines"}, "chart 'auto' or 'midpoint' and no base, got family='si"),
         (0.1, {"l": DT}, {"terms": ["m*p**2"]}, "has the name 'm'"),
     ],
 )

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 import warnings
 from importlib.metadata import version
 
@@ -20,15 +21,16 @@ import pytest
 from gfnn_jax import cli, scenes
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
-from gfnn_jax.errors import FitWarning
+from gfnn_jax.errors import FitError, FitWarning
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import CHARTS, MIDPOINT
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.jobs import fit as jobs_fit
+from gfnn_jax.jobs import fit_recording, progress, search
 from gfnn_jax.jobs import predict as predict_job
-from gfnn_jax.jobs import progress, search
 from gfnn_jax.learn import check
 from gfnn_jax.learn import fit as learn_fit
 from gfnn_jax.learn.options import OPTIONS
@@ -73,6 +75,12 @@ def oscillator(num, times, seed=0):
 def pairs_file(path, z=None, **more):
     z = oscillator(200, [0, DT]) if z is None else z
     np.savez(path, **({"z0": z[:, 0], "z1": z[:, 1], "dt": DT} | more))
+    return path
+
+
+def recording_file(path):
+    lines = ["t,theta", *(f"{t:.2f},{np.cos(t):.6f}" for t in np.arange(0, 9, 0.1))]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
 
@@ -222,6 +230,15 @@ BAD_USAGE = [
     (("predict", "{model}", "{to}", "--outside", "maybe"), "invalid choice: 'maybe'"),
     (("predict", "{model}", "{to}", "--out", "{data}"), "exists already"),
     (("predict", "{model}", "{to}", "--out", "{new}.csv"), "is written as .npz"),
+    (("fit", "{data}", "--out", "{new}", "--max-seconds", "None"),
+     "expected a finite number > 0, in seconds, got None"),
+    (("fit", "{data}", "--out", "{new}", "--max-operations", "None"),
+     "expected a whole number of operations, got None"),
+    (("predict", "{model}", "{to}", "--inputs", "{data}", "--estimate-from", "3"),
+     "--estimate-from, --inputs: only for the forecast of a recording by its law"),
+    (("fit", "{swing}", "--out", "{new}", "--tolerance", "1e-3", "--strict"),
+     "--tolerance, --strict: not for the law of a recording"),
+    (("fit", "{swing}", "--out", "{new}", "--despite", "sgin"), "different systems, got 'sgin'"),
 ]  # fmt: skip
 
 
@@ -252,6 +269,7 @@ def test_refusals(arguments, message, tmp_path, model, capsys, monkeypatch):
         "few": pairs_file(tmp_path / "few.npz", z[:2]),
         "sixteen": pairs_file(tmp_path / "sixteen.npz", z[:7]),
         "odd": pairs_file(tmp_path / "odd.npz", np.ones((9, 2, 3))),
+        "swing": recording_file(tmp_path / "swing.csv"),
     }  # fmt: skip
     before = files(tmp_path)
     expanded = [b for a in arguments for b in (to if a == "{to}" else [a.format(**places)])]
@@ -606,6 +624,52 @@ def test_failing_arithmetic_is_one_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(search, "fit", fail)
     assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m") == 1
     assert capsys.readouterr().err.strip().endswith("the fit failed: SVD did not converge")
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (FitError("no law follows it"), 2, "gfnn: no law follows it"),
+        (np.linalg.LinAlgError("Singular matrix"), 1, "gfnn: the fit failed: Singular matrix"),
+    ],
+)
+def test_a_recording_without_a_law_is_one_line(error, status, line, tmp_path, capsys, monkeypatch):
+    def fail(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr(fit_recording, "learn_fit", fail)
+    data = recording_file(tmp_path / "swing.csv")
+    assert gfnn("fit", data, "--out", tmp_path / "m") == status
+    assert capsys.readouterr().err.splitlines()[-1] == line
+
+
+def test_warnings_of_a_law_are_warnings(monkeypatch):
+    law = types.SimpleNamespace(messages=("a drive is missing",))
+    monkeypatch.setattr(learn_fit, "fit_recording", lambda *args, **kwargs: law)
+    recording = Recording({"t": np.arange(9.0), "x": np.arange(9.0)}, positions=["x"])
+    with pytest.warns(FitWarning, match="a drive is missing"):
+        assert learn_fit.fit(recording) is law
+
+
+def test_a_forecast_takes_no_options_of_steps(model, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "_is_law", lambda folder: True)
+    data = recording_file(tmp_path / "swing.csv")
+    to = ("--initial", data, "--num-steps", 9, "--out", tmp_path / "f.csv")
+    assert gfnn("predict", model, *to, "--samples", 3, "--outside", "continue") == 2
+    assert "--samples, --outside: not for the forecast" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("relative", "met", "end"),
+    [
+        (True, False, "1e-06 of the spread: not met"),
+        (False, True, "1e-06 in the data's units: met"),
+    ],
+)
+def test_an_error_is_told_beside_what_it_is_held_to(relative, met, end):
+    fit = {"validation_rms": 2e-6, "validation_relative": 1e-6, "validation_bound": 3e-6,
+           "tolerance": 1e-6, "tolerance_is_relative": relative, "tolerance_met": met}  # fmt: skip
+    assert cli.error_line(fit).endswith(f"; 95 % bound 3.00e-06, tolerance {end}")
 
 
 def test_warnings_are_one_line(fitted, tmp_path, capsys, monkeypatch):

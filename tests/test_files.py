@@ -1,6 +1,7 @@
 """Reading a user's data: every good file gives its numbers back, every bad one its line."""
 
 import builtins
+import dataclasses
 import subprocess
 import sys
 import tracemalloc
@@ -528,9 +529,7 @@ def test_a_summary_says_what_is_there(tmp_path):
     z0 = np.array([[0.0, 1.0], [2.0, 3.0], [4.0, 5.0], [4.0, 5.0]])
     z1 = z0 + np.array([0.5, -2.0])
     first, q, p = summary(files.read_trajectories(save(tmp_path / "a.npz", z0=z0, z1=z1, dt=0.1)))
-    assert first == (
-        "4 pairs, d = 1, dt = 0.1; sequences: 4 of 2 states, no gap inside a sequence; copies: 1"
-    )
+    assert first == "4 pairs, d = 1, dt = 0.1; sequences: 4, each of 2 states; copies: 1"
     assert q.startswith("q1: 0 to 4.5, spread 1.6")
     assert p.startswith("p1: -1 to 5, spread")
     assert p.endswith("movement in a step 2")
@@ -538,3 +537,9 @@ def test_a_summary_says_what_is_there(tmp_path):
     with pytest.warns(DataWarning, match="constant"):
         _, q, _ = summary(files.read_trajectories(path))
     assert q == "q1: 0 to 8 km, spread 2.582, movement in a step 1"
+    t = np.delete(np.arange(0, 4, 0.1), slice(20, 30))
+    z = np.stack([np.cos(t), -np.sin(t)], axis=1)
+    gap = files.read_trajectories(save(tmp_path / "g.npz", trajectories=z[None], times=t[None]))
+    assert "; sequences: 1, each of 30 states; gaps: 1; " in summary(gap)[0]
+    drawn = summary(dataclasses.replace(gap, sampled=900))[0]
+    assert drawn == "29 pairs (a sample of 900), d = 1, dt = 0.1 to 1.1; gaps: 1; copies: 0"

@@ -252,9 +252,9 @@ def test_uniform_friction_of_a_double_pendulum(tmp_path):
 def test_energy_that_no_input_explains_is_named():
     t, theta = pendulum(gamma=-0.03, end=25.0, amplitude=0.6)
     recording = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
-    fit = gfnn.fit(recording)
+    with pytest.warns(gfnn.FitWarning, match="gains energy that no input explains"):
+        fit = gfnn.fit(recording)
     assert fit.friction.terms == ()
-    assert any("gains energy that no input explains" in message for message in fit.messages)
 
 
 def test_forecasts_hold_what_their_bands_say(swing):
@@ -376,13 +376,12 @@ def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs(tmp_path):
         "w": rng.normal(size=len(t)),
     }
     recording = gfnn.Recording(table, positions=["x"], inputs=["u", "w"])
-    fit = gfnn.fit(recording, friction="linear", input_hold="linear")
+    with pytest.warns(gfnn.FitWarning, match="no force of the input w is seen"):
+        fit = gfnn.fit(recording, friction="linear", input_hold="linear")
     for name, value in (("u", 3.0), ("w", 0.0)):
         gain, std = fit.gains[name]["x"]
         assert abs(gain - value) < 4 * std < 0.05, name
-    named = [message for message in fit.messages if message.startswith("no force of input")]
-    assert len(named) == 1
-    assert "input w " in named[0]
+    assert len(fit.messages) == 1
     assert fit.friction.terms[0].coefficient == pytest.approx(0.1, rel=0.05)
     ahead = gfnn.Recording({k: v[500:] for k, v in table.items()}, positions=["x"],
                            inputs=["u", "w"])  # fmt: skip

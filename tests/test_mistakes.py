@@ -128,7 +128,7 @@ WITH_A_MAP = {
     "the inverse of no state": (lambda m: m.inverse(), "map.inverse(z); the inverse map itself is"),
     "nothing saved": (lambda m: m.rollout(Z0[:3], 9, save_every=0), "save_every >= 1"),
     "dt < 0": (lambda m: m.rollout(Z0[:3], 9, dt=-DT), "give rollout a negative num_steps"),
-    "another dt": (lambda m: m.rollout(Z0[:3], 9, dt=0.2), "fit with learn='hamiltonian'"),
+    "another dt": (lambda m: m.rollout(Z0[:3], 9, dt=0.2), "a map of dt = 0.1 only"),
     "parameters that it has not": (
         lambda m: m.rollout(Z0[:3], 9, params={"l": 1.0}), "learned without"),
     "the time of no drive": (lambda m: m.rollout(Z0[:3], 9, t0=np.zeros(3)), "without a drive"),

@@ -199,6 +199,32 @@ def test_only_a_few_lanes_of_a_batch_are_in_the_loop():
     assert set(widths(together.jaxpr)) == {32}
 
 
+LINEARISED = []
+
+
+def counting(_, theta, x):
+    jax.debug.callback(lambda: LINEARISED.append(1))
+    return x * x - theta
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_lane_that_has_stopped_takes_no_updates(bad):
+    """A rollout keeps NaN in the place of a state that it has given up: no later step waits for
+    it. Evaluations of one lane: the linearisation at the guess and the residual after an update."""
+    theta, guess = 1.0 + 1e-3 * np.arange(40.0)[:, None], np.ones((40, 1))
+
+    def evaluations(theta, guess):
+        LINEARISED.clear()
+        jax.block_until_ready(solved(PerLane(counting), theta, guess))
+        jax.effects_barrier()
+        return len(LINEARISED)
+
+    guess = np.sqrt(theta)
+    good = evaluations(theta, guess)
+    theta[5] = guess[5] = bad
+    assert evaluations(theta, guess) == good
+
+
 # Derivatives.
 
 

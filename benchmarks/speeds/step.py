@@ -119,6 +119,7 @@ def step(quick: bool) -> Numbers:
             fresh_newton = timed(lambda: rollout(plain, z, num_steps, save_every=num_steps), 3)  # noqa: B023
             row["against_newton"] = fresh_newton.seconds / batch
         measured[name] = row
+        print(f"  {name}: {row}", flush=True)
     return measured
 
 
@@ -126,6 +127,6 @@ def waiting(batch: Callable[[], Any]) -> float:
     """Seconds of a rollout in which every lane of a batch waits for the one that takes longest."""
     with mock.patch.object(newton, "_FEWEST", LANES):
         jax.clear_caches()
-        seconds = timed(batch, 3).seconds
+        seconds = timed(batch, 1).seconds
     jax.clear_caches()
     return seconds

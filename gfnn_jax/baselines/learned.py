@@ -52,9 +52,9 @@ class Sequences:
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """Randomness and time of a training.
+    """Randomness and length of a training.
 
-    key: a ``jax.random.key``. cap: most seconds of training, compilation apart; None for no cap.
+    key: a ``jax.random.key``. cap: most operations of the training, counted; None for no cap.
     say: called with a line on the progress of the training.
     """
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gfnn_jax.data.faults import Fault, faults
+from gfnn_jax.data.faults import WRONG, Fault, faults
 from gfnn_jax.data.roles import ROLES
 from gfnn_jax.data.traits import Traits, traits
 from gfnn_jax.errors import InputError
@@ -163,12 +163,19 @@ def summarise(recording: Recording, options: Mapping[str, Any] | None = None) ->
 
 def refuse_mistakes(recording: Recording, despite: Sequence[str] = ()) -> None:
     """Raises InputError, a line with what mends it, where the samples show a mistake that makes a
-    fit meaningless; kinds of `Fault` in ``despite`` are let pass."""
+    fit meaningless; kinds of `Fault` in ``despite`` are let pass. Raises InputError for a kind
+    that is none."""
+    unknown = [kind for kind in despite if kind not in WRONG]
+    if unknown:
+        raise InputError(f"--despite: expected some of {', '.join(WRONG)}, got {unknown[0]!r}")
     wrong = [f for f in faults(traits(recording)) if f.wrong and f.kind not in despite]
     if wrong:
-        more = f"; {len(wrong) - 1} more: gfnn look" if len(wrong) > 1 else ""
+        more = f" gfnn look shows {len(wrong) - 1} more." if len(wrong) > 1 else ""
         kind = shlex.quote(wrong[0].kind)
-        raise InputError(f"{recording.source}: {wrong[0]} (or --despite {kind}){more}")
+        raise InputError(
+            f"{recording.source}: {wrong[0]}. If the data are right, fit with --despite {kind}."
+            f"{more}"
+        )
 
 
 def _motion(known: Traits) -> tuple[float | None, energy.Loss | None]:

@@ -127,6 +127,7 @@ def _remarks(column: Column) -> str:
 
 def _fault(fault) -> Text:
     text = Text(
-        "wrong: " if fault.wrong else "note: ", style="bold red" if fault.wrong else "yellow"
+        f"wrong ({fault.kind}): " if fault.wrong else "note: ",
+        style="bold red" if fault.wrong else "yellow",
     )
     return text.append(str(fault), style="not bold default")

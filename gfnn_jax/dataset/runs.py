@@ -130,4 +130,15 @@ def first_occurrences(pairs: Pairs) -> np.ndarray:
     given = [] if not np.ndim(pairs.dt) else [pairs.dt]
     given += [np.asarray(values) for values in (pairs.args or {}).values()]
     rows = np.column_stack([np.asarray(pairs.z0), np.asarray(pairs.z1), *given])
+    if _all_differ(rows):
+        return np.arange(len(rows))
     return np.sort(np.unique(rows, axis=0, return_index=True)[1])
+
+
+def _all_differ(rows: np.ndarray) -> bool:
+    """Whether no two rows (n, k) have one sum of their bits times random factors: then all differ.
+    Sorting these sums takes a tenth of the time of sorting the rows."""
+    bits = (rows + 0.0).view(np.uint64)  # no zero is negative
+    factors = np.random.default_rng(0).integers(2**63, size=rows.shape[1], dtype=np.uint64) | 1
+    sums = np.sort(bits @ factors)
+    return not (sums[1:] == sums[:-1]).any()

@@ -86,15 +86,24 @@ def as_varied(
     of_dt = differs == "dt" and not pairs.args and structure is None and learn != "hamiltonian"
     if of_dt and base is None and family in _OF_DT and chart in ("auto", "midpoint"):
         return pairs, learn, messages
-    if of_dt and (learn == "map" or chart != "auto"):
+    asked = {"learn": learn, "family": family, "chart": chart}
+    came = [f"{name}={value!r}" for name, value in asked.items() if value != "auto"]
+    came += ["a base"] if base is not None else []
+    if differs == "parameters":
+        expected = f"family {' or '.join(map(repr, families))} and no base"
+        got = f"family={family!r}" + " and a base" * (base is not None)
+        raise FitError(f"the pairs differ in their parameters: expected {expected}, got {got}")
+    if of_dt:
         raise FitError(
-            "the pairs differ in their dt: expected no base, the family auto or polynomial and "
-            f"the chart auto or midpoint, for S of dt; got {family} and {chart}"
+            "the pairs differ in their dt: expected family 'auto' or 'polynomial', chart 'auto' or "
+            f"'midpoint' and no base, got {', '.join(came)}"
         )
-    if learn == "map" or (family, chart) != ("auto", "auto") or base is not None:
+    if came and came != ["learn='hamiltonian'"]:
+        beside = " and in parameters" if pairs.args else ""
         raise FitError(
-            f"the pairs differ in their {differs}: expected learn='auto' or 'hamiltonian', and no "
-            "family, chart or base, for S is that of one dt"
+            f"the pairs differ in their dt{beside}{' of a structure' * (structure is not None)}: "
+            "only H is learned of them, expected no family, chart or base, and no learn='map'; got "
+            + ", ".join(came)
         )
     return pairs, "hamiltonian", messages
 

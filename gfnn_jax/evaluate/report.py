@@ -79,6 +79,7 @@ def assemble(
             "messages": list(fit.messages),
         },
         "hamiltonian": _hamiltonian(fit),
+        "partial_laws": [law._asdict() for law in fit.partial_laws],
         "map": {
             "multiplier": fit.map.multiplier(),
             "damping": _damping(fit),

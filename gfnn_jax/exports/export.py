@@ -83,10 +83,13 @@ def _about(folder: Path | None) -> dict[str, Any]:
         return about
     about["model"] = f"{folder.name}, SHA-256 {saved.digest(folder)}"
     record = saved.record(folder)
+    fit = record.get("fit")
+    relative = not isinstance(fit, Mapping) or fit.get("tolerance_is_relative", True)
+    unit = "relative to each coordinate's spread" if relative else "in the data's units"
     for part, key, told in (
         ("data", "source", "data"),
         ("data", "units", "units"),
-        ("fit", "tolerance", "tolerance asked for, relative to each coordinate's spread"),
+        ("fit", "tolerance", f"tolerance asked for, {unit}"),
         ("fit", "validation_relative", "one-step error of held-out pairs, relative"),
         ("fit", "validation_rms", "one-step error of held-out pairs, in the data's units"),
     ):

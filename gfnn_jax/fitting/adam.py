@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gfnn_jax.families import Family
+from gfnn_jax.fitting.operations import operations_of
 from gfnn_jax.phase_space import require_x64
 
 Rows = Float[Array | np.ndarray, "_ _"]
@@ -98,8 +99,9 @@ class AdamFit(NamedTuple):
 
     train_rms, validation_rms: of that epoch, per component of the loss; the first is a mean over
     its batches, while parameters moved. history: both of every epoch, (epochs,) each.
-    seconds: without compilation; with those of the run that was resumed. stopped_because: "epochs",
-    or words that say that the cap was reached, or where numbers ceased to be finite.
+    seconds: without compilation; with those of the run that was resumed. operations: counted, of an
+    epoch. stopped_because: "epochs", or words that say that the cap was reached, or where numbers
+    ceased to be finite.
     """
 
     params: Any
@@ -109,6 +111,7 @@ class AdamFit(NamedTuple):
     epochs: int
     seconds: float
     compile_seconds: float
+    operations: float
     stopped_because: str
 
 
@@ -236,9 +239,8 @@ def minimise(
                 lists of NumPy arrays and numbers (and the containers of ``params``). Given back as
                 ``resume`` the fit goes on as though it had never stopped, bit for bit on one
                 device; ``params`` then only lends its structure.
-    cap:        seconds after which no epoch is begun, compilation apart. The rate then goes through
-                its whole schedule in the time there is: what the schedule sees is the larger of the
-                share of the epochs and the share of the time that has passed.
+    cap:        operations of the training, counted (`fitting.operations`): the epochs are as many
+                as it allows, one or more, and the rate goes through its whole schedule in them.
     devices:    JAX's, of this process, among which the rows of each batch are shared out; their
                 number divides that of the rows. Batches are the same, so that the results differ by
                 rounding from those of one device, and a state may be gone on with on another
@@ -282,10 +284,10 @@ def _minimise(
         )
     length = recipe.epoch_length or num_rows // batch_size
 
-    def rates(epoch, seconds):
+    def rates(epoch):
         """The rate of each iteration of an epoch: (length,)."""
-        passed = max(epoch / recipe.epochs, seconds / cap if cap else 0.0)
-        return _rates(round(passed * recipe.epochs * length), recipe=recipe, length=length)
+        first = round(epoch / epochs * recipe.epochs * length)
+        return _rates(first, recipe=recipe, length=length)
 
     def order(epoch):
         """The rows of each batch (length, batch_size): permutations in a row that fill the epoch.
@@ -302,8 +304,12 @@ def _minimise(
         return jax.device_put(batches, among) if devices else batches
 
     started = time.perf_counter()
-    carry = _first_carry(params)
-    _run_epoch.lower(carry, given, order(0), rates(0, 0.0), train, loss=loss).compile()
+    carry, epochs = _first_carry(params), recipe.epochs
+    program = _run_epoch.trace(carry, given, order(0), rates(0), train, loss=loss)
+    operations = operations_of(program.jaxpr)
+    if cap is not None:
+        epochs = min(epochs, max(1, int(cap / operations)))
+    program.lower().compile()
     _validate.lower(params, given, validation, loss=loss).compile()
     compile_seconds = time.perf_counter() - started
 
@@ -324,13 +330,11 @@ def _minimise(
         carry = structure.unflatten([jnp.array(leaf) for leaf in resume["carry"]])
         carry = jax.device_put(carry, everywhere) if devices else carry
 
-    stopped_because = "epochs"
-    while epoch < recipe.epochs:
-        if cap is not None and epoch > 0 and seconds * (1 + 0.5 / epoch) > cap:
-            stopped_because = f"the cap of {cap:g} s"
-            break
+    capped = epochs < recipe.epochs
+    stopped_because = f"the cap of {cap:.3g} operations" if capped else "epochs"
+    while epoch < epochs:
         started = time.perf_counter()
-        batches, now_rates = order(epoch), rates(epoch, seconds)
+        batches, now_rates = order(epoch), rates(epoch)
         carry, value = _run_epoch(carry, given, batches, now_rates, train, loss=loss)
         epoch += 1
         held = _validate(carry[0], given, validation, loss=loss)
@@ -359,6 +363,7 @@ def _minimise(
         epochs=epoch,
         seconds=seconds,
         compile_seconds=compile_seconds,
+        operations=operations,
         stopped_because=stopped_because,
     )
 

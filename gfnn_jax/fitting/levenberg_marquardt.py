@@ -9,7 +9,7 @@ A itself costs less), and then tries steps θ + δ₁ + δ₂ under growing damp
 
     (AᵀA + μI) δ₁ = −Aᵀr,        (AᵀA + μI) δ₂ = −½ Aᵀ r″(δ₁, δ₁).
 
-δ₁ is the step of Levenberg (1944) and Marquardt (1963), and μ follows Nielsen (IMM-REP-1999-05).
+δ₁ is the step of Levenberg and Marquardt, and μ follows Nielsen (`solve.levenberg_marquardt`).
 δ₂ follows the bend of the valley (Transtrum & Sethna, arXiv:1201.5885): it costs a few gradient
 evaluations, no second Jacobian, and saves most of the iterations.
 
@@ -38,11 +38,11 @@ from jaxtyping import Array, Float
 from gfnn_jax.families import Family
 from gfnn_jax.fitting.training import Limits, LMResult, LMState, first_state, result_of, trained
 from gfnn_jax.phase_space import require_x64
+from gfnn_jax.solve.levenberg_marquardt import Nielsen, Tried
 
 # δ₂ is a correction: where it is not small beside δ₁ the expansion has failed and δ₁ goes alone.
 LARGEST_ACCELERATION = 0.75
-# Damping grown by 2^(1 + 2 + ... + 10) without descent: F is flat to roundoff.
-MAX_TRIALS = 11
+OF_LARGEST = 1e-3  # the first damping, of the largest entry on AᵀA's diagonal
 
 Rows = Float[Array | np.ndarray, "_ _"]
 
@@ -92,11 +92,23 @@ def levenberg_marquardt(
     chunks = jax.device_put(chunked(w, target_gradient, weight, chunk))
     held = jax.device_put((held_w, held_target, weight[None, :]))
 
-    at = partial(linearize, family, chunks, layout=layout)
-    tried = partial(attempt, family, chunks, layout=layout)
+    def linearised(theta):
+        """Trial steps from θ, of any damping: all of them share one linearisation."""
+        matrix, slope, loss = linearize(family, chunks, theta, layout=layout)
+        if not math.isfinite(float(loss)):
+            raise ValueError("∇S(params, w) is not finite on the training pairs at the start")
 
-    def descend(theta, damping):
-        return _descend(theta, damping, at, tried)
+        def tried(damping) -> Tried:
+            if math.isnan(damping):
+                damping = OF_LARGEST * float(np.max(np.diagonal(np.asarray(matrix))))
+            found = attempt(
+                family, chunks, theta, matrix, slope, np.float64(damping), layout=layout
+            )
+            trial, trial_loss, promised = found
+            decrease = float(loss - trial_loss)
+            return Tried((trial, float(trial_loss)), decrease, damping, float(promised))
+
+        return tried
 
     def validation_rms(theta):
         return math.sqrt(float(_loss(family, held, theta, layout=layout)))
@@ -108,28 +120,9 @@ def levenberg_marquardt(
         max_iterations, block, target_rms, patience, (on_progress, checkpoint)
     )  # fmt: skip
     first = first_state(theta, math.nan, validation_rms(theta)) if resume is None else resume
-    state, why = trained(first, descend, validation_rms, w.size, options)
+    state, why = trained(first, linearised, Nielsen(), validation_rms, w.size, options)
     params = unflattened(np.asarray(state.best_theta), layout)
     return result_of(state, params, compile_seconds, why)
-
-
-def _descend(theta, damping, at, tried):
-    """One iteration: (θ, F, μ) of the first trial step that lowers F, or None where none does."""
-    matrix, slope, loss = at(theta)
-    if not math.isfinite(float(loss)):
-        raise ValueError("∇S(params, w) is not finite on the training pairs at the start")
-    if math.isnan(damping):
-        damping = 1e-3 * float(np.max(np.diagonal(np.asarray(matrix))))
-    growth = 2.0
-    for _ in range(MAX_TRIALS):
-        trial, trial_loss, promised = tried(theta, matrix, slope, np.float64(damping))
-        decrease = float(loss - trial_loss)
-        # False for NaN as well: a failed factorisation or an overflow is a step too long.
-        if decrease > 0:
-            gain = decrease / float(promised)
-            return trial, float(trial_loss), damping * max(1 / 3, 1 - (2 * gain - 1) ** 3)
-        damping, growth = damping * growth, 2 * growth
-    return None
 
 
 def flattened(params):

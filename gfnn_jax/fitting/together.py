@@ -21,6 +21,7 @@ from jaxtyping import Float
 from gfnn_jax.families import Family
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.fitting.levenberg_marquardt import (
+    OF_LARGEST,
     Rows,
     attempt,
     check_rows,
@@ -31,8 +32,10 @@ from gfnn_jax.fitting.levenberg_marquardt import (
     unflattened,
 )
 from gfnn_jax.fitting.training import Limits, LMResult, LMState, first_state, result_of, trained
+from gfnn_jax.solve.levenberg_marquardt import Nielsen, Tried
 
-TOGETHER_GROWTH = 4.0  # of the damping, after a step that has not lowered F
+# One trial in an iteration: a member whose step fails waits with four times the damping.
+WAITING = Nielsen(growth=4.0, trials=1)
 
 
 def levenberg_marquardt_together(
@@ -78,11 +81,17 @@ def levenberg_marquardt_together(
     parts = np.pad(np.sqrt(shares), ((0, 0), (0, padding))).reshape(-1, *weights.shape[:2], 1)
     on_device = tuple(points), parts * weights
 
-    def descend(theta, damping):
-        theta, losses, damping = program(theta, damping)
-        if not np.isfinite(losses).all():
-            raise ValueError("∇S(params, w) is not finite on the training pairs at the start")
-        return theta, float(np.mean(losses)), np.asarray(damping)
+    def linearised(theta):
+        """The trial step of every member from θ (E, P)."""
+
+        def tried(damping) -> Tried:
+            theta_, losses, decrease, promised, used = program(theta, damping)
+            if not np.isfinite(losses).all():
+                raise ValueError("∇S(params, w) is not finite on the training pairs at the start")
+            there = theta_, float(np.mean(losses))
+            return Tried(there, *map(np.asarray, (decrease, used, promised)))
+
+        return tried
 
     def validation_rms(theta):
         return math.sqrt(float(_loss_of_mean(family, held, theta, layout=layout)))
@@ -96,17 +105,17 @@ def levenberg_marquardt_together(
         max_iterations, block, target_rms, patience, (on_progress, checkpoint)
     )  # fmt: skip
     first = first_state(theta, unknown, validation_rms(theta)) if resume is None else resume
-    state, why = trained(first, descend, validation_rms, w.size, options)
+    state, why = trained(first, linearised, WAITING, validation_rms, w.size, options)
     each = [unflattened(one, layout) for one in np.asarray(state.best_theta)]
     return result_of(state, jax.tree.map(lambda *a: np.stack(a), *each), compile_seconds, why)
 
 
 def _compiled_together(family, rows, theta, layout):
-    """One trial step of all members (θ, μ) -> (θ, F, μ), compiled."""
+    """One trial step of all members, compiled: `_try_together`'s of (θ, μ)."""
     given = (family, *jax.device_put(rows))
     unknown = np.full(len(theta), math.nan)
-    _descend_together.lower(*given, theta, unknown, layout=layout).compile()
-    return partial(_descend_together, *given, layout=layout)
+    _try_together.lower(*given, theta, unknown, layout=layout).compile()
+    return partial(_try_together, *given, layout=layout)
 
 
 def _compiled_on_devices(family, rows, theta, layout):
@@ -118,13 +127,13 @@ def _compiled_on_devices(family, rows, theta, layout):
     def compile_on(device, _) -> None:
         family, points, own = placed[device]
         unknown = np.full(1, math.nan)
-        _descend_together.lower(family, points, own[0], theta[:1], unknown, layout=layout).compile()
+        _try_together.lower(family, points, own[0], theta[:1], unknown, layout=layout).compile()
 
     def program(theta, damping):
         def of_one(i: int, device):
             family, points, own = placed[device]
             start = theta[i : i + 1], damping[i : i + 1]
-            found = _descend_together(family, points, own[i], *start, layout=layout)
+            found = _try_together(family, points, own[i], *start, layout=layout)
             return jax.tree.map(np.asarray, found)
 
         found = row_blocks.each(of_one, range(len(theta)))
@@ -135,26 +144,23 @@ def _compiled_on_devices(family, rows, theta, layout):
 
 
 @partial(jax.jit, static_argnames="layout")
-def _descend_together(family, points, weights, thetas, dampings, *, layout):
-    """One trial step of every member: θ (E, P), F and μ (E,) after it, θ as before where F did not
-    fall. The products AᵀA of all members are one batched product of matrices."""
+def _try_together(family, points, weights, thetas, dampings, *, layout):
+    """One trial step of every member: θ (E, P) and F (E,) after it, as before where F did not fall;
+    the decrease of F, the promised one, and μ (E,). The products AᵀA of all members are one batched
+    product of matrices."""
 
     def of_one(theta, damping, weight):
         chunks = (*points, weight)
         matrix, slope, loss = linearize(family, chunks, theta, layout=layout)
-        first = 1e-3 * jnp.max(jnp.diagonal(matrix))
+        first = OF_LARGEST * jnp.max(jnp.diagonal(matrix))
         damping = jnp.where(jnp.isnan(damping), first, damping)
         trial, trial_loss, promised = attempt(
             family, chunks, theta, matrix, slope, damping, layout=layout
         )
-        decrease = loss - trial_loss
-        better = decrease > 0
-        shrunk = damping * jnp.maximum(1 / 3, 1 - (2 * decrease / promised - 1) ** 3)
-        return (
-            jnp.where(better, trial, theta),
-            jnp.where(better, trial_loss, loss),
-            jnp.where(better, shrunk, TOGETHER_GROWTH * damping),
-        )
+        better = loss - trial_loss > 0
+        theta = jnp.where(better, trial, theta)
+        losses = jnp.where(better, trial_loss, loss)
+        return theta, losses, loss - trial_loss, promised, damping
 
     return jax.vmap(of_one)(thetas, dampings, weights)
 

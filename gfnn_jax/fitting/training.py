@@ -6,10 +6,12 @@ parameters are kept that fit the validation pairs best.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.errors import OutOfTime
+from gfnn_jax.solve.levenberg_marquardt import Rule, Tried, descended
 
 BLOCK = 10  # iterations that are made together: a unit of a fit's budget
 
@@ -73,11 +76,24 @@ class Limits(NamedTuple):
     told: tuple[Callable[[LMState], Any] | None, ...]
 
 
-def trained(state: LMState, descend, validation_rms, size: int, options: Limits):
-    """The last state from this one on, and why there is no further one."""
-    started, seconds_before = time.perf_counter(), state.seconds
+@dataclasses.dataclass(frozen=True)
+class _Training:
+    """A training where it stands: `solve.levenberg_marquardt` makes its iterations.
 
-    def reason_to_stop(state):
+    linearised: θ -> trial steps from there, of each damping one. size: numbers in the residual.
+    """
+
+    state: LMState
+    linearised: Callable[[Any], Callable[[Any], Tried]]
+    validation_rms: Callable[[Any], float]
+    size: int
+    options: Limits
+    started: float
+
+    @property
+    def stopped_because(self) -> str | None:
+        """The reason why there is no further iteration, None where there is one."""
+        state, options = self.state, self.options
         if state.best_validation_rms <= options.target_rms:
             return "target"
         if state.iteration >= options.max_iterations:
@@ -86,33 +102,42 @@ def trained(state: LMState, descend, validation_rms, size: int, options: Limits)
             return "no progress"
         return None
 
-    def iterate(state):
-        """The next state, or None where no step lowers F."""
-        step = descend(state.theta, state.damping)
-        if step is None:
-            return None
-        theta, loss, damping = step
-        train_rms = math.sqrt(loss / size)
-        seconds = seconds_before + time.perf_counter() - started
-        state = _next_state(state, theta, damping, train_rms, validation_rms(theta), seconds)
-        for report in options.told:
+    @cached_property
+    def _steps(self) -> Callable[[Any], Tried]:
+        return self.linearised(self.state.theta)
+
+    def tried(self, damping: Any, failures: int) -> Tried:
+        return self._steps(damping)
+
+    def moved(self, there: Any, damping: Any) -> tuple[_Training, bool]:
+        """The training at θ and F of a step, validated and reported."""
+        theta, loss = there
+        train_rms, held_rms = math.sqrt(loss / self.size), self.validation_rms(theta)
+        seconds = time.perf_counter() - self.started
+        state = _next_state(self.state, theta, damping, train_rms, held_rms, seconds)
+        for report in self.options.told:
             if report is not None:
                 report(state)
-        return state
+        further = dataclasses.replace(self, state=state)
+        return further, further.stopped_because is not None
 
-    while (stopped_because := reason_to_stop(state)) is None:
+
+def trained(
+    state: LMState, linearised, rule: Rule, validation_rms, size: int, options: Limits
+) -> tuple[LMState, str]:
+    """The last state from this one on, and why there is no further one."""
+    started = time.perf_counter() - state.seconds
+    here = _Training(state, linearised, validation_rms, size, options, started)
+    while (stopped_because := here.stopped_because) is None:
         try:
             with options.block(BLOCK):
-                for _ in range(BLOCK):
-                    further = iterate(state)
-                    if further is None:
-                        return state, "no progress"
-                    state = further
-                    if reason_to_stop(state) is not None:
-                        break
+                found = descended(here, rule, BLOCK, here.state.damping)
+                here = found.problem
         except OutOfTime:
-            return state, "budget"
-    return state, stopped_because
+            return here.state, "budget"
+        if found.stuck:
+            return here.state, "no progress"
+    return here.state, stopped_because
 
 
 def result_of(state: LMState, params, compile_seconds: float, stopped_because: str) -> LMResult:

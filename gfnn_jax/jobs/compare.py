@@ -30,9 +30,10 @@ from gfnn_jax.scenes import Scene
 from gfnn_jax.storage.outputs import atomic_folder, atomic_write, failures_as_work_errors
 from gfnn_jax.storage.partial import unfinished
 
-CAP, QUICK_CAP = 60.0, 2.0
+CAP, QUICK_CAP = 60.0, 2.0  # seconds, at the rate below
+RATE = 4e10  # counted operations of a training that a quiet core makes in a second, about
 
-__all__ = ["CAP", "OURS", "PAPER_GFNN", "QUICK_CAP", "TITLES", "Compared", "compare"]
+__all__ = ["CAP", "OURS", "PAPER_GFNN", "QUICK_CAP", "RATE", "TITLES", "Compared", "compare"]
 
 
 class Compared(NamedTuple):
@@ -56,10 +57,10 @@ def compare(
 ) -> Compared | None:
     """Learn a scene by these methods (with none named, all that apply), into the folder out.
 
-    cap: most seconds of training for each, compilation apart; 60 by default, 2 with quick. quick:
-    fewer pairs and test states. resume: keep the methods that are done; returns None where ``out``
-    has them all. Raises InputError for a scene or a method that cannot be compared, WorkError where
-    a method fails.
+    cap: most training of each, in seconds that stand for RATE counted operations, whatever the
+    machine; 60 by default, 2 with quick. quick: fewer pairs and test states. resume: keep the
+    methods that are done; returns None where ``out`` has them all. Raises InputError for a scene or
+    a method that cannot be compared, WorkError where a method fails.
     """
     scene = scene_named(name)
     if scene.parameters:
@@ -81,7 +82,7 @@ def compare(
                 continue
             progress.say(f"{TITLES[method]}: data")
             try:
-                part, rollouts = learn_and_roll(method, data, cap, progress)
+                part, rollouts = learn_and_roll(method, data, cap * RATE, progress)
             except ValueError as error:  # the results of the other methods are kept
                 raise WorkError(
                     f"{TITLES[method]}: {error} (leave it out with --methods; --resume keeps the "

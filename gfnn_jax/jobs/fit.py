@@ -21,7 +21,14 @@ from gfnn_jax.jobs.search import BEST, failures_of_arithmetic, refusals, scene_n
 from gfnn_jax.jobs.written import Ran, already_done, publish, write
 from gfnn_jax.learn.check import FEWEST
 from gfnn_jax.learn.options import FitOptions
-from gfnn_jax.learn.refit import can_be_refitted, help_refit, not_refitted, refit, work_of_refit
+from gfnn_jax.learn.refit import (
+    can_be_refitted,
+    help_refit,
+    not_refitted,
+    refit,
+    why_not,
+    work_of_refit,
+)
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.processes import Group, Share
@@ -113,8 +120,7 @@ def fit(
                     fitted = not_refitted(fitted, f"no time, it would take about {seconds:.2g} s")
             else:
                 group.told({})
-                why = "only sums of terms are (leave out --family mlp)"
-                fitted = not_refitted(fitted, why) if large else fitted
+                fitted = not_refitted(fitted, why_not(fitted.map)) if large else fitted
             progress.say("the report: the posterior, and the derivative of a step")
             fitted = fitted.settled()
             result = report.assemble(

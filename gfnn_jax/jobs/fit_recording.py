@@ -11,7 +11,7 @@ from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.evaluate import law_report, report
 from gfnn_jax.evaluate.figures_of_laws import law_figure
 from gfnn_jax.jobs.progress import SILENT, Progress
-from gfnn_jax.jobs.search import refusals
+from gfnn_jax.jobs.search import failures_of_arithmetic, refusals
 from gfnn_jax.jobs.written import REPORT
 from gfnn_jax.learn.fit import fit as learn_fit
 from gfnn_jax.learn.options import FitOptions
@@ -37,13 +37,15 @@ def fit_recording(
     """Learn the law of recordings (files), and write it with its report into the folder ``out``.
 
     columns: keywords of `gfnn_jax.read`. despite: kinds of mistakes that the files may show.
-    options: `FitOptions`. Raises InputError where `gfnn look` finds a mistake.
+    options: `FitOptions`. Raises InputError where `gfnn look` finds a mistake, or no law follows
+    the recording; WorkError where the arithmetic fails.
     """
     with refusals():
         asked = FitOptions(**options)
     recording = read(list(data), **columns)
     refuse_mistakes(recording, despite)
-    fitted = learn_fit(recording, options=asked, on_progress=progress.tell)
+    with refusals(), failures_of_arithmetic():
+        fitted = learn_fit(recording, options=asked, on_progress=progress.tell)
     result = law_report.assemble(fitted, source=recording.source, seed=asked.seed)
     kept = ("seed", "device", "data", "fit", "map", "lagrangian", "friction", "gauge")
     job = {

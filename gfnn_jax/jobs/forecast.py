@@ -44,6 +44,8 @@ def forecast_recording(
     `gfnn_jax.read` beside the roles, which the model knows.
     """
     ensure_new(out, overwrite)
+    if out.suffix not in (".csv", ".npz"):
+        raise InputError(f"{out}: a forecast is written as .csv or .npz")
     if num_steps is not None and num_steps < 0:
         raise InputError("expected --num-steps above 0: a forecast begins where a recording ends")
     map_ = load(model)

@@ -37,7 +37,7 @@ def learn_and_roll(
 ) -> tuple[dict[str, Any], Rollouts]:
     """Learn and roll out a method: the report's model, data, fit and map, and the rollouts.
 
-    cap: most seconds of training, compilation apart.
+    cap: most operations of training, counted.
     """
     told = Progress(
         lambda line: progress.say(f"{TITLES[method]}: {line}"),
@@ -99,6 +99,7 @@ def _training(training: Any, cap: float | None) -> dict[str, Any]:
         "train_rms": training.train_rms,
         "loss_rms": training.validation_rms,
         "cap": cap,
+        "operations": training.operations * training.epochs,
         "capped": "cap" in training.stopped_because,
         "stopped_because": training.stopped_because,
     }

@@ -37,6 +37,9 @@ _RIGHT = "H is right, as far as these pairs tell, and what it leaves over is noi
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _SHARE = 0.1  # of the residual, that a change of volume must explain
 _KNOWN = 1.5  # times the noise that was given: up to it, what is left over is that noise
+# Times the noise: above it a map's own error is not what noise makes of it, √(2m/N) with N rows,
+# three or more for each of the m terms.
+_OWN_ERROR = 1.5
 _ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
 _RESIDUAL_PAIRS = 2_000  # whose residuals are looked at
 _FRICTION_PAIRS = 1_000  # where the tolerance is met
@@ -286,6 +289,13 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     own, sizes_of_noise = "", ", ".join(f"{sigma:.1e}" for sigma in noise)
     if candidate.learns == "map" and entry is not None and isinstance(entry.sweep, LinearSweep):
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / data.spread) ** 2))
+        if part > _OWN_ERROR:
+            message = (
+                f"what is left over differs between neighbouring pairs, as noise does, but fits to "
+                f"either half of them differ by {part:.1g} times as much, as noise does not let "
+                "them: these functions cannot follow some of the states, as of close passages"
+            )
+            return _LeftOver(None, [message], "these functions cannot follow some of the states")
         own = f" (the map's own error is then about {part:.1g} of it)"
     hidden, reason = "", "what is left over is noise"
     if len(np.unique(sequence)) == len(sequence):

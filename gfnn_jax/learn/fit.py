@@ -46,6 +46,7 @@ from gfnn_jax.learn.stated import stated
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.hamiltonians.formula import PartialLaw
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.recordings import fit_recording
 from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS, drawn
@@ -72,6 +73,7 @@ class Fit:
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
     scene: as given. damping: of a map that loses area, by how much of it in a step. positions: of a
     map that was learned from positions alone, what its S is like; num_pairs are then triples.
+    partial_laws: where no H meets the tolerance, the laws of physics that come closest.
     stated_by: the pairs by which the chosen candidate's error was measured, and whether the map was
     fitted to them afterwards.
     validation_pairs, test_pairs: that chose, and that stated the error; None where the pairs were
@@ -101,6 +103,7 @@ class Fit:
     scene: Scene | None = None
     damping: LearnedDamping | None = None
     positions: OfPositions | None = None
+    partial_laws: tuple[PartialLaw, ...] = ()
     stated_by: str = ""
     test_pairs: Pairs | None = None
     operations: int = 0
@@ -296,17 +299,21 @@ def fit(
     Raises FitError, in one line, where the data are too few or not finite or a chart that was asked
     for is singular over them (naming the chart to use instead). Warns (FitWarning) where nothing
     meets the tolerance, where a chart is close to singular, where pairs contradict their neighbours
-    (a few are left out), and where the pairs do not look symplectic.
+    (a few are left out), and where the pairs do not look symplectic; of a recording where its law
+    did not converge, misses a drive, or has an input of no effect.
     """
     options = dataclasses.replace(options or FitOptions(), **changes)
     if isinstance(pairs, Recording):
         _check_of_recording(scene, options)
         if options.learn == "map":
             return fit_positions(pairs, options, clock, on_progress, on_candidate)
-        return fit_recording(
+        law = fit_recording(
             pairs, friction=options.friction, input_hold=options.input_hold, mass=options.mass,
             terms=tuple(options.terms), loss=options.loss, on_progress=on_progress,
         )  # fmt: skip
+        for message in law.messages:
+            warnings.warn(message, FitWarning, stacklevel=2)
+        return law
     if options.loss is not None:
         raise FitError("a loss is of a recording whose law is learned: expected none of pairs")
     budget = options.budget(clock, pairs.dim if isinstance(pairs, Pairs) else None, spent)
@@ -376,6 +383,7 @@ def fit(
         pairs=data.pairs,
         scene=scene,
         damping=seen.damping if chosen.candidate.learns == "map" else None,
+        partial_laws=() if found.met_by_law else tuple(request.partial_laws),
         stated_by=stated_by,
         test_pairs=data.pairs.take(data.test) if len(data.test) else None,
         operations=budget.operations,

@@ -3,7 +3,8 @@
 Neighbours tell an outlier where states are dense (`diagnosis.local_jacobians.outliers`); a map that
 all pairs agree on tells it anywhere. What a map cannot represent is smooth: its residual is as
 large at the neighbours. A gross error of measurement stands alone. So may a state at the rim of the
-data, as of the closest passages: the message names both.
+data, as of the closest passages; there a smaller size of the map errs far more still, while it
+finds the same gross error. Of a law, which has no sizes, a message names both.
 """
 
 from __future__ import annotations
@@ -14,12 +15,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.diagnosis.diagnosis import Diagnosis
 from gfnn_jax.learn.diagnose import diagnose_request
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched, searched
-from gfnn_jax.models.generating_functions.sweeps import LinearSweep
+from gfnn_jax.models.generating_functions.sweeps import LinearSweep, Size
 
 # A residual beyond so many times what all but two of its neighbours stay below, and the median of
 # all. Of normal noise and d = 1 it is four times the median in one of 60,000 pairs.
@@ -36,6 +38,10 @@ _TAIL, _APART = 3.0, 0.5
 # Where there is none just there: residuals below the smallest of them, down to this part of it, are
 # fewer. One or two of few pairs lie apart by chance: fewer than so many need a wider gap.
 _GAP, _SEVERAL, _WIDE_GAP = 0.6, 5, 0.1
+# A smaller size is the next one whose median residual is so many times larger. A row is at the rim
+# where that size leaves more of it by this factor, and the two differ there by so many times what
+# they do at the median.
+_COARSER, _MORE, _DIFFER = 2.0, 1.3, 3.0
 _ROUNDOFF = 1e-10  # of the spread: below it residuals are arithmetic
 _MOST = 0.12  # of the pairs: gross errors of a twentieth of the states of sequences, two pairs each
 _ROUNDS = 3  # large ones hide smaller ones
@@ -53,10 +59,10 @@ class Cleaned(NamedTuple):
 
 
 def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> Cleaned:
-    """Searched again without gross errors, as long as that lowers what is left over of the others;
-    as it is, where the tolerance is met, there are none, or too many."""
-    everyone, gone = found.data, 0
-    count = len(everyone)
+    """Searched again without gross errors, as long as that lowers what is left over of the others,
+    or without states that the map cannot follow, where the others then meet the tolerance; as it
+    is, where the tolerance is met, there are none, or too many."""
+    wrong, rim, count = np.zeros(0, int), np.zeros(0, int), len(found.data)
     request = dataclasses.replace(request, factors=None, checkpoints=None)
     for _ in range(_ROUNDS):
         size = _residuals(found)
@@ -65,28 +71,42 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
         rows, rise = _standing_alone(found.data, size, _ORDINARY), _RISE
         if not len(rows):
             rows, rise = _standing_alone(found.data, size, np.inf), _MENDED
-        if not len(rows) or gone + len(rows) > _MOST * count or request.budget.over:
+        gone = len(wrong) + len(rim) + len(rows)
+        if not len(rows) or gone > _MOST * count or request.budget.over:
             break
         others = np.setdiff1d(np.arange(len(size)), rows)
         if not _rms(size) > _SPOILT * _rms(size[others]):
             break
-        request.say(f"without {gone + len(rows)} of {count} pairs that are gross errors")
+        at_rim = _at_the_rim(found, rows)
+        request.say(f"without {gone} of {count} pairs that the map misses by far")
         data = found.data.take(others)
         diagnosis = diagnose_request(request, data)
         again = searched(request, data, diagnosis, None)
         left = _residuals(again)
         if left is not None and not _rms(left) <= rise * _rms(size[others]):
             break
-        seen, found, gone = diagnosis, again, gone + len(rows)
-    if not gone:
-        return Cleaned(seen, found, [])
-    left_out = everyone.row[~np.isin(everyone.row, found.data.row)]
-    rows = ", ".join(map(str, left_out[:5]))
-    rows += ", …" if gone > 5 else ""
-    return Cleaned(seen, found, [
-        f"{gone} of {count} pairs (rows {rows}) are gross errors beside the map of the others, or "
-        "lie at the rim of the data where it cannot follow: they were given no weight"
-    ])  # fmt: skip
+        if at_rim and left is not None:  # the tolerance is missed without these exact pairs too
+            break
+        named = found.data.row[rows]
+        wrong, rim = (wrong, np.append(rim, named)) if at_rim else (np.append(wrong, named), rim)
+        seen, found = diagnosis, again
+    messages = []
+    if len(wrong):
+        messages.append(
+            f"{_named(wrong, count)} are gross errors beside the map of the others, or lie at the "
+            "rim of the data where it cannot follow: they were given no weight"
+        )
+    if len(rim):
+        messages.append(
+            f"{_named(rim, count)} lie at the rim of the data, where S cannot follow them: the map "
+            "is fitted, and its error stated, without them"
+        )
+    return Cleaned(seen, found, messages)
+
+
+def _named(rows: np.ndarray, count: int) -> str:
+    first = ", ".join(map(str, np.sort(rows)[:5])) + (", …" if len(rows) > 5 else "")
+    return f"{len(rows)} of {count} pairs (rows {first})"
 
 
 def _rms(size) -> float:
@@ -97,27 +117,57 @@ def _residuals(found: Searched) -> np.ndarray | None:
     """(N,) what the best map leaves of every pair; of a law by its steps ÷ scale, of S in its
     gradient, which has the same unit. None where it meets the tolerance, or is neither."""
     law, data, tolerance = found.law, found.data, found.tolerance
-    entry = next(iter(found.found.ranking), None)
-    best = min(
-        (c for c in (law and law.candidate, entry and entry.candidate) if c is not None),
-        key=lambda c: c.validation_relative, default=None,
-    )  # fmt: skip
+    best = _best(found)
     if best is None or tolerance.met_by(best) or best.validation_relative <= _ROUNDOFF:
         return None
     if data.structure is not None or data.varied:
         return None
     if law is not None and best is law.candidate:
-        left = (law.flow.image(data.y0) - data.y1) / data.scale
-    elif entry is not None and isinstance(entry.sweep, LinearSweep) and _same(entry.sweep, data):
-        left = entry.sweep.residuals(entry.size)
-    else:
+        return _sizes((law.flow.image(data.y0) - data.y1) / data.scale)
+    swept = _swept(found)
+    return None if swept is None else _sizes(swept[0].residuals(swept[1]))
+
+
+def _best(found: Searched) -> Candidate | None:
+    """The more accurate of the law and the first of the generated maps."""
+    law, entry = found.law, next(iter(found.found.ranking), None)
+    both = (law and law.candidate, entry and entry.candidate)
+    known = (candidate for candidate in both if candidate is not None)
+    return min(known, key=lambda candidate: candidate.validation_relative, default=None)
+
+
+def _swept(found: Searched) -> tuple[LinearSweep, Size] | None:
+    """The sweep and size of the first generated map, where the sweep is of these pairs."""
+    entry = next(iter(found.found.ranking), None)
+    if entry is None or not isinstance(entry.sweep, LinearSweep):
         return None
+    return (entry.sweep, entry.size) if entry.sweep.data.pairs is found.data.pairs else None
+
+
+def _sizes(left: np.ndarray) -> np.ndarray:
     size = np.linalg.norm(left, axis=1)
     return np.where(np.isfinite(size), size, np.inf)
 
 
-def _same(sweep: LinearSweep, data: Dataset) -> bool:
-    return sweep.data.pairs is data.pairs
+def _at_the_rim(found: Searched, rows: np.ndarray) -> bool:
+    """Return whether these rows lie, for the most part, where S cannot follow: there a smaller
+    size of its sweep leaves more, and more than elsewhere. A gross error is the same for both."""
+    swept = _swept(found)
+    if swept is None or (found.law is not None and _best(found) is found.law.candidate):
+        return False
+    (sweep, chosen), others = swept, np.ones(len(found.data), bool)
+    others[rows] = False
+    left = sweep.residuals(chosen)
+    size = _sizes(left)
+    place = sweep.sizes.index(chosen)
+    for smaller in reversed(sweep.sizes[:place]):
+        coarse = sweep.residuals(smaller)
+        if np.median(_sizes(coarse)[others]) > _COARSER * np.median(size[others]):
+            differ = _sizes(coarse - left)
+            more = _sizes(coarse)[rows] > _MORE * size[rows]
+            apart = differ[rows] > _DIFFER * np.median(differ[others])
+            return bool(np.mean(more & apart) > 0.5)
+    return False
 
 
 def _standing_alone(data: Dataset, size, ordinary: float) -> np.ndarray:

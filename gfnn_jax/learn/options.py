@@ -22,13 +22,15 @@ RUN, FIT = ("gfnn run", "gfnn fit"), ("gfnn fit",)
 
 
 class Kind(NamedTuple):
-    """Values of an option: their description, the test of one, how text gives one, and the list of
-    them where they are few."""
+    """Values of an option: their description, the test of one, how text gives one, the list of
+    them where they are few, and the description of those that text can give, where Python takes
+    more."""
 
     words: str
     holds: Callable[[Any], bool]
     read: Callable[[str], Any] = str
     choices: tuple[str, ...] = ()
+    typed: str = ""
 
 
 def _one_of(*choices: str, or_holds: Callable[[Any], bool] = lambda value: False) -> Kind:
@@ -77,11 +79,11 @@ DEVICES = Kind(
 STRUCTURE = Kind(EXPECTED, names_structure)
 _SECONDS = Kind(
     "a finite number > 0, or None for no limit", lambda v: v in ("auto", None) or _is_positive(v),
-    float,
+    float, typed="a finite number > 0, in seconds",
 )  # fmt: skip
 _OPERATIONS = Kind(
     "a whole number of operations, or None for no limit",
-    lambda v: isinstance(v, Integral) and int(v) >= 0, int,
+    lambda v: isinstance(v, Integral) and int(v) >= 0, int, typed="a whole number of operations",
 )  # fmt: skip
 _TERMS = Kind(
     "a sequence of texts or functions of z, () for none",

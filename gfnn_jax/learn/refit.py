@@ -62,6 +62,13 @@ def can_be_refitted(map_: SymplecticMap) -> bool:
     return index is not None and hasattr(map_.pieces[index].family, "term_gradients")
 
 
+def why_not(map_: SymplecticMap) -> str:
+    """Return why `refit` cannot be done of this map, as a message says it."""
+    if _fitted_piece(map_.pieces) is None:
+        return "there was no time for a better model (a larger --max-seconds gives it)"
+    return "a refit needs a family that is linear in its coefficients (polynomial, features, sines)"
+
+
 def not_refitted(fitted: Fit, why: str) -> Fit:
     """The fit of a sample as it is, with a warning (FitWarning) that says so, and why."""
     message = (

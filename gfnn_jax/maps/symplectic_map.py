@@ -214,7 +214,7 @@ class SymplecticMap:
         return _step(self.reversed(), z, args)
 
     def over(self, dt, lanes: tuple[int, ...] = ()) -> SymplecticMap:
-        """Make the map over another dt: of the flow of one Hamiltonian, or of an S of dt.
+        """Make the map over another dt: of the flow of one law, or of an S of dt.
 
         Outside the range of dt that an S of dt was learned with, the lanes' status is 1. dt: above
         0, a number, or one per lane, of the shape ``lanes``. Raises ValueError for any other map,
@@ -232,8 +232,8 @@ class SymplecticMap:
                 )
         if len(self.pieces) != 1 or not serves_any_dt(self.pieces[0]):
             raise ValueError(
-                "only the flow of a Hamiltonian can step another dt, got a map of dt = "
-                f"{float(np.asarray(self.dt)):g} only: fit with learn='hamiltonian'"
+                f"this is a map of dt = {float(np.asarray(self.dt)):g} only. Fit a law (--learn "
+                "hamiltonian, learn='hamiltonian'), or S to pairs of several dt"
             )
         if dt.shape not in ((), lanes):
             raise ValueError(

@@ -21,10 +21,14 @@ def median_step(times: Sequence[np.ndarray]) -> float:
     return float(np.median(steps)) if len(steps) else np.nan
 
 
+def longest_step(steps: np.ndarray) -> float:
+    """The longest step that is no gap among these steps (n,)."""
+    return float(_GAP * np.quantile(steps, 0.95)) if len(steps) else np.inf
+
+
 def gaps(times: Sequence[np.ndarray]) -> list[tuple[int, float, float]]:
     """(number of the run, begin, end in s) of each gap."""
-    steps = np.concatenate([np.diff(t) for t in times])
-    longest = _GAP * np.quantile(steps, 0.95) if len(steps) else np.inf
+    longest = longest_step(np.concatenate([np.diff(t) for t in times]))
     return [
         (run, float(t[k]), float(t[k + 1]))
         for run, t in enumerate(times)

@@ -114,14 +114,15 @@ def newton_krylov(
     """Solve the lanes of ``done`` = (x, aux at x, Info) that are not ok by Newton's method.
 
     It starts from guess (B, n); each step is halved until the residual is smaller. The other lanes
-    are returned as they are.
+    are returned as they are. A guess that is not finite, as of a state that a rollout has given up,
+    takes no updates.
     """
     unit, settled = equation.unit(shared, lanes), settled_floors(guess.dtype)
     _, aux, info = done
     most, infinite = info.iterations + _MOST_NEWTON, jnp.full_like(guess, jnp.inf)
     begun = _Damped(  # the first step is zero and leads to the guess
         guess, infinite, aux, infinite[:, 0], jnp.zeros_like(guess), jnp.ones_like(guess[:, :1]),
-        info.iterations, info.status != OK,
+        info.iterations, (info.status != OK) & jnp.isfinite(largest(guess)),
     )  # fmt: skip
 
     def improve(state: _Damped) -> _Damped:

@@ -21,15 +21,17 @@ units of the noise through a robust loss (`solve.robust`). The noise may be esti
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from gfnn_jax.solve.levenberg_marquardt import Factors, Tried, descended
 from gfnn_jax.solve.robust import Loss, SoftL1, of_residuals
 
 _DEFECT = 0.1  # a defect of this many standard deviations costs as much as a residual of one
 _CLOSED = 0.1  # standard deviations, rms: arcs whose defects are smaller are orbits of the model
-_SHRINK, _GROW = 0.2, 5.0  # of the damping
+_DAMPING = Factors(1e-4, first=5e-6, grown_by=5.0, shrunk_by=0.2, least=1e-12, keeps=True)
 _SETTLED = 0.003  # of the noise: a change that needs no further iteration
 _BLOCK_BYTES = 64 * 2**20  # of the sensitivities of a block of arcs
 OUTLYING = 5.0  # standard deviations: a residual beyond does not tell the noise
@@ -146,56 +148,15 @@ def fit_arcs(
     estimated by every iteration, of (A, L, k) one factor for each of the k. None: sigma is known.
     """
     seen = np.isfinite(y)
-    known = np.where(seen, y, 0.0)
-
-    def evaluate(p: np.ndarray, x: np.ndarray, units: _Units) -> _Iterate:
-        with np.errstate(all="ignore"):
-            steps, observed = model.steps(p, x), model.observe(p, x)
-            off = np.where(seen, known - observed.values, 0.0)
-        return _Iterate.at(p, x, steps, observed, seen, off, units)
-
-    here = best = evaluate(p, x, _Units(sigma, state_scale, loss))
-    damping, converged, iteration = 1e-4, False, 0
-    closed = float(_CLOSED * np.sqrt(x.size))
-    while iteration < max_iterations:
-        iteration += 1
-        if not np.isfinite(here.cost):
-            break
-        rows = _reduced(here, leverage=least is not None)
-        there, share = here, 1.0
-        while share > 1e-3:
-            dp, dx = _solve(rows, here.steps, damping)
-            there = evaluate(here.p + share * dp, here.x + share * dx, here.units)
-            if here.gap > closed:  # arcs that are not yet orbits of the model
-                better = there.gap < (1 - 0.5 * share) * here.gap
-            else:
-                better = there.merit < here.merit * (1 + 1e-9)
-            if better:
-                break
-            damping, share = max(damping, 1e-6) * _GROW, 0.5 * share
-        if share <= 1e-3:
-            converged = here.gap <= closed  # no step lowers the cost
-            break
-        damping = max(damping * _SHRINK, 1e-12) if share == 1.0 else damping
-        gained = here.merit - there.merit
-        settled = max(here.gap, there.gap) <= closed and gained <= tolerance * here.cost
-        here = there
-        if least is not None:
-            before, here = here.units, here.rescaled(rows, least)
-            settled &= bool(np.allclose(here.units.sigma, before.sigma, rtol=_SETTLED, atol=0))
-            best = here
-        elif here.gap <= closed and (best.gap > closed or here.merit < best.merit):
-            best = here
-        if settled:
-            converged = True
-            break
-    best = best if best.gap <= closed else here
-    rows = _reduced(best)
-    return Fitted(
-        best.p, best.x, np.where(seen, best.residuals, np.nan), best.units.sigma, rows.factor,
-        rows.scores, rows.arcs[:, :, : x.shape[-1]], rows.transports,
-        best.cost if best.gap <= closed else np.inf, iteration, converged,
-    )  # fmt: skip
+    data = _Data(model, seen, np.where(seen, y, 0.0), least, tolerance)
+    here = data.at(p, x, _Units(sigma, state_scale, loss))
+    start = _AtStates(data, here, here)
+    if not np.isfinite(here.cost):
+        return start.fitted(0, converged=False)
+    found = descended(start, _DAMPING, max_iterations)
+    last: _AtStates = found.problem
+    converged = found.settled or (found.stuck and last.closed(last.here))
+    return last.fitted(found.steps, converged and bool(np.isfinite(last.here.cost)))
 
 
 def eliminated_rows(
@@ -248,6 +209,78 @@ def _linearised_at(
     off = np.where(seen, np.where(seen, y, 0.0) - observed.values, 0.0)
     units = _Units(sigma, np.ones(x.shape[-1]), loss)
     return _linearised(_Iterate.at(p, x, steps, observed, seen, off, units), slice(None))
+
+
+class _Data(NamedTuple):
+    """What arcs are fitted to: which of y (A, L, k) was seen, and y, 0 where it was not. least:
+    what of the residuals is no noise; None: the noise is known. tolerance: of the cost."""
+
+    model: Model
+    seen: np.ndarray
+    known: np.ndarray
+    least: np.ndarray | None
+    tolerance: float
+
+    def at(self, p: np.ndarray, x: np.ndarray, units: _Units) -> _Iterate:
+        """The residuals and defects of coefficients p and states x."""
+        with np.errstate(all="ignore"):
+            steps, observed = self.model.steps(p, x), self.model.observe(p, x)
+            off = np.where(self.seen, self.known - observed.values, 0.0)
+        return _Iterate.at(p, x, steps, observed, self.seen, off, units)
+
+
+@dataclasses.dataclass(frozen=True)
+class _AtStates:
+    """The problem of all arcs where a descent stands, and the best iterate that it came by.
+
+    While defects matter a step has to close them; then it has to lower the cost.
+    """
+
+    data: _Data
+    here: _Iterate
+    best: _Iterate
+
+    @cached_property
+    def _rows(self) -> _Rows:
+        return _reduced(self.here, leverage=self.data.least is not None)
+
+    def closed(self, at: _Iterate) -> bool:
+        """True where arcs are orbits of the model."""
+        return at.gap <= float(_CLOSED * np.sqrt(self.here.x.size))
+
+    def tried(self, damping: float, failures: int) -> Tried:
+        """A step of p and x; each that failed halves the next."""
+        here, share = self.here, 0.5**failures
+        dp, dx = _solve(self._rows, here.steps, damping)
+        there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
+        if self.closed(here):
+            return Tried(there, here.merit * (1 + 1e-9) - there.merit, damping)
+        return Tried(there, (1 - 0.5 * share) * here.gap - there.gap, damping)
+
+    def moved(self, there: _Iterate, damping: float) -> tuple[_AtStates, bool]:
+        """The problem at the end of a step, in units of the noise that its residuals tell; settled
+        where it gained little and, where the noise is estimated, that is the same."""
+        before, best, least = self.here, self.best, self.data.least
+        settled = self.closed(before) and self.closed(there)
+        settled &= before.merit - there.merit <= self.data.tolerance * before.cost
+        here = there
+        if least is not None:
+            best = here = there.rescaled(self._rows, least)
+            sigma = there.units.sigma
+            settled &= bool(np.allclose(here.units.sigma, sigma, rtol=_SETTLED, atol=0))
+        elif self.closed(here) and (not self.closed(best) or here.merit < best.merit):
+            best = here
+        return _AtStates(self.data, here, best), settled or not np.isfinite(here.cost)
+
+    def fitted(self, iterations: int, converged: bool) -> Fitted:
+        """The fit that ends here."""
+        best, seen = self.best if self.closed(self.best) else self.here, self.data.seen
+        rows, m = _reduced(best), best.x.shape[-1]
+        return Fitted(
+            best.p, best.x, np.where(seen, best.residuals, np.nan), best.units.sigma, rows.factor,
+            rows.scores, rows.arcs[:, :, :m], rows.transports,
+            best.cost if self.closed(best) else np.inf, iterations, converged,
+        )  # fmt: skip
 
 
 class _Units(NamedTuple):

@@ -7,10 +7,10 @@ the recording cannot be learned from as it is read; the others are notes.
 from __future__ import annotations
 
 from gfnn_jax.data.faults import angles, sensors, times, velocities
-from gfnn_jax.data.faults.fault import Fault
+from gfnn_jax.data.faults.fault import WRONG, Fault
 from gfnn_jax.data.traits import Traits
 
-__all__ = ["Fault", "faults"]
+__all__ = ["WRONG", "Fault", "faults"]
 
 _CHECKS = (
     sensors.constant, sensors.repeated, velocities.related, angles.units, angles.wraps,

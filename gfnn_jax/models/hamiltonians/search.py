@@ -29,6 +29,7 @@ from gfnn_jax.fitting.significance import null_terms, significant, significant_t
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.models.hamiltonians.arcs import arcs_of
 from gfnn_jax.models.hamiltonians.centrifugal import centrifugal_terms
+from gfnn_jax.models.hamiltonians.formula import OnPartial
 from gfnn_jax.models.hamiltonians.friction import (
     Forces,
     beside_friction,
@@ -69,6 +70,7 @@ _POOR, _POOR_GIVEN, _POOR_STRUCTURED = 2, 3, 5
 _SMALL = 35  # terms of the libraries that are tried before laws of physics: 0.3 s of two bodies
 _EXACT = 1e-13  # of the spread: a polynomial that errs by no more is no approximation
 _TURNING = 2_000  # pairs that tell how far a step turns the states
+_AFFINE_ROWS = 50_000  # training pairs that the affine map is fitted to
 _FIRST_ROUND = 5e8  # operations that the first round of growth is expected to take
 _EXPLAINED = 0.05  # of the spread: an error below it is that of the right branch of the turns
 
@@ -83,11 +85,13 @@ def learn_hamiltonian(
     say: Callable[[str], Any] = lambda message: None,
     options: Options = OPTIONS,
     dearest: float = np.inf,
+    partly: OnPartial = lambda law: None,
 ) -> LearnedHamiltonian:
     """The Hamiltonian of these pairs: the smallest library that meets the tolerance, else the best.
 
     data: without a base map. scene: lends its features and reversor. terms: a user's own.
-    dearest: as of `LawWork`.
+    dearest: as of `LawWork`. partly: called with laws of physics that explain a part, where none
+    explains all.
 
     Raises FitError where no library can be tried, OutOfTime where the budget ends before the first.
     """
@@ -107,7 +111,7 @@ def learn_hamiltonian(
             data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
         )
         own = LawWork(problem, budget, most, dearest)
-        whole = law_of_sequences(problem, own, data, tolerance, say)
+        whole = law_of_sequences(problem, own, data, tolerance, say, partly)
         if whole is not None:
             seconds = time.perf_counter() - started
             problem.allowance = UNBOUNDED
@@ -135,7 +139,7 @@ def learn_hamiltonian(
             early = _small_polynomials(problem, work, data, tolerance, options, say)
             best = early[-1] if early and _is_exact(early[-1], tolerance) else None
         if best is None:
-            best = law_of_physics(problem, work, data, tolerance, say)
+            best = law_of_physics(problem, work, data, tolerance, say, partly)
         if best is None:
             best = with_masses = mechanical(problem, work, data, tolerance)
     if best is None or not best.error.bound <= tolerance.bound:
@@ -439,7 +443,8 @@ def affine_error(data: Dataset, tolerance: Tolerance) -> OneStepError:
         return np.column_stack([np.ones(len(z)), z])
 
     moved = data.y1 - data.y0
-    known = np.linalg.lstsq(design(data.training), moved[data.training], rcond=None)[0]
+    rows = data.training[:_AFFINE_ROWS]
+    known = np.linalg.lstsq(design(rows), moved[rows], rcond=None)[0]
     found = data.y0[data.validation] + design(data.validation) @ known
     return measured_error(data, tolerance, to_user(data.coordinates, found))
 

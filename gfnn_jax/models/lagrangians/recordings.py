@@ -336,13 +336,20 @@ def _described(
         names[i]: (float(fit.p[fit.form.count + k]), float(zero_std[k]))
         for k, i in enumerate(fit.structure.zeros)
     }
-    messages = [] if fit.fitted.converged else ["the last fit had not converged"]
+    messages = []
+    if not fit.fitted.converged:
+        messages.append(
+            "the fit of the law did not converge: its coefficients and standard errors are not "
+            "reliable. Fit a shorter part of the record (--from, --to) or fewer terms (--terms)"
+        )
     if chosen[0].gains:
         messages.append(
-            "the record gains energy that no input explains: is a drive missing among the inputs?"
+            "the record gains energy that no input explains. If the system is driven, name its "
+            "drive: --inputs NAME (inputs=)"
         )
     messages += [
-        f"no force of input {u} is seen: it hardly varies, or moves nothing"
+        f"no force of the input {u} is seen: its gain is within {_SEEN:g} standard errors of 0. "
+        f"Record a stronger or more varied {u}, or leave it out of --inputs (inputs=)"
         for u, forces in gains.items()
         if all(abs(gain) < _SEEN * error for gain, error in forces.values())
     ]

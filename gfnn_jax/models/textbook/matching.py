@@ -11,11 +11,21 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import cached_property
 
 import numpy as np
 
 from gfnn_jax.models.textbook.arguments import Argument
-from gfnn_jax.models.textbook.atoms import Atom, Average, Dictionary, gradient_of, weight_of
+from gfnn_jax.models.textbook.atoms import (
+    Atom,
+    Average,
+    Dictionary,
+    constants_of,
+    gradient_of,
+    weight_of,
+    with_constants,
+)
+from gfnn_jax.solve.levenberg_marquardt import Factors, Tried, descended
 
 _BEAM = 4  # states that go on
 _PAIRED = 160  # atoms, those that explain most, whose pairs are tried
@@ -23,6 +33,9 @@ _BRANCHES = 4  # atoms, and pairs of them, that each state is continued by
 _INDEPENDENT = 1e-5  # of a column, that those before it do not span
 _HARDLY = 4.0  # times what a match leaves over, that a plainer one may leave
 _REFINEMENTS = 8  # Gauss–Newton steps of inner constants
+_DAMPING = Factors(first=1e-2, shrunk_by=0.1, least=5e-4, trials=4)  # of them, of their lengths
+_GAINED = 1e-3  # of what is left over: a step that gains less is the last
+_FARTHEST = 0.2  # of the distances: by which a centre moves in a step
 _FLOOR = 1e-13  # of what is left over: below it is roundoff
 SAID = 0.5  # halvings of what is left over that a unit of complexity must bring, of clean pairs
 
@@ -60,11 +73,14 @@ class Matching:
         """The part of the target that base and atoms do not explain."""
         return float(np.linalg.norm(self._residual(atoms)[0])) / self.size
 
-    def best(self, dictionary: Dictionary, most: int) -> list[Match]:
+    def best(
+        self, dictionary: Dictionary, most: int, starts: Sequence[tuple[Atom, ...]] = ()
+    ) -> list[Match]:
         """The matches of each number of atoms up to ``most`` that the search went on with, the
-        cheapest to say for what they leave over first."""
-        beam = [Match((), self.left_over(()))]
-        found = {frozenset[Atom](): beam[0]}
+        cheapest to say for what they leave over first. starts: atoms that it begins with too,
+        beside none."""
+        beam = [self.refined(atoms) for atoms in ((), *starts)]
+        found = {frozenset(match.atoms): match for match in beam}
         for _ in range(most):
             grown: dict[frozenset[Atom], Match] = {}
             for match in beam:
@@ -129,46 +145,23 @@ class Matching:
 
     def refined(self, atoms: tuple[Atom, ...]) -> Match:
         """The match with the inner constants that leave least."""
-        inner = [
-            (i, k) for i, atom in enumerate(atoms) for k, f in enumerate(atom)
-            if f.theta is not None
-        ]  # fmt: skip
+        inner = [(i, k) for i, atom in enumerate(atoms) for k in range(len(constants_of(atom)))]
         left = self.left_over(atoms)
         if not inner:
             return Match(atoms, left)
-        damping = 0.0
-        for _ in range(_REFINEMENTS):
-            residual, basis, coefficients = self._residual(atoms)
-            slopes = np.stack(
-                [
-                    coefficients[i] * self._flat(gradient_of(atoms[i], self.arguments, along=k))
-                    for i, k in inner
-                ],
-                axis=1,
-            )
-            slopes = slopes - basis @ (basis.T @ slopes)
-            if not (np.isfinite(slopes).all() and np.isfinite(residual).all()):
-                break
-            size = np.linalg.norm(slopes, axis=0)
-            if not (size > 0).all():
-                break
-            better = None
-            for _ in range(4):
-                rows = np.vstack([slopes / size, damping * np.eye(len(inner))])
-                step = np.linalg.lstsq(rows, np.append(residual, np.zeros(len(inner))), rcond=1e-12)
-                tried = _moved(atoms, inner, step[0] / size)
-                there = self.left_over(tried)
-                if there < left:
-                    better = tried, there
-                    break
-                damping = max(10 * damping, 1e-2)
-            if better is None:
-                break
-            gained, damping = 1 - better[1] / left, 0.1 * damping if damping > 1e-3 else 0.0
-            atoms, left = better
-            if gained < 1e-3:
-                break
-        return Match(atoms, left)
+        start = _AtConstants(self, tuple(inner), Match(atoms, left))
+        return descended(start, _DAMPING, _REFINEMENTS).problem.match
+
+    def slopes(self, match: Match, inner: Sequence[tuple[int, int]]):
+        """(residual, its slopes (rows, n) in these constants with base and coefficients
+        projected out)."""
+        residual, basis, coefficients = self._residual(match.atoms)
+        columns = [
+            coefficients[i] * self._flat(gradient_of(match.atoms[i], self.arguments, along=k))
+            for i, k in inner
+        ]
+        slopes = np.stack(columns, axis=1)
+        return residual, slopes - basis @ (basis.T @ slopes)
 
     def _residual(self, atoms: Sequence[Atom]):
         """(what is left over, an orthonormal basis of base and atoms, the atoms' coefficients)."""
@@ -218,7 +211,7 @@ class Matching:
         for k in order:
             i, j = divmod(int(k), len(top))
             pair = dictionary.atoms[top[i]], dictionary.atoms[top[j]]
-            kind = tuple(tuple((f.place, f.kind) for f in atom) for atom in pair)
+            kind = tuple(tuple(f.form for f in atom) for atom in pair)
             if kind not in seen:
                 seen.add(kind)
                 found.append(pair)
@@ -240,30 +233,70 @@ class Matching:
         told = size > _INDEPENDENT
         return np.where(told, residual @ columns / np.where(told, size, 1.0), 0.0), size
 
+    def moved(self, atoms: tuple[Atom, ...], step: np.ndarray) -> tuple[Atom, ...]:
+        """The atoms with their constants a step on. No θ more than doubles, or changes its sign; a
+        centre moves by no more than a part of the distances from it."""
+        changes, found = iter(step.tolist()), []
+        for atom in atoms:
+            moved = []
+            for factor in atom:
+                if factor.theta is not None:
+                    moved.append(
+                        factor.theta
+                        + np.clip(next(changes), -0.7 * abs(factor.theta), abs(factor.theta))
+                    )
+                far = _FARTHEST * np.abs(self.arguments[factor.place].value).max()
+                moved += [c + np.clip(next(changes), -far, far) for c in factor.centre]
+            found.append(with_constants(atom, map(float, moved)))
+        return tuple(found)
+
     def _flat(self, gradient: np.ndarray) -> np.ndarray:
         return (self._average(gradient) * self.weight).ravel()
+
+
+@dataclasses.dataclass(frozen=True)
+class _AtConstants:
+    """A match whose inner constants descend; ``inner``: (atom, factor) of each. Its cost is what
+    is left over."""
+
+    matching: Matching
+    inner: tuple[tuple[int, int], ...]
+    match: Match
+
+    @cached_property
+    def _linear(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """What is left over, the scaled slopes and their sizes; None where a slope is no number."""
+        residual, slopes = self.matching.slopes(self.match, self.inner)
+        size = np.linalg.norm(slopes, axis=0)
+        sound = np.isfinite(slopes).all() and np.isfinite(residual).all() and (size > 0).all()
+        return (residual, slopes / size, size) if sound else None
+
+    def tried(self, damping: float, failures: int) -> Tried:
+        """The match with the constants of a step."""
+        if self._linear is None:
+            return Tried(None, np.nan, damping, hopeless=True)
+        residual, slopes, size = self._linear
+        rows = np.vstack([slopes, damping * np.eye(len(size))])
+        step = np.linalg.lstsq(rows, np.append(residual, np.zeros(len(size))), rcond=1e-12)[0]
+        atoms = self.matching.moved(self.match.atoms, step / size)
+        there = Match(atoms, self.matching.left_over(atoms))
+        return Tried(there, self.match.left - there.left, damping)
+
+    def moved(self, there: Match, damping: float) -> tuple[_AtConstants, bool]:
+        """The match of a step; settled where it gained little."""
+        settled = 1 - there.left / self.match.left < _GAINED
+        return dataclasses.replace(self, match=there), settled
 
 
 def _apart(order: np.ndarray, atoms: list[Atom], count: int) -> list[int]:
     """The first of each kind of atom, whatever its constant."""
     seen: dict[tuple, int] = {}
     for i in order[: 60 * count]:
-        kind = tuple((f.place, f.kind) for f in atoms[i])
+        kind = tuple(f.form for f in atoms[i])
         seen.setdefault(kind, int(i))
         if len(seen) == count:
             break
     return list(seen.values())
-
-
-def _moved(atoms, inner: list[tuple[int, int]], step) -> tuple[Atom, ...]:
-    moved = [list(atom) for atom in atoms]
-    for (i, k), change in zip(inner, step, strict=True):
-        factor = moved[i][k]
-        assert factor.theta is not None
-        # No constant more than doubles, or changes its sign, in a step.
-        change = float(np.clip(change, -0.7 * abs(factor.theta), abs(factor.theta)))
-        moved[i][k] = dataclasses.replace(factor, theta=factor.theta + change)
-    return tuple(map(tuple, moved))
 
 
 def orthonormal(columns: np.ndarray) -> np.ndarray:
