@@ -16,6 +16,7 @@ import numpy as np
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
+from gfnn_jax.dataset.rests import moving
 from gfnn_jax.dataset.stretches import Nodes, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
@@ -92,6 +93,11 @@ def fit_recording(
         seen = seen.shifted(np.where(np.isin(range(seen.dim), far), middle, 0.0))
         found = _stretches(recording, seen, angles)
     scales = measure(found)
+    if seen.is_plain:
+        found, resting = moving(found, scales)
+        if resting:
+            scales = measure(found)
+            told(f"{resting:.3g} s at rest left out")
     given = np.array([recording.std[name] or np.nan for name in seen.channels])
     scales = dataclasses.replace(scales, sigma=np.where(given > 0, given, scales.sigma))
     asked = _asked(terms, seen, options.dry_width * float(np.mean(scales.speed)))
