@@ -292,7 +292,7 @@ def test_outliers_are_left_out(pendulum_fit):
 
 def test_a_tolerance_out_of_reach_gives_the_best_and_says_so():
     kept = []
-    with pytest.warns(gfnn.FitWarning, match=r"no candidate meets.*the search ended because"):
+    with pytest.warns(gfnn.FitWarning, match=r"no candidate meets.*The search ended because"):
         fit = gfnn.fit(
             pendulum_pairs(60), chart="midpoint", family="polynomial", tolerance=1e-18,
             on_better=lambda *kind: kept.append(kind),
@@ -335,7 +335,7 @@ def test_a_map_without_all_images_is_still_given(monkeypatch):
 
 
 def test_no_time_at_all_leaves_the_linear_map_and_says_so():
-    with pytest.warns(gfnn.FitWarning, match="there was no time for one unit"):
+    with pytest.warns(gfnn.FitWarning, match="there was no time for a first model"):
         fit = gfnn.fit(pendulum_pairs(), max_seconds=1e-9)
     assert fit.chosen.label == "linear"
 

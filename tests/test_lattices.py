@@ -481,14 +481,14 @@ def test_a_structure_is_proposed_and_not_used():
         pairs = drawn(6, 60, family, params, dt)
         return " ".join(proposed(Dataset.of(pairs, CARTESIAN)))
 
-    assert "--structure ring explains" in best_of(*springs(6))
-    assert "--structure chain explains" in best_of(*springs(6, "free"))
+    assert "the structure ring explains" in best_of(*springs(6))
+    assert "the structure chain explains" in best_of(*springs(6, "free"))
     apart = body_terms(3, 2, (2, -1), alike=True)  # distances at random: near collisions apart
-    assert "--structure bodies:3 explains" in best_of(apart, np.array([0.5, 0.3, 1e-3]), 0.02)
+    assert "the structure bodies:3 explains" in best_of(apart, np.array([0.5, 0.3, 1e-3]), 0.02)
     bent = given_terms(6, [*(f"p{i}**2" for i in range(1, 7)), "q1*q3*q6", "q2**4*q5", "q1**2"])
     assert best_of(bent, np.array([0.5] * 6 + [3.0, 5.0, 1.0])) == ""
     pairs = drawn(6, 60, *springs(6), 0.1)
-    with pytest.warns(gfnn.FitWarning, match="--structure ring explains these pairs"):
+    with pytest.warns(gfnn.FitWarning, match="the structure ring explains these pairs"):
         fit = gfnn.fit(pairs, learn="map", chart="type2", tolerance=1e-12, max_seconds=10)
     assert not fit.met
 

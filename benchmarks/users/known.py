@@ -170,7 +170,7 @@ def interleaved() -> Case:
     """Columns in the order q1, p1, q2, p2."""
     laws = drawn(henon_heiles, box([0.3] * 4), 0.2, 2_000)
     data, fresh = (changed(pairs, lambda z: z[:, [0, 2, 1, 3]]) for pairs in laws)
-    return Case(data, fresh, meets=False, words=("are q and p in order",))
+    return Case(data, fresh, meets=False, words=("the order q1…qd, p1…pd",))
 
 
 def recorded(law: Field, half: Sequence[float], sigma: float) -> np.ndarray:

@@ -76,8 +76,9 @@ def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
         return Charts([CHARTS[beyond[0]]], None, judgements, [message])
     lows = ", ".join(f"{n} {j.sign * j.low:.2g}" for n, j in judgements.items())
     raise FitError(
-        f"no chart covers these data, with or without a base map (smallest determinants: {lows}): "
-        "sample with a smaller dt, or learn a smaller region"
+        f"no chart covers these data, with or without a base map: each has a determinant near 0 "
+        f"({lows}), and no generating function exists there. Take pairs of a smaller dt or of a "
+        "smaller region, or learn H, which needs no chart: --learn hamiltonian (learn=)"
     )
 
 

@@ -18,7 +18,7 @@ from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.dataset.stretches import Nodes, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
+from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.flows.motion import WEIGHTS
 from gfnn_jax.maps.estimates import law_in_use
 from gfnn_jax.maps.inputs import HOLDS, Signals
@@ -41,7 +41,7 @@ from gfnn_jax.models.lagrangians.learned_law import (
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.next_motion import Motion, next_motions
 from gfnn_jax.models.lagrangians.residuals import Trace, whiteness
-from gfnn_jax.models.lagrangians.search import SearchOptions, describe, search
+from gfnn_jax.models.lagrangians.search import NO_LAW, SearchOptions, describe, search
 from gfnn_jax.models.lagrangians.text import (
     Expression,
     Term,
@@ -49,6 +49,7 @@ from gfnn_jax.models.lagrangians.text import (
     speed_names,
     terms_of,
     which_friction_told,
+    word_of,
 )
 from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels
 from gfnn_jax.solve.robust import Loss
@@ -106,7 +107,7 @@ def fit_recording(
     acting, choice, nodes = search(*record) if asked is None else fit_given(asked, *record)
     fit, inputs_of = acting.fit, acting.bench.inputs
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
-        raise FitError("no law of the terms tried follows this recording from sample to sample")
+        raise FitError(NO_LAW)
     finer = scales.substeps_for(fit.sigma)  # local cubics may have seen more noise than there is
     if finer > scales.substeps:
         inputs_of = ArcInputs(nodes, finer, acting.hold, acting.delay)
@@ -116,7 +117,7 @@ def fit_recording(
     speeds = velocities(recording, fit, nodes)
     honest = tuple(name for name, one in speeds.items() if one.used)
     for name, one in speeds.items():
-        told(f"{name}: {one.text}")
+        told(f"velocity {name}: {one.text}")
     if honest:
         own = np.array([speeds[name].sigma for name in honest])
         seen = seen.beside({n: recording.velocities.index(n) for n in honest})
@@ -131,14 +132,17 @@ def fit_recording(
     _check_told(fit, fitted)
     law, covariance = in_columns(fit)
     names = recording.coordinates
-    gauge = f"the mean of M11 over the data is 1 ({names[0]})"
+    gauge = (
+        f"the mean inertia M11 (of {names[0]}) over the data is 1, the unit of L, R, gains and "
+        f"energies; --mass {names[0]}=VALUE (mass=) gives them theirs"
+    )
     scale = 1.0
     if mass:
         (name, value), i = next(iter(mass.items())), names.index(next(iter(mass)))
         masses = law.masses(np.concatenate([n.x[:, : fit.form.dim] for n in nodes]))
         scale = value / float(np.mean(masses[:, i, i]))
         law, covariance = scaled(law, covariance, scale)
-        gauge = f"the mean mass of {name} over the data is {value:g}"
+        gauge = f"the mean inertia of {name} over the data is {value:g}, as given"
     x = np.concatenate([n.x for n in nodes])
     d = fit.form.dim
     zeros = np.zeros(d)
@@ -153,7 +157,7 @@ def fit_recording(
         None if seen.is_plain and loss is None else fitted,
     )  # fmt: skip
     bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
-    told("bands: forecasts from windows of the record")
+    told("bands: forecasting from windows of the record")
     spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
     thirds = _thirds(bench, nodes, fit, sensors, found)
     used, horizons = calibrated(law_in_use(moving, root, sensors), thirds, found, scales, spread)
@@ -171,7 +175,7 @@ def fit_recording(
     )
     map_ = _with_sensors(map_, used.sensors)
     traces = _traces(recording, seen.channels, fit, law, nodes, zeros, inputs_of)
-    told("which motion to record next")
+    told("finding the motion to record next")
     motions = next_motions(bench, fit, angles)
     return _described(
         recording, fit, map_, law, covariance, (choice, scale), horizons, gauge, tuple(steps),
@@ -194,7 +198,7 @@ def _options(friction: str) -> SearchOptions:
 
 def _check(recording: Recording, input_hold: str, mass: Mapping[str, float] | None) -> None:
     if not recording.coordinates:
-        raise InputError(f"{recording.source}: expected positions, found none (--positions)")
+        raise InputError(f"{recording.source}: no positions. Name them: --positions (positions=)")
     if input_hold not in ("auto", *HOLDS):
         raise InputError(f"expected input_hold auto, {', '.join(HOLDS)}, got {input_hold!r}")
     for name, value in (mass or {}).items():
@@ -222,8 +226,8 @@ def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
     if open_:
         shown = ", ".join(names[i] for i in lengths)
         raise InputError(
-            f"{', '.join(open_)}: every scale of {shown} has a law of the same terms: leave it "
-            "out, or observe a velocity of known scale beside"
+            f"{', '.join(open_)}: not identifiable, for every scale of {shown} has a law of the "
+            "same terms. Take it out of --scale or --observe, or observe a velocity of known scale"
         )
     return seen, angles
 
@@ -245,8 +249,8 @@ def _check_told(fit: LawFit, seen: Observation) -> None:
         left = R[:, k] - others @ np.linalg.lstsq(others, R[:, k], rcond=None)[0]
         if not np.linalg.norm(left) > _IMITATED * size[k]:
             raise FitError(
-                f"{name}: the record does not tell it from the coefficients of the law: leave it "
-                "out, or give it as a number"
+                f"{name}: not identifiable from this record, for coefficients of the law act as it "
+                "does. Write its value into --observe (observe=), or leave it out"
             )
 
 
@@ -375,20 +379,9 @@ def _in_words(
             name: float(q / recording.factors.get(name, 1.0))
             for name, q in zip(recording.coordinates, motion.start, strict=True)
         }
-        told = {_word(key, codes, speeds): gain for key, gain in motion.gains.items()}
+        told = {word_of(key, codes, speeds): gain for key, gain in motion.gains.items()}
         named.append(NextMotion(start, told))
     return tuple(named)
-
-
-def _word(key: Any, codes: Sequence[str], speeds: Sequence[str]) -> str:
-    """A coefficient by its term."""
-    kind, *rest = key
-    one, none = np.ones(1), np.zeros(1)
-    if kind == "term":
-        return terms_of(Terms.of(rest, len(codes)), one, none, codes, speeds).terms[0].term
-    if kind == "loss":
-        return "R: " + friction_of(Friction.of(rest, len(codes)), one, none, speeds).terms[0].term
-    return f"{'gain' if kind == 'gain' else 'zero'} of {codes[rest[0]]}"
 
 
 def _traces(
@@ -435,7 +428,9 @@ def _alike(fit: LawFit, lagrangian: Expression, friction: Expression) -> tuple[s
     listed, together = list(names.values()), [names[key] for key in fit.untold()]
     pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > _ALIKE, 1)), strict=True)
     only = (f"{', '.join(together)}: only together",) if together else ()
-    return only + tuple(f"{listed[i]} and {listed[j]} ({correlation[i, j]:+.3f})" for i, j in pairs)
+    return only + tuple(
+        f"{listed[i]} and {listed[j]} (correlation {correlation[i, j]:+.3f})" for i, j in pairs
+    )
 
 
 def _energy(
