@@ -112,29 +112,31 @@ def _check_structured(
     """Raises FitError for what does not go with a structure."""
     learn, terms, chart, angles = options.learn, options.terms, options.chart, options.angles
     if (options.family, options.base) != ("auto", None):
-        raise FitError("a structure has its own terms: expected no family or base")
+        raise FitError(f"structure {structure} has its own terms: expected no family or base")
     if chart == "type1":
-        raise FitError("expected another chart than type1 for a structure")
+        raise FitError(f"structure {structure}: expected another chart than type1")
     bodies = structure.startswith("bodies")
     if bodies and (learn == "map" or chart != "auto"):
-        raise FitError("a structure of bodies is that of H: expected no learn='map' or chart")
+        raise FitError(
+            f"structure {structure}: only H is learned, expected no learn='map' or chart"
+        )
     coordinates = scene.coordinates if scene is not None else CARTESIAN
     if bodies and (angles or coordinates.angles):
-        raise FitError("bodies go with plain q and p: expected no angles")
+        raise FitError(f"structure {structure}: expected no angles")
     own = coordinates.forward is not CARTESIAN.forward or coordinates.cyclic
     if own or pairs.args or pairs.period is not None:
         raise FitError(
-            "a structure goes with q and p of the sites: expected no other coordinates, no "
-            "parameters or drive"
+            f"structure {structure}: expected plain q and p, no coordinates of a scene, parameters "
+            "or drive"
         )
     if learn == "hamiltonian" and (angles or coordinates.angles):
-        raise FitError("a structure's H goes with plain q and p: with angles, S is learned")
+        raise FitError(f"structure {structure} with angles: only S is learned (learn='map')")
     if learn == "map" and np.ndim(pairs.dt):
-        raise FitError("expected pairs of one dt, as those of a map are; got several")
+        raise FitError(f"structure {structure}: learn='map' expects pairs of one dt, got several")
     if terms and (angles or coordinates.angles):
-        raise FitError("terms are those of H: expected none where sites have angles")
+        raise FitError(f"structure {structure} with angles: expected no terms, which are of H")
     if terms and bodies:
-        raise FitError("terms go with a ring or a chain: those of bodies are powers of distances")
+        raise FitError(f"structure {structure}: expected no terms, it has powers of distances")
     for term in terms:
         if not isinstance(term, str):
             raise FitError(

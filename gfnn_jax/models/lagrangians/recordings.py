@@ -67,7 +67,7 @@ def fit_recording(
     """The law of a recording, from its positions and inputs.
 
     friction: "auto", "none", "linear", "quadratic", "dry", or several of them, as
-    "linear+dry". input_hold: "auto", or how inputs go on between samples: "hold", "linear" or
+    "linear+dry". input_hold: "auto", or the inputs between samples: "hold", "linear" or
     "band". mass: the known mass (or moment of inertia) of one position, which fixes the scale of L.
     terms: those of L, V and R, as text in the names of columns (`models.lagrangians.given_terms`),
     which are then all that is fitted. loss: of residuals in units of their noise; None: the soft L1
