@@ -5,7 +5,8 @@
     python -m benchmarks --quick           all of them, small sizes, into runs/
     python -m benchmarks laws --only hard  options are handed to each study
     python -m benchmarks --check           what is older than its code again, oldest first
-    python -m benchmarks --check --tell    only says which these are; with names, of these studies
+    python -m benchmarks --check --tell    only says which these are, and how long they took
+    python -m benchmarks args --check      of these studies alone
 
 Each study is a script with a command line of its own (`python benchmarks/laws.py --help`) and runs
 in a process of its own: a process may map only so many compiled programs.

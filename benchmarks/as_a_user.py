@@ -2,6 +2,7 @@
 
     python benchmarks/as_a_user.py                          cases that have no result yet, table
     python benchmarks/as_a_user.py --only friction,degrees  these cases again
+    python benchmarks/as_a_user.py --old                    those of older code too
     python benchmarks/as_a_user.py --quick                  few short cases, into runs/as-a-user
     python benchmarks/as_a_user.py --tables                 only the table again
 
@@ -31,6 +32,7 @@ from typing import NamedTuple
 # Sets float64, so it comes before all of JAX.
 from harness import (
     HERE,
+    PROCESSOR_TIME,
     RESULTS,
     TABLES,
     Numbers,
@@ -46,6 +48,7 @@ from harness import (
 import jax
 import numpy as np
 import sympy
+from current import code_of
 from users.case import Case, Refused
 from users.known import KNOWN
 from users.refused import REFUSED
@@ -72,9 +75,8 @@ QUICK = ("single-orbit", "micro-units", "hidden-parameter", "twenty-pairs", "fri
 
 class Learned(NamedTuple):
     """Result of a case, by Python or the command line. seconds: of the processor. law: the line
-    about H, "" where there is none; formula: H, where it is shown. damping: of a map that loses
-    area. noise: (2d,) as `fit.noise`, or
-    None."""
+    about H, "" where there is none; formula: H, where it is shown. friction: of a map or law that
+    has some. noise: (2d,) as `fit.noise`, or None."""
 
     map: gfnn.SymplecticMap
     seconds: float
@@ -87,7 +89,7 @@ class Learned(NamedTuple):
     noise: list[float] | None
     law: str = ""
     formula: str | None = None
-    damping: str = ""
+    friction: str = ""
 
 
 # What is said and what is true
@@ -108,8 +110,16 @@ def by_python(case: Case) -> Learned:
         chosen.validation_relative, chosen.validation_bound, fit.met,
         None if fit.noise is None else fit.noise.tolist(),
         "" if fit.formula is None else f"H = {fit.formula}", fit.formula,
-        "" if fit.damping is None else f"friction: {fit.damping}",
+        _of_friction(fit),
     )  # fmt: skip
+
+
+def _of_friction(fit: gfnn.Fit) -> str:
+    """The friction that was learned, "" of a map or law without."""
+    law = fit.hamiltonian if fit.chosen.learns == "hamiltonian" else None
+    terms = [] if law is None else [term.term for term in law.friction]
+    told = [*([] if fit.damping is None else [str(fit.damping)]), *terms]
+    return f"friction: {'; '.join(told)}" if told else ""
 
 
 def by_command(case: Case) -> Learned:
@@ -156,7 +166,7 @@ def untruths(case: Case, learned: Learned, errors: np.ndarray) -> list[str]:
     """List what the fit said wrongly, or did not say."""
     error = float(np.sqrt(np.mean(errors**2)))
     said = " ".join([*learned.messages, learned.ended, learned.model, learned.law,
-                     learned.damping])  # fmt: skip
+                     learned.friction])  # fmt: skip
     found = [f"not said: {pattern}" for pattern in case.words if not re.search(pattern, said)]
     found += [f"said: {pattern}" for pattern in case.never if re.search(pattern, said)]
     if case.quiet and learned.messages:
@@ -304,9 +314,12 @@ def tables(path: Path) -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", metavar="A,B", help=", ".join(CASES))
+    parser.add_argument("--old", action="store_true", help="cases of older code again")
     parser.add_argument("--quick", action="store_true", help="few short cases; no table")
     parser.add_argument("--tables", action="store_true", help="only make the table again")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the result")
+    parser.add_argument(PROCESSOR_TIME, action="store_true",
+                        help="stages too are timed in seconds of the processor")  # fmt: skip
     arguments = parser.parse_args(argv)
     chosen = (
         arguments.only.split(",") if arguments.only else list(QUICK if arguments.quick else CASES)
@@ -317,12 +330,16 @@ def main(argv: Sequence[str] | None = None) -> None:
     folder = arguments.out or (Path("runs/as-a-user") if arguments.quick else RESULTS)
     path = folder / "as-a-user.json"
     measured = read({"": path}).get("", {"measured": {}})["measured"]
+    code = code_of(Path(__file__).resolve())
     for name in [] if arguments.tables else chosen:
-        if name in measured and not arguments.only:
+        old = arguments.old and measured.get(name, {}).get("code") != code
+        if name in measured and not (arguments.only or old):
             continue
-        measured[name] = m = measure(name)
+        measured[name] = m = measure(name) | {"code": code}
         measured = {n: measured[n] for n in CASES if n in measured}
-        write(path, {"quick": arguments.quick, "measured": measured})
+        codes = {m.get("code") for m in measured.values()}  # the file is as old as its oldest case
+        write(path, {"quick": arguments.quick, "measured": measured,
+                     "code": code if codes == {code} else None})  # fmt: skip
         verdict = "; ".join(m["wrong"]) or "truthful"
         print(
             f"{name}: {m['seconds']:.1f} s, {m['model']}, claimed {number(m['claimed'])}, true "

@@ -1,7 +1,9 @@
 """Which results are of current code, and those that are not measured again, oldest first.
 
 A result holds a digest of the code that it measured: of the package and of its study, comments,
-docstrings and layout left out. A run that is interrupted goes on with what is still old.
+docstrings and layout left out. Every change of the package makes all results old, for what it may
+change is not known: `--tell` says how long it would take to measure them again. A run that is
+interrupted goes on with what is still old.
 """
 
 from __future__ import annotations
@@ -125,10 +127,10 @@ def check(
     old = [result for result in known.values() if not result.current]
     say(f"{len(known) - len(old)} of {len(known)} results are of current code")
     failed = False
+    if only_tell:
+        _tell(sorted(old, key=_age), say)
+        return 0
     for result in sorted(old, key=_age):
-        if only_tell:
-            say(f"{result.path.name}: older than the code that it measures ({_age(result)[0]})")
-            continue
         before = json.loads(result.path.read_text(encoding="utf-8"))
         aside = result.path.with_suffix(".before")
         if not result.piece:  # such a study measures what has no result
@@ -145,6 +147,31 @@ def check(
         after = json.loads(result.path.read_text(encoding="utf-8"))
         say(f"{result.path.name}: {what_moved(before.get('measured'), after.get('measured'))}")
     return int(failed)
+
+
+def _tell(old: list[Result], say: Callable[[str], Any]) -> None:
+    """Say which results these are, how long each took, and how long all of them would."""
+    known = []
+    for result in old:
+        seconds = _seconds(json.loads(result.path.read_text(encoding="utf-8")))
+        known += [] if seconds is None else [seconds]
+        took = "time not known" if seconds is None else f"{seconds:.0f} s"
+        say(f"{result.path.name}: older than the code that it measures ({_age(result)[0]}, {took})")
+    if old:
+        unknown = len(old) - len(known)
+        others = f", and {unknown} more whose time is not known" if unknown else ""
+        say(f"all of them again: about {sum(known) / 3600:.1f} h{others}")
+
+
+def _seconds(found: dict[str, Any]) -> float | None:
+    """Seconds that a result took: of the whole, else the sum of its cases'; None where neither is
+    known."""
+    if "seconds" in found:
+        return float(found["seconds"])
+    measured = found.get("measured")
+    cases = measured.values() if isinstance(measured, dict) else ()
+    each = [case["seconds"] for case in cases if isinstance(case, dict) and "seconds" in case]
+    return float(sum(each)) if each and all(isinstance(s, (int, float)) for s in each) else None
 
 
 def _age(result: Result) -> tuple[str, float]:

@@ -436,6 +436,8 @@ def _summarise(ran: Any, out: Path) -> None:
             print(note)
         for loss in report["hamiltonian"]["friction"]:
             print(f"friction {loss['term']}: {loss['coefficient']:.6g} ± {loss['std']:.1g}")
+    for law in ran.fit.partial_laws:
+        print(law)
     print(f"the search ended: {fit['ended']}")
     rollout = report["rollout"]
     if rollout is not None:

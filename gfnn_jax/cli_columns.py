@@ -58,9 +58,15 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
         help="names of coordinates that --observe is written in, where no column measures them",
     )  # fmt: skip
     group.add_argument(
-        "--from", dest="start", type=_finite, metavar="T", help="rows from time T on"
+        "--from",
+        dest="start",
+        type=_finite,
+        metavar="T",
+        help="rows from time T on, in the file's unit",
     )
-    group.add_argument("--to", dest="stop", type=_finite, metavar="T", help="rows up to time T")
+    group.add_argument(
+        "--to", dest="stop", type=_finite, metavar="T", help="rows up to time T, in that unit"
+    )
     group.add_argument("--every", type=_count, metavar="K", help="every K-th row")
 
 

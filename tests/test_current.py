@@ -4,6 +4,8 @@ import json
 import sys
 from pathlib import Path
 
+import pytest
+
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import current
@@ -45,13 +47,14 @@ def test_what_is_old_is_measured_again(tmp_path, monkeypatch):
         ("new", "2026-11-20", "new"), ("young", "2026-11-22", "old"), ("old", "2026-11-21", "old"),
         ("broken", "2026-11-22", None),
     ):  # fmt: skip
-        result = {"date": date, "code": code, "measured": {"rms": 1.0, "seconds": 9.0}}
+        result = {"date": date, "code": code, "seconds": 9.0, "measured": {"rms": 1.0}}
         (tmp_path / f"tries-{name}.json").write_text(json.dumps(result))
     assert current.check(["tries"], tmp_path, only_tell=True, say=said.append) == 0
     assert said[0] == "1 of 4 results are of current code"
     assert [line.split(":")[0] for line in said[1:]] == [
-        "tries-old.json", "tries-young.json", "tries-broken.json"
+        "tries-old.json", "tries-young.json", "tries-broken.json", "all of them again"
     ]  # fmt: skip
+    assert said[1].endswith("(2026-11-21, 9 s)")
     said.clear()
     assert current.check(["tries"], tmp_path, say=said.append) == 1
     assert said[1] == "tries-old.json: rms 1 → 2"
@@ -59,6 +62,19 @@ def test_what_is_old_is_measured_again(tmp_path, monkeypatch):
     said.clear()
     assert current.check(["tries"], tmp_path, only_tell=True, say=said.append) == 0
     assert said[0] == "3 of 4 results are of current code"
+
+
+@pytest.mark.parametrize(
+    ("found", "seconds"),
+    [
+        ({"seconds": 3.0, "measured": {"a": {"seconds": 9.0}}}, 3.0),
+        ({"measured": {"a": {"seconds": 1.0}, "b": {"seconds": 2.0}}}, 3.0),
+        ({"measured": {"a": {"seconds": {"x": 1.0}}}}, None),
+        ({"measured": [1, 2]}, None),
+    ],
+)
+def test_the_time_that_a_result_took(found, seconds):
+    assert current._seconds(found) == seconds
 
 
 def test_what_moved():

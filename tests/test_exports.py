@@ -33,6 +33,7 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import fit_predictors
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping, DampingOfArgs, FunctionsOfArgs
+from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.laws import map_of_law
 from gfnn_jax.maps.parameters import sampled
 from gfnn_jax.phase_space import symplectic_form
@@ -175,9 +176,22 @@ def compiled(path, *flags):
 
 def by_c(function, z):
     """Images (N, 2d) and statuses (N,), one state after another, in place."""
-    pointer = ctypes.POINTER(ctypes.c_double)
     images = np.array(z)
-    found = [function(row.ctypes.data_as(pointer), row.ctypes.data_as(pointer)) for row in images]
+    found = [function(by_c_pointer(row), by_c_pointer(row)) for row in images]
+    return images, np.array(found)
+
+
+def by_c_pointer(row):
+    return row.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+
+
+def by_c_with(function, z, args):
+    """Images (N, 2d) and statuses (N,) of states with their args (N, k)."""
+    images, rows = np.array(z), [by_c_pointer(a) for a in np.ascontiguousarray(args)]
+    found = [
+        function(by_c_pointer(row), a, by_c_pointer(row))
+        for row, a in zip(images, rows, strict=True)
+    ]
     return images, np.array(found)
 
 
@@ -255,13 +269,9 @@ def test_c_of_a_map_with_parameters(kind, tmp_path):
     args[-1], z[-2] = np.nan, np.nan
     path = gfnn.export(map_, "c", tmp_path / "own.c")
     assert f"args = (l), in the data l from {args[:300].min():.6g} to" in path.read_text()
-    library, pointer = compiled(path), ctypes.POINTER(ctypes.c_double)
+    library = compiled(path)
     for function, own in ((library.own_step, map_.step), (library.own_inverse, map_.inverse)):
-        images = z.copy()
-        rows = [
-            [a.ctypes.data_as(pointer) for a in both] for both in zip(images, args, strict=True)
-        ]
-        status = np.array([function(row, given, row) for row, given in rows])
+        images, status = by_c_with(function, z, args)
         expected, info = own(z, args)
         np.testing.assert_array_equal(status, info.status)
         assert {OK, LEFT_DOMAIN, NON_FINITE} <= {*status.tolist()}
@@ -270,11 +280,95 @@ def test_c_of_a_map_with_parameters(kind, tmp_path):
         np.testing.assert_allclose(images[inside], expected[inside], rtol=1e-14, atol=1e-14)
 
 
-def test_a_driven_map_has_no_c(tmp_path):
-    map_, _, lengths = with_length("law")
-    driven = dataclasses.replace(map_, parameters=sampled(("t",), lengths, DT, 2 * np.pi))
-    with pytest.raises(gfnn.InputError, match=r"the map is driven.*use --to stablehlo"):
-        gfnn.export(driven, "c", tmp_path / "a.c")
+def driven(kind):
+    """A map under a drive of period 2, its states and times (N, 1)."""
+    z, times = 0.5 * states(1), np.random.default_rng(2).uniform(-9, 9, (300, 1))
+    unit, terms = np.ones(2), ["p1**2", "q1**2", "q1*cos(pi*t)", "q1**2*p1*sin(2*pi*t)"]
+    family, params = given_terms(1, terms, ("t",)), np.array([0.5, 0.4, 0.3, 0.2])
+    if kind == "law":
+        piece = Flow(family, params, DT, unit, 4, 2)
+    else:
+        piece = Generated(family, params, TYPE2, DT, unit)
+    most = sampled(("t",), np.linspace(0, 1.2, 9)[:, None], DT, 2.0)  # not all of the period
+    return dataclasses.replace(map_of(piece, z), parameters=most), z, times
+
+
+@needs_cc
+@pytest.mark.parametrize("kind", ["law", "type 2"])
+def test_c_of_a_driven_map(kind, tmp_path):
+    map_, z, times = driven(kind)
+    path = gfnn.export(map_, "c", tmp_path / "own.c")
+    assert "t: the time of the drive at z, of the step and of its inverse" in path.read_text()
+    library = compiled(path)
+    for function, own in ((library.own_step, map_.step), (library.own_inverse, map_.inverse)):
+        images, status = by_c_with(function, z, times)
+        expected, info = own(z, t0=times[:, 0])
+        np.testing.assert_array_equal(status, info.status)
+        assert {OK, LEFT_DOMAIN} == {*status.tolist()}
+        np.testing.assert_allclose(images, expected, rtol=1e-14, atol=1e-14)
+
+
+def pushed(hold, delay=0.0, uniform=0.0, stiff=False):
+    """A double pendulum with friction of every kind and an input on both angles, and its states.
+
+    hold: the rule between samples; None: no input."""
+    none = (0, 0)
+    terms = lagrangian.Terms.of(
+        [((2, 0), none, none, 0.0), ((0, 2), none, none, 0.0), ((1, 1), none, (1, -1), 0.0),
+         (none, none, (1, 0), 0.0), (none, (0, 2), none, 0.0)], 2,
+    )  # fmt: skip
+    rows = [((1, 0), lagrangian.LINEAR, 0.0), ((1, -1), lagrangian.QUADRATIC, 0.0),
+            ((0, 1), lagrangian.DRY, 1e-4 if stiff else 0.3)]  # fmt: skip
+    friction = lagrangian.Friction.of(rows, 2)
+    gains = np.zeros((2, 0)) if hold is None else np.array([[1.0], [0.5]])
+    law = lagrangian.Lagrangian(
+        terms, np.array([1.0, 0.5, 1.0, 2.0, -0.5]), friction, np.array([0.1, 0.2, 0.05]), uniform,
+        gains,
+    )  # fmt: skip
+    z = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 4))
+    signals = None if hold is None else Signals(("F",), hold, delay)
+    return map_of_law(law, z, 0.05, tolerance=1e-12, signals=signals), z
+
+
+@needs_cc
+def test_c_of_a_map_with_friction(tmp_path):
+    map_, z = pushed(None, uniform=0.3)
+    library = compiled(gfnn.export(map_, "c", tmp_path / "own.c"))
+    for function, own in ((library.own_step, map_.step), (library.own_inverse, map_.inverse)):
+        images, status = by_c(function, z)
+        expected, info = own(z)
+        np.testing.assert_array_equal(status, info.status)
+        np.testing.assert_allclose(images, expected, rtol=1e-14, atol=1e-14)
+
+
+@needs_cc
+@pytest.mark.parametrize(
+    ("hold", "delay"),
+    [("linear", 0.013), *(pytest.param(h, d, marks=pytest.mark.slow)
+                          for h, d in (("hold", 0.0), ("hold", 0.02), ("band", 0.013)))],
+)  # fmt: skip
+def test_c_of_a_map_with_inputs(hold, delay, tmp_path):
+    """Steps of one state under samples of a force are a rollout, and the inverse undoes each."""
+    map_, z = pushed(hold, delay, uniform=0.2)
+    library, pointer = compiled(gfnn.export(map_, "c", tmp_path / "own.c")), by_c_pointer
+    u = np.sin(0.7 * np.arange(31))[:, None]
+    expected, _ = map_.rollout(z[0], 30, inputs=u)
+    many = np.concatenate([np.repeat(u[:1], 99), u[:, 0], np.repeat(u[-1:], 99)])
+    state, found = z[0].copy(), [z[0]]
+    args = np.zeros(map_.signals.degree + 1)
+    for n in range(30):
+        if (hold, delay) == ("hold", 0.0):
+            assert not hasattr(library, "own_inputs")
+            args[:] = u[n]
+        else:
+            library.own_inputs(pointer(many[99 + n :]), pointer(args))
+        assert library.own_step(pointer(state), pointer(args), pointer(state)) <= LEFT_DOMAIN
+        found.append(state.copy())
+        back = np.empty(4)
+        library.own_inverse(pointer(state), pointer(args), pointer(back))
+        np.testing.assert_allclose(back, found[-2], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+    assert np.abs(np.asarray(expected) - map_.rollout(z[0], 30)[0]).max() > 0.1  # the force acts
 
 
 @needs_cc

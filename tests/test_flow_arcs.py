@@ -1,6 +1,7 @@
 """H from whole noisy sequences, and gross errors among measured states and pairs."""
 
 import re
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -13,7 +14,7 @@ from gfnn_jax.fitting import least_squares
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.models.hamiltonians.flow_arcs import FlowOnArcs, fit_flow, longest_arc
-from gfnn_jax.models.hamiltonians.whole_sequences import about_outliers
+from gfnn_jax.models.hamiltonians.whole_sequences import about_outliers, root_of
 from gfnn_jax.scenes import henon_heiles
 from gfnn_jax.solve.latent_arcs import OUTLYING
 
@@ -222,3 +223,20 @@ def test_states_in_a_row_are_no_outliers(beside, says):
     residuals[[1, 3], [5, 18], 1] = beside
     (told,) = about_outliers(residuals)
     assert says in told
+
+
+@pytest.mark.parametrize("misfit", [0.0, 1.0])
+def test_a_misfit_that_is_alike_along_an_arc_does_not_average_away(misfit):
+    """Of a constant through measured numbers, to which every arc adds one of its own: the next arc
+    is off by as much as those, however many there are; by noise alone the mean is known better."""
+    arcs, length = 40, 20
+    rng = np.random.default_rng(3)
+    y = misfit * rng.normal(size=(arcs, 1, 1)) + rng.normal(size=(arcs, length, 1))
+    left = y - y.mean()
+    whole = np.concatenate([np.ones((y.size, 1)), left.reshape(-1, 1)], axis=1)
+    found = SimpleNamespace(
+        factor=np.linalg.qr(whole, mode="r"), residuals=left, scores=left.sum(axis=1)
+    )
+    deviation = abs(root_of(found)[0, 0])
+    expected = misfit or 1 / np.sqrt(y.size)
+    assert 0.7 * expected < deviation < 1.4 * expected

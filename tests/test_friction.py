@@ -1,4 +1,5 @@
-"""Friction that is learned with H: uniform, whose flow keeps a multiple of J, or linear in v."""
+"""Friction that is learned with H from pairs: uniform, whose flow keeps a multiple of J, or linear,
+quadratic or dry."""
 
 import numpy as np
 import pytest
@@ -99,6 +100,74 @@ def test_a_system_that_keeps_its_energy_gets_no_friction(noise):
     fit = gfnn.fit(gfnn.Pairs(pairs.z0, image, 0.5), tolerance=1e-10, learn="hamiltonian")
     assert fit.hamiltonian.friction == ()
     assert fit.map.multiplier() == 1.0
+
+
+def test_quadratic_friction_is_told_from_pairs():
+    """Exact where no speed turns; of the kinds not there an upper limit."""
+    rng = np.random.default_rng(0)
+    z, fresh = (np.c_[rng.uniform(-2, 2, n), rng.uniform(-1, 1, n)] for n in (200, 50))
+    pairs, others = (
+        pairs_of(lambda _, z: [z[1], -np.sin(z[0]) - 0.1 * abs(z[1]) * z[1]], states, 0.3)
+        for states in (z, fresh)
+    )
+    fit = gfnn.fit(pairs, tolerance=1e-7, angles=(0,), learn="hamiltonian")
+    law = {term: c for term, c in law_of(fit).items() if abs(c) > 1e-12}
+    assert law == pytest.approx({"cos(q1)": -1.0, "p1²": 0.5}, rel=1e-12)
+    (found,) = fit.hamiltonian.friction
+    assert found.term == "⅓ |v1|³"
+    assert found.coefficient == pytest.approx(0.1, abs=1e-12)
+    error = np.abs(np.asarray(fit.map.step(fresh)[0]) - others.z1).max(axis=1)
+    steady = (fresh[:, 1] * others.z1[:, 1] > 0) & (np.abs(others.z1[:, 1]) > 0.05)
+    assert error[steady].max() < 1e-12
+    assert error.max() < 1e-6
+    assert fit.map.multiplier() is None
+    which = fit.hamiltonian.which_friction
+    assert which.kinds == ("quadratic",)
+    assert which.odds["none"] > 1e6
+    assert set(which.limits) == {"v1**2", "abs(v1)"}
+    assert max(which.limits.values()) < 1e-12
+
+
+def block(z, dt, held=0.05):
+    """Images of states (N, 2) of a block on a spring, q̈ = −q − 0.05 sgn q̇, in closed form: half
+    turns about ±0.05, until it stops."""
+    images = []
+    for q, v in z:
+        left = dt
+        while True:
+            side = np.sign(v) or -np.sign(q) * (abs(q) > held)
+            if not side:
+                break
+            about = -side * held
+            angle, size = np.arctan2(-v, q - about), np.hypot(q - about, v)
+            turn = (np.pi if side < 0 else 2 * np.pi) - (angle % (2 * np.pi))
+            turn = turn if turn > 1e-12 else np.pi
+            step = min(left, turn)
+            q, v = about + size * np.cos(angle + step), -size * np.sin(angle + step)
+            left -= step
+            if left <= 0:
+                break
+            v = 0.0
+        images.append([q, v])
+    return np.array(images)
+
+
+@pytest.mark.slow
+def test_dry_friction_is_told_from_pairs():
+    """A block that turns and stops in some of the steps; the law is known to roundoff."""
+    rng = np.random.default_rng(1)
+    z, fresh = (np.c_[rng.uniform(-1, 1, n), rng.uniform(-1, 1, n)] for n in (200, 50))
+    fit = gfnn.fit(gfnn.Pairs(z, block(z, 0.3), 0.3), tolerance=1e-4, learn="hamiltonian")
+    assert law_of(fit) == pytest.approx({"q1²": 0.5, "p1²": 0.5}, rel=1e-12)
+    (found,) = fit.hamiltonian.friction
+    assert found.term == "|v1|"
+    assert found.coefficient == pytest.approx(0.05, abs=1e-12)
+    exact = block(fresh, 0.3)
+    error = np.abs(np.asarray(fit.map.step(fresh)[0]) - exact).max(axis=1)
+    assert error.max() < 3e-3
+    assert np.median(error) < 1e-6
+    assert fit.hamiltonian.which_friction.kinds == ("dry",)
+    assert "smoothed over speeds" in fit.hamiltonian.notes[-1]
 
 
 def double_pendulum(gamma, count=200, dt=0.2):

@@ -8,10 +8,19 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
+from gfnn_jax.evaluate.report import assemble
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.models.textbook.arguments import arguments_of
-from gfnn_jax.models.textbook.atoms import Factor, atom_text, dictionary_of, gradient_of, powers_of
+from gfnn_jax.models.textbook.atoms import (
+    Factor,
+    atom_text,
+    constants_of,
+    dictionary_of,
+    gradient_of,
+    powers_of,
+    with_constants,
+)
 from gfnn_jax.models.textbook.matching import Matching, orthonormal
 from gfnn_jax.models.textbook.search import Textbook
 from gfnn_jax.models.textbook.shapes import constants_for, has_constant, kinds_for, values
@@ -74,6 +83,26 @@ def searched(pairs, **options):
     return search.law(products=False) or search.law(products=True)
 
 
+def two_centres(z):
+    """∇ of ½p² − 0.8/|q − (−0.2, 0)| − 0.3/|q − (0.7, 0.4)|."""
+    q, force = z[:, :2], np.zeros((len(z), 2))
+    for weight, centre in ((0.8, (-0.2, 0.0)), (0.3, (0.7, 0.4))):
+        away = q - np.array(centre)
+        force += weight * away / np.linalg.norm(away, axis=1, keepdims=True) ** 3
+    return np.concatenate([force, z[:, 2:]], axis=1)
+
+
+def top(z):
+    """∇ of ½p₂² + ½(p₁ − p₃ cos q₂)²/sin² q₂ + 0.8 p₃² + 1.5 cos q₂."""
+    (_, q, _), (p1, p2, p3) = z[:, :3].T, z[:, 3:].T
+    sin, cos, none = np.sin(q), np.cos(q), np.zeros(len(z))
+    turned = (p1 - p3 * cos) / sin
+    force = turned * p3 - turned**2 * cos / sin - 1.5 * sin
+    return np.stack(
+        [none, force, none, turned / sin, p2, 1.6 * p3 - turned * cos / sin], axis=1
+    )  # fmt: skip
+
+
 def read(law):
     """text -> coefficient of the terms that are not roundoff."""
     named = zip(law.family.term_names, law.coefficients, strict=True)
@@ -126,6 +155,25 @@ def test_the_derivative_in_a_constant_is_that_of_the_gradient():
     np.testing.assert_allclose(slope, expected, rtol=1e-8)
 
 
+def test_a_distance_from_a_centre_is_the_formula_that_it_is_written_as():
+    z = ring(5)
+    arguments = arguments_of(z)
+    place = next(i for i, a in enumerate(arguments) if a.axes)
+    centre = (0.8, -0.3)
+    atom = (Factor(place, ("power", -3.0), centre=centre),)
+    assert atom_text(atom, arguments) == "1/sqrt((q1 - 0.8)**2 + (q2 + 0.3)**2)**3"
+    assert constants_of(with_constants(atom, (0.0, 0.5))) == [0.0, 0.5]
+    expected = given_terms(2, [atom_text(atom, arguments)]).gradient(np.ones(1), z)
+    np.testing.assert_allclose(gradient_of(atom, arguments), expected, rtol=1e-12, atol=1e-12)
+    for axis in (0, 1):
+        ahead, behind = (
+            gradient_of(with_constants(atom, centre + sign * 1e-6 * np.eye(2)[axis]), arguments)
+            for sign in (1, -1)
+        )
+        slope = gradient_of(atom, arguments, along=axis)
+        np.testing.assert_allclose(slope, (ahead - behind) / 2e-6, rtol=1e-6, atol=1e-8)
+
+
 def test_products_of_coordinates_are_read_as_such():
     arguments = arguments_of(ring(3))
     atom = (Factor(0, ("power", 2.0)), Factor(3, ("power", 1.0)))
@@ -167,6 +215,33 @@ def test_constants_inside_come_out_exactly():
     found = read(searched(morse_pairs(150)))
     expected = {"p1²": 0.5, "exp(-2.6*q1)": 0.8, "exp(-1.3*q1)": -1.6}
     assert found == pytest.approx(expected, abs=1e-11)
+
+
+def test_centres_beside_the_origin_are_found_told_nothing():
+    rng = np.random.default_rng(0)
+    z0 = rng.uniform(-1, 1, (600, 4)) * [1.6, 1.6, 1, 1]
+    apart = [np.linalg.norm(z0[:, :2] - c, axis=1) for c in ((-0.2, 0), (0.7, 0.4))]
+    pairs = pairs_of(two_centres, z0[np.min(apart, axis=0) > 0.45][:250], dt=0.05)
+    problem = Problem(pairs.z0, pairs.z1, pairs.dt, sizes(pairs.z0))
+    found = read(Textbook(problem, np.arange(250)).law(centres=True))
+    expected = {
+        "p1²": 0.5, "p2²": 0.5, "1/sqrt((q1 + 0.2)**2 + q2**2)": -0.8,
+        "1/sqrt((q1 - 0.7)**2 + (q2 - 0.4)**2)": -0.3,
+    }  # fmt: skip
+    assert found == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_heavy_top_in_eulers_angles_is_found_told_nothing():
+    rng = np.random.default_rng(0)
+    low, high = [-3, 0.5, -3, -1, -1, -1], [3, 2.6, 3, 1, 1, 1]
+    pairs = pairs_of(top, rng.uniform(low, high, (200, 6)), dt=0.05)
+    problem = Problem(pairs.z0, pairs.z1, pairs.dt, sizes(pairs.z0))
+    found = read(Textbook(problem, np.arange(200), angles=(0, 1, 2)).law(products=True))
+    expected = {
+        "p2²": 0.5, "p3²": 0.3, "cos(q2)": 1.5, "p1**2/sin(q2)**2": 0.5, "p3**2/sin(q2)**2": 0.5,
+        "p1*p3*cos(q2)/sin(q2)**2": -1.0,
+    }  # fmt: skip
+    assert found == pytest.approx(expected, abs=1e-12)
 
 
 def test_a_law_outside_of_the_dictionary_is_no_formula():
@@ -222,3 +297,7 @@ def test_a_fit_told_nothing_finds_keplers_law():
 def test_a_law_outside_of_the_dictionary_ends_as_a_map():
     fit = gfnn.fit(outside_pairs(400), tolerance=1e-6, max_seconds=None)
     assert fit.chosen.learns == "map"
+    assert len(fit.partial_laws) == 3
+    assert all("p1²" in law.formula and 1e-10 < law.left < 1e-2 for law in fit.partial_laws)
+    told = assemble(fit, scene=None, dt=0.1, seed=0, data={}, rollout=None)
+    assert told["partial_laws"][0]["formula"] == fit.partial_laws[0].formula

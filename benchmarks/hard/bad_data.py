@@ -18,7 +18,7 @@ import gfnn_jax as gfnn
 
 def bad_data(quick: bool) -> tuple[list[Case], Numbers]:
     scene = pendulum_scene(0.4)
-    data, fresh = drawn(scene, 1_000, quick)
+    data, fresh = drawn(scene, 300 if quick else 1_000, quick)
     z0, z1 = np.asarray(data.z0), np.asarray(data.z1)
     rng = np.random.default_rng(SEED)
     options = {"chart": "midpoint", "family": "polynomial"}
@@ -33,7 +33,7 @@ def bad_data(quick: bool) -> tuple[list[Case], Numbers]:
             measured[name]["noise"] = np.asarray(fit.noise).tolist()
 
     wrong = z1.copy()
-    rows = rng.permutation(len(z1))[:10]
+    rows = rng.permutation(len(z1))[: len(z1) // 100]
     wrong[rows] = z1[np.roll(rows, 1)]
     add("1 % of the pairs wrong", z0, wrong)
     for sigma in (1e-2,) if quick else (1e-6, 1e-4, 1e-2, 1e-1):

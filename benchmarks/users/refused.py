@@ -46,6 +46,12 @@ def inverse_without_state() -> Any:
     return fit.map.inverse()
 
 
+def step_backwards() -> Any:
+    """A step of a law over −dt, which its inverse is."""
+    fit = gfnn.fit(swings(200)[0], tolerance=1e-6, learn="hamiltonian")
+    return fit.map.over(-0.2)
+
+
 def mixed_lengths() -> Any:
     pairs = swings(100)[0]
     return gfnn.fit(gfnn.Pairs(pairs.z0, pairs.z1[:50], pairs.dt))
@@ -69,6 +75,7 @@ REFUSED: dict[str, Callable[[], Refused]] = {
     "no-time": lambda: Refused(fitted(max_seconds=0), "as max_seconds, got 0"),
     "tolerance-text": lambda: Refused(fitted(tolerance="1e-6"), "as tolerance, got '1e-6'"),
     "angle-of-five": lambda: Refused(fitted(angles=(5,)), "different angles among"),
+    "step-backwards": lambda: Refused(step_backwards, "num_steps"),
     "inverse-without-state": lambda: Refused(inverse_without_state, "inverse"),
     "numpy-scene": lambda: Refused(
         lambda: gfnn.sample_pairs(by_numpy(), 10, jax.random.key(SEED)), "jax.numpy"

@@ -58,6 +58,12 @@ def dry_pendulum(z, friction: float):
     return np.stack([p, -np.sin(q) - friction * np.tanh(p / 1e-3)])
 
 
+def resisting_air(z, friction: float = 0.05):
+    """A pendulum whose friction is quadratic in p."""
+    q, p = z
+    return np.stack([p, -np.sin(q) - friction * np.abs(p) * p])
+
+
 def pendulum(z, stiffness: Any = 1.0, friction: float = 0.0):
     """stiffness: g / length, a number or one per state. friction: of the momentum, per time."""
     q, p = z

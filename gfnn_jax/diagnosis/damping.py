@@ -39,7 +39,8 @@ _CERTAIN = 5.0  # standard errors that make a factor other than 1 certain
 _SAMPLE, _PLENTY = 1_000, 20
 _DEGREES = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20, 24, 28)  # of S, that are tried in turn
 _ROWS_PER_TERM = 3
-_MOST_OPERATIONS = 1e9  # rows × terms² of one solve: a quarter of a second on one core
+# Rows × terms² of one solve: a quarter of a second on one core, and of a sample a fortieth.
+_MOST_OPERATIONS, _OF_SAMPLE = 1e9, 1e8
 _UPDATES = 10  # of Gauss–Newton, which converges in four or five
 _CLOSE = 0.01  # standard errors: an update that is smaller is the last
 _CHANGED = 1e-13  # of a coefficient's unit, in which an update that is smaller is the last too
@@ -113,11 +114,13 @@ def area_factors(jacobians, scale) -> np.ndarray:
 
 
 def learn_damping(
-    data: Dataset, jacobians, error: float, chart: str, reversor
-) -> LearnedDamping | None:
+    data: Dataset, jacobians, error: float, chart: str, reversor,
+    most_operations: float = _MOST_OPERATIONS,
+) -> LearnedDamping | None:  # fmt: skip
     """The D_b behind these pairs; None where areas are kept, or no D_b explains what is lost.
 
     data: without a base map. jacobians: (n, 2d, 2d) local ones, known to the error.
+    most_operations: rows × terms² of one solve.
     """
     factors, dim = area_factors(jacobians, data.scale), data.dim
     b = float(np.median(factors))
@@ -126,7 +129,7 @@ def learn_damping(
         return None
     if len(data.training) > _PLENTY * _SAMPLE:
         some = data.take(np.concatenate([data.training[:_SAMPLE], data.validation[:_SAMPLE]]))
-        if learn_damping(some, jacobians, error, chart, reversor) is None:
+        if learn_damping(some, jacobians, error, chart, reversor, _OF_SAMPLE) is None:
             return None
     start = LearnedDamping(np.asarray(b), np.asarray(np.inf), np.zeros(dim))
     undamped = data.without(None, start.piece)
@@ -134,7 +137,7 @@ def learn_damping(
         charts = choose_charts(chart, undamped, reversor, start.undone(jacobians))
     except FitError:  # no chart covers the rest
         return None
-    problems = [_Problem(data, each, charts.half) for each in charts.charts]
+    problems = [_Problem(data, each, charts.half, most_operations) for each in charts.charts]
 
     def best(spread: np.ndarray) -> tuple[_Fitted, _Problem]:
         first = np.full((1, len(spread)), b)
@@ -190,12 +193,13 @@ class _Fitted(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class _Problem:
-    """The pairs, chart and half base map of the symplectic part, and the rows that train and
-    judge."""
+    """The pairs, chart and half base map of the symplectic part, and rows × terms² of the largest
+    solve."""
 
     data: Dataset
     chart: AnyChart
     half: Affine | None
+    most_operations: float
 
     def best(self, spread: np.ndarray, factor: np.ndarray) -> _Fitted:
         """Degree of S, and of b in the args, which leaves least of the held-out rows.
@@ -267,7 +271,7 @@ class _Problem:
             family = Products(inputs, degree)
             terms = family.num_parameters
             if degree > _DEGREES[0] and (
-                _ROWS_PER_TERM * terms > w.size or w.size * terms**2 > _MOST_OPERATIONS
+                _ROWS_PER_TERM * terms > w.size or w.size * terms**2 > self.most_operations
             ):
                 return
             yield family

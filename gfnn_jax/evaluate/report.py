@@ -79,6 +79,7 @@ def assemble(
             "messages": list(fit.messages),
         },
         "hamiltonian": _hamiltonian(fit),
+        "partial_laws": [law._asdict() for law in fit.partial_laws],
         "map": {
             "multiplier": fit.map.multiplier(),
             "damping": _damping(fit),
@@ -135,10 +136,19 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
     if fit.hamiltonian is None or fit.formula is None:
         return None
     law = fit.hamiltonian
+    which = law.which_friction
     return {
         "formula": fit.formula,
         "terms": [term._asdict() for term in law.terms],
         "friction": [term._asdict() for term in law.friction],
+        "which_friction": None
+        if which is None
+        else {
+            "kinds": list(which.kinds),
+            "odds": which.odds,
+            "limits": which.limits,
+            "text": str(which),
+        },
         "constants": [term._asdict() for term in law.constants],
         "symmetries": list(law.symmetries),
         "fractions": [str(p) for p in law.proposals],

@@ -86,10 +86,12 @@ static void to_user(const double y[4], double z[4])
 
 def newton_solver(unknowns: int, width: int) -> str:
     """Write Newton's method in C for at most ``unknowns`` unknowns of states (width,)."""
-    bend = newton._BENT
+    rules, bend = newton.RULES, newton.RULES.bent
+    least, most = (literal(part * bend) for part in (rules.least_bent, rules.most_bent))
+    off, floors = literal(rules.off_path), literal(rules.rounding)
     return f"""\
 enum {{ MOST = {MOST_UPDATES}, N = {unknowns}, WIDTH = {width} }};
-static const double FLOOR = {literal(newton._FLOOR_EPS * _EPS)};
+static const double FLOOR = {literal(rules.floor * _EPS)};
 static const double SETTLED = {literal(newton.settled_floors(np.float64))};
 
 struct point {{
@@ -138,7 +140,7 @@ static double floors(int n, const struct point *at)
 
 static int goes_on(double error, double merit, double before)
 {{
-    return error > SETTLED || (error > 1.0 && merit < 0.5*before);
+    return error > SETTLED || (error > 1.0 && merit < {literal(rules.halves)}*before);
 }}
 
 /* The root x near the guess x, and the gradient of S there. */
@@ -158,8 +160,8 @@ static int newton(const struct equation *of, const double *z, double *x, double 
     const int smaller = after < merit;
     const int done = smaller && !goes_on(error_there, after, merit);
     int open = !done && (smaller || error > SETTLED);
-    const int straight = error_there <= SETTLED || after <= {literal(newton._STRAIGHT)}*merit;
-    double factor = straight ? 1.0 : {literal(newton._BEGIN)};
+    const int straight = error_there <= SETTLED || after <= {literal(rules.straight)}*merit;
+    double factor = straight ? 1.0 : {literal(rules.begin)};
     if (smaller && !open) {{
         here = there;
         error = error_there;
@@ -183,21 +185,21 @@ static int newton(const struct equation *of, const double *z, double *x, double 
             off[i] = there.residual[i] - told;
         }}
         const double floor = FLOOR*largest(n, there.size);
-        const int near = largest(n, off) <= {literal(newton._OFF_PATH)}*factor*merit + 4.0*floor;
+        const int near = largest(n, off) <= {off}*factor*merit + {floors}*floor;
         const int by_the_path = bent <= {literal(bend)} && near && sign_there == sign;
         const int settled = error <= SETTLED;
         if (by_the_path || (settled && new_merit < merit)) {{
             iterations++;
             open = goes_on(new_error, new_merit, merit) && iterations < MOST;
-            const double bend = clip(bent, {literal(0.25 * bend)}, {literal(2 * bend)});
-            factor = fmin({literal(0.95 * bend)}/bend*factor, 1.0);
+            const double bend = clip(bent, {least}, {most});
+            factor = fmin({literal(rules.longer * bend)}/bend*factor, 1.0);
             here = there;
             error = new_error;
             merit = new_merit;
             memcpy(x, tried, n*sizeof *x);
             memcpy(step, next, n*sizeof *step);
         }} else {{
-            open = factor > (settled ? 1.0 : {literal(0.5**newton._HALVINGS)});
+            open = factor > (settled ? 1.0 : {literal(0.5**rules.halvings)});
             factor *= 0.5;
         }}
     }}
@@ -251,55 +253,63 @@ static double eliminated(int n, const double *matrix, const double *rhs, double 
 def fixed_point_solver(width: int, stages: int, more: int = 0) -> str:
     """Write Gauss collocation by fixed point in C, for at most ``stages`` stages.
 
-    States have ``width`` entries, and ``more`` args follow them.
+    States have ``width`` entries, and at most ``more`` args follow them.
     """
-    room, follow = "", ""
-    if more:
-        room = f" + {more}"
-        follow = f"    memcpy(inside + STATE, z + STATE, {more}*sizeof *z);\n"
     return f"""\
-enum {{ MOST_STAGES = {stages}, STATE = {width} }};
+enum {{ MOST_STAGES = {stages}, STATE = {width}, ARGS = {more} }};
 
-/* z after h: L_i = h b_i J grad H(z + sum_j mu_ij L_j), z + sum_i L_i; weights: h b_i. */
-static int collocated(void (*gradient)(const double *, double *), int stages,
-                      const double *coupling, const double *weights, const double *scale, double *z)
+/* weights: h b_i; times: h c_i; later: the args a time after, NULL where they do not change. */
+struct flow {{
+    int stages, args;
+    const double *coupling, *weights, *times, *scale;
+    void (*gradient)(const double *w, double *g);
+    void (*later)(const double *args, const double *after, double *later);
+}};
+
+/* L_i = h b_i J grad H(z + sum_j mu_ij L_j), moved: sum_i L_i. */
+static int collocated(const struct flow *of, const double *z, double *moved)
 {{
-    double slopes[MOST_STAGES][STATE], fresh[MOST_STAGES][STATE], inside[STATE{room}], g[STATE];
-    double change = INFINITY;
-{follow}    gradient(z, g);
-    for (int i = 0; i < stages; i++)
+    const int stages = of->stages;
+    double slopes[MOST_STAGES][STATE], fresh[MOST_STAGES][STATE], g[STATE];
+    double inside[MOST_STAGES][STATE + ARGS], change = INFINITY;
+    of->gradient(z, g);
+    for (int i = 0; i < stages; i++) {{
+        if (of->later)
+            of->later(z + STATE, of->times + i, inside[i] + STATE);
+        else
+            memcpy(inside[i] + STATE, z + STATE, of->args*sizeof *z);
         for (int a = 0; a < STATE; a++)
-            slopes[i][a] = weights[i]*(a < STATE/2 ? g[a + STATE/2] : -g[a - STATE/2]);
+            slopes[i][a] = of->weights[i]*(a < STATE/2 ? g[a + STATE/2] : -g[a - STATE/2]);
+    }}
     for (int iterations = 1; ; iterations++) {{
-        double moved = 0.0;
+        double most = 0.0;
         for (int i = 0; i < stages; i++) {{
             for (int a = 0; a < STATE; a++) {{
                 double sum = 0.0;
                 for (int j = 0; j < stages; j++)
-                    sum += coupling[i*stages + j]*slopes[j][a];
-                inside[a] = z[a] + sum;
+                    sum += of->coupling[i*stages + j]*slopes[j][a];
+                inside[i][a] = z[a] + sum;
             }}
-            gradient(inside, g);
+            of->gradient(inside[i], g);
             for (int a = 0; a < STATE; a++) {{
-                fresh[i][a] = weights[i]*(a < STATE/2 ? g[a + STATE/2] : -g[a - STATE/2]);
-                const double size = (fabs(z[a]) + scale[a])/stages;
+                fresh[i][a] = of->weights[i]*(a < STATE/2 ? g[a + STATE/2] : -g[a - STATE/2]);
+                const double size = (fabs(z[a]) + of->scale[a])/stages;
                 const double part = fabs(fresh[i][a] - slopes[i][a])/size;
-                if (part > moved || isnan(part))
-                    moved = isnan(moved) ? moved : part;
+                if (part > most || isnan(part))
+                    most = isnan(most) ? most : part;
             }}
         }}
-        const int settled = moved <= {literal(_EPS**flow._SETTLED)} && moved > 0.5*change;
-        change = moved;
+        const int settled = most <= {literal(_EPS**flow._SETTLED)} && most > 0.5*change;
+        change = most;
         memcpy(slopes, fresh, sizeof slopes);
-        if (moved <= {literal(flow._FLOOR_EPS * _EPS)} || settled || !isfinite(moved)
+        if (most <= {literal(flow._FLOOR_EPS * _EPS)} || settled || !isfinite(most)
             || iterations == {flow._MOST})
             break;
     }}
     for (int a = 0; a < STATE; a++) {{
-        double sum = 0.0;
+        moved[a] = 0.0;
         for (int i = 0; i < stages; i++)
-            sum += slopes[i][a];
-        z[a] += sum;
+            moved[a] += slopes[i][a];
     }}
     if (change <= {literal(_EPS**flow._SETTLED)})
         return OK;

@@ -1,6 +1,7 @@
 """Pieces of a map in C: ``int PIECE_step(double *z)``, and ``PIECE_back``, its inverse.
 
-The args, values of a map's parameters, follow the state in z and in w, and are not changed.
+The args follow the state in z and in w: parameters, the time of a drive, coefficients of inputs. A
+piece does not change them; it moves copies of them to the times of its stages.
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.exports.formulas import on_symbols
 from gfnn_jax.exports.symbols import Tape, literal
 from gfnn_jax.families.displacements import OfDisplacement
+from gfnn_jax.families.family import at_time
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.flows.legendre import Legendre
+from gfnn_jax.flows.uniform import CaldirolaKanai, Uniform, without_forces
 from gfnn_jax.generating.generated import Generated, ImplicitStep
 from gfnn_jax.generating.predictor import PolynomialModel
 from gfnn_jax.maps.affine import Affine
@@ -34,9 +37,9 @@ def why_not_piece(piece: Any) -> str | None:
     if not isinstance(piece, (Generated, Flow)):
         return f"the map has a piece {type(piece).__name__}"
     family = piece.family
-    if isinstance(family, Legendre) and family.dim > COFACTORS_UP_TO:
-        return f"the masses of {family.dim} degrees of freedom are no small system"
-    inner = family.family if isinstance(family, OfDisplacement) else family
+    inner = family.family if isinstance(family, OfDisplacement) else without_forces(family)
+    if isinstance(inner, Legendre) and inner.dim > COFACTORS_UP_TO:
+        return f"the masses of {inner.dim} degrees of freedom are no small system"
     if not isinstance(inner, (Products, Terms, Legendre)):
         return f"the map is one of {getattr(family, 'label', type(family).__name__)}"
     if isinstance(piece, Flow) and piece.newton:
@@ -61,11 +64,11 @@ def piece_functions(name: str, piece: Any, back: Any, width: int, more: int = 0)
         ways = (("step", piece), ("back", back))
         return [part for way, one in ways for part in _explicit(f"{name}_{way}", one, width, more)]
     family, params = on_symbols(piece.family), np.asarray(piece.params)
+    if isinstance(piece, Flow):
+        return _flow(name, piece, back, width, more)
     tape = Tape()
     w, args = _with_args(tape, "w", width, more)
     parts = [tape.function(f"{name}_gradient", {"g": family.gradient(params, w, args)})]
-    if isinstance(piece, Flow):
-        return [*parts, *_flow(name, piece, back)]
     tape = Tape()
     w, args = _with_args(tape, "w", width, more)
     gradient, hessian = family.gradient_and_hessian(params, w, args)
@@ -124,15 +127,19 @@ def _generated(name: str, family: str, piece: Generated, width: int, more: int) 
     dt, scale = float(np.asarray(piece.dt)), np.asarray(piece.scale)
     equation = ImplicitStep(chart)
 
+    def state_and_args(tape: Tape) -> tuple[np.ndarray, Any]:
+        z, args = _with_args(tape, "z", width, more)
+        return z, args if args is None else at_time(piece.family, args, 0.5 * dt)
+
     tape = Tape()
-    z, args = _with_args(tape, "z", width, more)
+    z, args = state_and_args(tape)
     guess = chart.first_guess(z)[:, chart.free(width // 2)]
     if piece.predictor is not None:
         guess = guess + _predicted(piece.predictor.forward, z, args)
     parts = [tape.function(f"{name}_guess", {"x": guess})]
 
     tape = Tape()
-    (z, args), x = _with_args(tape, "z", width, more), tape.inputs("x", n)
+    (z, args), x = state_and_args(tape), tape.inputs("x", n)
     w = chart.complete(chart.first_guess(z), x)
     if args is not None:
         w = np.concatenate([w, args], axis=1)
@@ -208,30 +215,80 @@ def _predicted(model: PolynomialModel, z, args):
     return model.of_variables(np.array([within], dtype=object))
 
 
-def _flow(name: str, piece: Flow, back: Flow) -> list[str]:
-    """Write Gauss collocation by fixed point; the gradient of H is in C already."""
+def moves_args(piece: Any, more: int) -> bool:
+    """Return whether what a piece depends on changes during a step."""
+    return isinstance(piece, Flow) and _later("", on_symbols(piece.family), more) is not None
+
+
+def _later(name: str, family: Any, more: int) -> str | None:
+    """Write the args of a family a time ``after`` later; None where they stay as they are."""
+    if not more:
+        return None
+    tape = Tape()
+    args, after = tape.inputs("args", more), tape.inputs("after", 1)
+    later = at_time(family, args, after[0])
+    if all(a is b for a, b in zip(np.ravel(args), np.ravel(later), strict=True)):
+        return None
+    return tape.function(name, {"later": later})
+
+
+def _flow(name: str, piece: Flow, back: Flow, width: int, more: int) -> list[str]:
+    """Write Gauss collocation by fixed point. With uniform friction its variables are (q, p~) of
+    `flows.uniform`, and the time since the substep began is one arg more."""
+    family, params = on_symbols(piece.family), np.asarray(piece.params)
+    uniform = isinstance(family, Uniform)
+    staged, inside = (CaldirolaKanai(family.family), more + 1) if uniform else (family, more)
+    tape = Tape()
+    w, args = _with_args(tape, "w", width, inside)
+    parts = [tape.function(f"{name}_gradient", {"g": staged.gradient(params, w, args)})]
+    of_substeps, of_stages = _later(f"{name}_later", family, more), "NULL"
+    if of_substeps is not None:
+        parts.append(of_substeps)
+        of_stages = f"{name}_later"
+    if uniform:
+        of_stages = f"{name}_stage"
+        parts.append(_later(of_stages, staged, inside) or "")
     rule, stages = gauss(piece.stages), piece.stages
-    parts = [
-        f"static const double {name}_coupling[{stages * stages}] = {_row(rule.coupling)};\n"
-        f"static const double {name}_scale[] = {_row(piece.scale)};\n"
-    ]
+    parts.append(
+        f"static const double {name}_coupling[{stages * stages}] = {table(rule.coupling)};\n"
+        f"static const double {name}_scale[] = {table(piece.scale)};\n"
+    )
     for way, one in (("step", piece), ("back", back)):
         h = float(np.asarray(one.dt)) / one.substeps
+        tape = Tape()
+        z, moved = tape.inputs("z", width), tape.inputs("moved", width)
+        image = z + (family.moved(params, z, moved, h) if uniform else moved)
+        parts.append(tape.function(f"{name}_{way}_image", {"Z": image}))
+        begin = [f"memcpy(begun, z, {width if of_substeps else width + more}*sizeof *z);"]
+        if of_substeps:
+            begin += [
+                f"const double after = i*{literal(h)};",
+                f"{name}_later(z + {width}, &after, begun + {width});",
+            ]
+        if uniform:
+            begin.append(f"begun[{width + more}] = 0.0;")
+        lines = "\n".join(f"        {line}" for line in begin)
         parts.append(f"""\
 static int {name}_{way}(double *z)
 {{
-    static const double weights[{stages}] = {_row(rule.weights * h)};
+    static const double weights[{stages}] = {table(rule.weights * h)};
+    static const double times[{stages}] = {table(rule.nodes * h)};
+    static const struct flow of = {{{stages}, {inside}, {name}_coupling, weights, times,
+                                   {name}_scale, {name}_gradient, {of_stages}}};
+    double begun[{width + inside}], moved[{width}];
     int status = OK;
-    for (int i = 0; i < {one.substeps}; i++)
-        status = worse(status, collocated({name}_gradient, {stages}, {name}_coupling, weights,
-                                          {name}_scale, z));
+    for (int i = 0; i < {one.substeps}; i++) {{
+{lines}
+        status = worse(status, collocated(&of, begun, moved));
+        {name}_{way}_image(begun, moved, z);
+    }}
     return status;
 }}
 """)
     return parts
 
 
-def _row(values) -> str:
+def table(values) -> str:
     """Write numbers as the initialiser of a C array, four in a line."""
     texts = [literal(v) for v in np.ravel(np.asarray(values)).tolist()]
     lines = [", ".join(texts[i : i + 4]) for i in range(0, len(texts), 4)]

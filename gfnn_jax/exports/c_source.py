@@ -15,6 +15,14 @@ import numpy as np
 from gfnn_jax.coordinates import CARTESIAN, polar
 from gfnn_jax.errors import InputError
 from gfnn_jax.exports import c_parts
+from gfnn_jax.exports.c_args import (
+    about_args,
+    args_after,
+    inputs_of_samples,
+    inside_ranges,
+    num_args,
+    of_samples,
+)
 from gfnn_jax.exports.c_pieces import piece_functions, unknowns, why_not_piece
 from gfnn_jax.exports.symbols import Tape, literal
 from gfnn_jax.families.expressions import coordinate_names
@@ -31,8 +39,6 @@ def why_not(map_: SymplecticMap) -> str | None:
     """Reason why a map cannot be written in C; None where it can."""
     if np.dtype(map_.scale.dtype) != np.float64:
         return f"the map is of {np.dtype(map_.scale.dtype)}, not of float64"
-    if map_.parameters is not None and map_.parameters.period is not None:
-        return "the map is driven"
     if map_.coordinates.forward not in (CARTESIAN.forward, _POLAR):
         return f"the map has the {map_.coordinates.name} coordinates of its scene"
     if not isinstance(map_.domain, Domain):
@@ -43,9 +49,10 @@ def why_not(map_: SymplecticMap) -> str | None:
 def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     """Write a map as C: ``int NAME_step(const double z[2d], double Z[2d])`` and ``NAME_inverse``.
 
-    For a map with k parameters both take ``const double args[k]`` after z. about: entries of the
-    comment at the top, name -> text. Raises InputError, in one line, for a map that cannot be
-    written in C.
+    For a map with parameters, a drive or inputs both take ``const double args[k]`` after z; where
+    inputs change during a step, ``NAME_inputs`` makes their part of the args of samples. about:
+    entries of the comment at the top, name -> text. Raises InputError, in one line, for a map that
+    cannot be written in C.
     """
     if (reason := why_not(map_)) is not None:
         raise InputError(
@@ -54,7 +61,7 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
         )
     map_ = jax.tree.map(np.asarray, map_)
     pieces, width, domain = map_.pieces, 2 * map_.dim, map_.domain
-    more = _num_args(map_)
+    more = num_args(map_)
     assert isinstance(domain, Domain)
     parts = [_comment(map_, name, about), c_parts.INCLUDES, c_parts.COMMON]
     if map_.coordinates.angles:
@@ -67,7 +74,7 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     if most > COFACTORS_UP_TO:
         parts.append(c_parts.ELIMINATION)
     if stages := max((p.stages for p in pieces if isinstance(p, Flow)), default=0):
-        parts.append(c_parts.fixed_point_solver(width, stages, more))
+        parts.append(c_parts.fixed_point_solver(width, stages, more + 1))  # 1: a piece's own
     if domain.keep:
         tape = Tape()
         y = tape.inputs("y", width)
@@ -75,25 +82,27 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     for i, (piece, back) in enumerate(zip(pieces, map_.reversed().pieces[::-1], strict=True)):
         parts += piece_functions(f"piece{i}", piece, back, width, more)
     order = range(len(pieces))
-    parts.append(_whole(map_, f"{name}_step", [f"piece{i}_step" for i in order]))
-    parts.append(_whole(map_, f"{name}_inverse", [f"piece{i}_back" for i in reversed(order)]))
+    ahead = args_after(map_)
+    parts.append(_whole(map_, f"{name}_step", [f"piece{i}_step" for i in order], []))
+    parts.append(
+        _whole(map_, f"{name}_inverse", [f"piece{i}_back" for i in reversed(order)], ahead)
+    )
+    if of_samples(map_):
+        parts.append(inputs_of_samples(map_, name))
     return "\n".join(parts)
 
 
-def _num_args(map_: SymplecticMap) -> int:
-    return 0 if map_.parameters is None else len(map_.parameters.names)
-
-
 def _signature(map_: SymplecticMap, name: str) -> str:
-    width, more = 2 * map_.dim, _num_args(map_)
+    width, more = 2 * map_.dim, num_args(map_)
     args = f"const double args[{more}], " if more else ""
     return f"int {name}(const double z[{width}], {args}double Z[{width}])"
 
 
-def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str]) -> str:
-    """Write the public function: `SymplecticMap._apply` of one state; args follow it in y."""
+def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str], ahead: Sequence[str]) -> str:
+    """Write the public function: `SymplecticMap._apply` of one state; args follow it in y, moved by
+    the lines ``ahead``."""
     width, angles, domain = 2 * map_.dim, map_.coordinates.angles, map_.domain
-    more = _num_args(map_)
+    more = num_args(map_)
     changed = map_.coordinates.forward is not CARTESIAN.forward
     centres = np.ravel(np.asarray(map_.angle_centre))
     turns = f", turns[{len(angles)}]" if angles else ""
@@ -101,6 +110,7 @@ def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str]) -> str:
         f"double y[{width + more}]{turns};",
         "to_inner(z, y);" if changed else f"memcpy(y, z, {width}*sizeof *y);",
         *([f"memcpy(y + {width}, args, {more}*sizeof *y);"] if more else []),
+        *ahead,
         *(
             f"y[{a}] = reduced(y[{a}], {literal(centre)}, &turns[{k}]);"
             for k, (a, centre) in enumerate(zip(angles, centres, strict=True))
@@ -114,12 +124,7 @@ def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str]) -> str:
             "christoffel(y, kappa);",
             f"inside = inside && kappa[0] <= {literal(float(np.asarray(domain.limit)))};",
         ]
-    if map_.parameters is not None:
-        low, high = map_.parameters.bounds
-        lines += [
-            f"inside = inside && args[{k}] >= {literal(a)} && args[{k}] <= {literal(b)};"
-            for k, (a, b) in enumerate(zip(low, high, strict=True))
-        ]
+    lines += inside_ranges(map_)
     lines += [
         "int status = OK;",
         *(f"status = worse(status, {piece}(y));" for piece in pieces),
@@ -141,16 +146,8 @@ def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     sizes = ", ".join(f"{n} {s:.3g}" for n, s in zip(names, map_.scale, strict=True))
     angles = [names[i] for i in map_.coordinates.angles if map_.coordinates.forward is not _POLAR]
     turned = f" {', '.join(angles)}: period 2 pi, any number of turns." if angles else ""
-    given, outside = "", "z lies"
-    if map_.parameters is not None:
-        ranges = ", ".join(
-            f"{n} from {low:.6g} to {high:.6g}"
-            for n, low, high in zip(
-                map_.parameters.names, map_.parameters.low, map_.parameters.high, strict=True
-            )
-        )
-        given = f"\n   args = ({', '.join(map_.parameters.names)}), in the data {ranges}."
-        outside = "z or args are"
+    given = about_args(map_, name)
+    outside = "z or args are" if map_.parameters is not None else "z lies"
     told = "\n".join(
         f"   {key}: {value:.3g}" if isinstance(value, float) else f"   {key}: {value}"
         for key, value in about.items()

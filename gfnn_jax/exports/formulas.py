@@ -13,7 +13,11 @@ from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.jets import jets
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.traced import traced
+from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.legendre import Legendre
+from gfnn_jax.flows.uniform import CaldirolaKanai, Uniform
+
+_NARROWEST = 1e-150  # width of dry friction that no speed is below, and whose square is a number
 
 
 class Formulas(Inputs):
@@ -55,7 +59,11 @@ def on_symbols(family: Any) -> Any:
     if isinstance(family, Legendre):
         phases = np.array([_Phase(phase) for phase in family.terms.phases], dtype=object)
         return Legendre(dataclasses.replace(family.terms, phases=phases))
-    if isinstance(family, OfDisplacement):
+    if isinstance(family, Forced):  # of no width, friction would ask whether a symbol is 0
+        widths = np.maximum(family.friction.widths, _NARROWEST)
+        friction = dataclasses.replace(family.friction, widths=widths)
+        family = dataclasses.replace(family, friction=friction)
+    if isinstance(family, (OfDisplacement, Forced, Uniform, CaldirolaKanai)):
         return dataclasses.replace(family, family=on_symbols(family.family))
     if not isinstance(family, Products) or family.inputs.features is None:
         return family

@@ -67,6 +67,8 @@ class Symbol:
         return self.tape.made("fabs", self)
 
     def __pow__(self, exponent):
+        if exponent in (0, 1):
+            return self if exponent else 1.0
         return self * self if exponent == 2 else self.tape.made("pow", self, exponent)
 
     def clipped(self, low: float, high: float) -> Symbol:

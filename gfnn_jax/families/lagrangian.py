@@ -215,7 +215,8 @@ class Friction:
         size = xp.abs(s)
         kinds, widths = as_row(self.kinds, s), as_row(self.widths, s)
         root = xp.sqrt(s * s + widths**2)
-        root = xp.where(root > 0, root, 1.0)  # at rest with ε = 0 there is no direction to push
+        # At rest with ε = 0 there is no direction to push.
+        root = root + (root == 0).astype(root.dtype)
         linear, quadratic = kinds == LINEAR, kinds == QUADRATIC
         value = xp.where(linear, 0.5 * s * s, xp.where(quadratic, size**3 / 3, root - widths))
         slope = xp.where(linear, s, xp.where(quadratic, s * size, s / root))

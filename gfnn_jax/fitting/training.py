@@ -92,7 +92,7 @@ class _Training:
 
     @property
     def stopped_because(self) -> str | None:
-        """Why there is no further iteration, None where there is one."""
+        """The reason why there is no further iteration, None where there is one."""
         state, options = self.state, self.options
         if state.best_validation_rms <= options.target_rms:
             return "target"

@@ -24,6 +24,7 @@ from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.generating_functions.sweeps import OF_SOLVE, OF_STEPS, LinearSweep
 from gfnn_jax.models.hamiltonians.choose_law import long_step
+from gfnn_jax.models.hamiltonians.learned_law import TURNS
 from gfnn_jax.models.hamiltonians.white import leaves_white
 from gfnn_jax.search.search import COMPARABLE, MET, Entry
 
@@ -264,6 +265,8 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     candidate, data = chosen.candidate, searched.data
     law = searched.law
     entry = chosen.entry or next(iter(searched.found.ranking), None)
+    if candidate.learns == "hamiltonian" and law is not None and law.turns:
+        return _LeftOver(None, [], TURNS)
     if candidate.learns == "hamiltonian" and law is not None and law.friction:
         entry = None  # S has none
     if entry is not None:
@@ -297,7 +300,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
                 "follow some of the states, as of close passages"
             )
             return _LeftOver(None, [message], "the terms tried cannot follow some of the states")
-        own = f". The map's own error is then about {part:.1g} of it"
+        own = f". The map's own error is then about {part:.1g} of this noise"
     hidden, reason = "", "the residuals are noise"
     if len(np.unique(sequence)) == len(sequence):
         hidden = (

@@ -46,6 +46,7 @@ from gfnn_jax.learn.stated import stated
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.hamiltonians.formula import PartialLaw
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.recordings import fit_recording
 from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS, drawn
@@ -72,6 +73,7 @@ class Fit:
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
     scene: as given. damping: of a map that loses area, by how much of it in a step. positions: of a
     map that was learned from positions alone, what its S is like; num_pairs are then triples.
+    partial_laws: where no H meets the tolerance, the laws of physics that come closest.
     stated_by: the pairs by which the chosen candidate's error was measured, and whether the map was
     fitted to them afterwards.
     validation_pairs, test_pairs: that chose, and that stated the error; None where the pairs were
@@ -101,6 +103,7 @@ class Fit:
     scene: Scene | None = None
     damping: LearnedDamping | None = None
     positions: OfPositions | None = None
+    partial_laws: tuple[PartialLaw, ...] = ()
     stated_by: str = ""
     test_pairs: Pairs | None = None
     operations: int = 0
@@ -381,6 +384,7 @@ def fit(
         pairs=data.pairs,
         scene=scene,
         damping=seen.damping if chosen.candidate.learns == "map" else None,
+        partial_laws=() if found.met_by_law else tuple(request.partial_laws),
         stated_by=stated_by,
         test_pairs=data.pairs.take(data.test) if len(data.test) else None,
         operations=budget.operations,

@@ -59,9 +59,9 @@ class Cleaned(NamedTuple):
 
 
 def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> Cleaned:
-    """Searched again without gross errors, or states that the map cannot follow, as long as that
-    lowers what is left over of the others; as it is, where the tolerance is met, there are none, or
-    too many."""
+    """Searched again without gross errors, as long as that lowers what is left over of the others,
+    or without states that the map cannot follow, where the others then meet the tolerance; as it
+    is, where the tolerance is met, there are none, or too many."""
     wrong, rim, count = np.zeros(0, int), np.zeros(0, int), len(found.data)
     request = dataclasses.replace(request, factors=None, checkpoints=None)
     for _ in range(_ROUNDS):
@@ -84,6 +84,8 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
         again = searched(request, data, diagnosis, None)
         left = _residuals(again)
         if left is not None and not _rms(left) <= rise * _rms(size[others]):
+            break
+        if at_rim and left is not None:  # the tolerance is missed without these exact pairs too
             break
         named = found.data.row[rows]
         wrong, rim = (wrong, np.append(rim, named)) if at_rim else (np.append(wrong, named), rim)

@@ -22,6 +22,7 @@ from gfnn_jax.learn.check import (
     unnamed_angles,
 )
 from gfnn_jax.learn.options import FitOptions
+from gfnn_jax.models.hamiltonians.formula import PartialLaw
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
 
@@ -32,7 +33,7 @@ class Request:
 
     options: of the fit, with ``learn`` as the pairs allow it. tolerance, structure: those of the
     options, and the scene's. say, tell: on_progress and on_candidate of `gfnn.fit`. messages:
-    warnings about the pairs and the request.
+    warnings about the pairs and the request. partial_laws: those that were found so far.
     """
 
     pairs: Pairs
@@ -47,6 +48,12 @@ class Request:
     say: Callable[[str], Any]
     tell: Callable[[Candidate], Any]
     messages: list[str]
+    partial_laws: list[PartialLaw] = dataclasses.field(default_factory=list)
+
+    def partly(self, law: PartialLaw) -> None:
+        """Keep a law that explains a part."""
+        self.say(f"H: {law}")
+        self.partial_laws.append(law)
 
     @property
     def reversor(self):

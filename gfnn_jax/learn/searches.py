@@ -164,7 +164,7 @@ def _law(
     else:
         law = law_of(
             data, request.tolerance, request.scene, options.learn, options.terms, request.budget,
-            request.say, dearest,
+            request.say, dearest, request.partly,
         )  # fmt: skip
     if law is not None:
         if better is not None:

@@ -106,6 +106,14 @@ class Signals:
         unit = xp.asarray(dt, u.dtype) ** np.arange(len(weights), dtype=u.dtype)
         return (found / as_row(unit[:, None], found)).reshape(*u.shape[:-1], -1)
 
+    def stencil(self, dt: float) -> tuple[int, np.ndarray]:
+        """(first, weights): where the samples begin that a step takes, counted from that of its
+        begin, and the coefficients (degree + 1, samples) of its polynomial in time."""
+        first, weights = _stencil(self.hold, self.delay / dt)
+        used = np.flatnonzero(weights.any(axis=0))
+        weights = weights[:, used[0] : used[-1] + 1]
+        return first + int(used[0]), weights / dt ** np.arange(len(weights))[:, None]
+
     @property
     def _named(self) -> str:
         return ", ".join(self.names)

@@ -51,7 +51,7 @@ class Problem(Protocol):
 
 @runtime_checkable
 class Rule(Protocol):
-    """How the damping follows from step to step."""
+    """The damping, as it follows from step to step."""
 
     @property
     def start(self) -> float: ...

@@ -26,16 +26,32 @@ from gfnn_jax.arrays import namespace
 from gfnn_jax.solve.linear import small_solve, solve_and_sign
 from gfnn_jax.solve.status import NON_FINITE, NOT_CONVERGED, OK, Info
 
-_HALVINGS = 30
-# Largest change of the residual's slope along a step, relative to the steeper slope; largest
-# difference between the residual's change and its estimate from the two slopes (trapezoidal rule),
-# relative to that change.
-_BENT, _OFF_PATH = 0.35, 0.05
-# The first step is tried whole where the update with the same step has left at most _STRAIGHT of
-# the residual, else the part _BEGIN of it: a whole step may lead past folds, small steps seldom do.
-_STRAIGHT, _BEGIN = 0.01, 0.125
-# A residual of this many eps of the size of its terms is the floor: a few roundings of that size.
-_FLOOR_EPS = 4.0
+
+class Rules(NamedTuple):
+    """Numbers of the iteration: those of `iterate`, and of the C that `exports` writes of it."""
+
+    floor: float = 4.0  # roundoff: a residual of this many eps of the size of its terms
+    halves: float = 0.5  # near the floor a lane goes on while an update leaves less than this part
+    # The first step is tried whole where the update with the same step has left at most
+    # ``straight`` of the residual, else the part ``begin`` of it: a whole step may lead past folds,
+    # small steps seldom do.
+    straight: float = 0.01
+    begin: float = 0.125
+    # Largest change of the residual's slope along a step, relative to the steeper slope; largest
+    # difference between the residual's change and its estimate from the two slopes (trapezoidal
+    # rule), relative to that change, beyond ``rounding`` floors.
+    bent: float = 0.35
+    off_path: float = 0.05
+    rounding: float = 4.0
+    # The next part of a step is this times what the slope's change allows, that change taken to be
+    # within these parts of ``bent``.
+    longer: float = 0.95
+    least_bent: float = 0.25
+    most_bent: float = 2.0
+    halvings: int = 30  # of a step, before a lane is given up
+
+
+RULES = Rules()
 # Where one update is not enough, max(_FEWEST, B // _PART) lanes of a batch are gathered at a time
 # for _VISIT updates. With fewer lanes fewer wait for the slowest, but all are scanned more often.
 # Tuned on CPUs (benchmarks/speed.py); where all lanes of a batch are hard, gathering costs up to a
@@ -133,9 +149,9 @@ def iterate(
     # it in vain at every step of the batch.
     leads_on = jnp.isfinite(before) & jnp.isfinite(largest(step))
     begun = ~done & leads_on & (smaller | (first.error > settled)) & (most > 1)
-    straight = (second.error <= settled) | (after <= _STRAIGHT * before)
+    straight = (second.error <= settled) | (after <= RULES.straight * before)
     state = where(smaller & ~begun, second, first)._replace(
-        factor=jnp.where(straight, ones, _BEGIN * ones),
+        factor=jnp.where(straight, ones, RULES.begin * ones),
         iterations=jnp.where(begun, 0, 1).astype(jnp.int32),  # the loop makes the first one again
         open=begun,
     )
@@ -163,17 +179,17 @@ def settled_floors(dtype) -> float:
 def floors(evaluation: Evaluation):
     """Largest residual of each lane, in units of its roundoff floor."""
     eps = float(jnp.finfo(evaluation.residual.dtype).eps)
-    return largest(evaluation.residual / evaluation.size) / (_FLOOR_EPS * eps)
+    return largest(evaluation.residual / evaluation.size) / (RULES.floor * eps)
 
 
 def relative(error):
     """Convert an error in roundoff floors to one relative to the residual's terms."""
-    return error * (_FLOOR_EPS * float(jnp.finfo(error.dtype).eps))
+    return error * (RULES.floor * float(jnp.finfo(error.dtype).eps))
 
 
 def _goes_on(error, merit, merit_before, settled: float):
     """Return whether a lane with this error needs a further update."""
-    return (error > settled) | ((error > 1.0) & (merit < 0.5 * merit_before))
+    return (error > settled) | ((error > 1.0) & (merit < RULES.halves * merit_before))
 
 
 def _newton(equation, shared, lanes, state: _Iterate, *, most, settled) -> _Iterate:
@@ -188,21 +204,24 @@ def _newton(equation, shared, lanes, state: _Iterate, *, most, settled) -> _Iter
     slope = -jnp.sum(matrix * state.step[:, None, :], axis=-1)
     bent = largest(slope + state.residual) / jnp.maximum(largest(slope), merit)
     told = state.residual + 0.5 * part * (slope - state.residual)
-    floor = _FLOOR_EPS * float(jnp.finfo(x.dtype).eps) * jnp.max(evaluation.size, axis=-1)
-    near = largest(residual - told) <= _OFF_PATH * state.factor * merit + 4 * floor
-    by_the_path = (bent <= _BENT) & near & (sign_here == state.sign)
+    floor = RULES.floor * float(jnp.finfo(x.dtype).eps) * jnp.max(evaluation.size, axis=-1)
+    near = (
+        largest(residual - told) <= RULES.off_path * state.factor * merit + RULES.rounding * floor
+    )
+    by_the_path = (bent <= RULES.bent) & near & (sign_here == state.sign)
     settled_here = state.error <= settled
     better = state.open & (by_the_path | (settled_here & (new_merit < merit)))
     iterations = state.iterations + 1
     further = _goes_on(error, new_merit, merit, settled) & (iterations < most)
     # The next part is as long as the slope's change allows, if it goes on as it did.
-    longer = 0.95 * _BENT / jnp.clip(bent, 0.25 * _BENT, 2 * _BENT) * state.factor
+    likely = jnp.clip(bent, RULES.least_bent * RULES.bent, RULES.most_bent * RULES.bent)
+    longer = RULES.longer * RULES.bent / likely * state.factor
     new = _Iterate(
         x, residual, evaluation.aux, error, state.sign, step, jnp.minimum(longer, 1.0),
         iterations, further,
     )  # fmt: skip
     # Close to the floor only the full step makes sense: what is left is roundoff.
-    shortest = jnp.where(settled_here, 1.0, 0.5**_HALVINGS).astype(x.dtype)
+    shortest = jnp.where(settled_here, 1.0, 0.5**RULES.halvings).astype(x.dtype)
     halved = state._replace(
         factor=jnp.where(state.open, 0.5 * state.factor, state.factor),
         open=state.open & (state.factor > shortest),

@@ -14,6 +14,7 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError
 from gfnn_jax.fitting.turns import backwards, tangent, turns
+from gfnn_jax.models.hamiltonians.formula import OnPartial
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.options import OPTIONS
 from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
@@ -43,13 +44,14 @@ def law_of(
     budget: Budget,
     say: Callable[[str], Any],
     dearest: float = np.inf,
+    partly: OnPartial = lambda law: None,
 ) -> LearnedHamiltonian | None:
     """The Hamiltonian of these pairs, or None where "auto" finds none, or the budget ends before
     the first.
 
     data: without a base map. dearest: operations of a step of H that is chosen beside a map that
-    meets the tolerance; of use where H is not asked for. Raises FitError where a Hamiltonian is
-    asked for and there is none to learn.
+    meets the tolerance; of use where H is not asked for. partly: as of `learn_hamiltonian`.
+    Raises FitError where a Hamiltonian is asked for and there is none to learn.
     """
     unfit = unfit_for_law(data, scene)
     if unfit is not None:
@@ -69,7 +71,7 @@ def law_of(
         with np.errstate(all="ignore"):  # starts that run away are part of the search
             return learn_hamiltonian(
                 data, tolerance, scene, terms=terms, budget=budget, say=say, options=options,
-                dearest=np.inf if foremost else dearest,
+                dearest=np.inf if foremost else dearest, partly=partly,
             )  # fmt: skip
     except OutOfTime:
         budget.leave_out("H", "no set of terms was fitted within the budget")

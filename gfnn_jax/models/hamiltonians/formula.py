@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,21 @@ class Rival(NamedTuple):
 
     formula: str
     odds: float
+
+
+class PartialLaw(NamedTuple):
+    """A law that explains a part of the motion, where none explains all of it. left: what its flow
+    leaves over, in ``unit``s: parts of the spread, or times the noise."""
+
+    formula: str
+    left: float
+    unit: str
+
+    def __str__(self) -> str:
+        return f"a partial law leaves {self.left:.2g} {self.unit} over: {self.formula}"
+
+
+OnPartial = Callable[[PartialLaw], Any]
 
 
 def formula(terms: Sequence[Term]) -> str:

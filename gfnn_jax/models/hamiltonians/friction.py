@@ -1,11 +1,12 @@
-"""H together with friction: uniform, ṗ = −∂H/∂q − γp, or linear in each velocity, R = Σ ½ρ_i v_i².
+"""H together with friction: uniform, ṗ = −∂H/∂q − γp, or Rayleigh's R = Σ ρ_k r_k(v).
 
 Friction is looked for where H alone misses the tolerance and friction would explain a certain part
 of what it leaves over, and is kept where it lowers the held-out error by half: a system that keeps
 its energy gets no spurious loss. Uniform friction comes first, because its flow keeps a multiple of
 J; it is claimed where it meets the tolerance, or where rates of their own for the degrees of
 freedom would explain no more. A constant determinant of local Jacobians is no sign of it, which two
-oscillators of different friction have too.
+oscillators of different friction have too. Then comes friction linear in each velocity, and where
+neither meets the tolerance all kinds compete (`friction_kinds`).
 """
 
 from __future__ import annotations
@@ -18,16 +19,22 @@ import numpy as np
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError, OutOfTime
-from gfnn_jax.families.lagrangian import LINEAR, Friction
+from gfnn_jax.families.lagrangian import LINEAR, UNIFORM, Friction
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.uniform import Uniform, without_forces
-from gfnn_jax.models.hamiltonians.learned_law import FittedLaw
+from gfnn_jax.models.hamiltonians.friction_kinds import (
+    Rates,
+    candidates,
+    choice_of,
+    with_friction,
+    without_turns,
+)
+from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
 from gfnn_jax.models.hamiltonians.legendre import lagrangian_of
 from gfnn_jax.models.hamiltonians.libraries import libraries_of, modes_of
 from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
 from gfnn_jax.models.hamiltonians.work import LawWork
-from gfnn_jax.phase_space import split
 
 _CERTAIN = 5.0  # standard errors of a coefficient of friction
 _GAINED = 0.5  # of the held-out error of H alone: what friction must lower it to
@@ -37,6 +44,7 @@ _BOXES = ((1, 1), (1, 2), (2, 2))  # (order, degree) of the modes of angles that
 
 Searched = tuple[FittedLaw, Options]
 Forces = Callable[[Any], Any]  # what makes a family with friction of one of H
+Search = Callable[[Forces, Dataset], Searched]  # of laws with these forces, by these pairs
 
 
 def linear_in_velocities(family) -> Forced:
@@ -47,7 +55,7 @@ def linear_in_velocities(family) -> Forced:
 
 def beside_friction(
     problem: Problem, work: LawWork, before: Searched, data: Dataset, tolerance: Tolerance,
-    search: Callable[[Forces], Searched],
+    search: Search,
 ) -> Searched:  # fmt: skip
     """The best that ``search`` finds with friction, where H alone, ``before``, misses the tolerance
     and friction is certain and worth it; else ``before``."""
@@ -65,7 +73,7 @@ def beside_friction(
         return before
     for forces in (Uniform, linear_in_velocities)[: 1 if data.dim == 1 else 2]:
         try:
-            found = search(forces)
+            found = search(forces, data)
         except OutOfTime:
             work.budget.leave_out("H with friction", work.ended)
             break
@@ -79,8 +87,47 @@ def beside_friction(
             continue
         best = found
         if met:
-            break
+            return best
+    try:
+        return _of_kinds(problem, work, before, best, data, tolerance, search) or best
+    except OutOfTime:
+        work.budget.leave_out("H with friction of every kind", work.ended)
+    except (FitError, np.linalg.LinAlgError):
+        pass
     return best
+
+
+def _of_kinds(
+    problem: Problem, work: LawWork, before: Searched, best: Searched, data: Dataset,
+    tolerance: Tolerance, search: Search,
+) -> Searched | None:  # fmt: skip
+    """H with the kinds of friction that held-out pairs choose; None where these are those of
+    ``best``, or not certain, or not worth it."""
+    near = best[0]
+    every = candidates(data, near.family, near.fit.coefficients)
+    steady = without_turns(data, near.family, near.fit.coefficients, every)
+    full, options = search(lambda family: Forced(family, every), steady)
+    choice = choice_of(problem, full.family, full.fit.coefficients, full.fit.steps, full.fit.used)
+    if choice is None or not choice.kinds:
+        return None
+    taken = set(choice.kinds)  # of kinds beside these limits tell
+    odds = {kinds: odds for kinds, odds in choice.odds.items() if not taken <= set(kinds)}
+    if taken <= {LINEAR, UNIFORM} and best is not before:
+        return near._replace(odds=odds), best[1]
+    own = without_forces(full.family)
+    family = with_friction(own, choice.rows)
+    names = dict(zip(full.family.term_names, full.fit.coefficients, strict=True))
+    start = np.array([names.get(name, 0.0) for name in family.term_names])
+    steady = without_turns(data, family, start)
+    rows = steady.training
+    with work.again("H with the friction that was chosen", family, len(rows)):
+        fit = problem.fit(family, start, rows, rounds=False)
+    error = validation_error(family, fit, steady, tolerance)
+    law = full._replace(family=family, fit=fit, rows=rows, error=error, larger=None, odds=odds)
+    alone = validation_error(before[0].family, before[0].fit, steady, tolerance)
+    if not _certain(law) or not error.relative < _GAINED * alone.relative:
+        return None
+    return law, options
 
 
 def mechanical(
@@ -98,7 +145,7 @@ def mechanical(
     if alone is None:
         return None
 
-    def search(forces: Forces) -> Searched:
+    def search(forces: Forces, data: Dataset) -> Searched:
         found = lagrangian_of(problem, work, data, tolerance, forces)
         assert found is not None
         return found, OPTIONS
@@ -146,7 +193,7 @@ def _alike(problem: Problem, law: FittedLaw, rows) -> bool:
         return True
     c, steps = law.fit.coefficients, law.fit.steps
     found = problem.images(law.family, c, rows, steps, derivatives=True)
-    own = problem.images(law.family, c, rows, steps, derivatives=True, along=_Rates(law.family.dim))
+    own = problem.images(law.family, c, rows, steps, derivatives=True, along=Rates(law.family.dim))
     residual = ((found.states - problem.z1[rows]) / problem.scale).ravel()
     columns = [f.by_coefficient / problem.scale[:, None] for f in (found, own)]
     if not all(np.isfinite(a).all() for a in (residual, *columns)):
@@ -159,16 +206,3 @@ def _alike(problem: Problem, law: FittedLaw, rows) -> bool:
         return float(np.linalg.norm(scaled @ np.linalg.lstsq(scaled, residual)[0] - residual))
 
     return left(*columns) > _ALIKE * left(columns[0])
-
-
-class _Rates:
-    """The fields (p_i, 0) of every degree of freedom, as the terms of a linear family."""
-
-    def __init__(self, dim: int):
-        self.num_parameters = dim
-
-    def term_gradients(self, w, args=None):
-        """(..., 2d, d)."""
-        p = split(w)[1]
-        rates = p[..., None] * np.eye(p.shape[-1])
-        return np.concatenate([rates, np.zeros_like(rates)], axis=-2)

@@ -37,13 +37,20 @@ from gfnn_jax.models.hamiltonians.cost_of_flow import (
 )
 from gfnn_jax.models.hamiltonians.formula import Rival, Term, as_code, formula
 from gfnn_jax.models.hamiltonians.fractions import Proposal
+from gfnn_jax.models.hamiltonians.friction_kinds import (
+    followed,
+    is_smooth,
+    told_of,
+    without_turns,
+)
 from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
 from gfnn_jax.models.hamiltonians.symmetries import symmetries_of
 from gfnn_jax.models.hamiltonians.whole_sequences import Whole
-from gfnn_jax.models.lagrangians.text import odds_text
+from gfnn_jax.models.lagrangians.text import WhichFriction, odds_text
 from gfnn_jax.phase_space import apply_j, symplectic_form
 
 FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
+TURNS = "friction is not smooth in steps in which a body turns or stops"
 _NEAR_ROUNDOFF = 3e-15  # of the spread
 _NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
 _FEWEST_SAMPLED = 2_000  # pairs that tell noise from misfit; of many sites, numbers
@@ -92,6 +99,17 @@ class LearnedHamiltonian:
     symmetries: tuple[str, ...] = ()
     proposals: tuple[Proposal, ...] = ()
     rivals: tuple[Rival, ...] = ()
+    widths: tuple[float, ...] = ()
+    turns: bool = False
+    kinds: Callable[[], WhichFriction | None] | None = None
+
+    @cached_property
+    def which_friction(self) -> WhichFriction | None:
+        """The kinds of friction, their odds against others where all of them competed, and the
+        largest coefficients that the pairs allow of those not seen. None of a network, of a law
+        with parameters or of many sites, and where the pairs' flow fails. Computed when it is first
+        asked for."""
+        return None if self.kinds is None else self.kinds()
 
     @cached_property
     def root(self) -> np.ndarray | None:
@@ -147,6 +165,11 @@ class LearnedHamiltonian:
         if self.rivals:
             text = "; ".join(f"{odds_text(r.odds)} against {r.formula}" for r in self.rivals)
             found.append(f"odds by description length: {text}")
+        if self.friction and self.which_friction is not None:
+            found.append(f"friction: {self.which_friction}")
+        if self.widths:
+            text = ", ".join(f"{width:.1g}" for width in self.widths)
+            found.append(f"dry friction of the map is smoothed over speeds ε = {text}")
         return tuple(found)
 
     @property
@@ -179,7 +202,8 @@ class FittedLaw(NamedTuple):
     whether their errors were the same, which is that of the pairs; larger: the largest
     of those. dropped: terms that went in the end. whole:
     what whole sequences tell, where they were fitted. constants: numbers inside terms that were
-    fitted with them. symmetries, proposals, rivals: as of `LearnedHamiltonian`."""
+    fitted with them. symmetries, proposals, rivals: as of `LearnedHamiltonian`. odds: of the kinds
+    of its friction against others, where these competed."""
 
     family: Any  # of terms of H, or of L, with friction or without
     fit: FlowFit
@@ -197,6 +221,7 @@ class FittedLaw(NamedTuple):
     symmetries: tuple[str, ...] = ()
     proposals: tuple[Proposal, ...] = ()
     rivals: tuple[Rival, ...] = ()
+    odds: dict[tuple[int, ...], float] | None = None
 
 
 def learned_from(
@@ -212,10 +237,15 @@ def learned_from(
     by_row = problem  # each at its own dt
     if data.own_dt is not None:  # the map's own dt, from which others follow
         problem = Problem(data.y0, data.y1, data.dt, data.scale, args=data.args, weight=data.weight)
-    steps = _cheapest(problem, family, fit, fastest, data, tolerance, options)
+    steady = without_turns(data, family, fit.coefficients)
+    steps = _cheapest(problem, family, fit, fastest, steady, tolerance, options)
+    sharp, own_steps, turns = family, steps, not is_smooth(family)
+    noise = max(bound_of(tolerance, data.scale), fit.rms)
+    family, fewest, widths = followed(family, fit.coefficients, data, noise)
+    steps = dataclasses.replace(steps, substeps=max(fewest, steps.substeps))
     steps = _resolving(family, fit.coefficients, steps, data, tolerance)
     contraction = contraction_of(fastest, data.dt, steps)
-    by_newton = contraction > CONTRACTING and not matrix_free(family)
+    by_newton = (contraction > CONTRACTING or bool(widths)) and not matrix_free(family)
     scale = data.scale
     off = truncation(family, fit.coefficients, z, data.dt, steps, args=args, scale=scale) / scale
     flow = Flow(
@@ -257,13 +287,16 @@ def learned_from(
         getattr(without_forces(family), "prefix", "") + formula(terms),
         float(np.abs(off).max()),
         omega_h, contraction, fit.condition, found.null, left_out,
-        tuple(_messages(error, omega_h, data, tolerance, found, left_out, int((~resolved).sum()))),
+        tuple(_messages(error, omega_h, data, tolerance, found, left_out, int((~resolved).sum()),
+                        turns)),
         stalled=found.stalled,
         covariance=covariance, noise=None if whole is None else whole.noise,
         arcs=0 if whole is None else whole.arcs,
         dropped=found.dropped, unmet=_unmet(error, omega_h, tolerance, found),
         friction=friction, constants=found.constants, symmetries=symmetries,
-        proposals=found.proposals, rivals=found.rivals,
+        proposals=found.proposals, rivals=found.rivals, widths=widths,
+        turns=turns and found.error.bound <= tolerance.bound < error.bound,
+        kinds=partial(told_of, by_row, sharp, fit.coefficients, own_steps, data, found.odds or {}),
     )  # fmt: skip
 
 
@@ -438,11 +471,8 @@ def _unmet(error: OneStepError, omega_h: float, tolerance, found: FittedLaw) -> 
             f"The motion turns by ωh = {omega_h:.2g} radians in a step; beyond π pairs of one dt "
             "do not determine H (aliasing): sample with a smaller dt, or with several"
         )
-    elif without_forces(found.family) is not found.family:
-        why = (
-            "Its friction is linear in the velocities, and may be of another kind, dry or "
-            "quadratic: the law of a recording of the positions tells which (--positions)"
-        )
+    elif not is_smooth(found.family):
+        why = TURNS.capitalize()
     elif found.ended:
         why = f"The search for modes ended: {found.ended}"
     return (
@@ -453,7 +483,7 @@ def _unmet(error: OneStepError, omega_h: float, tolerance, found: FittedLaw) -> 
 
 def _messages(
     error: OneStepError, omega_h: float, data, tolerance, found: FittedLaw, left_out: int,
-    unresolved: int,
+    unresolved: int, turns: bool,
 ) -> Iterator[str]:  # fmt: skip
     if error.bound <= tolerance.bound and omega_h > FAST:
         yield (
@@ -476,7 +506,12 @@ def _messages(
             f"{left_out} of {len(found.rows)} pairs move too fast for the steps by which H was "
             "fitted, as in close passages: they were left out"
         )
-    if unresolved:
+    if unresolved and turns:
+        yield (
+            f"{TURNS}: there the map errs, and not the law, in {unresolved} of "
+            f"{len(data.validation)} held-out pairs"
+        )
+    elif unresolved:
         yield (
             f"{unresolved} of {len(data.validation)} held-out pairs move too fast for the map's "
             "steps, as in close passages: there the map errs, and not H"

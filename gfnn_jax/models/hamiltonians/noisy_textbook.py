@@ -26,7 +26,7 @@ from gfnn_jax.errors import InputError, OutOfTime
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.models.hamiltonians.flow_arcs import FlowWithConstants
-from gfnn_jax.models.hamiltonians.formula import Rival, Term
+from gfnn_jax.models.hamiltonians.formula import OnPartial, PartialLaw, Rival, Term
 from gfnn_jax.models.hamiltonians.formula import formula as formula_of
 from gfnn_jax.models.hamiltonians.fractions import proposals
 from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
@@ -69,10 +69,12 @@ class _Told(NamedTuple):
 
 
 def law_of_sequences(
-    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance, say: Callable[[str], Any]
-) -> FittedLaw | None:
+    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance,
+    say: Callable[[str], Any], partly: OnPartial,
+) -> FittedLaw | None:  # fmt: skip
     """The law, or None where the pairs are no noisy sequences of one dt, or nothing in the
-    dictionary leaves no more than their noise."""
+    dictionary leaves no more than their noise. partly: called with the three laws that come
+    closest, where none does."""
     if data.varied or data.structure is not None or data.dim > len(_OPERATIONS):
         return None
     stretches = _stretches(data)
@@ -88,7 +90,9 @@ def law_of_sequences(
             formulas = search.formulas()
         family = formulas[0].family(formulas[0].constants)
         with work.library(name, family, len(formulas) * len(data.training)):
-            return _chosen(problem, formulas, data, tolerance, noise, Allowance(work.budget), say)
+            return _chosen(
+                problem, formulas, data, tolerance, noise, Allowance(work.budget), partly
+            )
     except OutOfTime:
         work.budget.leave_out(name, work.ended)
     except (np.linalg.LinAlgError, InputError):
@@ -99,7 +103,10 @@ def law_of_sequences(
 def _stretches(data: Dataset) -> list[np.ndarray]:
     """States (L, 2d) of the training sequences without gaps, their angles going on over turns."""
     rows = np.sort(data.training)[:_LOOKED_AT]
-    breaks = np.flatnonzero(~next_of(data.pairs, rows)) + 1
+    goes_on = next_of(data.pairs, rows)
+    if not goes_on.any():
+        return []
+    breaks = np.flatnonzero(~goes_on) + 1
     moved = data.y1 - data.y0
     return [
         np.concatenate([data.y0[own[:1]], data.y0[own[0]] + np.cumsum(moved[own], axis=0)])
@@ -122,7 +129,7 @@ def _noise_of(stretches: list[np.ndarray], scale: np.ndarray) -> np.ndarray | No
 
 def _chosen(
     problem: Problem, formulas: list[Formula], data: Dataset, tolerance: Tolerance,
-    noise: np.ndarray, allowance: Allowance, say: Callable[[str], Any],
+    noise: np.ndarray, allowance: Allowance, partly: OnPartial,
 ) -> FittedLaw | None:  # fmt: skip
     """The law of least description length, where it leaves no more than noise."""
     first = formulas[0]
@@ -150,7 +157,7 @@ def _chosen(
         if found is None or not _rms(noise_of(found) / noise) <= _AS_NOISE:
             for law in sorted(told, key=lambda law: law.length)[:3]:
                 left = _rms(noise_of(law.fitted) / noise)
-                say(f"H: a partial law leaves {left:.2g} times the noise over: {_shown(law)}")
+                partly(PartialLaw(_shown(law), left, "times the noise"))
             return None
     formula, fitted = best.formula, best.fitted
     if tells(fitted, len(fitted.p)):

@@ -29,12 +29,14 @@ from gfnn_jax.fitting.significance import null_terms, significant, significant_t
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.models.hamiltonians.arcs import arcs_of
 from gfnn_jax.models.hamiltonians.centrifugal import centrifugal_terms
+from gfnn_jax.models.hamiltonians.formula import OnPartial
 from gfnn_jax.models.hamiltonians.friction import (
     Forces,
     beside_friction,
     libraries_with,
     mechanical,
 )
+from gfnn_jax.models.hamiltonians.friction_kinds import is_smooth, without_turns
 from gfnn_jax.models.hamiltonians.learned_law import (
     Dropped,
     FittedLaw,
@@ -68,6 +70,7 @@ _POOR, _POOR_GIVEN, _POOR_STRUCTURED = 2, 3, 5
 _SMALL = 35  # terms of the libraries that are tried before laws of physics: 0.3 s of two bodies
 _EXACT = 1e-13  # of the spread: a polynomial that errs by no more is no approximation
 _TURNING = 2_000  # pairs that tell how far a step turns the states
+_AFFINE_ROWS = 50_000  # training pairs that the affine map is fitted to
 _FIRST_ROUND = 5e8  # operations that the first round of growth is expected to take
 _EXPLAINED = 0.05  # of the spread: an error below it is that of the right branch of the turns
 
@@ -82,11 +85,13 @@ def learn_hamiltonian(
     say: Callable[[str], Any] = lambda message: None,
     options: Options = OPTIONS,
     dearest: float = np.inf,
+    partly: OnPartial = lambda law: None,
 ) -> LearnedHamiltonian:
     """The Hamiltonian of these pairs: the smallest library that meets the tolerance, else the best.
 
     data: without a base map. scene: lends its features and reversor. terms: a user's own.
-    dearest: as of `LawWork`.
+    dearest: as of `LawWork`. partly: called with laws of physics that explain a part, where none
+    explains all.
 
     Raises FitError where no library can be tried, OutOfTime where the budget ends before the first.
     """
@@ -106,7 +111,7 @@ def learn_hamiltonian(
             data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
         )
         own = LawWork(problem, budget, most, dearest)
-        whole = law_of_sequences(problem, own, data, tolerance, say)
+        whole = law_of_sequences(problem, own, data, tolerance, say, partly)
         if whole is not None:
             seconds = time.perf_counter() - started
             problem.allowance = UNBOUNDED
@@ -134,7 +139,7 @@ def learn_hamiltonian(
             early = _small_polynomials(problem, work, data, tolerance, options, say)
             best = early[-1] if early and _is_exact(early[-1], tolerance) else None
         if best is None:
-            best = law_of_physics(problem, work, data, tolerance, say)
+            best = law_of_physics(problem, work, data, tolerance, say, partly)
         if best is None:
             best = with_masses = mechanical(problem, work, data, tolerance)
     if best is None or not best.error.bound <= tolerance.bound:
@@ -147,13 +152,17 @@ def learn_hamiltonian(
                 raise
         if with_masses is not None and with_masses.error.relative <= best.error.relative:
             best = with_masses._replace(noisy=True)
-    everyone = np.arange(len(data))
+    everyone = np.arange(len(data)) if is_smooth(best.family) else best.rows
     if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
         raise FitError(
             f"the H found is too fast: one dt needs {MOST_SUBSTEPS} substeps or more. Use a "
             "smaller dt; if the pairs are of a map without a flow, use --learn map (learn='map')"
         )
-    outside, what = None, ""
+    outside, what, far = None, "", everywhere.training[outer]
+    whole, law = everywhere, (best.family, best.fit.coefficients)
+    data, everywhere, there = (
+        without_turns(rows, *law) for rows in (data, whole, whole.validated_on(far))
+    )
     try:
         if best.noisy:
             what = "dropping the terms of H that are noise"
@@ -163,8 +172,7 @@ def learn_hamiltonian(
         what = "dropping the terms of H that the pairs do not ask for"
         with work.again(what, best.family, len(best.fit.used)):
             best = _sparse(problem, best, data, tolerance, options, say)
-        if outer.any():
-            there = everywhere.validated_on(everywhere.training[outer])
+        if len(there.validation) and outer.any():
             outside = validation_error(best.family, best.fit, there, tolerance).relative
         misses = best.error.bound > tolerance.bound and np.isfinite(dearest)
         few = len(best.fit.used) < len(everywhere.training)
@@ -174,7 +182,7 @@ def learn_hamiltonian(
                 best = _refitted(problem, best, everywhere.training, data, tolerance)
     except OutOfTime:  # what was found stands
         budget.leave_out(what, work.ended)
-    problem.allowance = UNBOUNDED
+    problem.allowance, everywhere = UNBOUNDED, whole
     of_arcs = None
     if arcs is not None:
         of_arcs = partial(covariance_root, best, problem, everywhere, best.fit.steps)
@@ -184,7 +192,8 @@ def learn_hamiltonian(
         )
         best = best._replace(error=validation_error(best.family, best.fit, of_steps, tolerance))
     noisy = best.noisy or arcs is not None
-    if noisy and best.error.bound > tolerance.bound:
+    smooth = is_smooth(best.family)  # |v|v and sign v, whole sequences turn in
+    if noisy and smooth and best.error.bound > tolerance.bound:
         what = "the fit of H to whole sequences"
         say("H: whole sequences")
         try:
@@ -239,7 +248,9 @@ def _of_libraries(
     early: the first libraries without friction, where these are fitted already.
     """
 
-    def search(forces: Forces | None = None) -> tuple[FittedLaw, Options]:
+    def search(
+        forces: Forces | None = None, data: Dataset = data
+    ) -> tuple[FittedLaw, Options]:  # fmt: skip
         known = early if forces is None else ()
         return _searched(problem, work, data, tolerance, scene, terms, options, say, forces, known)
 
@@ -434,7 +445,8 @@ def affine_error(data: Dataset, tolerance: Tolerance) -> OneStepError:
         return np.column_stack([np.ones(len(z)), z])
 
     moved = data.y1 - data.y0
-    known = np.linalg.lstsq(design(data.training), moved[data.training], rcond=None)[0]
+    rows = data.training[:_AFFINE_ROWS]
+    known = np.linalg.lstsq(design(rows), moved[rows], rcond=None)[0]
     found = data.y0[data.validation] + design(data.validation) @ known
     return measured_error(data, tolerance, to_user(data.coordinates, found))
 

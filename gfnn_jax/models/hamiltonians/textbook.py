@@ -18,24 +18,31 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.fitting.gauss_newton import Problem
-from gfnn_jax.models.hamiltonians.formula import Term, formula
+from gfnn_jax.models.hamiltonians.formula import OnPartial, PartialLaw, Term, formula
 from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
 from gfnn_jax.models.hamiltonians.work import LawWork
 from gfnn_jax.models.textbook.search import OPTIONS, Law, Textbook
 
-# Operations of a search by degrees of freedom from 1, without products and with them: about the
-# longest of the laws of benchmarks/textbook.py.
-_OPERATIONS = {False: (1e8, 1.5e8, 3e8, 5e8), True: (2e8, 3e8, 4e8, 5e8)}
+# Dictionaries, in the order in which they are tried, and the operations of a search by degrees of
+# freedom from 1: about the longest of the laws of benchmarks/textbook.py.
+_DICTIONARIES = (
+    ("laws of physics", {}, (1e8, 1.5e8, 3e8, 5e8)),
+    ("laws of physics with products", {"products": True}, (2e8, 3e8, 4e8, 5e8)),
+    ("laws of physics with centres", {"centres": True}, (0.0, 2e8, 4e8, 0.0)),
+)
 _FEWEST = 60  # pairs
 _NOTHING = 1e-9  # of the largest term: a term so small is roundoff
+_SHOWN = 1e-5  # of a coefficient of a partial law: what is not shown of it
 _EXACT = 1e-9  # of the spread: the error of a law that is no approximation
 
 
 def law_of_physics(
-    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance, say: Callable[[str], Any]
-) -> FittedLaw | None:
+    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance,
+    say: Callable[[str], Any], partly: OnPartial,
+) -> FittedLaw | None:  # fmt: skip
     """The law, or None where none is found, or the pairs are of no autonomous flow of a few degrees
-    of freedom in plain coordinates and angles."""
+    of freedom in plain coordinates and angles. partly: called with the three laws that come
+    closest, where none is exact."""
     simple = data.args is None and data.structure is None
     if not simple or data.dim > OPTIONS.most_dim or len(data.training) < _FEWEST:
         return None
@@ -47,12 +54,12 @@ def law_of_physics(
         cyclic=coordinates.cyclic, say=say,
     )  # fmt: skip
     law = None
-    for products, name in ((False, "laws of physics"), (True, "laws of physics with products")):
-        if law is not None:
-            break
+    for name, contents, operations in _DICTIONARIES:
+        if law is not None or not operations[data.dim - 1]:
+            continue
         try:
-            with work.budget.unit(name, MATCHING, _OPERATIONS[products][data.dim - 1]):
-                law = search.law(products=products)
+            with work.budget.unit(name, MATCHING, operations[data.dim - 1]):
+                law = search.law(**contents)
         except OutOfTime:
             work.budget.leave_out(name, work.ended)
             return None
@@ -61,10 +68,9 @@ def law_of_physics(
     if law is None:
         for partial in search.partial:
             family, c = _without_nothing(partial, data.y0[rows], data.scale)
-            shown = formula(
-                [Term(*t, 0.0) for t in zip(family.term_names, c.tolist(), strict=True)]
-            )
-            say(f"H: a partial law leaves {partial.left:.1e} of the spread over: {shown}")
+            named = zip(family.term_names, c.tolist(), strict=True)
+            shown = formula([Term(name, value, _SHOWN * abs(value)) for name, value in named])
+            partly(PartialLaw(shown, partial.left, "of the spread"))
         return None
     family, start = _without_nothing(law, data.y0[rows], data.scale)
     try:

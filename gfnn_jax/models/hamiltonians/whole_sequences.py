@@ -30,7 +30,7 @@ _ROWS_PER_TERM = 200
 _STATES = 100  # from which the noise and its growth along an arc are measured
 _STEP_ERROR = 0.01  # of a step's own error ÷ the noise
 _IN_A_ROW = 2.5  # times the noise: neighbours of a state that stands alone stay below
-_IN_A_ROW = 2.5  # times the noise: neighbours of a state that stands alone stay below
+_BY_CHANCE = 2.0  # standard errors of the arcs' variation, within which it is that of noise
 
 
 class Whole(NamedTuple):
@@ -194,11 +194,18 @@ def _of_selection(triangle: Triangle, c: np.ndarray, few: np.ndarray) -> float:
 
 
 def root_of(found: Fitted) -> np.ndarray:
-    """(m, m), rootᵀ root the covariance: that of independent noise, widened where the arcs' own
-    gradients vary by more than noise makes them: misfit is alike along an arc."""
+    """(m, m), rootᵀ root the covariance: that of independent noise, and of the misfit by which the
+    arcs' own gradients vary by more than noise makes them.
+
+    Misfit is alike along an arc, and stays however many arcs there are. Where it is certain, only
+    as many arcs count as there are coefficients, as in `fitting.uncertainty`: bands then hold what
+    the terms cannot represent.
+    """
     root, (arcs, count) = triangle_of(found).spectrum().root().T, found.scores.shape
-    vary = np.sum((found.scores @ root.T) ** 2) / count / max(1 - count / arcs, 1 / arcs)
-    return root * np.sqrt(max(vary, 1.0))
+    each = np.sum((found.scores @ root.T) ** 2, axis=1) / count
+    misfit = max(each.sum() / max(1 - count / arcs, 1 / arcs) - 1.0, 0.0)
+    certain = misfit > _BY_CHANCE * np.sqrt(arcs) * each.std()
+    return root * np.sqrt(1.0 + misfit * (max(arcs / count, 1.0) if certain else 1.0))
 
 
 def about_outliers(residuals: np.ndarray) -> tuple[str, ...]:

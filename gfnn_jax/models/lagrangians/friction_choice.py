@@ -1,4 +1,4 @@
-"""Choice of the friction that a record shows: held-out arcs say, and with what odds.
+"""Choice of the friction that data show: held-out arcs, or pairs, say, and with what odds.
 
 Close to a fit its residuals are linear in small changes of the coefficients, so that one evaluation
 of the arcs serves every set of frictions: of each set all coefficients of the law are found from
@@ -68,10 +68,11 @@ def _plainness(kinds: tuple[int, ...]) -> tuple[int, ...]:
 
 
 class _Judged(NamedTuple):
-    """A set of frictions and its held-out residuals (A, L, k)."""
+    """A set of frictions and its held-out residuals (A, L, k); rounding: of each of these."""
 
     rows: tuple[Loss, ...]
     residuals: np.ndarray
+    rounding: float
 
     @property
     def kinds(self) -> tuple[int, ...]:
@@ -79,7 +80,7 @@ class _Judged(NamedTuple):
 
     @property
     def cost(self) -> float:
-        return float(np.sum(self.residuals**2))
+        return float(np.sum(self.residuals**2) + self.residuals.size * self.rounding**2)
 
 
 def which_friction(
@@ -89,11 +90,17 @@ def which_friction(
     choose: bool = True,
     before: FrictionChoice | None = None,
 ) -> FrictionChoice:
+    """The choice by the arcs of a fit (`chosen`)."""
+    return chosen(_table_of(bench, fit, candidates), choose, before)
+
+
+def chosen(
+    table: Table, choose: bool = True, before: FrictionChoice | None = None
+) -> FrictionChoice:
     """The choice among sets of the candidates' kinds, each with the directions that it needs; not
     to ``choose`` is to take as many of the kinds as there are. Among equals the kinds chosen
     ``before`` stay."""
-    table = _Table.of(bench, fit, candidates)
-    kinds = sorted({row[1] for row in candidates})
+    kinds = sorted({row[1] for row in table.candidates})
     every = (chosen for n in range(len(kinds) + 1) for chosen in combinations(kinds, n))
     every = (chosen for chosen in every if not {LINEAR, UNIFORM} <= set(chosen))
     sets = [judged for judged in map(table.leanest, every) if judged is not None]
@@ -106,9 +113,8 @@ def which_friction(
     taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, _plainness(s.kinds)))
     odds = {s.kinds: evidence.odds(taken, s) for s in sets if s is not taken}
     others = table.others(taken.rows)
-    limits = {row: max(rho, 0.0) + _LIMIT * error for row, (rho, error) in others.items()}
     gains = not taken.rows and any(rho < -_GAINS * error for rho, error in others.values())
-    return FrictionChoice(taken.rows, odds, limits, gains)
+    return FrictionChoice(taken.rows, odds, table.limits(taken.rows), gains)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,33 +135,39 @@ class _Evidence:
         return float(np.exp(np.clip(log, -_SURE, _SURE)))
 
 
+def _table_of(bench: Workbench, fit: LawFit, candidates: Sequence[Loss]) -> Table:
+    """The arcs of a fit, a third of the record held out at a time."""
+    structure = fit.structure
+    others = tuple(row for row in candidates if row not in structure.friction)
+    larger = structure.plus([("loss", row) for row in others])
+    p = larger.start(fit.values)
+    model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
+    noise, loss = fit.sigma * fit.arcs.noise, bench.seen.loss
+    rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, noise, loss)
+    keys = larger.keys()
+    own = [keys.index(("loss", row)) for row in candidates]
+    rest = [k for k in range(len(keys)) if k not in own]
+    rows = rows[..., [*rest, *own, len(keys)]]
+    rows[..., -1] += rows[..., len(rest) : -1] @ p[own]  # as if there were no friction
+    return Table(tuple(candidates), rows, fit.correlation)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Table:
-    """Rows (A, L, k, n + 1) of the arcs, the candidates' columns last but the residuals, which are
-    those without friction; the arcs of each third (thirds, A); the correlation of residuals."""
+class Table:
+    """Rows (A, L, k, n + 1) of arcs, or of pairs, close to a fit: derivatives in the coefficients,
+    the candidates' last, and the residuals, which are those without friction; the correlation of
+    residuals; and their rounding, below which no set is better than another."""
 
     candidates: tuple[Loss, ...]
     rows: np.ndarray
-    folds: np.ndarray
     correlation: float
+    rounding: float = 0.0
 
-    @staticmethod
-    def of(bench: Workbench, fit: LawFit, candidates: Sequence[Loss]) -> _Table:
-        structure = fit.structure
-        others = tuple(row for row in candidates if row not in structure.friction)
-        larger = structure.plus([("loss", row) for row in others])
-        p = larger.start(fit.values)
-        model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
-        noise, loss = fit.sigma * fit.arcs.noise, bench.seen.loss
-        rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, noise, loss)
-        keys = larger.keys()
-        own = [keys.index(("loss", row)) for row in candidates]
-        rest = [k for k in range(len(keys)) if k not in own]
-        rows = rows[..., [*rest, *own, len(keys)]]
-        rows[..., -1] += rows[..., len(rest) : -1] @ p[own]  # as if there were no friction
-        place = np.arange(len(rows)) * FOLDS // len(rows)
-        folds = place == np.unique(place)[:, None]
-        return _Table(tuple(candidates), rows, folds, fit.correlation)
+    @functools.cached_property
+    def folds(self) -> np.ndarray:
+        """The arcs of each third (thirds, A)."""
+        place = np.arange(len(self.rows)) * FOLDS // len(self.rows)
+        return place == np.unique(place)[:, None]
 
     @property
     def width(self) -> int:
@@ -187,7 +199,7 @@ class _Table:
             others = np.linalg.lstsq(triangle[:f, :f], aim, rcond=_RCOND)[0]
             residuals[held] = self.rows[held] @ np.concatenate([-others, -losses, [1.0]])
         rows = tuple(self.candidates[k] for k in subset)
-        return _Judged(rows, residuals)
+        return _Judged(rows, residuals, self.rounding)
 
     def leanest(self, kinds: tuple[int, ...]) -> _Judged | None:
         """The set of all these kinds without the directions that held-out arcs do not miss; None
@@ -223,6 +235,11 @@ class _Table:
             error = np.sqrt(self.correlation * self._variance(R[-1, -1])) / size
             found[row] = float(R[-2, -1] / R[-2, -2]), float(error)
         return found
+
+    def limits(self, taken: tuple[Loss, ...]) -> dict[Loss, float]:
+        """Upper limits of ρ of the candidates that were not taken."""
+        others = self.others(taken).items()
+        return {row: max(rho, 0.0) + _LIMIT * error for row, (rho, error) in others}
 
     def _variance(self, rest: float) -> float:
         """Variance of the residuals, by their norm."""

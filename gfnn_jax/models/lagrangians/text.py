@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.exports.symbolic import as_sympy
-from gfnn_jax.families.lagrangian import LINEAR, QUADRATIC, UNIFORM, Friction, Terms
+from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM, Friction, Terms
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, losses
 
@@ -80,6 +80,9 @@ def friction_of(
         speed = _sum(("-" if e < 0 else "") + _times(abs(e), v) for e, v in parts if e)
         if kind == QUADRATIC:
             listed.append(Term(f"abs({speed})**3", rho / 3, s / 3))
+            continue
+        if kind == DRY and width == 0:
+            listed.append(Term(f"abs({speed})", float(rho), float(s)))
             continue
         speed = f"({speed})" if sum(map(bool, c)) > 1 else speed
         if kind == LINEAR:

@@ -1,8 +1,8 @@
 """Arguments of laws: the scalars of a state that its roles and geometry suggest.
 
 Each coordinate; sines and cosines of angles and of their differences; differences of positions;
-distances from the origin, of momenta, of a degree of freedom in its plane (q, p), between vortices,
-between bodies; q·p and q × p.
+distances from the origin, or from another centre, of momenta, of a degree of freedom in its plane
+(q, p), between vortices, between bodies; q·p and q × p.
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.families.expressions import coordinate_names
+from gfnn_jax.models.textbook.shapes import number
 
 
 class Argument(NamedTuple):
     """text: as formulas write it. value (N,), gradient (N, 2d) at the states. square: of a
     distance, the text of its square. index: of the coordinate that it is, -1 of another. circular:
-    whether it is the sine or cosine of an angle."""
+    whether it is the sine or cosine of an angle. axes: of a distance from the origin that may be
+    one from another centre, the positions."""
 
     text: str
     value: np.ndarray
@@ -26,6 +28,11 @@ class Argument(NamedTuple):
     square: str = ""
     index: int = -1
     circular: bool = False
+    axes: tuple[Argument, ...] = ()
+
+    def around(self, centre: tuple[complex, ...]) -> Argument:
+        """The distance from this centre, which may be complex."""
+        return _distance([_less(x, c) for x, c in zip(self.axes, centre, strict=True)])
 
 
 def arguments_of(
@@ -57,7 +64,9 @@ def arguments_of(
     found += [_distance([at(i), at(i + dim)]) for i in positions]
     found += [_distance([apart(i, j), apart(i + dim, j + dim)]) for i, j in pairs]
     if len(positions) == dim and dim in (2, 3):
-        found += [_distance([at(i + k) for i in positions]) for k in (0, dim)]
+        axes = tuple(map(at, positions))
+        found.append(_distance(list(axes))._replace(axes=axes))
+        found.append(_distance([at(i + dim) for i in positions]))
         found.append(_along([(at(i), at(i + dim)) for i in positions]))
     if dim == 3:
         found += [_distance([at(i), at(j)]) for i, j in pairs]
@@ -78,6 +87,15 @@ def _distance(parts: list[Argument]) -> Argument:
     gradient = np.sum([x.value[:, None] * x.gradient for x in parts], axis=0) / root[:, None]
     square = " + ".join(f"({x.text})**2" if " " in x.text else f"{x.text}**2" for x in parts)
     return Argument(f"sqrt({square})", root, gradient, square=square)
+
+
+def _less(x: Argument, c: complex) -> Argument:
+    """x − c."""
+    if c == 0:
+        return x
+    shift = float(np.real(c))
+    text = f"{x.text} {'-' if shift > 0 else '+'} {number(abs(shift))}"
+    return Argument(text, x.value - c, x.gradient)
 
 
 def _along(parts: list[tuple[Argument, Argument]]) -> Argument:

@@ -7,8 +7,16 @@ are a few products of arrays.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from itertools import combinations_with_replacement
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import (
+    chain,
+    combinations,
+    combinations_with_replacement,
+    count,
+    islice,
+    permutations,
+    product,
+)
 from typing import NamedTuple
 
 import numpy as np
@@ -30,30 +38,64 @@ _COARSE = 3  # of the constants tried of one factor, those of a product
 _SMALL = 4  # coordinates 2d; beyond them products have no constants: they are too many
 _INDEPENDENT = 1e-6  # of a column's length, that the base does not span
 _MOST_MONOMIALS = 500  # of the dictionary
+_CENTRES = {2: 15, 3: 9}  # tried along each axis, of the plane and of space
+_WIDER = 1.2  # times the box of the positions: where centres are tried
+_CENTRAL = (  # shapes of the distance from a centre
+    ("power", -1.0), ("power", -2.0), ("power", -3.0), ("power", 1.0), ("log", 0.0),
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
 class Factor:
-    """The shape of the argument at this place of a list, and its constant."""
+    """The shape of the argument at this place of a list, its constant θ, and the centre from which
+    the argument is a distance, where that is not the origin."""
 
     place: int
     kind: Kind
     theta: float | None = None
+    centre: tuple[float, ...] = ()
+
+    @property
+    def form(self) -> tuple[int, Kind, int]:
+        """The factor without its constants."""
+        return self.place, self.kind, len(self.centre)
+
+    def argument(self, arguments: Sequence[Argument]) -> Argument:
+        """The argument among these."""
+        found = arguments[self.place]
+        return found.around(self.centre) if self.centre else found
 
 
 Atom = tuple[Factor, ...]
 Average = Callable[[np.ndarray], np.ndarray]  # rows (…, R, 2d) of gradients (…, N, 2d)
 
 
+def constants_of(atom: Atom) -> list[float]:
+    """The constants inside the atom: of each factor θ, then its centre."""
+    return [c for f in atom for c in (*(() if f.theta is None else (f.theta,)), *f.centre)]
+
+
+def with_constants(atom: Atom, constants: Iterable[float]) -> Atom:
+    """The atom with these constants inside, in the order of ``constants_of``."""
+    given = iter(constants)
+    return tuple(
+        dataclasses.replace(
+            f,
+            theta=None if f.theta is None else next(given),
+            centre=tuple(islice(given, len(f.centre))),
+        )
+        for f in atom
+    )
+
+
 def gradient_of(atom: Atom, arguments: Sequence[Argument], along: int | None = None) -> np.ndarray:
-    """∇ (N, 2d) of the atom; with ``along`` its derivative in the constant of that factor."""
-    parts = []
-    for k, factor in enumerate(atom):
-        theta = factor.theta
-        if k == along:
-            assert theta is not None
-            theta = theta + 1j * _STEP
+    """∇ (N, 2d) of the atom; with ``along`` its derivative in that one of its constants."""
+    parts, step = [], (1j * _STEP if k == along else 0.0 for k in count())
+    for factor in atom:
+        theta = None if factor.theta is None else factor.theta + next(step)
+        centre = tuple(c + next(step) for c in factor.centre)
         argument = arguments[factor.place]
+        argument = argument.around(centre) if centre else argument
         parts.append((argument.gradient, *values(factor.kind, argument.value, theta)))
     total = np.zeros(1)
     for k, (gradient, _, slope) in enumerate(parts):
@@ -67,7 +109,7 @@ def atom_text(atom: Atom, arguments: Sequence[Argument]) -> str:
     """The atom as code writes it."""
     over, under = [], []
     for factor in atom:
-        argument = arguments[factor.place]
+        argument = factor.argument(arguments)
         text = text_of(factor.kind, argument.text, argument.square, factor.theta)
         (under if text.startswith("1/") else over).append(text.removeprefix("1/"))
     return "*".join(over or ["1"]) + "".join(f"/{text}" for text in under)
@@ -85,8 +127,9 @@ def powers_of(atom: Atom, arguments: Sequence[Argument], width: int) -> tuple[in
 
 
 def weight_of(atoms: Sequence[Atom]) -> float:
-    """Amount that there is to say of atoms."""
-    return sum(complexity(factor.kind) for atom in atoms for factor in atom)
+    """Amount that there is to say of atoms: of their shapes, and of centres that are not 0."""
+    factors = [factor for atom in atoms for factor in atom]
+    return sum(complexity(f.kind) + sum(c != 0 for c in f.centre) for f in factors)
 
 
 class Dictionary(NamedTuple):
@@ -107,41 +150,27 @@ class _Singles(NamedTuple):
 
 def dictionary_of(
     arguments: Sequence[Argument], weight: np.ndarray, base: np.ndarray, *, degree: int,
-    products: bool, average: Average = np.asarray,
+    products: bool = False, centres: bool = False, average: Average = np.asarray,
 ) -> Dictionary:  # fmt: skip
     """The atoms that are tried. weight (2d,), or of each row: by which gradients are multiplied.
     base: orthonormal columns (rows, n), beside which atoms are looked for.
 
     Shapes of one argument, and products of coordinates from the third to this degree, without the
     coordinates and products of two, which are in every law. products: of a coordinate, a product
-    of two or a sine or cosine with a shape of another argument too. average: makes the rows of
-    gradients at the states.
+    of two or a sine or cosine with a shape of another argument too. centres: shapes of distances
+    from centres beside the origin too. average: makes the rows of gradients at the states.
     """
     atoms: list[Atom] = []
     gradients: list[np.ndarray] = []
     with np.errstate(all="ignore"):
-        singles = [_singles(place, argument, 1) for place, argument in enumerate(arguments)]
-        for argument, single in zip(arguments, singles, strict=True):
-            atoms += [(factor,) for factor in single.factors]
-            gradients.append(average(single.slope[:, :, None] * argument.gradient))
-        mixed = _monomials(arguments, degree)
-        atoms += mixed
-        gradients += [average(gradient_of(atom, arguments))[None] for atom in mixed]
+        groups = [_of_one(arguments), _of_coordinates(arguments, degree)]
         if products:
-            every = _COARSE if weight.shape[-1] <= _SMALL else None
-            coarse = [_singles(p, argument, every) for p, argument in enumerate(arguments)]
-            for multiplier in _multipliers(arguments):
-                used = {index for f in multiplier for index in _entering(arguments[f.place])}
-                value, gradient = (
-                    _value_of(multiplier, arguments),
-                    gradient_of(multiplier, arguments),
-                )
-                for argument, single in zip(arguments, coarse, strict=True):
-                    if used == _entering(argument):
-                        continue
-                    atoms += [(*multiplier, factor) for factor in single.factors]
-                    along = (single.slope * value)[:, :, None] * argument.gradient
-                    gradients.append(average(along + single.value[:, :, None] * gradient))
+            groups.append(_of_products(arguments, _COARSE if weight.shape[-1] <= _SMALL else None))
+        if centres:
+            groups.append(_of_centres(arguments))
+        for own, gradient in chain(*groups):
+            atoms += own
+            gradients.append(average(gradient))
         rows = (np.concatenate(gradients) * weight).reshape(len(atoms), -1)
         size = np.linalg.norm(rows, axis=1)
     kept = np.flatnonzero(np.isfinite(size) & (size > 0))
@@ -170,6 +199,80 @@ def blocks_of(arguments: Sequence[Argument], degree: int) -> list[tuple[Atom, ..
         if block and len(block) <= _MOST_MONOMIALS:
             found.append(block)
     return found
+
+
+_Group = Iterator[tuple[list[Atom], np.ndarray]]  # atoms, gradients (atoms, N, 2d)
+
+
+def tops_of(arguments: Sequence[Argument]) -> list[tuple[Atom, ...]]:
+    """The three atoms that (p_i − p_j cos q)²/sin² q has beside p_j²: of a body that turns about
+    several axes, in Euler angles. None of them explains much without the others."""
+    dim = arguments[0].gradient.shape[1] // 2
+    momenta = [place for place, argument in enumerate(arguments) if argument.index >= dim]
+    circular = [place for place, argument in enumerate(arguments) if argument.circular]
+    found = []
+    for above, under in permutations(circular, 2):
+        one_angle = _entering(arguments[above]) == _entering(arguments[under])
+        kinds = kinds_for(arguments[under].value, circular=True)
+        if not one_angle or ("power", -2.0) not in kinds:
+            continue
+        pole = Factor(under, ("power", -2.0))
+        for i, j in combinations(momenta, 2):
+            squares = ((Factor(k, ("power", 2.0)), pole) for k in (i, j))
+            both = (Factor(place, ("power", 1.0)) for place in (i, j, above))
+            found.append((*squares, (*both, pole)))
+    return found
+
+
+def _of_one(arguments: Sequence[Argument]) -> _Group:
+    """Shapes of one argument."""
+    for place, argument in enumerate(arguments):
+        single = _singles(place, argument, 1)
+        yield (
+            [(factor,) for factor in single.factors],
+            single.slope[:, :, None] * argument.gradient,
+        )
+
+
+def _of_coordinates(arguments: Sequence[Argument], degree: int) -> _Group:
+    """Products of coordinates."""
+    for atom in _monomials(arguments, degree):
+        yield [atom], gradient_of(atom, arguments)[None]
+
+
+def _of_products(arguments: Sequence[Argument], every: int | None) -> _Group:
+    """Products with a shape of something else, of every so manieth of its constants."""
+    coarse = [_singles(p, argument, every) for p, argument in enumerate(arguments)]
+    for multiplier in _multipliers(arguments):
+        used = {index for f in multiplier for index in _entering(arguments[f.place])}
+        value, gradient = _value_of(multiplier, arguments), gradient_of(multiplier, arguments)
+        for argument, single in zip(arguments, coarse, strict=True):
+            if used == _entering(argument):
+                continue
+            along = (single.slope * value)[:, :, None] * argument.gradient
+            yield (
+                [(*multiplier, factor) for factor in single.factors],
+                along + single.value[:, :, None] * gradient,
+            )
+
+
+def _of_centres(arguments: Sequence[Argument]) -> _Group:
+    """Shapes of distances from the points of a grid."""
+    for place, argument in enumerate(arguments):
+        if not argument.axes:
+            continue
+        points = _CENTRES[len(argument.axes)]
+        for centre in product(*(_grid(x.value, points) for x in argument.axes)):
+            moved = argument.around(centre)
+            slopes = np.array([values(kind, moved.value, None)[1] for kind in _CENTRAL])
+            atoms = [(Factor(place, kind, centre=centre),) for kind in _CENTRAL]
+            yield atoms, slopes[:, :, None] * moved.gradient
+
+
+def _grid(x: np.ndarray, points: int) -> list[float]:
+    """Points along the range of x and somewhat beyond."""
+    middle, half = 0.5 * (x.min() + x.max()), 0.5 * _WIDER * np.ptp(x)
+    return np.linspace(middle - half, middle + half, points).tolist()
 
 
 def _singles(place: int, argument: Argument, every: int | None) -> _Singles:
@@ -217,7 +320,8 @@ def _multipliers(arguments: Sequence[Argument]) -> list[Atom]:
 def _value_of(atom: Atom, arguments: Sequence[Argument]) -> np.ndarray:
     found = np.ones(len(arguments[0].value))
     for factor in atom:
-        found = found * values(factor.kind, arguments[factor.place].value, factor.theta)[0]
+        argument = factor.argument(arguments)
+        found = found * values(factor.kind, argument.value, factor.theta)[0]
     return found
 
 

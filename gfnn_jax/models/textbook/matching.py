@@ -16,7 +16,15 @@ from functools import cached_property
 import numpy as np
 
 from gfnn_jax.models.textbook.arguments import Argument
-from gfnn_jax.models.textbook.atoms import Atom, Average, Dictionary, gradient_of, weight_of
+from gfnn_jax.models.textbook.atoms import (
+    Atom,
+    Average,
+    Dictionary,
+    constants_of,
+    gradient_of,
+    weight_of,
+    with_constants,
+)
 from gfnn_jax.solve.levenberg_marquardt import Factors, Tried, descended
 
 _BEAM = 4  # states that go on
@@ -27,6 +35,7 @@ _HARDLY = 4.0  # times what a match leaves over, that a plainer one may leave
 _REFINEMENTS = 8  # Gauss–Newton steps of inner constants
 _DAMPING = Factors(first=1e-2, shrunk_by=0.1, least=5e-4, trials=4)  # of them, of their lengths
 _GAINED = 1e-3  # of what is left over: a step that gains less is the last
+_FARTHEST = 0.2  # of the distances: by which a centre moves in a step
 _FLOOR = 1e-13  # of what is left over: below it is roundoff
 SAID = 0.5  # halvings of what is left over that a unit of complexity must bring, of clean pairs
 
@@ -64,11 +73,14 @@ class Matching:
         """The part of the target that base and atoms do not explain."""
         return float(np.linalg.norm(self._residual(atoms)[0])) / self.size
 
-    def best(self, dictionary: Dictionary, most: int) -> list[Match]:
+    def best(
+        self, dictionary: Dictionary, most: int, starts: Sequence[tuple[Atom, ...]] = ()
+    ) -> list[Match]:
         """The matches of each number of atoms up to ``most`` that the search went on with, the
-        cheapest to say for what they leave over first."""
-        beam = [Match((), self.left_over(()))]
-        found = {frozenset[Atom](): beam[0]}
+        cheapest to say for what they leave over first. starts: atoms that it begins with too,
+        beside none."""
+        beam = [self.refined(atoms) for atoms in ((), *starts)]
+        found = {frozenset(match.atoms): match for match in beam}
         for _ in range(most):
             grown: dict[frozenset[Atom], Match] = {}
             for match in beam:
@@ -133,10 +145,7 @@ class Matching:
 
     def refined(self, atoms: tuple[Atom, ...]) -> Match:
         """The match with the inner constants that leave least."""
-        inner = [
-            (i, k) for i, atom in enumerate(atoms) for k, f in enumerate(atom)
-            if f.theta is not None
-        ]  # fmt: skip
+        inner = [(i, k) for i, atom in enumerate(atoms) for k in range(len(constants_of(atom)))]
         left = self.left_over(atoms)
         if not inner:
             return Match(atoms, left)
@@ -144,7 +153,7 @@ class Matching:
         return descended(start, _DAMPING, _REFINEMENTS).problem.match
 
     def slopes(self, match: Match, inner: Sequence[tuple[int, int]]):
-        """(what is left over, its slopes (rows, n) in these constants with base and coefficients
+        """(residual, its slopes (rows, n) in these constants with base and coefficients
         projected out)."""
         residual, basis, coefficients = self._residual(match.atoms)
         columns = [
@@ -202,7 +211,7 @@ class Matching:
         for k in order:
             i, j = divmod(int(k), len(top))
             pair = dictionary.atoms[top[i]], dictionary.atoms[top[j]]
-            kind = tuple(tuple((f.place, f.kind) for f in atom) for atom in pair)
+            kind = tuple(tuple(f.form for f in atom) for atom in pair)
             if kind not in seen:
                 seen.add(kind)
                 found.append(pair)
@@ -223,6 +232,23 @@ class Matching:
         size = np.sqrt(np.maximum(1 - np.sum((own.T @ columns) ** 2, axis=0), 0.0))
         told = size > _INDEPENDENT
         return np.where(told, residual @ columns / np.where(told, size, 1.0), 0.0), size
+
+    def moved(self, atoms: tuple[Atom, ...], step: np.ndarray) -> tuple[Atom, ...]:
+        """The atoms with their constants a step on. No θ more than doubles, or changes its sign; a
+        centre moves by no more than a part of the distances from it."""
+        changes, found = iter(step.tolist()), []
+        for atom in atoms:
+            moved = []
+            for factor in atom:
+                if factor.theta is not None:
+                    moved.append(
+                        factor.theta
+                        + np.clip(next(changes), -0.7 * abs(factor.theta), abs(factor.theta))
+                    )
+                far = _FARTHEST * np.abs(self.arguments[factor.place].value).max()
+                moved += [c + np.clip(next(changes), -far, far) for c in factor.centre]
+            found.append(with_constants(atom, map(float, moved)))
+        return tuple(found)
 
     def _flat(self, gradient: np.ndarray) -> np.ndarray:
         return (self._average(gradient) * self.weight).ravel()
@@ -252,7 +278,7 @@ class _AtConstants:
         residual, slopes, size = self._linear
         rows = np.vstack([slopes, damping * np.eye(len(size))])
         step = np.linalg.lstsq(rows, np.append(residual, np.zeros(len(size))), rcond=1e-12)[0]
-        atoms = _moved(self.match.atoms, self.inner, step / size)
+        atoms = self.matching.moved(self.match.atoms, step / size)
         there = Match(atoms, self.matching.left_over(atoms))
         return Tried(there, self.match.left - there.left, damping)
 
@@ -266,22 +292,11 @@ def _apart(order: np.ndarray, atoms: list[Atom], count: int) -> list[int]:
     """The first of each kind of atom, whatever its constant."""
     seen: dict[tuple, int] = {}
     for i in order[: 60 * count]:
-        kind = tuple((f.place, f.kind) for f in atoms[i])
+        kind = tuple(f.form for f in atoms[i])
         seen.setdefault(kind, int(i))
         if len(seen) == count:
             break
     return list(seen.values())
-
-
-def _moved(atoms, inner: Sequence[tuple[int, int]], step) -> tuple[Atom, ...]:
-    moved = [list(atom) for atom in atoms]
-    for (i, k), change in zip(inner, step, strict=True):
-        factor = moved[i][k]
-        assert factor.theta is not None
-        # No constant more than doubles, or changes its sign, in a step.
-        change = float(np.clip(change, -0.7 * abs(factor.theta), abs(factor.theta)))
-        moved[i][k] = dataclasses.replace(factor, theta=factor.theta + change)
-    return tuple(map(tuple, moved))
 
 
 def orthonormal(columns: np.ndarray) -> np.ndarray:

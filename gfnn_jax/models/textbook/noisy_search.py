@@ -22,9 +22,11 @@ from gfnn_jax.models.textbook.atoms import (
     Atom,
     atom_text,
     blocks_of,
+    constants_of,
     dictionary_of,
     powers_of,
     weight_of,
+    with_constants,
 )
 from gfnn_jax.models.textbook.matching import Match, Matching, orthonormal
 from gfnn_jax.models.textbook.weak_gradients import WeakGradients
@@ -74,7 +76,7 @@ class Formula(NamedTuple):
     @property
     def constants(self) -> np.ndarray:
         """(k,): the constants inside the atoms."""
-        return np.array([f.theta for atom in self.atoms for f in atom if f.theta is not None])
+        return np.array([c for atom in self.atoms for c in constants_of(atom)])
 
     @property
     def numbers(self) -> list[list[int]]:
@@ -82,7 +84,7 @@ class Formula(NamedTuple):
         found: list[list[int]] = [[] for _ in range(self.plain.num_parameters)]
         place = len(self.coefficients)
         for atom in self.atoms:
-            inside = sum(f.theta is not None for f in atom)
+            inside = len(constants_of(atom))
             found.append(list(range(place, place + inside)))
             place += inside
         return found
@@ -100,7 +102,7 @@ class Formula(NamedTuple):
     @property
     def kind(self) -> frozenset:
         """The terms without their constants."""
-        shapes = [tuple(sorted((f.place, f.kind) for f in atom)) for atom in self.atoms]
+        shapes = [tuple(sorted(f.form for f in atom)) for atom in self.atoms]
         return frozenset([*self.plain.term_names, *((s, shapes.count(s)) for s in shapes)])
 
     def take(self, kept: Sequence[int], coefficients: np.ndarray) -> Formula:
@@ -116,12 +118,7 @@ class Formula(NamedTuple):
 def _with(atoms: Sequence[Atom], constants: np.ndarray) -> tuple[Atom, ...]:
     """The atoms with these constants (k,) inside."""
     given = iter(constants.tolist())
-    return tuple(
-        tuple(
-            f if f.theta is None else dataclasses.replace(f, theta=next(given)) for f in atom
-        )
-        for atom in atoms
-    )  # fmt: skip
+    return tuple(with_constants(atom, given) for atom in atoms)
 
 
 def said_of(plain: Terms, atoms: Sequence[Atom]) -> float:

@@ -27,9 +27,12 @@ from gfnn_jax.models.textbook.atoms import (
     Dictionary,
     atom_text,
     blocks_of,
+    constants_of,
     dictionary_of,
     powers_of,
+    tops_of,
     weight_of,
+    with_constants,
 )
 from gfnn_jax.models.textbook.matching import Match, Matching, orthonormal
 from gfnn_jax.phase_space import apply_j
@@ -130,11 +133,18 @@ class Textbook:
         self._closest: _State | None = None  # of the laws that were not exact
         self._partial: list[_State] = []
 
-    def law(self, *, products: bool) -> Law | None:
-        """The plainest law whose flow takes z₀ to z₁, of a dictionary without products of shapes or
-        with them; None where none is found."""
+    def law(self, *, products: bool = False, centres: bool = False) -> Law | None:
+        """The plainest law whose flow takes z₀ to z₁, of a dictionary with products of shapes, with
+        distances from other centres than the origin, or with neither; None where none is found."""
+        if centres and not any(argument.axes for argument in self._arguments):
+            return None
+        alone = not (products or centres)
         with np.errstate(all="ignore"):
-            found = self._found(products)
+            found = self._found(
+                self._dictionary(products, centres),
+                blocks_of(self._arguments, self._degree) if alone else [],
+                tops_of(self._arguments) if products else [],
+            )
             return None if found is None else self._simplified(found).law
 
     @property
@@ -142,7 +152,7 @@ class Textbook:
         """The three laws that came closest where none is exact, each of other terms."""
         kinds: dict[tuple, _State] = {}
         for state in sorted(self._partial, key=lambda s: s.law.left):
-            kind = tuple(sorted(tuple((f.place, f.kind) for f in a) for a in state.match.atoms))
+            kind = tuple(sorted(tuple(f.form for f in a) for a in state.match.atoms))
             kinds.setdefault(kind, state)
         return [state.law for state in list(kinds.values())[:3]]
 
@@ -151,30 +161,33 @@ class Textbook:
         degrees = self._options.degrees
         return degrees[self._dim - 1] if self._dim <= len(degrees) else 3
 
-    def _dictionary(self, products: bool) -> Dictionary:
+    def _dictionary(self, products: bool = False, centres: bool = False) -> Dictionary:
         return dictionary_of(
-            self._arguments, self._weight, self._spanned, degree=self._degree, products=products
-        )
+            self._arguments, self._weight, self._spanned, degree=self._degree, products=products,
+            centres=centres,
+        )  # fmt: skip
 
     def _matching(self, target: np.ndarray) -> Matching:
         flat = (target * self._weight).ravel()
         return Matching(self._spanned, flat, self._weight, self._arguments)
 
-    def _found(self, products: bool) -> _State | None:
-        """The simplest law that is exact, of a dictionary with products or without."""
+    def _found(
+        self, dictionary: Dictionary, blocks: list[tuple[Atom, ...]],
+        starts: list[tuple[Atom, ...]],
+    ) -> _State | None:  # fmt: skip
+        """The simplest law of these atoms that is exact. blocks: of atoms that laws have together,
+        tried as a whole; starts: others, beside which the search looks for more."""
         options = self._options
-        dictionary = self._dictionary(products)
         if self._closest is not None and self._explains_nothing(self._closest, dictionary):
             return None  # what is left over is noise
         self._say(f"H: {len(dictionary.atoms)} atoms of laws of physics")
-        blocks = [] if products else blocks_of(self._arguments, self._degree)
         rows = self._middle.size
         most = rows / options.rows_per_term - self._base.num_parameters
         blocks = [b for b in blocks if len(b) < most]
         target, last = self._target, np.inf
         for _ in range(options.rounds):
             matching = self._matching(target)
-            tried = self._finalists(matching, dictionary)
+            tried = self._finalists(matching, dictionary, starts)
             whole = sorted((matching.refined(b) for b in blocks), key=lambda m: m.left)
             tried += [m for m in whole if m.left < 10 * tried[0].left][:2]
             states = [s for m in tried for s in [self._converged(m, target)] if s is not None]
@@ -198,8 +211,9 @@ class Textbook:
         ]  # fmt: skip
         if not others:
             return state.law.left <= options.roundoff
-        numbers = len(state.match.atoms) + sum(f.theta is not None for a in others for f in a)
-        return state.law.left <= 10.0 ** -(options.digits + options.digits_a_number * numbers)
+        numbers = len(state.match.atoms) + sum(len(constants_of(a)) for a in others)
+        digits = options.digits + options.digits_a_number * numbers
+        return state.law.left <= 10.0**-digits
 
     def _explains_nothing(self, state: _State, dictionary: Dictionary) -> bool:
         """Whether no atom explains more of what is left over than it would of noise."""
@@ -207,10 +221,12 @@ class Textbook:
         chance = 2 * np.log(len(dictionary.atoms)) + self._options.certain
         return bool(-self._middle.size * np.log1p(-min(gain, 1 - 1e-12)) < chance)
 
-    def _finalists(self, matching: Matching, dictionary: Dictionary) -> list[Match]:
+    def _finalists(
+        self, matching: Matching, dictionary: Dictionary, starts: list[tuple[Atom, ...]]
+    ) -> list[Match]:
         """The best matches, and plainer ones that leave hardly more."""
         options = self._options
-        tried = matching.best(dictionary, options.atoms)[: options.finalists]
+        tried = matching.best(dictionary, options.atoms, starts)[: options.finalists]
         plainer = [matching.plainer(m, dictionary) for m in tried[: options.plainer]]
         return list({m.atoms: m for m in [*plainer, *tried]}.values())
 
@@ -273,7 +289,7 @@ class Textbook:
     def _simplified(self, state: _State) -> _State:
         """The simplest law that is as exact: other atoms that match the corrected gradients, fewer
         of them, constants of fewer digits."""
-        dictionary = self._dictionary(False)
+        dictionary = self._dictionary()
         matching = self._matching(state.target)
         bound = 3 * max(state.law.left, self._options.roundoff)
         options = [
@@ -306,21 +322,28 @@ class Textbook:
     def _rounded(self, state: _State, bound: float) -> _State:
         """With each constant of as few digits as leave the law as exact."""
         for i, atom in enumerate(state.match.atoms):
-            for k, factor in enumerate(atom):
-                if factor.theta is None:
-                    continue
-                for digits in range(1, 13):
-                    theta = float(f"{factor.theta:.{digits}g}")
-                    if abs(theta - factor.theta) > _ROUNDED * abs(factor.theta):
-                        continue
-                    atoms = [list(a) for a in state.match.atoms]
-                    atoms[i][k] = dataclasses.replace(factor, theta=theta)
-                    match = Match(tuple(map(tuple, atoms)), state.match.left)
+            for k, constant in enumerate(constants_of(atom)):
+                for rounded in _of_few_digits(constant):
+                    atoms = list(state.match.atoms)
+                    inner = constants_of(atoms[i])
+                    inner[k] = rounded
+                    atoms[i] = with_constants(atom, inner)
+                    match = Match(tuple(atoms), state.match.left)
                     law, corrected = self._corrected(match, state.target)
                     if law is not None and law.left <= max(bound / 3, 2 * state.law.left):
                         state = _State(match, law, corrected)
                         break
         return state
+
+
+def _of_few_digits(constant: float) -> Iterator[float]:
+    """Numbers near the constant, those of fewest digits first."""
+    if abs(constant) < _ROUNDED:
+        yield 0.0
+    for digits in range(1, 13):
+        rounded = float(f"{constant:.{digits}g}")
+        if abs(rounded - constant) <= _ROUNDED * abs(constant):
+            yield rounded
 
 
 def _shorter(atoms: tuple[Atom, ...]) -> Iterator[tuple[Atom, ...]]:
