@@ -425,8 +425,8 @@ def _grown(
         ended = ended or work.ended
     if grown is None or not np.isfinite(grown.rms):
         raise FitError(
-            f"{len(data.y0)} pairs determine no H of Fourier modes. Add pairs; if they are of a "
-            "map without a flow, use --learn map (learn='map')"
+            f"expected more pairs: {len(data.y0)} determine no H of Fourier modes. If they are of "
+            "a map without a flow, use --learn map (learn='map')"
         )
     work.capped((1 - options.growth_part) * options.mode_operations)
     count = int(np.ceil(options.judged_rows * len(grown.coefficients) / (2 * data.dim)))
