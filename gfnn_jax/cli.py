@@ -29,6 +29,10 @@ from gfnn_jax.storage.outputs import ensure_new
 from gfnn_jax.storage.partial import unfinished_note
 
 _FEW_TERMS = 15  # of a law with noise that is shown as H
+_MEANS = {
+    "left the domain": " (extrapolated from there)", "not converged": " (NaN from there)",
+    "non-finite": " (NaN from there)",
+}  # fmt: skip
 
 
 class _Terminated(KeyboardInterrupt):
@@ -476,7 +480,8 @@ def _print_status(status, left_at) -> None:
     """Print the number of lanes by status, and the steps at which lanes left the domain."""
     from gfnn_jax.evaluate.report import status_counts
 
-    print(", ".join(f"{n} {name}" for name, n in status_counts(status).items() if n))
+    counts = status_counts(status).items()
+    print(", ".join(f"{n} {name}{_MEANS.get(name, '')}" for name, n in counts if n))
     left = [lane for lane in range(len(left_at)) if left_at[lane] >= 0]
     shown = ", ".join(f"{lane} at step {left_at[lane]}" for lane in left[:10])
     if left:

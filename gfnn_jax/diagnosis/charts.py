@@ -84,8 +84,8 @@ def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
 
 def _about(name, judgement: ChartJudgement, what, valid) -> str:
     instead = [n for n in ("midpoint", "type2", "type3") if n in valid and n != name]
-    advice = f"; use --chart {instead[0]}" if instead else ""
+    advice = f". Use --chart {instead[0]} (chart=)" if instead else ". Take a smaller dt"
     return (
-        f"chart {name} {what}: its determinant falls to {judgement.low:.2g} and is negative for "
-        f"{100 * judgement.negative:.0f} % of the states{advice}"
+        f"chart {name} {what}: its determinant, of ∂w/∂z, falls to {judgement.low:.2g} and is "
+        f"negative for {100 * judgement.negative:.0f} % of the states{advice}"
     )

@@ -500,8 +500,8 @@ def candidates_table(fit: Fit):
     table = Table(title=f"candidates for tolerance {fit.tolerance:g} ({fit.num_pairs} pairs)")
     for head in ("", "chart", "family"):
         table.add_column(head)
-    numbers = ("parameters", "error ÷ spread", "95 % bound", "outside", "kflop/step", "µs/step",
-               "fit s")  # fmt: skip
+    bound = "95 % bound" if fit.asked.relative else "95 % bound (absolute)"
+    numbers = ("parameters", "error ÷ spread", bound, "outside", "kflop/step", "µs/step", "fit s")
     for head in numbers:
         table.add_column(head, justify="right")
     for c in fit.candidates:

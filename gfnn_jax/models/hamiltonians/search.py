@@ -195,14 +195,14 @@ def learn_hamiltonian(
     smooth = is_smooth(best.family)  # |v|v and sign v, whole sequences turn in
     if noisy and smooth and best.error.bound > tolerance.bound:
         what = "the fit of H to whole sequences"
-        say("H: whole sequences")
+        say("H: fitting whole sequences")
         try:
             with work.again(what, best.family, len(everywhere.training)):
                 best = _of_sequences(problem, best, everywhere, tolerance, budget)
         except OutOfTime:
             budget.leave_out(what, budget.ended)
         except np.linalg.LinAlgError as error:
-            budget.leave_out(what, f"the arithmetic failed ({error})")
+            budget.leave_out(what, f"its linear algebra failed: {error}")
     seconds = time.perf_counter() - started
     learned = learned_from(best, problem, everywhere, tolerance, seconds, options, of_arcs)
     candidate = dataclasses.replace(learned.candidate, outside=outside)
