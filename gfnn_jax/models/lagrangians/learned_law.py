@@ -118,10 +118,14 @@ class LearnedLaw:
             f"{sum(energy['supplied'].values()):.3g} - lost {sum(energy['lost'].values()):.3g} + "
             f"unexplained {energy['closure']:.1g}"
         )
+        wander = self.map.sensors.wander if self.map.sensors is not None else None
         for name, sigma in self.noise.items():
+            zero = "" if wander is None else (
+                f" on a zero that wanders by {wander.size * sigma:.3g} over {wander.time:.3g} s"
+            )  # fmt: skip
             lines.append(
-                f"{name}: noise σ {sigma:.3g}, RMS residual {self.residual[name]:.3g} (unit of the "
-                f"file); residuals {self.whiteness[name].text}"
+                f"{name}: noise σ {sigma:.3g}{zero}, RMS residual {self.residual[name]:.3g} (unit "
+                f"of the file); residuals {self.whiteness[name].text}"
             )
         for fraction, seconds, predicted in self.horizon:
             lines.append(
