@@ -542,3 +542,25 @@ def test_where_every_map_has_failing_steps_the_one_with_the_fewest_is_taken(monk
     fit = quiet_fit(pendulum_pairs(), learn="map", tolerance=1e-20)
     assert len(seen) > 2
     assert (fit.chosen.chart, fit.chosen.label) == (seen[1].chart, seen[1].label)
+
+
+def test_where_every_map_has_failing_steps_smaller_ones_are_looked_at(monkeypatch):
+    measured, of_ranking, counts, seen = choose.measured, choose._of_ranking, [], []
+
+    def noted(ranking, request):
+        counts.append(len(ranking))
+        return of_ranking(ranking, request)
+
+    def finalists_fail(candidate, map_, *rest):
+        seen.append(candidate)
+        if len(seen) > counts[0]:
+            return measured(candidate, map_, *rest)
+        failing = dataclasses.replace(candidate, map=map_, validation_bound=np.inf)
+        return Assembled(failing, 0.0, failed=len(seen))
+
+    monkeypatch.setattr(choose, "_of_ranking", noted)
+    monkeypatch.setattr(choose, "measured", finalists_fail)
+    fit = quiet_fit(pendulum_pairs(), learn="map", tolerance=1e-20)
+    assert len(seen) == counts[0] + 1
+    assert (fit.chosen.chart, fit.chosen.family) == (seen[0].chart, seen[0].family)
+    assert fit.chosen.num_parameters < seen[0].num_parameters

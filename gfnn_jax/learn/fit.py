@@ -32,6 +32,7 @@ from gfnn_jax.errors import FitError, FitWarning, InputError, OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.all_rows import with_test_rows
+from gfnn_jax.learn.check import wrapped
 from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.conclude import conclude
 from gfnn_jax.learn.diagnose import diagnose_request
@@ -335,7 +336,10 @@ def fit(
     warn(request.messages)
     on_progress("looking at the map's local Jacobians")
     with row_blocks.on_devices(_devices(options.devices)):
-        data, about_pairs = clean(identified(request.pairs), request.coordinates, request.structure)
+        data, about_pairs = clean(
+            identified(request.pairs), request.coordinates, request.structure,
+            jumps=bool(wrapped(request.pairs, request.coordinates)),
+        )  # fmt: skip
         warn(about_pairs)
         looked_at = len(looked_for_errors(len(request.pairs)))
         if looked_at < len(request.pairs):
