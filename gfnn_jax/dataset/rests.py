@@ -20,7 +20,7 @@ _STILL = 1.5  # of the noise: the standard deviation up to which a coordinate st
 _KEPT = 0.25  # periods of a rest that stay, in which the body comes to a stop or starts
 
 
-def moving(found: Sequence[Stretch], scales: Scales) -> tuple[list[Stretch], float]:
+def without_rests(found: Sequence[Stretch], scales: Scales) -> tuple[list[Stretch], float]:
     """The stretches of plain positions without their rests, and the seconds that were left out; the
     stretches as they are where too little would be left."""
     window = max(9, round(scales.period / scales.dt))
