@@ -40,7 +40,7 @@ def _still(stretch: Stretch, sigma: np.ndarray, window: int) -> np.ndarray:
     if count < 1:
         return np.zeros(len(q), bool)
     views = np.lib.stride_tricks.sliding_window_view(q, window, axis=0)
-    quiet = (views.std(axis=-1) <= _STILL * sigma).all(axis=1)
+    quiet = (views.std(axis=-1) <= _STILL * sigma[: q.shape[1]]).all(axis=1)
     begun = np.concatenate([np.cumsum(quiet), np.full(window - 1, np.sum(quiet))])
     ended = np.concatenate([np.zeros(window, int), np.cumsum(quiet)[:-1]])[: len(q)]
     return begun > ended

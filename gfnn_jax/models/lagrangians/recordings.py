@@ -132,6 +132,7 @@ def fit_recording(
         scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, own]))
         given = np.array([recording.std[name] or np.nan for name in seen.channels])
         found = _stretches(recording, seen, angles)
+        found = without_rests(found, scales)[0] if rests else found
     _check_told(fit, seen)
     told("bands: forecasting from windows of the record")
     bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
