@@ -304,6 +304,7 @@ def _described(
             "the record gains energy that no input explains. If the system is driven, name its "
             "drive: --inputs NAME (inputs=)"
         )
+    messages += parameters_left_out(recording)
     messages += [
         f"no force of the input {u} is seen: its gain is within {_SEEN:g} standard errors of 0. "
         f"Record a stronger or more varied {u}, or leave it out of --inputs (inputs=)"
@@ -325,6 +326,20 @@ def _described(
         messages=tuple(messages), steps=steps, num_samples=len(recording), seconds=seconds,
         ended="every length of arcs was fitted",
     )  # fmt: skip
+
+
+def parameters_left_out(recording: Recording) -> list[str]:
+    """A warning for each parameter that differs from run to run: a law has none."""
+    found = []
+    for name in recording.parameters:
+        values = np.concatenate([recording.values(name, run) for run in recording.runs])
+        least, most = np.nanmin(values), np.nanmax(values)
+        if least < most:
+            found.append(
+                f"{name} is {least:g} to {most:g} and the law is one for all runs. If {name} "
+                "moves anything, fit the runs of each value by themselves"
+            )
+    return found
 
 
 def _in_words(
