@@ -291,9 +291,9 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / data.spread) ** 2))
         if part > _OWN_ERROR:
             message = (
-                f"what is left over differs between neighbouring pairs, as noise does, but fits to "
-                f"either half of them differ by {part:.1g} times as much, as noise does not let "
-                "them: these functions cannot follow some of the states, as of close passages"
+                "what is left over is no noise, though neighbouring pairs differ in it: fits to "
+                f"either half of them differ by {part:.2g} times as much; these functions cannot "
+                "follow some of the states, as of close passages"
             )
             return _LeftOver(None, [message], "these functions cannot follow some of the states")
         own = f" (the map's own error is then about {part:.1g} of it)"
