@@ -430,6 +430,9 @@ def _summarise(ran: Any, out: Path) -> None:
             print(note)
         for loss in report["hamiltonian"]["friction"]:
             print(f"{loss['term']}: {loss['coefficient']:.6g} ± {loss['std']:.1g}")
+    told = report["hamiltonian"] is not None and report["hamiltonian"]["symmetries"]
+    if ran.fit.symmetries and not told:
+        print(f"symmetries of the pairs: {'; '.join(map(str, ran.fit.symmetries))}")
     for law in ran.fit.partial_laws:
         print(law)
     print(fit["ended"])

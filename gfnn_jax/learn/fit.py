@@ -27,10 +27,12 @@ from gfnn_jax.dataset.runs import identified
 from gfnn_jax.diagnosis.clean import clean
 from gfnn_jax.diagnosis.damping import LearnedDamping
 from gfnn_jax.diagnosis.local_jacobians import ChartJudgement, looked_for_errors
+from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs, symmetries_of_pairs
 from gfnn_jax.errors import FitError, FitWarning, InputError, OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.all_rows import with_test_rows
+from gfnn_jax.learn.check import wrapped
 from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.conclude import conclude
 from gfnn_jax.learn.diagnose import diagnose_request
@@ -73,6 +75,7 @@ class Fit:
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
     scene: as given. damping: of a map that loses area, by how much of it in a step. positions: of a
     map that was learned from positions alone, what its S is like; num_pairs are then triples.
+    symmetries: that the pairs show, whatever was learned.
     partial_laws: where no H meets the tolerance, the laws of physics that come closest.
     stated_by: the pairs by which the chosen candidate's error was measured, and whether the map was
     fitted to them afterwards.
@@ -103,6 +106,7 @@ class Fit:
     scene: Scene | None = None
     damping: LearnedDamping | None = None
     positions: OfPositions | None = None
+    symmetries: tuple[SymmetryOfPairs, ...] = ()
     partial_laws: tuple[PartialLaw, ...] = ()
     stated_by: str = ""
     test_pairs: Pairs | None = None
@@ -332,7 +336,10 @@ def fit(
     warn(request.messages)
     on_progress("looking at the map's local Jacobians")
     with row_blocks.on_devices(_devices(options.devices)):
-        data, about_pairs = clean(identified(request.pairs), request.coordinates, request.structure)
+        data, about_pairs = clean(
+            identified(request.pairs), request.coordinates, request.structure,
+            jumps=bool(wrapped(request.pairs, request.coordinates)),
+        )  # fmt: skip
         warn(about_pairs)
         looked_at = len(looked_for_errors(len(request.pairs)))
         if looked_at < len(request.pairs):
@@ -383,6 +390,7 @@ def fit(
         pairs=data.pairs,
         scene=scene,
         damping=seen.damping if chosen.candidate.learns == "map" else None,
+        symmetries=symmetries_of_pairs(found.data),
         partial_laws=() if found.met_by_law else tuple(request.partial_laws),
         stated_by=stated_by,
         test_pairs=data.pairs.take(data.test) if len(data.test) else None,

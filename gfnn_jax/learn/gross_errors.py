@@ -115,7 +115,8 @@ def _rms(size) -> float:
 
 def _residuals(found: Searched) -> np.ndarray | None:
     """(N,) what the best map leaves of every pair; of a law by its steps ÷ scale, of S in its
-    gradient, which has the same unit. None where it meets the tolerance, or is neither."""
+    gradient, which has the same unit. None where it meets the tolerance, is neither, or has dry
+    friction: its steps are not smooth where a body turns, and no error of a measurement is."""
     law, data, tolerance = found.law, found.data, found.tolerance
     best = _best(found)
     if best is None or tolerance.met_by(best) or best.validation_relative <= _ROUNDOFF:
@@ -123,7 +124,7 @@ def _residuals(found: Searched) -> np.ndarray | None:
     if data.structure is not None or data.varied:
         return None
     if law is not None and best is law.candidate:
-        return _sizes((law.flow.image(data.y0) - data.y1) / data.scale)
+        return None if law.widths else _sizes((law.flow.image(data.y0) - data.y1) / data.scale)
     swept = _swept(found)
     return None if swept is None else _sizes(swept[0].residuals(swept[1]))
 

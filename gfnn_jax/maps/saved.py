@@ -51,6 +51,7 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.scene import Scene
 from gfnn_jax.solve.robust import Biweight, SoftL1
+from gfnn_jax.solve.wander import Wander
 from gfnn_jax.storage.checkpoints import load_model, save_model
 from gfnn_jax.storage.outputs import ensure_new
 
@@ -60,7 +61,7 @@ _TYPES: dict[str, type] = {
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
         Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
         Windows, Groups, Ranges, OfTimeStep, Ensemble, Uniform, Forced, Legendre, Friction, Signals,
-        Sensors, Observation, SoftL1, Biweight, Damping, DampingOfArgs, FunctionsOfArgs,
+        Sensors, Wander, Observation, SoftL1, Biweight, Damping, DampingOfArgs, FunctionsOfArgs,
         OfDisplacement,
     )
 } | {"LagrangianTerms": lagrangian.Terms}  # fmt: skip

@@ -73,7 +73,8 @@ class LearnedHamiltonian:
     in the end. friction: γ where that is uniform, else the terms of Rayleigh's R; of a system
     without, (). constants: numbers inside terms that noisy sequences told, each with its term and
     its standard error. symmetries: that H has to roundoff. proposals: simple fractions near its
-    numbers, which noisy sequences allow. rivals: the next two laws that they allow.
+    numbers, which noisy sequences allow. rivals: the next two laws that they allow. misfit: whether
+    these sequences are certain that H lacks something.
     """
 
     candidate: Candidate
@@ -99,6 +100,7 @@ class LearnedHamiltonian:
     symmetries: tuple[str, ...] = ()
     proposals: tuple[Proposal, ...] = ()
     rivals: tuple[Rival, ...] = ()
+    misfit: bool = False
     widths: tuple[float, ...] = ()
     turns: bool = False
     kinds: Callable[[], WhichFriction | None] | None = None
@@ -291,7 +293,7 @@ def learned_from(
                         turns)),
         stalled=found.stalled,
         covariance=covariance, noise=None if whole is None else whole.noise,
-        arcs=0 if whole is None else whole.arcs,
+        arcs=0 if whole is None else whole.arcs, misfit=whole is not None and whole.misfit,
         dropped=found.dropped, unmet=_unmet(error, omega_h, tolerance, found),
         friction=friction, constants=found.constants, symmetries=symmetries,
         proposals=found.proposals, rivals=found.rivals, widths=widths,
@@ -498,6 +500,11 @@ def _messages(
         )
     if found.whole is not None:
         yield from found.whole.messages
+        if found.whole.misfit:
+            yield (
+                "H misses whole sequences by more than their noise: it lacks terms that single "
+                "steps do not tell; bands count what it misses"
+            )
     if found.undetermined:
         names = found.undetermined
         some = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")

@@ -109,9 +109,13 @@ class LearnedLaw:
             f"{sum(energy['lost'].values()):.3g}, supplied {sum(energy['supplied'].values()):.3g}, "
             f"unexplained {energy['closure']:.1g}"
         )
+        wander = self.map.sensors.wander if self.map.sensors is not None else None
         for name, sigma in self.noise.items():
+            zero = "" if wander is None else (
+                f" on a zero that wanders by {wander.size * sigma:.3g} over {wander.time:.3g} s"
+            )  # fmt: skip
             lines.append(
-                f"{name}: noise {sigma:.3g}, residual of the law {self.residual[name]:.3g}, "
+                f"{name}: noise {sigma:.3g}{zero}, residual of the law {self.residual[name]:.3g}, "
                 f"{self.whiteness[name].text}"
             )
         for fraction, seconds, predicted in self.horizon:

@@ -16,27 +16,25 @@ import numpy as np
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
+from gfnn_jax.dataset.rests import moving
 from gfnn_jax.dataset.stretches import Nodes, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
 from gfnn_jax.flows.motion import WEIGHTS
-from gfnn_jax.maps.estimates import law_in_use
 from gfnn_jax.maps.inputs import HOLDS, Signals
-from gfnn_jax.maps.laws import conformal, map_of_law
+from gfnn_jax.maps.laws import map_of_law
 from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.calibration import Thirds, calibrated
-from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
+from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_law import fit_given
 from gfnn_jax.models.lagrangians.given_terms import Given, given_terms
+from gfnn_jax.models.lagrangians.in_use import Record, best_in_use
 from gfnn_jax.models.lagrangians.learned_law import (
     LearnedLaw,
     NextMotion,
     hamiltonian_of,
-    in_columns,
-    scaled,
 )
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.next_motion import Motion, next_motions
@@ -92,6 +90,11 @@ def fit_recording(
         seen = seen.shifted(np.where(np.isin(range(seen.dim), far), middle, 0.0))
         found = _stretches(recording, seen, angles)
     scales = measure(found)
+    if seen.is_plain:
+        found, resting = moving(found, scales)
+        if resting:
+            scales = measure(found)
+            told(f"{resting:.3g} s at rest left out")
     given = np.array([recording.std[name] or np.nan for name in seen.channels])
     scales = dataclasses.replace(scales, sigma=np.where(given > 0, given, scales.sigma))
     asked = _asked(terms, seen, options.dry_width * float(np.mean(scales.speed)))
@@ -126,55 +129,37 @@ def fit_recording(
         scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, own]))
         given = np.array([recording.std[name] or np.nan for name in seen.channels])
         found = _stretches(recording, seen, angles)
+    _check_told(fit, seen)
+    told("bands: forecasts from windows of the record")
+    bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
+    record = Record(recording, nodes, found, scales, given, mass or {}, acting.hold, acting.delay)
+    best = best_in_use(record, bench, fit, choice, told)
+    fit, law, sensors = best.fit, best.law, best.calibration.law.sensors
     first = fit.form.count + len(fit.structure.zeros)
-    fitted = dataclasses.replace(seen, values=fit.p[first:])
-    _check_told(fit, fitted)
-    law, covariance = in_columns(fit)
-    names = recording.coordinates
-    gauge = f"the mean of M11 over the data is 1 ({names[0]})"
-    scale = 1.0
-    if mass:
-        (name, value), i = next(iter(mass.items())), names.index(next(iter(mass)))
-        masses = law.masses(np.concatenate([n.x[:, : fit.form.dim] for n in nodes]))
-        scale = value / float(np.mean(masses[:, i, i]))
-        law, covariance = scaled(law, covariance, scale)
-        gauge = f"the mean mass of {name} over the data is {value:g}"
     x = np.concatenate([n.x for n in nodes])
     d = fit.form.dim
     zeros = np.zeros(d)
     zeros[list(fit.structure.zeros)] = fit.p[fit.form.count : first]
     q, v = x[:, :d] + zeros, x[:, d:]
-    moving, of_moving = conformal(law, covariance)
-    root = _root(of_moving)
-    noise = np.where(given > 0, given, np.minimum(scales.sigma, fit.rms()))
-    sensors = Sensors(
-        names, recording.inputs, recording.angles, noise, scales.omega, scales.period, acting.hold,
-        acting.delay, np.array([scales.period]), np.zeros((1, len(noise))),
-        None if seen.is_plain and loss is None else fitted,
-    )  # fmt: skip
-    bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
-    told("bands: forecasts from windows of the record")
-    spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
-    thirds = _thirds(bench, nodes, fit, sensors, found)
-    used, horizons = calibrated(law_in_use(moving, root, sensors), thirds, found, scales, spread)
     z = np.concatenate([q, law.momentum(q, v)], axis=1)
     u = np.concatenate([n.stretch.u[n.at] for n in nodes])
     signals = Signals(recording.inputs, acting.hold, acting.delay) if recording.inputs else None
     map_ = map_of_law(
-        moving,
+        best.moving,
         z,
         scales.dt,
         angles=angles,
         signals=signals,
         inputs=u if signals else None,
-        root=root,
+        root=best.root,
     )
-    map_ = _with_sensors(map_, used.sensors)
+    map_ = _with_sensors(map_, sensors)
     traces = _traces(recording, seen.channels, fit, law, nodes, zeros, inputs_of)
     told("which motion to record next")
-    motions = next_motions(bench, fit, angles)
+    motions = next_motions(best.bench, fit, angles)
     return _described(
-        recording, fit, map_, law, covariance, (choice, scale), horizons, gauge, tuple(steps),
+        recording, fit, map_, law, best.covariance, (best.choice, best.scale),
+        best.calibration.horizons, best.gauge, tuple(steps),
         traces, motions, time.process_time() - started, speeds,
         (acting.delay, acting.error) if recording.inputs else None,
     )  # fmt: skip
@@ -254,33 +239,6 @@ def _asked(terms: Sequence[Any], seen: Observation, width: float) -> Given | Non
     """The terms that were given, by the names of formulas."""
     names = symbols((*seen.coordinates, *seen.speeds))
     return given_terms(terms, names[: seen.dim], names[seen.dim :], width) if terms else None
-
-
-def _root(covariance: np.ndarray) -> np.ndarray:
-    """rootᵀ root = covariance, of its eigenvalues above roundoff."""
-    values, vectors = np.linalg.eigh(covariance)
-    kept = values > 1e-14 * max(float(values.max(initial=0.0)), 1e-300)
-    return np.sqrt(values[kept])[:, None] * vectors[:, kept].T
-
-
-def _thirds(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, sensors: Sensors,
-    found: Sequence[Stretch],
-) -> Thirds:  # fmt: skip
-    """The laws of the record without each third, of which less data tell less."""
-    fewer, laws, begins = np.sqrt(FOLDS / (FOLDS - 1)), [], []
-    for other, run, t in bench.without_thirds(nodes, fit):
-        law, covariance = in_columns(other)
-        own = sensors
-        if sensors.observation is not None:
-            first = fit.form.count + len(fit.structure.zeros)
-            shown = dataclasses.replace(sensors.observation, values=other.p[first:])
-            own = dataclasses.replace(sensors, observation=shown)
-        laws.append(law_in_use(law, fewer * _root(covariance), own))
-        begins.append(
-            next((i, t) for i, s in enumerate(found) if s.run == run and s.t[0] <= t <= s.t[-1])
-        )
-    return Thirds(tuple(laws), tuple(begins))
 
 
 def _with_sensors(map_: Any, sensors: Sensors) -> Any:
