@@ -191,9 +191,12 @@ def test_gross_errors_among_pairs_do_not_spoil_the_law(spoilt):
     assert found["q1² q2"] == pytest.approx(1.0, abs=3e-3)
     assert fit.met
     told = " ".join(fit.messages)
-    assert "gross errors" in told
+    assert "outliers" in told
     named = [
-        int(n) for part in re.findall(r"rows ([\d, ]+)", told) for n in part.split(",") if n.strip()
+        int(n)
+        for part in re.findall(r"numbers ([\d, ]+)", told)
+        for n in part.split(",")
+        if n.strip()
     ]
     assert sorted(named) == rows.tolist()
 

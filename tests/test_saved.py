@@ -173,7 +173,7 @@ def test_a_function_of_ones_own_is_refused(tmp_path):
         (lambda d: d["map"].pop("dt"), "does not describe a map"),
         (lambda d: d["map"]["pieces"]["0"].update(surprise=1), "does not describe a map"),
         (lambda d: d.pop("map"), "does not describe a map"),
-        (lambda d: d.update(scene="nowhere"), "pass it"),
+        (lambda d: d.update(scene="nowhere"), "Load it in Python"),
     ],
 )
 def test_a_foreign_description(change, message, tmp_path):

@@ -56,13 +56,17 @@ def clean(
     if len(found_outliers):
         messages.append(
             f"{len(found_outliers)} of {count} pairs contradict the pairs around them "
-            f"(rows {_named(row[found_outliers])}): "
-            + ("outliers, they are left out" if few else "too many to be left out")
+            f"(numbers {_named(row[found_outliers])}, from 0): "
+            + (
+                "outliers, they are left out"
+                if few
+                else "too many for outliers, they are kept. Is q first, and does z1 follow z0?"
+            )
         )
     if len(gross):
         messages.append(
-            f"{len(gross)} of {count} pairs (rows {_named(row[gross])}) are gross errors beside "
-            "a polynomial through the others: they are left out"
+            f"{len(gross)} of {count} pairs (numbers {_named(row[gross])}, from 0) are far from a "
+            "polynomial fitted to the others: outliers, they are left out"
         )
     return data, messages
 

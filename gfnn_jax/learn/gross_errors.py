@@ -93,20 +93,21 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
     messages = []
     if len(wrong):
         messages.append(
-            f"{_named(wrong, count)} are gross errors beside the map of the others, or lie at the "
-            "rim of the data where it cannot follow: they were given no weight"
+            f"{_named(wrong, count)} are far from the map of the others: outliers, or states at "
+            "the edge of the data that it cannot follow. They are left out. If they are right, add "
+            "pairs there"
         )
     if len(rim):
         messages.append(
-            f"{_named(rim, count)} lie at the rim of the data, where S cannot follow them: the map "
-            "is fitted, and its error stated, without them"
+            f"{_named(rim, count)} lie at the edge of the data, where S cannot follow them: the "
+            "map is fitted, and its error stated, without them"
         )
     return Cleaned(seen, found, messages)
 
 
 def _named(rows: np.ndarray, count: int) -> str:
     first = ", ".join(map(str, np.sort(rows)[:5])) + (", …" if len(rows) > 5 else "")
-    return f"{len(rows)} of {count} pairs (rows {first})"
+    return f"{len(rows)} of {count} pairs (numbers {first}, from 0)"
 
 
 def _rms(size) -> float:
