@@ -47,7 +47,7 @@ class InUse(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Record:
-    """What all fits of a recording share: its nodes, stretches and scales, σ of channels as given
+    """The data that all fits of a recording share: its nodes, stretches and scales, σ of channels as given
     (NaN where not), the known mass, and how inputs act between samples."""
 
     recording: Recording
