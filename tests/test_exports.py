@@ -18,6 +18,7 @@ from scipy.linalg import expm
 import gfnn_jax as gfnn
 from gfnn_jax import cli, cli_parser, scenes
 from gfnn_jax.coordinates import CARTESIAN, Coordinates, polar, to_inner
+from gfnn_jax.exports import polynomials
 from gfnn_jax.exports.export import SUFFIXES
 from gfnn_jax.exports.symbols import Tape
 from gfnn_jax.families import lagrangian
@@ -474,6 +475,24 @@ def test_command_line(tmp_path, capsys):
     assert (tmp_path / "m.c").read_text() == before
     assert cli.main(["export", str(tmp_path / "none"), "--to", "c"]) == 2
     assert "no such file" in capsys.readouterr().err
+
+
+# Polynomials
+
+
+def test_polynomials_are_arranged_anew():
+    map_, z = map_in(TYPE2, 2, 3, angles=(1,), predicted=True)
+    model = jax.tree.map(np.asarray, map_.pieces[0].predictor.forward)
+    x = model.family.inputs(z)
+    within = [np.clip(x[:, 0], -model.reach[0], model.reach[0]), np.cos(x[:, 1]), np.sin(x[:, 1]),
+              *np.clip(x[:, 2:].T, -model.reach[2], model.reach[2])]  # fmt: skip
+    terms = polynomials.in_powers(model)
+    for k, expected in enumerate(model(z).T):
+        found = polynomials.horner({n: c[k] for n, c in terms.items()}, within)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+    far = 3 * z
+    expected = map_.domain.christoffel(far)
+    np.testing.assert_allclose(polynomials.christoffel(map_.domain, far.T), expected, rtol=1e-12)
 
 
 # Symbols

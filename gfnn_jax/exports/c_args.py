@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gfnn_jax.exports.c_pieces import moves_args, table
-from gfnn_jax.exports.symbols import literal
+from gfnn_jax.exports.c_pieces import moves_args
+from gfnn_jax.exports.symbols import literal, table
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.exports.formulas import on_symbols
-from gfnn_jax.exports.symbols import Tape, literal
+from gfnn_jax.exports.polynomials import side_by_side, variables
+from gfnn_jax.exports.symbols import Tape, literal, table
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.products import Products
@@ -22,7 +23,6 @@ from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.uniform import CaldirolaKanai, Uniform, without_forces
 from gfnn_jax.generating.generated import Generated, ImplicitStep
-from gfnn_jax.generating.predictor import PolynomialModel
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping, DampingOfArgs
 from gfnn_jax.solve.linear import COFACTORS_UP_TO, by_cofactors
@@ -39,7 +39,7 @@ def why_not_piece(piece: Any) -> str | None:
     family = piece.family
     inner = family.family if isinstance(family, OfDisplacement) else without_forces(family)
     if isinstance(inner, Legendre) and inner.dim > COFACTORS_UP_TO:
-        return f"the masses of {inner.dim} degrees of freedom are no small system"
+        return f"its Legendre transform has more than {COFACTORS_UP_TO} degrees of freedom"
     if not isinstance(inner, (Products, Terms, Legendre)):
         return f"the map is one of {getattr(family, 'label', type(family).__name__)}"
     if isinstance(piece, Flow) and piece.newton:
@@ -133,10 +133,17 @@ def _generated(name: str, family: str, piece: Generated, width: int, more: int) 
 
     tape = Tape()
     z, args = state_and_args(tape)
-    guess = chart.first_guess(z)[:, chart.free(width // 2)]
+    guess: dict[str, Any] = {"x": chart.first_guess(z)[:, chart.free(width // 2)]}
+    parts, begin = [], f"{name}_guess(z, x);"
     if piece.predictor is not None:
-        guess = guess + _predicted(piece.predictor.forward, z, args)
-    parts = [tape.function(f"{name}_guess", {"x": guess})]
+        model = piece.predictor.forward
+        within = on_symbols(model.family).inputs(z, args)[0]
+        guess["v"] = variables(model, within)
+        begin = (
+            f"double v[{len(guess['v'])}];\n    {name}_guess(z, x, v);\n    {name}_predict(v, x);"
+        )
+        parts.append(side_by_side(f"{name}_predict", model))
+    parts.append(tape.function(f"{name}_guess", guess))
 
     tape = Tape()
     (z, args), x = state_and_args(tape), tape.inputs("x", n)
@@ -195,7 +202,7 @@ static int {name}(double *z)
 {{
     static const struct equation of = {{{n}, {name}_evaluate, {name}_linearise, {name}_solve}};
     double x[{n}], g[{width}], Z[{width}];
-    {name}_guess(z, x);
+    {begin}
     const int status = newton(&of, z, x, g);
     {name}_image(z, x, g, Z);
     memcpy(z, Z, sizeof Z);
@@ -203,16 +210,6 @@ static int {name}(double *z)
 }}
 """)
     return parts
-
-
-def _predicted(model: PolynomialModel, z, args):
-    """Evaluate the predictor's correction of the first guess at symbols z (1, 2d), args (1, k)."""
-    variables = on_symbols(model.family).inputs(z, args)[0]
-    within = [
-        v if np.isinf(reach) else v.clipped(-reach, reach)
-        for v, reach in zip(variables, model.reach, strict=True)
-    ]
-    return model.of_variables(np.array([within], dtype=object))
 
 
 def moves_args(piece: Any, more: int) -> bool:
@@ -286,10 +283,3 @@ static int {name}_{way}(double *z)
 }}
 """)
     return parts
-
-
-def table(values) -> str:
-    """Write numbers as the initialiser of a C array, four in a line."""
-    texts = [literal(v) for v in np.ravel(np.asarray(values)).tolist()]
-    lines = [", ".join(texts[i : i + 4]) for i in range(0, len(texts), 4)]
-    return "{\n    " + ",\n    ".join(lines) + "\n}"

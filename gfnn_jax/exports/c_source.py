@@ -24,6 +24,7 @@ from gfnn_jax.exports.c_args import (
     of_samples,
 )
 from gfnn_jax.exports.c_pieces import piece_functions, unknowns, why_not_piece
+from gfnn_jax.exports.polynomials import christoffel
 from gfnn_jax.exports.symbols import Tape, literal
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.flows.flow import Flow
@@ -56,8 +57,8 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     """
     if (reason := why_not(map_)) is not None:
         raise InputError(
-            f"{reason}, and cannot be written in C, which takes polynomials, Fourier harmonics and "
-            "formulas: use --to stablehlo"
+            f"this map cannot be written in C: {reason}. C takes polynomials, Fourier harmonics "
+            "and formulas: use --to stablehlo"
         )
     map_ = jax.tree.map(np.asarray, map_)
     pieces, width, domain = map_.pieces, 2 * map_.dim, map_.domain
@@ -78,7 +79,7 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     if domain.keep:
         tape = Tape()
         y = tape.inputs("y", width)
-        parts.append(tape.function("christoffel", {"kappa": domain.christoffel(y)}))
+        parts.append(tape.function("christoffel", {"kappa": christoffel(domain, y[0])}))
     for i, (piece, back) in enumerate(zip(pieces, map_.reversed().pieces[::-1], strict=True)):
         parts += piece_functions(f"piece{i}", piece, back, width, more)
     order = range(len(pieces))

@@ -2,8 +2,10 @@
 
 Families, charts and domains are written once against the array namespace of their input. On an
 object array of symbols, the lines that a fit runs in NumPy record their arithmetic. Products with
-zero and sums with zero are left out, and a repeated operation is computed once. All other
-operations keep their order, so that the C code rounds as NumPy does.
+zero and sums with zero are left out, a repeated operation is computed once, factors that are
+numbers are multiplied beforehand, and a division is a product with the reciprocal: it takes as long
+as ten products, and many numbers are divided by the same one. All other operations keep their
+order, so that the C code rounds nearly as NumPy does.
 """
 
 from __future__ import annotations
@@ -53,7 +55,9 @@ class Symbol:
         return _product(other, self)
 
     def __truediv__(self, other):
-        return self if other == 1 else self.tape.made("/", self, other)
+        if isinstance(other, Symbol):
+            return self * self.tape.made("/", 1.0, other)
+        return self * (1.0 / other)
 
     def __rtruediv__(self, other):
         return self.tape.made("/", other, self)
@@ -113,6 +117,8 @@ def _product(a, b):
             return 0.0 if one == 0 else (other if one == 1 else -other)
     if not isinstance(b, Symbol):  # a constant stands first
         a, b = b, a
+    if not isinstance(a, Symbol) and b.operation == "*" and not isinstance(b.operands[0], Symbol):
+        return _product(a * b.operands[0], b.operands[1])
     return b.tape.made("*", a, b)
 
 
@@ -152,10 +158,17 @@ class Tape:
         given = [f"const double {n}[{size}]" for n, size in self._inputs.items()]
         taken = [f"double {n}[{size}]" for n, size in sizes.items()]
         uses = self._uses(results.values())
-        texts: dict[int, tuple[str, int]] = {}
         used = {s.operands[0].partition("[")[0] for s in self._made
                 if s.operation == "input" and s.number in uses}  # fmt: skip
-        lines = [f"    (void)({n});" for n in self._inputs if n not in used]
+        lines = [f"(void)({n});" for n in self._inputs if n not in used] + self.lines(results)
+        body = [f"    {line}" for line in lines]
+        return "\n".join([f"static void {name}({', '.join([*given, *taken])})", "{", *body, "}\n"])
+
+    def lines(self, results: Mapping[str, Any]) -> list[str]:
+        """Write the lines that compute the results, which are named as C assigns to them."""
+        uses = self._uses(results.values())
+        texts: dict[int, tuple[str, int]] = {}
+        lines = []
         for symbol in self._made:
             if symbol.number not in uses:
                 continue
@@ -164,10 +177,9 @@ class Tape:
             if symbol.operation == "input" or inline:
                 texts[symbol.number] = text, binds
             else:
-                lines.append(f"    const double t{symbol.number} = {text};")
+                lines.append(f"const double t{symbol.number} = {text};")
                 texts[symbol.number] = f"t{symbol.number}", _ATOM
-        lines += [f"    {n} = {_operand(value, texts, _SUM)};" for n, value in results.items()]
-        return "\n".join([f"static void {name}({', '.join([*given, *taken])})", "{", *lines, "}\n"])
+        return lines + [f"{n} = {_operand(value, texts, _SUM)};" for n, value in results.items()]
 
     def _uses(self, results) -> dict[int, int]:
         """Number of uses of each symbol that the results depend on."""
@@ -184,6 +196,13 @@ class Tape:
 def literal(value: Any) -> str:
     """Write a number so that C reads it back, a float64 to the last bit."""
     return repr(float(value))
+
+
+def table(values) -> str:
+    """Write numbers as the initialiser of a C array, four in a line."""
+    texts = [literal(v) for v in np.ravel(np.asarray(values)).tolist()]
+    lines = [", ".join(texts[i : i + 4]) for i in range(0, len(texts), 4)]
+    return "{\n    " + ",\n    ".join(lines) + "\n}"
 
 
 def _operand(value, texts, least: int) -> str:

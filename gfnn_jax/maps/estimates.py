@@ -121,11 +121,14 @@ def forecast(
     last = np.array([np.max(w.t) for w in windows])
     if times.ndim != 1 or not np.all(np.diff(times) > 0) or not np.all(times[0] >= last):
         raise InputError(
-            f"expected rising times from the end of each run on ({last.max():g} s), got "
+            f"expected rising times, none before the latest end of a run ({last.max():g} s), got "
             f"{times.ravel()[0]:g} to {times.ravel()[-1]:g} s"
         )
     if sensors.inputs and inputs is None:
-        raise InputError(f"expected inputs {', '.join(sensors.inputs)} ahead of time: inputs=")
+        raise InputError(
+            f"the law has inputs ({', '.join(sensors.inputs)}): give them for the times of the "
+            "forecast, --inputs FILE (inputs=)"
+        )
     if inputs is not None and sensors.inputs:
         windows = [
             _with_inputs(window, inputs, sensors, run)
@@ -150,7 +153,10 @@ def windows_of(sensors: Sensors, recording: Recording) -> list[Window]:
     needed = (*sensors.seen.needed, *sensors.inputs)
     missing = [n for n in needed if n not in recording.columns]
     if missing:
-        raise InputError(f"{recording.source}: expected columns {', '.join(missing)}")
+        raise InputError(
+            f"{recording.source}: has no columns {', '.join(missing)}, which the law was learned "
+            "from"
+        )
     windows = []
     for run in recording.runs:
         t = recording.times(run)

@@ -138,7 +138,10 @@ def load(folder, scene: Scene | None = None) -> SymplecticMap:
     name = description.get("scene")
     if scene is None and name is not None:
         if name not in SCENES:
-            raise InputError(f"{folder}: was learned in the scene '{name}': pass it (scene=...)")
+            raise InputError(
+                f"{folder}: was learned in the scene '{name}', which the package has not. Load it "
+                "in Python: gfnn.load(folder, scene=...)"
+            )
         scene = SCENES[name]()
     if scene is not None and name is not None and scene.name != name:
         raise InputError(f"{folder}: was learned in the scene '{name}', not in '{scene.name}'")
@@ -147,7 +150,9 @@ def load(folder, scene: Scene | None = None) -> SymplecticMap:
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{folder}: does not describe a map of this release ({error})") from error
+        raise InputError(
+            f"{folder}: does not describe a map of this release ({error}). Fit it again"
+        ) from error
 
 
 def packed(map_: SymplecticMap, scene: Scene | None = None) -> dict[str, np.ndarray]:

@@ -77,7 +77,10 @@ def beside_friction(
         except OutOfTime:
             work.budget.leave_out("H with friction", work.ended)
             break
-        except (FitError, np.linalg.LinAlgError):
+        except FitError:  # no such friction is in the pairs
+            continue
+        except np.linalg.LinAlgError as error:
+            work.budget.leave_out("H with friction", f"the arithmetic failed ({error})")
             continue
         law = found[0]
         met = law.error.bound <= bound
@@ -92,8 +95,10 @@ def beside_friction(
         return _of_kinds(problem, work, before, best, data, tolerance, search) or best
     except OutOfTime:
         work.budget.leave_out("H with friction of every kind", work.ended)
-    except (FitError, np.linalg.LinAlgError):
+    except FitError:  # no such friction is in the pairs
         pass
+    except np.linalg.LinAlgError as error:
+        work.budget.leave_out("H with friction of every kind", f"the arithmetic failed ({error})")
     return best
 
 

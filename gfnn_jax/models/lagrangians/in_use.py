@@ -47,8 +47,8 @@ class InUse(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Record:
-    """A recording as all fits of it share it: its nodes, stretches and scales, σ of channels as
-    given (NaN where not), the known mass, and how inputs act between samples."""
+    """The data that all fits of a recording share: its nodes, stretches and scales, σ of channels
+    as given (NaN where not), the known mass, and how inputs act between samples."""
 
     recording: Recording
     nodes: Sequence[Nodes]
@@ -63,13 +63,16 @@ class Record:
         """The fit made ready for forecasts."""
         law, covariance = in_columns(fit)
         names, scale = self.recording.coordinates, 1.0
-        gauge = f"the mean of M11 over the data is 1 ({names[0]})"
+        gauge = (
+            f"the mean inertia M11 (of {names[0]}) over the data is 1, the unit of L, R, gains and "
+            f"energies; --mass {names[0]}=VALUE (mass=) gives them theirs"
+        )
         for name, value in self.mass.items():
             q = np.concatenate([n.x[:, : fit.form.dim] for n in self.nodes])
             i = names.index(name)
             scale = value / float(np.mean(law.masses(q)[:, i, i]))
             law, covariance = scaled(law, covariance, scale)
-            gauge = f"the mean mass of {name} over the data is {value:g}"
+            gauge = f"the mean inertia of {name} over the data is {value:g}, as given"
         moving, of_moving = conformal(law, covariance)
         root, sensors = _root(of_moving), self.sensors(bench, fit)
         spread = np.nanstd(np.concatenate([s.y for s in self.found]), axis=0)

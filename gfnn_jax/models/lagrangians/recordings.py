@@ -16,9 +16,10 @@ import numpy as np
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
+from gfnn_jax.dataset.rests import without_rests
 from gfnn_jax.dataset.stretches import Nodes, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
+from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.flows.motion import WEIGHTS
 from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import map_of_law
@@ -38,7 +39,7 @@ from gfnn_jax.models.lagrangians.learned_law import (
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.next_motion import Motion, next_motions
 from gfnn_jax.models.lagrangians.residuals import Trace, whiteness
-from gfnn_jax.models.lagrangians.search import SearchOptions, describe, search
+from gfnn_jax.models.lagrangians.search import NO_LAW, SearchOptions, describe, search
 from gfnn_jax.models.lagrangians.text import (
     Expression,
     Term,
@@ -46,6 +47,7 @@ from gfnn_jax.models.lagrangians.text import (
     speed_names,
     terms_of,
     which_friction_told,
+    word_of,
 )
 from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels
 from gfnn_jax.solve.robust import Loss
@@ -63,7 +65,7 @@ def fit_recording(
     """The law of a recording, from its positions and inputs.
 
     friction: "auto", "none", "linear", "quadratic", "dry", or several of them, as
-    "linear+dry". input_hold: "auto", or how inputs go on between samples: "hold", "linear" or
+    "linear+dry". input_hold: "auto", or the inputs between samples: "hold", "linear" or
     "band". mass: the known mass (or moment of inertia) of one position, which fixes the scale of L.
     terms: those of L, V and R, as text in the names of columns (`models.lagrangians.given_terms`),
     which are then all that is fitted. loss: of residuals in units of their noise; None: the soft L1
@@ -89,6 +91,13 @@ def fit_recording(
         seen = seen.shifted(np.where(np.isin(range(seen.dim), far), middle, 0.0))
         found = _stretches(recording, seen, angles)
     scales = measure(found)
+    rests: list[str] = []
+    if seen.is_plain:
+        found, resting = without_rests(found, scales)
+        if resting:
+            scales = measure(found)
+            rests = [f"{resting:.3g} s at rest left out: a body that stands still tells no law"]
+            told(rests[0])
     given = np.array([recording.std[name] or np.nan for name in seen.channels])
     scales = dataclasses.replace(scales, sigma=np.where(given > 0, given, scales.sigma))
     asked = _asked(terms, seen, options.dry_width * float(np.mean(scales.speed)))
@@ -103,7 +112,7 @@ def fit_recording(
     acting, choice, nodes = search(*record) if asked is None else fit_given(asked, *record)
     fit, inputs_of = acting.fit, acting.bench.inputs
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
-        raise FitError("no law of the terms tried follows this recording from sample to sample")
+        raise FitError(NO_LAW)
     finer = scales.substeps_for(fit.sigma)  # local cubics may have seen more noise than there is
     if finer > scales.substeps:
         inputs_of = ArcInputs(nodes, finer, acting.hold, acting.delay)
@@ -113,7 +122,7 @@ def fit_recording(
     speeds = velocities(recording, fit, nodes)
     honest = tuple(name for name, one in speeds.items() if one.used)
     for name, one in speeds.items():
-        told(f"{name}: {one.text}")
+        told(f"velocity {name}: {one.text}")
     if honest:
         own = np.array([speeds[name].sigma for name in honest])
         seen = seen.beside({n: recording.velocities.index(n) for n in honest})
@@ -123,8 +132,9 @@ def fit_recording(
         scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, own]))
         given = np.array([recording.std[name] or np.nan for name in seen.channels])
         found = _stretches(recording, seen, angles)
+        found = without_rests(found, scales)[0] if rests else found
     _check_told(fit, seen)
-    told("bands: forecasts from windows of the record")
+    told("bands: forecasting from windows of the record")
     bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
     record = Record(recording, nodes, found, scales, given, mass or {}, acting.hold, acting.delay)
     best = best_in_use(record, bench, fit, choice, told)
@@ -149,14 +159,15 @@ def fit_recording(
     )
     map_ = _with_sensors(map_, sensors)
     traces = _traces(recording, seen.channels, fit, law, nodes, zeros, inputs_of)
-    told("which motion to record next")
+    told("finding the motion to record next")
     motions = next_motions(best.bench, fit, angles)
-    return _described(
+    learned = _described(
         recording, fit, map_, law, best.covariance, (best.choice, best.scale),
         best.calibration.horizons, best.gauge, tuple(steps),
         traces, motions, time.process_time() - started, speeds,
         (acting.delay, acting.error) if recording.inputs else None,
     )  # fmt: skip
+    return dataclasses.replace(learned, messages=(*rests, *learned.messages))
 
 
 def _options(friction: str) -> SearchOptions:
@@ -173,7 +184,7 @@ def _options(friction: str) -> SearchOptions:
 
 def _check(recording: Recording, input_hold: str, mass: Mapping[str, float] | None) -> None:
     if not recording.coordinates:
-        raise InputError(f"{recording.source}: expected positions, found none (--positions)")
+        raise InputError(f"{recording.source}: no positions. Name them: --positions (positions=)")
     if input_hold not in ("auto", *HOLDS):
         raise InputError(f"expected input_hold auto, {', '.join(HOLDS)}, got {input_hold!r}")
     for name, value in (mass or {}).items():
@@ -201,8 +212,8 @@ def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
     if open_:
         shown = ", ".join(names[i] for i in lengths)
         raise InputError(
-            f"{', '.join(open_)}: every scale of {shown} has a law of the same terms: leave it "
-            "out, or observe a velocity of known scale beside"
+            f"{', '.join(open_)}: not identifiable, for every scale of {shown} has a law of the "
+            "same terms. Take it out of --scale or --observe, or observe a velocity of known scale"
         )
     return seen, angles
 
@@ -224,8 +235,8 @@ def _check_told(fit: LawFit, seen: Observation) -> None:
         left = R[:, k] - others @ np.linalg.lstsq(others, R[:, k], rcond=None)[0]
         if not np.linalg.norm(left) > _IMITATED * size[k]:
             raise FitError(
-                f"{name}: the record does not tell it from the coefficients of the law: leave it "
-                "out, or give it as a number"
+                f"{name}: not identifiable from this record, for coefficients of the law act as it "
+                "does. Write its value into --observe (observe=), or leave it out"
             )
 
 
@@ -342,20 +353,9 @@ def _in_words(
             name: float(q / recording.factors.get(name, 1.0))
             for name, q in zip(recording.coordinates, motion.start, strict=True)
         }
-        told = {_word(key, codes, speeds): gain for key, gain in motion.gains.items()}
+        told = {word_of(key, codes, speeds): gain for key, gain in motion.gains.items()}
         named.append(NextMotion(start, told))
     return tuple(named)
-
-
-def _word(key: Any, codes: Sequence[str], speeds: Sequence[str]) -> str:
-    """A coefficient by its term."""
-    kind, *rest = key
-    one, none = np.ones(1), np.zeros(1)
-    if kind == "term":
-        return terms_of(Terms.of(rest, len(codes)), one, none, codes, speeds).terms[0].term
-    if kind == "loss":
-        return "R: " + friction_of(Friction.of(rest, len(codes)), one, none, speeds).terms[0].term
-    return f"{'gain' if kind == 'gain' else 'zero'} of {codes[rest[0]]}"
 
 
 def _traces(
@@ -402,7 +402,9 @@ def _alike(fit: LawFit, lagrangian: Expression, friction: Expression) -> tuple[s
     listed, together = list(names.values()), [names[key] for key in fit.untold()]
     pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > _ALIKE, 1)), strict=True)
     only = (f"{', '.join(together)}: only together",) if together else ()
-    return only + tuple(f"{listed[i]} and {listed[j]} ({correlation[i, j]:+.3f})" for i, j in pairs)
+    return only + tuple(
+        f"{listed[i]} and {listed[j]} (correlation {correlation[i, j]:+.3f})" for i, j in pairs
+    )
 
 
 def _energy(

@@ -1,4 +1,4 @@
-"""Wander of channels' zeros by the residuals of arcs: restricted maximum likelihood.
+"""Zeros of channels that wander, found in the residuals of arcs by restricted maximum likelihood.
 
 Of rows X of all that was fitted, states and coefficients, and residuals r with covariance σ² C
 (`solve.wander`), N of them less M fitted numbers,
