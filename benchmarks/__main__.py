@@ -62,7 +62,8 @@ def main(argv: Sequence[str]) -> int:
                 f"expected --check with --tell or alone, got {' '.join(options)}", file=sys.stderr
             )
             return 2
-        return check(names or list(known), HERE / "results", only_tell="--tell" in options)
+        tell = "--tell" in options
+        return check(list(known), HERE / "results", only=names, only_tell=tell)
     paths = os.pathsep.join([str(HERE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
     failed = []
     for name in names or known:

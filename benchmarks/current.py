@@ -16,7 +16,7 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -113,9 +113,21 @@ def _prefix(study: Path) -> str:
 
 
 def check(
-    studies: list[str], folder: Path, *, only_tell: bool = False, say: Callable[[str], Any] = print
+    studies: list[str],
+    folder: Path,
+    *,
+    only: Collection[str] = (),
+    only_tell: bool = False,
+    say: Callable[[str], Any] = print,
 ) -> int:
-    """Measure again what is not of current code, oldest first; 1 where a study failed."""
+    """Measure again what is not of current code, oldest first; 1 where a study failed.
+
+    studies: all that there are, which tells whose a result is. only: those that are looked at; with
+    none, all of them.
+    """
+    for aside in sorted(folder.glob("*.before")):  # of a run that was killed
+        result = aside.with_suffix(".json")
+        aside.unlink() if result.exists() else aside.rename(result)
     known: dict[Path, Result] = {}
     for name in studies:  # of two prefixes of a name the longer one is its study's
         for result in results_of(HERE / f"{name}.py", folder):
@@ -124,8 +136,9 @@ def check(
                 known[result.path] = result
     for path in sorted(set(folder.glob("*.json")) - set(known)):
         say(f"{path.name}: no study of this folder makes it: remove it?")
-    old = [result for result in known.values() if not result.current]
-    say(f"{len(known) - len(old)} of {len(known)} results are of current code")
+    asked = [result for result in known.values() if not only or result.study.stem in only]
+    old = [result for result in asked if not result.current]
+    say(f"{len(asked) - len(old)} of {len(asked)} results are of current code")
     failed = False
     if only_tell:
         _tell(sorted(old, key=_age), say)

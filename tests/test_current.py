@@ -64,6 +64,30 @@ def test_what_is_old_is_measured_again(tmp_path, monkeypatch):
     assert said[0] == "3 of 4 results are of current code"
 
 
+def test_a_study_alone_leaves_the_others_results_and_what_a_kill_left_is_found(
+    tmp_path, monkeypatch
+):
+    """Results of "tries-again" are not those of "tries", whose names begin as theirs do."""
+    said = []
+    monkeypatch.setattr(current, "HERE", tmp_path)
+    monkeypatch.setattr(current, "PACKAGE", tmp_path / "none")
+    monkeypatch.setattr(current, "code_of", lambda path: "new")
+    for name in ("tries", "tries_again"):
+        prefix = name.replace("_", "-")
+        text = STUDY.replace('"tries")', f'"{prefix}")').format(
+            benchmarks=str(Path(current.__file__).parent), out=str(tmp_path), code="new"
+        )
+        (tmp_path / f"{name}.py").write_text(text)
+        result = {"date": "2026-11-21", "code": "old", "seconds": 9.0, "measured": {"rms": 1.0}}
+        (tmp_path / f"{prefix}-one.json").write_text(json.dumps(result))
+    (tmp_path / "tries-one.json").rename(tmp_path / "tries-one.before")  # killed
+    both = ["tries", "tries_again"]
+    assert current.check(both, tmp_path, only=["tries"], say=said.append) == 0
+    assert said == ["0 of 1 results are of current code", "tries-one.json: rms 1 → 2"]
+    assert json.loads((tmp_path / "tries-again-one.json").read_text())["code"] == "old"
+    assert not list(tmp_path.glob("*.before"))
+
+
 @pytest.mark.parametrize(
     ("found", "seconds"),
     [

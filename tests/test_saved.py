@@ -148,7 +148,7 @@ def test_a_scene_of_ones_own(tmp_path):
         models.save(saved, tmp_path / "m")
     assert not (tmp_path / "m").exists()
     models.save(saved, tmp_path / "m", scene=mine)
-    with pytest.raises(InputError, match="learned in the scene 'mine': pass it"):
+    with pytest.raises(InputError, match="learned in the scene 'mine', which the package has not"):
         models.load(tmp_path / "m")
     with pytest.raises(InputError, match="learned in the scene 'mine', not in 'two-body'"):
         models.load(tmp_path / "m", scene=two_body())

@@ -47,8 +47,8 @@ class InUse(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Record:
-    """The data that all fits of a recording share: its nodes, stretches and scales, σ of channels as
-    given (NaN where not), the known mass, and how inputs act between samples."""
+    """The data that all fits of a recording share: its nodes, stretches and scales, σ of channels
+    as given (NaN where not), the known mass, and how inputs act between samples."""
 
     recording: Recording
     nodes: Sequence[Nodes]

@@ -28,7 +28,7 @@ def _time(seconds: float) -> str:
     """A horizon in words."""
     if seconds == 0:
         return "at no time, for the noise alone is larger"
-    return f"for {seconds:.3g} s" if np.isfinite(seconds) else "for all of the eight periods tried"
+    return f"for {seconds:.3g} s" if np.isfinite(seconds) else "for more than eight periods"
 
 
 class NextMotion(NamedTuple):
@@ -130,7 +130,7 @@ class LearnedLaw:
         for fraction, seconds, predicted in self.horizon:
             lines.append(
                 f"95 % of forecasts err by less than {fraction:.0%} of the spread: "
-                f"{_time(seconds)} (bands foretell {_time(predicted)})"
+                f"{_time(seconds)} (by the bands {_time(predicted)})"
             )
         lines += [f"to record next: {motion}" for motion in self.next_motions[:1]]
         return "\n".join(lines)
