@@ -117,8 +117,8 @@ def by_python(case: Case) -> Learned:
 def _of_friction(fit: gfnn.Fit) -> str:
     """The friction that was learned, "" of a map or law without."""
     law = fit.hamiltonian if fit.chosen.learns == "hamiltonian" else None
-    terms = [] if law is None else [term.term for term in law.friction]
-    told = [*([] if fit.damping is None else [str(fit.damping)]), *terms]
+    notes = [] if law is None or not law.friction else list(law.notes)
+    told = [*([] if fit.damping is None else [str(fit.damping)]), *notes]
     return f"friction: {'; '.join(told)}" if told else ""
 
 

@@ -122,14 +122,15 @@ class Budget:
         most = self.max_operations
         if most is not None and self.operations + count > most:
             left = max(most - self.operations, 0)
-            needed = f"{name} would take {count:.1e}, and {left:.1e} of {most:,} are left"
-            self._end("there were no operations for", needed)
+            needed = f"{name} needs {count:.1e}, and {left:.1e} of {most:,} are left"
+            self._end("there were no operations for", f"{needed} (--max-operations)")
         if self.max_seconds is not None:
             seconds, now = self._foretold(kind, count) + self._set_apart, self.seconds
             if now + seconds > self.max_seconds:
                 left = max(self.max_seconds - now, 0.0)
-                needed = f"{name} and what follows would take about {seconds:.2g} s"
-                self._end(_NO_TIME, f"{needed}, and {left:.2g} of {self.max_seconds:g} s are left")
+                needed = f"{name} needs about {seconds:.2g} s with what must follow it"
+                left_over = f"{left:.2g} of {self.max_seconds:g} s are left"
+                self._end(_NO_TIME, f"{needed}, and {left_over} (--max-seconds)")
         with self._timed(kind, count):
             yield
         self.operations += count
@@ -171,7 +172,8 @@ class Budget:
         if self.over:
             raise OutOfTime
         if self.max_seconds is not None and self.seconds + self._set_apart > self.max_seconds:
-            self.ended = f"{_NO_TIME}{self._after}: {self.max_seconds:g} s are over"
+            over = f"{self.max_seconds:g} s are over (--max-seconds)"
+            self.ended = f"{_NO_TIME}{self._after}: {over}"
             raise OutOfTime
 
     def _end(self, spent: str, needed: str) -> None:
@@ -180,7 +182,9 @@ class Budget:
 
     @property
     def _after(self) -> str:
-        return f" more after unit {self._done} ({self._last})" if self._done else " one unit"
+        if not self._done:
+            return " a first model"
+        return f" more after step {self._done} of the search ({self._last})"
 
     @property
     def _set_apart(self) -> float:

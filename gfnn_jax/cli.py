@@ -29,6 +29,10 @@ from gfnn_jax.storage.outputs import ensure_new
 from gfnn_jax.storage.partial import unfinished_note
 
 _FEW_TERMS = 15  # of a law with noise that is shown as H
+_MEANS = {
+    "left the domain": " (extrapolated from there)", "not converged": " (NaN from there)",
+    "non-finite": " (NaN from there)",
+}  # fmt: skip
 
 
 class _Terminated(KeyboardInterrupt):
@@ -162,7 +166,10 @@ def _fit(arguments: argparse.Namespace) -> None:
             return _fit_positions(arguments, columns, options)
         return _fit_law(arguments, columns, options)
     if options.get("learn") == "lagrangian":
-        raise InputError("--learn lagrangian: expected a recording, got states q, p")
+        raise InputError(
+            f"--learn lagrangian: {arguments.data[0]} is read as states q, p. If these columns are "
+            "measured positions, name them: --positions A,B"
+        )
     options["angles"] = _as_indices(columns)
     with contextlib.ExitStack() as stack:
         group = None
@@ -317,11 +324,13 @@ def _forecast(arguments: argparse.Namespace) -> None:
         inputs=arguments.inputs, compare=arguments.compare, overwrite=arguments.overwrite,
     )  # fmt: skip
     times = [f.times[-1] for f in found.values()]
-    print(f"{arguments.out}: forecasts of {len(found)} runs, up to t = {max(times):g}")
+    print(f"{arguments.out}: forecasts of {len(found)} runs, up to t = {max(times):g} in the unit "
+          "of the file")  # fmt: skip
     if judged is not None:
         for name, (rms, median, within) in judged.columns.items():
-            print(f"{name}: error {rms:.4g} rms, {median:.4g} median; {within:.0%} of "
-                  f"{judged.num_samples} samples within two standard deviations")  # fmt: skip
+            print(f"{name}: RMS error {rms:.4g}, median of its size {median:.4g}, in its unit; "
+                  f"{within:.0%} of {judged.num_samples} samples within two standard deviations "
+                  "(95 % expected)")  # fmt: skip
 
 
 def _predict_and_tell(arguments: argparse.Namespace, share: processes.Share | None) -> None:
@@ -347,7 +356,8 @@ def _predict_and_tell(arguments: argparse.Namespace, share: processes.Share | No
     if predicted.horizon is not None:
         passed = predicted.horizon[predicted.horizon >= 0]
         first = f", the first at step {passed.min()}" if passed.size else ""
-        print(f"{passed.size} of {num_lanes} bands exceed {arguments.horizon:g}{first}")
+        print(f"the band of the position (2 σ) exceeds {arguments.horizon:g} in {passed.size} of "
+              f"{num_lanes} trajectories{first}")  # fmt: skip
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -396,10 +406,10 @@ def law_line(report: dict[str, Any]) -> str:
     noisy = report["data"]["noise"] is not None and len(law["terms"]) <= _FEW_TERMS
     if chosen and not fit["tolerance_met"] and not noisy:
         return (
-            f"best partial law: {len(law['terms'])} terms, leaves "
-            f"{fit['validation_relative']:.1e} of the spread over"
+            f"best partial law: H of {len(law['terms'])} terms, one-step error "
+            f"{fit['validation_relative']:.1e} of the spread (report.json)"
         )
-    return f"{'' if chosen else 'not chosen: '}H = {law['formula']}"
+    return f"{'' if chosen else 'found, and dearer per step than the map: '}H = {law['formula']}"
 
 
 def error_line(fit: dict[str, Any]) -> str:
@@ -429,16 +439,19 @@ def _summarise(ran: Any, out: Path) -> None:
         for note in report["hamiltonian"]["notes"]:
             print(note)
         for loss in report["hamiltonian"]["friction"]:
-            print(f"{loss['term']}: {loss['coefficient']:.6g} ± {loss['std']:.1g}")
+            print(f"friction {loss['term']}: {loss['coefficient']:.6g} ± {loss['std']:.1g}")
+    told = report["hamiltonian"] is not None and report["hamiltonian"]["symmetries"]
+    if ran.fit.symmetries and not told:
+        print(f"symmetries of the pairs: {'; '.join(map(str, ran.fit.symmetries))}")
     for law in ran.fit.partial_laws:
         print(law)
-    print(fit["ended"])
+    print(f"the search ended: {fit['ended']}")
     rollout = report["rollout"]
     if rollout is not None:
         errors = ", ".join(f"{e:.1e} at step {n}" for n, e in rollout["error"].items())
         print(f"mean position error {errors}")
         if rollout["growth_exponent"] is not None:
-            print(f"growth exponent {rollout['growth_exponent']:.2f}")
+            print(f"growth of the error: as steps to the power {rollout['growth_exponent']:.2f}")
         counts = rollout["status_counts"].items()
         print("rollouts: " + ", ".join(f"{n} {name}" for name, n in counts if n))
     print(_holds(ran.fit))
@@ -447,12 +460,15 @@ def _summarise(ran: Any, out: Path) -> None:
 
 def _holds(fit: Any) -> str:
     """Describe where the map may be trusted, in one sentence."""
-    parts = ["valid where the data are; a prediction names the trajectories that leave them"]
+    parts = ["valid where the data are: gfnn predict names the trajectories that leave them"]
     outside = fit.chosen.outside
     if outside is not None and math.isfinite(outside):
-        parts.append(f"error at the outermost twentieth {outside:.1e} of the spread")
+        parts.append(
+            f"a fit without the outermost 5 % of the states errs there by {outside:.1e} of the "
+            "spread"
+        )
     if fit.chosen.learns == "hamiltonian":
-        parts.append("any time step: gfnn predict --dt")
+        parts.append("other time steps: gfnn predict --dt")
     return "; ".join(parts)
 
 
@@ -467,7 +483,8 @@ def _print_status(status, left_at) -> None:
     """Print the number of lanes by status, and the steps at which lanes left the domain."""
     from gfnn_jax.evaluate.report import status_counts
 
-    print(", ".join(f"{n} {name}" for name, n in status_counts(status).items() if n))
+    counts = status_counts(status).items()
+    print(", ".join(f"{n} {name}{_MEANS.get(name, '')}" for name, n in counts if n))
     left = [lane for lane in range(len(left_at)) if left_at[lane] >= 0]
     shown = ", ".join(f"{lane} at step {left_at[lane]}" for lane in left[:10])
     if left:

@@ -16,7 +16,8 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
     ``--angles`` are names of columns, or whole numbers, the indices in z of canonical states.
     """
     group = command.add_argument_group(
-        "columns of a recording", "names separated by commas; without them names and data decide"
+        "columns of a recording",
+        "names separated by commas; without these options the file's names and data tell the roles",
     )
     for role in ROLES:
         group.add_argument(f"--{role}", type=_names, metavar="A,B", help=f"columns of {role}")
@@ -36,26 +37,36 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--mass", type=_numbers, action="append", metavar="NAME=m",
-        help="known mass, or moment of inertia, of a position",
+        help="known mass, or moment of inertia, of one position, which gives L its unit",
     )  # fmt: skip
-    group.add_argument("--offset", type=_names, metavar="A,B", help="columns with unknown offsets")
-    group.add_argument("--scale", type=_names, metavar="A,B", help="columns of unknown scale")
+    group.add_argument(
+        "--offset", type=_names, metavar="A,B", help="columns whose offset is fitted with the law"
+    )
+    group.add_argument(
+        "--scale", type=_names, metavar="A,B", help="columns whose scale is fitted with the law"
+    )
     group.add_argument(
         "--observe", type=_formula, action="append", metavar="COLUMN=TEXT",
         help="what a sensor shows, as 'px = x0 + R*sin(theta + tilt)': its parameters are fitted",
     )  # fmt: skip
     group.add_argument(
         "--guess", type=_guesses, action="append", metavar="NAME=X",
-        help="where parameters of --observe start",
+        help="start values of the parameters of --observe",
     )  # fmt: skip
     group.add_argument(
         "--coordinates", type=_names, metavar="A,B",
-        help="what moves, where --observe says how columns show it",
+        help="names of coordinates that --observe is written in, where no column measures them",
     )  # fmt: skip
     group.add_argument(
-        "--from", dest="start", type=_finite, metavar="T", help="rows from time T on"
+        "--from",
+        dest="start",
+        type=_finite,
+        metavar="T",
+        help="rows from time T on, in the file's unit",
     )
-    group.add_argument("--to", dest="stop", type=_finite, metavar="T", help="rows up to time T")
+    group.add_argument(
+        "--to", dest="stop", type=_finite, metavar="T", help="rows up to time T, in that unit"
+    )
     group.add_argument("--every", type=_count, metavar="K", help="every K-th row")
 
 

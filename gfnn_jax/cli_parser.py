@@ -29,10 +29,15 @@ WORDS = """\
 the table of candidates:
   chart      where the generating function S is evaluated: type2 at (q, P), type3 at (Q, p),
              midpoint at ((q + Q)/2, (p + P)/2), type1 at (q, Q); capitals are one step later
-  error      one-step error of held-out pairs; relative: RMS over coordinates of error divided by
-             that coordinate's spread
-  95 % bound the tolerance is met where this upper bound of the relative error is within it
-  outside    relative error at the outermost twentieth of the states, of a fit without them"""
+             flow: the flow of H, which has no chart
+  error ÷ spread
+             one-step error of held-out pairs, RMS over coordinates of error divided by that
+             coordinate's spread (standard deviation); after ~ an estimate, not measured by steps
+  95 % bound upper bound of the error, relative as --tolerance is, or absolute as
+             --absolute-tolerance; the tolerance is met where the bound is no larger
+  outside    relative error at the outermost twentieth of the states, by a fit without them
+  kflop/step thousand operations per step, counted; µs/step its measured time in a batch
+  fit s      seconds of the fit; → marks the candidate that is chosen"""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -101,13 +106,14 @@ def parser() -> argparse.ArgumentParser:
     )
 
     command = commands.add_parser(
-        "fit", help="learn the map of your own trajectories",
-        description="Learn the map of a .npz, .npy or .csv file; q first.",
+        "fit", help="learn from your own recording, or from states q, p",
+        description="Learn from a recording (positions over time: a law with friction and inputs) "
+        "or from states q, p (a symplectic map, or H). The columns tell which of them a file is.",
         **_with_status(fitting),
     )  # fmt: skip
     command.set_defaults(command="fit")
     command.add_argument(
-        "data", type=Path, metavar="DATA", nargs="+", help="one file, or several with the same dt"
+        "data", type=Path, metavar="DATA", nargs="+", help="one file or several, of one kind"
     )
     command.add_argument("--out", type=Path, metavar="MODEL", required=True, help="folder to write")
     command.add_argument("--dt", type=_positive, metavar="H", help="time step, if DATA has none")
@@ -130,29 +136,34 @@ def parser() -> argparse.ArgumentParser:
 
     command = commands.add_parser(
         "predict", help="predict with a learned map",
-        description="Predict from initial states (.npy, .npz with z0, or a trajectory file).",
+        description="Predict from initial states (.npy, .npz with z0, a trajectory file), or "
+        "forecast from the end of a recording.",
         **_with_status(others),
     )  # fmt: skip
     command.set_defaults(command="predict")
     command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
     command.add_argument(
         "--initial", type=Path, metavar="FILE", required=True,
-        help="initial states, or a trajectory file: its sequences continue from their last states; "
-        "of a map of positions a recording, whose runs continue from their last two",
+        help="initial states; or a trajectory file, whose sequences continue from their last "
+        "states; or a recording, whose runs continue from the states estimated at their ends (of a "
+        "map of positions, from their last two positions)",
     )  # fmt: skip
     command.add_argument(
         "--num-steps", type=_steps, metavar="N", help="steps to predict, backwards where N < 0"
     )
     command.add_argument(
         "--estimate-from", type=_count, metavar="K",
-        help="of a recording: samples that the state at its end is estimated from",
+        help="of a recording: estimate the state at its end from the last K samples",
     )  # fmt: skip
     command.add_argument(
-        "--inputs", type=Path, metavar="FILE", help="of a recording: the inputs ahead of its end"
+        "--inputs",
+        type=Path,
+        metavar="FILE",
+        help="of a recording: file of the inputs after its end, at the times of the forecast",
     )
     command.add_argument(
         "--compare", type=Path, metavar="FILE",
-        help="of a recording: what was measured after its end, which the forecast is held to",
+        help="of a recording: file of what was measured after its end; prints the errors",
     )  # fmt: skip
     command.add_argument(
         "--save-every", type=_count, metavar="K", default=1,
@@ -160,7 +171,7 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument(
         "--dt", type=_positive, metavar="H",
-        help="another time step than that of the data, for a model of a Hamiltonian or of pairs "
+        help="time step, for a model that serves others than that of its data: H, or S of pairs "
         "with several time steps",
     )  # fmt: skip
     command.add_argument(
@@ -173,7 +184,8 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument(
         "--horizon", type=_positive, metavar="SIZE",
-        help="with --samples: adds the step at which the band of the position exceeds SIZE",
+        help="with --samples: adds the first step at which the band of the position (two standard "
+        "deviations of its distance) exceeds SIZE, in the data's unit",
     )  # fmt: skip
     command.add_argument(
         "--outside", choices=("continue", "stop"),

@@ -57,8 +57,8 @@ def test_a_unit_that_does_not_fit_is_not_begun_nor_anything_smaller_in_its_stead
     with pytest.raises(OutOfTime):
         moved(budget, hand, 5 * LARGE, 0.0, "degree 4")  # of 10 s, at 2 s each
     assert budget.ended == (
-        "there was no time for more after unit 1 (degree 3): degree 4 and what follows would take "
-        "about 10 s, and 8 of 10 s are left"
+        "there was no time for more after step 1 of the search (degree 3): degree 4 needs about 10 "
+        "s with what must follow it, and 8 of 10 s are left (--max-seconds)"
     )
     with pytest.raises(OutOfTime):
         moved(budget, hand, 1, 0.0)
@@ -280,7 +280,7 @@ def test_a_bound_on_operations_puts_none_on_the_clock_unless_told():
     """Of a clock that jumps by hours, 120 s end a fit that is told nothing before any unit."""
     pairs, options = kepler(100), {"learn": "map", "tolerance": 1e-4}
     told_nothing = gfnn.fit(pairs, clock=Jumping(1), **options)
-    assert "there was no time for one unit" in told_nothing.ended
+    assert "there was no time for a first model" in told_nothing.ended
     found = gfnn.fit(pairs, max_operations=10**8, clock=Jumping(1), **options)
     same_bits(found, gfnn.fit(pairs, max_operations=10**8, max_seconds=None, **options))
     assert found.operations > 0
@@ -336,7 +336,7 @@ def test_seconds_that_are_gone_already_count():
         warnings.simplefilter("ignore", gfnn.FitWarning)
         fit = gfnn.fit(kepler(), max_seconds=10.0, clock=hand, spent=9.9)
     assert fit.chosen.family == "linear"
-    assert "there was no time for one unit" in fit.ended
+    assert "there was no time for a first model" in fit.ended
 
 
 @QUIETLY
@@ -361,7 +361,7 @@ def test_the_words_of_a_search_that_was_cut_off():
                    max_operations=30 * 10**7)  # fmt: skip
     said = " ".join([*fit.messages, fit.ended])
     assert "promised" not in said
-    assert "no operations for more after unit" in said
+    assert "no operations for more after step" in said
 
 
 @QUIETLY

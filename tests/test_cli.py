@@ -986,8 +986,18 @@ def test_compiled_programs_are_kept_in_the_users_cache(tmp_path, monkeypatch):
     [
         (True, None, 30, "H = q1²"),
         (False, [1e-3, 1e-3], 2, "H = q1²"),
-        (False, [1e-3, 1e-3], 30, "best partial law: 30 terms, leaves 2.0e-02 of the spread over"),
-        (False, None, 2, "best partial law: 2 terms, leaves 2.0e-02 of the spread over"),
+        (
+            False,
+            [1e-3, 1e-3],
+            30,
+            "best partial law: H of 30 terms, one-step error 2.0e-02 of the spread (report.json)",
+        ),
+        (
+            False,
+            None,
+            2,
+            "best partial law: H of 2 terms, one-step error 2.0e-02 of the spread (report.json)",
+        ),
     ],
 )
 def test_a_law_that_has_met_nothing_is_not_printed_as_h(met, noise, terms, line):

@@ -289,7 +289,7 @@ def test_noise_that_was_given_is_told_from_what_a_map_cannot_represent():
             fit = gfnn.fit(pairs, tolerance=1e-6, learn="map", chart="midpoint")
         np.testing.assert_allclose(fit.noise, std, rtol=1e-12)
         said[std] = " ".join(fit.messages)
-    assert "what is left over is the noise that was given" in said[1e-3]
+    assert "the residuals are the noise that was given" in said[1e-3]
     assert "std is too small" in said[1e-4]
 
 

@@ -148,3 +148,16 @@ def test_a_misfit_does_not_differ_between_sequences(dim):
             assert not differs_between_sequences(z, np.sin(steep * z @ wave), sequence)
     hidden = rng.normal(size=20)[sequence, None]
     assert differs_between_sequences(z, hidden * z[:, ::-1], sequence)
+
+
+def test_a_misfit_that_grows_in_close_passages_does_not_differ_between_sequences():
+    """Of Kepler's orbits a few states close to the centre leave over far more than all others."""
+    rng, turn = np.random.default_rng(4), np.linspace(0, 4, 50)
+    size, eccentricity = rng.uniform(0.3, 0.6, (20, 1)), rng.uniform(0.6, 0.85, (20, 1))
+    radius = size / (1 + eccentricity * np.cos(turn - rng.uniform(1, 3, (20, 1))))
+    angle = rng.uniform(0, 2 * np.pi, (20, 1)) + turn
+    q = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+    z = np.concatenate([q, np.gradient(q, axis=1)], axis=2).reshape(-1, 4)
+    misfit, sequence = z / radius.reshape(-1, 1) ** 8, np.repeat(np.arange(20), 50)
+    assert not differs_between_sequences(z, misfit, sequence)
+    assert differs_between_sequences(z, rng.normal(size=20)[sequence, None] * misfit, sequence)

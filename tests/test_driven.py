@@ -256,7 +256,7 @@ def test_one_phase_is_no_drive():
     assert "t = 0.3" in messages[0]
     assert "2 whole periods" in messages[0]
     _, _, messages = as_varied(gfnn.Pairs(Z, Z, 1.0, t0=0.3, period=5.0), **GIVEN)
-    assert "a second step is at another time" in messages[0]
+    assert "A second step begins at another phase" in messages[0]
 
 
 def test_pairs_are_a_pytree_with_their_time():

@@ -165,7 +165,7 @@ def test_states_without_coordinates_are_refused():
     """The body at the centre has no polar angle."""
     z0 = np.random.default_rng(0).normal(size=(40, 4))
     z0[7, :2] = 0.0
-    with pytest.raises(gfnn.FitError, match="1 pairs without, the first is row 7"):
+    with pytest.raises(gfnn.FitError, match=r"1 pairs have no .* the first is number 7"):
         gfnn.fit(gfnn.Pairs(z0, z0 + 1e-3, 0.1), gfnn.scenes.two_body())
 
 
@@ -282,7 +282,9 @@ def test_outliers_are_left_out(pendulum_fit):
     pairs = pendulum_pairs()
     z1 = pairs.z1.copy()
     z1[[50, 300]] += 0.7
-    with pytest.warns(gfnn.FitWarning, match=r"2 of 400 pairs contradict.*rows 50, 300.*left out"):
+    with pytest.warns(
+        gfnn.FitWarning, match=r"2 of 400 pairs contradict.*numbers 50, 300.*left out"
+    ):
         fit = gfnn.fit(gfnn.Pairs(pairs.z0, z1, 0.4), tolerance=1e-7)
     assert fit.met
     assert fit.num_pairs == 398
@@ -292,7 +294,7 @@ def test_outliers_are_left_out(pendulum_fit):
 
 def test_a_tolerance_out_of_reach_gives_the_best_and_says_so():
     kept = []
-    with pytest.warns(gfnn.FitWarning, match=r"no candidate meets.*the search ended because"):
+    with pytest.warns(gfnn.FitWarning, match=r"no candidate meets.*The search ended because"):
         fit = gfnn.fit(
             pendulum_pairs(60), chart="midpoint", family="polynomial", tolerance=1e-18,
             on_better=lambda *kind: kept.append(kind),
@@ -335,7 +337,7 @@ def test_a_map_without_all_images_is_still_given(monkeypatch):
 
 
 def test_no_time_at_all_leaves_the_linear_map_and_says_so():
-    with pytest.warns(gfnn.FitWarning, match="there was no time for one unit"):
+    with pytest.warns(gfnn.FitWarning, match="there was no time for a first model"):
         fit = gfnn.fit(pendulum_pairs(), max_seconds=1e-9)
     assert fit.chosen.label == "linear"
 
@@ -542,3 +544,25 @@ def test_where_every_map_has_failing_steps_the_one_with_the_fewest_is_taken(monk
     fit = quiet_fit(pendulum_pairs(), learn="map", tolerance=1e-20)
     assert len(seen) > 2
     assert (fit.chosen.chart, fit.chosen.label) == (seen[1].chart, seen[1].label)
+
+
+def test_where_every_map_has_failing_steps_smaller_ones_are_looked_at(monkeypatch):
+    measured, of_ranking, counts, seen = choose.measured, choose._of_ranking, [], []
+
+    def noted(ranking, request):
+        counts.append(len(ranking))
+        return of_ranking(ranking, request)
+
+    def finalists_fail(candidate, map_, *rest):
+        seen.append(candidate)
+        if len(seen) > counts[0]:
+            return measured(candidate, map_, *rest)
+        failing = dataclasses.replace(candidate, map=map_, validation_bound=np.inf)
+        return Assembled(failing, 0.0, failed=len(seen))
+
+    monkeypatch.setattr(choose, "_of_ranking", noted)
+    monkeypatch.setattr(choose, "measured", finalists_fail)
+    fit = quiet_fit(pendulum_pairs(), learn="map", tolerance=1e-20)
+    assert len(seen) == counts[0] + 1
+    assert (fit.chosen.chart, fit.chosen.family) == (seen[0].chart, seen[0].family)
+    assert fit.chosen.num_parameters < seen[0].num_parameters

@@ -88,7 +88,7 @@ def test_rates_that_differ_are_no_uniform_friction():
     assert found == pytest.approx({"½ v1²": 0.1, "½ v2²": 0.3}, rel=1e-11)
     assert fit.map.multiplier() is None
     assert np.isnan(fit.symplecticity_defect)
-    with pytest.raises(gfnn.FitError, match="without friction"):
+    with pytest.raises(gfnn.FitError, match="no friction"):
         fit.accelerate()
 
 

@@ -47,7 +47,7 @@ def test_masses_are_there_without_being_said():
         ("cos(0.5*theta1)", "is no term"),
         ("omega1**2*omega2", "is no term"),
         ("theta3**2", "is no term"),
-        ("omega2**2", "expected one with omega1\\*\\*2"),
+        ("omega2**2", "add a kinetic one, omega1\\*\\*2"),
         ("V: omega1**2", "has a velocity"),
         ("R: omega1**4", "is no term"),
         ("R: theta1**2", "is no term"),

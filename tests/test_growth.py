@@ -87,7 +87,7 @@ def test_growth_ends_where_nothing_gains_and_says_so():
     noise = 1e-3 * np.random.default_rng(1).standard_normal(pairs.z1.shape)
     found = learned(Pairs(pairs.z0, pairs.z1 + noise, 0.2), 1e-9)
     assert {t.term for t in found.terms} == {"cos(q1)", "p1²"}
-    assert "modes were added until no candidate gains" in found.unmet
+    assert "The search for modes ended: no further mode gains" in found.unmet
 
 
 def test_too_few_pairs_are_refused():

@@ -436,9 +436,12 @@ def test_kicked_sites_of_plain_coordinates():
         ({"structure": "ring", "chart": "type1"}, "another chart"),
         ({"structure": "ring", "angles": (0,)}, "all q of the sites"),
         ({"structure": "ring", "angles": tuple(range(20)), "learn": "hamiltonian"}, "S is learned"),
-        ({"structure": "ring", "angles": tuple(range(20)), "terms": ["p1**2"]}, "those of H"),
-        ({"structure": "bodies:10", "learn": "map"}, "is that of H"),
-        ({"structure": "bodies:10", "angles": (0,)}, "plain q and p"),
+        (
+            {"structure": "ring", "angles": tuple(range(20)), "terms": ["p1**2"]},
+            "no terms, which are",
+        ),
+        ({"structure": "bodies:10", "learn": "map"}, "only H is learned"),
+        ({"structure": "bodies:10", "angles": (0,)}, "expected no angles"),
         ({"structure": "ring", "terms": ["exp(q9)"]}, "q9"),
         ({"structure": "ring", "terms": [lambda z: z[0]]}, "as text"),
         ({"structure": "bodies:3"}, "3 bodies in 1 to 3 dimensions"),
@@ -481,14 +484,14 @@ def test_a_structure_is_proposed_and_not_used():
         pairs = drawn(6, 60, family, params, dt)
         return " ".join(proposed(Dataset.of(pairs, CARTESIAN)))
 
-    assert "--structure ring explains" in best_of(*springs(6))
-    assert "--structure chain explains" in best_of(*springs(6, "free"))
+    assert "the structure ring explains" in best_of(*springs(6))
+    assert "the structure chain explains" in best_of(*springs(6, "free"))
     apart = body_terms(3, 2, (2, -1), alike=True)  # distances at random: near collisions apart
-    assert "--structure bodies:3 explains" in best_of(apart, np.array([0.5, 0.3, 1e-3]), 0.02)
+    assert "the structure bodies:3 explains" in best_of(apart, np.array([0.5, 0.3, 1e-3]), 0.02)
     bent = given_terms(6, [*(f"p{i}**2" for i in range(1, 7)), "q1*q3*q6", "q2**4*q5", "q1**2"])
     assert best_of(bent, np.array([0.5] * 6 + [3.0, 5.0, 1.0])) == ""
     pairs = drawn(6, 60, *springs(6), 0.1)
-    with pytest.warns(gfnn.FitWarning, match="--structure ring explains these pairs"):
+    with pytest.warns(gfnn.FitWarning, match="the structure ring explains these pairs"):
         fit = gfnn.fit(pairs, learn="map", chart="type2", tolerance=1e-12, max_seconds=10)
     assert not fit.met
 

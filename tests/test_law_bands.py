@@ -76,6 +76,7 @@ def test_bands_and_horizon_of_a_law_that_is_wrong_hold_what_it_misses():
 def test_bands_of_a_law_that_is_right_hold_no_more(swing):
     recording, fit = swing
     assert np.all(np.asarray(fit.map.sensors.misfit) < 1e-3)  # as large as the noise
+    assert fit.map.sensors.wander is None
     with_misfit, _ = covered(fit, recording, np.arange(30.5, 38.5, 0.7), 1.5)
     assert 0.9 < with_misfit < 0.995
 

@@ -129,14 +129,14 @@ def test_when_a_law_is_preferred(law, map_, taken):
         ({"terms": ["p1**"]}, "p1"),
         ({"terms": ["p3**2"]}, "p3"),
         ({"terms": ["__import__('os')"]}, "__import__"),
-        ({"terms": ["p1**2"], "learn": "map"}, "expected learn='auto' or 'hamiltonian'"),
+        ({"terms": ["p1**2"], "learn": "map"}, "beside them, got learn='map'"),
         ({"terms": [3]}, "texts or functions"),
         ({"terms": ["sqrt(q1)"]}, "finite at all states, got 'sqrt"),
         ({"tolerance": "1e-6"}, "number > 0 as tolerance"),
         ({"angles": 0}, "a tuple of indices"),
-        ({"terms": ["p1**2"], "learn": "auto", "chart": "type2"}, "no family or chart"),
-        ({"family": "sines"}, "those of S"),
-        ({"chart": "type2"}, "those of S"),
+        ({"terms": ["p1**2"], "learn": "auto", "chart": "type2"}, "got chart='type2'"),
+        ({"family": "sines"}, "these are of S"),
+        ({"chart": "type2"}, "these are of S"),
     ],
 )
 def test_refusals(options, words):
@@ -275,7 +275,7 @@ def test_an_alias_is_named_and_the_map_is_had_in_time():
         z = np.random.default_rng(0).uniform(-1, 1, (300, 2))
         return gfnn.Pairs(z, z @ np.array([[c, -s], [s, c]]), 1.0)
 
-    with pytest.warns(gfnn.FitWarning, match="frequencies differ by 2π per step"):
+    with pytest.warns(gfnn.FitWarning, match="the motion turns by ωh"):
         fit = gfnn.fit(turned(4.0), tolerance=1e-8)
     assert fit.met
     fit = gfnn.fit(turned(np.pi), tolerance=1e-8, max_seconds=20)
@@ -301,7 +301,9 @@ def test_pairs_are_drawn_in_the_region_that_is_named(law):
     np.testing.assert_allclose(pairs.z0.max(axis=0), region[1], atol=0.02)
     with pytest.raises(gfnn.InputError, match=r"region of shape \(2, 4\), lowest values below"):
         law.accelerate(region=region[::-1])
-    with pytest.raises(gfnn.FitError, match="a Hamiltonian that meets its tolerance, got none"):
+    with pytest.raises(
+        gfnn.FitError, match="expected an H within the tolerance, this fit has none"
+    ):
         dataclasses.replace(law, hamiltonian=None).accelerate()
 
 

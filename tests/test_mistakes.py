@@ -45,7 +45,7 @@ MISTAKES = {
     "transposed": (lambda: fit(Z0.T, Z1.T), "a row is a state; are the arrays transposed?"),
     "the same state all over": (lambda: fit(0 * Z0, 0 * Z1), "at least 8 different pairs"),
     "the same columns twice": (
-        lambda: fit(Z0, Z0), "z1 = z0 in every pair: H = 0, or the same columns twice?"),
+        lambda: fit(Z0, Z0), "z1 = z0 in every pair: is H = 0, or are these the same columns"),
     "seven pairs": (lambda: fit(Z0[:7], Z1[:7]), "at least 8 different pairs for d = 1, got 7"),
     "complex numbers": (lambda: fit(Z0 + 0j), "z0 of real numbers, got complex128"),
     "numbers as text": (lambda: fit(Z0, Z1.astype(str)), "z1 of real numbers, got <U"),

@@ -23,7 +23,7 @@ def test_a_wider_swing_tells_what_a_small_one_cannot():
     best = fit.next_motions[0]
     assert best.start["theta"] > 0.6
     assert best.gains["cos(2*theta)"] > 5
-    assert f"let go at theta = {best.start['theta']:.3g}" in fit.table
+    assert f"release from rest at theta = {best.start['theta']:.3g}. Standard" in fit.table
     both = gfnn.fit(recorded(0.3, best.start["theta"]), terms=TERMS)
     before, after = (f.lagrangian.terms[2].std for f in (fit, both))
     # What is foretold counts terms of higher modes too, which this law has not.

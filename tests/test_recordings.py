@@ -228,7 +228,7 @@ REFUSED = {
     "t,x\n0,inf\n1,2\n": "line 2, x: infinite",
     "t,x\n0,00,1,5\n0,10,1,6\n": "decimal commas",
     "t [fortnight],x\n0,1\n1,2\n": "--time-unit",
-    "t,x,v1,v2\n0,1,2,3\n1,2,3,4\n": "say which",
+    "t,x,v1,v2\n0,1,2,3\n1,2,3,4\n": "v1, v2 are velocities and only x positions",
     "": "expected rows of numbers",
     "x\n1\n": "at least two columns",
 }  # fmt: skip

@@ -69,7 +69,7 @@ def test_wrong_pairs_are_left_out(sampled):
     z1[rows] += [[0.0, 1e3], [0.0, 1e3], [np.pi, 0.0]]
     wrong = gfnn.Pairs(pairs.z0, z1, 1.0)
     clean = pairs.take(np.delete(np.arange(3_000), rows))
-    with pytest.warns(gfnn.FitWarning, match="3 of 3000 pairs are far from what the others tell"):
+    with pytest.warns(gfnn.FitWarning, match="3 of 3000 pairs are outliers"):
         again = refit(fit, [wrong], wrong.take(slice(200)))
     assert again.met
     assert again.num_pairs == 2_997

@@ -148,7 +148,7 @@ def test_a_scene_of_ones_own(tmp_path):
         models.save(saved, tmp_path / "m")
     assert not (tmp_path / "m").exists()
     models.save(saved, tmp_path / "m", scene=mine)
-    with pytest.raises(InputError, match="learned in the scene 'mine': pass it"):
+    with pytest.raises(InputError, match="learned in the scene 'mine', which the package has not"):
         models.load(tmp_path / "m")
     with pytest.raises(InputError, match="learned in the scene 'mine', not in 'two-body'"):
         models.load(tmp_path / "m", scene=two_body())
@@ -173,7 +173,7 @@ def test_a_function_of_ones_own_is_refused(tmp_path):
         (lambda d: d["map"].pop("dt"), "does not describe a map"),
         (lambda d: d["map"]["pieces"]["0"].update(surprise=1), "does not describe a map"),
         (lambda d: d.pop("map"), "does not describe a map"),
-        (lambda d: d.update(scene="nowhere"), "pass it"),
+        (lambda d: d.update(scene="nowhere"), "Load it in Python"),
     ],
 )
 def test_a_foreign_description(change, message, tmp_path):

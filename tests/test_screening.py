@@ -172,3 +172,17 @@ def test_a_fit_is_not_spoilt(length):
         errors.append(np.sqrt(np.mean((found - true) ** 2)))
     assert errors[1] < 2 * errors[0] + 1e-5
     assert fit.num_pairs == np.sum(~(wrong[:, :-1] | wrong[:, 1:]))
+
+
+def test_an_angle_that_jumps_makes_no_errors():
+    """Rotors whose angle is wrapped and not named: where it jumps a pair contradicts the others."""
+    z = np.array([0.0, 2.8]) + np.random.default_rng(0).uniform(-1, 1, (1_000, 2)) * [np.pi, 0.6]
+    z1 = images(SWING, np.array([0.5, -1.0]), z, 0.1, Steps(4, 2)).states
+    z1[:, 0] = np.remainder(z1[:, 0] + np.pi, 2 * np.pi) - np.pi
+    pairs = gfnn.Pairs(z, z1, 0.1)
+    kept, told = (
+        clean(identified(pairs), Coordinates("cartesian"), jumps=jumps) for jumps in (True, False)
+    )
+    assert len(kept[0]) == len(pairs)
+    assert kept[1] == []
+    assert told[1]  # nothing but the jumps is wrong with them

@@ -190,8 +190,8 @@ def test_what_was_found_before_the_budget_was_spent_stands():
     assert sweep.judged == [10, 100]
     assert order(found) == [100]
     assert found.ended.startswith(
-        "there were no operations for more after unit 2 (polynomial 100): polynomial 1000 would "
-        "take"
+        "there were no operations for more after step 2 of the search (polynomial 100): polynomial "
+        "1000 needs"
     )
 
 
@@ -284,5 +284,5 @@ def test_nothing_is_foretold_from_two_sizes_or_a_stall():
 def test_what_the_spent_budget_cut_off_is_foretold():
     sweep = Sweep(geometric(1e-1, 1e-1, 9))
     found = found_in(sweep, bound=1e-7, budget=Budget(max_operations=4 * WORK))
-    assert found.ended.startswith("there were no operations for more after unit 4")
+    assert found.ended.startswith("there were no operations for more after step 4")
     assert found.ended.endswith("; extrapolated, polynomial 8 would meet the tolerance")

@@ -68,7 +68,7 @@ def test_a_step_that_is_too_long_is_named(dt, said):
     messages = long_step(data, None)
     assert bool(messages) is said
     if said:
-        assert "(ωh > π)" in messages[0]
+        assert "ωh > π)" in messages[0]
     assert not long_step(data, gfnn.scenes.make("standard-map-regular"))
 
 

@@ -118,14 +118,20 @@ def check_dt(dt: Any, what: str) -> float:
 def agreed_dt(path, given: float | None, found: float | None) -> float:
     if found is not None and np.isnan(found):
         if given is not None:
-            raise InputError(f"{path}: the given dt = {given} disagrees with times that are uneven")
+            raise InputError(
+                f"{path}: the given dt = {given} disagrees with times that are uneven. Leave out "
+                "--dt (dt=)"
+            )
         return found
     if given is None and found is None:
-        raise InputError(f"{path}: holds no time step and none was given (dt)")
+        raise InputError(f"{path}: holds no time step. Give it: --dt (dt=)")
     if given is None or found is None:
         return given if found is None else found  # pyright: ignore[reportReturnType]
     if abs(given - found) > TIME_TOLERANCE * found:
-        raise InputError(f"{path}: the given dt = {given} disagrees with the file's dt = {found}")
+        raise InputError(
+            f"{path}: the given dt = {given} disagrees with the file's dt = {found}. Leave out "
+            "--dt (dt=)"
+        )
     return given
 
 

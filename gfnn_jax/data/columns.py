@@ -58,8 +58,9 @@ def roles_of(
     for role in ("velocities", "momenta"):
         if len(roles[role]) > len(roles["positions"]) > 0:
             raise InputError(
-                f"{source}: {role} by their names {', '.join(roles[role])}, positions "
-                f"{', '.join(roles['positions'])}: say which, --positions and --{role}"
+                f"{source}: by their names {', '.join(roles[role])} are {role} and only "
+                f"{', '.join(roles['positions'])} positions. Name each pair: --positions and "
+                f"--{role}, in one order"
             )
     return roles, notes
 

@@ -353,8 +353,8 @@ def _warn_of_odd_columns(path, states: np.ndarray, sequence: np.ndarray) -> None
     if constant:
         names = ", ".join(column(c, dim) for c in constant)
         warnings.warn(
-            f"{path}: constant column(s) {names}; a conserved momentum may be, other columns "
-            "should not",
+            f"{path}: constant column(s) {names}. A conserved momentum is constant; else check "
+            "the columns",
             DataWarning,
             stacklevel=3,
         )

@@ -47,7 +47,7 @@ def number_of_parts(out: Path, share: Share, *, resume: bool) -> int:
         return share.count
     found = " and of ".join(map(str, sorted(there)))
     raise InputError(
-        f"{out}: parts of {found} are there, {share.count} are wanted: "
+        f"{out}: unfinished parts by {found} processes are there, and this job has {share.count}: "
         + ("delete those of one kind" if resume else "--resume goes on with them, or delete them")
     )
 

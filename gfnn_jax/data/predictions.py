@@ -282,7 +282,7 @@ class PredictionWriter:
             if job.get(key) != self._job.get(key):
                 raise InputError(
                     f"{self.partial}: belongs to another prediction: {key} is {job.get(key)} there "
-                    f"and {self._job.get(key)} here"
+                    f"and {self._job.get(key)} here. --overwrite discards it"
                 )
         for line in lines[1:]:
             carry = self._verified_carry(line)

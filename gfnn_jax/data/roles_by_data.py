@@ -44,10 +44,12 @@ def positions_and_velocities(
     rest = [name for name in moving if not any(name in pair for pair in pairs)]
     if rest or not pairs:
         shown = ", ".join(rest or names)
+        if not moving:
+            raise InputError(f"{source}: none of the columns {', '.join(names)} varies")
         raise InputError(
             f"{source}: the names {', '.join(names)} do not tell what was measured, and {shown} "
-            f"may be motion or what drives it: say --positions {','.join(moving)}, or some of them "
-            "and --inputs"
+            f"may be motion or what drives it. Name them: --positions {','.join(moving)}, or some "
+            "of them and --inputs"
         )
     return tuple(x for x, _ in pairs), tuple(v for _, v in pairs)
 

@@ -69,24 +69,24 @@ def _motion(summary: RecordingSummary) -> str:
     if summary.period is None:
         return ""
     per = summary.period / summary.dt_median
-    said = [f"motion: a mean period of {summary.period:.4g} s has {per:.3g} samples"]
+    said = [f"motion: mean period {summary.period:.4g} s, {per:.3g} samples"]
     if summary.coarsest and summary.coarsest > 1.5 * summary.dt_median:
-        said.append(f"steps of {summary.coarsest:.3g} s would tell it as well")
+        said.append(f"steps of {summary.coarsest:.3g} s would suffice")
     return "; ".join([*said, _loss(summary)])
 
 
 def _loss(summary: RecordingSummary) -> str:
     loss = summary.loss
     if loss is None:
-        return "no balance of energy is told"
+        return "friction: not estimated, for the samples allow no balance of energy"
     beside = " beside what the inputs supply" if summary.driven else ""
-    size = f"{100 * abs(loss.per_period):.2g} ± {100 * loss.error:.1g} % of the energy a period"
+    size = f"{100 * abs(loss.per_period):.2g} ± {100 * loss.error:.1g} % of the energy per period"
     if not loss.seen and loss.error > _TOLD:
-        return f"whether there is friction{beside} cannot be told ({size})"
+        return f"friction{beside} not determined ({size})"
     if not loss.seen:
         return f"no friction seen{beside} ({size})"
     if loss.per_period < 0:
-        return f"a gain of {size}{beside}: a drive that no input explains"
+        return f"a gain of {size}{beside}: a drive is missing (--inputs)"
     kind = f"; {loss.kind} friction fits best" if loss.kind else ""
     return f"friction takes {size}{beside}{kind}"
 
@@ -116,7 +116,7 @@ def _remarks(column: Column) -> str:
     if column.sigma and column.resolution and column.resolution > 0.25 * column.sigma:
         said.append("quantised")
     if column.derivative_of is not None and column.factor is not None:
-        late = f", {1e3 * column.lag:.2g} ms late" if column.lag is not None else ""
+        late = f", lag {1e3 * column.lag:.2g} ms" if column.lag is not None else ""
         said.append(f"{column.factor:.3g} × d{column.derivative_of}/dt{late}")
     if column.missing:
         said.append(f"{column.missing} missing")

@@ -70,8 +70,9 @@ class Dataset:
         known = np.isfinite(before + after).all(axis=1)
         if not known.all():
             raise FitError(
-                f"expected states that have {coordinates.name} coordinates, got "
-                f"{int((~known).sum())} pairs without, the first is row {int(np.argmin(known))}"
+                f"{int((~known).sum())} pairs have no {coordinates.name} coordinates of the scene, "
+                f"the first is number {int(np.argmin(known))}, from 0. Leave them out, or fit "
+                "without --scene (scene=)"
             )
         lifted = lift if structure is None or not structure.angles else lift_sites
         y0, y1, centres, covered = lifted(before, after, coordinates)

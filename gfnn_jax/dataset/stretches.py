@@ -141,7 +141,8 @@ def stretches(
     found = [s for s in found if len(s.t) >= _SHORTEST]
     if not found:
         raise FitError(
-            f"{recording.source}: expected stretches of at least {_SHORTEST} samples without a gap"
+            f"{recording.source}: no run has {_SHORTEST} samples in a row (a step above {GAP:g} "
+            "times the median, or a missing position or input, is a gap)"
         )
     return found
 
@@ -165,7 +166,10 @@ def measure(found: Sequence[Stretch]) -> Scales:
     speed = np.sqrt(np.mean(np.concatenate([s.v for s in smooths]) ** 2, axis=0))
     acceleration = np.sqrt(np.mean(np.concatenate([s.a for s in smooths]) ** 2, axis=0))
     if not np.all(speed > 0):
-        raise InputError("expected positions that move: a column is constant")
+        still = ", ".join(str(i + 1) for i in np.flatnonzero(~(speed > 0)))
+        raise InputError(
+            f"position {still} does not move: leave it out of --positions (positions=)"
+        )
     dt = float(np.median(np.concatenate([np.diff(s.t) for s in found])))
     if not all(np.array_equal(s.y, s.q) for s in found):
         sigma = _noise_of_channels(found)
@@ -186,7 +190,7 @@ def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:
         ]
         known = [pair for pair in known if len(pair[0]) >= _SHORTEST]
         if not known:
-            raise FitError(f"expected channels with {_SHORTEST} samples in a row, got fewer")
+            raise FitError(f"a column has no {_SHORTEST} samples in a row: leave it out")
         sigma.append(float(choose_half(known)[1][0]))
     return np.array(sigma)
 

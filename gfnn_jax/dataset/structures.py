@@ -185,7 +185,8 @@ def structure_of(
     sides = {(): "", tuple(range(dim)): "q", tuple(range(2 * dim)): "qp"}
     if coordinates.angles not in sides:
         raise FitError(
-            f"expected no angles, or all q of the sites, or all q and p; got {coordinates.angles}"
+            f"angles: expected none, all q of the sites (0 to {dim - 1}), or all q and p (0 to "
+            f"{2 * dim - 1}), got {coordinates.angles}"
         )
     if coordinates.angles and fields > 1:
         raise FitError(

@@ -76,15 +76,16 @@ def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
         return Charts([CHARTS[beyond[0]]], None, judgements, [message])
     lows = ", ".join(f"{n} {j.sign * j.low:.2g}" for n, j in judgements.items())
     raise FitError(
-        f"no chart covers these data, with or without a base map (smallest determinants: {lows}): "
-        "sample with a smaller dt, or learn a smaller region"
+        f"no chart covers these data, with or without a base map: each has a determinant near 0 "
+        f"({lows}), and no generating function exists there. Take pairs of a smaller dt or of a "
+        "smaller region, or learn H, which needs no chart: --learn hamiltonian (learn=)"
     )
 
 
 def _about(name, judgement: ChartJudgement, what, valid) -> str:
     instead = [n for n in ("midpoint", "type2", "type3") if n in valid and n != name]
-    advice = f"; use --chart {instead[0]}" if instead else ""
+    advice = f". Use --chart {instead[0]} (chart=)" if instead else ". Take a smaller dt"
     return (
-        f"chart {name} {what}: its determinant falls to {judgement.low:.2g} and is negative for "
-        f"{100 * judgement.negative:.0f} % of the states{advice}"
+        f"chart {name} {what}: its determinant, of ∂w/∂z, falls to {judgement.low:.2g} and is "
+        f"negative for {100 * judgement.negative:.0f} % of the states{advice}"
     )

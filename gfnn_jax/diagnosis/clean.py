@@ -16,10 +16,12 @@ _MOST_OUTLIERS = 0.05  # of the pairs may be left out
 
 
 def clean(
-    found: Identified, coordinates: Coordinates, structure: Structure | None = None
-) -> tuple[Dataset, list[str]]:
+    found: Identified, coordinates: Coordinates, structure: Structure | None = None,
+    jumps: bool = False,
+) -> tuple[Dataset, list[str]]:  # fmt: skip
     """The data set without copies, without gross errors that are certain, and, where they are few,
-    without outliers; and warnings about what was left out.
+    without outliers; and warnings about what was left out. jumps: whether an angle is wrapped that
+    was not named: pairs contradict their neighbours where it jumps, and none is an error.
 
     Raises FitError where too few are left, or states have no inner coordinates.
     """
@@ -32,7 +34,7 @@ def clean(
         if structure is None:
             check_number(pairs)
     data = Dataset.of(pairs, coordinates, structure, row)
-    if structure is not None:  # too few pairs for so many dimensions to have neighbours
+    if structure is not None or jumps:  # of many dimensions too few pairs have neighbours
         return data, messages
     everyone, count = data, len(data)
     found_outliers = outliers(data.y0, data.y1, data.scale, given_by(data))
@@ -54,13 +56,17 @@ def clean(
     if len(found_outliers):
         messages.append(
             f"{len(found_outliers)} of {count} pairs contradict the pairs around them "
-            f"(rows {_named(row[found_outliers])}): "
-            + ("outliers, they are left out" if few else "too many to be left out")
+            f"(numbers {_named(row[found_outliers])}, from 0): "
+            + (
+                "outliers, they are left out"
+                if few
+                else "too many for outliers, they are kept. Is q first, and does z1 follow z0?"
+            )
         )
     if len(gross):
         messages.append(
-            f"{len(gross)} of {count} pairs (rows {_named(row[gross])}) are gross errors beside "
-            "a polynomial through the others: they are left out"
+            f"{len(gross)} of {count} pairs (numbers {_named(row[gross])}, from 0) are far from a "
+            "polynomial fitted to the others: outliers, they are left out"
         )
     return data, messages
 

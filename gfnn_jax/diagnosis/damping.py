@@ -94,12 +94,13 @@ class LearnedDamping:
         else:
             each = zip(*map(np.ravel, self.extremes), strict=True)
             told = [f"{low:.6g} to {high:.6g}" for low, high in each]
-        by = f", by {', '.join(self.names)}" if self.names else ""
+        by = f", depending on {', '.join(self.names)}" if self.names else ""
         if self.uniform:
-            return f"every step multiplies areas by {told[0]}{by}, the same everywhere"
+            return f"every step multiplies areas by {told[0]}{by}, one factor for all states"
+        planes = [f"{factor} in (q{i}, p{i})" for i, factor in enumerate(told, 1)]
         return (
-            f"every step multiplies areas by {', '.join(told)}{by}, each degree of freedom by its "
-            "own: no multiple of the symplectic form is kept"
+            f"every step multiplies areas by {', '.join(planes)}{by}: no multiple of the "
+            "symplectic form is kept"
         )
 
 

@@ -63,10 +63,10 @@ def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = F
         at = centres(at, jacobians, seed)
         differing = where_areas_differ(jacobians, at, plain.scale, plain.parameters)
         messages.append(
-            f"the pairs do not look symplectic: ‖MᵀJM − J‖ is about {defect:.2g}, known to within "
-            f"{error:.1g} (0 for a symplectic map): are q and p in order, and is there friction? "
-            "If p are velocities, learn the law of a Recording of them (--positions, --velocities)."
-            f"{differing}"
+            f"the pairs do not look symplectic: ‖MᵀJM − J‖ is {defect:.2g} ± {error:.1g} (M: local "
+            "Jacobians, coordinates in units of their spread) where a symplectic map has 0. Check "
+            "the order q1…qd, p1…pd, and look for friction or a drive. If p are velocities, learn "
+            f"the law of a recording (--positions, --velocities; gfnn.Recording).{differing}"
         )
     charts = choose_charts(chart, data, reversor, jacobians)
     if charts.half is not None:
@@ -83,5 +83,5 @@ def _thin(data: Dataset) -> list[str]:
     where = "a curve" if dimension == 1 else f"a surface of dimension {dimension}"
     return [
         f"the pairs lie on {where} of the {len(seen)}-dimensional phase space, as those of one "
-        "orbit do: the map is learned there only"
+        "orbit do. The map is learned there only: other initial states widen it"
     ]

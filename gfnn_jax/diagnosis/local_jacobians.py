@@ -52,6 +52,7 @@ _THIN = 0.05
 # What an affine fit within sequences may leave of a residual that agrees within them; neighbours
 # among which the nearest one of another sequence is sought.
 _EXPLAINED, _SEQUENCE_NEIGHBOURS = 0.25, 50
+_NEARBY = 16  # neighbours that tell the size of what is left over at a state
 # Times as much as a neighbour as far in the same sequence leaves over, one of another sequence does
 # where something differs between them.
 _ACROSS = 3.0
@@ -349,6 +350,14 @@ def sampled_dimension(y, scale) -> int:
     return int(np.median(np.sum(spread > _THIN * spread[:, :1], axis=1)))
 
 
+def _in_local_units(z: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Residuals (N, 2d) ÷ their root mean square among the neighbours of z (N, 2d)."""
+    count = min(len(z), _NEARBY)
+    _, near = cKDTree(z).query(z, k=count)
+    size = np.sqrt(np.mean(residual[near.reshape(len(z), count)] ** 2, axis=1))
+    return residual / np.where(size > 0, size, 1.0)
+
+
 def differs_between_sequences(z, residual, sequence) -> bool:
     """Return whether what a fit left over agrees within a sequence and differs between sequences:
     then something that the states do not hold, a parameter, differs between them.
@@ -357,9 +366,12 @@ def differs_between_sequences(z, residual, sequence) -> bool:
     pair of a sequence is predicted by an affine fit to the rest of it; between, a pair by its
     nearest neighbour in other sequences, and by the next one of its own that is no nearer. Noise is
     predicted by none of them, a misfit by as far a neighbour of whichever sequence; where that is
-    too far away to tell, as in many dimensions, nothing is.
+    too far away to tell, as in many dimensions, nothing is. Residuals are looked at in units of
+    their size nearby: a step magnifies the noise of the states, in close passages a hundred times,
+    and a few of these would stand for all.
     """
-    z, residual = np.asarray(z), np.asarray(residual)
+    z = np.asarray(z)
+    residual = _in_local_units(z, np.asarray(residual))
     total, within, rows = 0.0, 0.0, []
     for number in np.unique(sequence):
         own = np.flatnonzero(sequence == number)

@@ -3,6 +3,7 @@ null where they do not apply, with the law's own beside them."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -69,6 +70,7 @@ def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:
         "observe": fit.observe,
         "sensors": {name: {"value": c, "std": s} for name, (c, s) in fit.sensors.items()},
         "noise": {n: {"sigma": s, "residual": fit.residual[n]} for n, s in fit.noise.items()},
+        "wander": None if sensors.wander is None else dataclasses.asdict(sensors.wander),
         "velocities": {name: one._asdict() for name, one in fit.velocities.items()},
         "whiteness": {
             name: {

@@ -50,6 +50,7 @@ def assemble(
             "num_pairs": fit.num_pairs,
             "symplecticity_defect": fit.data_defect,
             "noise": None if fit.noise is None else fit.noise.tolist(),
+            "symmetries": [symmetry._asdict() for symmetry in fit.symmetries],
             **data,
         },
         "model": {

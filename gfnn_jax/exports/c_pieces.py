@@ -39,7 +39,7 @@ def why_not_piece(piece: Any) -> str | None:
     family = piece.family
     inner = family.family if isinstance(family, OfDisplacement) else without_forces(family)
     if isinstance(inner, Legendre) and inner.dim > COFACTORS_UP_TO:
-        return f"the masses of {inner.dim} degrees of freedom are no small system"
+        return f"its Legendre transform has more than {COFACTORS_UP_TO} degrees of freedom"
     if not isinstance(inner, (Products, Terms, Legendre)):
         return f"the map is one of {getattr(family, 'label', type(family).__name__)}"
     if isinstance(piece, Flow) and piece.newton:

@@ -57,8 +57,8 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     """
     if (reason := why_not(map_)) is not None:
         raise InputError(
-            f"{reason}, and cannot be written in C, which takes polynomials, Fourier harmonics and "
-            "formulas: use --to stablehlo"
+            f"this map cannot be written in C: {reason}. C takes polynomials, Fourier harmonics "
+            "and formulas: use --to stablehlo"
         )
     map_ = jax.tree.map(np.asarray, map_)
     pieces, width, domain = map_.pieces, 2 * map_.dim, map_.domain

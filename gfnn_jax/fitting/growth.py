@@ -94,7 +94,7 @@ def grow(
     steps, resolved = None, 1.0
     for _ in range(options.rounds):
         if idle == options.idle:
-            ended = "no candidate gains"
+            ended = "no further mode gains"
             break
         count = int(options.rows_per_mode * len(present) / (2 * basis.dim))
         some = rows[: max(options.pairs, count)]
@@ -124,10 +124,12 @@ def grow(
         tried = basis.around(solved) if gain > _SETTLED else []
         found = looked.candidates(tried, rest, span, room, options)
         if not found and gain > _GAINED:
-            ended = "no room for more" if room <= 0 else "no candidate gains"
+            ended = (
+                "the pairs have no room for more modes" if room <= 0 else "no further mode gains"
+            )
             break
         if _out_of_reach(pace[-4:], goal, most):
-            ended = f"more than {most} modes would be needed"
+            ended = f"more than {most} modes are needed"
             break
         present = solved | dict.fromkeys(found, 0.0)
     yield best._replace(ended=ended or f"{options.rounds} rounds are over")

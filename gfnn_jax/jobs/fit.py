@@ -84,7 +84,7 @@ def fit(
     if not group.first:
         progress.say("waiting for the map of a sample")
         told = group.told()
-        progress.say("own pairs, for the chosen candidate")
+        progress.say("fitting the chosen model to the pairs of this process")
         with failures_of_arithmetic(), row_blocks.on_devices(own):
             help_refit(told, pairs, group, scene=scene)
         return None
@@ -109,7 +109,7 @@ def fit(
                 seconds = work_of_refit(fitted, trajectories.sampled, reading)
                 try:
                     with fitted.budget.last(_TO_ALL, READING, seconds, decides=True):
-                        progress.say("all pairs, for the chosen candidate")
+                        progress.say("fitting the chosen model to all pairs")
                         with failures_of_arithmetic(), row_blocks.on_devices(own):
                             fitted = refit(
                                 fitted, pairs, fitted.validation_pairs, test=fitted.test_pairs,

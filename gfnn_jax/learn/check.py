@@ -44,7 +44,8 @@ def check_request(
         raise FitError(f"expected a scene, as gfnn.scenes.make('two-body'), got {scene!r}")
     if options.learn not in LEARNS:
         raise FitError(
-            f"expected one of {', '.join(LEARNS)} as learn of pairs, got {options.learn!r}"
+            f"learn={options.learn!r}: only for a gfnn.Recording, got pairs; expected one of "
+            + ", ".join(LEARNS)
         )
     own_dt = bool(np.ndim(pairs.dt))
     if not own_dt and not isinstance(pairs.dt, numbers.Real) and (
@@ -100,8 +101,8 @@ def check_moves(pairs: Pairs) -> None:
     z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
     if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= _STILL:
         raise FitError(
-            "expected states that move, got z1 = z0 in every pair: H = 0, or the same columns "
-            "twice?"
+            "expected states that move, got z1 = z0 in every pair: is H = 0, or are these the same "
+            "columns twice?"
         )
 
 
@@ -111,29 +112,31 @@ def _check_structured(
     """Raises FitError for what does not go with a structure."""
     learn, terms, chart, angles = options.learn, options.terms, options.chart, options.angles
     if (options.family, options.base) != ("auto", None):
-        raise FitError("a structure has its own terms: expected no family or base")
+        raise FitError(f"structure {structure} has its own terms: expected no family or base")
     if chart == "type1":
-        raise FitError("expected another chart than type1 for a structure")
+        raise FitError(f"structure {structure}: expected another chart than type1")
     bodies = structure.startswith("bodies")
     if bodies and (learn == "map" or chart != "auto"):
-        raise FitError("a structure of bodies is that of H: expected no learn='map' or chart")
+        raise FitError(
+            f"structure {structure}: only H is learned, expected no learn='map' or chart"
+        )
     coordinates = scene.coordinates if scene is not None else CARTESIAN
     if bodies and (angles or coordinates.angles):
-        raise FitError("bodies go with plain q and p: expected no angles")
+        raise FitError(f"structure {structure}: expected no angles")
     own = coordinates.forward is not CARTESIAN.forward or coordinates.cyclic
     if own or pairs.args or pairs.period is not None:
         raise FitError(
-            "a structure goes with q and p of the sites: expected no other coordinates, no "
-            "parameters or drive"
+            f"structure {structure}: expected plain q and p, no coordinates of a scene, parameters "
+            "or drive"
         )
     if learn == "hamiltonian" and (angles or coordinates.angles):
-        raise FitError("a structure's H goes with plain q and p: with angles, S is learned")
+        raise FitError(f"structure {structure} with angles: only S is learned (learn='map')")
     if learn == "map" and np.ndim(pairs.dt):
-        raise FitError("expected pairs of one dt, as those of a map are; got several")
+        raise FitError(f"structure {structure}: learn='map' expects pairs of one dt, got several")
     if terms and (angles or coordinates.angles):
-        raise FitError("terms are those of H: expected none where sites have angles")
+        raise FitError(f"structure {structure} with angles: expected no terms, which are of H")
     if terms and bodies:
-        raise FitError("terms go with a ring or a chain: those of bodies are powers of distances")
+        raise FitError(f"structure {structure}: expected no terms, it has powers of distances")
     for term in terms:
         if not isinstance(term, str):
             raise FitError(
@@ -176,10 +179,12 @@ def coarse_tolerance(pairs: Pairs, tolerance: Tolerance) -> list[str]:
     size = float(np.sqrt(np.mean(moved**2)))
     if not tolerance.bound > _COARSE * size > 0:
         return []
-    unit = " of the coordinates' spread" if tolerance.relative else ""
+    unit = "of the coordinates' spread" if tolerance.relative else "in the data's units"
+    option = "tolerance" if tolerance.relative else "absolute_tolerance"
     return [
-        f"a step moves the states by {size:.1e}{unit}: a tolerance of {tolerance.bound:g}, more "
-        "than a hundredth of that, is met by maps that hardly know the motion: ask for less"
+        f"a step moves the states by {size:.1e} {unit}: maps close to the identity meet the "
+        f"tolerance {tolerance.bound:g}. Set --{option.replace('_', '-')} ({option}=) to "
+        f"{_COARSE * size:.0e} or less"
     ]
 
 
@@ -191,8 +196,9 @@ def not_radians(pairs: Pairs, coordinates: Coordinates) -> list[str]:
     z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
     range_, move = np.ptp(z0, axis=0), np.abs(z1 - z0).max(axis=0)
     return [
-        f"coordinate {a}, given as an angle, runs over {range_[a]:.3g} and moves by up to "
-        f"{move[a]:.3g} in a step: an angle has period 2π (radians); are these degrees?"
+        f"coordinate {a} of z, given as an angle, ranges over {range_[a]:.3g} and moves by up to "
+        f"{move[a]:.3g} in a step. Angles are in radians: are these degrees? Convert them, or take "
+        f"{a} out of --angles (angles=)"
         for a in coordinates.angles
         if range_[a] > 2 * TWO_PI and move[a] > np.pi
     ]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from gfnn_jax.budget import ROWS, Budget
 from gfnn_jax.candidates.assemble import composed, measured
@@ -19,6 +21,7 @@ from gfnn_jax.models.hamiltonians.learned_law import assembled as flow_assembled
 from gfnn_jax.search.search import Entry
 
 _CONFIRMED = 1.1  # of the error that the search measured
+_SMALLER = 3  # sizes that are looked at below maps all of which have steps that fail
 
 
 class Chosen(NamedTuple):
@@ -57,14 +60,16 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     """The first whose own steps bear out what the search measured, else the best.
 
     Where the steps of a map that was to meet the tolerance do not, larger ones of its sweep are
-    looked at before others. Errors are infinite where a step fails: of such maps the one is taken
-    of which the fewest do.
+    looked at before others. Errors are infinite where a step fails: where some fail of every map,
+    smaller ones of the best sweep follow, and of maps that all have such steps the one is taken of
+    which the fewest do.
     """
     budget, say, bound = request.budget, request.say, request.tolerance.bound
     compile_seconds, tried = 0.0, []
     first = ranking[0]
     larger = _larger(first, budget, say) if first.candidate.validation_bound <= bound else ()
-    for entry in itertools.chain([first], larger, ranking[1:]):
+    smaller = _smaller(tried, budget, say)
+    for entry in itertools.chain([first], larger, ranking[1:], smaller):
         say(f"compiling the step of {entry.candidate.chart} {entry.candidate.label}")
         sweep = entry.sweep
         map_ = composed(sweep.piece(entry.size), sweep.data)
@@ -72,7 +77,9 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
         compile_seconds += assembled.compile_seconds
         tried.append((assembled.candidate, assembled.failed, entry))
         expected = max(bound, _CONFIRMED * entry.candidate.validation_bound)
-        if assembled.candidate.validation_bound <= expected or not assembled.compiled:
+        if not assembled.compiled:
+            break
+        if np.isfinite(found := assembled.candidate.validation_bound) and found <= expected:
             break
     candidate, _, entry = min(
         tried, key=lambda t: (t[0].validation_bound > bound, t[0].validation_bound, t[1])
@@ -82,8 +89,26 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
 
 def _larger(entry: Entry, budget: Budget, say) -> Iterator[Entry]:
     """The larger sizes of an entry's sweep, validated by steps, as far as the budget goes."""
-    sweep = entry.sweep
-    for size in sweep.sizes[sweep.sizes.index(entry.size) + 1 :]:
+    sizes = entry.sweep.sizes
+    return _validated(entry.sweep, sizes[sizes.index(entry.size) + 1 :], budget, say)
+
+
+def _smaller(tried: list[tuple[Candidate, int, Entry]], budget: Budget, say) -> Iterator[Entry]:
+    """A few sizes below those of these whose sweep has the fewest failed steps, as far as the
+    budget goes, up to one without; none where one of them has none already."""
+    if not all(failed for _, failed, _ in tried):
+        return
+    sweep = min(tried, key=lambda t: t[1])[2].sweep
+    least = min(sweep.sizes.index(e.size) for _, _, e in tried if e.sweep is sweep)
+    for entry in _validated(sweep, sweep.sizes[:least][: -_SMALLER - 1 : -1], budget, say):
+        yield entry
+        if not tried[-1][1]:
+            return
+
+
+def _validated(sweep: Any, sizes: Sequence[Any], budget: Budget, say) -> Iterator[Entry]:
+    """These sizes of a sweep, validated by steps, as far as the budget goes."""
+    for size in sizes:
         work = sweep.work(size) + sweep.work_of_steps(size)
         try:
             with budget.unit(sweep.named(size), ROWS, work):

@@ -29,11 +29,11 @@ from gfnn_jax.models.hamiltonians.white import leaves_white
 from gfnn_jax.search.search import COMPARABLE, MET, Entry
 
 _NO_MORE = {
-    False: "no larger library of terms promised to meet it",
-    True: "the training of the network gained no more",
+    False: "no larger set of terms promises to meet it",
+    True: "the network's training gains no more",
 }
-_LOOK = "a look whether what the map leaves over is noise of the pairs"
-_RIGHT = "H is right, as far as these pairs tell, and what it leaves over is noise"
+_LOOK = "the test whether the residuals are noise"
+_WHITE = "the residuals of H are white, as noise is"
 _CERTAIN = 5.0  # standard errors that make a change of volume certain
 _SHARE = 0.1  # of the residual, that a change of volume must explain
 _KNOWN = 1.5  # times the noise that was given: up to it, what is left over is that noise
@@ -66,10 +66,11 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         ended = MET if met else cut or _NO_MORE[request.of_network]
     if ended.startswith(MET) and not met:
         ended = (
-            "the validation pairs, which choose, meet the tolerance; the test pairs, which state "
-            "the error, do not"
+            "the map meets it on the pairs that chose it, and not on the test pairs, which chose "
+            "nothing: more pairs narrow the bound"
             if np.isfinite(candidate.validation_relative)
-            else "the steps of a map that was to meet it do not converge from some of the states"
+            else "the implicit step of the map that should meet it fails for some of the states: "
+            "a smaller dt, or a smaller region, helps"
         )
     if met and not ended.startswith(MET):  # by the pairs that state the error
         ended = MET
@@ -112,7 +113,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         messages = [unmet, *messages]
     unmet = not_met(candidate, request.tolerance, ended)
     messages = (
-        [*diagnosis, *messages, unmet] if reason == _RIGHT else [*messages, unmet, *diagnosis]
+        [*diagnosis, *messages, unmet] if reason == _WHITE else [*messages, unmet, *diagnosis]
     )
     messages += request.budget.left_out
     return Conclusion(ended, noise, messages)
@@ -133,8 +134,9 @@ def _hidden(chosen: Chosen, searched: Searched) -> list[str]:
         return []
     change, error = found
     return [
-        f"phase-space volumes change by {change:.2g} (± {error:.1g}) of themselves in a step, as "
-        "by friction; the map keeps them and meets the tolerance, a smaller one asks for friction"
+        f"phase-space volumes change by {change:.2g} ± {error:.1g} (relative) in a step, as by "
+        "friction. The map keeps volumes: it meets the tolerance of one step, and long rollouts "
+        "miss the decay. With a smaller --tolerance (tolerance=) a fit looks for friction"
     ]
 
 
@@ -220,11 +222,11 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
     _, y0, _, residual, scale, sequence, _ = sample
     if differs_between_sequences(y0 / scale, residual / scale, sequence):
         message = (
-            "what is left over agrees within a sequence and differs between sequences: something "
-            "that the states do not hold (a mass, a length, a field) differs between them: give it "
-            "as a parameter (args), or fit the sequences of one value by themselves"
+            "the residuals are alike within a sequence and differ between sequences: a quantity "
+            "that the states do not hold (a mass, a length, a field) differs. Give it as a "
+            "parameter (a column of its own, args=), or fit the sequences of one value alone"
         )
-        return _LeftOver(None, [message], "something that the states do not hold differs between "
+        return _LeftOver(None, [message], "a quantity that the states do not hold differs between "
                          "the sequences")  # fmt: skip
     if not stalled:
         return _LeftOver(None, [])
@@ -233,21 +235,23 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
     size = float(np.sqrt(np.mean((residual / scale) ** 2)))
     if abs(change) > max(_CERTAIN * error, _SHARE * residual.shape[1] * size):
         message = (
-            f"what is left over is no noise: phase-space volumes change by {change:.2g} "
-            f"(± {error:.1g}) of themselves in a step, as by friction: no symplectic map does"
+            f"the residuals are no noise: phase-space volumes change by {change:.2g} ± {error:.1g} "
+            "(relative) in a step, as by friction, and a symplectic map keeps them. The law of a "
+            "recording of the positions has friction (--positions, gfnn.Recording)"
         )
         return _LeftOver(None, [message], "volumes of phase space change, as by friction")
     if np.isfinite(error) or _told_by_neighbours(sample) is False:
         message = (
-            "what is left over is no noise, for neighbouring pairs agree in it: the motion has a "
-            "structure that these functions cannot represent, or it is not symplectic"
+            "the residuals are no noise: neighbouring pairs have similar ones. Either the terms "
+            "tried cannot represent the motion (give known ones: --terms, terms=), or it is not "
+            "symplectic (friction, a missing coordinate)"
         )
-        return _LeftOver(None, [message], "what is left over is a function of the states")
+        return _LeftOver(None, [message], "the residuals are a function of the states")
     return None
 
 
 def _told_by_neighbours(sample: _Sample) -> bool | None:
-    """Whether what is left over is noise; None where the pairs lie too far apart to tell."""
+    """Return whether the residuals are noise; None where the pairs lie too far apart to tell."""
     _, y0, _, residual, scale, sequence, place = sample
     return is_noise(y0 / scale, residual / scale, sequence, place)
 
@@ -286,48 +290,55 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     known_noise = data.noise_of_channels
     if known_noise is not None:
         return _beside_known(noise, known_noise)
-    own, sizes_of_noise = "", ", ".join(f"{sigma:.1e}" for sigma in noise)
+    own, sizes_of_noise = "", _by_name(noise)
     if candidate.learns == "map" and entry is not None and isinstance(entry.sweep, LinearSweep):
         part = entry.sweep.own_error(entry.size) / np.sqrt(np.mean((noise / data.spread) ** 2))
         if part > _OWN_ERROR:
             message = (
-                f"what is left over differs between neighbouring pairs, as noise does, but fits to "
-                f"either half of them differ by {part:.1g} times as much, as noise does not let "
-                "them: these functions cannot follow some of the states, as of close passages"
+                "the residuals look like noise, but fits to halves of the pairs differ by "
+                f"{part:.1g} times as much, more than noise makes them. The terms tried cannot "
+                "follow some of the states, as of close passages"
             )
-            return _LeftOver(None, [message], "these functions cannot follow some of the states")
-        own = f" (the map's own error is then about {part:.1g} of it)"
-    hidden, reason = "", "what is left over is noise"
+            return _LeftOver(None, [message], "the terms tried cannot follow some of the states")
+        own = f". The map's own error is then about {part:.1g} of this noise"
+    hidden, reason = "", "the residuals are noise"
     if len(np.unique(sequence)) == len(sequence):
         hidden = (
-            ", or depends on something that the states do not hold (a parameter, a drive), which "
-            "single pairs do not tell from noise"
+            ". Single pairs cannot tell noise from something that the states do not hold (a "
+            "parameter, a drive)"
         )
         reason += ", or something that the states do not hold"
     of_law = law if candidate.learns == "hamiltonian" and not hidden else None
     if of_law is not None and leaves_white(of_law, searched.data):
         message = (
-            "H is right, as far as these pairs tell: what it leaves over is white, noise of about "
-            f"{sizes_of_noise} on the coordinates in their order"
+            "the residuals of H are white: these pairs say nothing against H. They are noise of "
+            f"about {sizes_of_noise}"
         )
-        return _LeftOver(noise, [message], _RIGHT)
-    message = (
-        f"what is left over is noise of about {sizes_of_noise} on the coordinates in their "
-        f"order{own}{hidden}"
-    )
+        return _LeftOver(noise, [message], _WHITE)
+    message = f"the residuals are noise of about {sizes_of_noise}{own}{hidden}"
     return _LeftOver(noise, [message], reason)
+
+
+def _by_name(noise: np.ndarray) -> str:
+    """Noise (2d,) of each coordinate, in the data's units."""
+    return ", ".join(f"{s:.1e} ({n})" for n, s in zip(_names(len(noise)), noise, strict=True))
+
+
+def _names(width: int) -> list[str]:
+    return [f"{letter}{i + 1}" for letter in "qp" for i in range(width // 2)]
 
 
 def _beside_known(found: np.ndarray, known: np.ndarray) -> _LeftOver:
     """Noise (2d,) that was given, beside what the residuals suggest (2d,)."""
     ratio = float(np.max(found / known))
     if ratio <= _KNOWN:
-        reason = "what is left over is the noise that was given"
+        reason = "the residuals are the noise that was given"
         return _LeftOver(known, [f"larger models are no more accurate: {reason}"], reason)
+    name = _names(len(found))[int(np.argmax(found / known))]
     message = (
-        f"larger models are no more accurate, and leave up to {ratio:.2g} times the noise that was "
-        "given: std is too small, or the pairs have a structure that these functions cannot "
-        "represent"
+        f"larger models are no more accurate, and the residuals are up to {ratio:.2g} times the "
+        f"noise that was given ({name}): std is too small, or the terms tried cannot represent "
+        "the motion (give known ones: --terms, terms=)"
     )
     return _LeftOver(known, [message])
 
@@ -341,9 +352,9 @@ def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOv
     rows = np.sort(data.training)[:few]
     noise = noise_of_sites(chosen.candidate.map, data.pairs.take(rows))
     message = (
-        "other libraries of the structure are no more accurate: what is left over is noise of "
-        f"about {noise[0]:.1e} on positions and {noise[-1]:.1e} on momenta, or terms that these "
-        "libraries do not hold"
+        "other terms of the structure are no more accurate: the residuals are noise of about "
+        f"{noise[0]:.1e} on positions and {noise[-1]:.1e} on momenta, or terms that were not tried "
+        "(give known ones: --terms, terms=)"
     )
     return _LeftOver(noise, [message])
 
@@ -375,6 +386,6 @@ def not_met(chosen: Candidate, tolerance: Tolerance, ended: str) -> str:
         else "leaves held-out states without an image (its step does not converge there)"
     )
     return (
-        f"no candidate meets the tolerance {tolerance.bound:g}: the most accurate {found}; "
-        f"the search ended because {ended}"
+        f"no candidate meets the tolerance {tolerance.bound:g}: the most accurate {found}. "
+        f"The search ended because {ended}"
     )

@@ -93,20 +93,21 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
     messages = []
     if len(wrong):
         messages.append(
-            f"{_named(wrong, count)} are gross errors beside the map of the others, or lie at the "
-            "rim of the data where it cannot follow: they were given no weight"
+            f"{_named(wrong, count)} are far from the map of the others: outliers, or states at "
+            "the edge of the data that it cannot follow. They are left out. If they are right, add "
+            "pairs there"
         )
     if len(rim):
         messages.append(
-            f"{_named(rim, count)} lie at the rim of the data, where S cannot follow them: the map "
-            "is fitted, and its error stated, without them"
+            f"{_named(rim, count)} lie at the edge of the data, where S cannot follow them: the "
+            "map is fitted, and its error stated, without them"
         )
     return Cleaned(seen, found, messages)
 
 
 def _named(rows: np.ndarray, count: int) -> str:
     first = ", ".join(map(str, np.sort(rows)[:5])) + (", …" if len(rows) > 5 else "")
-    return f"{len(rows)} of {count} pairs (rows {first})"
+    return f"{len(rows)} of {count} pairs (numbers {first}, from 0)"
 
 
 def _rms(size) -> float:
@@ -115,7 +116,8 @@ def _rms(size) -> float:
 
 def _residuals(found: Searched) -> np.ndarray | None:
     """(N,) what the best map leaves of every pair; of a law by its steps ÷ scale, of S in its
-    gradient, which has the same unit. None where it meets the tolerance, or is neither."""
+    gradient, which has the same unit. None where it meets the tolerance, is neither, or has dry
+    friction: its steps are not smooth where a body turns, and no error of a measurement is."""
     law, data, tolerance = found.law, found.data, found.tolerance
     best = _best(found)
     if best is None or tolerance.met_by(best) or best.validation_relative <= _ROUNDOFF:
@@ -123,7 +125,7 @@ def _residuals(found: Searched) -> np.ndarray | None:
     if data.structure is not None or data.varied:
         return None
     if law is not None and best is law.candidate:
-        return _sizes((law.flow.image(data.y0) - data.y1) / data.scale)
+        return None if law.widths else _sizes((law.flow.image(data.y0) - data.y1) / data.scale)
     swept = _swept(found)
     return None if swept is None else _sizes(swept[0].residuals(swept[1]))
 

@@ -88,7 +88,7 @@ def fit_monitors(
     """
     places = tuple(tuple(names) for names in places)
     if len({len(names) for names in places}) != 1 or len(places) < 2:
-        raise InputError(f"expected two places or more, of as many columns each, got {places}")
+        raise InputError(f"places: expected two or more, with equally many columns, got {places}")
     missing = [n for names in places for n in names if n not in recording.columns]
     if missing:
         raise InputError(f"{recording.source}: expected columns {', '.join(missing)}")
@@ -101,12 +101,12 @@ def fit_monitors(
         )
     known = tuple(_matrix(stretch, len(places[0])) for stretch in between)
     if all(m is None for m in known) or all(m is not None for m in known):
-        raise InputError("expected some stretches that are known, and some that are not")
+        raise InputError("between: expected some stretches that are known, and some None")
     lost = [k for k in range(len(places)) if known[k] is None and known[k - 1] is None]
     if lost:
         raise InputError(
-            f"place {', '.join(str(k + 1) for k in lost)} lies at no known stretch, so that its "
-            "momenta are not known: leave it out"
+            f"place {', '.join(str(k + 1) for k in lost)} has no known stretch on either side, so "
+            "that its momenta are unknown. Give one (between=), or leave the place out"
         )
     runs = [[_readings(recording, names, run) for names in places] for run in recording.runs]
     states = [_states(q, known) for q in runs]
@@ -185,11 +185,15 @@ def _matrix(stretch: float | np.ndarray | None, dim: int) -> np.ndarray | None:
     form = symplectic_form(dim)
     defect = np.abs(matrix.T @ form @ matrix - form).max()
     if not defect < _SYMPLECTIC * max(1.0, np.abs(matrix).max() ** 2):
-        raise InputError(f"expected a symplectic matrix, got one of defect {defect:.2g}")
+        raise InputError(
+            f"between: expected symplectic matrices in q1…qd, p1…pd, got one with |MᵀJM − J| of "
+            f"{defect:.2g}"
+        )
     values = np.linalg.svd(matrix[:dim, dim:], compute_uv=False)
     if not values[-1] > _SEEN * max(values[0], 1e-300):
         raise InputError(
-            "a known stretch turns no momenta into displacements: it does not tell them"
+            "between: the block ∂Q/∂p of a matrix is singular (a phase advance near a multiple of "
+            "π), so that two readings tell no momenta. Give another stretch as the known one"
         )
     return matrix
 

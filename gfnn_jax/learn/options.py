@@ -135,12 +135,12 @@ class FitOptions:
 
     tolerance: float = field(default=1e-6, metadata=_about(
         POSITIVE,
-        "bound on the one-step error, RMS over coordinates of error divided by spread, at its "
-        "upper 95 % bound", "E",
+        "largest one-step error of a map of states, RMS over coordinates of error divided by "
+        "spread; its upper 95 % bound must not exceed it", "E",
     ))  # fmt: skip
     absolute_tolerance: float | None = field(default=None, metadata=_about(
         POSITIVE,
-        "instead of the tolerance: bound on the RMS per component, in the data's units", "E", FIT,
+        "instead of the tolerance: largest RMS error per coordinate, in the data's units", "E", FIT,
     ))  # fmt: skip
     learn: str = field(default="auto", metadata=_about(
         _one_of("auto", "map", "hamiltonian", "lagrangian"),
@@ -163,8 +163,9 @@ class FitOptions:
         STRUCTURE,
         "structure of many degrees of freedom: H is a sum over equal sites, with terms in q1, p1 "
         "of a site and q2, p2, … of the next ones (ring:2 has two q at every site, side by side); "
-        "or over bodies and pairs of bodies (bodies:4:abbb: the last three are alike); of sites S, "
-        "where a map is learned or no H meets the tolerance; default: that of the scene",
+        "or over bodies and pairs of bodies (bodies:4:abbb: the last three are alike). Of a ring "
+        "or a chain S is learned instead where a map is asked for or no H meets the tolerance. "
+        "Default: that of the scene",
         "|".join(STRUCTURES),
     ))  # fmt: skip
     family: Any = field(default="auto", metadata=_about(
@@ -193,9 +194,9 @@ class FitOptions:
     ))  # fmt: skip
     max_seconds: float | Literal["auto"] | None = field(default="auto", metadata=_about(
         _SECONDS,
-        "time for the fit, after which the best map so far is kept (default 120, or none with a "
-        "maximum of operations); in Python None: no limit, and the same map on a busy machine and "
-        "an idle one", "S", decides=False,
+        "time for the fit in seconds, after which the best map so far is kept (default 120, or no "
+        "limit with a maximum of operations); in Python None: no limit, and the same map on a busy "
+        "machine and an idle one", "S", decides=False,
     ))  # fmt: skip
     max_operations: int | None = field(default=None, metadata=_about(
         _OPERATIONS,
@@ -207,12 +208,15 @@ class FitOptions:
     ))  # fmt: skip
     friction: str = field(default="auto", metadata=_about(
         _TEXT,
-        "of a recording: auto, none, linear, quadratic, dry, uniform, several joined by +", "KIND",
-        FIT,
+        "of a recording, friction by its force: auto, none, linear (viscous, ∝ v), quadratic "
+        "(drag, "
+        "∝ v |v|), dry (Coulomb), uniform (R = γT); several joined by +", "KIND", FIT,
     ))  # fmt: skip
     input_hold: str = field(default="auto", metadata=_about(
         _one_of("auto", "hold", "linear", "band"),
-        "of a recording: how inputs go on between samples", None, FIT,
+        "of a recording, inputs between samples: hold (zero order), linear, band (band-limited), "
+        "or "
+        "auto, by held-out data", None, FIT,
     ))  # fmt: skip
     mass: Mapping[str, float] | None = field(default=None, metadata=_about(
         _MASSES, "of a recording: the known mass of one position", commands=()
@@ -242,27 +246,35 @@ class FitOptions:
             and not self.terms and self.structure is None
         ):  # fmt: skip
             raise FitError(
-                "with model=… nothing else is learned: expected no learn, terms, base, "
-                "structure, family or chart beside it"
+                "model: nothing else is learned beside it, expected no learn, terms, base, "
+                "structure, family or chart"
             )
         if self.ensemble > 1 and (self.family != "mlp" or of_h):
             raise FitError(
-                "an ensemble is of networks S: expected family='mlp', and no learn='hamiltonian'"
+                "an ensemble is of networks S: expected family='mlp' and no learn='hamiltonian', "
+                f"got {self._given}"
             )
         if self.terms and (self.learn == "map" or not plain):
             raise FitError(
-                "terms are those of H: expected learn='auto' or 'hamiltonian', and no family or "
-                "chart"
+                "terms are those of H: expected no learn='map', family or chart beside them, got "
+                f"{self._given}"
             )
         if self.base is not None and (of_h or self.terms):
             raise FitError(
-                "base is factored out of a map S: expected no terms and no learn='hamiltonian'"
+                "base is factored out of a map S: expected no terms or learn='hamiltonian' beside "
+                f"it, got {self._given or 'terms'}"
             )
         if of_h and (self.family not in ("auto", "mlp") or self.chart != "auto"):
             raise FitError(
-                "family and chart are those of S: learn='hamiltonian' has no chart, and no family "
-                "but 'mlp'"
+                "learn='hamiltonian' has no chart, and no family but 'mlp': these are of S; got "
+                f"{self._given}"
             )
+
+    @property
+    def _given(self) -> str:
+        """What was asked for of learn, family and chart."""
+        asked = {"learn": self.learn, "family": self.family, "chart": self.chart}
+        return ", ".join(f"{n}={value!r}" for n, value in asked.items() if value != "auto")
 
     @property
     def deciding(self) -> dict[str, Any]:

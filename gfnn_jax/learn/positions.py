@@ -72,10 +72,10 @@ class OfPositions:
         kind = "symmetric, as of a reversible map" if self.symmetric else "of no symmetry"
         listed = "" if self.noise is None else ", ".join(f"{s:.3g}" for s in self.noise)
         return (
-            f"S(q, Q) of {self.num_triples:,} triples of positions, {kind}; its factor, and so the "
-            "unit of momenta, is fixed by its mixed term"
-            + (f"; {left} more combinations of terms are left open, and are 0" if left else "")
-            + (f"; the readings have noise of {listed}" if listed else "")
+            f"S(q, Q) of {self.num_triples:,} triples of successive positions, {kind}. Positions "
+            "do not tell its scale: momenta, energies and areas have a unit of their own"
+            + (f". {left} undetermined combinations of terms are 0" if left else "")
+            + (f". The noise of the readings is {listed}" if listed else "")
         )
 
 
@@ -123,8 +123,8 @@ def learn_positions(
             best = other
     if best is None:
         raise FitError(
-            f"expected more triples of positions, or more time: {len(triples)} are too few for the "
-            "smallest S, or no S of theirs has a step"
+            f"{len(triples)} triples of positions gave no S(q, Q) whose step can be solved. Add "
+            "positions, or raise --max-seconds (max_seconds=)"
         )
     return sweep.learned(sweep.without_noise(best), say)
 
@@ -227,7 +227,7 @@ class _Sweep:
         else the best as it is."""
         if not self._stalls(best):
             return best
-        self.say("larger S leave as much: the readings have noise")
+        self.say("larger S are no more accurate: fitting the noise of the readings too")
         symmetric, split = best.about.symmetric, self.split
         training, held_out = (
             self.triples.take(np.sort(rows)) for rows in (split.training, split.validation)

@@ -32,8 +32,9 @@ def proposed(data: Dataset) -> list[str]:
     if not left < _EXPLAINED:
         return []
     return [
-        f"--structure {best} explains these pairs: a sample leaves {left:.1g} of forces and "
-        f"velocities over, to second order in dt; fit with structure='{best}'"
+        f"the structure {best} explains these pairs: a sample of them leaves relative residuals of "
+        f"{left:.1g} in forces and velocities, to second order in dt. Fit again with --structure "
+        f"{best} (structure='{best}')"
     ]
 
 
@@ -46,7 +47,8 @@ def structures_to_try(request: Request, data: Dataset) -> Iterator[tuple[Request
         if left < _TRIED:
             structure = structure_of(best, data.dim, data.coordinates)
             request.say(
-                f"a {best} explains all but {left:.1g} of forces and velocities: tried first"
+                f"the structure {best} leaves relative residuals of {left:.1g} in forces and "
+                "velocities: it is tried first"
             )
             same = Dataset.of(data.pairs, data.coordinates, structure, data.row)
             yield (

@@ -133,8 +133,8 @@ def refit(
         found = worker.solved(chunks, held, group)
         if found.outliers:
             warn(
-                f"{found.outliers} of {found.count + found.outliers} pairs are far from what "
-                "the others tell: outliers, they are left out"
+                f"{found.outliers} of {found.count + found.outliers} pairs are outliers, with "
+                f"residuals above {_OUTLYING:g} standard deviations: they are left out"
             )
         if found.other_dt:
             warn(
@@ -156,8 +156,11 @@ def refit(
     else:
         group.told({})
     if chosen is None or not after <= _NO_WORSE * before:
-        found_map = "no map" if chosen is None else f"a worse map ({after:.2e})"
-        warn(f"all pairs give {found_map}: that of the sample ({before:.2e}) is kept")
+        found_map = "no map" if chosen is None else f"a worse map (RMS error {after:.2e})"
+        warn(
+            f"the fit to all pairs gives {found_map}: that of the sample (RMS error {before:.2e} "
+            "in the data's units) is kept"
+        )
         chosen, num_pairs = old, fitted.num_pairs
     elif law is not None and found.law is not None and old.learns == "hamiltonian":
         law = _with_coefficients(law, found.law, chosen)

@@ -195,7 +195,7 @@ def _sweeps(request: Request, taken: Dataset, seen: Diagnosis) -> list[Any]:
 
 def _nothing_found(num_pairs: int, budget: Budget) -> str:
     if budget.over:
-        return f"expected a larger budget: no candidate was finished; {budget.ended}"
+        return f"expected a larger budget, for {budget.ended}"
     return f"expected more pairs: {num_pairs} are too few for the smallest model of this kind"
 
 

@@ -135,9 +135,9 @@ def of_few(errors: np.ndarray, tolerance: Tolerance) -> str:
     if not _OF_FEW * np.median(errors) < rms < np.inf or rms < _MATTERS * tolerance.bound:
         return ""
     return (
-        f"few states make the error: nine of ten err by less than "
-        f"{np.quantile(errors, _NINE_OF_TEN):.1e}{' of the spread' if tolerance.relative else ''}, "
-        "and the RMS of other states may be far larger than its bound"
+        f"few states make most of the error: nine of ten err by less than "
+        f"{np.quantile(errors, _NINE_OF_TEN):.1e}{' of the spread' if tolerance.relative else ''}. "
+        "The 95 % bound of the RMS does not hold for other states: quote the error of nine of ten"
     )
 
 

@@ -1,9 +1,10 @@
 """A map and its sensors: states estimated from a recording, and forecasts with bands.
 
 The samples before a time are fitted by one arc of the law, its first state unknown: that gives the
-state there with its covariance. A forecast is the orbit from it. Its band holds the error of that
-state, of the law's coefficients, the noise of a sample, and the law's own misfit, as forecasts of
-data that it was not learned from have shown it.
+state there with its covariance, and where zeros of channels wander, these too. A forecast is the
+orbit from it, on zeros that go back to their mean. Its band holds the error of that state, of the
+law's coefficients, the noise of a sample, and the law's own misfit, as forecasts of data that it
+was not learned from have shown it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from gfnn_jax.maps import stops
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.signals.local_cubics import smooth
-from gfnn_jax.solve.latent_arcs import Observed, Steps, fit_arcs
+from gfnn_jax.solve.latent_arcs import Observed, Steps, fit_arcs, linearised
 
 FEWEST = 5  # samples from which a state is estimated
 _MOST = 160  # samples of a window that are used
@@ -98,8 +99,9 @@ def estimate(map_: Any, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """`SymplecticMap.estimate`."""
     law = law_of(map_)
     windows = windows_of(law.sensors, recording)
-    x, covariance = estimate_states(law, windows)
     lagrangian, d = law.form.lagrangian(law.p), law.form.dim
+    x, covariance = estimate_states(law, windows)
+    x, covariance = x[:, : 2 * d], covariance[:, : 2 * d, : 2 * d]
     found = lagrangian.derivatives(x[:, :d], x[:, d:])
     z = np.concatenate([x[:, :d], found.by_v], axis=1)
     turn = np.zeros_like(covariance)
@@ -119,11 +121,14 @@ def forecast(
     last = np.array([np.max(w.t) for w in windows])
     if times.ndim != 1 or not np.all(np.diff(times) > 0) or not np.all(times[0] >= last):
         raise InputError(
-            f"expected rising times from the end of each run on ({last.max():g} s), got "
+            f"expected rising times, none before the latest end of a run ({last.max():g} s), got "
             f"{times.ravel()[0]:g} to {times.ravel()[-1]:g} s"
         )
     if sensors.inputs and inputs is None:
-        raise InputError(f"expected inputs {', '.join(sensors.inputs)} ahead of time: inputs=")
+        raise InputError(
+            f"the law has inputs ({', '.join(sensors.inputs)}): give them for the times of the "
+            "forecast, --inputs FILE (inputs=)"
+        )
     if inputs is not None and sensors.inputs:
         windows = [
             _with_inputs(window, inputs, sensors, run)
@@ -148,7 +153,10 @@ def windows_of(sensors: Sensors, recording: Recording) -> list[Window]:
     needed = (*sensors.seen.needed, *sensors.inputs)
     missing = [n for n in needed if n not in recording.columns]
     if missing:
-        raise InputError(f"{recording.source}: expected columns {', '.join(missing)}")
+        raise InputError(
+            f"{recording.source}: has no columns {', '.join(missing)}, which the law was learned "
+            "from"
+        )
     windows = []
     for run in recording.runs:
         t = recording.times(run)
@@ -214,8 +222,8 @@ class _Windows:
 
 
 def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np.ndarray]:
-    """(q, v) (B, 2d) at the last sample of each window, and its covariance (B, 2d, 2d) in the
-    law."""
+    """(q, v, b) (B, m) at the last sample of each window, and its covariance (B, m, m) in the law:
+    b (k,) the zeros of the channels where these wander, of length 0 where they do not."""
     sensors = law.sensors
     length = max(len(w.t) for w in windows)
     count = windows[0].y.shape[1]
@@ -235,9 +243,42 @@ def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np
     arcs = _Windows(law, np.diff(t, axis=1), u)
     sigma = sensors.seen.state_sigma(x[:, -1], sensors.sigma)
     scale = np.concatenate([sigma, sigma * sensors.omega])
-    sigma = sensors.sigma * np.array(noise)
-    found = fit_arcs(arcs, np.zeros(0), x, y, sigma, scale, loss=sensors.seen.loss)
-    return found.x[:, -1], found.last_covariance()
+    sigma, loss, wander = sensors.sigma * np.array(noise), sensors.seen.loss, sensors.wander
+    unseen = np.where(np.isfinite(y), np.array(noise), np.inf)
+    white = None if wander is None else wander.whitening(t, unseen)
+    found = fit_arcs(arcs, np.zeros(0), x, y, sigma, scale, loss=loss, whitening=white)
+    if wander is None or white is None:
+        return found.x[:, -1], found.last_covariance()
+    J, last = linearised(arcs, np.zeros(0), found.x, y, sigma, loss, white)
+    near = white @ wander.latest(t, unseen).swapaxes(1, 2)[..., None]
+    weights = np.sqrt(np.nan_to_num(loss.weights(found.whitened)))
+    near = weights * near[..., 0].swapaxes(1, 2)
+    return _with_zeros(found.x[:, -1], J, last, near, wander.size**2, sensors.sigma)
+
+
+def _with_zeros(
+    x: np.ndarray, J: np.ndarray, last: np.ndarray, near: np.ndarray, variance: float,
+    sigma: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """States x (B, m) with the zeros that the same samples tell, and the covariance of both.
+
+    J, last: of `linearised`. near: (B, L, k) covariance of the rows' values with the zeros.
+    variance: of the zeros, in units of σ². Of c = ``near``, rows J for the first state and r of the
+    residuals, and P = (JᵀJ)⁻¹: the zeros are cᵀr, their covariance is that of no samples less
+    cᵀc − cᵀJ P Jᵀc, and with the first state −P Jᵀc.
+    """
+    lanes, length, k = near.shape
+    c = (near[..., None] * np.eye(k)).reshape(lanes, length * k, k)
+    m, r = x.shape[1], J[..., -1:]
+    Q, R = np.linalg.qr(J[..., :-1])
+    root, own = last[..., :m] @ np.linalg.pinv(R), Q.swapaxes(1, 2) @ c
+    across = -root @ own * sigma
+    open_ = variance * np.eye(k) - c.swapaxes(1, 2) @ c + own.swapaxes(1, 2) @ own
+    covariance = np.block([
+        [root @ root.swapaxes(1, 2), across],
+        [across.swapaxes(1, 2), sigma[:, None] * open_ * sigma],
+    ])  # fmt: skip
+    return np.concatenate([x, (c.swapaxes(1, 2) @ r)[..., 0] * sigma], axis=1), covariance
 
 
 def _near(sensors: Sensors, t: np.ndarray) -> int:
@@ -260,14 +301,16 @@ def propagate(
     law: Law, windows: Sequence[Window], x: np.ndarray, covariance: np.ndarray, last: np.ndarray,
     times: np.ndarray,
 ) -> Orbits:  # fmt: skip
-    """Orbits from states x (B, 2d) with their covariance at times ``last`` (B,), to times (B,
-    n)."""
+    """Orbits from what `estimate_states` found, x (B, m) with its covariance, at times ``last``
+    (B,), to times (B, n)."""
     d, sensors, count = law.form.dim, law.sensors, len(law.p)
-    ends, begun = np.concatenate([last[:, None], times], axis=1), x
-    steps = np.diff(ends, axis=1)
-    root = np.linalg.cholesky(covariance + 1e-300 * np.eye(2 * d)) if len(x) else covariance
-    spread = np.concatenate([root, np.zeros((len(x), 2 * d, law.root.shape[0]))], axis=2)
-    states, covariances, now = [], [], last
+    ends, (x, zeros) = np.concatenate([last[:, None], times], axis=1), np.split(x, [2 * d], axis=1)
+    begun, steps = x, np.diff(ends, axis=1)
+    size = covariance.shape[-1]
+    root = np.linalg.cholesky(covariance + 1e-300 * np.eye(size)) if len(x) else covariance
+    root = np.concatenate([root, np.zeros((len(x), size, law.root.shape[0]))], axis=2)
+    spread, of_zeros = root[:, : 2 * d], root[:, 2 * d :]
+    states, spreads, now = [], [], last
     for k in range(times.shape[1]):
         parts = substeps_of(sensors, np.max(steps[:, k], initial=0.0))
         both = np.stack([now, times[:, k]], axis=1)
@@ -275,15 +318,20 @@ def propagate(
         step = law.form.step(law.p, x, steps[:, k], u[:, 0])
         x, now = step.states, times[:, k]
         spread = step.by_state @ spread
-        spread[..., 2 * d :] += step.by_coefficients[..., :count] @ law.root.T
+        spread[..., size:] += step.by_coefficients[..., :count] @ law.root.T
         states.append(x)
-        covariances.append(spread @ spread.swapaxes(1, 2))
-    orbit, of_states = np.stack(states, axis=1), np.stack(covariances, axis=1)
+        spreads.append(spread)
+    orbit, spread = np.stack(states, axis=1), np.stack(spreads, axis=1)
     orbit = _with_stops(law, windows, np.concatenate([begun[:, None], orbit], axis=1), ends)
-    seen = sensors.seen(orbit)
-    own = np.einsum("bnki,bnij,bnkj->bnk", seen.by_state, of_states, seen.by_state)
-    own = own + sensors.sigma**2 + sensors.misfit_at(times - last[:, None]) ** 2
-    return Orbits(seen.values, np.sqrt(own), orbit, of_states)
+    seen, ahead = sensors.seen(orbit), times - last[:, None]
+    values, shown, further = seen.values, seen.by_state @ spread, 0.0
+    if sensors.wander is not None:
+        left = sensors.wander.fading(ahead)[..., None]
+        values = values + left * zeros[:, None]
+        shown = shown + left[..., None] * of_zeros[:, None]
+        further = sensors.wander.size**2 * (1 - left**2) * sensors.sigma**2
+    own = np.sum(shown**2, axis=-1) + further + sensors.sigma**2 + sensors.misfit_at(ahead) ** 2
+    return Orbits(values, np.sqrt(own), orbit, spread @ spread.swapaxes(2, 3))
 
 
 def _with_stops(

@@ -101,7 +101,8 @@ def _ends(map_: Any, piece: Any, recording: Recording) -> _Ends:
     """By an orbit of S through the last readings of every run."""
     sensors, dim = map_.sensors, map_.dim
     if sensors is None:
-        raise InputError("expected a map that knows its sensors: one that this release has learned")
+        raise InputError("expected a map that knows its sensors, got one of an older release or of "
+                         "pairs: fit the recording again")  # fmt: skip
     windows = [_window(map_, piece, recording, run) for run in recording.runs]
     arcs, sigma = _arcs(map_, piece), np.tile(sensors.sigma, 2)
     known = dataclasses.replace(arcs, basis=arcs.basis[:, :0])

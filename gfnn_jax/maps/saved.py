@@ -51,6 +51,7 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.scene import Scene
 from gfnn_jax.solve.robust import Biweight, SoftL1
+from gfnn_jax.solve.wander import Wander
 from gfnn_jax.storage.checkpoints import load_model, save_model
 from gfnn_jax.storage.outputs import ensure_new
 
@@ -60,7 +61,7 @@ _TYPES: dict[str, type] = {
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
         Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
         Windows, Groups, Ranges, OfTimeStep, Ensemble, Uniform, Forced, Legendre, Friction, Signals,
-        Sensors, Observation, SoftL1, Biweight, Damping, DampingOfArgs, FunctionsOfArgs,
+        Sensors, Wander, Observation, SoftL1, Biweight, Damping, DampingOfArgs, FunctionsOfArgs,
         OfDisplacement,
     )
 } | {"LagrangianTerms": lagrangian.Terms}  # fmt: skip
@@ -137,7 +138,10 @@ def load(folder, scene: Scene | None = None) -> SymplecticMap:
     name = description.get("scene")
     if scene is None and name is not None:
         if name not in SCENES:
-            raise InputError(f"{folder}: was learned in the scene '{name}': pass it (scene=...)")
+            raise InputError(
+                f"{folder}: was learned in the scene '{name}', which the package has not. Load it "
+                "in Python: gfnn.load(folder, scene=...)"
+            )
         scene = SCENES[name]()
     if scene is not None and name is not None and scene.name != name:
         raise InputError(f"{folder}: was learned in the scene '{name}', not in '{scene.name}'")
@@ -146,7 +150,9 @@ def load(folder, scene: Scene | None = None) -> SymplecticMap:
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{folder}: does not describe a map of this release ({error})") from error
+        raise InputError(
+            f"{folder}: does not describe a map of this release ({error}). Fit it again"
+        ) from error
 
 
 def packed(map_: SymplecticMap, scene: Scene | None = None) -> dict[str, np.ndarray]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.maps.observation import Observation
+from gfnn_jax.solve.wander import Wander
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +21,8 @@ class Sensors:
     later, in seconds. leads, misfit: (n,) times ahead, and (n, k) the standard deviation there of
     forecasts of data that the law was not learned from, as far as neither the noise nor the errors
     of state and coefficients explain it. observation: how channels show a state, and the loss of
-    their noise; None where they are the positions, and it is the usual one.
+    their noise; None where they are the positions, and it is the usual one. wander: how zeros of
+    channels move, each in units of its σ; None where they stay.
     """
 
     positions: tuple[str, ...]
@@ -34,6 +36,7 @@ class Sensors:
     leads: Any
     misfit: Any
     observation: Observation | None = None
+    wander: Wander | None = None
 
     @property
     def seen(self) -> Observation:

@@ -16,6 +16,7 @@ c_n the move of x_{n+1} that would close the defect, which makes δx_n a functio
 alone. The arc's own δx_0 is eliminated by its own QR; what remains of all arcs are rows for δp.
 Where it converges the defects are zero, and each arc is an orbit of the model. Residuals enter in
 units of the noise through a robust loss (`solve.robust`). The noise may be estimated on the way.
+Where it is not white, a *whitening* (`solve.wander`) mixes residuals along an arc into white ones.
 """
 
 from __future__ import annotations
@@ -91,15 +92,17 @@ class Fitted:
     """The fit of all arcs.
 
     p: (n,) coefficients. x: (A, L, m) states. residuals: (A, L, k) in units of the noise, NaN where
-    nothing was seen. sigma: the noise as given or estimated, (k,) or (A, L, k). factor: the
-    triangle (n + 1, n + 1) of [∂r/∂p, r] without the states. scores: (A, n) each arc's part of the
-    gradient in p. arcs: (A, m, m) triangles of each δx_0 with p fixed. transports: (A, m, m)
-    ∂x_{L−1}/∂x_0. cost: infinite where the defects could not be closed.
+    nothing was seen; whitened: the same after the whitening. sigma: the noise as given or
+    estimated, (k,) or (A, L, k). factor: the triangle (n + 1, n + 1) of [∂r/∂p, r] without the
+    states. scores: (A, n) each arc's part of the gradient in p. arcs: (A, m, m) triangles of each
+    δx_0 with p fixed. transports: (A, m, m) ∂x_{L−1}/∂x_0. cost: infinite where the defects could
+    not be closed.
     """
 
     p: np.ndarray
     x: np.ndarray
     residuals: np.ndarray
+    whitened: np.ndarray
     sigma: np.ndarray
     factor: np.ndarray
     scores: np.ndarray
@@ -136,6 +139,7 @@ def fit_arcs(
     tolerance: float = 1e-4,
     loss: Loss = SOFT_L1,
     least: np.ndarray | None = None,
+    whitening: np.ndarray | None = None,
 ) -> Fitted:
     """Fit p (n,) and the states x (A, L, m), from what they start at, to y (A, L, k).
 
@@ -146,10 +150,11 @@ def fit_arcs(
 
     least: (k,) what of the residuals is no noise; sigma is then where the noise starts from, and is
     estimated by every iteration, of (A, L, k) one factor for each of the k. None: sigma is known.
+    whitening: (A, k, L, L) of residuals in units of sigma, by channel; None: they are white.
     """
     seen = np.isfinite(y)
     data = _Data(model, seen, np.where(seen, y, 0.0), least, tolerance)
-    here = data.at(p, x, _Units(sigma, state_scale, loss))
+    here = data.at(p, x, _Units(sigma, state_scale, loss, whitening))
     start = _AtStates(data, here, here)
     if not np.isfinite(here.cost):
         return start.fitted(0, converged=False)
@@ -161,11 +166,11 @@ def fit_arcs(
 
 def eliminated_rows(
     model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
-    loss: Loss = SOFT_L1,
+    loss: Loss = SOFT_L1, whitening: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Rows (R, n + 1) of [∂r/∂p, r] at p and x, without the states of each arc: what its own state
     does not explain."""
-    (J, _), m = _linearised_at(model, p, x, y, sigma, loss), x.shape[-1]
+    (J, _), m = linearised(model, p, x, y, sigma, loss, whitening), x.shape[-1]
     across = np.linalg.qr(J[..., :m], mode="complete")[0][..., m:]
     return (across.swapaxes(1, 2) @ J[..., m:]).reshape(-1, J.shape[-1] - m)
 
@@ -174,7 +179,7 @@ def last_by_coefficients(
     model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
 ) -> np.ndarray:
     """Derivative (A, m, n) in p of the last state of each arc that was fitted to y with p fixed."""
-    (J, last), m = _linearised_at(model, p, x, y, sigma, SOFT_L1), x.shape[-1]
+    (J, last), m = linearised(model, p, x, y, sigma), x.shape[-1]
     R = np.asarray(np.linalg.qr(J, mode="r"))
     first = np.linalg.solve(R[:, :m, :m], -R[:, :m, m:-1])
     return last[..., :m] @ first + last[..., m:-1]
@@ -182,32 +187,35 @@ def last_by_coefficients(
 
 def rows_of_arcs(
     model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
-    loss: Loss = SOFT_L1,
+    loss: Loss = SOFT_L1, whitening: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Rows (A, L, k, n + 1) of the coefficients and the residuals, weighted as robust loss has it,
     after each arc's own δx_0 was projected out: residuals − rows · δp are those of any other
     coefficients near p, each arc with the state that suits them best."""
-    (J, _), m = _linearised_at(model, p, x, y, sigma, loss), x.shape[-1]
+    (J, _), m = linearised(model, p, x, y, sigma, loss, whitening), x.shape[-1]
     Q = np.linalg.qr(J[..., :m])[0]
     return (J[..., m:] - Q @ (Q.swapaxes(1, 2) @ J[..., m:])).reshape(*y.shape, -1)
 
 
 def sensitivities(
     model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
-    loss: Loss = SOFT_L1,
+    loss: Loss = SOFT_L1, whitening: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
     """The triangle (n + 1, n + 1) of `eliminated_rows`: what a test of coefficients needs."""
-    factor = np.asarray(np.linalg.qr(eliminated_rows(model, p, x, y, sigma, loss), mode="r"))
+    rows = eliminated_rows(model, p, x, y, sigma, loss, whitening)
+    factor = np.asarray(np.linalg.qr(rows, mode="r"))
     return np.concatenate([factor, np.zeros((factor.shape[1] - len(factor), factor.shape[1]))])
 
 
-def _linearised_at(
-    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray, loss: Loss
-) -> tuple[np.ndarray, np.ndarray]:
-    """`_linearised` of all arcs at p and x."""
+def linearised(
+    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
+    loss: Loss = SOFT_L1, whitening: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Rows (A, L k, m + n + 1) of [δx_0, δp, r] of all arcs at p and x, weighted as robust loss has
+    it, and δx_{L−1} (A, m, m + n + 1) by the same and by the defects before it."""
     seen, steps, observed = np.isfinite(y), model.steps(p, x), model.observe(p, x)
     off = np.where(seen, np.where(seen, y, 0.0) - observed.values, 0.0)
-    units = _Units(sigma, np.ones(x.shape[-1]), loss)
+    units = _Units(sigma, np.ones(x.shape[-1]), loss, whitening)
     return _linearised(_Iterate.at(p, x, steps, observed, seen, off, units), slice(None))
 
 
@@ -277,23 +285,31 @@ class _AtStates:
         best, seen = self.best if self.closed(self.best) else self.here, self.data.seen
         rows, m = _reduced(best), best.x.shape[-1]
         return Fitted(
-            best.p, best.x, np.where(seen, best.residuals, np.nan), best.units.sigma, rows.factor,
-            rows.scores, rows.arcs[:, :, :m], rows.transports,
-            best.cost if self.closed(best) else np.inf, iterations, converged,
+            best.p, best.x, np.where(seen, best.residuals, np.nan),
+            np.where(seen, best.white, np.nan), best.units.sigma, rows.factor, rows.scores,
+            rows.arcs[:, :, :m], rows.transports, best.cost if self.closed(best) else np.inf,
+            iterations, converged,
         )  # fmt: skip
 
 
 class _Units(NamedTuple):
-    """σ of what is seen, the defects (m,) that count as much, and the loss."""
+    """σ of what is seen, the defects (m,) that count as much, the loss, and the whitening."""
 
     sigma: np.ndarray
     state: np.ndarray
     loss: Loss
+    whitening: np.ndarray | None = None
+
+    def white(self, rows: np.ndarray, block: slice = slice(None)) -> np.ndarray:
+        """Rows (a, L, k, ...) of a block of arcs, mixed along each arc into white ones."""
+        if self.whitening is None:
+            return rows
+        return np.einsum("akij,ajk...->aik...", self.whitening[block], rows, optimize=True)
 
 
 class _Iterate(NamedTuple):
-    """Where an iteration stands: residuals in units of σ, the cost of the residuals, and the norm
-    of the defects in units of the states'."""
+    """Where an iteration stands: residuals in units of σ, the same made white, their cost, and the
+    norm of the defects in units of the states'."""
 
     p: np.ndarray
     x: np.ndarray
@@ -301,6 +317,7 @@ class _Iterate(NamedTuple):
     observed: Observed
     seen: np.ndarray
     residuals: np.ndarray
+    white: np.ndarray
     cost: float
     gap: float
     units: _Units
@@ -310,11 +327,12 @@ class _Iterate(NamedTuple):
         """off: residuals (A, L, k) in the units of y."""
         with np.errstate(all="ignore"):
             residuals = off / units.sigma
-            cost = float(np.sum(units.loss.of(residuals)))
+            white = units.white(residuals)
+            cost = float(np.sum(units.loss.of(white)))
             gap = float(np.linalg.norm(steps.closing / units.state))
         if not np.isfinite(cost + gap):
             cost = gap = np.inf
-        return cls(p, x, steps, observed, seen, residuals, cost, gap, units)
+        return cls(p, x, steps, observed, seen, residuals, white, cost, gap, units)
 
     @property
     def merit(self) -> float:
@@ -336,7 +354,7 @@ class _Iterate(NamedTuple):
             sigma = np.hypot(moved * before, least)
         # Of a state (q, v) whose positions are seen, velocities change as they do.
         state = self.units.state * np.resize(moved, self.units.state.shape)
-        units = _Units(sigma, state, self.units.loss)
+        units = self.units._replace(sigma=sigma, state=state)
         return self.at(self.p, self.x, self.steps, self.observed, self.seen, off, units)
 
 
@@ -395,7 +413,8 @@ def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
     J[..., m:-1] += observed.by_coefficients
     J /= sigma[..., None]
     J[..., -1] = residuals - J[..., -1]
-    weight = np.where(at.seen[block], np.sqrt(at.units.loss.weights(residuals)), 0.0)
+    J = at.units.white(J, block)
+    weight = np.where(at.seen[block], np.sqrt(at.units.loss.weights(at.white[block])), 0.0)
     J *= weight[..., None]
     return J.reshape(num_arcs, length * k, -1), S[:, -1]
 

@@ -53,10 +53,10 @@ def units(traits: Traits) -> Iterator[Fault]:
         jump, swing = jumps(traits, name), _swing(_raw(traits, name))
         if jump is not None and jump[0] == 360:
             found = f"{name} jumps by 360 ({jump[1]} times)"
-            yield Fault("degrees", found, f"it is in degrees: --degrees {name}", option)
+            yield Fault("degrees", found, f"Its unit is degrees: --degrees {name}", option)
         elif swing > _SWING and np.ptp(_all(traits, name)) < 720 and not _settled(traits, name):
-            found = f"{name} swings by {swing:.3g}: degrees, or {swing / TURN:.0f} turns"
-            remedy = f"--degrees {name}, or --angles {name} if it is in radians"
+            found = f"{name} swings by {swing:.3g}, degrees or {swing / TURN:.0f} turns in radians"
+            remedy = f"If degrees: --degrees {name}. If radians: --angles {name}"
             yield Fault("degrees", found, remedy, option)
 
 
@@ -94,7 +94,8 @@ def wraps(traits: Traits) -> Iterator[Fault]:
         if jump is not None:
             option = "degrees" if jump[0] == 360 else "angles"
             found = f"{name} jumps by {jump[0]:.3g} ({jump[1]} times)"
-            yield Fault("wrapped", found, f"it is an angle: --{option} {name}", {option: (name,)})
+            yield Fault("wrapped", found, f"Name it as an angle: --{option} {name}",
+                        {option: (name,)})  # fmt: skip
 
 
 def interpolated_jumps(traits: Traits) -> Iterator[Fault]:
@@ -103,9 +104,9 @@ def interpolated_jumps(traits: Traits) -> Iterator[Fault]:
         count = sum(_cuts(x) for x in _raw(traits, name))
         if count:
             yield Fault(
-                "interpolated jump", f"{name} runs through its range in a few samples where it "
-                f"should jump by a turn ({count} times)",
-                "interpolate its sine and cosine, or the unwrapped angle",
+                "interpolated jump", f"{name} was resampled across its wraps: {count} jumps by a "
+                "turn take several samples",
+                "Unwrap the angle before resampling, or resample its sine and cosine",
             )  # fmt: skip
 
 
@@ -136,5 +137,5 @@ def coarse(traits: Traits) -> Iterator[Fault]:
         wide = int(np.sum(np.abs(np.angle(np.exp(1j * steps))) > _WIDE))
         is_lift = np.ptp(_all(traits, name)) > 1.02 * TURN
         if wide > max(3, 0.01 * len(steps)) and not is_lift:
-            found = f"{name} moves by more than 135° in {wide} steps, perhaps the other way round"
-            yield Fault("coarse", found, "sample faster, or give the lifted angle", wrong=False)
+            found = f"{name} moves by more than 135° in {wide} steps, in an ambiguous direction"
+            yield Fault("coarse", found, "Sample faster, or give the unwrapped angle", wrong=False)

@@ -18,8 +18,9 @@ NOTES = (
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """kind: one of WRONG, or of NOTES. message: what was found. remedy: what mends it. options:
-    those of `gfnn_jax.read` that do, if any. wrong: whether a fit must not begin."""
+    """kind: one of WRONG, or of NOTES. message: what was found. remedy: what mends it, "" for
+    nothing to do. options: those of `gfnn_jax.read` that do, if any. wrong: whether a fit must not
+    begin."""
 
     kind: str
     message: str
@@ -31,4 +32,4 @@ class Fault:
         assert self.kind in (WRONG if self.wrong else NOTES), self.kind
 
     def __str__(self) -> str:
-        return f"{self.message}: {self.remedy}"
+        return f"{self.message}. {self.remedy}" if self.remedy else self.message

@@ -22,7 +22,7 @@ def constant(traits: Traits) -> Iterator[Fault]:
             if np.isfinite(values).any() and np.nanmin(values) == np.nanmax(values):
                 yield Fault(
                     "constant", f"{name} is {np.nanmin(values):g} in all rows",
-                    f"leave it out of --{role}", wrong=role != "inputs",
+                    f"Leave it out of --{role}", wrong=role != "inputs",
                 )  # fmt: skip
 
 
@@ -31,7 +31,7 @@ def repeated(traits: Traits) -> Iterator[Fault]:
         a, b = traits.columns[one], traits.columns[other]
         if np.nanmin(a) < np.nanmax(a) and np.array_equal(a, b, equal_nan=True):
             yield Fault(
-                "repeated", f"{one} and {other} are equal in all rows", f"leave {other} out"
+                "repeated", f"{one} and {other} are equal in all rows", f"Leave {other} out"
             )
 
 
@@ -51,8 +51,8 @@ def clipped(traits: Traits) -> Iterator[Fault]:
                 shown = extreme / recording.factors[name]
                 yield Fault(
                     "clipped",
-                    f"{name} stays at its extreme {shown:.6g} {count} times, as at a limit",
-                    "leave such stretches out: --from, --to, or NaN in them",
+                    f"{name} saturates: {count} times it stays at its extreme, {shown:.6g}",
+                    "Leave these samples out: --from, --to, or NaN in them",
                 )
 
 
@@ -78,12 +78,11 @@ def missing(traits: Traits) -> Iterator[Fault]:
         ]  # fmt: skip
         cells = int(np.sum(~np.isfinite(traits.columns[name])))
         if gone:
-            found = f"{name} is missing in run {', '.join(gone[:8])}"
-            remedy = "nothing, if it was not measured there"
-            yield Fault("missing column", found, remedy, wrong=False)
+            found = f"{name} has no values in run {', '.join(gone[:8])}"
+            yield Fault("missing column", found, "", wrong=False)
         elif cells:
-            found = f"{name} is missing in {cells} rows"
-            yield Fault("missing", found, "nothing: they are left out", wrong=False)
+            found = f"{name} has no value in {cells} rows, which are not used for it"
+            yield Fault("missing", found, "", wrong=False)
 
 
 def outliers(traits: Traits) -> Iterator[Fault]:
@@ -92,4 +91,4 @@ def outliers(traits: Traits) -> Iterator[Fault]:
         if count:
             first = float(np.concatenate(traits.times)[traits.noise[name].outliers[0]])
             found = f"{name} has {count} outliers, the first at t = {first:.6g} s"
-            yield Fault("outliers", found, "a fit leaves them out", wrong=False)
+            yield Fault("outliers", found, "A fit leaves them out", wrong=False)

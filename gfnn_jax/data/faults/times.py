@@ -21,7 +21,7 @@ def units(traits: Traits) -> Iterator[Fault]:
         power = np.log10(step / traits.step) / 3
         if abs(power) > 0.9 and abs(power - round(power)) < 0.02:
             found = f"the steps of run {run} are {step:g} s, those of others {traits.step:g} s"
-            yield Fault("time unit", found, "give its times in the unit of the others")
+            yield Fault("time unit", found, "Give its times in the unit of the others")
 
 
 def drifting(traits: Traits) -> Iterator[Fault]:
@@ -32,8 +32,8 @@ def drifting(traits: Traits) -> Iterator[Fault]:
     if abs(drifts[run]) > _DRIFT:
         yield Fault(
             "drifting clock",
-            f"the step changes steadily by {100 * drifts[run]:.2g} % along run {run}",
-            f"if the clock drifts and not the sampling, give even steps: --dt {traits.step:g}",
+            f"the time step drifts by {100 * drifts[run]:.2g} % along run {run}",
+            f"If the samples are even and the clock drifts, give even steps: --dt {traits.step:g}",
         )
 
 
@@ -41,11 +41,11 @@ def systems(traits: Traits) -> Iterator[Fault]:
     runs = different_systems(traits)
     if runs:
         yield Fault(
-            "different systems", f"runs {', '.join(runs[:8])} do not share one law",
-            "fit them apart, or give what differs as a column: --parameters",
+            "different systems", f"runs {', '.join(runs[:8])} do not follow the law of the others",
+            "Check their units and signs, name what differs (--parameters), or fit them apart",
         )  # fmt: skip
 
 
 def reading(traits: Traits) -> Iterator[Fault]:
     for note in traits.recording.notes:
-        yield Fault("reading", note, "nothing, if that is meant", wrong=False)
+        yield Fault("reading", note, "", wrong=False)

@@ -48,7 +48,7 @@ def related(traits: Traits) -> Iterator[Fault]:
     second = _second(recording.time_unit, factors)
     if second is not None:
         said = ", ".join(f"{v} is {r.factor:.4g} × d{x}/dt" for (x, v), r in known.items())
-        yield Fault("time unit", said, f"the times are in {second}: --time-unit {second}",
+        yield Fault("time unit", said, f"The times are in {second}: --time-unit {second}",
                     {"time_unit": second})  # fmt: skip
         return
     for (x, v), relation in known.items():
@@ -103,24 +103,26 @@ def _second(unit: str, factors: list[float]) -> str | None:
 
 def _pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]:
     factor, degree = relation.factor, 180 / np.pi
-    without = f"or leave it out: --positions {','.join(traits.recording.positions)}"
+    without = f"or ignore {v}: --positions {','.join(traits.recording.positions)}"
     alone = {"positions": traits.recording.positions}
     said = f"{v} is {factor:.4g} × d{x}/dt"
     if relation.explained < _DERIVATIVE:
         yield Fault(
-            "no derivative", f"{v} is not the derivative of {x}, which explains "
-            f"{100 * relation.explained:.0f} % of it", f"give it another role, {without}", alone,
+            "no derivative", f"{v} is not the derivative of {x}: d{x}/dt explains "
+            f"{100 * relation.explained:.0f} % of its variance",
+            f"Name {v} as an input (--inputs {v}), {without}", alone,
         )  # fmt: skip
     elif abs(factor * degree - 1) < _NEAR:
-        yield Fault("degrees", said, f"{x} is in degrees: --degrees {x}", {"degrees": (x,)})
+        yield Fault("degrees", said, f"The unit of {x} is degrees: --degrees {x}",
+                    {"degrees": (x,)})  # fmt: skip
     elif abs(factor / degree - 1) < _NEAR:
-        yield Fault("degrees", said, f"{v} is in degrees per second: --degrees {v}",
+        yield Fault("degrees", said, f"The unit of {v} is degrees per second: --degrees {v}",
                     {"degrees": (v,)})  # fmt: skip
     elif abs(factor + 1) < _NEAR:
-        yield Fault("sign", said, f"turn its sign, {without}", alone)
+        yield Fault("sign", said, f"Change the sign of {v} in the file, {without}", alone)
     elif factor < 0 or abs(np.log(factor)) > _OFF:
         yield Fault(
-            "factor", said, f"check its unit, fit its scale (--scale {v}), {without}", alone
+            "factor", said, f"Check its unit, fit its scale (--scale {v}), {without}", alone
         )
     else:
         yield from _derived(traits, x, v, relation)
@@ -129,7 +131,7 @@ def _pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]
 def _derived(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]:
     """Notes about a velocity that was made of the position."""
     alone = {"positions": traits.recording.positions}
-    without = f"--positions {','.join(traits.recording.positions)} leaves it out"
+    without = f"To ignore {v}: --positions {','.join(traits.recording.positions)}"
     kind = difference(traits.times, traits.columns[x], traits.columns[v])
     if kind is not None:
         yield Fault("difference", f"{v} is the {kind} difference of {x} and tells nothing more",
@@ -139,6 +141,6 @@ def _derived(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fau
     late = max(5 * relation.lag_error, _LATE * traits.step)
     if abs(relation.factor - 1) > error or abs(relation.lag) > late:
         yield Fault(
-            "filtered", f"{v} is {relation.factor:.3g} × d{x}/dt, {1e3 * relation.lag:.2g} ms late",
-            without, alone, wrong=False,
+            "filtered", f"{v} looks filtered: it is {relation.factor:.3g} × d{x}/dt with a lag of "
+            f"{1e3 * relation.lag:.2g} ms", without, alone, wrong=False,
         )  # fmt: skip

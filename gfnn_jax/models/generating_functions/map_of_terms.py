@@ -95,8 +95,9 @@ def learn_map(
             raise
     if best is None or not np.isfinite(best.error.bound):
         raise FitError(
-            "expected pairs that tell an S of such terms: they are too few, or no chart covers "
-            f"them{' for all values of the parameters' if data.args is not None else ''}"
+            "the pairs determine no S of such terms: they are too few, or no chart covers them"
+            f"{' for all values of the parameters' if data.args is not None else ''}. Add pairs, "
+            "or take a smaller dt"
         )
     rivals = [
         f for f in tried

@@ -74,12 +74,12 @@ def law_of(
                 dearest=np.inf if foremost else dearest, partly=partly,
             )  # fmt: skip
     except OutOfTime:
-        budget.leave_out("H", "no library of terms was fitted within the budget")
+        budget.leave_out("H", "no set of terms was fitted within the budget")
     except (FitError, np.linalg.LinAlgError) as error:
         if learn == "hamiltonian" or terms:
             raise FitError(str(error)) from error
         if isinstance(error, np.linalg.LinAlgError):
-            budget.leave_out("H", f"the arithmetic failed ({error})")
+            budget.leave_out("H", f"its linear algebra failed: {error}")
     return None
 
 
@@ -95,9 +95,9 @@ def long_step(data: Dataset, scene: Scene | None) -> list[str]:
     if angle < _TURNED:
         return []
     return [
-        f"around their centre a step of {data.dt:g} turns the states by {angle:.2g} radians "
-        f"backwards, or by {2 * np.pi - angle:.2g} forwards (ωh > π): pairs of one dt may then not "
-        "determine H; sample with a smaller dt, or with several"
+        f"a step of {data.dt:g} turns the states around their centre by {angle:.2g} radians "
+        f"backwards, or by {2 * np.pi - angle:.2g} forwards (aliasing, ωh > π): pairs of one dt "
+        "may not determine H. Sample with a smaller dt, or with several"
     ]
 
 
@@ -108,7 +108,7 @@ def unfit_for_law(data: Dataset, scene: Scene | None) -> str | None:
     if scene is not None and scene.period is not None and data.period is None:
         return f"the Hamiltonian of the scene {scene.name} depends on time"
     if any(a >= data.dim for a in data.coordinates.angles):
-        return "a momentum is an angle"
+        return "--angles (angles=) names a momentum"
     return None
 
 

@@ -73,7 +73,8 @@ class LearnedHamiltonian:
     in the end. friction: γ where that is uniform, else the terms of Rayleigh's R; of a system
     without, (). constants: numbers inside terms that noisy sequences told, each with its term and
     its standard error. symmetries: that H has to roundoff. proposals: simple fractions near its
-    numbers, which noisy sequences allow. rivals: the next two laws that they allow.
+    numbers, which noisy sequences allow. rivals: the next two laws that they allow. misfit: whether
+    these sequences are certain that H lacks something.
     """
 
     candidate: Candidate
@@ -99,6 +100,7 @@ class LearnedHamiltonian:
     symmetries: tuple[str, ...] = ()
     proposals: tuple[Proposal, ...] = ()
     rivals: tuple[Rival, ...] = ()
+    misfit: bool = False
     widths: tuple[float, ...] = ()
     turns: bool = False
     kinds: Callable[[], WhichFriction | None] | None = None
@@ -291,7 +293,7 @@ def learned_from(
                         turns)),
         stalled=found.stalled,
         covariance=covariance, noise=None if whole is None else whole.noise,
-        arcs=0 if whole is None else whole.arcs,
+        arcs=0 if whole is None else whole.arcs, misfit=whole is not None and whole.misfit,
         dropped=found.dropped, unmet=_unmet(error, omega_h, tolerance, found),
         friction=friction, constants=found.constants, symmetries=symmetries,
         proposals=found.proposals, rivals=found.rivals, widths=widths,
@@ -465,19 +467,19 @@ def unexplained(
 def _unmet(error: OneStepError, omega_h: float, tolerance, found: FittedLaw) -> str:
     if error.bound <= tolerance.bound:
         return ""
-    why = "; terms that you know would help (terms)"
+    why = "If you know terms of H, give them: --terms (terms=)"
     if omega_h > FAST:
         why = (
-            f"; it oscillates by {omega_h:.2g} radians in a step, and beyond π one dt does not "
-            "tell H: sample with a shorter one"
+            f"The motion turns by ωh = {omega_h:.2g} radians in a step; beyond π pairs of one dt "
+            "do not determine H (aliasing): sample with a smaller dt, or with several"
         )
     elif not is_smooth(found.family):
-        why = f"; {TURNS}"
+        why = TURNS.capitalize()
     elif found.ended:
-        why = f"; modes were added until {found.ended}"
+        why = f"The search for modes ended: {found.ended}"
     return (
-        "no H of the terms tried meets the tolerance: the best misses the images by "
-        f"{error.relative:.2e} of the spread{why}"
+        "no H of the terms tried meets the tolerance: the best has a one-step error of "
+        f"{error.relative:.2e} of the spread. {why}"
     )
 
 
@@ -487,23 +489,24 @@ def _messages(
 ) -> Iterator[str]:  # fmt: skip
     if error.bound <= tolerance.bound and omega_h > FAST:
         yield (
-            f"H oscillates by {omega_h:.2g} radians in a step (ωh, its median over the states"
-            f"{', beyond π' if omega_h > np.pi else ''}): an H whose frequencies differ by 2π per "
-            "step gives the same pairs, or nearly; this is the "
-            + (
-                "simplest; a smaller dt, or several, would settle it"
-                if omega_h > np.pi
-                else "slowest"
-            )
+            f"the motion turns by ωh = {omega_h:.2g} radians in a step (median over the states"
+            f"{', beyond π' if omega_h > np.pi else ''}). Pairs of one dt tell frequencies only "
+            "modulo 2π/dt (aliasing): of the H that fit, this is the "
+            + ("simplest. A smaller dt, or several, would decide" if omega_h > np.pi else "slowest")
         )
     if found.whole is not None:
         yield from found.whole.messages
+        if found.whole.misfit:
+            yield (
+                "H misses whole sequences by more than their noise: it lacks terms that single "
+                "steps do not tell; bands count what it misses"
+            )
     if found.undetermined:
         names = found.undetermined
         some = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
         yield (
-            f"the pairs do not determine {len(names)} terms of H ({some}): these terms are left "
-            "out, and H is known only near the pairs"
+            f"the pairs do not determine {len(names)} terms of H ({some}): they are left out, and "
+            "H holds only where the pairs are"
         )
     if left_out:
         yield (

@@ -36,6 +36,7 @@ from gfnn_jax.models.hamiltonians.whole_sequences import (
     Sequences,
     Whole,
     about_outliers,
+    lacks_terms,
     noise_of,
     root_of,
     tells,
@@ -289,7 +290,7 @@ def _law(
     fit = fit._replace(coefficients=c, standard_errors=deviations[:terms])
     whole = Whole(
         tuple(range(terms)), fit, _root_of_coefficients(covariance, terms), noise_of(fitted),
-        len(fitted.x), about_outliers(fitted.residuals),
+        len(fitted.x), about_outliers(fitted.residuals), lacks_terms(fitted),
     )  # fmt: skip
     error = validation_error(family, fit, data, tolerance)
     return FittedLaw(

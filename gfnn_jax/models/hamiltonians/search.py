@@ -121,7 +121,7 @@ def learn_hamiltonian(
             return found
     of_steps, arcs = data, arcs_of(data)
     if arcs is not None:
-        say(f"H: arcs of {arcs.length} steps, in which the states move far against their noise")
+        say(f"H: fitting arcs of {arcs.length} steps, for single steps are too noisy")
         data = arcs.data
     problem = Problem(
         data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
@@ -155,7 +155,8 @@ def learn_hamiltonian(
     everyone = np.arange(len(data)) if is_smooth(best.family) else best.rows
     if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
         raise FitError(
-            "expected pairs of a flow: the H that was found moves faster than its steps follow"
+            f"the H found is too fast: one dt needs {MOST_SUBSTEPS} substeps or more. Use a "
+            "smaller dt; if the pairs are of a map without a flow, use --learn map (learn='map')"
         )
     outside, what, far = None, "", everywhere.training[outer]
     whole, law = everywhere, (best.family, best.fit.coefficients)
@@ -194,14 +195,14 @@ def learn_hamiltonian(
     smooth = is_smooth(best.family)  # |v|v and sign v, whole sequences turn in
     if noisy and smooth and best.error.bound > tolerance.bound:
         what = "the fit of H to whole sequences"
-        say("H: whole sequences")
+        say("H: fitting whole sequences")
         try:
             with work.again(what, best.family, len(everywhere.training)):
                 best = _of_sequences(problem, best, everywhere, tolerance, budget)
         except OutOfTime:
             budget.leave_out(what, budget.ended)
         except np.linalg.LinAlgError as error:
-            budget.leave_out(what, f"the arithmetic failed ({error})")
+            budget.leave_out(what, f"its linear algebra failed: {error}")
     seconds = time.perf_counter() - started
     learned = learned_from(best, problem, everywhere, tolerance, seconds, options, of_arcs)
     candidate = dataclasses.replace(learned.candidate, outside=outside)
@@ -289,7 +290,7 @@ def _searched(
     try:
         for i, family in enumerate(libraries):
             if tried and too_dear(problem, family, tried[-1], data, tolerance, work.dearest):
-                say(f"H: {family.num_parameters} terms would cost more than the map at hand")
+                say(f"H: {family.num_parameters} terms skipped, dearer per step than the map found")
                 continue
             if i < len(early):
                 found = early[i]
@@ -424,7 +425,8 @@ def _grown(
         ended = ended or work.ended
     if grown is None or not np.isfinite(grown.rms):
         raise FitError(
-            f"expected more pairs, or pairs of a flow: {len(data.y0)} tell no library of modes"
+            f"expected more pairs: {len(data.y0)} determine no H of Fourier modes. If they are of "
+            "a map without a flow, use --learn map (learn='map')"
         )
     work.capped((1 - options.growth_part) * options.mode_operations)
     count = int(np.ceil(options.judged_rows * len(grown.coefficients) / (2 * data.dim)))

@@ -9,11 +9,11 @@ restricted where these allow it; a law then has the symmetry to roundoff, and co
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.diagnosis.symmetries import generators, reflections
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.phase_space import symplectic_form
 
@@ -98,60 +98,12 @@ def _candidates(family: Terms, z: np.ndarray, angles: tuple[int, ...]) -> Iterat
     dim = family.dim
     with np.errstate(all="ignore"):
         gradients = family.term_gradients(z)
-        for text, generator in _generators(dim, angles):
+        for text, generator in generators(dim, angles):
             # {φ, I} = ∇φᵀ J ∇I, of a quadratic or linear I with ∇I = A z + b.
             moved = (z @ generator[:, :-1].T + generator[:, -1]) @ symplectic_form(dim).T
             yield Symmetry(text, np.einsum("nij,ni->nj", gradients, moved))
-        for text, matrix in _reflections(dim, angles):
+        for text, matrix in reflections(dim, angles):
             there = np.einsum("ki,nkj->nij", matrix, family.term_gradients(z @ matrix.T))
             rows = (gradients - there).reshape(-1, gradients.shape[-1])
             if np.isfinite(rows).all():
                 yield Symmetry(text, rows)
-
-
-def _generators(dim: int, angles: tuple[int, ...]) -> Iterator[tuple[str, np.ndarray]]:
-    """(text, [A b] (2d, 2d + 1)) of the generators I = ½ zᵀA z + bᵀz."""
-    one = dim == 1
-    plain = [i for i in range(dim) if i not in angles]
-    for i in range(dim):
-        yield (
-            f"translation of q{i + 1}: p{i + 1} conserved",
-            _generator(dim, linear={i + dim: 1.0}),
-        )
-    if not one:
-        yield (
-            "translation of all positions: the sum of all momenta conserved",
-            _generator(dim, linear={i + dim: 1.0 for i in range(dim)}),
-        )
-    for i, j in combinations(plain, 2):
-        yield (
-            f"rotation in (q{i + 1}, q{j + 1}): angular momentum "
-            f"q{i + 1} p{j + 1} − q{j + 1} p{i + 1} conserved",
-            _generator(dim, {(i, j + dim): 1.0, (j, i + dim): -1.0}),
-        )
-    if len(plain) == dim:
-        squares = "q1² + p1²" if one else "the sum of all q² + p²"
-        yield (
-            f"rotation of every (q, p): {squares} conserved",
-            _generator(dim, {(i, i): 1.0 for i in range(2 * dim)}),
-        )
-
-
-def _generator(dim: int, quadratic=None, linear=None) -> np.ndarray:
-    found = np.zeros((2 * dim, 2 * dim + 1))
-    for (i, j), value in (quadratic or {}).items():
-        found[i, j] = found[j, i] = value
-    for i, value in (linear or {}).items():
-        found[i, -1] = value
-    return found
-
-
-def _reflections(dim: int, angles: tuple[int, ...]) -> Iterator[tuple[str, np.ndarray]]:
-    """(text, R (2d, 2d)) of the linear maps under which H may be the same."""
-    yield "reversal of time", np.diag(np.repeat([1.0, -1.0], dim))
-    yield "reflection of all coordinates", -np.eye(2 * dim)
-    for i, j in combinations(range(dim), 2):
-        if (i in angles) == (j in angles):
-            order = np.arange(2 * dim)
-            order[[i, j, i + dim, j + dim]] = order[[j, i, j + dim, i + dim]]
-            yield f"exchange of degrees of freedom {i + 1} and {j + 1}", np.eye(2 * dim)[order]

@@ -14,10 +14,11 @@ _PAIRS = 2_000  # whose residuals are looked at
 
 def leaves_white(law: LearnedHamiltonian, data: Dataset) -> bool:
     """Return whether no polynomial generator explains more than chance of what the law leaves over,
-    by an F test (`learned_law.unexplained`). False where the pairs are too few to tell, and of a
-    law with parameters or over sites."""
+    by an F test (`learned_law.unexplained`). False where the pairs are too few to tell, of a law
+    with parameters or over sites, and where whole sequences are certain of a misfit."""
     family = without_forces(law.flow.family)
-    if not isinstance(family, Terms) or data.varied or data.structure is not None:
+    plain = isinstance(family, Terms) and not data.varied and data.structure is None
+    if not plain or law.misfit:
         return False
     rows = np.sort(data.training)[:_PAIRS]
     residual = data.y1[rows] - law.flow.image(data.y0[rows])

@@ -30,13 +30,15 @@ _ROWS_PER_TERM = 200
 _STATES = 100  # from which the noise and its growth along an arc are measured
 _STEP_ERROR = 0.01  # of a step's own error ÷ the noise
 _IN_A_ROW = 2.5  # times the noise: neighbours of a state that stands alone stay below
-_BY_CHANCE = 2.0  # standard errors of the arcs' variation, within which it is that of noise
+# Misfit is certain beyond so many standard errors of the arcs' variation, and so much of that of
+# noise, which alone varies by a quarter.
+_BY_CHANCE, _CLEAR = 2.0, 0.5
 
 
 class Whole(NamedTuple):
     """kept: places of the family's terms that are left. fit: theirs. root: (k, k), rootᵀ root is
     the coefficients' covariance. noise: (2d,) standard deviation of each coordinate's noise. arcs:
-    into which the sequences were cut. messages: about gross errors."""
+    into which the sequences were cut. messages: about gross errors. misfit: as `lacks_terms`."""
 
     kept: tuple[int, ...]
     fit: FlowFit
@@ -44,6 +46,7 @@ class Whole(NamedTuple):
     noise: np.ndarray
     arcs: int
     messages: tuple[str, ...]
+    misfit: bool = False
 
 
 class Measured(NamedTuple):
@@ -153,7 +156,7 @@ def fitted_to_sequences(
     return Whole(
         kept,
         fit._replace(coefficients=found.p, standard_errors=np.linalg.norm(root, axis=0)),
-        root, noise_of(found), len(found.x), about_outliers(found.residuals),
+        root, noise_of(found), len(found.x), about_outliers(found.residuals), lacks_terms(found),
     )  # fmt: skip
 
 
@@ -202,10 +205,22 @@ def root_of(found: Fitted) -> np.ndarray:
     the terms cannot represent.
     """
     root, (arcs, count) = triangle_of(found).spectrum().root().T, found.scores.shape
-    each = np.sum((found.scores @ root.T) ** 2, axis=1) / count
-    misfit = max(each.sum() / max(1 - count / arcs, 1 / arcs) - 1.0, 0.0)
-    certain = misfit > _BY_CHANCE * np.sqrt(arcs) * each.std()
+    misfit, certain = _misfit(found.scores @ root.T)
     return root * np.sqrt(1.0 + misfit * (max(arcs / count, 1.0) if certain else 1.0))
+
+
+def lacks_terms(found: Fitted) -> bool:
+    """Return whether the arcs are certain that the law misses more than noise."""
+    return _misfit(found.scores @ triangle_of(found).spectrum().root())[1]
+
+
+def _misfit(scores: np.ndarray) -> tuple[float, bool]:
+    """What the arcs' gradients (arcs, count), in units of what noise makes of all of them, vary by
+    more than by noise, and whether that is certain."""
+    arcs, count = scores.shape
+    each = np.sum(scores**2, axis=1) / count
+    misfit = max(float(each.sum()) / max(1 - count / arcs, 1 / arcs) - 1.0, 0.0)
+    return misfit, misfit > max(_CLEAR, _BY_CHANCE * float(np.sqrt(arcs) * each.std()))
 
 
 def about_outliers(residuals: np.ndarray) -> tuple[str, ...]:

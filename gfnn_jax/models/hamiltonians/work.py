@@ -37,7 +37,7 @@ class LawWork:
     @property
     def ended(self) -> str:
         """Reason that cut the search short; "" where nothing has."""
-        capped = f"a search for H may take {self._cap.most:.2g} operations, and has taken them"
+        capped = f"the search for H reached its own limit of {self._cap.most:.2g} operations"
         return self.budget.ended or (capped if self._cap.spent > self._cap.most else "")
 
     @property

@@ -42,6 +42,22 @@ class Horizon(NamedTuple):
     predicted: float
 
 
+class Calibration(NamedTuple):
+    """The law with the window of its estimates and its misfit, its horizons, and the median errors
+    (n, k) of forecasts by the time ahead, in units of the spread."""
+
+    law: Law
+    horizons: list[Horizon]
+    median: np.ndarray
+
+    def against(self, other: Calibration) -> float:
+        """Median errors as a multiple of another's, in the geometric mean; 1 where they are of
+        other times."""
+        if self.median.shape != other.median.shape or not self.median.size:
+            return 1.0
+        return float(np.exp(np.mean(np.log(self.median / other.median))))
+
+
 class Thirds(NamedTuple):
     """The laws learned without each third of a record, and (stretch, time) where these begin."""
 
@@ -55,12 +71,12 @@ class Thirds(NamedTuple):
 
 def calibrated(
     law: Law, thirds: Thirds, found: Sequence[Stretch], scales: Scales, spread: np.ndarray
-) -> tuple[Law, list[Horizon]]:
+) -> Calibration:
     """The law with the best window for its estimates and the misfit of its forecasts, and its
     horizons. ``spread`` (k,) of the channels."""
     starts = _starts(found, scales)
     if not starts:
-        return law, []
+        return Calibration(law, [], np.zeros((0, len(spread))))
     short = (_SHORT - 1) * scales.dt
     choices = []
     for periods in _CHOICES:
@@ -82,7 +98,7 @@ def calibrated(
     told = np.isfinite(errors).all(axis=-1).sum(axis=0) >= _FEWEST
     leads, errors, deviations = leads[told], errors[:, told], deviations[:, told]
     if not len(leads):
-        return law, []
+        return Calibration(law, [], np.zeros((0, len(spread))))
     missed = np.nanquantile(errors**2 / 4 - deviations**2, _INSIDE, axis=0)
     misfit = np.sqrt(np.maximum(missed, 0.0))
     sensors = dataclasses.replace(law.sensors, window=best[0], leads=leads, misfit=misfit)
@@ -92,7 +108,8 @@ def calibrated(
     horizons = [
         Horizon(f, _passed(measured, leads, f), _passed(predicted, leads, f)) for f in FRACTIONS
     ]
-    return law._replace(sensors=sensors), horizons
+    median = np.nanmedian(np.abs(errors), axis=0) / spread
+    return Calibration(law._replace(sensors=sensors), horizons, median)
 
 
 def _shared(values: np.ndarray) -> np.ndarray:

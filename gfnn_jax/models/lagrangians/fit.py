@@ -15,6 +15,7 @@ from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.arcs import LawOnArcs
 from gfnn_jax.models.lagrangians.structure import Key, Structure
 from gfnn_jax.solve.latent_arcs import Fitted, fit_arcs, rows_of_arcs, sensitivities
+from gfnn_jax.solve.wander import Wander
 
 _SETTLED = 1.15  # a noise scale that changed by less needs no second fit
 _NOTHING = 1e-9  # of the largest singular value of scaled columns: a combination that does nothing
@@ -76,12 +77,19 @@ class Without(NamedTuple):
 @dataclasses.dataclass(frozen=True, eq=False)
 class Workbench:
     """Basis that all fits of one recording share: positions of the gauge, the inputs of arcs, the
-    fastest frequency ω, and how states are seen."""
+    fastest frequency ω, how states are seen, and how zeros of channels wander, if they do."""
 
     gauge: np.ndarray
     inputs: Any  # of arcs: ArcInputs, or a function in its place
     omega: float
     seen: Observation
+    wander: Wander | None = None
+
+    def whitening(self, arcs: Arcs) -> np.ndarray | None:
+        """Whitening (A, k, L, L) of the residuals of arcs; None where they are white."""
+        if self.wander is None:
+            return None
+        return self.wander.whitening(arcs.t, np.where(np.isfinite(arcs.y), arcs.noise, np.inf))
 
     def model(self, structure: Structure, arcs: Arcs, given: np.ndarray, free: np.ndarray):
         form = structure.form(self.gauge)
@@ -110,26 +118,30 @@ class Workbench:
         p = structure.start(known)
         x = arcs.x
         model = self.model(structure, arcs, p, np.arange(len(p)))
+        whitening = self.whitening(arcs)
         for _ in range(3 if rescale else 1):
             noise, scale = sigma * arcs.noise, self.state_scale(sigma)
             found = fit_arcs(
                 model, p, x, arcs.y, noise, scale, tolerance=1e-4 if rescale else 1e-3,
-                loss=self.seen.loss,
+                loss=self.seen.loss, whitening=whitening,
             )  # fmt: skip
             p, x = found.p, found.x
-            change = np.nanmedian(np.abs(found.residuals), axis=(0, 1)) / 0.6745
+            change = np.nanmedian(np.abs(found.whitened), axis=(0, 1)) / 0.6745
             change = np.maximum(change, 1e-3)
             if not rescale or np.max(np.abs(np.log(change))) < np.log(_SETTLED):
                 break
             sigma = sigma * change
-        return LawFit(structure, model.form, arcs, found, sigma, correlation_time(found.residuals))
+        return LawFit(structure, model.form, arcs, found, sigma, correlation_time(found.whitened))
 
     def held_out(self, fit: LawFit, arcs: Arcs) -> np.ndarray:
         """The cost (A,) of arcs that the fit has not seen, with their own states."""
         model = self.model(fit.structure, arcs, fit.p, np.arange(0))
         noise, scale = fit.sigma * arcs.noise, self.state_scale(fit.sigma)
         loss = self.seen.loss
-        found = fit_arcs(model, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, 1e-3, loss)
+        found = fit_arcs(
+            model, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, 1e-3, loss,
+            whitening=self.whitening(arcs),
+        )  # fmt: skip
         if not np.isfinite(found.cost):
             return np.full(len(arcs.home), np.inf)
         return np.nansum(loss.of(found.residuals), axis=(1, 2))
@@ -152,9 +164,12 @@ class Workbench:
         arcs, third = in_thirds(nodes, fit)
         noise, scale, loss = fit.sigma * arcs.noise, self.state_scale(fit.sigma), self.seen.loss
         known = self.model(fit.structure, arcs, fit.p, np.arange(0))
-        own = fit_arcs(known, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, loss=loss)
+        whitening = self.whitening(arcs)
+        own = fit_arcs(
+            known, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, loss=loss, whitening=whitening
+        )
         model = self.model(fit.structure, arcs, fit.p, np.arange(len(fit.p)))
-        rows = rows_of_arcs(model, fit.p, own.x, arcs.y, noise, loss)
+        rows = rows_of_arcs(model, fit.p, own.x, arcs.y, noise, loss, whitening)
         found = []
         for k in np.unique(third):
             i, first, _ = arcs.home[int(np.argmax(third == k))]
@@ -176,7 +191,8 @@ class Workbench:
         p = larger.start(known)
         model = self.model(larger, fit.arcs, p, np.arange(len(p)))
         noise = fit.sigma * fit.arcs.noise
-        R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, self.seen.loss)
+        white = self.whitening(fit.arcs)
+        R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, self.seen.loss, white)
         old = [keys.index(k) for k in known]
         own = [keys.index(k) for k in new]
         Q = np.linalg.qr(R[:, old])[0] if old else np.zeros((len(R), 0))

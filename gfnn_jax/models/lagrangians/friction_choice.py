@@ -143,7 +143,8 @@ def _table_of(bench: Workbench, fit: LawFit, candidates: Sequence[Loss]) -> Tabl
     p = larger.start(fit.values)
     model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
     noise, loss = fit.sigma * fit.arcs.noise, bench.seen.loss
-    rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, noise, loss)
+    white = bench.whitening(fit.arcs)
+    rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, noise, loss, white)
     keys = larger.keys()
     own = [keys.index(("loss", row)) for row in candidates]
     rest = [k for k in range(len(keys)) if k not in own]

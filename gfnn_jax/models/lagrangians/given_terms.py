@@ -66,7 +66,7 @@ def given_terms(
         rows = [(speeds_of, none, none, 0.0) for speeds_of in own] + rows
     first = next((row for row in rows if row[0][0] == 2), None)
     if first is None:
-        raise InputError(f"terms: expected one with {speeds[0]}**2, which sets the scale of L")
+        raise InputError(f"terms: add a kinetic one, {speeds[0]}**2, which sets the scale of L")
     ordered = dict.fromkeys([first, *rows])
     moving = tuple(row for row in ordered if any(map(any, row[:3])))  # constants move nothing
     return Given(moving, tuple(dict.fromkeys(losses)) if "R" in kinds else None)
@@ -176,9 +176,9 @@ class _Reader(NamedTuple):
 
     def refused(self, text: str) -> InputError:
         return InputError(
-            f"terms: '{text}' is no term of a law: expected powers of {', '.join(self.positions)} "
-            f"times cos or sin of whole multiples, and up to two of {', '.join(self.speeds)}; of "
-            "R v**2, abs(v)**3 or abs(v)"
+            f"terms: '{text}' is no term of a law. A term of L or V is a product of powers of "
+            f"{', '.join(self.positions)}, one cos or sin of a sum of whole multiples of them, and "
+            f"in L up to two of {', '.join(self.speeds)}; one of R is v**2, abs(v)**3 or abs(v)"
         )
 
 

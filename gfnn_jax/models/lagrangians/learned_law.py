@@ -21,6 +21,14 @@ _RULES = {
     "linear": "linear between samples",
     "band": "band-limited between samples",
 }
+_SHOWN = 3  # pairs of coefficients that are not told apart
+
+
+def _time(seconds: float) -> str:
+    """A horizon in words."""
+    if seconds == 0:
+        return "at no time, for the noise alone is larger"
+    return f"for {seconds:.3g} s" if np.isfinite(seconds) else "for more than eight periods"
 
 
 class NextMotion(NamedTuple):
@@ -32,8 +40,8 @@ class NextMotion(NamedTuple):
 
     def __str__(self) -> str:
         at = ", ".join(f"{name} = {q:.3g}" for name, q in self.start.items())
-        best = ", ".join(f"{t} {min(g, 1000):.2g}" for t, g in [*self.gains.items()][:3])
-        return f"let go at {at}: standard errors smaller by factors, {best}"
+        best = ", ".join(f"of {t} {min(g, 1000):.2g}×" for t, g in [*self.gains.items()][:3])
+        return f"release from rest at {at}. Standard errors shrink: {best}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -92,32 +100,37 @@ class LearnedLaw:
     def table(self) -> str:
         """The law, its errors and its horizon, a line each."""
         lines = [f"L = {self.lagrangian}", f"R = {self.friction}"]
-        lines += [f"friction: {self.which_friction}", f"gauge: {self.gauge}"]
+        lines += [f"friction: {self.which_friction}", f"scale of L: {self.gauge}"]
+        lines += [f"not told apart: {pair}" for pair in self.alike[:_SHOWN]]
         lines += [
-            f"{name}: zero at {zero:.5f}({std:.5f})" for name, (zero, std) in self.zeros.items()
+            f"{name}: zero at {measured(zero, std)} rad" for name, (zero, std) in self.zeros.items()
         ]
         lines += [f"{column} shows {formula}" for column, formula in self.observe.items()]
         lines += [f"{name} = {measured(value, std)}" for name, (value, std) in self.sensors.items()]
-        lines += [f"{name}: {one.text}" for name, one in self.velocities.items()]
+        lines += [f"velocity {name}: {one.text}" for name, one in self.velocities.items()]
         for name, forces in self.gains.items():
             told = ", ".join(f"{q} {g:.6g} ± {s:.2g}" for q, (g, s) in forces.items())
-            lines.append(f"force of {name}: {told}")
+            lines.append(f"gain of {name}, force per unit of it: {told}")
         lines += [self._inputs_told] if self.delay is not None else []
         energy = self.energy
         lines.append(
-            f"energy per second: stored {energy['stored']:.3g}, lost "
-            f"{sum(energy['lost'].values()):.3g}, supplied {sum(energy['supplied'].values()):.3g}, "
+            f"energy per second: stored {energy['stored']:.3g} = supplied "
+            f"{sum(energy['supplied'].values()):.3g} - lost {sum(energy['lost'].values()):.3g} + "
             f"unexplained {energy['closure']:.1g}"
         )
+        wander = self.map.sensors.wander if self.map.sensors is not None else None
         for name, sigma in self.noise.items():
+            zero = "" if wander is None else (
+                f" on a zero that wanders by {wander.size * sigma:.3g} over {wander.time:.3g} s"
+            )  # fmt: skip
             lines.append(
-                f"{name}: noise {sigma:.3g}, residual of the law {self.residual[name]:.3g}, "
-                f"{self.whiteness[name].text}"
+                f"{name}: noise σ {sigma:.3g}{zero}, RMS residual {self.residual[name]:.3g} (unit "
+                f"of the file); residuals {self.whiteness[name].text}"
             )
         for fraction, seconds, predicted in self.horizon:
             lines.append(
-                f"95 % of forecasts within {fraction:.0%} of the spread for {seconds:.3g} s (by "
-                f"the bands {predicted:.3g} s)"
+                f"95 % of forecasts err by less than {fraction:.0%} of the spread: "
+                f"{_time(seconds)} (by the bands {_time(predicted)})"
             )
         lines += [f"to record next: {motion}" for motion in self.next_motions[:1]]
         return "\n".join(lines)
@@ -130,7 +143,7 @@ class LearnedLaw:
         delay, error = self.delay
         rule = _RULES[self.map.sensors.hold]
         if not np.isfinite(error):
-            return f"inputs: {rule}; what they do later the record does not tell"
+            return f"inputs: {rule}; the record does not determine their delay"
         if delay == 0:
             return f"inputs: {rule}, no delay seen (standard error {error:.2g} s)"
         return f"inputs: {rule}, acting {measured(delay, error)} s later"

@@ -48,7 +48,8 @@ def next_motions(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[M
     keys = larger.keys()
     p, noise = larger.start(fit.values), fit.sigma * fit.arcs.noise
     model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
-    R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, bench.seen.loss)[:, :-1]
+    loss, white = bench.seen.loss, bench.whitening(fit.arcs)
+    R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, loss, white)[:, :-1]
     own = [k for k, key in enumerate(keys) if key in known]
     Q = np.linalg.qr(R[:, own])[0]
     rest = np.linalg.norm(R - Q @ (Q.T @ R), axis=0)
@@ -61,7 +62,8 @@ def next_motions(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[M
     for arcs in _followed(bench, fit, _starts(bench, fit, angles)):
         model = bench.model(larger, arcs, p, np.arange(len(p)))
         model = dataclasses.replace(model, u=np.zeros_like(model.u))
-        J = sensitivities(model, p, arcs.x, arcs.y, fit.sigma * arcs.noise)[:, :-1]
+        noise, white = fit.sigma * arcs.noise, bench.whitening(arcs)
+        J = sensitivities(model, p, arcs.x, arcs.y, noise, whitening=white)[:, :-1]
         after = before + _information(J[:, kept] / scale)
         less = np.sqrt(np.diag(_inverse(before)) / np.diag(_inverse(after)))
         order = np.argsort(-less)

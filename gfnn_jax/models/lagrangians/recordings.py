@@ -16,32 +16,30 @@ import numpy as np
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
+from gfnn_jax.dataset.rests import moving
 from gfnn_jax.dataset.stretches import Nodes, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
+from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.flows.motion import WEIGHTS
-from gfnn_jax.maps.estimates import law_in_use
 from gfnn_jax.maps.inputs import HOLDS, Signals
-from gfnn_jax.maps.laws import conformal, map_of_law
+from gfnn_jax.maps.laws import map_of_law
 from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.calibration import Thirds, calibrated
-from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
+from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_law import fit_given
 from gfnn_jax.models.lagrangians.given_terms import Given, given_terms
+from gfnn_jax.models.lagrangians.in_use import Record, best_in_use
 from gfnn_jax.models.lagrangians.learned_law import (
     LearnedLaw,
     NextMotion,
     hamiltonian_of,
-    in_columns,
-    scaled,
 )
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.next_motion import Motion, next_motions
 from gfnn_jax.models.lagrangians.residuals import Trace, whiteness
-from gfnn_jax.models.lagrangians.search import SearchOptions, describe, search
+from gfnn_jax.models.lagrangians.search import NO_LAW, SearchOptions, describe, search
 from gfnn_jax.models.lagrangians.text import (
     Expression,
     Term,
@@ -49,6 +47,7 @@ from gfnn_jax.models.lagrangians.text import (
     speed_names,
     terms_of,
     which_friction_told,
+    word_of,
 )
 from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels
 from gfnn_jax.solve.robust import Loss
@@ -66,7 +65,7 @@ def fit_recording(
     """The law of a recording, from its positions and inputs.
 
     friction: "auto", "none", "linear", "quadratic", "dry", or several of them, as
-    "linear+dry". input_hold: "auto", or how inputs go on between samples: "hold", "linear" or
+    "linear+dry". input_hold: "auto", or the inputs between samples: "hold", "linear" or
     "band". mass: the known mass (or moment of inertia) of one position, which fixes the scale of L.
     terms: those of L, V and R, as text in the names of columns (`models.lagrangians.given_terms`),
     which are then all that is fitted. loss: of residuals in units of their noise; None: the soft L1
@@ -92,6 +91,11 @@ def fit_recording(
         seen = seen.shifted(np.where(np.isin(range(seen.dim), far), middle, 0.0))
         found = _stretches(recording, seen, angles)
     scales = measure(found)
+    if seen.is_plain:
+        found, resting = moving(found, scales)
+        if resting:
+            scales = measure(found)
+            told(f"{resting:.3g} s at rest left out")
     given = np.array([recording.std[name] or np.nan for name in seen.channels])
     scales = dataclasses.replace(scales, sigma=np.where(given > 0, given, scales.sigma))
     asked = _asked(terms, seen, options.dry_width * float(np.mean(scales.speed)))
@@ -106,7 +110,7 @@ def fit_recording(
     acting, choice, nodes = search(*record) if asked is None else fit_given(asked, *record)
     fit, inputs_of = acting.fit, acting.bench.inputs
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
-        raise FitError("no law of the terms tried follows this recording from sample to sample")
+        raise FitError(NO_LAW)
     finer = scales.substeps_for(fit.sigma)  # local cubics may have seen more noise than there is
     if finer > scales.substeps:
         inputs_of = ArcInputs(nodes, finer, acting.hold, acting.delay)
@@ -116,7 +120,7 @@ def fit_recording(
     speeds = velocities(recording, fit, nodes)
     honest = tuple(name for name, one in speeds.items() if one.used)
     for name, one in speeds.items():
-        told(f"{name}: {one.text}")
+        told(f"velocity {name}: {one.text}")
     if honest:
         own = np.array([speeds[name].sigma for name in honest])
         seen = seen.beside({n: recording.velocities.index(n) for n in honest})
@@ -126,55 +130,37 @@ def fit_recording(
         scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, own]))
         given = np.array([recording.std[name] or np.nan for name in seen.channels])
         found = _stretches(recording, seen, angles)
+    _check_told(fit, seen)
+    told("bands: forecasting from windows of the record")
+    bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
+    record = Record(recording, nodes, found, scales, given, mass or {}, acting.hold, acting.delay)
+    best = best_in_use(record, bench, fit, choice, told)
+    fit, law, sensors = best.fit, best.law, best.calibration.law.sensors
     first = fit.form.count + len(fit.structure.zeros)
-    fitted = dataclasses.replace(seen, values=fit.p[first:])
-    _check_told(fit, fitted)
-    law, covariance = in_columns(fit)
-    names = recording.coordinates
-    gauge = f"the mean of M11 over the data is 1 ({names[0]})"
-    scale = 1.0
-    if mass:
-        (name, value), i = next(iter(mass.items())), names.index(next(iter(mass)))
-        masses = law.masses(np.concatenate([n.x[:, : fit.form.dim] for n in nodes]))
-        scale = value / float(np.mean(masses[:, i, i]))
-        law, covariance = scaled(law, covariance, scale)
-        gauge = f"the mean mass of {name} over the data is {value:g}"
     x = np.concatenate([n.x for n in nodes])
     d = fit.form.dim
     zeros = np.zeros(d)
     zeros[list(fit.structure.zeros)] = fit.p[fit.form.count : first]
     q, v = x[:, :d] + zeros, x[:, d:]
-    moving, of_moving = conformal(law, covariance)
-    root = _root(of_moving)
-    noise = np.where(given > 0, given, np.minimum(scales.sigma, fit.rms()))
-    sensors = Sensors(
-        names, recording.inputs, recording.angles, noise, scales.omega, scales.period, acting.hold,
-        acting.delay, np.array([scales.period]), np.zeros((1, len(noise))),
-        None if seen.is_plain and loss is None else fitted,
-    )  # fmt: skip
-    bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
-    told("bands: forecasts from windows of the record")
-    spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
-    thirds = _thirds(bench, nodes, fit, sensors, found)
-    used, horizons = calibrated(law_in_use(moving, root, sensors), thirds, found, scales, spread)
     z = np.concatenate([q, law.momentum(q, v)], axis=1)
     u = np.concatenate([n.stretch.u[n.at] for n in nodes])
     signals = Signals(recording.inputs, acting.hold, acting.delay) if recording.inputs else None
     map_ = map_of_law(
-        moving,
+        best.moving,
         z,
         scales.dt,
         angles=angles,
         signals=signals,
         inputs=u if signals else None,
-        root=root,
+        root=best.root,
     )
-    map_ = _with_sensors(map_, used.sensors)
+    map_ = _with_sensors(map_, sensors)
     traces = _traces(recording, seen.channels, fit, law, nodes, zeros, inputs_of)
-    told("which motion to record next")
-    motions = next_motions(bench, fit, angles)
+    told("finding the motion to record next")
+    motions = next_motions(best.bench, fit, angles)
     return _described(
-        recording, fit, map_, law, covariance, (choice, scale), horizons, gauge, tuple(steps),
+        recording, fit, map_, law, best.covariance, (best.choice, best.scale),
+        best.calibration.horizons, best.gauge, tuple(steps),
         traces, motions, time.process_time() - started, speeds,
         (acting.delay, acting.error) if recording.inputs else None,
     )  # fmt: skip
@@ -194,7 +180,7 @@ def _options(friction: str) -> SearchOptions:
 
 def _check(recording: Recording, input_hold: str, mass: Mapping[str, float] | None) -> None:
     if not recording.coordinates:
-        raise InputError(f"{recording.source}: expected positions, found none (--positions)")
+        raise InputError(f"{recording.source}: no positions. Name them: --positions (positions=)")
     if input_hold not in ("auto", *HOLDS):
         raise InputError(f"expected input_hold auto, {', '.join(HOLDS)}, got {input_hold!r}")
     for name, value in (mass or {}).items():
@@ -222,8 +208,8 @@ def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
     if open_:
         shown = ", ".join(names[i] for i in lengths)
         raise InputError(
-            f"{', '.join(open_)}: every scale of {shown} has a law of the same terms: leave it "
-            "out, or observe a velocity of known scale beside"
+            f"{', '.join(open_)}: not identifiable, for every scale of {shown} has a law of the "
+            "same terms. Take it out of --scale or --observe, or observe a velocity of known scale"
         )
     return seen, angles
 
@@ -245,8 +231,8 @@ def _check_told(fit: LawFit, seen: Observation) -> None:
         left = R[:, k] - others @ np.linalg.lstsq(others, R[:, k], rcond=None)[0]
         if not np.linalg.norm(left) > _IMITATED * size[k]:
             raise FitError(
-                f"{name}: the record does not tell it from the coefficients of the law: leave it "
-                "out, or give it as a number"
+                f"{name}: not identifiable from this record, for coefficients of the law act as it "
+                "does. Write its value into --observe (observe=), or leave it out"
             )
 
 
@@ -254,33 +240,6 @@ def _asked(terms: Sequence[Any], seen: Observation, width: float) -> Given | Non
     """The terms that were given, by the names of formulas."""
     names = symbols((*seen.coordinates, *seen.speeds))
     return given_terms(terms, names[: seen.dim], names[seen.dim :], width) if terms else None
-
-
-def _root(covariance: np.ndarray) -> np.ndarray:
-    """rootᵀ root = covariance, of its eigenvalues above roundoff."""
-    values, vectors = np.linalg.eigh(covariance)
-    kept = values > 1e-14 * max(float(values.max(initial=0.0)), 1e-300)
-    return np.sqrt(values[kept])[:, None] * vectors[:, kept].T
-
-
-def _thirds(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, sensors: Sensors,
-    found: Sequence[Stretch],
-) -> Thirds:  # fmt: skip
-    """The laws of the record without each third, of which less data tell less."""
-    fewer, laws, begins = np.sqrt(FOLDS / (FOLDS - 1)), [], []
-    for other, run, t in bench.without_thirds(nodes, fit):
-        law, covariance = in_columns(other)
-        own = sensors
-        if sensors.observation is not None:
-            first = fit.form.count + len(fit.structure.zeros)
-            shown = dataclasses.replace(sensors.observation, values=other.p[first:])
-            own = dataclasses.replace(sensors, observation=shown)
-        laws.append(law_in_use(law, fewer * _root(covariance), own))
-        begins.append(
-            next((i, t) for i, s in enumerate(found) if s.run == run and s.t[0] <= t <= s.t[-1])
-        )
-    return Thirds(tuple(laws), tuple(begins))
 
 
 def _with_sensors(map_: Any, sensors: Sensors) -> Any:
@@ -375,20 +334,9 @@ def _in_words(
             name: float(q / recording.factors.get(name, 1.0))
             for name, q in zip(recording.coordinates, motion.start, strict=True)
         }
-        told = {_word(key, codes, speeds): gain for key, gain in motion.gains.items()}
+        told = {word_of(key, codes, speeds): gain for key, gain in motion.gains.items()}
         named.append(NextMotion(start, told))
     return tuple(named)
-
-
-def _word(key: Any, codes: Sequence[str], speeds: Sequence[str]) -> str:
-    """A coefficient by its term."""
-    kind, *rest = key
-    one, none = np.ones(1), np.zeros(1)
-    if kind == "term":
-        return terms_of(Terms.of(rest, len(codes)), one, none, codes, speeds).terms[0].term
-    if kind == "loss":
-        return "R: " + friction_of(Friction.of(rest, len(codes)), one, none, speeds).terms[0].term
-    return f"{'gain' if kind == 'gain' else 'zero'} of {codes[rest[0]]}"
 
 
 def _traces(
@@ -435,7 +383,9 @@ def _alike(fit: LawFit, lagrangian: Expression, friction: Expression) -> tuple[s
     listed, together = list(names.values()), [names[key] for key in fit.untold()]
     pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > _ALIKE, 1)), strict=True)
     only = (f"{', '.join(together)}: only together",) if together else ()
-    return only + tuple(f"{listed[i]} and {listed[j]} ({correlation[i, j]:+.3f})" for i, j in pairs)
+    return only + tuple(
+        f"{listed[i]} and {listed[j]} (correlation {correlation[i, j]:+.3f})" for i, j in pairs
+    )
 
 
 def _energy(

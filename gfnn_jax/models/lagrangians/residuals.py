@@ -64,14 +64,14 @@ class Whiteness(NamedTuple):
         seen = np.flatnonzero(self.autocorrelation[1:] > self.bound)
         found = "white" if self.white else (
             f"not white (ρ = {self.autocorrelation[1:][np.argmax(self.autocorrelation[1:])]:.2f}"
-            + (f", up to {self.lags[1 + seen[-1]]:.3g} s)" if len(seen) else ")")
+            + (f", up to a lag of {self.lags[1 + seen[-1]]:.3g} s)" if len(seen) else ")")
         )  # fmt: skip
         told = "".join(
-            f"; {'with' if one.seen else 'none with'} {name} (ρ = {one.correlation:+.2f} at "
-            f"{one.lag:.3g} s)"
+            f"; {'correlated' if one.seen else 'not correlated'} with {name} (ρ = "
+            f"{one.correlation:+.2f} at a lag of {one.lag:.3g} s)"
             for name, one in self.inputs.items()
         )
-        return f"{found}{told}; fit {self.fit_percent:.2f} %"
+        return f"{found}{told}; {self.fit_percent:.2f} % of the variation followed"
 
 
 def whiteness(

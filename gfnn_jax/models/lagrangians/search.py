@@ -25,9 +25,16 @@ from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, which_fr
 from gfnn_jax.models.lagrangians.input_rules import Acting, choose_rule, with_delay
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.structure import Key, Loss, Structure
+from gfnn_jax.models.lagrangians.text import word_of
 from gfnn_jax.models.lagrangians.weak_start import protected, weak_start
 
 _AS_WELL = 1.01  # times the cost, with which a law follows the record as well
+
+NO_LAW = (
+    "no law of the terms tried follows this recording. Check units and roles (gfnn look); name a "
+    "missing input or position (--inputs, --positions); cut off rest and collisions (--from, "
+    "--to); or give terms that you know (--terms)"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,10 +113,7 @@ def search(
             starts.append(rule.fit)
             told(f"{options.periods[0]:g} periods: {describe(starts[-1])}")
     if not starts:
-        raise FitError(
-            "no law of the terms tried follows this recording: is something missing that moves its "
-            "positions (an input, another position), or that stops them?"
-        )
+        raise FitError(NO_LAW)
     (bench,) = benches.values()
     misfit = [
         float(np.max(start.rms() / scales.sigma)) if np.isfinite(start.fitted.cost) else np.inf
@@ -153,9 +157,14 @@ def search(
 def describe(fit: LawFit) -> str:
     rms = " ".join(f"{r:.3g}" for r in fit.rms())
     return (
-        f"{len(fit.p)} coefficients, residual {rms}, correlated over {fit.correlation:.1f} nodes, "
-        f"{fit.fitted.iterations} iterations" + ("" if fit.fitted.converged else ", not converged")
+        f"{len(fit.p)} coefficients, RMS residual {rms} correlated over {fit.correlation:.1f} "
+        f"points, {fit.fitted.iterations} iterations"
+        + ("" if fit.fitted.converged else ", not converged")
     )
+
+
+def _word(bench: Workbench, key: Key) -> str:
+    return word_of(key, bench.seen.coordinates, bench.seen.speeds)
 
 
 def prune(
@@ -185,7 +194,7 @@ def prune(
             if gains(without, costs, options.gain):
                 refused.add(key)
                 continue
-        told(f"  without {key}: {z[key]:.1f} standard errors")
+        told(f"  dropped {_word(bench, key)}: {z[key]:.1f} standard errors")
         arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
         fit, costs = bench.fit(smaller, fit.values, arcs, fit.sigma), None
 
@@ -221,7 +230,8 @@ def told_apart(bench: Workbench, fit: LawFit, told: Callable) -> LawFit:
         if without.fitted.cost > _AS_WELL * fit.fitted.cost:  # its zero is out of reach
             fixed = fixed | {gone}
             continue
-        told(f"  without {gone}: told only together with {open_[1:]}")
+        others = ", ".join(_word(bench, key) for key in open_[1:])
+        told(f"  dropped {_word(bench, gone)}: told only together with {others}")
         fit = without
 
 
@@ -259,8 +269,9 @@ def grow(
         with_it = bench.cross_validate(nodes, fit, larger, fit.values)
         kept = gains(costs, with_it, options.gain)
         told(
-            f"  {'with' if kept else 'not'} {key}: score {scores[key]:.1f}, held-out "
-            f"{np.sum(costs):.5g} → {np.sum(with_it):.5g}"
+            f"  {'added' if kept else 'refused'} {_word(bench, key)}: "
+            f"{scores[key]:.1f} standard errors, cost of held-out arcs {np.sum(costs):.5g} → "
+            f"{np.sum(with_it):.5g}"
         )
         if not kept:
             refused.add(key)
@@ -285,7 +296,8 @@ def choose_friction(
         fit = bench.fit(fit.structure, fit.values, arcs, sigma)
     choice = which_friction(bench, fit, candidates, options.choose_friction)
     for _ in range(options.choices):
-        told(f"  friction: {choice.rows}")
+        rows = [_word(bench, ("loss", row)) for row in choice.rows]
+        told(f"  friction: {', '.join(rows) or 'none'}")
         if set(choice.rows) == set(fit.structure.friction):
             break
         structure = dataclasses.replace(fit.structure, friction=choice.rows)

@@ -92,6 +92,17 @@ def friction_of(
     return Expression(tuple(listed))
 
 
+def word_of(key: tuple[Any, ...], names: Sequence[str], speeds: Sequence[str]) -> str:
+    """A coefficient of a structure, by its term."""
+    kind, *rest = key
+    one, none = np.ones(1), np.zeros(1)
+    if kind == "term":
+        return terms_of(Terms.of(rest, len(names)), one, none, names, speeds).terms[0].term
+    if kind == "loss":
+        return "R: " + friction_of(Friction.of(rest, len(names)), one, none, speeds).terms[0].term
+    return f"{'gain' if kind == 'gain' else 'zero'} of {names[rest[0]]}"
+
+
 @dataclasses.dataclass(frozen=True)
 class WhichFriction:
     """The kinds of friction that a record shows. odds: that they forecast better than other kinds
@@ -106,9 +117,9 @@ class WhichFriction:
         text = "+".join(self.kinds) or "none"
         if self.odds:
             rival = min(self.odds, key=lambda name: self.odds[name])
-            text += f", odds {odds_text(self.odds[rival])} against {rival}"
-        seen = [f"{_pretty(term)} < {limit:.2g}" for term, limit in self.limits.items()]
-        return text + (f"; not seen: {', '.join(seen)}" if seen else "")
+            text += f", on held-out arcs odds of {odds_text(self.odds[rival])} against {rival}"
+        seen = [f"of {_pretty(term)} below {limit:.2g}" for term, limit in self.limits.items()]
+        return text + (f"; not seen, coefficients in R (2 σ): {', '.join(seen)}" if seen else "")
 
 
 def which_friction_told(

@@ -51,8 +51,9 @@ class Velocity(NamedTuple):
         why = "used" if self.used else "not used"
         colour = "white" if self.white else "coloured"
         return (
-            f"{why}: scale {self.scale[0]:.4f} ± {self.scale[1]:.1g}, lag "
-            f"{1e3 * self.lag[0]:.2g} ± {1e3 * self.lag[1]:.1g} ms, {colour} noise {self.sigma:.3g}"
+            f"{why}; against the law its scale is {self.scale[0]:.4f} ± {self.scale[1]:.1g}, its "
+            f"lag {1e3 * self.lag[0]:.2g} ± {1e3 * self.lag[1]:.1g} ms, its noise {colour} with "
+            f"σ {self.sigma:.3g}"
         )
 
 

@@ -54,7 +54,10 @@ def weak_start(
             c, residual, inverse = _solve(X[..., keep] * weight[:, None], Y * weight)
             size = np.sqrt(np.mean(residual**2, axis=0))
             if not np.min(size) > 1e-9 * np.linalg.norm(X[..., keep] * c):
-                raise FitError("a combination of these terms vanishes all along the recording")
+                raise FitError(
+                    "terms: a combination of them vanishes all along the recording, so that their "
+                    "coefficients are not determined. Leave one out, or add a force"
+                )
             weight = np.maximum(weight / size, np.max(weight / size) / _APART)
         error = np.sqrt(_OVERLAP * np.mean(residual**2)) * np.linalg.norm(inverse, axis=1)
         z = [

@@ -55,8 +55,8 @@ def drawn(
     good = np.isfinite(z0 + z1).all(axis=1)
     if good.sum() < 0.5 * num_pairs:
         raise FitError(
-            f"expected a law that maps the states of the region, got images of {int(good.sum())} "
-            f"of {num_pairs} after dt = {dt:g}"
+            f"accelerate: the flow of H over dt = {dt:g} fails for {num_pairs - int(good.sum())} "
+            f"of {num_pairs} states of the region. Choose a smaller region= or dt="
         )
     return Pairs(z0[good], z1[good], dt)
 

@@ -46,8 +46,8 @@ def flow_of(family: Terms, params, data: Dataset) -> Flow:
     failed = ~np.isfinite(np.concatenate([flow.image(y0), flow.inverse().image(y1)])).all(axis=1)
     if failed.any():
         raise FitError(
-            "expected a law whose flow takes every state a step on and back, got "
-            f"{int(failed.sum())} of {len(y0) + len(y1)} without an image"
+            f"base: the flow of the given H fails for {int(failed.sum())} of {len(y0) + len(y1)} "
+            "states within one step. Check its formula and units, or leave these states out"
         )
     return flow
 

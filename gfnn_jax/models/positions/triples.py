@@ -95,14 +95,14 @@ def triples_of(recording: Recording, *, sites: bool = False) -> Triples:
     q = np.concatenate(rows) if rows else np.empty((0, 3, len(names)))
     if not len(q):
         raise FitError(
-            f"{recording.source}: expected three positions in a row of some run, found none"
+            f"{recording.source}: no run has three rows in succession with all positions"
         )
     dt = float(np.median(np.concatenate(steps)))
     off = np.abs(np.concatenate(steps) - dt).max()
     if off > _EVEN * dt:
         raise FitError(
-            f"{recording.source}: expected positions at even times to learn a map from, a step of "
-            f"{dt:g} s; some are off by {off:.2g} s"
+            f"{recording.source}: a map needs positions at even times; the step is {dt:g} s, and "
+            f"some are off by {off:.2g} s. A law takes uneven times: --learn lagrangian (learn=)"
         )
     whole = np.concatenate([recording.array("positions", run) for run in recording.runs])
     wrapped = bool(angles) and bool(np.nanmax(np.ptp(whole[:, angles], axis=0)) <= _ONE_TURN)

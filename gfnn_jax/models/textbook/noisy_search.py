@@ -188,7 +188,7 @@ class NoisyTextbook:
             self._arguments, self._weight, self._spanned, degree=self._degree, products=products,
             average=self._weak.average,
         )  # fmt: skip
-        self._say(f"H: {len(dictionary.atoms)} atoms of laws of physics")
+        self._say(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
         said = options.said / (len(self._target) * np.log(2))
         matching = Matching(
             self._spanned, self._target, self._weight, self._arguments, said, self._weak.average

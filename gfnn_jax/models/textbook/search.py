@@ -180,7 +180,7 @@ class Textbook:
         options = self._options
         if self._closest is not None and self._explains_nothing(self._closest, dictionary):
             return None  # what is left over is noise
-        self._say(f"H: {len(dictionary.atoms)} atoms of laws of physics")
+        self._say(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
         rows = self._middle.size
         most = rows / options.rows_per_term - self._base.num_parameters
         blocks = [b for b in blocks if len(b) < most]

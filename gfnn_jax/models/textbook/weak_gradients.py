@@ -25,6 +25,10 @@ _EVERY = 6  # states, at which windows begin
 _SMOOTHED, _DEGREE = (9, 7), 4  # states and degree of local polynomials that smooth a sequence
 _BIASED = 1.3  # times the noise, that a local polynomial leaves over where it is not the orbit
 _MOST = 320  # windows
+# Of a window that is looked at: the degree of the polynomials that are to follow its states, and
+# what they may leave over, in units of the noise. Where an orbit turns faster, as at a pole or in a
+# close passage, the sums over the window are no integrals.
+_FOLLOWS, _LEFT = 8, 2.0
 
 
 class WeakGradients(NamedTuple):
@@ -60,7 +64,7 @@ def weak_gradients(
     sequences: list[np.ndarray], dt: float, noise: np.ndarray
 ) -> WeakGradients | None:
     """The windows of sequences (L, 2d) of states dt apart, with noise (2d,) on each coordinate.
-    None where no sequence is as long as a window."""
+    None where no sequence is as long as a window, or turns slowly enough for one."""
     u = np.arange(1, _STATES + 1) / (_STATES + 1) * 2 - 1
     bump = (1 - u**2) ** _POWER
     bump /= bump.sum()
@@ -80,11 +84,27 @@ def weak_gradients(
         count += len(sequence)
     if not states:
         return None
-    smooth, own = np.concatenate(states), np.concatenate(places)
+    own, whole = np.concatenate(places), np.concatenate(measured)
+    own = own[_followed(whole[own], noise)]
+    if not len(own):
+        return None
     own = own[:: -(-len(own) // _MOST)]
-    rate = np.einsum("w,rwi->ri", slope, np.concatenate(measured)[own])
-    deviation = np.roll(noise, smooth.shape[1] // 2) * np.linalg.norm(slope)
-    return WeakGradients(smooth, np.concatenate(noises), -apply_j(rate), deviation, own, bump)
+    used, place = np.unique(own, return_inverse=True)
+    rate = np.einsum("w,rwi->ri", slope, whole[own])
+    deviation = np.roll(noise, len(noise) // 2) * np.linalg.norm(slope)
+    return WeakGradients(
+        np.concatenate(states)[used], np.concatenate(noises)[used], -apply_j(rate), deviation,
+        place.reshape(own.shape), bump,
+    )  # fmt: skip
+
+
+def _followed(windows: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """(R,) which windows (R, w, 2d) polynomials follow to their noise (2d,)."""
+    count = windows.shape[1]
+    basis = np.linalg.qr(np.vander(np.linspace(-1, 1, count), _FOLLOWS + 1))[0]
+    over = windows - np.einsum("wk,vk,rvi->rwi", basis, basis, windows)
+    left = np.sqrt(np.sum(over**2, axis=1) / (count - basis.shape[1]))
+    return (left <= _LEFT * noise).all(axis=1)
 
 
 def _smoothed(sequence: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

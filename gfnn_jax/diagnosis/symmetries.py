@@ -1,0 +1,151 @@
+"""Symmetries of the pairs by themselves, whatever is learned from them.
+
+A continuous symmetry of H conserves its generator I(z) = ½zᵀAz + bᵀz (Noether): what I changes by
+from the first state of a run to its last tells. A discrete one, H(R z) = H(z) with an orthogonal R,
+makes ∇H at R z the image of that at z: gradients at the midpoints of some pairs, as polynomials
+hold them, are compared with the images of others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.runs import next_of
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.products import Products
+from gfnn_jax.fitting.linear_starts import fitted_gradients
+from gfnn_jax.phase_space import apply_j
+
+_MOST_DIM = 4
+_CONSERVED = 0.01  # of what it would change by, that a conserved quantity changes by
+_DEGREES, _MOST_TERMS, _ROWS_PER_TERM = (2, 3, 4, 5, 6), 210, 4
+_FITTED = 0.2  # of the gradients, that polynomials may leave over where they are compared
+_AS_WELL = 1.5  # times what they leave of the pairs themselves, they may leave of the images
+_SEEN = 0.5  # part of the images that must lie among the pairs
+
+
+class SymmetryOfPairs(NamedTuple):
+    """text: as it is told. left: of a conserved quantity what it changes by, in parts of what it
+    would; else what gradients and their images differ by, in parts of the gradients."""
+
+    text: str
+    left: float
+
+    def __str__(self) -> str:
+        return f"{self.text} (to {self.left:.0e})"
+
+
+def symmetries_of_pairs(data: Dataset) -> tuple[SymmetryOfPairs, ...]:
+    """The symmetries that the pairs show; none of pairs with args, of many degrees of freedom, or
+    where too few lie where their images do. data: without a base map."""
+    if data.varied or data.structure is not None or data.dim > _MOST_DIM:
+        return ()
+    angles = tuple(a for a in data.coordinates.angles if a < data.dim)
+    if len(angles) < len(data.coordinates.angles):  # a momentum is one: pairs of a kicked map
+        return ()
+    return (*_conserved(data, angles), *_reflected(data, angles))
+
+
+def _conserved(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPairs]:
+    rows = np.arange(len(data.y0))
+    goes_on = next_of(data.pairs, rows)
+    first = data.y0[np.concatenate([[True], ~goes_on])]
+    last = data.y1[np.concatenate([~goes_on, [True]])]
+    moved = np.sqrt(np.mean(((last - first) / data.scale) ** 2))
+    for text, generator in generators(data.dim, angles):
+        values = [_generated(generator, z) for z in (data.y0, first, last)]
+        spread = np.std(values[0])
+        if not spread > 0 or not moved > 0:
+            continue
+        left = np.sqrt(np.mean((values[2] - values[1]) ** 2)) / spread / moved
+        if left <= _CONSERVED:
+            yield SymmetryOfPairs(text, float(left))
+
+
+def _generated(generator: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """I (N,) at z (N, 2d)."""
+    return np.sum(z * (0.5 * z @ generator[:, :-1] + generator[:, -1]), axis=1)
+
+
+def _reflected(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPairs]:
+    middle, weight = 0.5 * (data.y0 + data.y1), 1.0 / np.roll(data.scale, data.dim)
+    gradient = -apply_j(data.y1 - data.y0) / data.dt
+    train, held = data.training, data.validation
+    inputs = box_inputs(middle[train], angles=angles, cyclic=data.coordinates.cyclic)
+    most = min(_MOST_TERMS, len(train) * 2 * data.dim // _ROWS_PER_TERM)
+    known = [f for f in (Products(inputs, n) for n in _DEGREES) if f.num_parameters <= most]
+    if not known or not len(held):
+        return
+    c = fitted_gradients(known[-1], middle[train], gradient[train], data.scale)
+
+    def missed(z: np.ndarray, wanted: np.ndarray) -> float:
+        off = (known[-1].term_gradients(z) @ c - wanted) * weight
+        return float(np.sqrt(np.mean(off**2) / np.mean((wanted * weight) ** 2)))
+
+    plain = [i for i in range(2 * data.dim) if i not in angles]
+    low, high = middle[train].min(axis=0)[plain], middle[train].max(axis=0)[plain]
+    for text, matrix in reflections(data.dim, angles):
+        there = middle[held] @ matrix.T
+        seen = ((there[:, plain] >= low) & (there[:, plain] <= high)).all(axis=1)
+        if np.mean(seen) < _SEEN:
+            continue
+        own = missed(middle[held][seen], gradient[held][seen])
+        left = missed(there[seen], gradient[held][seen] @ matrix.T)
+        if own <= _FITTED and left <= _AS_WELL * own:
+            yield SymmetryOfPairs(text, left)
+
+
+# What is looked for, of pairs and of laws
+
+
+def generators(dim: int, angles: tuple[int, ...]) -> Iterator[tuple[str, np.ndarray]]:
+    """(text, [A b] (2d, 2d + 1)) of the generators I = ½ zᵀA z + bᵀz."""
+    one = dim == 1
+    plain = [i for i in range(dim) if i not in angles]
+    for i in range(dim):
+        yield (
+            f"translation of q{i + 1}: p{i + 1} conserved",
+            _generator(dim, linear={i + dim: 1.0}),
+        )
+    if not one:
+        yield (
+            "translation of all positions: the sum of all momenta conserved",
+            _generator(dim, linear={i + dim: 1.0 for i in range(dim)}),
+        )
+    for i, j in combinations(plain, 2):
+        yield (
+            f"rotation in (q{i + 1}, q{j + 1}): angular momentum "
+            f"q{i + 1} p{j + 1} − q{j + 1} p{i + 1} conserved",
+            _generator(dim, {(i, j + dim): 1.0, (j, i + dim): -1.0}),
+        )
+    if len(plain) == dim:
+        squares = "q1² + p1²" if one else "the sum of all q² + p²"
+        yield (
+            f"rotation of every (q, p): {squares} conserved",
+            _generator(dim, {(i, i): 1.0 for i in range(2 * dim)}),
+        )
+
+
+def _generator(dim: int, quadratic=None, linear=None) -> np.ndarray:
+    found = np.zeros((2 * dim, 2 * dim + 1))
+    for (i, j), value in (quadratic or {}).items():
+        found[i, j] = found[j, i] = value
+    for i, value in (linear or {}).items():
+        found[i, -1] = value
+    return found
+
+
+def reflections(dim: int, angles: tuple[int, ...]) -> Iterator[tuple[str, np.ndarray]]:
+    """(text, R (2d, 2d)) of the linear maps under which H may be the same."""
+    yield "reversal of time", np.diag(np.repeat([1.0, -1.0], dim))
+    yield "reflection of all coordinates", -np.eye(2 * dim)
+    for i, j in combinations(range(dim), 2):
+        if (i in angles) == (j in angles):
+            order = np.arange(2 * dim)
+            order[[i, j, i + dim, j + dim]] = order[[j, i, j + dim, i + dim]]
+            yield f"exchange of degrees of freedom {i + 1} and {j + 1}", np.eye(2 * dim)[order]

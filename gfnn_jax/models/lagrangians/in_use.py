@@ -1,0 +1,144 @@
+"""A fit made ready for forecasts: the law in columns, its sensors, bands by held-out thirds.
+
+Where residuals show that zeros of channels wander there are two such fits, and the one whose
+forecasts of held-out data are better is taken.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.dataset.stretches import Nodes, Scales, Stretch
+from gfnn_jax.families.lagrangian import Lagrangian
+from gfnn_jax.maps.estimates import law_in_use
+from gfnn_jax.maps.laws import conformal
+from gfnn_jax.maps.sensors import Sensors
+from gfnn_jax.models.lagrangians.calibration import Calibration, Thirds, calibrated
+from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
+from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
+from gfnn_jax.models.lagrangians.learned_law import in_columns, scaled
+from gfnn_jax.models.lagrangians.wandering import wander_of
+from gfnn_jax.solve.latent_arcs import SOFT_L1
+
+_BETTER = 0.95  # of the median error of held-out forecasts, that zeros which wander have to reach
+
+
+class InUse(NamedTuple):
+    """A fit on its workbench, how its friction was chosen, its law and covariance in the columns'
+    units, the law that moves with a root of its covariance, the factor of L and what fixes it, and
+    its calibration."""
+
+    bench: Workbench
+    fit: LawFit
+    choice: FrictionChoice
+    law: Lagrangian
+    covariance: np.ndarray
+    moving: Lagrangian
+    root: np.ndarray
+    scale: float
+    gauge: str
+    calibration: Calibration
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Record:
+    """The data that all fits of a recording share: its nodes, stretches and scales, σ of channels
+    as given (NaN where not), the known mass, and how inputs act between samples."""
+
+    recording: Recording
+    nodes: Sequence[Nodes]
+    found: Sequence[Stretch]
+    scales: Scales
+    given: np.ndarray
+    mass: Mapping[str, float]
+    hold: str
+    delay: float
+
+    def in_use(self, bench: Workbench, fit: LawFit, choice: FrictionChoice) -> InUse:
+        """The fit made ready for forecasts."""
+        law, covariance = in_columns(fit)
+        names, scale = self.recording.coordinates, 1.0
+        gauge = (
+            f"the mean inertia M11 (of {names[0]}) over the data is 1, the unit of L, R, gains and "
+            f"energies; --mass {names[0]}=VALUE (mass=) gives them theirs"
+        )
+        for name, value in self.mass.items():
+            q = np.concatenate([n.x[:, : fit.form.dim] for n in self.nodes])
+            i = names.index(name)
+            scale = value / float(np.mean(law.masses(q)[:, i, i]))
+            law, covariance = scaled(law, covariance, scale)
+            gauge = f"the mean inertia of {name} over the data is {value:g}, as given"
+        moving, of_moving = conformal(law, covariance)
+        root, sensors = _root(of_moving), self.sensors(bench, fit)
+        spread = np.nanstd(np.concatenate([s.y for s in self.found]), axis=0)
+        thirds = self.thirds(bench, fit, sensors)
+        used = law_in_use(moving, root, sensors)
+        calibration = calibrated(used, thirds, self.found, self.scales, spread)
+        return InUse(bench, fit, choice, law, covariance, moving, root, scale, gauge, calibration)
+
+    def sensors(self, bench: Workbench, fit: LawFit) -> Sensors:
+        """The sensors, as yet without a misfit."""
+        scales, recording, seen = self.scales, self.recording, bench.seen
+        noise = np.where(self.given > 0, self.given, np.minimum(scales.sigma, fit.rms()))
+        if bench.wander is not None:  # sizes of wanders are in units of the white part
+            noise = fit.sigma
+        plain = seen.is_plain and seen.loss == SOFT_L1
+        first = fit.form.count + len(fit.structure.zeros)
+        return Sensors(
+            recording.coordinates, recording.inputs, recording.angles, noise, scales.omega,
+            scales.period, self.hold, self.delay, np.array([scales.period]),
+            np.zeros((1, len(noise))),
+            None if plain else dataclasses.replace(seen, values=fit.p[first:]), bench.wander,
+        )  # fmt: skip
+
+    def thirds(self, bench: Workbench, fit: LawFit, sensors: Sensors) -> Thirds:
+        """The laws of the record without each third, of which less data tell less."""
+        fewer, laws, begins = np.sqrt(FOLDS / (FOLDS - 1)), [], []
+        for other, run, t in bench.without_thirds(self.nodes, fit):
+            law, covariance = in_columns(other)
+            own = sensors
+            if sensors.observation is not None:
+                first = fit.form.count + len(fit.structure.zeros)
+                shown = dataclasses.replace(sensors.observation, values=other.p[first:])
+                own = dataclasses.replace(sensors, observation=shown)
+            laws.append(law_in_use(law, fewer * _root(covariance), own))
+            begins.append(
+                next(
+                    (i, t) for i, s in enumerate(self.found)
+                    if s.run == run and s.t[0] <= t <= s.t[-1]
+                )
+            )  # fmt: skip
+        return Thirds(tuple(laws), tuple(begins))
+
+
+def best_in_use(
+    record: Record, bench: Workbench, fit: LawFit, choice: FrictionChoice,
+    told: Callable[[str], object],
+) -> InUse:  # fmt: skip
+    """The fit as it is, or fitted anew with zeros of channels that wander."""
+    steady = record.in_use(bench, fit, choice)
+    wander = wander_of(bench, fit)
+    if wander is None:
+        return steady
+    bench = dataclasses.replace(bench, wander=wander)
+    arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+    fit = bench.fit(fit.structure, fit.values, arcs, fit.sigma)
+    wandering = record.in_use(bench, fit, choice)
+    share = wandering.calibration.against(steady.calibration)
+    told(
+        f"zeros that wander by {wander.size:.2g} σ over {wander.time:.3g} s: held-out forecasts "
+        f"err by {share:.3g} times as much"
+    )
+    return wandering if share < _BETTER else steady
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """rootᵀ root = covariance, of its eigenvalues above roundoff."""
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > 1e-14 * max(float(values.max(initial=0.0)), 1e-300)
+    return np.sqrt(values[kept])[:, None] * vectors[:, kept].T

@@ -1,0 +1,125 @@
+"""Zeros of sensors that wander: whitened residuals, estimates of states and zeros, a whole fit."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from test_law_fits import pendulum
+
+import gfnn_jax as gfnn
+from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
+from gfnn_jax.maps.estimates import Window, estimate_states, law_in_use, propagate
+from gfnn_jax.maps.observation import Observation
+from gfnn_jax.maps.sensors import Sensors
+from gfnn_jax.solve.robust import SoftL1
+from gfnn_jax.solve.wander import Wander
+
+WANDER = Wander(2.0, 1.5)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+def wandering(t, rng, wander=WANDER, noise=1.0):
+    """A path of noise at even times: white, on the process step by step."""
+    fade = np.exp(-(t[1] - t[0]) / wander.time)
+    b = np.zeros(len(t))
+    b[0] = wander.size * rng.normal()
+    for n in range(1, len(t)):
+        b[n] = fade * b[n - 1] + wander.size * np.sqrt(1 - fade**2) * rng.normal()
+    return noise * (b + rng.normal(size=len(t)))
+
+
+def test_whitened_noise_is_white(rng):
+    """Samples of the process, built step by step, and one of them unseen."""
+    t = np.arange(8) * 0.4
+    paths = np.array([wandering(t, rng) for _ in range(6_000)])
+    noise = np.ones((1, 8, 1))
+    noise[0, 3] = np.inf
+    paths[:, 3] = 0.0
+    white = WANDER.whitening(t[None], noise)[0, 0]
+    covariance = np.cov(paths @ white.T, rowvar=False)
+    expected = np.diag(np.arange(8) != 3).astype(float)
+    np.testing.assert_allclose(covariance, expected, atol=0.08)
+
+
+def free_body(sigma, wander):
+    """A law without forces, known exactly, q = q0 + v t; residuals of any size count in full."""
+    law = Lagrangian(
+        Terms.of([((2,), (0,), (0,), 0.0)], 1), np.array([0.5]), Friction.of([], 1), np.zeros(0),
+        0.0, np.zeros((1, 0)),
+    )  # fmt: skip
+    sensors = Sensors(
+        ("x",), (), (), np.array([sigma]), 1.0, 10.0, "hold", 0.0, np.array([1.0]),
+        np.zeros((1, 1)), dataclasses.replace(Observation.plain(["x"]), loss=SoftL1(1e6)), wander,
+    )  # fmt: skip
+    return law_in_use(law, None, sensors)
+
+
+@pytest.mark.parametrize("size", [0.3, 2.0])
+def test_a_state_and_its_zero_are_those_of_the_normal_distribution(rng, size):
+    """The joint normal distribution of samples, zeros and a later sample, with a flat prior of the
+    state, conditioned by its precision matrix."""
+    sigma, wander = 0.01, Wander(size, 1.5)
+    t, ahead = np.arange(20) * 0.1, np.array([0.3, 2.0])
+    y = 1.0 + 0.5 * t + wandering(t, rng, wander, sigma)
+    law = free_body(sigma, wander)
+    window = Window(t, y[:, None], t, np.zeros((20, 0)))
+    x, covariance = estimate_states(law, [window])
+    orbits = propagate(law, [window], x, covariance, t[-1:], t[-1] + ahead[None])
+
+    times = np.append(t, t[-1] + ahead)
+    every = np.stack([np.ones_like(times), times - t[-1]], axis=1)
+    K = sigma**2 * wander.covariance(times[:, None] - times)
+    C, c, X = K[:20, :20] + sigma**2 * np.eye(20), K[20:, :20], every[:20]
+    P = np.linalg.inv(X.T @ np.linalg.solve(C, X))
+    state = P @ X.T @ np.linalg.solve(C, y)
+    np.testing.assert_allclose(x[0, :2], state, rtol=1e-6)
+    np.testing.assert_allclose(covariance[0, :2, :2], P, rtol=1e-6)
+    mean = every[20:] @ state + c @ np.linalg.solve(C, y - X @ state)
+    rest = every[20:] - c @ np.linalg.solve(C, X)
+    cov = K[20:, 20:] + sigma**2 * np.eye(2) - c @ np.linalg.solve(C, c.T) + rest @ P @ rest.T
+    np.testing.assert_allclose(orbits.values[0, :, 0], mean, atol=1e-6 * sigma)
+    np.testing.assert_allclose(orbits.std[0, :, 0], np.sqrt(np.diag(cov)), rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def swing():
+    """A pendulum whose zero wanders by twice the noise, and its law without the last part."""
+    t, theta = pendulum(gamma=0.02, noise=0.0, end=80.0, dt=0.1)
+    theta = theta + wandering(t, np.random.default_rng(3), noise=5e-3)
+    recording = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
+    return recording, gfnn.fit(recording.slice(stop=55.0), friction="linear")
+
+
+def test_a_fit_finds_how_a_zero_wanders(swing, tmp_path):
+    _, fit = swing
+    found = fit.map.sensors.wander
+    assert found is not None
+    assert 0.5 < found.size * fit.noise["theta"] / (2.0 * 5e-3) < 2
+    assert 0.4 < found.time / 1.5 < 2.5
+    assert fit.noise["theta"] == pytest.approx(5e-3, rel=0.25)
+    for term, true in zip(fit.lagrangian.terms[1:], [2.0], strict=True):
+        assert abs(term.coefficient - true) < 3 * term.std
+    fit.map.save(tmp_path / "map")
+    assert gfnn.load(tmp_path / "map").sensors.wander == found
+
+
+def test_forecasts_on_a_zero_that_wanders(swing):
+    """Smaller errors than without it, and bands that hold them."""
+    recording, fit = swing
+    sensors = fit.map.sensors
+    steady = dataclasses.replace(fit.map, sensors=dataclasses.replace(sensors, wander=None))
+    errors, inside = [], []
+    for map_ in (fit.map, steady):
+        own = []
+        for start in np.arange(56.0, 78.0, 1.0):
+            later = recording.slice(start + 1e-9, start + 1.5)
+            found = map_.forecast(recording.slice(start - 3.0, start), later.times("0"))
+            own.append(found.values["theta"][0] - later.values("theta", "0"))
+            inside.append(np.abs(own[-1]) <= 2 * found.std["theta"][0])
+        errors.append(np.sqrt(np.mean(np.concatenate(own) ** 2)))
+    assert errors[0] < 0.95 * errors[1]
+    assert 0.88 < np.mean(np.concatenate(inside[: len(inside) // 2])) <= 1.0
