@@ -441,7 +441,7 @@ def noise():
 HARD = {
     "a step far too long: Hénon–Heiles, ωh = 10": far_too_long_a_step,
     "close passages: two bodies, e up to 0.98, dt 0.1": close_passages,
-    "terms that cannot represent H: a rational well": rational_well,
+    "no polynomial of few terms: a rational well": rational_well,
     "collinear terms": collinear_terms,
     "friction: a hundredth of p a step": friction,
     "20 pairs of Hénon–Heiles": partial(few_pairs, 20),

@@ -12,6 +12,7 @@ from gfnn_jax.data.kinds import are_recordings
 from gfnn_jax.data.recording_summary import as_typed
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.errors import InputError
+from gfnn_jax.models.lagrangians.recordings import parameters_left_out
 
 T = np.array([0.0, 0.1, 0.25, 0.3, 1.0])
 THETA = np.array([0.5, 0.25, -0.125, 1e-3, 2.0])
@@ -168,6 +169,9 @@ def test_columns_that_differ_from_run_to_run_are_parameters():
     recording = gfnn.Recording({**table, "day": [7, 7, 7, 7]})
     assert recording.parameters == ("mass",)
     assert recording.ignored == ("day",)
+    (told,) = parameters_left_out(recording)
+    assert told.startswith("mass is 1 to 2 and the law is one for all runs")
+    assert parameters_left_out(recording.slice(run="0")) == []
 
 
 def test_an_angle_is_lifted_and_a_lift_is_trusted():

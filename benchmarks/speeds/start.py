@@ -102,6 +102,7 @@ class Process(NamedTuple):
 def process(arguments: Sequence[str], cache: Path | None) -> Process:
     """A fresh Python process with this compile cache, or none."""
     env = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    env.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed package has its byte code
     env |= {"PYTHONPATH": str(HERE.parent), "MPLBACKEND": "agg"}
     if cache is not None:
         env["JAX_COMPILATION_CACHE_DIR"] = str(cache)

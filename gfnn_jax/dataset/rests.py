@@ -20,7 +20,7 @@ _STILL = 1.5  # of the noise: the standard deviation up to which a coordinate st
 _KEPT = 0.25  # periods of a rest that stay, in which the body comes to a stop or starts
 
 
-def moving(found: Sequence[Stretch], scales: Scales) -> tuple[list[Stretch], float]:
+def without_rests(found: Sequence[Stretch], scales: Scales) -> tuple[list[Stretch], float]:
     """The stretches of plain positions without their rests, and the seconds that were left out; the
     stretches as they are where too little would be left."""
     window = max(9, round(scales.period / scales.dt))
@@ -40,7 +40,7 @@ def _still(stretch: Stretch, sigma: np.ndarray, window: int) -> np.ndarray:
     if count < 1:
         return np.zeros(len(q), bool)
     views = np.lib.stride_tricks.sliding_window_view(q, window, axis=0)
-    quiet = (views.std(axis=-1) <= _STILL * sigma).all(axis=1)
+    quiet = (views.std(axis=-1) <= _STILL * sigma[: q.shape[1]]).all(axis=1)
     begun = np.concatenate([np.cumsum(quiet), np.full(window - 1, np.sum(quiet))])
     ended = np.concatenate([np.zeros(window, int), np.cumsum(quiet)[:-1]])[: len(q)]
     return begun > ended

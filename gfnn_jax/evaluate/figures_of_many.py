@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from gfnn_jax.evaluate.figures import COLOURS, HEIGHT, WIDTH, style
+from gfnn_jax.evaluate.figures_style import COLOURS, HEIGHT, WIDTH, style
 from gfnn_jax.phase_space import split
 
 MODES = 4  # number of modes that are drawn, those of the longest waves

@@ -49,30 +49,35 @@ def stopped(
     duration = float(np.max(ends[:, -1] - ends[:, 0]))
     narrow = sticking(law, noise, duration)
     family, params = family_of(narrow)
-    d, transform, last = law.dim, Legendre(law.terms), ends.shape[1] - 1
+    d, transform = law.dim, Legendre(law.terms)
     q = orbit[:, 0, :d]
     z = np.concatenate([q, law.momentum(q, orbit[:, 0, d:])], axis=1)
     stiff, slow = stiffness(narrow, q), _near_rest(law, orbit)
-    found = [orbit[:, 0]]
+    found, moves = [orbit[:, 0]], np.ones(len(q), bool)
     for k, h in enumerate(np.diff(ends, axis=1).T):
-        count = parts if not slow[k] else max(parts, int(np.ceil(np.max(h) * stiff / STIFFEST)))
-        u = np.tensordot(inputs(k, count), WEIGHTS, axes=(2, 0))  # means over the parts
-        for n in range(count):
-            args = u[:, n] if law.num_inputs else None
-            z = images(family, params, z, h / count, Steps(_STAGES, 1), args=args).states
+        fine = max(parts, int(np.ceil(np.max(h) * stiff / STIFFEST)))
+        for count, lanes in ((parts, moves & ~slow[:, k]), (fine, moves & slow[:, k])):
+            if not lanes.any():
+                continue
+            u = np.tensordot(inputs(k, count), WEIGHTS, axes=(2, 0))[lanes]  # means over the parts
+            for n in range(count):
+                args = u[:, n] if law.num_inputs else None
+                step = h[lanes] / count
+                z[lanes] = images(
+                    family, params, z[lanes], step, Steps(_STAGES, 1), args=args
+                ).states
         found.append(np.concatenate([z[:, :d], transform.velocity(law.coefficients, z)], axis=1))
-        crept = np.abs(found[-1][:, :d] - found[-2][:, :d]) * duration
-        still = np.max(np.abs(found[-1][:, d:])) * duration <= noise
-        if still and not law.num_inputs and np.all(crept <= noise * h[:, None]):
-            found += [found[-1]] * (last - k - 1)  # nothing will move it again
-            break
+        if not law.num_inputs:  # else they may move a body again
+            crept = np.abs(found[-1][:, :d] - found[-2][:, :d]) * duration
+            creeps = np.abs(found[-1][:, d:]) * duration
+            moves = moves & np.any((crept > noise * h[:, None]) | (creeps > noise), axis=1)
     return np.stack(found[1:], axis=1)
 
 
 def _near_rest(law: Lagrangian, orbit: np.ndarray) -> np.ndarray:
-    """Steps (n,) of orbits (B, n + 1, 2d) in which a speed of dry friction turns or is small."""
+    """Steps (B, n) of orbits (B, n + 1, 2d) in which a speed of dry friction turns or is small."""
     dry = law.friction.kinds == DRY
     speeds = orbit[..., law.dim :] @ law.friction.directions[dry].T / law.friction.widths[dry]
     before, after = speeds[:, :-1], speeds[:, 1:]
     small = np.minimum(np.abs(before), np.abs(after)) < _NEAR
-    return np.any(small | (before * after < 0), axis=(0, 2))
+    return np.any(small | (before * after < 0), axis=2)

@@ -78,13 +78,13 @@ class Known:
     model: Model
     p: np.ndarray
 
-    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
-        closing, by_state, by_coefficients = self.model.steps(self.p, x)
-        return Steps(closing, by_state, by_coefficients[..., :0])
 
-    def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
-        values, by_state, by_coefficients = self.model.observe(self.p, x)
-        return Observed(values, by_state, by_coefficients[..., :0])
+def evaluated(model: Model | Known, p: np.ndarray, x: np.ndarray) -> tuple[Steps, Observed]:
+    """The linearised defects of states x (A, L, m), and what is seen of them."""
+    if not isinstance(model, Known):
+        return model.steps(p, x), model.observe(p, x)
+    (*steps, by_p), (*observed, seen_by_p) = evaluated(model.model, model.p, x)
+    return Steps(*steps, by_p[..., :0]), Observed(*observed, seen_by_p[..., :0])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +129,7 @@ class Fitted:
 
 
 def fit_arcs(
-    model: Model,
+    model: Model | Known,
     p: np.ndarray,
     x: np.ndarray,
     y: np.ndarray,
@@ -165,7 +165,7 @@ def fit_arcs(
 
 
 def eliminated_rows(
-    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
+    model: Model | Known, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
     loss: Loss = SOFT_L1, whitening: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Rows (R, n + 1) of [∂r/∂p, r] at p and x, without the states of each arc: what its own state
@@ -176,7 +176,7 @@ def eliminated_rows(
 
 
 def last_by_coefficients(
-    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
+    model: Model | Known, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
 ) -> np.ndarray:
     """Derivative (A, m, n) in p of the last state of each arc that was fitted to y with p fixed."""
     (J, last), m = linearised(model, p, x, y, sigma), x.shape[-1]
@@ -186,7 +186,7 @@ def last_by_coefficients(
 
 
 def rows_of_arcs(
-    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
+    model: Model | Known, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
     loss: Loss = SOFT_L1, whitening: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Rows (A, L, k, n + 1) of the coefficients and the residuals, weighted as robust loss has it,
@@ -198,7 +198,7 @@ def rows_of_arcs(
 
 
 def sensitivities(
-    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
+    model: Model | Known, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
     loss: Loss = SOFT_L1, whitening: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
     """The triangle (n + 1, n + 1) of `eliminated_rows`: what a test of coefficients needs."""
@@ -208,12 +208,12 @@ def sensitivities(
 
 
 def linearised(
-    model: Model, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
+    model: Model | Known, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
     loss: Loss = SOFT_L1, whitening: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Rows (A, L k, m + n + 1) of [δx_0, δp, r] of all arcs at p and x, weighted as robust loss has
     it, and δx_{L−1} (A, m, m + n + 1) by the same and by the defects before it."""
-    seen, steps, observed = np.isfinite(y), model.steps(p, x), model.observe(p, x)
+    seen, (steps, observed) = np.isfinite(y), evaluated(model, p, x)
     off = np.where(seen, np.where(seen, y, 0.0) - observed.values, 0.0)
     units = _Units(sigma, np.ones(x.shape[-1]), loss, whitening)
     return _linearised(_Iterate.at(p, x, steps, observed, seen, off, units), slice(None))
@@ -223,7 +223,7 @@ class _Data(NamedTuple):
     """What arcs are fitted to: which of y (A, L, k) was seen, and y, 0 where it was not. least:
     what of the residuals is no noise; None: the noise is known. tolerance: of the cost."""
 
-    model: Model
+    model: Model | Known
     seen: np.ndarray
     known: np.ndarray
     least: np.ndarray | None
@@ -232,7 +232,7 @@ class _Data(NamedTuple):
     def at(self, p: np.ndarray, x: np.ndarray, units: _Units) -> _Iterate:
         """The residuals and defects of coefficients p and states x."""
         with np.errstate(all="ignore"):
-            steps, observed = self.model.steps(p, x), self.model.observe(p, x)
+            steps, observed = evaluated(self.model, p, x)
             off = np.where(self.seen, self.known - observed.values, 0.0)
         return _Iterate.at(p, x, steps, observed, self.seen, off, units)
 

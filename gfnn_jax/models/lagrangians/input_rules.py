@@ -106,8 +106,7 @@ def _correction(here: Acting, interval: float) -> tuple[float, float]:
     bench = dataclasses.replace(here.bench, inputs=lambda arcs: both)
     p = structure.start(known)
     model = bench.model(structure, fit.arcs, p, np.arange(len(p)))
-    noise, white = fit.sigma * fit.arcs.noise, here.bench.whitening(fit.arcs)
-    R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, whitening=white)
+    R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, fit.sigma * fit.arcs.noise)
     own = [keys.index(key) for key in known]
     column = sum(
         known["gain", i, j] * R[:, keys.index(("gain", i, count + j))]

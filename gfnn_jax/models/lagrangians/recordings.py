@@ -16,7 +16,7 @@ import numpy as np
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
-from gfnn_jax.dataset.rests import moving
+from gfnn_jax.dataset.rests import without_rests
 from gfnn_jax.dataset.stretches import Nodes, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.lagrangian import Lagrangian
@@ -91,11 +91,13 @@ def fit_recording(
         seen = seen.shifted(np.where(np.isin(range(seen.dim), far), middle, 0.0))
         found = _stretches(recording, seen, angles)
     scales = measure(found)
+    rests: list[str] = []
     if seen.is_plain:
-        found, resting = moving(found, scales)
+        found, resting = without_rests(found, scales)
         if resting:
             scales = measure(found)
-            told(f"{resting:.3g} s at rest left out")
+            rests = [f"{resting:.3g} s at rest left out: a body that stands still tells no law"]
+            told(rests[0])
     given = np.array([recording.std[name] or np.nan for name in seen.channels])
     scales = dataclasses.replace(scales, sigma=np.where(given > 0, given, scales.sigma))
     asked = _asked(terms, seen, options.dry_width * float(np.mean(scales.speed)))
@@ -130,6 +132,7 @@ def fit_recording(
         scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, own]))
         given = np.array([recording.std[name] or np.nan for name in seen.channels])
         found = _stretches(recording, seen, angles)
+        found = without_rests(found, scales)[0] if rests else found
     _check_told(fit, seen)
     told("bands: forecasting from windows of the record")
     bench = Workbench(gauge_of, inputs_of, scales.omega, seen)
@@ -158,12 +161,13 @@ def fit_recording(
     traces = _traces(recording, seen.channels, fit, law, nodes, zeros, inputs_of)
     told("finding the motion to record next")
     motions = next_motions(best.bench, fit, angles)
-    return _described(
+    learned = _described(
         recording, fit, map_, law, best.covariance, (best.choice, best.scale),
         best.calibration.horizons, best.gauge, tuple(steps),
         traces, motions, time.process_time() - started, speeds,
         (acting.delay, acting.error) if recording.inputs else None,
     )  # fmt: skip
+    return dataclasses.replace(learned, messages=(*rests, *learned.messages))
 
 
 def _options(friction: str) -> SearchOptions:
@@ -300,6 +304,7 @@ def _described(
             "the record gains energy that no input explains. If the system is driven, name its "
             "drive: --inputs NAME (inputs=)"
         )
+    messages += parameters_left_out(recording)
     messages += [
         f"no force of the input {u} is seen: its gain is within {_SEEN:g} standard errors of 0. "
         f"Record a stronger or more varied {u}, or leave it out of --inputs (inputs=)"
@@ -321,6 +326,20 @@ def _described(
         messages=tuple(messages), steps=steps, num_samples=len(recording), seconds=seconds,
         ended="every length of arcs was fitted",
     )  # fmt: skip
+
+
+def parameters_left_out(recording: Recording) -> list[str]:
+    """A warning for each parameter that differs from run to run: a law has none."""
+    found = []
+    for name in recording.parameters:
+        values = np.concatenate([recording.values(name, run) for run in recording.runs])
+        least, most = np.nanmin(values), np.nanmax(values)
+        if least < most:
+            found.append(
+                f"{name} is {least:g} to {most:g} and the law is one for all runs. If {name} "
+                "moves anything, fit the runs of each value by themselves"
+            )
+    return found
 
 
 def _in_words(

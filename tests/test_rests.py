@@ -1,0 +1,66 @@
+"""Rests of a recording: where dry friction holds a body, its samples are no equation of motion."""
+
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax.dataset.rests import without_rests
+from gfnn_jax.dataset.stretches import measure, stretches
+
+HELD, NOISE, DT = 0.1, 1e-3, 0.05
+
+
+def block(q, v, t):
+    """Positions of a block on a spring, q̈ = −q − 0.1 sgn q̇, in closed form: half turns about ±0.1,
+    until it stops."""
+    found, begun = np.full_like(t, np.nan), 0.0
+    while side := np.sign(v) or -np.sign(q) * (abs(q) > HELD):
+        about = -side * HELD
+        size, angle = np.hypot(q - about, v), np.arctan2(-v, q - about)
+        left = ((0.0 if side > 0 else np.pi) - angle) % (2 * np.pi)  # until it turns
+        now = (t >= begun) & (t <= begun + left)
+        found[now] = about + size * np.cos(angle + t[now] - begun)
+        q, v, begun = about + size * np.cos(angle + left), 0.0, begun + left
+    return np.where(np.isnan(found), q, found)
+
+
+def record(seed=0):
+    """Three runs, more than half of which the block stands still, where it has come to rest."""
+    rng, t = np.random.default_rng(seed), np.arange(0, 36, DT)
+    tables = [
+        {"run": np.full(len(t), str(k)), "t": t,
+         "x": block(*start, t) + NOISE * rng.normal(size=len(t))}
+        for k, start in enumerate(((1.0, 0.0), (0.7, 0.2), (-0.8, 0.5)))
+    ]  # fmt: skip
+    return gfnn.Recording(tables, positions=["x"])
+
+
+def test_what_stands_still_is_left_out():
+    found = stretches(record())
+    parts, seconds = without_rests(found, measure(found))
+    assert 50 < seconds < 75
+    assert len(parts) == 3
+    for part, whole in zip(parts, found, strict=True):
+        assert part.t[0] == whole.t[0]
+        left = np.setdiff1d(whole.t, part.t)
+        assert np.std(whole.q[np.isin(whole.t, left)]) < 1.5 * NOISE
+
+
+def test_what_moves_is_kept():
+    t = np.arange(0, 40, DT)
+    x = np.sin(t) + NOISE * np.random.default_rng(0).normal(size=len(t))
+    found = stretches(gfnn.Recording({"t": t, "x": x}, positions=["x"]))
+    parts, seconds = without_rests(found, measure(found))
+    assert seconds == 0
+    np.testing.assert_array_equal(parts[0].t, found[0].t)
+
+
+@pytest.mark.slow
+def test_dry_friction_of_a_record_that_rests_half_its_time():
+    fit = gfnn.fit(record())
+    assert fit.which_friction.kinds == ("dry",)
+    spring, dry = fit.lagrangian.terms[1], fit.friction.terms[0]
+    assert abs(spring.coefficient + 0.5) < 3 * spring.std
+    assert abs(dry.coefficient - HELD) < 3 * dry.std
+    assert dry.std < 0.002
+    assert any("at rest" in message for message in fit.messages)
