@@ -89,7 +89,7 @@ def levenberg_marquardt_together(
             if not np.isfinite(losses).all():
                 raise ValueError("∇S(params, w) is not finite on the training pairs at the start")
             there = theta_, float(np.mean(losses))
-            return Tried(there, *map(np.asarray, (decrease, used, promised)))
+            return Tried(there, np.asarray(decrease), np.asarray(used), np.asarray(promised))
 
         return tried
 

@@ -83,8 +83,11 @@ def evaluated(model: Model | Known, p: np.ndarray, x: np.ndarray) -> tuple[Steps
     """The linearised defects of states x (A, L, m), and what is seen of them."""
     if not isinstance(model, Known):
         return model.steps(p, x), model.observe(p, x)
-    (*steps, by_p), (*observed, seen_by_p) = evaluated(model.model, model.p, x)
-    return Steps(*steps, by_p[..., :0]), Observed(*observed, seen_by_p[..., :0])
+    steps, observed = evaluated(model.model, model.p, x)
+    return (
+        steps._replace(by_coefficients=steps.by_coefficients[..., :0]),
+        observed._replace(by_coefficients=observed.by_coefficients[..., :0]),
+    )
 
 
 @dataclasses.dataclass(frozen=True)

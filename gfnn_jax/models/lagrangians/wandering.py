@@ -47,12 +47,11 @@ def wander_of(bench: Workbench, fit: LawFit) -> Wander | None:
         while moved:
             moved = False
             for factors in ((step, 1), (1 / step, 1), (1, step), (1, 1 / step)):
-                size, periods = np.clip(
-                    np.multiply(here, factors), *zip(_SIZES, _TIMES, strict=True)
-                )
+                size = float(np.clip(here[0] * factors[0], *_SIZES))
+                periods = float(np.clip(here[1] * factors[1], *_TIMES))
                 found = likelihood(size, periods)
                 if found > best + 0.01:
-                    here, best, moved = (float(size), float(periods)), found, True
+                    here, best, moved = (size, periods), found, True
     if best < _likelihood(rows, m, free) + _EVIDENCE:
         return None
     return Wander(here[0], here[1] * period)
@@ -60,8 +59,8 @@ def wander_of(bench: Workbench, fit: LawFit) -> Wander | None:
 
 def _likelihood(rows: np.ndarray, m: int, free: int) -> float:
     """The part of the likelihood that whitened rows (A, L, k, m + n + 1) tell."""
-    R = np.linalg.qr(rows.reshape(len(rows), -1, rows.shape[-1]), mode="r")
-    rest = np.linalg.qr(R[:, m:, m:].reshape(-1, rows.shape[-1] - m), mode="r")
+    R = np.asarray(np.linalg.qr(rows.reshape(len(rows), -1, rows.shape[-1]), mode="r"))
+    rest = np.asarray(np.linalg.qr(R[:, m:, m:].reshape(-1, rows.shape[-1] - m), mode="r"))
     left = _log_diagonal(R[:, :m, :m]) + _log_diagonal(rest[:-1, :-1])
     return float(-free * np.log(max(abs(rest[-1, -1]), 1e-300)) - left)
 
