@@ -122,7 +122,7 @@ def test_a_factor_that_depends_on_a_parameter_is_learned(of_decay):
     assert np.abs(found - np.exp(-given)).max() < 1e-9
     assert abs(of_decay.map.multiplier({"decay": 0.15}) - found[1]) < 1e-15
     assert of_decay.map.multiplier() is None  # of no parameter in particular
-    assert "by decay, the same everywhere" in str(of_decay.damping)
+    assert "depending on decay, one factor for all states" in str(of_decay.damping)
     test = pairs_by(200, 1)
     error = np.asarray(of_decay.map.step(test.z0, test.args)[0]) - test.z1
     assert np.abs(nearest_image(error, (0,))).max() < 1e-7

@@ -108,7 +108,7 @@ def test_wrong_pairs_are_named_and_left_out():
     z1[wrong] = z1[np.roll(wrong, 1)] + 0.5
     fitted, said = fit(z0, z1, chart="midpoint", tolerance=1e-3)
     assert "8 of 800 pairs contradict" in said
-    assert "rows 0, 100, 200, 300, 400, …" in said
+    assert "numbers 0, 100, 200, 300, 400, …" in said
     assert fitted.num_pairs == 792
     z = disc(200, seed=4)
     assert rms(fitted.map, z, kick_and_drift(z)) < 1e-3

@@ -246,4 +246,4 @@ def test_a_file_in_degrees_and_milliseconds_is_forecast_in_them(tmp_path, capsys
     found = np.genfromtxt("f.csv", delimiter=",", names=True)
     np.testing.assert_allclose(found["t"], 1e3 * t[350:])
     assert np.abs(found["phi"] - np.degrees(theta[350:]) - 5).max() < 0.3
-    assert "phi: error 0.06" in capsys.readouterr().out
+    assert "phi: RMS error 0.06" in capsys.readouterr().out

@@ -420,7 +420,7 @@ def test_what_no_map_can_be_learned_from_is_refused():
     read = turns(4, 2, 0)
     with pytest.raises(gfnn.FitError, match="at least 20 triples of positions, got 4"):
         gfnn.fit(recorded(read, ["x"]), learn="map")
-    with pytest.raises(gfnn.FitError, match="three positions in a row"):
+    with pytest.raises(gfnn.FitError, match="three rows in succession"):
         gfnn.fit(recorded(read[:, :2], ["x"]), learn="map")
     uneven = Recording(
         {"t": [0.0, 1.0, 2.5, 3.0, 4.0], "x": np.arange(5.0)}, positions=["x"]

@@ -47,7 +47,7 @@ def test_coloured_residuals_and_those_of_an_input_are_told(rng):
     assert of.inputs["u"].seen
     assert of.inputs["u"].lag == pytest.approx(3 * STEP)
     assert of.inputs["u"].correlation == pytest.approx(np.sqrt(0.5) * 47 / 50, abs=0.08)
-    assert "; with u (ρ = +0." in of.text
+    assert "; correlated with u (ρ = +0." in of.text
 
 
 def test_values_that_are_missing_count_as_nothing(rng):
