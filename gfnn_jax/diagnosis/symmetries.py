@@ -24,6 +24,8 @@ from gfnn_jax.phase_space import apply_j
 _MOST_DIM = 4
 _CONSERVED = 0.01  # of what it would change by, that a conserved quantity changes by
 _DEGREES, _MOST_TERMS, _ROWS_PER_TERM = (2, 3, 4, 5, 6), 210, 4
+_ROWS = 100_000  # pairs, the first ones, of which runs are followed
+_TRAINED, _HELD = 1_000, 500  # pairs to which gradients are fitted, and on which they are compared
 _FITTED = 0.2  # of the gradients, that polynomials may leave over where they are compared
 _AS_WELL = 1.5  # times what they leave of the pairs themselves, they may leave of the images
 _SEEN = 0.5  # part of the images that must lie among the pairs
@@ -41,8 +43,8 @@ class SymmetryOfPairs(NamedTuple):
 
 
 def symmetries_of_pairs(data: Dataset) -> tuple[SymmetryOfPairs, ...]:
-    """The symmetries that the pairs show; none of pairs with args, of many degrees of freedom, or
-    where too few lie where their images do. data: without a base map."""
+    """The symmetries that the pairs show, or a sample of them; none of pairs with args, of many
+    degrees of freedom, or where too few lie where their images do. data: without a base map."""
     if data.varied or data.structure is not None or data.dim > _MOST_DIM:
         return ()
     angles = tuple(a for a in data.coordinates.angles if a < data.dim)
@@ -52,13 +54,13 @@ def symmetries_of_pairs(data: Dataset) -> tuple[SymmetryOfPairs, ...]:
 
 
 def _conserved(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPairs]:
-    rows = np.arange(len(data.y0))
-    goes_on = next_of(data.pairs, rows)
-    first = data.y0[np.concatenate([[True], ~goes_on])]
-    last = data.y1[np.concatenate([~goes_on, [True]])]
+    rows = np.arange(min(len(data.y0), _ROWS))
+    goes_on, before, after = next_of(data.pairs, rows), data.y0[rows], data.y1[rows]
+    first = before[np.concatenate([[True], ~goes_on])]
+    last = after[np.concatenate([~goes_on, [True]])]
     moved = np.sqrt(np.mean(((last - first) / data.scale) ** 2))
     for text, generator in generators(data.dim, angles):
-        values = [_generated(generator, z) for z in (data.y0, first, last)]
+        values = [_generated(generator, z) for z in (before, first, last)]
         spread = np.std(values[0])
         if not spread > 0 or not moved > 0:
             continue
@@ -73,9 +75,11 @@ def _generated(generator: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _reflected(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPairs]:
-    middle, weight = 0.5 * (data.y0 + data.y1), 1.0 / np.roll(data.scale, data.dim)
-    gradient = -apply_j(data.y1 - data.y0) / data.dt
-    train, held = data.training, data.validation
+    rows = np.concatenate([_some(data.training, _TRAINED), _some(data.validation, _HELD)])
+    train, held = np.split(np.arange(len(rows)), [min(len(data.training), _TRAINED)])
+    before, after = data.y0[rows], data.y1[rows]
+    middle, weight = 0.5 * (before + after), 1.0 / np.roll(data.scale, data.dim)
+    gradient = -apply_j(after - before) / data.dt
     inputs = box_inputs(middle[train], angles=angles, cyclic=data.coordinates.cyclic)
     most = min(_MOST_TERMS, len(train) * 2 * data.dim // _ROWS_PER_TERM)
     known = [f for f in (Products(inputs, n) for n in _DEGREES) if f.num_parameters <= most]
@@ -98,6 +102,11 @@ def _reflected(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPai
         left = missed(there[seen], gradient[held][seen] @ matrix.T)
         if own <= _FITTED and left <= _AS_WELL * own:
             yield SymmetryOfPairs(text, left)
+
+
+def _some(rows: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of these rows, evenly spaced."""
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int)]
 
 
 # What is looked for, of pairs and of laws
