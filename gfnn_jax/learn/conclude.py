@@ -66,8 +66,8 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         ended = MET if met else cut or _NO_MORE[request.of_network]
     if ended.startswith(MET) and not met:
         ended = (
-            "the map meets it on the pairs that chose it, and not on the test pairs, which chose "
-            "nothing: more pairs narrow the bound"
+            "the map meets the tolerance on the pairs that chose it, and not on the test pairs, "
+            "which chose nothing: more pairs narrow the bound"
             if np.isfinite(candidate.validation_relative)
             else "the implicit step of the map that should meet it fails for some of the states: "
             "a smaller dt, or a smaller region, helps"
