@@ -39,6 +39,7 @@ from gfnn_jax.learn.diagnose import diagnose_request
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.options import FitOptions, with_options
+from gfnn_jax.learn.paid_for import paid_for
 from gfnn_jax.learn.positions import OfPositions, learn_positions
 from gfnn_jax.learn.posterior import with_posterior, work_of_posterior
 from gfnn_jax.learn.propose import structures_to_try
@@ -334,10 +335,12 @@ def fit(
         say=on_progress, tell=on_candidate,
     )  # fmt: skip
     warn(request.messages)
-    on_progress("estimating local Jacobians from neighbouring pairs")
+    taken = paid_for(identified(request.pairs), budget, options.seed)
+    request = dataclasses.replace(request, pairs=taken.pairs)
+    on_progress(f"estimating local Jacobians from {len(taken.pairs):,} pairs")
     with row_blocks.on_devices(_devices(options.devices)):
         data, about_pairs = clean(
-            identified(request.pairs), request.coordinates, request.structure,
+            taken, request.coordinates, request.structure,
             jumps=bool(wrapped(request.pairs, request.coordinates)),
         )  # fmt: skip
         warn(about_pairs)
