@@ -1,5 +1,5 @@
-"""Misfit of a library of terms, told without a flow: what it leaves over of the target gradients of a
-gradients of a chart in a held-out sample of the pairs."""
+"""Misfit of a library of terms, told without a flow: what it leaves over of the target gradients
+of a chart in a held-out sample of the pairs."""
 
 from __future__ import annotations
 
