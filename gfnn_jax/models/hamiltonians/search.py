@@ -20,6 +20,7 @@ from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
 from gfnn_jax.dataset.split import outermost
+from gfnn_jax.dataset.structures import Bodies
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms
@@ -52,6 +53,7 @@ from gfnn_jax.models.hamiltonians.libraries import (
     libraries_of,
     modes_of,
     own_terms,
+    promising,
 )
 from gfnn_jax.models.hamiltonians.noisy_textbook import law_of_sequences
 from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
@@ -331,6 +333,8 @@ def _libraries(
     without a fit."""
     known = libraries_of if forces is None else partial(libraries_with, forces)
     libraries = list(known(data, scene, terms, options))
+    if isinstance(data.structure, Bodies):
+        return promising(libraries, data), []
     if len(libraries) > 1 and libraries[0].quadratic and not data.varied:
         affine = affine_error(data, tolerance).bound
         if affine > _HOPELESS * tolerance.bound:
