@@ -182,7 +182,9 @@ class Budget:
     def leave_out(self, what: str, why: str) -> None:
         """Have it told in the end; what the clock ended is told at length once, in ``ended``."""
         why = "no time" if why.startswith(_NO_TIME) else why
-        self.left_out.append(f"left out: {what} ({why})")
+        told = f"left out: {what} ({why})"
+        if told not in self.left_out:
+            self.left_out.append(told)
 
     def check(self) -> None:
         """Check between the parts of a unit: raises OutOfTime where it takes longer than foretold

@@ -97,10 +97,11 @@ def test_a_map_asked_for_is_a_map(pairs):
     np.testing.assert_allclose(again, energy, rtol=0, atol=4 * np.max(error))
 
 
-def candidate(operations, error):
+def candidate(operations, error, bound=None, num_parameters=3):
     return types.SimpleNamespace(
-        operations=operations, validation_bound=error, validation_relative=error
-    )
+        operations=operations, validation_bound=error if bound is None else bound,
+        validation_relative=error, validation_rms=error, num_parameters=num_parameters,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -113,11 +114,15 @@ def candidate(operations, error):
         (candidate(9.0, 1e-6), candidate(1.0, 1e-5), True),  # neither does
         (candidate(1.0, 1e-5), candidate(9.0, 1e-6), False),
         (candidate(9.0, 1.005e-5), candidate(1.0, 1e-5), True),  # noise tells them not apart
+        # By chance, of pairs so few that the bound is 1.21 times the error.
+        (candidate(9.0, 1.09e-5, 1.32e-5), candidate(1.0, 1e-5), True),
+        (candidate(9.0, 1.11e-5, 1.34e-5), candidate(1.0, 1e-5), False),
+        (candidate(9.0, 1.09e-5, 1.32e-5, 4), candidate(1.0, 1e-5), False),  # of more numbers
         (candidate(1.0, np.inf), candidate(9.0, np.inf), False),
     ],
 )
 def test_when_a_law_is_preferred(law, map_, taken):
-    assert preferred(law, map_, 1e-8) is taken
+    assert preferred(law, map_, Tolerance(1e-8)) is taken
 
 
 @pytest.mark.parametrize(

@@ -46,7 +46,7 @@ def choose(searched: Searched, request: Request) -> Chosen:
         return Chosen(candidate, of_terms.data, seconds)
     ranking, bound = searched.found.ranking, request.tolerance.bound
     best = ranking[0].candidate if ranking else None
-    if law is None or not (best is None or preferred(law.candidate, best, bound)):
+    if law is None or not (best is None or preferred(law.candidate, best, request.tolerance)):
         return _of_ranking(ranking, request)
     request.say(f"compiling the flow of {law.candidate.label}")
     candidate, seconds, *_ = flow_assembled(law, *given)

@@ -55,7 +55,7 @@ def without_bias(found: Searched, request: Request) -> Searched:
         return found
     best = ranking[0]
     met = found.tolerance.met_by(best.candidate)
-    if met or (law is not None and preferred(law.candidate, best.candidate, np.inf)):
+    if met or (law is not None and preferred(law.candidate, best.candidate, Tolerance(np.inf))):
         return found
     rivals = _as_far(found)
     if not rivals or request.budget.over:

@@ -144,7 +144,7 @@ def searched(
 def _no_better(of_terms: LearnedMap, law: LearnedHamiltonian, tolerance: Tolerance) -> bool:
     """Return whether the law that misses the tolerance is taken in the place of this S."""
     if of_terms.data.structure is None:
-        return preferred(law.candidate, of_terms.candidate, tolerance.bound)
+        return preferred(law.candidate, of_terms.candidate, tolerance)
     return of_terms.candidate.validation_bound >= _BETTER * law.candidate.validation_bound
 
 

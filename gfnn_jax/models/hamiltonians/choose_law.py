@@ -112,14 +112,21 @@ def unfit_for_law(data: Dataset, scene: Scene | None) -> str | None:
     return None
 
 
-def preferred(law: Candidate, chosen: Candidate, bound: float) -> bool:
+def preferred(law: Candidate, chosen: Candidate, tolerance: Tolerance) -> bool:
     """Return whether the law is taken instead of the map that was chosen: where it alone meets the
-    tolerance, or meets it and is not four times dearer, or none meets it and it is as good."""
-    if law.validation_bound <= bound:
+    tolerance, or meets it and is not four times dearer, or none meets it and it is as good.
+
+    Behind noise a law of fewer numbers is as good up to what chance makes of the held-out error.
+    """
+    if law.validation_bound <= tolerance.bound:
         return (
-            not chosen.validation_bound <= bound
+            not chosen.validation_bound <= tolerance.bound
             or law.operations <= MAX_COST_RATIO * chosen.operations
         )
-    if chosen.validation_bound <= bound or not np.isfinite(law.validation_relative):
+    if chosen.validation_bound <= tolerance.bound or not np.isfinite(law.validation_relative):
         return False
-    return law.validation_relative <= _AS_GOOD * chosen.validation_relative
+    as_good = _AS_GOOD
+    if law.num_parameters <= chosen.num_parameters:
+        size = law.validation_relative if tolerance.relative else law.validation_rms
+        as_good = max(as_good, np.sqrt(law.validation_bound / size) if size > 0 else 1.0)
+    return law.validation_relative <= as_good * chosen.validation_relative

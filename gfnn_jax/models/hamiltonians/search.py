@@ -318,7 +318,10 @@ def _searched(
     if best is None:
         raise FitError(f"expected more pairs: {len(data.y0)} are too few for any library of terms")
     best = best._replace(stalled=poor == most_poor)
-    return (best, options) if best.error.bound <= bound else _as_noise_tells(tried, best, options)
+    if best.error.bound <= bound:
+        return best, options
+    found, options = _as_noise_tells(tried, best, options)
+    return (found._replace(stalled=True) if found.noisy else found), options
 
 
 def _as_noise_tells(
@@ -330,7 +333,7 @@ def _as_noise_tells(
     near = [f for f in tried if f.error.relative <= options.flat * best.error.relative]
     if len(near) < 2:
         return best, options
-    noisy = near[0]._replace(noisy=True, larger=near[-1], stalled=True)
+    noisy = near[0]._replace(noisy=True, larger=near[-1], stalled=best.stalled)
     return noisy, dataclasses.replace(options, thresholds=(options.certain,))
 
 

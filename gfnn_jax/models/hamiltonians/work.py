@@ -71,9 +71,22 @@ class LawWork:
             self._problem.allowance = allowance
         self._evaluations = (self._cap.spent - before) / one
 
-    def again(self, name: str, family, rows: int):
-        """A unit in which terms that are close to their optimum are fitted to so many pairs."""
-        return self.budget.unit(name, FLOW, _CLOSE * self._one(family, rows))
+    @contextlib.contextmanager
+    def again(self, name: str, family, rows: int) -> Iterator[None]:
+        """A unit in which terms that are close to their optimum are fitted to so many pairs. It
+        makes a law of a library, so that the end of the search is no reason to leave it out."""
+        work = _CLOSE * self._one(family, rows)
+        if not self.budget.over:
+            with self.budget.unit(name, FLOW, work):
+                yield
+            return
+        allowance = self._problem.allowance
+        self._problem.allowance = Allowance(cap=self._cap)
+        try:
+            with self.budget.last(name, FLOW, work, decides=True):
+                yield
+        finally:
+            self._problem.allowance = allowance
 
     def round(self, name: str, expected: float):
         """A unit of so many operations."""
