@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.budget import COMPILE, MAX_SECONDS, ROWS, Budget
-from gfnn_jax.candidates.assemble import block_of
+from gfnn_jax.candidates.assemble import block_of, stepped
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
@@ -250,7 +250,10 @@ class Fit:
     def symplecticity_defect(self) -> float:
         """The largest defect ‖AᵀJA − μJ‖ of the chosen map's unrolled step at the test states, by
         its multiplier μ; NaN where it has none. Compiled when it is first asked for."""
-        return float(np.max(np.asarray(self.map.defect(self.test_states, self.test_args))))
+        z, args = self.test_states, self.test_args
+        steps = stepped(self.map, z, args=args, timed=False)  # by the program that is compiled
+        defects = self.map.defect(z, args, iterations=steps.iterations)
+        return float(np.max(np.asarray(defects)))
 
     @property
     def table(self) -> str:
