@@ -308,14 +308,19 @@ class Lagrangian:
         flat = matmul(as_row(self.losses, curvature) * curvature, outer)
         return flat.reshape(*v.shape, self.dim)
 
-    def acceleration(self, q: Any, v: Any, u: Any = None) -> Any:
-        """a of M a = ∂L/∂q − (∂²L/∂v∂q) v − ∂R/∂v − γ ∂L/∂v + G u, at q, v (..., d)."""
+    def balance(self, q: Any, v: Any, u: Any = None) -> tuple[Any, Any]:
+        """M (..., d, d) and the force (..., d) of M a = ∂L/∂q − (∂²L/∂v∂q) v − ∂R/∂v − γ ∂L/∂v +
+        G u, at q, v (..., d)."""
         f, df, _ = self.terms.potentials(q, order=1)
         g, dg = self.terms.motion(v)
         theta = as_row(self.coefficients, f)
         along = (df * v[..., None, :]).sum(-1)
         force = ((theta * g)[..., None] * df - (theta * along)[..., None] * dg).sum(-2)
-        return _solve(self._masses(f, self.terms.quadratic()[0]), force + self.forces(q, v, u))
+        return self._masses(f, self.terms.quadratic()[0]), force + self.forces(q, v, u)
+
+    def acceleration(self, q: Any, v: Any, u: Any = None) -> Any:
+        """a (..., d), the solution of `balance`."""
+        return _solve(*self.balance(q, v, u))
 
     def power(self, q: Any, v: Any, u: Any = None) -> tuple[Any, Any]:
         """Energy per unit of time: lost to each friction (..., F + 1), the last one uniform

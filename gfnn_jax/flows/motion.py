@@ -12,6 +12,7 @@ substeps as the fastest motion asks; all steps of a recording are taken at once,
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -153,15 +154,26 @@ class Form:
     def advance(self, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray) -> np.ndarray:
         """States (N, 2d) after a step, as `step` has them, without derivatives."""
         law, d, substeps = self.lagrangian(p), self.dim, u.shape[1]
-        h = (h / substeps)[:, None]
         for k in range(substeps):
-            rates: list[np.ndarray] = []
-            for i in range(6):
-                xi = x
-                for j in np.flatnonzero(_A[i]):
-                    xi = xi + _A[i, j] * h * rates[j]
-                a = law.acceleration(xi[:, :d], xi[:, d:], u[:, k, i])
-                rates.append(np.concatenate([xi[:, d:], a], axis=1))
-            for i in np.flatnonzero(WEIGHTS):
-                x = x + WEIGHTS[i] * h * rates[i]
+
+            def rate(i: int, x: np.ndarray, k: int = k) -> np.ndarray:
+                a = law.acceleration(x[:, :d], x[:, d:], u[:, k, i])
+                return np.concatenate([x[:, d:], a], axis=1)
+
+            x = runge_kutta(rate, x, (h / substeps)[:, None])
         return x
+
+
+def runge_kutta(
+    rate: Callable[[int, np.ndarray], np.ndarray], x: np.ndarray, h: np.ndarray
+) -> np.ndarray:
+    """States (N, m) after one step h (N, 1) of ẋ = rate(i, x), i the number of the stage."""
+    rates: list[np.ndarray] = []
+    for i in range(6):
+        xi = x
+        for j in np.flatnonzero(_A[i]):
+            xi = xi + _A[i, j] * h * rates[j]
+        rates.append(rate(i, xi))
+    for i in np.flatnonzero(WEIGHTS):
+        x = x + WEIGHTS[i] * h * rates[i]
+    return x

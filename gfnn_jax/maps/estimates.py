@@ -19,7 +19,7 @@ from gfnn_jax.data.channels import channels_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import UNIFORM, Friction, Lagrangian
-from gfnn_jax.flows.motion import Form
+from gfnn_jax.flows.motion import WEIGHTS, Form
 from gfnn_jax.flows.schedules import at_stages
 from gfnn_jax.maps import stops
 from gfnn_jax.maps.laws import law_of_map
@@ -344,13 +344,12 @@ def _with_stops(
     if not len(lanes):
         return orbit[:, 1:]
     some, orbit = [windows[i] for i in lanes.tolist()], orbit.copy()
-    noise = float(np.min(sensors.seen.state_sigma(orbit[:, 0], sensors.sigma)))
-
-    def inputs(k: int, parts: int) -> np.ndarray:
-        return _inputs(law, some, ends[lanes, k : k + 2], parts)[:, 0]
-
     parts = substeps_of(sensors, np.max(np.diff(ends, axis=1), initial=0.0))
-    found = stops.stopped(lagrangian, orbit[lanes], ends[lanes], noise, parts, inputs)
+
+    def inputs(k: int) -> np.ndarray:
+        return _inputs(law, some, ends[lanes, k : k + 2], parts)[:, 0].swapaxes(2, 3) @ WEIGHTS
+
+    found = stops.stopped(lagrangian, orbit[lanes, 0], ends[lanes], inputs)
     solved = np.isfinite(found).all(axis=(1, 2))
     orbit[lanes[solved], 1:] = found[solved]
     return orbit[:, 1:]
