@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Iterator
 from typing import Literal
@@ -90,6 +91,7 @@ class Budget:
         self.max_seconds, self.max_operations = max_seconds, max_operations
         self.ended, self.operations, self.left_out = "", 0, list[str]()
         self._clock, self._started = clock, clock() - spent
+        self._most = math.inf if max_operations is None else max_operations
         self._done, self._last, self._closed = 0, "", False
         self._measured: dict[str, tuple[float, float]] = {}  # kind -> operations, seconds
         self._reserved: dict[str, float] = {}  # kind -> operations that follow the search
@@ -105,6 +107,22 @@ class Budget:
         """Return whether a unit did not fit, so that no further one is begun."""
         return bool(self.ended)
 
+    def pays_for(self, operations: float) -> bool:
+        """Return whether the fit can rest on so many operations, which then count as done.
+
+        No clock is looked at: the seconds allowed are those of a quiet core. Where they are too
+        few the search ends before it has made as many, so that its own number of operations, given
+        as ``max_operations``, does not pay for them either.
+        """
+        count = int(operations)
+        allowed = math.inf if self.max_seconds is None else self.max_seconds * RATES[ROWS]
+        paid = count <= min(allowed, self._most)
+        if paid:
+            self.operations += count
+        else:
+            self._most = min(self._most, count - 1)
+        return paid
+
     @contextlib.contextmanager
     def unit(
         self, name: str, kind: str, operations: float, *, then: tuple[str, float] | None = None
@@ -119,11 +137,11 @@ class Budget:
             raise OutOfTime
         if then is not None:
             self._reserved[then[0]] = max(self._reserved.get(then[0], 0.0), then[1])
-        most = self.max_operations
-        if most is not None and self.operations + count > most:
-            left = max(most - self.operations, 0)
-            needed = f"{name} needs {count:.1e}, and {left:.1e} of {most:,} are left"
-            self._end("there were no operations for", f"{needed} (--max-operations)")
+        if self.operations + count > self._most:
+            left = max(self._most - self.operations, 0)
+            needed = f"{name} needs {count:.1e}, and {left:.1e} of {self._most:,} are left"
+            option = "--max-seconds" if self.max_operations is None else "--max-operations"
+            self._end("there were no operations for", f"{needed} ({option})")
         if self.max_seconds is not None:
             seconds, now = self._foretold(kind, count) + self._set_apart, self.seconds
             if now + seconds > self.max_seconds:
@@ -149,7 +167,7 @@ class Budget:
         if self.max_seconds is not None:
             late = self.seconds + self._foretold(kind, operations) > self.max_seconds
             self._closed = self._closed or late
-        spent = self.max_operations is not None and self.operations >= self.max_operations
+        spent = self.operations >= self._most
         if self._closed or (decides and spent):
             self.leave_out(name, _NO_TIME)
             raise OutOfTime

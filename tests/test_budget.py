@@ -16,7 +16,7 @@ from gfnn_jax.budget import COMPILE, FLOW, ROWS, Budget
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.learn import searches
+from gfnn_jax.learn import paid_for, searches
 
 QUIETLY = pytest.mark.filterwarnings("ignore::gfnn_jax.FitWarning")
 LARGE = 10**10  # operations whose time tells the rate of their kind: a second, by default
@@ -152,6 +152,27 @@ def test_a_unit_that_takes_longer_than_foretold_leaves_nothing_behind():
         slow_unit()
     assert budget.operations == 0
     assert budget.over
+
+
+def test_what_a_fit_rests_on_is_paid_for_by_seconds_of_a_quiet_core():
+    """Whether it is told by the seconds or by the operations that were done."""
+    for seconds, paid in ((9.0, False), (10.0, True)):
+        hand = Hand()
+        first = Budget(max_seconds=seconds, clock=hand)
+        hand.now = 1e9  # a busy machine
+        assert first.pays_for(10 * LARGE) == paid
+        hand.now = 0.0
+        with contextlib.suppress(OutOfTime):
+            while True:
+                moved(first, hand, 2 * LARGE, 0.1)
+        again = Budget(max_operations=first.operations)
+        assert again.pays_for(10 * LARGE) == paid
+        with contextlib.suppress(OutOfTime):
+            while True:
+                moved(again, hand, 2 * LARGE, 0.1)
+        assert again.operations == first.operations
+        assert (first.operations >= 10 * LARGE) == paid
+    assert Budget().pays_for(1e30)
 
 
 # Fits.
@@ -310,6 +331,34 @@ def test_a_faster_clock_ends_at_an_earlier_unit_which_operations_reproduce(learn
     operations = [fit.operations for fit in found]
     assert operations == sorted(operations, reverse=True)
     assert len(set(operations)) == len(operations)
+
+
+@QUIETLY
+def test_where_the_budget_does_not_pay_for_all_pairs_a_sample_is_fitted(monkeypatch):
+    """The seconds and operations of the budget tell, not the clock."""
+    monkeypatch.setattr(paid_for, "_OF_PAIR", 10**9)
+    monkeypatch.setattr(paid_for, "_FEWEST", 200)
+    pairs, work = kepler(), 300 * 16 * 10**9
+    seconds = work / 1e10
+    for allowed, tick, num_pairs in ((0.9, 4.0, 200), (0.9, 1e-3, 200), (1.1, 4.0, 300)):
+        looks = itertools.count()
+        options = {"tolerance": 1e-9, "learn": "map"}
+        fit = gfnn.fit(
+            pairs, max_seconds=allowed * seconds,
+            clock=lambda looks=looks, tick=tick: tick * next(looks), **options,
+        )  # fmt: skip
+        again = gfnn.fit(pairs, max_operations=fit.max_operations, **options)
+        assert fit.num_pairs == again.num_pairs == num_pairs
+        same_bits(fit, again)
+        assert again.operations == fit.operations
+        assert (fit.operations >= work) == (num_pairs == 300)
+        said = (
+            "left out: 100 of 300 pairs (the budget pays for a sample; --max-seconds 480 pays for "
+            "all)"
+        )
+        assert (said in fit.messages) == (num_pairs == 200)
+    whole = gfnn.fit(pairs, max_seconds=None, **options)
+    assert whole.num_pairs == 300
 
 
 @QUIETLY

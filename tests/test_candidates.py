@@ -166,6 +166,7 @@ def test_an_even_generating_function_is_known_by_its_pairs(odd, even, monkeypatc
     pairs = Pairs(z, np.concatenate([q + 0.1 * p, p], axis=1), 0.1)
     data = Dataset.of(identified(pairs).pairs, Coordinates("cartesian")).divided(0)
     assert is_even(data, (2, 4, 6), 300, 3) == even
+    assert not is_even(data, (2,), 300, 3)  # saves no more than six terms
     (found,) = sweeps.sweeps_for("polynomial", [MIDPOINT], data, Tolerance(1e-6), None)
     assert [size.family.degree for size in found.sizes] == ([2, 4] if even else [2, 3, 4])
     if even:

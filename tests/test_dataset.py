@@ -13,7 +13,7 @@ from gfnn_jax.data.sample import read_sample
 from gfnn_jax.dataset.bounds import bound_of_mean
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
-from gfnn_jax.dataset.runs import identified, next_of, steps_between
+from gfnn_jax.dataset.runs import identified, next_of, sampled, steps_between
 from gfnn_jax.dataset.split import correlation_time, split_rows
 from gfnn_jax.learn.stated import of_few
 from gfnn_jax.maps.affine import Affine
@@ -110,6 +110,26 @@ def test_a_permuted_fit_is_the_same_fit():
 def continued(sample):
     """Number of rows of the sample whose image is the next row's state."""
     return int(np.sum(steps_between(identified(sample.pairs()).pairs) == 1))
+
+
+@pytest.mark.parametrize(
+    ("lengths", "stretches"), [([1] * 1_000, 1), ([5] * 200, 5), ([700, 300], 10)]
+)
+def test_a_sample_of_pairs_is_of_whole_runs_or_long_stretches(lengths, stretches):
+    count = sum(lengths)
+    z = np.random.default_rng(0).normal(size=(2, count, 2))
+    run = np.repeat(np.arange(len(lengths)), lengths)
+    place = np.concatenate([np.arange(length) for length in lengths])
+    pairs = identified(gfnn.Pairs(z[0], z[1], 0.1, run=run, place=place)).pairs
+    rows = sampled(pairs, 200, seed=1)
+    assert len(rows) == 200
+    assert (np.diff(rows) > 0).all()
+    whole = rows.reshape(-1, stretches)
+    assert (np.diff(whole, axis=1) == 1).all()
+    assert (np.diff(pairs.run[whole], axis=1) == 0).all()
+    assert (place[whole[:, 0]] % stretches == 0).all()
+    np.testing.assert_array_equal(rows, sampled(pairs, 200, seed=1))
+    assert set(rows) != set(sampled(pairs, 200, seed=2))
 
 
 @pytest.mark.parametrize("kind", ["trajectories", "pairs", "table"])

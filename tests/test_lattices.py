@@ -12,6 +12,7 @@ import gfnn_jax as gfnn
 from gfnn_jax import cli, scenes
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.structures import Bodies
 from gfnn_jax.evaluate import figures, figures_of_many
 from gfnn_jax.families.sums import ENDS, Part, Sums, Windows, body_terms, matrix_free, site_terms
 from gfnn_jax.families.terms import Terms, given_terms
@@ -21,6 +22,7 @@ from gfnn_jax.flows.rates import rates
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.propose import proposed
+from gfnn_jax.models.hamiltonians.libraries import promising
 from gfnn_jax.phase_space import apply_j, defect_of_pairs
 from gfnn_jax.solve import krylov
 from gfnn_jax.solve.status import NON_FINITE
@@ -245,6 +247,39 @@ def test_bodies_that_are_alike_share_their_coefficients():
     z1 = images(family, np.array([0.5, -1.0]), z0, 0.2, Steps(8, 2)).states
     fit = gfnn.fit(gfnn.Pairs(z0, z1, 0.2), structure="bodies:3", tolerance=1e-12)
     assert str(fit.hamiltonian) == "0.5 Σ_i |p_i|² - Σ_{i<j} 1/|q_i - q_j|"
+
+
+def test_bodies_that_are_not_alike_are_told_by_the_midpoints_of_their_pairs():
+    """Libraries of equal bodies are left out where their masses differ, and only there."""
+    corners = 2 * np.pi / 3 * np.arange(3)
+    around = np.stack([np.cos(corners), np.sin(corners)], axis=1).ravel()
+    z0 = np.concatenate([around, np.zeros(6)]) + 0.1 * RNG.normal(size=(150, 12))
+    family = body_terms(3, 2, (-1,), alike=False)
+    equal, unequal = np.array([0.5] * 3 + [-1.0] * 3), np.array([0.5, 1, 2, -0.5, -0.25, -0.125])
+    left = []
+    for params in (equal, unequal):
+        z1 = images(family, params, z0, 0.2, Steps(8, 2)).states
+        data = Dataset.of(gfnn.Pairs(z0, z1, 0.2), CARTESIAN, Bodies(3, 2)).divided(0)
+        libraries = list(data.structure.libraries(6))
+        left.append([f.num_parameters for f in promising(libraries, data)])
+    assert left[0] == [f.num_parameters for f in libraries]
+    assert left[1] == [18, 33]
+
+
+@pytest.mark.slow
+def test_bodies_of_unequal_masses_told_nothing():
+    masses = (1.0, 0.7, 0.4)
+    family = body_terms(3, 2, (-1,), alike=False)
+    pulls = [-masses[i] * masses[j] for i, j in combinations(range(3), 2)]
+    exact = np.array([*(0.5 / m for m in masses), *pulls])
+    corners = 2 * np.pi / 3 * np.arange(3)
+    around = np.stack([np.cos(corners), np.sin(corners)], axis=1).ravel()
+    z0 = np.concatenate([around, np.zeros(6)]) + 0.15 * RNG.normal(size=(300, 12))
+    z1 = images(family, exact, z0, 0.1, Steps(8, 2)).states
+    fit = gfnn.fit(gfnn.Pairs(z0, z1, 0.1), tolerance=1e-8, max_seconds=None)
+    assert fit.chosen.label == "H, 6 terms"
+    found = [coefficient for _, coefficient, _ in fit.hamiltonian.terms]
+    np.testing.assert_allclose(found, exact, rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -110,12 +110,6 @@ def _dt_range(piece: Piece, data: Dataset) -> np.ndarray | None:
     return np.array([data.own_dt.min(), data.own_dt.max()])
 
 
-def in_block(z: np.ndarray) -> np.ndarray:
-    """States z (N, 2d), N no more than a block holds, repeated so that they fill it: for them the
-    step is compiled."""
-    return np.resize(z, (block_of(z.shape[1]), z.shape[1]))
-
-
 def block_of(width: int) -> int:
     """The number of states (2d,) of this width that are stepped together."""
     return max(1, min(_BLOCK, _BLOCK_NUMBERS // width))

@@ -14,6 +14,7 @@ from gfnn_jax.phase_space import Pairs
 
 _BRIDGED = 10  # pairs of a run, left out one after another, beyond which it does not go on
 _TOGETHER = 50  # pairs of a run that are looked at or left out as one
+_STRETCHES = 20  # of a sample of the runs, at least
 
 
 class Identified(NamedTuple):
@@ -122,6 +123,20 @@ def looked_at(pairs: Pairs, rows: np.ndarray, most: int) -> tuple[np.ndarray, np
         drawn = np.random.default_rng(0).permutation(block[-1] + 1)[: -(-most // together)]
         places = places[np.isin(block, drawn)]
     return places, next_of(pairs, rows[places])
+
+
+def sampled(pairs: Pairs, most: int, seed: int) -> np.ndarray:
+    """About ``most`` rows in rising order, drawn by the seed: whole runs, the longer ones in
+    stretches of a twentieth of all that are drawn. ``pairs``: in the order of their runs."""
+    goes_on = steps_between(pairs) > 0
+    first = np.concatenate([[True], ~goes_on])
+    run = np.cumsum(first) - 1
+    along = np.arange(len(pairs)) - np.flatnonzero(first)[run]
+    longest = max(1, most // _STRETCHES)
+    block = np.cumsum(first | (along % longest == 0)) - 1
+    order = np.random.default_rng(seed).permutation(block[-1] + 1)
+    drawn = order[: np.searchsorted(np.cumsum(np.bincount(block)[order]), most) + 1]
+    return np.flatnonzero(np.isin(block, drawn))
 
 
 def first_occurrences(pairs: Pairs) -> np.ndarray:

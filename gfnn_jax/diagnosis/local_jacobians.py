@@ -25,6 +25,8 @@ _NEIGHBOURS_PER_TERM = 3
 # From so many pairs on the neighbourhoods keep their size: more pairs then average the noise away
 # instead of shrinking them below it.
 _LOCAL_ENOUGH, _MOST_NEIGHBOURS = 4_000, 1_000
+# Neighbours are sought among so many pairs: a tree of a million takes a second more.
+_MOST_AMONG = 200_000
 _FILLED = 0.03  # of a neighbourhood's size: a thinner one says nothing of the direction across
 _SPANNED = 1e-8  # a smaller singular value of a local fit is a direction without neighbours
 # With more terms than these a local fit goes by its Gram matrix, which tells no directions apart
@@ -114,9 +116,11 @@ def local_jacobians(
     count = min(n, max(fewest, min(_MOST_NEIGHBOURS, fewest * n // _LOCAL_ENOUGH)))
     affordable = max(_FEWEST_CENTRES, int(_OPERATIONS / (6 * count * terms**2)))
     chosen = _centres(n, min(_CENTRES, affordable), seed)
-    tree = cKDTree(x)
+    among = _among(n, seed)
+    tree = cKDTree(x[among])
     while True:
         _, near = tree.query(x[chosen], k=count)
+        near = among[near]
         offset = x[near] - x[chosen][:, None, :]
         columns = [np.ones((*offset.shape[:2], 1)), offset]
         if quadratic:
@@ -147,6 +151,13 @@ def centres(y0, jacobians, seed: int) -> np.ndarray:
 
 def _centres(count: int, most: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).permutation(count)[:most]
+
+
+def _among(count: int, seed: int) -> np.ndarray:
+    """The rows of so many among which neighbours are sought."""
+    if count <= _MOST_AMONG:
+        return np.arange(count)
+    return np.sort(_centres(count, _MOST_AMONG, seed))
 
 
 def outliers(y0, y1, scale, given=None) -> np.ndarray:
@@ -344,8 +355,9 @@ def sampled_dimension(y, scale) -> int:
     x, width = np.asarray(y) / scale, np.shape(y)[1]
     count = min(len(x), _NEIGHBOURS_PER_TERM * (1 + width))
     centres = np.linspace(0, len(x) - 1, min(_CENTRES, len(x))).astype(int)
-    _, near = cKDTree(x).query(x[centres], k=count)
-    offset = x[near] - x[near].mean(axis=1, keepdims=True)
+    among = x[_among(len(x), 0)]
+    _, near = cKDTree(among).query(x[centres], k=count)
+    offset = among[near] - among[near].mean(axis=1, keepdims=True)
     spread = np.linalg.svd(offset, compute_uv=False)
     return int(np.median(np.sum(spread > _THIN * spread[:, :1], axis=1)))
 

@@ -36,6 +36,7 @@ from gfnn_jax.evaluate.figures_style import (
     look_of,
     save,
     style,
+    without_minor_ticks,
 )
 
 __all__ = (
@@ -84,6 +85,7 @@ def error_growth(errors: Mapping, ylabel="position error", ax=None, band=None) -
     _guide(ax, 1.0, r"$\propto n$")
     if band is not None:
         _shaded(ax, np.asarray(band[0]), np.mean(band[1], axis=0))
+    without_minor_ticks(ax)
     legend_above(ax)
     return ax
 
@@ -115,6 +117,7 @@ def element_errors(errors: Mapping, axes=None) -> tuple[Axes, Axes]:
     for i, (ax, label) in enumerate(zip(axes, labels, strict=True)):
         _error_curves(ax, {name: (v[0], v[1 + i]) for name, v in errors.items()}, label)
         legend_above(ax)
+    without_minor_ticks(*axes)
     return tuple(axes)
 
 
@@ -130,6 +133,7 @@ def energy_error(errors: Mapping, ax=None) -> Axes:
         _log_curve(ax, place, name, np.asarray(steps), size)
     _log_log(ax, r"energy error $|H-H_0|\,/\,|H_0|$ (RMS)")
     _guide(ax, 0.5, r"$\propto \sqrt{n}$")
+    without_minor_ticks(ax)
     legend_above(ax)
     return ax
 

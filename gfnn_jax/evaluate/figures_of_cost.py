@@ -19,6 +19,7 @@ from gfnn_jax.evaluate.figures_style import (
     legend_above,
     look_of,
     style,
+    without_minor_ticks,
 )
 
 
@@ -75,6 +76,7 @@ def speed_against_error(
     ax.xaxis.set_major_formatter("{x:g}")
     few = max(cost) < 1e3 * min(cost)
     ax.xaxis.set_minor_formatter("{x:g}" if few else NullFormatter())
+    without_minor_ticks(ax)
     _number_points(ax, cost, error, order)
     ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
     names = [

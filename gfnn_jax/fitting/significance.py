@@ -57,16 +57,72 @@ def significant(
 
     rms: of what the terms do not explain; None: of what all of them leave over.
     """
-    count, rows = len(coefficients), triangle.rows
-    kept = np.arange(count)
+    noise, problem = _noise(triangle, len(coefficients), rms), triangle.rebased(coefficients)
+    return _eliminated(problem, np.arange(len(coefficients)), coefficients, threshold * noise)
+
+
+def told_from_noise(
+    triangle: Triangle, coefficients: np.ndarray, threshold: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(kept, their coefficients) of the linearised problem of [∂r/∂c, r]: the terms that lower
+    ‖r‖² + n (threshold σ)², n of them, the most, σ the noise that all of them leave over.
+
+    Of terms that are nearly combinations of others, elimination may take the true one first, and
+    matching (orthogonal matching pursuit: Pati, Rezaiifar & Krishnaprasad 1993) may add a wrong one
+    first: the better of the two is taken.
+    """
+    problem = triangle.rebased(coefficients)
+    limit = threshold * _noise(triangle, len(coefficients), None)
+    found = [
+        _eliminated(problem, kept, coefficients[kept], limit)
+        for kept in (np.arange(len(coefficients)), _matched(problem.factor, limit))
+    ]
+
+    def cost(found: tuple[np.ndarray, np.ndarray]) -> float:
+        kept, c = found
+        left = problem.factor[:, kept] @ c - problem.factor[:, -1]
+        return float(left @ left) + len(kept) * limit**2
+
+    return min(found, key=cost)
+
+
+def _noise(triangle: Triangle, count: int, rms: float | None) -> float:
+    rows = triangle.rows
     unexplained = triangle.residual_norm(count) / np.sqrt(rows) if rms is None else rms
-    noise = max(unexplained, ROUNDOFF) * np.sqrt(rows / max(rows - count, 1))
-    problem, c = triangle.rebased(coefficients), coefficients
+    return max(unexplained, ROUNDOFF) * np.sqrt(rows / max(rows - count, 1))
+
+
+def _matched(factor: np.ndarray, limit: float) -> np.ndarray:
+    """The columns of [A b] that explain b one after another, whichever explains the most, until the
+    next explains less than ``limit``."""
+    columns, left = factor[:, :-1].copy(), factor[:, -1].copy()
+    size = np.linalg.norm(columns, axis=0)
+    kept: list[int] = []
+    while len(kept) < columns.shape[1]:
+        rest = np.linalg.norm(columns, axis=0)
+        known = rest > NULL * size
+        known[kept] = False
+        gain = np.where(known, np.abs(left @ columns) / np.where(known, rest, 1.0), 0.0)
+        best = int(np.argmax(gain))
+        if not gain[best] > limit:
+            break
+        kept.append(best)
+        direction = columns[:, best] / rest[best]
+        left -= direction * (direction @ left)
+        columns -= np.outer(direction, direction @ columns)
+    return np.sort(np.array(kept, int))
+
+
+def _eliminated(
+    problem: Triangle, kept: np.ndarray, c: np.ndarray, limit: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(kept, their coefficients) when of these terms those go whose absence leaves less than
+    ``limit`` over, the others solved for again, until there are none."""
     while kept.size:
         spectrum = problem.pruned(kept).spectrum()
         c = spectrum.solution(spectrum.inverse)
-        ratio = np.abs(c) / (noise * spectrum.deviations())
-        weak = ratio < threshold
+        ratio = np.abs(c) / spectrum.deviations()
+        weak = ratio < limit
         if not weak.any():
             break
         # Half of the weak ones at a time, the weakest first: they lend each other their weight.

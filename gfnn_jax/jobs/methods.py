@@ -160,7 +160,7 @@ def _map_part(map_: SymplecticMap, data: SharedData) -> dict[str, Any]:
     z = data.fresh.z0[:_NUM_DEFECTS]
     info = map_.step(z)[1]
     solved = np.asarray(info.status) < NOT_CONVERGED
-    defects = np.asarray(map_.defect(z))[solved]
+    defects = np.asarray(map_.defect(z, iterations=info.iterations))[solved]
     return {
         "symplecticity_defect": float(defects.max()) if len(defects) else None,
         "unsolved": float(np.mean(~solved)),

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.budget import COMPILE, MAX_SECONDS, ROWS, Budget
-from gfnn_jax.candidates.assemble import block_of
+from gfnn_jax.candidates.assemble import block_of, stepped
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
@@ -39,6 +39,7 @@ from gfnn_jax.learn.diagnose import diagnose_request
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.options import FitOptions, with_options
+from gfnn_jax.learn.paid_for import paid_for
 from gfnn_jax.learn.positions import OfPositions, learn_positions
 from gfnn_jax.learn.posterior import with_posterior, work_of_posterior
 from gfnn_jax.learn.propose import structures_to_try
@@ -249,7 +250,10 @@ class Fit:
     def symplecticity_defect(self) -> float:
         """The largest defect ‖AᵀJA − μJ‖ of the chosen map's unrolled step at the test states, by
         its multiplier μ; NaN where it has none. Compiled when it is first asked for."""
-        return float(np.max(np.asarray(self.map.defect(self.test_states, self.test_args))))
+        z, args = self.test_states, self.test_args
+        steps = stepped(self.map, z, args=args, timed=False)  # by the program that is compiled
+        defects = self.map.defect(z, args, iterations=steps.iterations)
+        return float(np.max(np.asarray(defects)))
 
     @property
     def table(self) -> str:
@@ -334,10 +338,12 @@ def fit(
         say=on_progress, tell=on_candidate,
     )  # fmt: skip
     warn(request.messages)
-    on_progress("estimating local Jacobians from neighbouring pairs")
+    taken = paid_for(identified(request.pairs), budget, options.seed)
+    request = dataclasses.replace(request, pairs=taken.pairs)
+    on_progress(f"estimating local Jacobians from {len(taken.pairs):,} pairs")
     with row_blocks.on_devices(_devices(options.devices)):
         data, about_pairs = clean(
-            identified(request.pairs), request.coordinates, request.structure,
+            taken, request.coordinates, request.structure,
             jumps=bool(wrapped(request.pairs, request.coordinates)),
         )  # fmt: skip
         warn(about_pairs)

@@ -10,17 +10,13 @@ import numpy as np
 
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.structures import structure_of
-from gfnn_jax.errors import FitError
-from gfnn_jax.families.sums import Sums
-from gfnn_jax.fitting.linear_starts import fitted_gradients
+from gfnn_jax.diagnosis.misfit import misfit
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.learn.request import Request
 
 _FEWEST_DIM = 6  # below it a fit needs no structure
 _CHARTS = ("midpoint", "type2")  # of flows, to O(h²), and of kicked maps
-_SAMPLE = 50  # pairs that a structure is fitted to; as many judge it
-_QUIET = 0.75  # of the sample, that moves least
-_MOST_TERMS = 60
+_MOST_TERMS = 150  # of a library that a sample is fitted by
 _EXPLAINED = 0.1  # of the forces or of the velocities, that the midpoint's error may leave over
 _TRIED = 0.02  # of them: so little that a law of the structure is looked for before anything else
 
@@ -79,35 +75,5 @@ def _misfit(text: str, data: Dataset) -> float:
     assert structure is not None
     libraries = list(structure.libraries(data.dim))
     small = [family for family in libraries if family.num_parameters <= _MOST_TERMS]
-    return min((_of_library(f, data) for f in small), default=np.inf)
-
-
-def _of_library(family: Sums, data: Dataset) -> float:
-    y0, y1 = _quiet(data)
-    half, found = len(y0) // 2, []
-    for chart in (CHARTS[name] for name in _CHARTS):
-        w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, data.dt)
-        try:
-            c = fitted_gradients(family, w[:half], target[:half], data.scale)
-        except (FitError, np.linalg.LinAlgError):  # functions that overflow at these states
-            continue
-        off = family.gradient(c, w[half:]) - target[half:]
-        found.append(_part(off, target[half:]))
-    return min(found, default=np.inf)
-
-
-def _quiet(data: Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """A sample of the pairs without those that move most, as close passages do."""
-    y0, y1 = data.y0[: 2 * _SAMPLE], data.y1[: 2 * _SAMPLE]
-    moved = np.abs((y1 - y0) / data.scale).max(axis=1)
-    quiet = moved <= np.quantile(moved, _QUIET)
-    return y0[quiet], y1[quiet]
-
-
-def _part(off: np.ndarray, target: np.ndarray) -> float:
-    """Size of off ÷ that of target in the median over pairs, of the forces or of the velocities,
-    whichever is larger."""
-    sizes = [np.linalg.norm(np.reshape(x, (len(x), 2, -1)), axis=2) for x in (off, target)]
-    left, whole = (np.median(size, axis=0) for size in sizes)
-    part = float(np.max(left / np.maximum(whole, np.finfo(float).tiny)))
-    return part if np.isfinite(part) else np.inf
+    charts = [CHARTS[name] for name in _CHARTS]
+    return min((misfit(f, data, chart) for f in small for chart in charts), default=np.inf)

@@ -24,7 +24,7 @@ from gfnn_jax.models.generating_functions.map_of_terms import LearnedMap, map_of
 from gfnn_jax.models.generating_functions.model_sweep import ModelSweep
 from gfnn_jax.models.generating_functions.network_sweep import NetworkSweep
 from gfnn_jax.models.generating_functions.sweeps import sweep_of_dt, sweeps_for
-from gfnn_jax.models.hamiltonians.choose_law import MAX_COST_RATIO, law_of
+from gfnn_jax.models.hamiltonians.choose_law import MAX_COST_RATIO, law_of, preferred
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.networks import learn_network
 from gfnn_jax.models.maps_of_laws.law_maps import (
@@ -38,6 +38,7 @@ from gfnn_jax.search.search import Entry, Found, Search
 
 # Operations of a size of S that is judged before H is looked for: a fifth of a second.
 _SMALL = 2e9
+_BETTER = 0.5  # of the error of an H, that S of a structure must have to be taken in its stead
 OnBetter = Callable[[SymplecticMap, Candidate], Any]
 
 
@@ -84,6 +85,8 @@ def searched(
     if wanted and options.family == "auto":
         try:
             of_terms = map_of(seen.data, tolerance, scene, options.chart, law, budget, say)
+            if of_terms is not None and law is not None and _no_better(of_terms, law, tolerance):
+                of_terms = None
         except FitError as error:
             failed = error
     if wanted and data.args is not None and not _met(of_terms, tolerance):
@@ -136,6 +139,13 @@ def searched(
         if best.validation_bound < of_terms.candidate.validation_bound:
             of_terms = None
     return Searched(law, of_terms, found, bool(climb.sweeps), charts, data, tolerance, linear)
+
+
+def _no_better(of_terms: LearnedMap, law: LearnedHamiltonian, tolerance: Tolerance) -> bool:
+    """Return whether the law that misses the tolerance is taken in the place of this S."""
+    if of_terms.data.structure is None:
+        return preferred(law.candidate, of_terms.candidate, tolerance.bound)
+    return of_terms.candidate.validation_bound >= _BETTER * law.candidate.validation_bound
 
 
 def _met(found: LearnedMap | None, tolerance: Tolerance) -> bool:

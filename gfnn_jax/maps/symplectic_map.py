@@ -299,7 +299,7 @@ class SymplecticMap:
         factors = [piece.multiplier(args) for piece in self.pieces]
         return None if any(factor is None for factor in factors) else math.prod(factors, start=1.0)
 
-    def defect(self, z, args=None, *, t0=None):
+    def defect(self, z, args=None, *, t0=None, iterations=None):
         """Symplecticity defect ‖AᵀJA − μJ‖ () or (B,) of the step's derivative A at z.
 
         It is in units of ``scale``, μ the multiplier; NaN where there is none.
@@ -307,10 +307,11 @@ class SymplecticMap:
         The derivative is the unrolled one, by forward differentiation through the iterations that
         ran. That of the implicit rule would look symplectic however badly the solve had converged.
         For many degrees of freedom the defect is estimated by random pairs of tangent vectors.
+        iterations: updates of the steps from z, where they were stepped before; else they are now.
         """
         z = self._states(z)
         args = self._args(args, z, t0)
-        ran = _step(self, z, args)[1].iterations
+        ran = _step(self, z, args)[1].iterations if iterations is None else iterations
         # A single update is the usual case; its derivative compiles in half the time.
         once = not isinstance(ran, Tracer) and np.max(np.asarray(ran), initial=0) <= 1
         return _defect(self, z, args, 1 if once else True)

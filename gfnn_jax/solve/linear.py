@@ -42,27 +42,38 @@ def solve_and_sign(matrix, rhs):
 def by_cofactors(matrix, rhs):
     """Solve by cofactors; return the solution (..., n) and the determinant (...)."""
     xp, n = namespace(matrix, rhs), rhs.shape[-1]
+    # Taken out once: an index costs JAX more time to trace than the arithmetic.
+    entries = [[matrix[..., i, j] for j in range(n)] for i in range(n)]
+    right = [rhs[..., i] for i in range(n)]
 
     @cache
     def minor(rows, columns):
         """Determinant of these rows and columns, expanded along the first row."""
         if not rows:
             return 1.0
-        total = 0.0
-        for sign, j in zip((1.0, -1.0) * n, columns):  # noqa: B905
-            others = tuple(k for k in columns if k != j)
-            total = total + sign * matrix[..., rows[0], j] * minor(rows[1:], others)
-        return total
+        if len(rows) == 1:
+            return entries[rows[0]][columns[0]]
+        return _alternating(
+            entries[rows[0]][j] * minor(rows[1:], tuple(k for k in columns if k != j))
+            for j in columns
+        )
 
     everything = tuple(range(n))
     without = [tuple(k for k in everything if k != i) for i in everything]
     determinant = minor(everything, everything)
-    x = [
-        sum((-1.0) ** (i + j) * minor(without[i], without[j]) * rhs[..., i] for i in everything)
-        / determinant
-        for j in everything
-    ]
+    x = []
+    for j in everything:
+        total = _alternating(minor(without[i], without[j]) * right[i] for i in everything)
+        x.append((total if j % 2 == 0 else -total) / determinant)
     return xp.stack(x, axis=-1), determinant
+
+
+def _alternating(terms):
+    """a − b + c − …"""
+    total, *others = terms
+    for i, term in enumerate(others):
+        total = total + term if i % 2 else total - term
+    return total
 
 
 def _by_elimination(matrix, rhs):

@@ -29,7 +29,7 @@ from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms, joined, multiplied
 from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.linear_starts import fitted_gradients
-from gfnn_jax.fitting.significance import null_terms, significant
+from gfnn_jax.fitting.significance import null_terms, significant, told_from_noise
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import CHARTS, AnyChart
 from gfnn_jax.generating.generated import Generated
@@ -38,11 +38,11 @@ from gfnn_jax.models.parameters import functions_of_parameters, state_libraries,
 _CHARTS = ("type2", "midpoint", "type3")  # that are tried, in this order
 _MOST_TERMS, _ROWS_PER_TERM = 500, 3
 _THRESHOLDS = (1e4, 1e3, 100.0, 30.0, 10.0)  # standard errors below which terms go, tried in turn
+_CERTAIN = 4.0  # where noise is left over: those that are larger it does not explain
 _RISE, _ROUNDING = 1.1, 1e-15  # of the held-out error that this may cost
 _STRUCTURED_ROWS = 50_000  # numbers of training pairs that sites are fitted to: no more are needed
 _NULL_ROWS = 4_000  # of them, which tell whose gradients are combinations of others
 _FEWER_TERMS = "dropping the terms of S that the pairs do not ask for"
-_BETTER = 0.5  # of the error of an H, that S of a structure must have to be taken in its stead
 _FLAT = 1.2  # libraries whose errors differ by less have met the pairs' noise
 _SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved
 
@@ -108,7 +108,7 @@ def learn_map(
         data = _fewer(data)
     try:
         with budget.unit(_FEWER_TERMS, ROWS, len(_THRESHOLDS) * _work(best.piece.family, data)):
-            best = _sparse(best, data, tolerance)
+            best = _sparse(best, data, tolerance, noisy=stalled)
     except OutOfTime:
         budget.leave_out(_FEWER_TERMS, budget.ended)
     piece = best.piece
@@ -129,22 +129,16 @@ def map_of(
     data: Dataset, tolerance: Tolerance, scene: Any, chart: str, law: Any, budget: Budget,
     say: Callable[[str], Any],
 ) -> LearnedMap | None:  # fmt: skip
-    """Learn by `learn_map`; None where it finds none, or none that is better than the law that
-    was."""
+    """Learn by `learn_map`; None where it finds none beside a law."""
     try:
         with np.errstate(all="ignore"):
-            found = learn_map(
+            return learn_map(
                 data, tolerance, scene, chart=chart, budget=budget, say=say, needed=law is None
             )
     except (FitError, OutOfTime):
         if law is None:
             raise
         return None
-    better = 1.0 if data.structure is None else _BETTER
-    error = found.candidate.validation_bound
-    if law is not None and not error < better * law.candidate.validation_bound:
-        return None
-    return found
 
 
 def assembled(learned: LearnedMap, tolerance: Tolerance, budget: Budget) -> Assembled:
@@ -307,8 +301,9 @@ def _larger(family: Terms | Sums, data: Dataset) -> Terms | Sums | None:
     return joined(family, multiplied(family, variables))
 
 
-def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance) -> _Tried:
-    """Drop the terms that the pairs do not ask for, as far as the held-out error allows."""
+def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance, noisy: bool) -> _Tried:
+    """Drop the terms that the pairs do not ask for, as far as the held-out error allows. noisy:
+    whether what is left over is noise, so that only terms go that it explains."""
     piece = full.piece
     w, target, args = _data(piece.chart, piece.family, data, data.training)
     weight = _weight(data)
@@ -316,8 +311,9 @@ def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance) -> _Tried:
     residual = terms @ piece.params - (target * weight).ravel()
     triangle = Triangle.of(np.column_stack([terms, residual]))
     tried: set[int] = set()
-    for threshold in _THRESHOLDS:
-        kept, _ = significant(triangle, piece.params, threshold)
+    tell, thresholds = (told_from_noise, (_CERTAIN,)) if noisy else (significant, _THRESHOLDS)
+    for threshold in thresholds:
+        kept, _ = tell(triangle, piece.params, threshold)
         if not 0 < len(kept) < piece.family.num_parameters or len(kept) in tried:
             continue
         tried.add(len(kept))

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
 from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.diagnosis.misfit import misfit
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.families.terms import Terms, given_terms, joined, multiplied, polynomial_terms
+from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.models.hamiltonians.options import Options
+
+_TELLING = 60  # pairs, from which on the midpoints of a sample tell libraries apart
+_WORSE = 3.0  # times what another library leaves of their gradients: too far from them
 
 
 def angles_and_others(data: Dataset) -> tuple[tuple[int, ...], tuple[str, ...]]:
@@ -89,3 +95,13 @@ def libraries_of(data: Dataset, scene, terms, options: Options) -> Iterator[Term
             if library.num_parameters > most:
                 return
             yield library
+
+
+def promising(libraries: list[Any], data: Dataset) -> list[Any]:
+    """The libraries but those that leave far more of the midpoints' gradients over than another
+    does, as that of equal bodies does of unequal ones: the fit of such a one takes longest."""
+    if data.varied or len(data.training) < _TELLING:
+        return libraries
+    left = [misfit(family, data, MIDPOINT) for family in libraries]
+    most = _WORSE * min(left, default=np.inf)
+    return [f for f, part in zip(libraries, left, strict=True) if part <= most]

@@ -20,12 +20,13 @@ from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
 from gfnn_jax.dataset.split import outermost
+from gfnn_jax.dataset.structures import Bodies
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.growth import grow
-from gfnn_jax.fitting.significance import null_terms, significant, significant_terms
+from gfnn_jax.fitting.significance import null_terms, significant_terms, told_from_noise
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.models.hamiltonians.arcs import arcs_of
 from gfnn_jax.models.hamiltonians.centrifugal import centrifugal_terms
@@ -52,10 +53,12 @@ from gfnn_jax.models.hamiltonians.libraries import (
     libraries_of,
     modes_of,
     own_terms,
+    promising,
 )
 from gfnn_jax.models.hamiltonians.noisy_textbook import law_of_sequences
 from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
 from gfnn_jax.models.hamiltonians.starts import starts
+from gfnn_jax.models.hamiltonians.symmetries import imposed
 from gfnn_jax.models.hamiltonians.textbook import law_of_physics
 from gfnn_jax.models.hamiltonians.whole_sequences import fitted_to_sequences
 from gfnn_jax.models.hamiltonians.work import LawWork
@@ -203,6 +206,11 @@ def learn_hamiltonian(
             budget.leave_out(what, budget.ended)
         except np.linalg.LinAlgError as error:
             budget.leave_out(what, f"its linear algebra failed: {error}")
+    if isinstance(best.family, Terms) and data.args is None and best.error.relative <= _ROUNDOFF:
+        c, deviations = best.fit.coefficients, best.fit.standard_errors
+        z = everywhere.y0[everywhere.validation]
+        c = imposed(best.family, c, deviations, z, data.coordinates.angles)
+        best = best._replace(fit=best.fit._replace(coefficients=c))
     seconds = time.perf_counter() - started
     learned = learned_from(best, problem, everywhere, tolerance, seconds, options, of_arcs)
     candidate = dataclasses.replace(learned.candidate, outside=outside)
@@ -255,7 +263,7 @@ def _of_libraries(
         return _searched(problem, work, data, tolerance, scene, terms, options, say, forces, known)
 
     if data.args is not None:
-        found = _walked(problem, work, data, tolerance, scene, terms, options, say), options
+        found = _walked(problem, work, data, tolerance, scene, terms, options, say)
     elif basis is not None:
         found = _grown(problem, work, basis, data, tolerance, options, say), options
     else:
@@ -315,12 +323,21 @@ def _searched(
             raise
     if best is None:
         raise FitError(f"expected more pairs: {len(data.y0)} are too few for any library of terms")
-    stalled = poor == most_poor
+    best = best._replace(stalled=poor == most_poor)
+    return (best, options) if best.error.bound <= bound else _as_noise_tells(tried, best, options)
+
+
+def _as_noise_tells(
+    tried: Sequence[FittedLaw], best: FittedLaw, options: Options
+) -> tuple[FittedLaw, Options]:
+    """The first and simplest of the libraries that are as good as the best, and the options that
+    drop what is noise, where there are several: they have met the pairs' noise, and the fewest
+    terms leave no more of it. Else the best."""
     near = [f for f in tried if f.error.relative <= options.flat * best.error.relative]
-    if len(near) > 1 and best.error.bound > bound:  # noise: the fewest terms leave no more of it
-        best = near[0]._replace(noisy=True, larger=near[-1])
-        stalled, options = True, dataclasses.replace(options, thresholds=(options.certain,))
-    return best._replace(stalled=stalled), options
+    if len(near) < 2:
+        return best, options
+    noisy = near[0]._replace(noisy=True, larger=near[-1], stalled=True)
+    return noisy, dataclasses.replace(options, thresholds=(options.certain,))
 
 
 def _libraries(
@@ -331,6 +348,8 @@ def _libraries(
     without a fit."""
     known = libraries_of if forces is None else partial(libraries_with, forces)
     libraries = list(known(data, scene, terms, options))
+    if isinstance(data.structure, Bodies):
+        return promising(libraries, data), []
     if len(libraries) > 1 and libraries[0].quadratic and not data.varied:
         affine = affine_error(data, tolerance).bound
         if affine > _HOPELESS * tolerance.bound:
@@ -363,8 +382,8 @@ def _beside_centrifugal(
 
 def _walked(
     problem, work: LawWork, data: Dataset, tolerance: Tolerance, scene, terms, options: Options, say
-) -> FittedLaw:
-    """The best of the libraries of states and parameters, which grow together."""
+) -> tuple[FittedLaw, Options]:
+    """The best of the libraries of states and parameters, which grow together; as `_searched`."""
     own = own_terms(data, terms) if terms else None
     angles, plain = angles_and_others(data)
     states = state_libraries(
@@ -378,6 +397,7 @@ def _walked(
     )
     most = len(data.training) * 2 * data.dim / options.rows_per_term
     best: FittedLaw | None = None
+    tried: list[FittedLaw] = []
 
     def attempt(family: Terms) -> FittedLaw:
         say(f"H: {family.num_parameters} terms")
@@ -388,16 +408,19 @@ def _walked(
             states, functions, attempt, lambda found: found.error.bound,
             bound=tolerance.bound, most=min(most, options.most_terms),
         ):  # fmt: skip
+            tried.append(found)
             if best is None or found.error.relative < best.error.relative:
                 best = found
-        stalled = best is not None and best.error.bound > tolerance.bound
+        stalled = True
     except OutOfTime:
         if best is None:
             raise
         stalled = False
     if best is None:
         raise FitError(f"expected more pairs: {len(data.y0)} are too few for any library of terms")
-    return best._replace(stalled=stalled)
+    if best.error.bound <= tolerance.bound:
+        return best, options
+    return _as_noise_tells(tried, best._replace(stalled=stalled), options)
 
 
 def _grown(
@@ -537,7 +560,7 @@ def _significant(problem, full: FittedLaw, rows, options: Options) -> FittedLaw 
     found = problem.linearised(full.family, full.fit.coefficients, full.fit.steps, resolved)
     if not np.isfinite(found.norm):
         return None
-    kept, start = significant(found, full.fit.coefficients, options.certain)
+    kept, start = told_from_noise(found, full.fit.coefficients, options.certain)
     if not len(kept):
         return None
     return full._replace(
