@@ -176,6 +176,24 @@ def kicked(z, strength):
     return np.stack([z[:, 0] + p, p], axis=1)
 
 
+def test_noise_hides_no_law_with_a_parameter():
+    """Powers of a parameter from −2 to 2 stand in for one another where there is noise."""
+    rng = np.random.default_rng(22)
+    z, k, dt = rng.uniform(-1, 1, (1_000, 2)), rng.uniform(0.5, 2.0, 1_000), 0.2
+    law = given_terms(1, ["p1**2/2 - k*cos(q1)"], ("k",))
+    later = images(law, np.ones(1), z, dt, FINE, args=k[:, None]).states
+    z0, z1 = (x + 1e-3 * rng.normal(size=x.shape) for x in (z, later))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        fit = gfnn.fit(gfnn.Pairs(z0, z1, dt, {"k": k}), angles=(0,), learn="hamiltonian")
+    piece = fit.map.pieces[fit.map.posterior.piece]
+    assert set(piece.family.term_names) == {"cos(q1) k", "p1²"}
+    root = fit.map.posterior.root
+    true = [{"cos(q1) k": -1.0, "p1²": 0.5}[name] for name in piece.family.term_names]
+    off = (np.asarray(piece.params) - true) / np.linalg.norm(root, axis=0)
+    assert np.abs(off).max() < 4
+
+
 def test_a_map_without_a_flow_has_parameters_too():
     rng = np.random.default_rng(0)
     z, strength = rng.uniform(0, 2 * np.pi, (500, 2)), rng.uniform(0.5, 2, 500)
