@@ -61,6 +61,17 @@ def pytest_configure(config):
     threadpool_limits(limits=1, user_api="blas")
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Give a worker whole files, unless ``--dist`` says otherwise: a fit that a module's tests
+    share is then made once, and so are the programs that they compile."""
+    if config.getvalue("dist") != "load":  # what -n alone means
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    return LoadFileScheduling(config, log)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _interruptible():
     """A shell that starts the tests in the background has them ignore SIGINT."""
@@ -98,7 +109,8 @@ _compiled = []
 
 
 def _count_compilations(event, duration, **_):
-    if event == "/jax/core/compile/backend_compile_duration":
+    # A program is lowered once; a newer JAX tells its compilation twice where it keeps programs.
+    if event == "/jax/core/compile/jaxpr_to_mlir_module_duration":
         _compiled.append(duration)
 
 

@@ -274,7 +274,7 @@ WORKER = textwrap.dedent(
 
 
 @pytest.mark.parametrize(
-    "kills", [2, pytest.param(20, marks=pytest.mark.slow)], ids=["short", "twenty"]
+    "kills", [1, pytest.param(20, marks=pytest.mark.slow)], ids=["short", "twenty"]
 )
 def test_sigkill(tmp_path, kills):
     """Killed at random moments and resumed, the training ends with the uninterrupted bits."""

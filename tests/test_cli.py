@@ -1,12 +1,7 @@
-"""The command line: exit statuses, one line per refusal, nothing harmed, reports, resuming."""
+"""The command line: exit statuses, one line per refusal, nothing harmed, reports."""
 
-import contextlib
 import dataclasses
-import errno
 import json
-import math
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -17,31 +12,29 @@ from importlib.metadata import version
 import jax
 import numpy as np
 import pytest
+from command_line import (
+    DT,
+    files,
+    fitted_oscillator,
+    gfnn,
+    oscillator,
+    oscillators_map,
+    pairs_file,
+    predict,
+)
 
 from gfnn_jax import cli, scenes
 from gfnn_jax.candidates.candidate import Candidate
-from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError, FitWarning
-from gfnn_jax.families.inputs import box_inputs
-from gfnn_jax.families.products import Products
-from gfnn_jax.generating.charts import CHARTS, MIDPOINT
-from gfnn_jax.generating.generated import Generated
-from gfnn_jax.jobs import fit as jobs_fit
+from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.jobs import fit_recording, progress, search
-from gfnn_jax.jobs import predict as predict_job
 from gfnn_jax.learn import check
 from gfnn_jax.learn import fit as learn_fit
 from gfnn_jax.learn.options import OPTIONS
 from gfnn_jax.maps import saved as models
-from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.inputs import HOLDS
-from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.phase_space import Pairs
-from gfnn_jax.storage import checkpoints
-
-DT = 0.1
 
 
 def kepler(a, e, mean_anomaly, orientation):
@@ -65,19 +58,6 @@ def kepler_orbits(num, times, seed=0):
     return np.stack([kepler(a, e, phase + a**-1.5 * t, turn) for t in times], axis=1)
 
 
-def oscillator(num, times, seed=0):
-    """(num, len(times), 2): q'' = −q, exactly."""
-    q, p = np.random.default_rng(seed).uniform(-1, 1, (2, num, 1))
-    t = np.asarray(times)
-    return np.stack([q * np.cos(t) + p * np.sin(t), p * np.cos(t) - q * np.sin(t)], axis=-1)
-
-
-def pairs_file(path, z=None, **more):
-    z = oscillator(200, [0, DT]) if z is None else z
-    np.savez(path, **({"z0": z[:, 0], "z1": z[:, 1], "dt": DT} | more))
-    return path
-
-
 def recording_file(path):
     lines = ["t,theta", *(f"{t:.2f},{np.cos(t):.6f}" for t in np.arange(0, 9, 0.1))]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -86,36 +66,12 @@ def recording_file(path):
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
-    """A saved map of one degree of freedom that no fit was needed for: S near ½(q² + p²)."""
-    folder = tmp_path_factory.mktemp("models") / "m"
-    z = np.random.default_rng(0).uniform(-1, 1, (100, 2))
-    family = Products(box_inputs(z), 2)
-    params = family.unflatten(np.linspace(0.1, 0.3, family.num_parameters))
-    generated = Generated(family, params, MIDPOINT, DT, np.ones(2))
-    map_ = SymplecticMap((generated,), CARTESIAN, covering(z), np.ones(2), np.zeros(0), DT)
-    models.save(map_, folder)
-    np.save(folder.parent / "z0.npy", np.array([[0.1, 0.2], [0.3, -0.4], [30.0, 0.0]]))
-    return folder
+    return oscillators_map(tmp_path_factory.mktemp("models") / "m")
 
 
 @pytest.fixture(scope="module")
 def fitted():
-    """A fit, for tests of what is done with one."""
-    z = oscillator(200, [0, DT])
-    return learn_fit.fit(Pairs(z[:, 0], z[:, 1], DT), chart="type2", tolerance=1e-2)
-
-
-def gfnn(*arguments):
-    return cli.main([str(a) for a in arguments])
-
-
-def predict(model, out, *more, num_steps=50):
-    return gfnn("predict", model, "--initial", model.parent / "z0.npy", "--num-steps", num_steps,
-                "--out", out, *more)  # fmt: skip
-
-
-def files(folder):
-    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    return fitted_oscillator()
 
 
 # Usage
@@ -415,50 +371,6 @@ def test_a_model_is_kept_and_known_again(fitted, tmp_path, capsys, monkeypatch):
     assert read_report(tmp_path / "m")["seed"] == 1
 
 
-def test_a_training_that_was_stopped(fitted, tmp_path, capsys, monkeypatch):
-    """Stop a training: its checkpoints stay beside the output, and are resumed or discarded."""
-    started_from = []
-
-    def training(*args, checkpoints, **kwargs):
-        found = checkpoints.latest()
-        started_from.append(found and found[0])
-        if found is None:
-            checkpoints.save(7, {"theta": np.arange(3.0)})
-            raise KeyboardInterrupt
-        return fitted
-
-    monkeypatch.setattr(search, "fit", training)
-    fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
-    assert gfnn(*fit) == 130
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last.endswith("m.partial keeps step_000000000007: --resume goes on with it")
-    assert gfnn(*fit) == 2
-    assert "m.partial: holds an unfinished fit" in capsys.readouterr().err
-    assert gfnn(*fit, "--resume", "--seed", 1) == 2
-    assert "m.partial: belongs to another fit: seed differ" in capsys.readouterr().err
-    assert gfnn(*fit, "--overwrite") == 130
-    assert gfnn(*fit, "--resume") == 0
-    assert started_from == [None, None, 7]
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["d.npz", "m"]
-
-
-def test_resuming_another_job_discards_no_training(fitted, tmp_path, capsys, monkeypatch):
-    """A job that needs no checkpoints looks at whose they are all the same."""
-
-    def training(*args, checkpoints, **kwargs):
-        checkpoints.save(7, {"theta": np.arange(3.0)})
-        raise KeyboardInterrupt
-
-    fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
-    monkeypatch.setattr(search, "fit", training)
-    assert gfnn(*fit, "--family", "mlp") == 130
-    before = files(tmp_path)
-    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
-    assert gfnn(*fit, "--resume") == 2
-    assert "m.partial: belongs to another fit: family differ" in capsys.readouterr().err
-    assert files(tmp_path) == before
-
-
 def test_data_inside_the_output_are_not_deleted(fitted, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
     model = tmp_path / "m"
@@ -468,115 +380,6 @@ def test_data_inside_the_output_are_not_deleted(fitted, tmp_path, capsys, monkey
     assert gfnn("fit", inside, "--out", model, "--overwrite") == 2
     assert "holds d.npz, which is no part of a model or a run" in capsys.readouterr().err
     assert files(tmp_path) == before
-
-
-def test_nothing_is_left_where_nothing_was_kept(tmp_path, capsys, monkeypatch):
-    def stop(*args, **kwargs):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(search, "fit", stop)
-    assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m") == 130
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last == "gfnn: stopped; nothing of the fit was kept"
-    assert [p.name for p in tmp_path.iterdir()] == ["d.npz"]
-
-
-def test_what_an_earlier_fit_kept_is_told_however_soon_a_signal_comes(
-    tmp_path, capsys, monkeypatch
-):
-    def stop(*args, **kwargs):
-        raise KeyboardInterrupt
-
-    (tmp_path / "m.partial" / "best").mkdir(parents=True)
-    (tmp_path / "m.partial" / "job.json").write_text("{}")
-    monkeypatch.setattr(jobs_fit, "read_trajectories", stop)
-    fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m", "--resume")
-    assert gfnn(*fit) == 130
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last == f"gfnn: stopped; {tmp_path}/m.partial keeps best: --resume goes on with it"
-
-
-def stopped_with(better):
-    """A fit that hands on these (map, candidate) and is then interrupted."""
-
-    def fit(*args, on_better, **kwargs):
-        for map_, candidate in better:
-            on_better(map_, candidate)
-        raise KeyboardInterrupt
-
-    return fit
-
-
-def test_an_interrupted_fit_publishes_the_best_of_all_its_runs(
-    fitted, tmp_path, capsys, monkeypatch
-):
-    """A resumed fit meets its small sizes again; what it left in OUT it may replace."""
-    fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m", "--resume")
-    for error, best in ((1e-2, 1e-2), (1e-3, 1e-3), (1e-1, 1e-3)):
-        candidate = dataclasses.replace(fitted.chosen, validation_relative=error)
-        monkeypatch.setattr(search, "fit", stopped_with([(fitted.map, candidate)]))
-        assert gfnn(*fit) == 130
-        assert "m and can be used" in capsys.readouterr().err
-        assert models.record(tmp_path / "m")["validation_relative"] == best
-    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
-    assert gfnn(*fit) == 0
-    assert "unfinished" not in models.record(tmp_path / "m")
-
-
-@pytest.mark.parametrize(
-    "family",
-    ["polynomial", *(pytest.param(f, marks=pytest.mark.slow) for f in ("sines", "mlp"))],
-)
-def test_a_fit_survives_two_of_each_signal(family, tmp_path, monkeypatch):
-    """Send signals to a fit that is resumed each time: the map is that of an undisturbed fit."""
-    data = pairs_file(tmp_path / "d.npz", oscillator(300, [0, 1.0]), dt=1.0)
-    # Tolerances that take several sizes, and a training that ends in seconds.
-    tolerance = {"polynomial": 1e-14, "sines": 1e-14, "mlp": 1e-2}[family]
-    fit = ("fit", data, "--family", family, "--chart", "midpoint", "--tolerance", tolerance)
-    assert gfnn(*fit, "--out", tmp_path / "whole") == 0
-    say, count = progress._Lines.say, 0
-    signals = [(signal.SIGINT, 2), (signal.SIGTERM, 3), (signal.SIGINT, 4), (signal.SIGTERM, 5)]
-    for number, moment in signals:
-        count = 0
-
-        def counting(self, message, number=number, moment=moment):
-            nonlocal count
-            say(self, message)
-            count += 1
-            if count == moment:
-                signal.raise_signal(number)
-
-        monkeypatch.setattr(progress._Lines, "say", counting)
-        status = gfnn(*fit, "--out", tmp_path / "m", "--resume")
-        assert status == (130 if number == signal.SIGINT else 143)
-        if (tmp_path / "m").exists():
-            assert np.isfinite(models.load(tmp_path / "m").step(np.full(2, 0.1))[0]).all()
-    monkeypatch.setattr(progress._Lines, "say", say)
-    assert gfnn(*fit, "--out", tmp_path / "m", "--resume") == 0
-    z = np.random.default_rng(1).uniform(-0.5, 0.5, (5, 2))
-    images = [models.load(tmp_path / name).step(z)[0] for name in ("m", "whole")]
-    np.testing.assert_array_equal(*images)
-
-
-def test_an_interrupted_fit_leaves_an_older_model_as_it_is(fitted, tmp_path, capsys, monkeypatch):
-    fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m", "--overwrite")
-    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
-    assert gfnn(*fit) == 0
-    before = files(tmp_path / "m")
-    monkeypatch.setattr(search, "fit", stopped_with([(fitted.map, fitted.chosen)]))
-    capsys.readouterr()
-    assert gfnn(*fit) == 130
-    assert files(tmp_path / "m") == before
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert f"m is as it was before; the best map so far is in {tmp_path}/m.partial/best" in told
-
-
-def test_a_killed_fit_that_kept_nothing_is_in_nobodys_way(fitted, tmp_path, monkeypatch):
-    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
-    (tmp_path / "m.partial").mkdir()
-    (tmp_path / "m.partial" / "job.json").write_text("{}")
-    assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m") == 0
-    assert not (tmp_path / "m.partial").exists()
 
 
 def test_strict(fitted, tmp_path, capsys, monkeypatch):
@@ -703,104 +506,6 @@ def test_leaving_the_domain_is_told(outside, model, tmp_path, capsys):
     assert "left the data's domain: trajectory 2 at step 0" in capsys.readouterr().out
 
 
-# Stops, failures and resuming
-
-
-@contextlib.contextmanager
-def stopped_after(num_chunks, stop):
-    """The prediction is stopped after so many chunks."""
-    append = predict_job.PredictionWriter.append
-    count = 0
-
-    def counting(writer, states, carry):
-        nonlocal count
-        append(writer, states, carry)
-        count += 1
-        if count == num_chunks:
-            stop()
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(predict_job, "_CHUNK_LANE_STEPS", 30)
-        patch.setattr(predict_job.PredictionWriter, "append", counting)
-        yield
-
-
-def interrupt():
-    raise KeyboardInterrupt
-
-
-def test_a_prediction_backwards_comes_back(model, tmp_path, capsys):
-    assert predict(model, tmp_path / "there.npz", num_steps=40) == 0
-    with np.load(tmp_path / "there.npz") as there:
-        ahead = there["trajectories"][:2]
-    np.save(tmp_path / "end.npy", ahead[:, -1])
-    with stopped_after(3, interrupt):
-        back = ("predict", model, "--initial", tmp_path / "end.npy", "--num-steps", -40,
-                "--save-every", 2, "--out", tmp_path / "back.npz")  # fmt: skip
-        assert gfnn(*back) == 130
-    assert gfnn(*back, "--resume") == 0
-    assert "2 trajectories of 40 steps backwards" in capsys.readouterr().out
-    with np.load(tmp_path / "back.npz") as found:
-        np.testing.assert_array_equal(found["steps"], np.arange(0, -41, -2))
-        assert found["dt"] == DT
-        np.testing.assert_allclose(found["trajectories"], ahead[:, ::-2], rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize(
-    ("stop", "status"),
-    [(interrupt, 130), (lambda: signal.raise_signal(signal.SIGTERM), 143)],
-)
-def test_a_prediction_resumes_to_the_same_bits(stop, status, model, tmp_path, capsys):
-    with stopped_after(math.inf, stop):
-        assert predict(model, tmp_path / "whole.npz") == 0
-    with stopped_after(3, stop):
-        assert predict(model, tmp_path / "p.npz") == status
-        assert not (tmp_path / "p.npz").exists()
-        last = capsys.readouterr().err.splitlines()[-1]
-        assert last.startswith("gfnn: terminated" if status == 143 else "gfnn: stopped")
-        assert last.endswith("p.npz.partial keeps 20 of 50 steps: --resume goes on with it")
-        assert predict(model, tmp_path / "p.npz") == 2
-        assert predict(model, tmp_path / "p.npz", "--resume", num_steps=60) == 2
-    with stopped_after(math.inf, stop):
-        assert predict(model, tmp_path / "p.npz", "--resume") == 0
-        assert predict(model, tmp_path / "p.npz", "--resume") == 0  # nothing left to do
-    assert (tmp_path / "p.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["p.npz", "whole.npz"]
-
-
-def test_a_full_disk(model, fitted, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
-    assert predict(model, tmp_path / "p.npz") == 0
-    before = files(tmp_path)
-    with monkeypatch.context() as patch:
-
-        def full(handle):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-        patch.setattr(os, "fsync", full)
-        assert predict(model, tmp_path / "p.npz", "--overwrite", num_steps=7) == 1
-        data = pairs_file(tmp_path / "d.npz")
-        assert gfnn("fit", data, "--out", tmp_path / "m") == 1
-    errors = [e for e in capsys.readouterr().err.splitlines() if e.startswith("gfnn: ")]
-    assert len(errors) == 2
-    assert all("No space left on device" in e for e in errors)
-    assert not (tmp_path / "m").exists()
-    assert before.items() <= files(tmp_path).items()
-
-
-def test_a_changed_model_is_refused(model, tmp_path, capsys):
-    for file in model.rglob("*"):
-        if file.is_file():
-            copy = tmp_path / "m" / file.relative_to(model)
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            copy.write_bytes(file.read_bytes())
-    text = (tmp_path / "m" / "model.json").read_text()
-    (tmp_path / "m" / "model.json").write_text(text.replace('"dt": 0.1', '"dt": 0.2'))
-    np.save(tmp_path / "z0.npy", np.zeros((1, 2)))
-    assert predict(tmp_path / "m", tmp_path / "p.npz") == 2
-    assert "has changed since it was saved" in capsys.readouterr().err
-
-
 # Runs
 
 
@@ -863,111 +568,6 @@ def test_run_of_a_network(tmp_path):
     report = check_run(tmp_path / "r", "two-body")
     assert report["model"]["family"] == "mlp"
     assert report["rollout"]["error"]["1000"] <= 0.15
-
-
-@pytest.mark.slow
-def test_killed_predictions_resume(model, tmp_path):
-    """Twenty SIGKILLs at random moments of a prediction: the same bits in the end."""
-    num_steps = 3_000_000
-    command = [sys.executable, "-m", "gfnn_jax", "predict", model, "--initial",
-               model.parent / "z0.npy", "--num-steps", num_steps, "--save-every", 1_000,
-               "--resume", "--out"]  # fmt: skip
-    command = [str(c) for c in command]
-    assert subprocess.run([*command, tmp_path / "whole.npz"], check=False).returncode == 0
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        process = subprocess.Popen([*command, tmp_path / "p.npz"])
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(timeout=rng.uniform(2, 6))
-        process.kill()
-        process.wait()
-    assert subprocess.run([*command, tmp_path / "p.npz"], check=False).returncode == 0
-    assert (tmp_path / "p.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
-
-
-# Every iteration of the training is saved and told.
-TRAINING = """
-import sys
-from gfnn_jax import cli
-from gfnn_jax.jobs import progress
-from gfnn_jax.models.generating_functions import network_sweep
-
-network_sweep._CHECKPOINT_SECONDS = progress.BETWEEN = 0.0
-sys.exit(cli.main(sys.argv[1:]))
-"""
-
-
-def killed_training(arguments, seconds):
-    """Start a training and kill it so many seconds after a few iterations; whether it was so."""
-    command = [sys.executable, "-c", TRAINING, *(str(a) for a in arguments)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    assert process.stderr is not None
-    with process, process.stderr as told:
-        iterations = (line for line in told if ": iteration " in line)
-        for _ in range(3):
-            next(iterations, None)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(seconds)
-        process.kill()
-    assert process.returncode in (0, -signal.SIGKILL)
-    return process.returncode != 0
-
-
-@pytest.mark.parametrize(
-    ("kills", "tolerance"),
-    [
-        pytest.param(1, 1e-3, marks=pytest.mark.slow),
-        pytest.param(20, 1e-14, marks=pytest.mark.slow),
-    ],
-)
-def test_killed_trainings_resume(kills, tolerance, tmp_path):
-    """SIGKILLs at random moments of a training: the same map in the end, to the last bit."""
-    data = pairs_file(tmp_path / "d.npz", oscillator(100, [0, 1.0]), dt=1.0)
-    fit = ("fit", data, "--family", "mlp", "--chart", "type2", "--tolerance", tolerance, "--out")
-    assert gfnn(*fit, tmp_path / "whole") == 0
-    whole, described = checkpoints.load_model(tmp_path / "whole")
-    rng, killed = np.random.default_rng(0), 0
-    while killed < kills:
-        out = tmp_path / f"after_{killed}"
-        resumed = (*fit, out, "--resume")
-        while killed < kills and killed_training(resumed, rng.uniform(0, kills / 5)):
-            killed += 1
-            assert list((tmp_path / f"{out.name}.partial").glob("step_*"))
-        assert gfnn(*resumed) == 0
-        arrays, as_described = checkpoints.load_model(out)
-        jax.tree.map(np.testing.assert_array_equal, arrays, whole)
-        assert as_described["map"] == described["map"]
-
-
-# Runs a command and prints its peak of resident memory. A process of its own: a child's figure
-# includes the memory of the process that it was forked from, which is small here.
-MEASURE = """
-import resource, subprocess, sys
-
-subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL)
-print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("lanes", "num_steps", "save_every"), [(1, 10_000_000, 1_000), (1_000, 125_000, 1)]
-)
-def test_memory_of_a_long_prediction(lanes, num_steps, save_every, model, tmp_path):
-    """Ten million steps of one trajectory, and an output of 2 GB: each within 1 GB of memory."""
-    z0, out = tmp_path / "z0.npy", tmp_path / "p.npz"
-    np.save(z0, np.random.default_rng(0).uniform(-0.5, 0.5, (lanes, 2)))
-    command = [sys.executable, "-c", MEASURE, sys.executable, "-m", "gfnn_jax", "predict", model,
-               "--initial", z0, "--num-steps", num_steps, "--save-every", save_every,
-               "--out", out]  # fmt: skip
-    done = subprocess.run([str(c) for c in command], check=True, stdout=subprocess.PIPE)
-    bytes_per_unit = 1 if sys.platform == "darwin" else 1024
-    assert int(done.stdout) * bytes_per_unit < 1e9
-    assert out.stat().st_size > lanes * num_steps // save_every * 16
-    with np.load(out) as predicted:
-        assert predicted["steps"][-1] == num_steps
-        assert predicted["status"].shape == (lanes,)
-    out.unlink()
 
 
 def test_compiled_programs_are_kept_in_the_users_cache(tmp_path, monkeypatch):

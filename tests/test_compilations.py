@@ -12,7 +12,7 @@ COUNTED = """
     compiled = []
 
     def count(event, duration, **_):
-        if event == "/jax/core/compile/backend_compile_duration":
+        if event == "/jax/core/compile/jaxpr_to_mlir_module_duration":
             compiled.append(duration)
 
     jax.monitoring.register_event_duration_secs_listener(count)

@@ -42,9 +42,9 @@ options = {
                      max_seconds=None),
 }
 for name, own in ((kind, pairs[kind]) for kind in sys.argv[1:]):
-    found = {n: gfnn.fit(own, devices=n, **options[name]) for n in (None, 1, 2, 4, 8)}
+    found = {n: gfnn.fit(own, devices=n, **options[name]) for n in (None, 1, 3, 8)}
     bits = {n: [np.asarray(a).tobytes() for a in jax.tree.leaves(f.map)] for n, f in found.items()}
-    assert all(bits[n] == bits[1] for n in (2, 4, 8)), f"{name}: bits depend on the devices"
+    assert all(bits[n] == bits[1] for n in (3, 8)), f"{name}: bits depend on the devices"
     assert len({f.chosen.label for f in found.values()}) == 1
     z = np.random.default_rng(1).uniform(-0.8, 0.8, (50, 2))
     plain, shared = (np.asarray(found[n].map.step(z)[0]) for n in (None, 1))

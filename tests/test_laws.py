@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import sympy
 from analytic import henon_heiles_pairs
+from command_line import gfnn as command
 from scipy.integrate import solve_ivp
-from test_cli import gfnn as command
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN

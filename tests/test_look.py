@@ -89,6 +89,13 @@ def test_a_summary_says_what_the_record_is(tmp_path):
     assert "theta" in html
 
 
+def test_a_summary_is_text_in_a_notebook_too(tmp_path, monkeypatch):
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    summary = gfnn.read(a_swing(tmp_path / "r.csv")).summary()
+    assert "800 samples" in str(summary)
+    assert "800 samples" in summary._repr_html_()
+
+
 def test_columns_keep_the_unit_of_the_file(tmp_path):
     path = a_swing(tmp_path / "r.csv", alpha=lambda t, x: np.degrees(x))
     options = {"positions": "alpha", "degrees": "alpha"}

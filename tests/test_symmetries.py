@@ -6,6 +6,8 @@ import gfnn_jax as gfnn
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.diagnosis.symmetries import symmetries_of_pairs
+from gfnn_jax.families.terms import given_terms
+from gfnn_jax.models.hamiltonians.symmetries import imposed
 
 
 def data_of(gradient, z0, angles=(), steps=20, dt=0.1):
@@ -78,3 +80,17 @@ def test_a_magnetic_field_is_not_reversed():
                        place=np.zeros(400, int))  # fmt: skip
     found = told(Dataset.of(pairs, Coordinates("cartesian")).divided(0))
     assert set(found) == {"reflection of all coordinates"}
+
+
+def test_a_law_has_its_symmetries_to_roundoff_where_its_errors_allow():
+    """p1² and p2² of a round law get one coefficient, unless they are known to differ."""
+    family = given_terms(2, ["p1**2", "p2**2", "q1**2", "q2**2", "1/sqrt(q1**2 + q2**2)"])
+    z = np.random.default_rng(0).uniform(0.5, 1.0, (50, 4))
+    exact = np.array([0.5, 0.5, 0.3, 0.3, -1.0])
+    off = np.array([3e-12, -1e-12, 0.0, 2e-12, 1e-12])
+    found = imposed(family, exact + off, np.full(5, 1e-12), z, ())
+    assert np.abs(np.array([found[0] - found[1], found[2] - found[3]])).max() < 5e-15
+    assert np.abs(found - exact).max() < 4e-12
+    np.testing.assert_array_equal(
+        imposed(family, exact + off, np.full(5, 1e-14), z, ()), exact + off
+    )

@@ -8,6 +8,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
+from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.runs import identified
+from gfnn_jax.diagnosis.symmetries import symmetries_of_pairs
 from gfnn_jax.evaluate.report import assemble
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting.gauss_newton import Problem
@@ -21,6 +25,7 @@ from gfnn_jax.models.textbook.atoms import (
     powers_of,
     with_constants,
 )
+from gfnn_jax.models.textbook.invariance import Invariance
 from gfnn_jax.models.textbook.matching import Matching, orthonormal
 from gfnn_jax.models.textbook.search import Textbook
 from gfnn_jax.models.textbook.shapes import constants_for, has_constant, kinds_for, values
@@ -210,6 +215,64 @@ def test_keplers_law_told_nothing():
     assert found == pytest.approx(expected, abs=1e-12)
 
 
+def broken_kepler_pairs(count, broken):
+    """Kepler with ``broken`` q1² more."""
+
+    def gradient(z):
+        q, p = z[:, :2], z[:, 2:]
+        force = q / np.sum(q**2, axis=1, keepdims=True) ** 1.5
+        return np.concatenate([force + 2 * broken * q * [1.0, 0.0], p], axis=1)
+
+    return pairs_of(gradient, ring(count))
+
+
+def test_symmetries_of_the_pairs_shorten_the_dictionary():
+    """A third of the atoms are left, and 8 of 14 products of two; the law is the same."""
+    pairs = kepler_pairs(200)
+    data = Dataset.of(identified(pairs).pairs, CARTESIAN).divided(0)
+    problem = Problem(data.y0, data.y1, data.dt, data.scale)
+    counts, laws = [], []
+    for symmetries in ((), symmetries_of_pairs(data)):
+        told = []
+        search = Textbook(problem, np.arange(200), symmetries=symmetries, say=told.append)
+        laws.append(read(search.law()))
+        counts.append(int(told[0].split("trying ")[1].split()[0]))
+        assert search.symmetric == bool(symmetries)
+    assert counts[1] < 0.4 * counts[0]
+    assert laws[1] == pytest.approx(laws[0], abs=1e-12)
+
+
+def test_a_symmetry_that_is_slightly_broken_is_not_imposed():
+    pairs = broken_kepler_pairs(200, 1e-4)
+    data = Dataset.of(identified(pairs).pairs, CARTESIAN).divided(0)
+    told = symmetries_of_pairs(data)
+    assert any("rotation" in symmetry.text for symmetry in told)  # as one that nearly holds
+    problem = Problem(data.y0, data.y1, data.dt, data.scale)
+    search = Textbook(problem, np.arange(200), symmetries=told)
+    assert not search.symmetric
+    assert read(search.law())["q1²"] == pytest.approx(1e-4, rel=1e-8)
+
+
+def test_atoms_and_terms_with_a_symmetry_are_left_as_they_are_by_it():
+    """Each atom that is kept, against its values at reflected and at turned states."""
+    pairs = kepler_pairs(200)
+    data = Dataset.of(identified(pairs).pairs, CARTESIAN).divided(0)
+    z = np.random.default_rng(1).uniform(0.5, 1.0, (100, 4))
+    arguments = arguments_of(z)
+    invariance = Invariance(symmetries_of_pairs(data), z, arguments, (), ())
+    weight, base = np.ones(4), np.zeros((400, 0))
+    every = dictionary_of(arguments, weight, base, degree=4).atoms
+    kept = [atom for atom in every if invariance.of_atom(atom)]
+    turn = np.array([[np.cos(0.1), np.sin(0.1)], [-np.sin(0.1), np.cos(0.1)]])
+    turned = z @ np.kron(np.eye(2), turn).T
+    assert len(kept) > 100
+    for atom in kept[::7]:
+        (term,) = [given_terms(2, [atom_text(atom, arguments)])]
+        one = np.ones(1)
+        np.testing.assert_allclose(term.value(one, turned), term.value(one, z), rtol=1e-9)
+    assert [a for a in every if a not in kept and len(a) > 1]
+
+
 def test_constants_inside_come_out_exactly():
     """Morse: ½p² + 0.8 (1 − e^(−1.3 q))²."""
     found = read(searched(morse_pairs(150)))
@@ -289,6 +352,8 @@ def test_a_fit_told_nothing_finds_keplers_law():
     assert fit.formula == "0.5*p1**2 + 0.5*p2**2 - 1/sqrt(q1**2 + q2**2)"
     error = np.asarray(fit.map.step(fresh.z0)[0]) - fresh.z1
     assert np.sqrt(np.mean(error**2)) < 1e-13
+    of_p1, of_p2, _ = (term.coefficient for term in fit.hamiltonian.terms)
+    assert abs(of_p1 - of_p2) <= 2e-15  # a rotation turns one into the other
     again = gfnn.fit(pairs, tolerance=1e-8, max_operations=fit.operations)
     assert again.formula == fit.formula
 

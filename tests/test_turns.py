@@ -94,4 +94,4 @@ def test_a_map_without_such_a_law_is_told_of_its_turns():
     c, s = np.cos(4.0), np.sin(4.0)
     pairs = gfnn.Pairs(z0, kicked @ np.array([[c, -s], [s, c]]), 1.0)
     with pytest.warns(gfnn.FitWarning, match=r"radians backwards, or by 3\.9"):
-        gfnn.fit(pairs, tolerance=1e-9, max_seconds=10, learn="hamiltonian")
+        gfnn.fit(pairs, tolerance=1e-9, max_seconds=None, max_operations=10**8, learn="hamiltonian")

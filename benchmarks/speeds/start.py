@@ -48,7 +48,7 @@ import jax
 compilations = 0
 def listen(event, seconds, **_):
     global compilations
-    compilations += event == "/jax/core/compile/backend_compile_duration"
+    compilations += event == "/jax/core/compile/jaxpr_to_mlir_module_duration"
 jax.monitoring.register_event_duration_secs_listener(listen)
 profile = cProfile.Profile()
 profile.enable()
@@ -70,7 +70,7 @@ import gfnn_jax as gfnn
 compilations = 0
 def listen(event, seconds, **_):
     global compilations
-    compilations += event == "/jax/core/compile/backend_compile_duration"
+    compilations += event == "/jax/core/compile/jaxpr_to_mlir_module_duration"
 jax.monitoring.register_event_duration_secs_listener(listen)
 scene = gfnn.scenes.make("henon-heiles-regular")
 found = {}

@@ -29,14 +29,15 @@ def screen(summary: RecordingSummary) -> Group:
 
 def as_text(summary: RecordingSummary) -> str:
     """The screen without colours."""
-    console = Console(file=io.StringIO(), width=_WIDTH, color_system=None)
+    # A notebook would take it for its own display.
+    console = Console(file=io.StringIO(), width=_WIDTH, color_system=None, force_jupyter=False)
     console.print(screen(summary), soft_wrap=False)
     return console.file.getvalue().rstrip()  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def as_html(summary: RecordingSummary) -> str:
     """The screen for a notebook."""
-    console = Console(file=io.StringIO(), width=_WIDTH, record=True)
+    console = Console(file=io.StringIO(), width=_WIDTH, record=True, force_jupyter=False)
     console.print(screen(summary))
     return console.export_html(inline_styles=True, code_format=_NOTEBOOK)
 

@@ -58,6 +58,7 @@ from gfnn_jax.models.hamiltonians.libraries import (
 from gfnn_jax.models.hamiltonians.noisy_textbook import law_of_sequences
 from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
 from gfnn_jax.models.hamiltonians.starts import starts
+from gfnn_jax.models.hamiltonians.symmetries import imposed
 from gfnn_jax.models.hamiltonians.textbook import law_of_physics
 from gfnn_jax.models.hamiltonians.whole_sequences import fitted_to_sequences
 from gfnn_jax.models.hamiltonians.work import LawWork
@@ -205,6 +206,11 @@ def learn_hamiltonian(
             budget.leave_out(what, budget.ended)
         except np.linalg.LinAlgError as error:
             budget.leave_out(what, f"its linear algebra failed: {error}")
+    if isinstance(best.family, Terms) and data.args is None and best.error.relative <= _ROUNDOFF:
+        c, deviations = best.fit.coefficients, best.fit.standard_errors
+        z = everywhere.y0[everywhere.validation]
+        c = imposed(best.family, c, deviations, z, data.coordinates.angles)
+        best = best._replace(fit=best.fit._replace(coefficients=c))
     seconds = time.perf_counter() - started
     learned = learned_from(best, problem, everywhere, tolerance, seconds, options, of_arcs)
     candidate = dataclasses.replace(learned.candidate, outside=outside)

@@ -19,6 +19,8 @@ from gfnn_jax.phase_space import symplectic_form
 
 _HOLDS = 1e-10  # of the restriction's parts, that a symmetry leaves over
 _STATES = 200
+_ALLOWED = 4.0  # standard errors by which a symmetry may move a coefficient
+_DIGITS = 1e-14  # of a coefficient: it may always move by so much
 _KNOWN = 1e-12  # of a number's size, or of the largest variance: an error below it is none
 _NULL = 1e-8  # of the largest restriction: below it a combination of terms has the symmetry
 
@@ -40,10 +42,29 @@ class Restricted(NamedTuple):
 
 def symmetries_of(family: Terms, c: np.ndarray, z: np.ndarray, angles: Sequence[int] = ()):
     """Texts of the symmetries that H = Σ c_j φ_j has to roundoff at states z (N, 2d)."""
-    return tuple(
-        s.text for s in _candidates(family, z[:_STATES], tuple(angles))
+    return tuple(s.text for s in _held(family, c, z, angles))
+
+
+def _held(family: Terms, c: np.ndarray, z: np.ndarray, angles: Sequence[int]) -> list[Symmetry]:
+    return [
+        s for s in _candidates(family, z[:_STATES], tuple(angles))
         if np.abs(s.rows @ c).max() <= _HOLDS * (np.abs(s.rows) @ np.abs(c)).max()
-    )  # fmt: skip
+    ]  # fmt: skip
+
+
+def imposed(
+    family: Terms, c: np.ndarray, deviations: np.ndarray, z: np.ndarray, angles: Sequence[int]
+) -> np.ndarray:
+    """The coefficients c (m,) with the symmetries that H nearly has, to roundoff, moved the least;
+    c itself where one would move by more than its standard error allows."""
+    held = _held(family, c, z, angles)
+    if not held:
+        return c
+    size = np.where(c != 0, np.abs(c), 1.0)
+    rows = np.concatenate([_independent(s.rows, c) for s in held]) * size
+    moved = c - size * (np.linalg.pinv(rows, rcond=_NULL) @ (rows @ (c / size)))
+    most = np.maximum(_ALLOWED * deviations, _DIGITS * np.abs(c))
+    return moved if np.all(np.abs(moved - c) <= most) else c
 
 
 def restricted(

@@ -16,6 +16,7 @@ import numpy as np
 from gfnn_jax.budget import MATCHING
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.diagnosis.symmetries import symmetries_of_pairs
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.models.hamiltonians.formula import OnPartial, PartialLaw, Term, formula
@@ -33,6 +34,7 @@ _DICTIONARIES = (
 _FEWEST = 60  # pairs
 _NOTHING = 1e-9  # of the largest term: a term so small is roundoff
 _SHOWN = 1e-5  # of a coefficient of a partial law: what is not shown of it
+_CERTAIN = 1e-12  # of the spread, that a law of the pairs' symmetries may leave over
 _EXACT = 1e-9  # of the spread: the error of a law that is no approximation
 
 
@@ -49,9 +51,12 @@ def law_of_physics(
     rows, coordinates = data.training, data.coordinates
     own = copy.copy(problem)  # its flows are no part of what libraries may take
     own.allowance = dataclasses.replace(problem.allowance, cap=None)
-    search = Textbook(
-        own, rows, angles=tuple(a for a in coordinates.angles if a < data.dim),
-        cyclic=coordinates.cyclic, say=say,
+    symmetric, search = (
+        Textbook(
+            own, rows, angles=tuple(a for a in coordinates.angles if a < data.dim),
+            cyclic=coordinates.cyclic, say=say, symmetries=symmetries,
+        )
+        for symmetries in (symmetries_of_pairs(data), ())
     )  # fmt: skip
     law = None
     for name, contents, operations in _DICTIONARIES:
@@ -59,7 +64,7 @@ def law_of_physics(
             continue
         try:
             with work.budget.unit(name, MATCHING, operations[data.dim - 1]):
-                law = search.law(**contents)
+                law = _found(symmetric, search, contents)
         except OutOfTime:
             work.budget.leave_out(name, work.ended)
             return None
@@ -84,6 +89,13 @@ def law_of_physics(
     if not (error.bound <= tolerance.bound and error.relative <= _EXACT):
         return None
     return FittedLaw(family, fit, rows, error, search.null, search.null)
+
+
+def _found(symmetric: Textbook, search: Textbook, contents: dict[str, bool]) -> Law | None:
+    """The law of a dictionary: of the atoms that have the pairs' symmetries, where it is as exact
+    as clean pairs are, else of all atoms."""
+    law = symmetric.law(**contents) if symmetric.symmetric else None
+    return law if law is not None and law.left <= _CERTAIN else search.law(**contents)
 
 
 def _without_nothing(law: Law, z: np.ndarray, scale: np.ndarray):

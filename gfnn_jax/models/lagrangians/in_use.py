@@ -1,7 +1,7 @@
 """A fit made ready for forecasts: the law in columns, its sensors, bands by held-out thirds.
 
 Where residuals show that zeros of channels wander there are two such fits, and the one whose
-forecasts of held-out data are better is taken.
+forecasts of held-out data err less is taken.
 """
 
 from __future__ import annotations
@@ -24,8 +24,6 @@ from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.learned_law import in_columns, scaled
 from gfnn_jax.models.lagrangians.wandering import wander_of
 from gfnn_jax.solve.latent_arcs import SOFT_L1
-
-_BETTER = 0.95  # of the median error of held-out forecasts, that zeros which wander have to reach
 
 
 class InUse(NamedTuple):
@@ -120,7 +118,8 @@ def best_in_use(
     record: Record, bench: Workbench, fit: LawFit, choice: FrictionChoice,
     told: Callable[[str], object],
 ) -> InUse:  # fmt: skip
-    """The fit as it is, or fitted anew with zeros of channels that wander."""
+    """The fit as it is, or fitted anew with zeros of channels that wander: where its residuals show
+    these (the likelihood's evidence) and forecasts of held-out data do not err more with them."""
     steady = record.in_use(bench, fit, choice)
     wander = wander_of(bench, fit)
     if wander is None:
@@ -134,7 +133,7 @@ def best_in_use(
         f"zeros that wander by {wander.size:.2g} σ over {wander.time:.3g} s: held-out forecasts "
         f"err by {share:.3g} times as much"
     )
-    return wandering if share < _BETTER else steady
+    return wandering if share < 1 else steady
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:

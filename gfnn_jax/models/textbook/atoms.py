@@ -151,6 +151,7 @@ class _Singles(NamedTuple):
 def dictionary_of(
     arguments: Sequence[Argument], weight: np.ndarray, base: np.ndarray, *, degree: int,
     products: bool = False, centres: bool = False, average: Average = np.asarray,
+    allowed: Callable[[Atom], bool] | None = None,
 ) -> Dictionary:  # fmt: skip
     """The atoms that are tried. weight (2d,), or of each row: by which gradients are multiplied.
     base: orthonormal columns (rows, n), beside which atoms are looked for.
@@ -158,7 +159,8 @@ def dictionary_of(
     Shapes of one argument, and products of coordinates from the third to this degree, without the
     coordinates and products of two, which are in every law. products: of a coordinate, a product
     of two or a sine or cosine with a shape of another argument too. centres: shapes of distances
-    from centres beside the origin too. average: makes the rows of gradients at the states.
+    from centres beside the origin too. average: makes the rows of gradients at the states. allowed:
+    says which atoms; None: all.
     """
     atoms: list[Atom] = []
     gradients: list[np.ndarray] = []
@@ -169,6 +171,9 @@ def dictionary_of(
         if centres:
             groups.append(_of_centres(arguments))
         for own, gradient in chain(*groups):
+            if allowed is not None:
+                chosen = [i for i, atom in enumerate(own) if allowed(atom)]
+                own, gradient = [own[i] for i in chosen], gradient[chosen]
             atoms += own
             gradients.append(average(gradient))
         rows = (np.concatenate(gradients) * weight).reshape(len(atoms), -1)

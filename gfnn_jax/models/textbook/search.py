@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
 from gfnn_jax.fitting.gauss_newton import Problem
@@ -34,6 +35,7 @@ from gfnn_jax.models.textbook.atoms import (
     weight_of,
     with_constants,
 )
+from gfnn_jax.models.textbook.invariance import Invariance
 from gfnn_jax.models.textbook.matching import Match, Matching, orthonormal
 from gfnn_jax.phase_space import apply_j
 
@@ -101,7 +103,7 @@ class _State(NamedTuple):
 class Textbook:
     """The search for the law of these rows of a problem's pairs, which have no args.
 
-    angles, cyclic: indices of z.
+    angles, cyclic: indices of z. symmetries: of the pairs; only what has them by itself is tried.
     null: the coordinates and products of two that the states do not tell from those before.
     Raises ValueError for more degrees of freedom than ``options.most_dim``.
     """
@@ -110,6 +112,7 @@ class Textbook:
         self, problem: Problem, rows: np.ndarray, *, angles: Sequence[int] = (),
         cyclic: Sequence[int] = (), options: Options = OPTIONS,
         say: Callable[[str], Any] = lambda message: None,
+        symmetries: Sequence[SymmetryOfPairs] = (),
     ):  # fmt: skip
         dim = problem.z0.shape[1] // 2
         if dim > options.most_dim:
@@ -127,24 +130,35 @@ class Textbook:
         every = polynomial_terms(dim, 2, cyclic=(*angles, *cyclic))
         kept, null = null_terms(every, self._middle)
         self._base, self.null = every.take(kept), tuple(every.term_names[j] for j in null)
+        given = self._middle, self._arguments, tuple(angles), tuple(cyclic)
+        self._invariance = Invariance(symmetries, *given)
+        self._tried = 0  # atoms of the dictionary before
+        if self._invariance:
+            self._base = self._base.take(self._invariance.terms(self._base))
         columns = self._base.term_gradients(self._middle) * self._weight[:, None]
         self._spanned = orthonormal(columns.reshape(-1, columns.shape[-1]))
         self._target = -apply_j(z1 - z0) / self._h
         self._closest: _State | None = None  # of the laws that were not exact
         self._partial: list[_State] = []
 
+    @property
+    def symmetric(self) -> bool:
+        """Return whether symmetries have left atoms out."""
+        return bool(self._invariance)
+
     def law(self, *, products: bool = False, centres: bool = False) -> Law | None:
         """The plainest law whose flow takes z₀ to z₁, of a dictionary with products of shapes, with
         distances from other centres than the origin, or with neither; None where none is found."""
         if centres and not any(argument.axes for argument in self._arguments):
             return None
-        alone = not (products or centres)
+        blocks = [] if products or centres else blocks_of(self._arguments, self._degree)
+        tops = tops_of(self._arguments) if products else []
         with np.errstate(all="ignore"):
-            found = self._found(
-                self._dictionary(products, centres),
-                blocks_of(self._arguments, self._degree) if alone else [],
-                tops_of(self._arguments) if products else [],
-            )
+            dictionary = self._dictionary(products, centres)
+            tried, self._tried = self._tried, len(dictionary.atoms)
+            if len(dictionary.atoms) == tried:  # products and centres have brought nothing
+                return None
+            found = self._found(dictionary, self._allowed(blocks), self._allowed(tops))
             return None if found is None else self._simplified(found).law
 
     @property
@@ -164,8 +178,15 @@ class Textbook:
     def _dictionary(self, products: bool = False, centres: bool = False) -> Dictionary:
         return dictionary_of(
             self._arguments, self._weight, self._spanned, degree=self._degree, products=products,
-            centres=centres,
+            centres=centres, allowed=self._invariance.of_atom if self._invariance else None,
         )  # fmt: skip
+
+    def _allowed(self, blocks: list[tuple[Atom, ...]]) -> list[tuple[Atom, ...]]:
+        """The atoms of these that have the symmetries."""
+        if not self._invariance:
+            return blocks
+        kept = (tuple(filter(self._invariance.of_atom, block)) for block in blocks)
+        return list(dict.fromkeys(block for block in kept if block))
 
     def _matching(self, target: np.ndarray) -> Matching:
         flat = (target * self._weight).ravel()

@@ -77,6 +77,14 @@ def kinds_for(x: np.ndarray, *, distance: bool = False, circular: bool = False) 
     return [*found, ("lorentz", 0.0), ("gauss", 0.0)]
 
 
+def parity(kind: Kind) -> int:
+    """1 of an even shape, f(−x) = f(x), -1 of an odd one, 0 of another."""
+    name, n = kind
+    if name == "power":
+        return (-1) ** int(n) if n % 1 == 0 else 0
+    return {"cos": 1, "root": 1, "lorentz": 1, "gauss": 1, "sin": -1}.get(name, 0)
+
+
 def constants_for(kind: Kind, x: np.ndarray) -> np.ndarray:
     """The θ that a shape is first tried with at x (N,), close enough for Gauss–Newton to go on."""
     size, spread = float(np.abs(x).max()), float(np.ptp(x))
