@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.evaluate import report
 from gfnn_jax.learn import searches
 from gfnn_jax.models.hamiltonians import choose_law

@@ -20,6 +20,7 @@ from gfnn_jax.budget import ROWS, Budget
 from gfnn_jax.candidates.candidate import Candidate, validated
 from gfnn_jax.dataset.arcs import arcs_of_pairs, onward
 from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import uncertainty

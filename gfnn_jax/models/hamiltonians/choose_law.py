@@ -128,5 +128,6 @@ def preferred(law: Candidate, chosen: Candidate, tolerance: Tolerance) -> bool:
     as_good = _AS_GOOD
     if law.num_parameters <= chosen.num_parameters:
         size = law.validation_relative if tolerance.relative else law.validation_rms
-        as_good = max(as_good, np.sqrt(law.validation_bound / size) if size > 0 else 1.0)
+        chance = law.validation_bound / size if size > 0 else 1.0
+        as_good = max(as_good, float(np.sqrt(chance)))
     return law.validation_relative <= as_good * chosen.validation_relative
