@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -258,21 +259,64 @@ def test_draws_run_all_along_the_orbit():
     assert index.max() > 9_800
 
 
-def test_data_of_a_scene_take_one_compilation_per_program_and_shape(compilations):
-    """Draw and step of the pairs, draw of the test states, trajectories; nothing of it eagerly."""
+def test_data_of_a_scene_take_one_compilation_per_program(compilations):
+    """Draw and step of the pairs, draw of the test states; nothing of it eagerly."""
+    flow = scenes.two_body().flow
+    scene = dataclasses.replace(scenes.two_body(), flow=lambda z, t: flow(z, t))  # seen by no test
     with compilations() as of_pairs:
-        tr.sample_pairs(scenes.two_body(), 37, KEY)
+        tr.sample_pairs(scene, 37, KEY)
     with compilations() as of_tests:
-        z0 = tr.sample_test_states(scenes.two_body(), 11, KEY)
-        tr.reference_trajectories(scenes.two_body(), z0, 13)
+        z0 = tr.sample_test_states(scene, 11, KEY)
+        tr.reference_trajectories(scene, z0, 13)
     with compilations() as again:
-        tr.sample_pairs(scenes.two_body(dt=0.2), 37, KEY)
-        tr.reference_trajectories(scenes.two_body(), z0, 13)
-    assert (of_pairs.count, of_tests.count, again.count) == (2, 2, 0)
+        tr.sample_pairs(dataclasses.replace(scene, dt=0.2), 37, KEY)
+        tr.reference_trajectories(scene, z0, 13)
+    assert (of_pairs.count, of_tests.count, again.count) == (2, 1, 0)
     with compilations() as of_an_orbit:
         tr.sample_pairs(scenes.standard_map(), 37, KEY)
         tr.sample_test_states(scenes.standard_map(), 37, KEY)
-    assert of_an_orbit.count <= 3
+    assert of_an_orbit.count <= 2  # the orbit and the pairs by one program
+    with compilations() as of_more:
+        tr.sample_pairs(scenes.standard_map(), 38, KEY)
+        tr.sample_test_states(scenes.standard_map(), 1, KEY)
+    assert of_more.count == 0
+
+
+@pytest.mark.parametrize("name", ["henon-heiles-section", "driven-pendulum-phase", "two-body"])
+def test_a_state_has_the_same_bits_beside_any_others(name, compilations):
+    """Alone, in another order, in blocks that are full or not, and for any number of steps."""
+    scene = integrated("two-body") if name == "two-body" else scenes.make(name)
+    num = 2 * tr.LANES_ON_CPU + 1
+    z0, t0 = tr.sample_states(scene, num, KEY), tr.sample_t0(scene, num, KEY)
+
+    def followed(rows, num_steps=3):
+        times = None if t0 is None else t0[rows]
+        return tr.reference_trajectories(scene, z0[rows], num_steps, t0=times)
+
+    whole = followed(np.arange(num))
+    with compilations() as found:
+        for rows in (np.arange(num)[::-1], np.arange(5, num), np.array([num - 1]), np.arange(0)):
+            np.testing.assert_array_equal(followed(rows), whole[rows])
+        np.testing.assert_array_equal(followed(np.arange(4), 2), whole[:4, :3])
+    assert found.count == 0
+
+
+def test_first_draws_are_those_of_more():
+    scene, driven = scenes.standard_map(), scenes.make("driven-pendulum-phase")
+    for num in (1, 37):
+        for draw in (partial(tr.sample_states, scene), partial(tr.sample_t0, driven)):
+            np.testing.assert_array_equal(draw(num, KEY), draw(tr.ROWS_DRAWN + 1, KEY)[:num])
+
+
+def test_long_trajectories_go_on_from_call_to_call():
+    """More states than one call returns, against a plain loop over the map."""
+    scene, num_steps = scenes.standard_map(), 2 * tr.SAVED_AT_ONCE + 6
+    z0 = tr.sample_states(scene, 3, KEY)
+    found = tr.reference_trajectories(scene, z0, num_steps, save_every=2)
+    path, step = [z0], jax.jit(jax.vmap(scene.step))
+    for _ in range(num_steps):
+        path.append(np.asarray(step(path[-1])))
+    np.testing.assert_allclose(found, np.stack(path[::2], axis=1), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.slow
