@@ -8,13 +8,13 @@ import numpy as np
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import FitError
 from gfnn_jax.fitting.linear_starts import fitted_gradients
-from gfnn_jax.generating.charts import Chart
+from gfnn_jax.generating.charts import AnyChart
 
 _SAMPLE = 50  # pairs that a library is fitted to; as many judge it
 _QUIET = 0.75  # of the sample, that moves least
 
 
-def misfit(family, data: Dataset, chart: Chart) -> float:
+def misfit(family, data: Dataset, chart: AnyChart) -> float:
     """Part of the held-out target gradients that a family, linear in its parameters, leaves over:
     the median over pairs, of the forces or of the velocities, whichever is larger; infinite where
     its functions overflow. data: without args."""
