@@ -12,7 +12,7 @@ from gfnn_jax.data.kinds import are_recordings
 from gfnn_jax.data.recording_summary import as_typed
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.errors import InputError
-from gfnn_jax.models.lagrangians.recordings import parameters_left_out
+from gfnn_jax.models.lagrangians.in_words import parameters_left_out
 
 T = np.array([0.0, 0.1, 0.25, 0.3, 1.0])
 THETA = np.array([0.5, 0.25, -0.125, 1e-3, 2.0])

@@ -40,6 +40,18 @@ class LawFit:
         return self.fitted.p
 
     @property
+    def zeros(self) -> np.ndarray:
+        """Zeros (d,) of the coordinates, 0 where none was fitted."""
+        zeros, where = np.zeros(self.form.dim), list(self.structure.zeros)
+        zeros[where] = self.p[self.form.count : self.form.count + len(where)]
+        return zeros
+
+    @property
+    def sensors(self) -> np.ndarray:
+        """Values of the sensors' parameters, which are behind the law's and its zeros."""
+        return self.p[self.form.count + len(self.structure.zeros) :]
+
+    @property
     def values(self) -> dict[Key, float]:
         return dict(zip(self.structure.keys(), map(float, self.p), strict=True))
 

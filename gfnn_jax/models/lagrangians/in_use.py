@@ -86,12 +86,11 @@ class Record:
         if bench.wander is not None:  # sizes of wanders are in units of the white part
             noise = fit.sigma
         plain = seen.is_plain and seen.loss == SOFT_L1
-        first = fit.form.count + len(fit.structure.zeros)
         return Sensors(
             recording.coordinates, recording.inputs, recording.angles, noise, scales.omega,
             scales.period, self.hold, self.delay, np.array([scales.period]),
             np.zeros((1, len(noise))),
-            None if plain else dataclasses.replace(seen, values=fit.p[first:]), bench.wander,
+            None if plain else dataclasses.replace(seen, values=fit.sensors), bench.wander,
         )  # fmt: skip
 
     def thirds(self, bench: Workbench, fit: LawFit, sensors: Sensors) -> Thirds:
@@ -101,8 +100,7 @@ class Record:
             law, covariance = in_columns(other)
             own = sensors
             if sensors.observation is not None:
-                first = fit.form.count + len(fit.structure.zeros)
-                shown = dataclasses.replace(sensors.observation, values=other.p[first:])
+                shown = dataclasses.replace(sensors.observation, values=other.sensors)
                 own = dataclasses.replace(sensors, observation=shown)
             laws.append(law_in_use(law, fewer * _root(covariance), own))
             begins.append(

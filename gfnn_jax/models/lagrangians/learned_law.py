@@ -205,12 +205,10 @@ def hamiltonian_of(terms: Terms, lagrangian: Expression, names: tuple[str, ...])
 def in_columns(fit: LawFit) -> tuple[Lagrangian, np.ndarray]:
     """The law in the measured coordinates (zeros of angles inside the phases of its terms), and the
     covariance of (θ, ρ, G row by row), and of γ where there is uniform friction."""
-    form, structure = fit.form, fit.structure
+    form = fit.form
     law = form.lagrangian(fit.p[: form.count])
-    zeros = np.zeros(form.dim)
-    zeros[list(structure.zeros)] = fit.p[form.count : form.count + len(structure.zeros)]
     terms = law.terms
-    moved = dataclasses.replace(terms, phases=terms.phases - terms.modes @ zeros)
+    moved = dataclasses.replace(terms, phases=terms.phases - terms.modes @ fit.zeros)
     rest = form.count - form.basis.shape[1]
     turn = np.zeros((terms.count + rest, len(fit.p)))
     turn[: terms.count, : form.basis.shape[1]] = form.basis

@@ -32,7 +32,7 @@ def wander_of(bench: Workbench, fit: LawFit) -> Wander | None:
     seen = np.isfinite(arcs.y)
     weights = np.where(seen, loss.weights(fit.fitted.residuals), np.nan)
     noise = np.where(seen, arcs.noise / np.sqrt(weights), np.inf)
-    free = seen.sum() - len(rows) * m - len(fit.p)
+    free = int(seen.sum()) - len(rows) * m - len(fit.p)
     rows = rows.reshape(*arcs.y.shape, -1)
     period = 2 * np.pi / bench.omega
 

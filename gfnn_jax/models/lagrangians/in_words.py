@@ -1,0 +1,212 @@
+"""Law in the words of its recording: names of columns, units of the file, warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.roles import symbols
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.lagrangians.fit import LawFit
+from gfnn_jax.models.lagrangians.in_use import InUse
+from gfnn_jax.models.lagrangians.learned_law import LearnedLaw, NextMotion, hamiltonian_of
+from gfnn_jax.models.lagrangians.next_motion import Motion
+from gfnn_jax.models.lagrangians.residuals import Trace, whiteness
+from gfnn_jax.models.lagrangians.text import (
+    Expression,
+    Term,
+    friction_of,
+    speed_names,
+    terms_of,
+    which_friction_told,
+    word_of,
+)
+from gfnn_jax.models.lagrangians.velocities import Velocity
+
+_SEEN = 3.0  # standard errors of a gain, below which its input is not seen to act
+_ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apart
+
+Gains = dict[str, dict[str, tuple[float, float]]]
+
+
+def in_words(
+    recording: Recording, best: InUse, map_: SymplecticMap, traces: tuple[Trace, ...],
+    motions: Sequence[Motion], measured: Mapping[str, Velocity],
+    delay: tuple[float, float] | None, messages: Sequence[str], steps: tuple[str, ...],
+    seconds: float,
+) -> LearnedLaw:  # fmt: skip
+    """The law, its sensors and what its fit showed, by names of columns and in the file's units.
+
+    measured: columns of velocities against the law. delay: of the inputs, with its standard error.
+    messages: warnings that come before those of the fit.
+    """
+    names = _names(recording)
+    fit, law = best.fit, best.law
+    sensors, channels = map_.sensors, map_.sensors.seen.channels
+    factors = np.array([recording.factors[name] for name in channels])
+    lagrangian, friction = _expressions(best, names)
+    gains = _gains(best, recording)
+    zeros, parameters = _zeros_and_sensors(fit, recording)
+    shown = dict(zip(channels, sensors.seen.formulas, strict=True))
+    return LearnedLaw(
+        map=map_, lagrangian=lagrangian, friction=friction, gains=gains, delay=delay,
+        which_friction=which_friction_told(best.choice, best.scale, law.dim, names.speeds),
+        hamiltonian=hamiltonian_of(law.terms, lagrangian, names.coordinates), zeros=zeros,
+        noise=dict(zip(channels, map(float, sensors.sigma / factors), strict=True)),
+        residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)),
+        gauge=best.gauge,
+        velocities={n: one.scaled(1 / recording.factors[n]) for n, one in measured.items()},
+        whiteness=whiteness(traces, channels, recording.inputs), traces=traces,
+        next_motions=_next_motions(motions, recording, names),
+        observe={n: f for n, f in shown.items() if n != f}, sensors=parameters,
+        alike=_alike(fit, lagrangian, friction), horizon=tuple(best.calibration.horizons),
+        energy=_energy(traces, friction, recording.inputs),
+        messages=(*messages, *_warnings(best, recording, gains)), steps=steps,
+        num_samples=len(recording), seconds=seconds, ended="every length of arcs was fitted",
+    )  # fmt: skip
+
+
+class _Names(NamedTuple):
+    """Symbols of coordinates and of their speeds, as formulas write them."""
+
+    coordinates: tuple[str, ...]
+    speeds: tuple[str, ...]
+
+
+def _names(recording: Recording) -> _Names:
+    names = recording.coordinates
+    listed = symbols((*names, *speed_names(names, recording.velocities)))
+    return _Names(listed[: len(names)], listed[len(names) :])
+
+
+def _standard_errors(best: InUse) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Standard errors of the terms of L, of R, of the gains (d, m), and of the last coefficient,
+    the rate γ of uniform friction where there is one."""
+    std = np.sqrt(np.maximum(np.diag(best.covariance), 0.0))
+    law = best.law
+    of_terms, of_losses, rest = np.split(std, np.cumsum([law.terms.count, law.friction.count]))
+    return of_terms, of_losses, rest[: law.gains.size].reshape(law.gains.shape), float(std[-1])
+
+
+def _expressions(best: InUse, names: _Names) -> tuple[Expression, Expression]:
+    """L and Rayleigh's R; uniform friction enters R as γ T."""
+    law = best.law
+    of_terms, of_losses, _, of_rate = _standard_errors(best)
+    lagrangian = terms_of(law.terms, law.coefficients, of_terms, *names)
+    friction = friction_of(law.friction, law.losses, of_losses, names.speeds)
+    if law.uniform == 0:
+        return lagrangian, friction
+    kinetic = tuple(
+        term for term, row in zip(lagrangian.terms, law.terms.rows(), strict=True) if any(row[0])
+    )
+    uniform = Term(f"({Expression(kinetic).formula})", float(law.uniform), of_rate)
+    return lagrangian, Expression((*friction.terms, uniform))
+
+
+def _gains(best: InUse, recording: Recording) -> Gains:
+    """Input -> its force on each position, with the standard error."""
+    gains, std = best.law.gains, _standard_errors(best)[2]
+    return {
+        u: {q: (float(gains[i, j]), float(std[i, j])) for i, q in enumerate(recording.coordinates)}
+        for j, u in enumerate(recording.inputs)
+    }
+
+
+def _zeros_and_sensors(
+    fit: LawFit, recording: Recording
+) -> tuple[dict[str, tuple[float, float]], dict[str, tuple[float, float]]]:
+    """Zeros of angles and parameters of sensors by name, with their standard errors."""
+    first = fit.form.count
+    std = np.sqrt(np.diag(fit.covariance()))[first:]
+    fitted = list(zip(map(float, fit.p[first:]), map(float, std), strict=True))
+    where = fit.structure.zeros
+    zeros = {recording.coordinates[i]: one for i, one in zip(where, fitted, strict=False)}
+    keys = fit.structure.keys()[first + len(where) :]
+    return zeros, {name: one for (_, name), one in zip(keys, fitted[len(where) :], strict=True)}
+
+
+def _warnings(best: InUse, recording: Recording, gains: Gains) -> list[str]:
+    """Reasons not to rely on the law, each with its remedy."""
+    found = []
+    if not best.fit.fitted.converged:
+        found.append(
+            "the fit of the law did not converge: its coefficients and standard errors are not "
+            "reliable. Fit a shorter part of the record (--from, --to) or fewer terms (--terms)"
+        )
+    if best.choice.gains:
+        found.append(
+            "the record gains energy that no input explains. If the system is driven, name its "
+            "drive: --inputs NAME (inputs=)"
+        )
+    found += parameters_left_out(recording)
+    return found + [
+        f"no force of the input {u} is seen: its gain is within {_SEEN:g} standard errors of 0. "
+        f"Record a stronger or more varied {u}, or leave it out of --inputs (inputs=)"
+        for u, forces in gains.items()
+        if all(abs(gain) < _SEEN * error for gain, error in forces.values())
+    ]
+
+
+def parameters_left_out(recording: Recording) -> list[str]:
+    """A warning for each parameter that differs from run to run: a law has none."""
+    found = []
+    for name in recording.parameters:
+        values = np.concatenate([recording.values(name, run) for run in recording.runs])
+        least, most = np.nanmin(values), np.nanmax(values)
+        if least < most:
+            found.append(
+                f"{name} is {least:g} to {most:g} and the law is one for all runs. If {name} "
+                "moves anything, fit the runs of each value by themselves"
+            )
+    return found
+
+
+def _next_motions(
+    motions: Sequence[Motion], recording: Recording, names: _Names
+) -> tuple[NextMotion, ...]:
+    """Motions to record, in the file's units where a column shows the coordinate."""
+    named = []
+    for motion in motions:
+        start = {
+            name: float(q / recording.factors.get(name, 1.0))
+            for name, q in zip(recording.coordinates, motion.start, strict=True)
+        }
+        named.append(NextMotion(start, {word_of(k, *names): g for k, g in motion.gains.items()}))
+    return tuple(named)
+
+
+def _alike(fit: LawFit, lagrangian: Expression, friction: Expression) -> tuple[str, ...]:
+    """Pairs of coefficients that the record cannot tell apart."""
+    covariance = fit.covariance()
+    scale = np.sqrt(np.diag(covariance))
+    with np.errstate(all="ignore"):
+        correlation = covariance / scale / scale[:, None]
+    texts = dict(zip(fit.structure.terms, (t.term for t in lagrangian.terms), strict=True))
+    texts |= dict(zip(fit.structure.friction, (t.term for t in friction.terms), strict=True))
+    names = {key: texts.get(key[1], " ".join(map(str, key))) for key in fit.values}
+    listed, together = list(names.values()), [names[key] for key in fit.untold()]
+    pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > _ALIKE, 1)), strict=True)
+    only = (f"{', '.join(together)}: only together",) if together else ()
+    return only + tuple(
+        f"{listed[i]} and {listed[j]} (correlation {correlation[i, j]:+.3f})" for i, j in pairs
+    )
+
+
+def _energy(
+    traces: Sequence[Trace], friction: Expression, inputs: tuple[str, ...]
+) -> dict[str, Any]:
+    """Energy per second, means over the arcs: stored, lost by each friction, supplied by each
+    input, and what these leave unexplained."""
+    total = sum(trace.t[-1] - trace.t[0] for trace in traces)
+    stored = float(sum(trace.energy[-1] - trace.energy[0] for trace in traces) / total)
+    lost = np.sum([trace.lost[-1] for trace in traces], axis=0) / total
+    supplied = np.sum([trace.supplied[-1] for trace in traces], axis=0) / total
+    return {
+        "stored": stored,
+        "lost": dict(zip((t.term for t in friction.terms), map(float, lost), strict=True)),
+        "supplied": dict(zip(inputs, map(float, supplied), strict=True)),
+        "closure": float(stored - np.sum(supplied) + np.sum(lost)),
+    }
