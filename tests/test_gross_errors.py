@@ -1,12 +1,16 @@
 """Pairs that a map misses by far: gross errors, and states at the rim that it cannot follow."""
 
+import dataclasses
 import types
 
 import numpy as np
 import pytest
 
+import gfnn_jax as gfnn
+from gfnn_jax.budget import FLOW, RATES, Budget
 from gfnn_jax.dataset.runs import first_occurrences
-from gfnn_jax.learn import gross_errors
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.learn import fit, gross_errors
 from gfnn_jax.phase_space import Pairs
 
 
@@ -45,3 +49,87 @@ def test_copies_are_found_whatever_the_sign_of_a_zero():
     z0[700, 1:], z1[700] = z0[3, 1:], z1[3]
     assert 700 not in first_occurrences(Pairs(z0, z1, 0.1))
     assert len(first_occurrences(Pairs(z0, z1, 0.1))) == 999
+
+
+# Gross errors are looked for within the budget.
+
+
+class Caught(Exception):
+    """What a fit hands to `without_gross_errors`."""
+
+
+@pytest.fixture(scope="module")
+def spoilt():
+    """(request, diagnosis, search) of an oscillator with noise, three of whose images are then
+    moved: before the search neighbours would tell them."""
+    rng = np.random.default_rng(0)
+    z0 = rng.uniform(-1, 1, (300, 2))
+    turn = np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
+    z1 = z0 @ turn.T + 1e-4 * rng.normal(size=z0.shape)
+
+    def caught(*given):
+        raise Caught(*given)
+
+    pairs = Pairs(z0, z1, 0.5)
+    options = {"learn": "hamiltonian", "terms": ["q1**2", "p1**2"], "tolerance": 1e-6}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit, "without_gross_errors", caught)
+        with pytest.raises(Caught) as known:
+            gfnn.fit(pairs, max_seconds=None, **options)
+    request, seen, found = known.value.args
+    z1 = found.data.y1.copy()
+    z1[[20, 150, 222]] += 0.03
+    data = dataclasses.replace(found.data, y1=z1, pairs=dataclasses.replace(pairs, z1=z1))
+    return request, seen, found._replace(data=data)
+
+
+@pytest.fixture
+def looked_for(spoilt, monkeypatch):
+    """Budget -> (number of pairs that are left, the states whose image was asked for)."""
+    asked, image = [], Flow.image
+    request, seen, found = spoilt
+
+    def counted(self, z, *args):
+        asked.append(len(z))
+        return image(self, z, *args)
+
+    def looked(budget):
+        asked.clear()
+        given = dataclasses.replace(request, budget=budget)
+        monkeypatch.setattr(Flow, "image", counted)
+        return len(gross_errors.without_gross_errors(given, seen, found).found.data), sum(asked)
+
+    return looked
+
+
+def test_without_a_budget_gross_errors_are_left_out(looked_for):
+    budget = Budget()
+    left, asked = looked_for(budget)
+    assert (left, asked >= 300, budget.left_out) == (297, True, [])
+    again = Budget(max_operations=budget.operations)
+    assert looked_for(again) == (left, asked)
+    assert again.operations == budget.operations
+
+
+@pytest.mark.parametrize("part", [0.9, 1.1])
+def test_where_the_budget_has_no_room_for_all_pairs_none_is_looked_at(part, spoilt, looked_for):
+    """At a part of the operations, and of the seconds, that the residuals alone take; with a
+    little more there is no room for the neighbours."""
+    work = 300 * spoilt[2].law.candidate.operations
+    clock = Budget(max_seconds=part * work / RATES[FLOW], clock=lambda: 0.0)
+    for budget in (clock, Budget(max_operations=int(part * work))):
+        assert looked_for(budget) == (300, 300 * (part > 1))
+        (told,) = budget.left_out
+        assert "left out: the search for pairs that the map misses by far (" in told
+        assert budget.operations <= part * work
+    again = Budget(max_operations=clock.operations)
+    assert looked_for(again) == (300, 300 * (part > 1))
+    assert again.operations == clock.operations
+
+
+def test_after_the_end_of_the_search_no_pair_is_looked_at(looked_for):
+    budget = Budget(max_operations=0)
+    with pytest.raises(gfnn.errors.OutOfTime), budget.unit("H", FLOW, 1):
+        pass
+    assert looked_for(budget) == (300, 0)
+    assert len(budget.left_out) == 1

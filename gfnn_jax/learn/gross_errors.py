@@ -5,19 +5,25 @@ all pairs agree on tells it anywhere. What a map cannot represent is smooth: its
 large at the neighbours. A gross error of measurement stands alone. So may a state at the rim of the
 data, as of the closest passages; there a smaller size of the map errs far more still, while it
 finds the same gross error. Of a law, which has no sizes, a message names both.
+
+That the residuals of all pairs are looked at is work of the search: it is left out, and told, where
+the budget has no room for it.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from gfnn_jax.budget import FLOW
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.diagnosis.diagnosis import Diagnosis
+from gfnn_jax.errors import OutOfTime
 from gfnn_jax.learn.diagnose import diagnose_request
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched, searched
@@ -48,6 +54,10 @@ _ROUNDS = 3  # large ones hide smaller ones
 # The RMS residual of all pairs over that of the others, for a search without them to be worth its
 # time; and by how much that of the others may rise then.
 _SPOILT, _RISE = 1.15, 1.02
+# Operations, as of flows in NumPy, of a pair in the trees of its state and image, and of finding
+# the neighbours of both, ÷ (2d)².
+_OF_TREES, _OF_NEIGHBOURS = 500, 1_400
+_WHAT = "the search for pairs that the map misses by far"
 
 
 class Cleaned(NamedTuple):
@@ -65,14 +75,27 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
     wrong, rim, count = np.zeros(0, int), np.zeros(0, int), len(found.data)
     request = dataclasses.replace(request, factors=None, checkpoints=None)
     for _ in range(_ROUNDS):
-        size = _residuals(found)
-        if size is None:
+        left = _residuals(found)
+        if left is None:
             break
-        rows, rise = _standing_alone(found.data, size, _ORDINARY), _RISE
+        try:
+            with request.budget.unit(_WHAT, FLOW, left.work):
+                size = left.sizes()
+            far = _far(size)
+            if not len(far):
+                break
+            # A search without them is followed by another look at the residuals.
+            work = _work_of_neighbours(found.data, far)
+            with request.budget.unit(_WHAT, FLOW, work, then=(FLOW, left.work)):
+                around = _around(found.data, size, far)
+        except OutOfTime:
+            request.budget.leave_out(_WHAT, request.budget.ended)
+            break
+        rows, rise = _standing_alone(size, far, around, _ORDINARY), _RISE
         if not len(rows):
-            rows, rise = _standing_alone(found.data, size, np.inf), _MENDED
+            rows, rise = _standing_alone(size, far, around, np.inf), _MENDED
         gone = len(wrong) + len(rim) + len(rows)
-        if not len(rows) or gone > _MOST * count or request.budget.over:
+        if not len(rows) or gone > _MOST * count:
             break
         others = np.setdiff1d(np.arange(len(size)), rows)
         if not _rms(size) > _SPOILT * _rms(size[others]):
@@ -83,8 +106,11 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
         diagnosis = diagnose_request(request, data)
         again = searched(request, data, diagnosis, None)
         left = _residuals(again)
-        if left is not None and not _rms(left) <= rise * _rms(size[others]):
-            break
+        if left is not None:
+            with request.budget.free(FLOW, left.work):
+                rms = _rms(left.sizes())
+            if not rms <= rise * _rms(size[others]):
+                break
         if at_rim and left is not None:  # the tolerance is missed without these exact pairs too
             break
         named = found.data.row[rows]
@@ -114,8 +140,15 @@ def _rms(size) -> float:
     return float(np.sqrt(np.mean(size**2)))
 
 
-def _residuals(found: Searched) -> np.ndarray | None:
-    """(N,) what the best map leaves of every pair; of a law by its steps ÷ scale, of S in its
+class _Residuals(NamedTuple):
+    """sizes: () -> (N,) what a map leaves of every pair. work: operations that this takes."""
+
+    sizes: Callable[[], np.ndarray]
+    work: float
+
+
+def _residuals(found: Searched) -> _Residuals | None:
+    """What the best map leaves of every pair; of a law by its steps ÷ scale, of S in its
     gradient, which has the same unit. None where it meets the tolerance, is neither, or has dry
     friction: its steps are not smooth where a body turns, and no error of a measurement is."""
     law, data, tolerance = found.law, found.data, found.tolerance
@@ -124,10 +157,16 @@ def _residuals(found: Searched) -> np.ndarray | None:
         return None
     if data.structure is not None or data.varied:
         return None
+    work = len(data) * best.operations
     if law is not None and best is law.candidate:
-        return None if law.widths else _sizes((law.flow.image(data.y0) - data.y1) / data.scale)
+        flow = law.flow
+        known = _Residuals(lambda: _sizes((flow.image(data.y0) - data.y1) / data.scale), work)
+        return None if law.widths else known
     swept = _swept(found)
-    return None if swept is None else _sizes(swept[0].residuals(swept[1]))
+    if swept is None:
+        return None
+    sweep, size = swept
+    return _Residuals(lambda: _sizes(sweep.residuals(size)), work)
 
 
 def _best(found: Searched) -> Candidate | None:
@@ -172,23 +211,37 @@ def _at_the_rim(found: Searched, rows: np.ndarray) -> bool:
     return False
 
 
-def _standing_alone(data: Dataset, size, ordinary: float) -> np.ndarray:
-    """The rows whose residual is far beyond those of all but a few of the neighbours, of the state
-    or of the image: a state that is a gross error has no neighbours but its like.
+def _far(size: np.ndarray) -> np.ndarray:
+    """The rows whose residual is far beyond the median."""
+    middle = np.median(size)
+    known = len(size) > _NEIGHBOURS and middle > 0
+    return np.flatnonzero(size > _BEYOND * middle) if known else np.zeros(0, int)
+
+
+def _work_of_neighbours(data: Dataset, far: np.ndarray) -> float:
+    """Operations of `_around`."""
+    return _OF_TREES * len(data) + _OF_NEIGHBOURS * data.y0.shape[1] ** 2 * len(far)
+
+
+def _around(data: Dataset, size: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """What the residuals of all but a few of the neighbours of these rows stay below, of the state
+    or of the image: a state that is a gross error has no neighbours but its like."""
+    around = np.full(len(far), np.inf)
+    for y in (data.y0 / data.scale, data.y1 / data.scale):
+        near = cKDTree(y).query(y[far], k=_NEIGHBOURS + 1)[1][:, 1:]
+        around = np.minimum(around, np.sort(size[near], axis=1)[:, -1 - _BUT])
+    return around
+
+
+def _standing_alone(
+    size: np.ndarray, far: np.ndarray, around: np.ndarray, ordinary: float
+) -> np.ndarray:  # fmt: skip
+    """Those of the rows ``far`` whose residual is far beyond ``around``, that of their neighbours.
 
     ordinary: times the median of all, that those neighbours' residuals stay below.
     """
-    if len(size) <= _NEIGHBOURS:
-        return np.zeros(0, int)
     middle = np.median(size)
-    rows = np.flatnonzero(size > _BEYOND * middle)
-    if not len(rows) or not middle > 0:
-        return rows[:0]
-    around = np.full(len(rows), np.inf)
-    for y in (data.y0 / data.scale, data.y1 / data.scale):
-        near = cKDTree(y).query(y[rows], k=_NEIGHBOURS + 1)[1][:, 1:]
-        around = np.minimum(around, np.sort(size[near], axis=1)[:, -1 - _BUT])
-    alone = rows[(size[rows] > _BEYOND * around) & (around < ordinary * middle)]
+    alone = far[(size[far] > _BEYOND * around) & (around < ordinary * middle)]
     between = np.sum((size > _TAIL * middle) & (size <= _BEYOND * middle))
     if between < _APART * len(alone):
         return alone
