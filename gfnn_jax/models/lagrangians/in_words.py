@@ -45,7 +45,9 @@ def in_words(
     """
     names = _names(recording)
     fit, law = best.fit, best.law
-    sensors, channels = map_.sensors, map_.sensors.seen.channels
+    sensors = map_.sensors
+    assert sensors is not None  # of every map of a recording
+    channels = sensors.seen.channels
     factors = np.array([recording.factors[name] for name in channels])
     lagrangian, friction = _expressions(best, names)
     gains = _gains(best, recording)
