@@ -440,6 +440,8 @@ def _summarise(ran: Any, out: Path) -> None:
             print(note)
         for loss in report["hamiltonian"]["friction"]:
             print(f"friction {loss['term']}: {loss['coefficient']:.6g} ± {loss['std']:.1g}")
+    if ran.fit.damping is not None:
+        print(ran.fit.damping.told(float(ran.fit.map.dt)))
     told = report["hamiltonian"] is not None and report["hamiltonian"]["symmetries"]
     if ran.fit.symmetries and not told:
         print(f"symmetries of the pairs: {'; '.join(map(str, ran.fit.symmetries))}")

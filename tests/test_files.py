@@ -146,6 +146,18 @@ def test_csv_headers(tmp_path):
         assert np.array_equal(files.read_trajectories(path, dt=0.5).states, Z)
 
 
+def test_arrays_that_are_not_read_are_named(tmp_path):
+    known = {"z0": Z, "z1": Z + 1, "dt": 0.1, "params": Z[:, :1], "param_names": ["k"]}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        files.read_trajectories(save(tmp_path / "known.npz", **known))
+        about = {"status": np.zeros(1), "job": "f3"}  # as predictions hold
+        files.read_trajectories(save(tmp_path / "p.npz", trajectories=Z[None], dt=0.1, **about))
+    path = save(tmp_path / "more.npz", k=Z[:, 0], args=Z[:, 1], **known)
+    with pytest.warns(DataWarning, match=r"more.npz: arrays ignored: k, args \(parameters are in"):
+        assert len(files.read_trajectories(path).states) == 2 * len(Z)
+
+
 @pytest.mark.parametrize("digits", [4, 5, 9])
 def test_printed_times_are_rounded(tmp_path, digits):
     """Steps of 1/3 differ by a unit of the last decimal, and a line of spaces is none."""

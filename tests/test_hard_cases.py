@@ -118,7 +118,8 @@ def test_little_friction_is_learned():
     z0, rate = disc(400, seed=5), 0.01
     z1 = kick_and_drift(z0) * [1, math.exp(-rate * DT)]
     fitted, said = fit(z0, z1, chart="midpoint", tolerance=1e-9)
-    assert not said
+    assert len(fitted.messages) == 1
+    assert "uniform friction of rate γ = 0.01 ± " in said
     assert float(fitted.damping.factor) == pytest.approx(math.exp(-rate * DT), abs=1e-9)
 
 

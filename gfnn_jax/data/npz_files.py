@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ from gfnn_jax.data.blocks import (
     ARC,
     TIME_TOLERANCE,
     Block,
+    DataWarning,
     Source,
     agreed_dt,
     check_dt,
@@ -29,6 +31,10 @@ _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
+_READ = {
+    "z0", "z1", "z0_std", "trajectories", "lengths", "steps", "dt", "times", "t0", "period",
+    "params", "param_names",
+}  # fmt: skip
 _OF_HEADERS = (TypeError,)  # NumPy sorts the keys of a header, which may be text and bytes
 
 
@@ -137,6 +143,12 @@ def open_npz(path: Path, stream, dt, initial: bool, driven: bool) -> Source:
             f"{path}: expected either the arrays z0 and z1, or trajectories; found "
             f"{', '.join(names[:8]) or 'none'}{', ...' * (len(names) > 8)}"
         )
+    further = [name for name in names if name not in _READ]
+    if further and "job" not in further:  # other arrays of a prediction are about it
+        warnings.warn(
+            f"{path}: arrays ignored: {', '.join(further)} (parameters are in params)",
+            DataWarning, stacklevel=4,
+        )  # fmt: skip
     found, own_dt, period = None, None, None
     if "period" in names and not initial:
         period = check_dt(member("period").whole(), f"{path}: period")

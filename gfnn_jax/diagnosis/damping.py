@@ -103,6 +103,14 @@ class LearnedDamping:
             "symplectic form is kept"
         )
 
+    def told(self, dt: float) -> str:
+        """Line about what was learned, with the rate γ of p' = −γ p where one factor b = e^(−γ dt)
+        shrinks all areas."""
+        if self.functions is not None or not self.uniform or not self.factor < 1:
+            return f"{self}. The map has it"
+        rate, std = -float(np.log(self.factor)) / dt, float(self.std / self.factor) / dt
+        return f"{self}: uniform friction of rate γ = {rate:.6g} ± {std:.1g} is in the map"
+
 
 def area_factors(jacobians, scale) -> np.ndarray:
     """(n,): the μ for which μ J is nearest to AᵀJA, of Jacobians A (n, 2d, 2d), in coordinates

@@ -69,8 +69,9 @@ class Fit:
     it. num_pairs: that trained and judged. judgements: chart -> its determinant over the data.
     data_defect: how far the pairs' local Jacobians are from symplectic (median). base_map: whether
     one was factored out. noise: (2d,) standard deviation of each coordinate's noise that the
-    residuals suggest where larger models stopped helping, else None. messages: the warnings.
-    ended: why the search ended. seconds: of it all; compile_seconds: of compiling, in them.
+    residuals suggest where larger models stopped helping, else None. messages: the warnings,
+    and the friction that the map has. ended: why the search ended. seconds: of it all;
+    compile_seconds: of compiling, in them.
     test_states: (n, 2d) held-out states, test_args their parameters. model_determinant_min: the
     chosen chart's determinant there, where it is closest to 0; NaN for a flow, which has no chart.
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
@@ -374,6 +375,9 @@ def fit(
         chosen, stated_by = with_test_rows(chosen, error, found, budget)
         conclusion = conclude(chosen, found, request)
         warn([*conclusion.messages, *filter(None, [error.few])])
+    damping = seen.damping if chosen.candidate.learns == "map" else None
+    if damping is not None:  # a fact, not a warning
+        messages.append(damping.told(data.dt))
     judged = min(_JUDGED, block_of(2 * data.dim))
     some = chosen.data.pairs.take(chosen.data.validation[:judged])
     return Fit(
@@ -396,7 +400,7 @@ def fit(
         model_determinant_min=_smallest_determinant(chosen),
         pairs=data.pairs,
         scene=scene,
-        damping=seen.damping if chosen.candidate.learns == "map" else None,
+        damping=damping,
         symmetries=symmetries_of_pairs(found.data),
         partial_laws=() if found.met_by_law else tuple(request.partial_laws),
         stated_by=stated_by,
