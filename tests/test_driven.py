@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import types
 import warnings
 from fractions import Fraction
 
@@ -12,8 +13,10 @@ import scipy.integrate
 
 import gfnn_jax as gfnn
 from gfnn_jax import cli
+from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.data.files import read_initial, read_trajectories
 from gfnn_jax.data.sample import read_sample
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.varied import as_varied
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps, images
@@ -21,6 +24,7 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.parameters import Parameters, sampled
+from gfnn_jax.models.hamiltonians.white import leaves_white
 from gfnn_jax.models.parameters import functions_of_parameters, state_libraries, walked
 from gfnn_jax.scenes.trajectories import sample_t0
 
@@ -54,6 +58,22 @@ def learned():
     z, t0 = states(300)
     pairs = gfnn.Pairs(z, image(z, t0), DT, t0=t0, period=PERIOD)
     return gfnn.fit(pairs, angles=(0,), tolerance=1e-11)
+
+
+def test_a_driven_law_is_white_where_it_is_right():
+    """Of the right law noise is left over, of one without the drive's term more."""
+    z, t0 = states(1_000, 5)
+    rng = np.random.default_rng(6)
+    z0, z1 = (x + 1e-3 * rng.normal(size=x.shape) for x in (z, image(z, t0)))
+    pairs = gfnn.Pairs(z0, z1, DT, t0=t0, period=PERIOD)
+    data = Dataset.of(pairs, CARTESIAN).trained_on(np.arange(1_000))
+
+    def white(c):
+        flow = Flow(LAW, np.array(c), DT, np.ones(2), 6, 1)
+        return leaves_white(types.SimpleNamespace(flow=flow, misfit=False), data)
+
+    assert white(C)
+    assert not white([1.0, -1.0, -0.14])
 
 
 # The arithmetic.

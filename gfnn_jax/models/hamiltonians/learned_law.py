@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -17,12 +17,14 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.exports.symbolic import as_latex, as_sympy
+from gfnn_jax.families.family import at_time
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
+from gfnn_jax.fitting.significance import null_terms
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre
@@ -424,30 +426,39 @@ def _unexplained_of_sites(
 
 
 def unexplained(
-    data: Dataset, rows, residual, taken: int, degree: int, states
+    data: Dataset, rows, residual, taken: int, degree: int, states,
+    generators: Sequence[Terms] = (),
 ) -> float | None:  # fmt: skip
     """Part of the mean square of a law's residuals (n, 2d) on these rows that no generator K
     explains, residual = J∇K at the images: K of as high a degree as the rows tell.
     taken: coefficients that the law itself was given, degree: its own. states: the residual's
-    derivatives and which pairs go on, as `shared_noise.scores` takes them, or None. None where the
-    rows are too few.
+    derivatives and which pairs go on, as `shared_noise.scores` takes them, or None. generators: by
+    rising size, of the state and the args of the data that have such. None where the rows are too
+    few.
 
     1 where K explains no more than it would of noise, by ``explained`` standard errors: an F test.
     """
-    z, coordinates, width = data.y1[rows], data.coordinates, residual.shape[1]
-    inputs = box_inputs(
-        z, angles=tuple(a for a in coordinates.angles if a < data.dim),
-        cyclic=coordinates.cyclic,
-    )  # fmt: skip
-    degrees = sorted({*OPTIONS.generators, degree + OPTIONS.beyond})
-    sizes = [Products(inputs, n) for n in degrees]
+    z, width, args = data.y1[rows], residual.shape[1], ()
+    sizes: Sequence[Products | Terms] = generators
+    if generators:
+        args = (at_time(generators[0], data.given(rows)[1], data.dt),)
+    else:
+        coordinates = data.coordinates
+        inputs = box_inputs(
+            z, angles=tuple(a for a in coordinates.angles if a < data.dim),
+            cyclic=coordinates.cyclic,
+        )  # fmt: skip
+        degrees = sorted({*OPTIONS.generators, degree + OPTIONS.beyond})
+        sizes = [Products(inputs, n) for n in degrees]
     most = min(len(rows) * width // OPTIONS.sampled_rows, OPTIONS.most_terms)
     known = [family for family in sizes if family.num_parameters <= most]
     if not known:
         return None
     family, weight = known[-1], 1.0 / np.roll(data.scale, data.dim)
+    if isinstance(family, Terms):  # functions of the args alone have no gradient
+        family = family.take(null_terms(family, z, args=args[0])[0])
     target = -apply_j(residual)
-    reduced = least_squares.reduce(family, [(z, target)], weight)
+    reduced = least_squares.reduce(family, [(z, target, *args)], weight)
     count, freedom = family.num_parameters, None
     if states is not None:
         to_target = -weight[:, None] * symplectic_form(data.dim)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.families.terms import Terms
+from gfnn_jax.families.terms import Terms, multiplied
 from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian, unexplained
+from gfnn_jax.models.hamiltonians.libraries import angles_and_others
+from gfnn_jax.models.parameters import functions_of_parameters, state_libraries
 
 _PAIRS = 2_000  # whose residuals are looked at
 
@@ -15,14 +17,31 @@ _PAIRS = 2_000  # whose residuals are looked at
 def leaves_white(law: LearnedHamiltonian, data: Dataset) -> bool:
     """Return whether no polynomial generator explains more than chance of what the law leaves over,
     by an F test (`learned_law.unexplained`). False where the pairs are too few to tell, of a law
-    with parameters or over sites, and where whole sequences are certain of a misfit."""
+    over sites or of pairs of many dt, and where whole sequences are certain of a misfit."""
     family = without_forces(law.flow.family)
-    plain = isinstance(family, Terms) and not data.varied and data.structure is None
+    plain = isinstance(family, Terms) and data.own_dt is None and data.structure is None
     if not plain or law.misfit:
         return False
     rows = np.sort(data.training)[:_PAIRS]
-    residual = data.y1[rows] - law.flow.image(data.y0[rows])
+    residual = data.y1[rows] - law.flow.image(data.y0[rows], data.given(rows)[1])
     resolved = np.isfinite(residual).all(axis=1)
     degree = int(np.max(np.sum(family.powers, axis=1), initial=0))
     taken = law.flow.family.num_parameters
-    return unexplained(data, rows[resolved], residual[resolved], taken, degree, None) == 1.0
+    given = data, rows[resolved], residual[resolved], taken, degree, None
+    return unexplained(*given, _with_args(data, rows)) == 1.0
+
+
+def _with_args(data: Dataset, rows: np.ndarray) -> list[Terms]:
+    """Generators of the state and of the parameters or the drive's time that the pairs have; none
+    of pairs without such."""
+    if data.args is None:
+        return []
+    angles, plain = angles_and_others(data)
+    states = state_libraries(
+        data.dim, data.parameters, angles=angles, cyclic=data.coordinates.cyclic, plain=plain,
+        features=None, reversor=None, own=None,
+    )  # fmt: skip
+    args = data.given(rows)[1]
+    functions = functions_of_parameters(data.dim, data.parameters, args, False, data.period)
+    every = (multiplied(state, own) for own in functions[0] for state in states)
+    return sorted(every, key=lambda family: family.num_parameters)
