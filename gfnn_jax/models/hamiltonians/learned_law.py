@@ -438,10 +438,11 @@ def unexplained(
 
     1 where K explains no more than it would of noise, by ``explained`` standard errors: an F test.
     """
-    z, width, args = data.y1[rows], residual.shape[1], ()
+    z, width = data.y1[rows], residual.shape[1]
     sizes: Sequence[Products | Terms] = generators
+    later = None  # the args at the end of a pair
     if generators:
-        args = (at_time(generators[0], data.given(rows)[1], data.dt),)
+        later = at_time(generators[0], data.given(rows)[1], data.dt)
     else:
         coordinates = data.coordinates
         inputs = box_inputs(
@@ -456,9 +457,10 @@ def unexplained(
         return None
     family, weight = known[-1], 1.0 / np.roll(data.scale, data.dim)
     if isinstance(family, Terms):  # functions of the args alone have no gradient
-        family = family.take(null_terms(family, z, args=args[0])[0])
+        family = family.take(null_terms(family, z, args=later)[0])
     target = -apply_j(residual)
-    reduced = least_squares.reduce(family, [(z, target, *args)], weight)
+    given = () if later is None else (later,)
+    reduced = least_squares.reduce(family, [(z, target, *given)], weight)
     count, freedom = family.num_parameters, None
     if states is not None:
         to_target = -weight[:, None] * symplectic_form(data.dim)
