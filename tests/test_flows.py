@@ -12,7 +12,8 @@ from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.maps.domain import covering
-from gfnn_jax.maps.symplectic_map import Piece, SymplecticMap
+from gfnn_jax.maps.piece import Piece
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import symplectic_form
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, OK
 

@@ -19,7 +19,8 @@ from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
 from gfnn_jax.maps.parameters import Parameters, sampled
-from gfnn_jax.maps.symplectic_map import Piece, SymplecticMap
+from gfnn_jax.maps.piece import Piece
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.solve.status import LEFT_DOMAIN
 
 _TIMING = "the time of a step, and the error of compiled ones"

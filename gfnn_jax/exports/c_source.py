@@ -100,7 +100,7 @@ def _signature(map_: SymplecticMap, name: str) -> str:
 
 
 def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str], ahead: Sequence[str]) -> str:
-    """Write the public function: `SymplecticMap._apply` of one state; args follow it in y, moved by
+    """Write the public function: `maps.inner.applied` of one state; args follow it in y, moved by
     the lines ``ahead``."""
     width, angles, domain = 2 * map_.dim, map_.coordinates.angles, map_.domain
     more = num_args(map_)

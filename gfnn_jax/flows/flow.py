@@ -111,7 +111,7 @@ class StageEquation:
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Flow:
-    """The flow of H(params, ·) over dt. A piece: see `maps.symplectic_map`. Where H depends on the
+    """The flow of H(params, ·) over dt. A piece: see `maps.piece`. Where H depends on the
     time, the last of the args is that of the state at which a step begins.
 
     family:   H, a family or a plain ``H(params, z)``; what it holds of the data are leaves.

@@ -97,7 +97,7 @@ class ImplicitStep:
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Generated:
-    """Map that S(params, ·) generates in a chart. A piece: see `maps.symplectic_map`.
+    """Map that S(params, ·) generates in a chart. A piece: see `maps.piece`.
 
     An S that depends on time is taken at the time of the middle of the step, forward and backward.
 

@@ -19,10 +19,11 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.bands import bands, horizon
+from gfnn_jax.maps.lanes import Lanes
 from gfnn_jax.maps.positions import starts_from_positions
 from gfnn_jax.maps.samples import Samples
 from gfnn_jax.maps.sharded import Sharded
-from gfnn_jax.maps.symplectic_map import Lanes, SymplecticMap
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import TIME
 from gfnn_jax.processes import Share, wait_for_all
 from gfnn_jax.storage.outputs import ensure_new

@@ -35,8 +35,9 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.conclude import not_met
 from gfnn_jax.learn.fit import Fit
 from gfnn_jax.learn.stated import FEWEST_TESTED
+from gfnn_jax.maps.piece import serves_any_dt
 from gfnn_jax.maps.saved import packed, unpacked
-from gfnn_jax.maps.symplectic_map import SymplecticMap, serves_any_dt
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.hamiltonians.formula import Term, formula
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.phase_space import Pairs

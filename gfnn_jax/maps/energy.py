@@ -15,6 +15,7 @@ import numpy as np
 from gfnn_jax.compiling import compiled_sooner
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.uniform import Power, power
+from gfnn_jax.maps.inner import after, inner
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 
@@ -54,7 +55,7 @@ def _check_flow(map_: SymplecticMap) -> None:
 @compiled_sooner
 def _power(map_, z, args):
     flow = map_.pieces[0]
-    return power(flow.family, flow.params, map_._inner(z)[0], args)
+    return power(flow.family, flow.params, inner(map_, z)[0], args)
 
 
 @partial(compiled_sooner, static_argnums=(3,))
@@ -63,15 +64,15 @@ def _ledger(map_, z0, args, num_steps):
 
     def step(carry, number):
         z, done = carry
-        given = map_._after(args, jnp.full(len(z), number))
+        given = after(map_, args, jnp.full(len(z), number))
         image, more = flow.work(z, given)
         return (image, jax.tree.map(jnp.add, done, more)), None
 
-    start = map_._inner(z0)[0]
-    begin = map_._after(args, jnp.zeros(len(z0), int))
+    start = inner(map_, z0)[0]
+    begin = after(map_, args, jnp.zeros(len(z0), int))
     none = jax.tree.map(jnp.zeros_like, power(flow.family, flow.params, start, begin))
     (end, done), _ = jax.lax.scan(step, (start, none), jnp.arange(num_steps))
-    finish = map_._after(args, jnp.full(len(z0), num_steps))
+    finish = after(map_, args, jnp.full(len(z0), num_steps))
     time = num_steps * map_.dt
     stored = (flow.value(end, finish) - flow.value(start, begin)) / time
     lost, supplied = (a / time for a in done)

@@ -14,15 +14,15 @@ import jax
 import numpy as np
 
 from gfnn_jax.compiling import compiled_sooner
-from gfnn_jax.maps.symplectic_map import (
+from gfnn_jax.maps.lanes import (
     Lanes,
     RolloutInfo,
-    SymplecticMap,
     advanced,
     begun,
     predicted,
     require_no_inputs_backwards,
 )
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 # Fewest lanes that are stepped together. More samples at once gain nothing on a CPU: a batched
 # program takes both sides of every branch (100 samples, Hénon–Heiles, µs per step: 1,000 states

@@ -16,8 +16,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.maps.lanes import Lanes, RolloutInfo
 from gfnn_jax.maps.samples import Samples
-from gfnn_jax.maps.symplectic_map import Lanes, RolloutInfo, SymplecticMap
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 # Lanes of a block. On a CPU 64 and 1,024 are no faster for a generated map, 64 perhaps for a law
 # (benchmarks/scaling.py, on a busy machine). An accelerator needs many; the best number was not

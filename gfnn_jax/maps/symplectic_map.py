@@ -15,100 +15,34 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from functools import partial, wraps
+from functools import partial
 from numbers import Integral
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from gfnn_jax.arrays import as_row
-from gfnn_jax.compiling import compiled_sooner
-from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
+from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.flows.flow import Flow
-from gfnn_jax.generating.generated import Generated, two_sum
+from gfnn_jax.maps import programs
 from gfnn_jax.maps.bands import Bands, bands
 from gfnn_jax.maps.domain import Domain, Ranges
-from gfnn_jax.maps.inputs import Scheduled, Signals
-from gfnn_jax.maps.modified_hamiltonian import NUM_STEPS, Cells, ModifiedHamiltonian, of_cells
+from gfnn_jax.maps.inputs import Signals
+from gfnn_jax.maps.lanes import (
+    Lanes,
+    RolloutInfo,
+    advance_lanes,
+    require_no_inputs_backwards,
+    roll_out,
+    start_lanes,
+)
+from gfnn_jax.maps.modified_hamiltonian import ModifiedHamiltonian
 from gfnn_jax.maps.parameters import Parameters, as_args
+from gfnn_jax.maps.piece import serves_any_dt
 from gfnn_jax.maps.posterior import Posterior
-from gfnn_jax.maps.rollout import scan_steps
 from gfnn_jax.maps.sensors import Sensors
-from gfnn_jax.phase_space import defect_of_pairs, require_x64, symplecticity_defect
-from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE, Info
-
-# Up to this 2d a defect uses all tangent vectors; beyond it this many random pairs of them.
-_WIDEST, _TANGENT_PAIRS = 64, 4
-_DT_EDGE = 1e-6  # relative tolerance at the ends of a range of dt, for printed numbers
-_TWO_PI_REST = 2.4492935982947064e-16  # 2π minus its float64 value
-
-
-@runtime_checkable
-class Piece(Protocol):
-    """Map in a row of such, batch first: z (B, 2d), by JAX.
-
-    A piece is a pytree. ``unrolled`` makes derivatives those of the iterations that ran; a number
-    also bounds the number of updates.
-    """
-
-    def step(self, z: Any, args: Any = None, *, unrolled: bool | int = False) -> tuple[Any, Info]:
-        """Step z: (Z, Info)."""
-        ...
-
-    def compensated_step(self, z: Any, compensation: Any, args: Any = None) -> tuple:
-        """Step z + compensation: (Z, compensation, Info). Rounding has lost the compensation."""
-        ...
-
-    def action(self, z: Any, image: Any, origin: Any, args: Any = None) -> Any:
-        """Action (B,) of the step from z to its image, about the origin (B, 2d).
-
-        See `maps.modified_hamiltonian`.
-        """
-        ...
-
-    def inverse(self) -> Any:
-        """Make the inverse piece."""
-        ...
-
-    def multiplier(self, args: Any = None) -> Any:
-        """μ of AᵀJA = μJ, which holds for the derivative A of every step: 1.0 of a symplectic
-        piece; another number, or one of each lane (B,), of a conformally symplectic one; None where
-        there is no such number."""
-        ...
-
-
-class Lanes(NamedTuple):
-    """Complete state of a batch of rollouts, from which it can be continued.
-
-    y: inner coordinates with angles reduced (B, 2d). compensation: their rounding error, less than
-    their last digit (B, 2d). winding: whole turns of the angles (B, a). status, left_at (step at
-    which the lane left the domain, −1 if never), iterations (most Newton updates of a step), steps
-    (number of steps done): each (B,).
-    """
-
-    y: Any
-    compensation: Any
-    winding: Any
-    status: Any
-    left_at: Any
-    iterations: Any
-    steps: Any
-
-
-class RolloutInfo(NamedTuple):
-    """Result of each lane of a rollout, (B,): status, left_at, iterations; and bands.
-
-    left_at: step at which the lane left the domain, −1 if it never did. iterations: most Newton
-    updates in a step. bands: those of the samples, where samples were asked for.
-    """
-
-    status: Any
-    left_at: Any
-    iterations: Any
-    bands: Bands | None = None
+from gfnn_jax.phase_space import require_x64
 
 
 @partial(
@@ -198,7 +132,7 @@ class SymplecticMap:
         that act during the step."""
         z = self._states(z)
         map_ = self if dt is None else self.over(dt, z.shape[:-1])
-        return _step(map_, z, self._args(args, z, t0, inputs))
+        return programs.step(map_, z, self._args(args, z, t0, inputs))
 
     def inverse(self, z=None, args=None, *, t0=None):
         """Make one step back, from Z to (z, Info). t0: the time at z, not at Z. Raises ValueError
@@ -211,7 +145,7 @@ class SymplecticMap:
         args = self._args(args, z := self._states(z), t0)
         if self.parameters is not None:
             args = self.parameters.after(args, 1, self.dt)
-        return _step(self.reversed(), z, args)
+        return programs.step(self.reversed(), z, args)
 
     def over(self, dt, lanes: tuple[int, ...] = ()) -> SymplecticMap:
         """Make the map over another dt: of the flow of one law, or of an S of dt.
@@ -311,15 +245,15 @@ class SymplecticMap:
         """
         z = self._states(z)
         args = self._args(args, z, t0)
-        ran = _step(self, z, args)[1].iterations if iterations is None else iterations
+        ran = programs.step(self, z, args)[1].iterations if iterations is None else iterations
         # A single update is the usual case; its derivative compiles in half the time.
         once = not isinstance(ran, Tracer) and np.max(np.asarray(ran), initial=0) <= 1
-        return _defect(self, z, args, 1 if once else True)
+        return programs.defect(self, z, args, 1 if once else True)
 
     def determinant(self, z, args=None, *, t0=None):
         """Chart determinant () or (B,) at z, the smallest of all pieces; NaN without a chart."""
         z = self._states(z)
-        return _determinant(self, z, self._args(args, z, t0))
+        return programs.determinant(self, z, self._args(args, z, t0))
 
     def hamiltonian(self, z, args=None, *, t0=None):
         """Hamiltonian H () or (B,) at z.
@@ -330,7 +264,7 @@ class SymplecticMap:
         if len(self.pieces) != 1 or not isinstance(self.pieces[0], Flow):
             return self.modified_hamiltonian(z, args).value
         z = self._states(z)
-        return _hamiltonian(self, z, self._args(args, z, t0))
+        return programs.hamiltonian(self, z, self._args(args, z, t0))
 
     def power(self, z, args=None, *, inputs=None):
         """Energy per unit of time at z: ``lost`` (..., F) by each friction and ``supplied``
@@ -372,7 +306,7 @@ class SymplecticMap:
         """(A, B) of a step: ∂Z/∂z (..., 2d, 2d) and ∂Z/∂u (..., 2d, k), inputs u, (k,) or (B, k),
         that do not change during the step."""
         z = self._states(z)
-        return _linearised(self, z, self._args(args, z, t0, inputs))
+        return programs.linearised(self, z, self._args(args, z, t0, inputs))
 
     def modified_hamiltonian(self, z, args=None) -> ModifiedHamiltonian:
         """Value and error, each () or (B,), of the Hamiltonian H̃ whose flow over dt is this map.
@@ -389,12 +323,12 @@ class SymplecticMap:
         if not (isinstance(multiplier, float) and multiplier == 1.0):
             raise ValueError("expected a map without friction: one with it conserves no energy")
         z = self._states(z)
-        return _modified(self, z, self._args(args, z))
+        return programs.modified(self, z, self._args(args, z))
 
     def start(self, z0, *, params=None, t0=None, stop_outside: bool = False) -> Lanes:
         """Start lanes at step 0 from z0 (B, 2d). States outside the domain have that status."""
         z0 = self._states(z0)
-        return _start(self, z0, self._args(params, z0, t0), stop_outside)
+        return start_lanes(self, z0, self._args(params, z0, t0), stop_outside)
 
     def advance(
         self, lanes: Lanes, num_saved: int, *, params=None, t0=None, inputs=None,
@@ -406,7 +340,7 @@ class SymplecticMap:
         that the lanes were started with. inputs: of all steps from their start on.
         """
         args = self._schedule(params, lanes.y, t0, inputs)
-        return _advance(self, lanes, args, num_saved, save_every, stop_outside)
+        return advance_lanes(self, lanes, args, num_saved, save_every, stop_outside)
 
     def rollout(
         self, z0=None, num_steps: int = 0, *, positions=None, params=None, t0=None, inputs=None,
@@ -452,7 +386,7 @@ class SymplecticMap:
             )
         map_ = self if dt is None else self.over(dt, z0.shape[:-1])
         args = map_._schedule(params, z0, t0, inputs, num_steps)
-        states, info = _rollout(map_, z0, args, num_steps // save_every, save_every, stop_outside)
+        states, info = roll_out(map_, z0, args, num_steps // save_every, save_every, stop_outside)
         if samples is None:
             return states, info
         if key is None:
@@ -490,12 +424,6 @@ class SymplecticMap:
         args = as_args(self.parameters, given, z.shape, dtype, t0)
         return self.signals.scheduled(args, inputs, z.shape, dtype, self.dt, num_steps)
 
-    def _after(self, args, steps):
-        """Advance args by a number of steps (B,)."""
-        if isinstance(args, Scheduled):
-            return args.at(self._after(args.params, steps), steps)
-        return args if self.parameters is None else self.parameters.after(args, steps, self.dt)
-
     def _states(self, z):
         dtype = np.dtype(self.scale.dtype)
         if dtype == np.float64:
@@ -509,266 +437,3 @@ class SymplecticMap:
                 f"expected states of shape ({2 * self.dim},) or (B, {2 * self.dim}), got {z.shape}"
             )
         return z
-
-    # Batches of states, by JAX.
-
-    def _angles(self):
-        return np.array(self.coordinates.angles, dtype=int)
-
-    def _reduce(self, y, compensation):
-        """Reduce the angles of y to their interval: (y, compensation, turns taken out).
-
-        The rounding error of 2π goes to the compensation, so that millions of turns add no drift.
-        An angle so large that its last digit exceeds a radian becomes NaN.
-        """
-        angles = self._angles()
-        if not angles.size:
-            return y, compensation, jnp.zeros((y.shape[0], 0), y.dtype)
-        two_pi, beyond = parts_of_two_pi(y.dtype)
-        turns = jnp.round((y[:, angles] - as_row(self.angle_centre, y)) / TWO_PI)
-        reduced, lost = two_sum(
-            y[:, angles] - turns * two_pi, compensation[:, angles] - turns * beyond
-        )
-        known = jnp.abs(turns) * float(jnp.finfo(y.dtype).eps) < 1.0
-        y = y.at[:, angles].set(jnp.where(known, reduced, jnp.nan))
-        return y, compensation.at[:, angles].set(lost), turns
-
-    def _inner(self, z):
-        """Convert the user's states to the reduced y, the compensation and the turns taken out."""
-        y = jax.vmap(self.coordinates.forward)(z)
-        return self._reduce(y, jnp.zeros_like(y))
-
-    def _outer(self, y, turns):
-        """Convert the reduced y and its turns to the user's states."""
-        angles = self._angles()
-        if angles.size:
-            two_pi, beyond = parts_of_two_pi(y.dtype)
-            y = y.at[:, angles].set((y[:, angles] + turns * beyond) + turns * two_pi)
-        return jax.vmap(self.coordinates.inverse)(y)
-
-    def _contains(self, y, args):
-        """Return whether states, parameters and dt lie in the ranges of the data (B,)."""
-        inside = self.domain.contains(y)
-        if self.dt_range is not None:
-            low, high = self.dt_range[0] * (1 - _DT_EDGE), self.dt_range[1] * (1 + _DT_EDGE)
-            inside = inside & (low <= abs(self.dt)) & (abs(self.dt) <= high)
-        if self.parameters is None:
-            return inside
-        given = args.params if isinstance(args, Scheduled) else args
-        return inside & self.parameters.contains(given[..., : len(self.parameters.names)])
-
-    def _apply(self, z, args, *, unrolled: bool | int = False):
-        """Step the states z (B, 2d) in the user's coordinates: (Z, Info)."""
-        y, _, turns = self._inner(z)
-        inside = self._contains(y, args)
-        infos = []
-        for piece in self.pieces:
-            y, info = piece.step(y, args, unrolled=unrolled)
-            infos.append(info)
-        info = _worst(infos)
-        status = jnp.where(info.status == OK, jnp.where(inside, OK, LEFT_DOMAIN), info.status)
-        status = jnp.where(jnp.all(jnp.isfinite(y), axis=-1), status, NON_FINITE)
-        return self._outer(y, turns), info._replace(status=status.astype(jnp.int32))
-
-
-def serves_any_dt(piece: Any) -> bool:
-    """Return whether a piece can be stepped over any dt."""
-    return isinstance(piece, Flow) or (isinstance(piece, Generated) and piece.serves_any_dt)
-
-
-def parts_of_two_pi(dtype):
-    """Split 2π into a number of this dtype and a small rest."""
-    near = np.asarray(TWO_PI, dtype)
-    return near, TWO_PI - float(near) + _TWO_PI_REST
-
-
-def _worst(infos: list[Info]) -> Info:
-    """Combine the Info of all pieces: the largest status, iterations and residual per lane."""
-    return jax.tree.map(lambda *column: jnp.max(jnp.stack(column), axis=0), *infos)
-
-
-def _or_one_state(function):
-    """Extend a function (map, z (B, 2d), args, ...) of a batch to one state z (2d,)."""
-
-    @wraps(function)
-    def either(map_, z, args, *static):
-        if z.ndim == 2:
-            return function(map_, z, args, *static)
-        return jax.tree.map(lambda a: a[0], function(map_, z[None], args, *static))
-
-    return either
-
-
-@compiled_sooner
-@_or_one_state
-def _step(map_, z, args):
-    return map_._apply(z, args)
-
-
-@partial(compiled_sooner, static_argnums=(3,), seldom_run=True)
-@_or_one_state
-def _defect(map_, z, args, unrolled):
-    multiplier = map_.multiplier(args)
-    if multiplier is None:
-        return jnp.full(z.shape[0], jnp.nan, z.dtype)
-
-    def tangent(unit):
-        step = partial(map_._apply, args=args, unrolled=unrolled)
-        return jax.jvp(lambda y: step(y)[0], (z,), (jnp.broadcast_to(unit, z.shape),))[1]
-
-    width = z.shape[1]
-    if width > _WIDEST:
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], (2 * _TANGENT_PAIRS, width))
-        before = jnp.asarray(signs / np.sqrt(width), z.dtype) * map_.scale[None]
-        after = jax.vmap(tangent)(before)
-        return defect_of_pairs(before[:, None], after, map_.scale, multiplier)
-    jacobian = jax.vmap(tangent, out_axes=-1)(jnp.eye(z.shape[1], dtype=z.dtype))
-    return symplecticity_defect(jacobian, map_.scale, multiplier)
-
-
-@compiled_sooner
-@_or_one_state
-def _linearised(map_, z, args):
-    width, signals = z.shape[1], map_.signals
-    count = 0 if signals is None else len(signals.names)
-
-    def step(moved):
-        acting = args
-        if signals is not None:  # the constant coefficients of the inputs come first of theirs
-            first = args.shape[-1] - (signals.degree + 1) * count
-            acting = jnp.broadcast_to(args, (len(z), args.shape[-1]))
-            acting = acting.at[:, first : first + count].add(moved[:, width:])
-        return map_._apply(z + moved[:, :width], acting)[0]
-
-    def along(unit):
-        at = jnp.zeros((len(z), width + count), z.dtype)
-        return jax.jvp(step, (at,), (jnp.broadcast_to(unit, at.shape),))[1]
-
-    both = jax.vmap(along, out_axes=-1)(jnp.eye(width + count, dtype=z.dtype))
-    return both[..., :width], both[..., width:]
-
-
-@compiled_sooner
-@_or_one_state
-def _hamiltonian(map_, z, args):
-    return map_.pieces[0].value(map_._inner(z)[0], args)
-
-
-@partial(compiled_sooner, seldom_run=True)
-@_or_one_state
-def _modified(map_, z, args):
-    y = map_._inner(z)[0]
-    return of_cells(_cells(map_, y, args), _cells(map_.reversed(), y, args), map_.dt)
-
-
-def _cells(map_, y, args) -> Cells:
-    """Compute the cells of the modified Hamiltonian along the steps from y (B, 2d)."""
-
-    def advance(carry, _):
-        y, origin = carry
-        image, total = y, jnp.zeros(y.shape[:1], y.dtype)
-        for piece in map_.pieces:
-            before = image
-            image, info = piece.step(before, args)
-            failed = (info.status > LEFT_DOMAIN)[:, None]
-            image = jnp.where(failed, jnp.nan, image)
-            total = total + piece.action(before, image, origin, args)
-        reduced, _, _ = map_._reduce(image, jnp.zeros_like(image))
-        return (reduced, origin + (reduced - image)), Cells(total, image - y, image - origin)
-
-    return jax.lax.scan(advance, (y, y), length=NUM_STEPS)[1]
-
-
-@compiled_sooner
-@_or_one_state
-def _determinant(map_, z, args):
-    y, _, _ = map_._inner(z)
-    found = []
-    for piece in map_.pieces:
-        image, _ = piece.step(y, args)
-        if isinstance(piece, Generated):
-            found.append(piece.determinant(y, image, args))
-        y = image
-    if not found:
-        return jnp.full(z.shape[0], jnp.nan, z.dtype)
-    found = jnp.stack(found, axis=-1)
-    smallest = jnp.argmin(jnp.abs(found), axis=-1)
-    return jnp.take_along_axis(found, smallest[:, None], axis=-1)[:, 0]
-
-
-def _judge(status, inside, stop_outside: bool):
-    """Update the status by the domain; only lanes that have not ended can change."""
-    outside = STOPPED_AT_EDGE if stop_outside else LEFT_DOMAIN
-    return jnp.where((status <= LEFT_DOMAIN) & ~inside, outside, status)
-
-
-def require_no_inputs_backwards(inputs) -> None:
-    """Raise ValueError for inputs of a rollout backwards, where nothing says which come first."""
-    if inputs is not None:
-        raise ValueError("expected no inputs of a rollout backwards (num_steps below 0)")
-
-
-def begun(map_, z, args, stop_outside) -> Lanes:
-    """Implement `SymplecticMap.start` for states z (B, 2d), inside ``jit``."""
-    y, compensation, turns = map_._inner(z)
-    inside, finite = map_._contains(y, args), jnp.all(jnp.isfinite(y), axis=-1)
-    status = _judge(jnp.where(finite, OK, NON_FINITE), inside, stop_outside)
-    count = jnp.zeros(z.shape[0], jnp.result_type(int))
-    left_at = jnp.where(inside | ~finite, count - 1, count)
-    return Lanes(
-        y, compensation, turns.astype(count.dtype), status.astype(jnp.int32), left_at,
-        jnp.zeros(z.shape[0], jnp.int32), count,
-    )  # fmt: skip
-
-
-_start = compiled_sooner(begun, (3,))
-
-
-def advanced(map_, lanes, args, num_saved, save_every, stop_outside) -> tuple[Lanes, Any]:
-    """Implement `SymplecticMap.advance` inside ``jit``."""
-
-    def step(lanes: Lanes) -> Lanes:
-        going = lanes.status <= LEFT_DOMAIN
-        y, compensation = jnp.where(going[:, None], lanes.y, jnp.nan), lanes.compensation
-        now, then = map_._after(args, lanes.steps), map_._after(args, lanes.steps + 1)
-        infos = []
-        for piece in map_.pieces:
-            y, compensation, info = piece.compensated_step(y, compensation, now)
-            infos.append(info)
-        info = _worst(infos)
-        y, compensation, turns = map_._reduce(y, compensation)
-        inside, finite = map_._contains(y, then), jnp.all(jnp.isfinite(y), axis=-1)
-        failed = jnp.where(finite, info.status, NON_FINITE)
-        status = jnp.where(failed == OK, _judge(lanes.status, inside, stop_outside), failed)
-        status = jnp.where(going, status, lanes.status).astype(jnp.int32)
-        leaves = going & (failed == OK) & ~inside & (lanes.left_at < 0)
-        winding = jnp.where(jnp.isfinite(turns), turns, 0.0).astype(lanes.winding.dtype)
-        return Lanes(
-            jnp.where((status <= LEFT_DOMAIN)[:, None], y, jnp.nan),
-            compensation,
-            lanes.winding + winding,
-            status,
-            jnp.where(leaves, lanes.steps + 1, lanes.left_at),
-            jnp.maximum(lanes.iterations, jnp.where(going, info.iterations, 0)),
-            lanes.steps + 1,
-        )
-
-    def observe(lanes: Lanes):
-        return map_._outer(lanes.y, lanes.winding.astype(lanes.y.dtype))
-
-    lanes, saved = scan_steps(step, lanes, num_saved, save_every=save_every, observe=observe)
-    return lanes, jnp.moveaxis(saved, 0, 1)
-
-
-_advance = compiled_sooner(advanced, (3, 4, 5))
-
-
-def predicted(map_, z, args, num_saved, save_every, stop_outside) -> tuple[Any, RolloutInfo]:
-    """Implement `SymplecticMap.rollout` for states z (B, 2d), inside ``jit``."""
-    lanes = begun(map_, z, args, stop_outside)
-    lanes, saved = advanced(map_, lanes, args, num_saved, save_every, stop_outside)
-    info = RolloutInfo(lanes.status, lanes.left_at, lanes.iterations)
-    return jnp.concatenate([z[:, None], saved], axis=1), info
-
-
-_rollout = compiled_sooner(_or_one_state(predicted), (3, 4, 5))

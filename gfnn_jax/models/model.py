@@ -44,7 +44,7 @@ class TrainingData(NamedTuple):
 class Fitted(NamedTuple):
     """A size of a model, fitted.
 
-    piece: of a map (`maps.symplectic_map.Piece`). label: as the table of candidates shows it.
+    piece: of a map (`maps.piece.Piece`). label: as the table of candidates shows it.
     operations: counted, of a predicted step.
     """
 

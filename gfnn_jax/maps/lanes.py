@@ -1,0 +1,123 @@
+"""Rollouts of a map, lane by lane: the state of each, what ends it, and the compiled programs."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from gfnn_jax.compiling import compiled_sooner
+from gfnn_jax.maps.bands import Bands
+from gfnn_jax.maps.inner import after, contains, inner, outer, reduced, worst
+from gfnn_jax.maps.programs import of_one_or_many
+from gfnn_jax.maps.rollout import scan_steps
+from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE
+
+
+class Lanes(NamedTuple):
+    """Complete state of a batch of rollouts, from which it can be continued.
+
+    y: inner coordinates with angles reduced (B, 2d). compensation: their rounding error, less than
+    their last digit (B, 2d). winding: whole turns of the angles (B, a). status, left_at (step at
+    which the lane left the domain, −1 if never), iterations (most Newton updates of a step), steps
+    (number of steps done): each (B,).
+    """
+
+    y: Any
+    compensation: Any
+    winding: Any
+    status: Any
+    left_at: Any
+    iterations: Any
+    steps: Any
+
+
+class RolloutInfo(NamedTuple):
+    """Result of each lane of a rollout, (B,): status, left_at, iterations; and bands.
+
+    left_at: step at which the lane left the domain, −1 if it never did. iterations: most Newton
+    updates in a step. bands: those of the samples, where samples were asked for.
+    """
+
+    status: Any
+    left_at: Any
+    iterations: Any
+    bands: Bands | None = None
+
+
+def _by_domain(status, inside, stop_outside: bool):
+    """Update the status by the domain; only lanes that have not ended can change."""
+    outside = STOPPED_AT_EDGE if stop_outside else LEFT_DOMAIN
+    return jnp.where((status <= LEFT_DOMAIN) & ~inside, outside, status)
+
+
+def require_no_inputs_backwards(inputs) -> None:
+    """Raise ValueError for inputs of a rollout backwards, where nothing says which come first."""
+    if inputs is not None:
+        raise ValueError("expected no inputs of a rollout backwards (num_steps below 0)")
+
+
+def begun(map_, z, args, stop_outside) -> Lanes:
+    """Implement `SymplecticMap.start` for states z (B, 2d), inside ``jit``."""
+    y, compensation, turns = inner(map_, z)
+    inside, finite = contains(map_, y, args), jnp.all(jnp.isfinite(y), axis=-1)
+    status = _by_domain(jnp.where(finite, OK, NON_FINITE), inside, stop_outside)
+    count = jnp.zeros(z.shape[0], jnp.result_type(int))
+    left_at = jnp.where(inside | ~finite, count - 1, count)
+    return Lanes(
+        y, compensation, turns.astype(count.dtype), status.astype(jnp.int32), left_at,
+        jnp.zeros(z.shape[0], jnp.int32), count,
+    )  # fmt: skip
+
+
+start_lanes = compiled_sooner(begun, (3,))
+
+
+def advanced(map_, lanes, args, num_saved, save_every, stop_outside) -> tuple[Lanes, Any]:
+    """Implement `SymplecticMap.advance` inside ``jit``."""
+
+    def step(lanes: Lanes) -> Lanes:
+        going = lanes.status <= LEFT_DOMAIN
+        y, compensation = jnp.where(going[:, None], lanes.y, jnp.nan), lanes.compensation
+        now, then = after(map_, args, lanes.steps), after(map_, args, lanes.steps + 1)
+        infos = []
+        for piece in map_.pieces:
+            y, compensation, info = piece.compensated_step(y, compensation, now)
+            infos.append(info)
+        info = worst(infos)
+        y, compensation, turns = reduced(map_, y, compensation)
+        inside, finite = contains(map_, y, then), jnp.all(jnp.isfinite(y), axis=-1)
+        failed = jnp.where(finite, info.status, NON_FINITE)
+        status = jnp.where(failed == OK, _by_domain(lanes.status, inside, stop_outside), failed)
+        status = jnp.where(going, status, lanes.status).astype(jnp.int32)
+        leaves = going & (failed == OK) & ~inside & (lanes.left_at < 0)
+        winding = jnp.where(jnp.isfinite(turns), turns, 0.0).astype(lanes.winding.dtype)
+        return Lanes(
+            jnp.where((status <= LEFT_DOMAIN)[:, None], y, jnp.nan),
+            compensation,
+            lanes.winding + winding,
+            status,
+            jnp.where(leaves, lanes.steps + 1, lanes.left_at),
+            jnp.maximum(lanes.iterations, jnp.where(going, info.iterations, 0)),
+            lanes.steps + 1,
+        )
+
+    def observe(lanes: Lanes):
+        return outer(map_, lanes.y, lanes.winding.astype(lanes.y.dtype))
+
+    lanes, saved = scan_steps(step, lanes, num_saved, save_every=save_every, observe=observe)
+    return lanes, jnp.moveaxis(saved, 0, 1)
+
+
+advance_lanes = compiled_sooner(advanced, (3, 4, 5))
+
+
+def predicted(map_, z, args, num_saved, save_every, stop_outside) -> tuple[Any, RolloutInfo]:
+    """Implement `SymplecticMap.rollout` for states z (B, 2d), inside ``jit``."""
+    lanes = begun(map_, z, args, stop_outside)
+    lanes, saved = advanced(map_, lanes, args, num_saved, save_every, stop_outside)
+    info = RolloutInfo(lanes.status, lanes.left_at, lanes.iterations)
+    return jnp.concatenate([z[:, None], saved], axis=1), info
+
+
+roll_out = compiled_sooner(of_one_or_many(predicted), (3, 4, 5))
