@@ -15,7 +15,7 @@ from gfnn_jax.fitting.linear_starts import log_start, midpoint_start
 from gfnn_jax.fitting.significance import null_terms
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.models.hamiltonians.formula import Term, formula
-from gfnn_jax.models.hamiltonians.learned_law import assembled
+from gfnn_jax.models.hamiltonians.law_candidate import assembled
 from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.phase_space import Pairs
 

@@ -11,7 +11,8 @@ from gfnn_jax.families.terms import given_terms, polynomial_terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.linear_starts import midpoint_start
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
+from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
+from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
 from gfnn_jax.models.hamiltonians.worth import too_dear
 from gfnn_jax.phase_space import Pairs
 

@@ -24,7 +24,7 @@ from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.generating_functions.sweeps import OF_SOLVE, OF_STEPS, LinearSweep
 from gfnn_jax.models.hamiltonians.choose_law import long_step
-from gfnn_jax.models.hamiltonians.learned_law import TURNS
+from gfnn_jax.models.hamiltonians.law_messages import TURNS
 from gfnn_jax.models.hamiltonians.white import leaves_white
 from gfnn_jax.search.search import COMPARABLE, MET, Entry
 

@@ -12,6 +12,7 @@ from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.flows.rates import rates
 from gfnn_jax.phase_space import symplectic_form
 
+FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
 CONTRACTING = 0.8  # a fixed point's factor up to which it is preferred to Newton's method
 FREQUENCY_STATES = 500  # by which frequencies are known
 

@@ -23,6 +23,7 @@ from gfnn_jax.families.lagrangian import LINEAR, UNIFORM, Friction
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.uniform import Uniform, without_forces
+from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.friction_kinds import (
     Rates,
     candidates,
@@ -30,10 +31,10 @@ from gfnn_jax.models.hamiltonians.friction_kinds import (
     with_friction,
     without_turns,
 )
-from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
 from gfnn_jax.models.hamiltonians.legendre import lagrangian_of
 from gfnn_jax.models.hamiltonians.libraries import libraries_of, modes_of
 from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
+from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
 from gfnn_jax.models.hamiltonians.work import LawWork
 
 _CERTAIN = 5.0  # standard errors of a coefficient of friction

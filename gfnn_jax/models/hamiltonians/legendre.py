@@ -21,7 +21,8 @@ from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.legendre import Legendre
-from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
+from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
+from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
 from gfnn_jax.models.hamiltonians.work import LawWork
 from gfnn_jax.phase_space import split
 

@@ -25,11 +25,12 @@ from gfnn_jax.dataset.runs import next_of
 from gfnn_jax.errors import InputError, OutOfTime
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps
+from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.flow_arcs import FlowWithConstants
 from gfnn_jax.models.hamiltonians.formula import OnPartial, PartialLaw, Rival, Term
 from gfnn_jax.models.hamiltonians.formula import formula as formula_of
 from gfnn_jax.models.hamiltonians.fractions import proposals
-from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
+from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
 from gfnn_jax.models.hamiltonians.symmetries import restricted
 from gfnn_jax.models.hamiltonians.whole_sequences import (
     Measured,

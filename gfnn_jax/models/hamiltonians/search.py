@@ -30,6 +30,8 @@ from gfnn_jax.fitting.significance import null_terms, significant_terms, told_fr
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.models.hamiltonians.arcs import arcs_of
 from gfnn_jax.models.hamiltonians.centrifugal import centrifugal_terms
+from gfnn_jax.models.hamiltonians.covariance import covariance_root
+from gfnn_jax.models.hamiltonians.fitted_law import Dropped, FittedLaw
 from gfnn_jax.models.hamiltonians.formula import OnPartial
 from gfnn_jax.models.hamiltonians.friction import (
     Forces,
@@ -38,15 +40,8 @@ from gfnn_jax.models.hamiltonians.friction import (
     mechanical,
 )
 from gfnn_jax.models.hamiltonians.friction_kinds import is_smooth, without_turns
-from gfnn_jax.models.hamiltonians.learned_law import (
-    Dropped,
-    FittedLaw,
-    LearnedHamiltonian,
-    bound_of,
-    covariance_root,
-    learned_from,
-    validation_error,
-)
+from gfnn_jax.models.hamiltonians.law_candidate import learned_from
+from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.libraries import (
     angles_and_others,
     check_finite,
@@ -58,6 +53,7 @@ from gfnn_jax.models.hamiltonians.libraries import (
 from gfnn_jax.models.hamiltonians.noisy_textbook import law_of_sequences
 from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
 from gfnn_jax.models.hamiltonians.starts import starts
+from gfnn_jax.models.hamiltonians.steps_of_law import bound_of, validation_error
 from gfnn_jax.models.hamiltonians.symmetries import imposed
 from gfnn_jax.models.hamiltonians.textbook import law_of_physics
 from gfnn_jax.models.hamiltonians.whole_sequences import fitted_to_sequences

@@ -9,7 +9,8 @@ import numpy as np
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting.linear_starts import forward_start, log_start, midpoint_start
 from gfnn_jax.flows.collocation import of_lanes
-from gfnn_jax.models.hamiltonians.learned_law import FAST, FittedLaw
+from gfnn_jax.models.hamiltonians.cost_of_flow import FAST
+from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 
 
 def starts(problem, family, rows, many, last: FittedLaw | None) -> Iterator[np.ndarray]:

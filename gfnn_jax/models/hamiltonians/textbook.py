@@ -19,8 +19,9 @@ from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.diagnosis.symmetries import symmetries_of_pairs
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.formula import OnPartial, PartialLaw, Term, formula
-from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, validation_error
+from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
 from gfnn_jax.models.hamiltonians.work import LawWork
 from gfnn_jax.models.textbook.search import OPTIONS, Law, Textbook
 

@@ -7,8 +7,9 @@ import numpy as np
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.families.terms import Terms, multiplied
 from gfnn_jax.flows.uniform import without_forces
-from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian, unexplained
+from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.libraries import angles_and_others
+from gfnn_jax.models.hamiltonians.unexplained import unexplained
 from gfnn_jax.models.parameters import functions_of_parameters, state_libraries
 
 _PAIRS = 2_000  # whose residuals are looked at
@@ -16,7 +17,7 @@ _PAIRS = 2_000  # whose residuals are looked at
 
 def leaves_white(law: LearnedHamiltonian, data: Dataset) -> bool:
     """Return whether no polynomial generator explains more than chance of what the law leaves over,
-    by an F test (`learned_law.unexplained`). False where the pairs are too few to tell, of a law
+    by an F test (`unexplained`). False where the pairs are too few to tell, of a law
     over sites or of pairs of many dt, and where whole sequences are certain of a misfit."""
     family = without_forces(law.flow.family)
     plain = isinstance(family, Terms) and data.own_dt is None and data.structure is None

@@ -10,7 +10,8 @@ from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.significance import significant
 from gfnn_jax.flows.rates import rates
 from gfnn_jax.models.hamiltonians.cost_of_flow import FREQUENCY_STATES, operations_of
-from gfnn_jax.models.hamiltonians.learned_law import FittedLaw, bound_of
+from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
+from gfnn_jax.models.hamiltonians.steps_of_law import bound_of
 
 
 def too_dear(
