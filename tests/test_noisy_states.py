@@ -23,7 +23,8 @@ from gfnn_jax.learn import noisy_sweeps
 from gfnn_jax.learn.noisy_sweeps import NoisySweep, best_size
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.models.generating_functions.map_arcs import GeneratedOnArcs, NearestArcs
-from gfnn_jax.models.generating_functions.sweeps import LinearSweep, Size
+from gfnn_jax.models.generating_functions.size import Size
+from gfnn_jax.models.generating_functions.sweeps import LinearSweep
 
 SIGMA, DT = 0.03, 0.5
 
@@ -151,7 +152,7 @@ def test_misfit_weighs_as_much_as_in_the_posterior(misfit, count):
         sizes=sizes,
         alike=uncertainty.ALIKE,
         factors=lambda *_: SimpleNamespace(train=Triangle(factor, rows)),
-        freedoms=lambda near, most, counts: list(map(float, counts)),
+        degrees_of_freedom=lambda near, most, counts: list(map(float, counts)),
     )
     found = best_size(cast(LinearSweep, sweep), sizes[0], sizes[-1], Budget(), print)
     assert found.size.family.num_parameters == count

@@ -27,7 +27,8 @@ from gfnn_jax.errors import OutOfTime
 from gfnn_jax.learn.diagnose import diagnose_request
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched, searched
-from gfnn_jax.models.generating_functions.sweeps import LinearSweep, Size
+from gfnn_jax.models.generating_functions.size import Size
+from gfnn_jax.models.generating_functions.sweeps import LinearSweep
 
 # A residual beyond so many times what all but two of its neighbours stay below, and the median of
 # all. Of normal noise and d = 1 it is four times the median in one of 60,000 pairs.

@@ -28,14 +28,14 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.learn.conclude import only_noise
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.models.generating_functions.map_arcs import LONGEST, GeneratedOnArcs, NearestArcs
-from gfnn_jax.models.generating_functions.sweeps import (
+from gfnn_jax.models.generating_functions.coefficient_noise import (
     SAMPLE_ROWS,
     Factors,
-    LinearSweep,
-    Size,
     part_of_noise,
 )
+from gfnn_jax.models.generating_functions.map_arcs import LONGEST, GeneratedOnArcs, NearestArcs
+from gfnn_jax.models.generating_functions.size import Size
+from gfnn_jax.models.generating_functions.sweeps import LinearSweep
 from gfnn_jax.models.hamiltonians.choose_law import preferred
 from gfnn_jax.search.search import COMPARABLE, Entry
 
@@ -127,7 +127,7 @@ def best_size(sweep: LinearSweep, near: Size, most: Size, budget: Budget, say) -
         sizes = sweep.sizes[: place + 1]
         counts = [size.family.num_parameters for size in sizes]
         left = [train.residual_norm(count) ** 2 for count in counts]
-        taken = np.array(sweep.freedoms(near, most, counts))
+        taken = np.array(sweep.degrees_of_freedom(near, most, counts))
         noise = left[-1] / (train.rows - taken[-1])
         # What each size leaves out of the next, beyond what that one makes of noise.
         added = np.maximum(-np.diff(left) - noise * np.diff(taken), 0.0)
@@ -227,7 +227,7 @@ class NoisySweep(LinearSweep):
         """Misfit's weight: along arcs of several steps it adds up in the rows themselves."""
         return uncertainty.ALIKE if self._nearest.x.shape[1] == 2 else 1.0
 
-    def freedoms(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
+    def degrees_of_freedom(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
         """Count the terms: the rows of an arc are independent."""
         return [float(count) for count in counts]
 
@@ -252,9 +252,9 @@ class NoisySweep(LinearSweep):
         """Zero: noise falls with the root of the rows, by a twentieth."""
         return 0.0
 
-    def own_error(self, size: Size) -> float:
-        """Own error of the measured points."""
-        return self.plain.own_error(size)
+    def error_by_noise(self, size: Size) -> float:
+        """Error by noise of the measured points."""
+        return self.plain.error_by_noise(size)
 
     def root(self, size: Size) -> np.ndarray:
         """Root of the covariance, as the sweep's own, of rows that are independent."""

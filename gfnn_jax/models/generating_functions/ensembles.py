@@ -18,7 +18,8 @@ from gfnn_jax.families.ensemble import Ensemble
 from gfnn_jax.fitting.together import levenberg_marquardt_together
 from gfnn_jax.fitting.training import LMResult, LMState
 from gfnn_jax.models.generating_functions.network_sweep import NetworkSweep
-from gfnn_jax.models.generating_functions.sweeps import Size, trial_residual
+from gfnn_jax.models.generating_functions.size import Size
+from gfnn_jax.models.generating_functions.sweeps import trial_residual
 
 # Variance of a misfit beside that of residuals which differ by chance, as in `fitting.uncertainty`:
 # it is alike along an orbit. Hénon–Heiles, 500 pairs without noise, three seeds: with 1, bands of

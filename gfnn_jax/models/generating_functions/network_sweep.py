@@ -18,7 +18,7 @@ from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
 from gfnn_jax.fitting.training import LMResult, LMState
-from gfnn_jax.models.generating_functions.sweeps import OF_STEPS, Generates, Size
+from gfnn_jax.models.generating_functions.size import OF_STEPS, Generates, Size
 
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
 _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000

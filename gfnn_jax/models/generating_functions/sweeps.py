@@ -6,33 +6,28 @@ import dataclasses
 import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from gfnn_jax.budget import Budget
-from gfnn_jax.candidates.assemble import with_predictor
 from gfnn_jax.candidates.candidate import Candidate, refined_images, validated
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
-from gfnn_jax.dataset.noise import of_pairs
-from gfnn_jax.dataset.rows import of_rows, rows_of, weighted_rows_of
-from gfnn_jax.dataset.runs import looked_at
+from gfnn_jax.dataset.rows import rows_of, weighted_rows_of
 from gfnn_jax.dataset.split import outermost
 from gfnn_jax.families.inputs import Inputs, box_inputs, variable_signs
 from gfnn_jax.families.own import own_families
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.time_step import OfTimeStep
-from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
+from gfnn_jax.fitting import least_squares
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
-from gfnn_jax.generating.generated import Generated
-from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.damping import Damping
+from gfnn_jax.models.generating_functions.coefficient_noise import CoefficientNoise, Factors
 from gfnn_jax.models.generating_functions.parity import is_even
+from gfnn_jax.models.generating_functions.size import OF_SOLVE, OF_STEPS, Size
 
 # Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
 # judged from one factor of the rows of its largest.
@@ -50,29 +45,6 @@ _SCARCE = 6
 # Rows × terms² of one factor: about half a minute on one core. 2,000 terms take 80,000 rows.
 _MOST_OPERATIONS = 3.2e11
 _WORTH_KEEPING = 1.0  # seconds
-# Operations of singular values, ÷ terms³; and of a step in NumPy, in units that take as long.
-OF_SOLVE, OF_STEPS = 22.0, 20.0
-# Pairs of a block that goes to one of two halves: long beside the noise that neighbours share.
-_HALVES_BLOCK = 50
-# Rows per term of a larger size, by which noise is told from misfit.
-SAMPLE_ROWS = 6
-_NOISE_PAIRS = 4_096  # that tell the noise of each coordinate
-
-
-@dataclasses.dataclass(frozen=True)
-class Size:
-    """One size of a sweep: what a search needs to know before it is judged."""
-
-    family: Any
-    group: Any  # the largest family that is judged from the same factor
-    order: float  # the logarithm of the error falls in proportion: a degree, or log₂ of a number
-
-    @property
-    def operations(self) -> float:
-        """Floating-point operations per predicted step: one update, which takes ∇S with its
-        Hessian, and ∇S where it leads."""
-        gradient, with_hessian = self.family.operations
-        return float(gradient + with_hessian)
 
 
 def sweeps_for(
@@ -119,48 +91,7 @@ def sweep_of_dt(data: Dataset, tolerance: Tolerance, scene, factors=None) -> Lin
     return LinearSweep(data, tolerance, MIDPOINT, "polynomial", None, reversor, factors)
 
 
-class Factors(NamedTuple):
-    """Factors of the training rows, of those held out, and of the training rows without the
-    outermost twentieth and of that twentieth alone."""
-
-    train: Triangle
-    held: Triangle
-    inner: Triangle
-    outer: Triangle
-
-    @classmethod
-    def of(cls, inner: Triangle, outer: Triangle, held: Triangle) -> Factors:
-        """The rows of the outermost twentieth are appended to the others by their own triangle."""
-        return cls(inner.append(outer.factor, outer.rows), held, inner, outer)
-
-
-class Generates:
-    """Base of the sweeps of S: a solved size makes a piece."""
-
-    data: Dataset
-    chart: AnyChart
-    tolerance: Tolerance
-
-    def solve(self, size: Size, budget: Budget, say) -> tuple[Any, Any]:
-        """Solve for the params of the size's family; with them what is known of the solution."""
-        raise NotImplementedError
-
-    def piece(self, size: Size) -> Generated:
-        """The piece that the size's S generates, with its predictor."""
-        data, params = self.data, self._params_of(size)
-        piece = Generated(size.family, params, self.chart, data.dt, data.scale)
-        return with_predictor(piece, data, data.training)
-
-    def images(self, size: Size, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Images of these rows (n, 2d), inner ones, and which steps were solved (n,)."""
-        params = self._params_of(size)
-        return refined_images(self.data, self.chart, size.family, params, rows)
-
-    def _params_of(self, size: Size) -> Any:
-        return self.solve(size, Budget(), lambda message: None)[1]
-
-
-class LinearSweep(Generates):
+class LinearSweep(CoefficientNoise):
     """The sizes of one linear family in one chart.
 
     factors: a ``KeptFactors``, where factors that took long are kept for a fit that goes on. even:
@@ -336,166 +267,16 @@ class LinearSweep(Generates):
             gradient = args[0] * gradient
         return weight * (gradient - target)
 
-    def own_error(self, size: Size) -> float:
-        """Error of the size's ∇S by noise, in the measure of train_rms: half of the
-        difference between the fits to either half of the training pairs, blocks in time."""
-        half = self.data.training // _HALVES_BLOCK % 2
-        train, held = self.factors(size.group, Budget(), lambda message: None)[:2]
-        count = size.family.num_parameters
-        one, other = (
-            least_squares.solve(
-                least_squares.reduce(
-                    self.in_rows(size.family), [tuple(a[half == i] for a in self._train)],
-                    self._weight,
-                ),
-                held, count,
-            ).coefficients
-            for i in (0, 1)
-        )  # fmt: skip
-        return train.image_norm(one - other) / (2 * np.sqrt(train.rows))
-
-    def root(self, size: Size) -> np.ndarray:
-        """(m, m): rootᵀ root is the covariance of the size's coefficients.
-
-        What of the residual is noise, a larger size tells: it leaves that too.
-        """
-        train = self.factors(size.group, Budget(), lambda message: None).train
-        family, solved = size.family, self.solve(size, Budget(), lambda message: None)[0]
-        larger = self._larger(size)
-        most = family if larger is None else larger.family
-        data, goes_on = self._sample(-(-SAMPLE_ROWS * most.num_parameters // self._width))
-        w, target, *args = data
-        params = family.unflatten(solved.coefficients)
-        slopes = self._slopes(family, w, *args)
-        residual = slopes @ solved.coefficients - target * self._weight
-        states = None
-        if goes_on.any() and self.moved_by_states:
-            states = (residual, *self.by_states(family, params, w, *args), goes_on)
-        scores = shared_noise.scores(slopes, *states) if states else None
-        noise = self._noise(size, larger, data, states) if larger is not None else None
-        return uncertainty.root(
-            train, family.num_parameters, slopes.reshape(-1, family.num_parameters),
-            residual.ravel(), noise=noise, ridge=solved.ridge, scores=scores,
-        )  # fmt: skip
-
-    def _slopes(self, family, w, *args) -> np.ndarray:
-        return self.in_rows(family).term_gradients(w, *args) * self._weight[:, None]
-
-    def in_rows(self, family: Any) -> Any:
-        """The family whose terms make the rows of this sweep."""
-        return of_rows(family, weighted=self.data.weight is not None)
-
-    def by_states(self, family, params, w, *args) -> tuple[np.ndarray, np.ndarray]:
-        """The residual's derivatives in z₀ and z₁ (n, 2d, 2d), those ÷ their scale."""
-        of_row = 1.0
-        if self.data.weight is not None:
-            *args, of_row = (*args[:-1], args[-1][..., None])
-        hessian = family.gradient_and_hessian(params, w, *args)[1]
-        if self.data.own_dt is not None:
-            hessian = args[0][..., None] * hessian
-        of_point, of_target = self.of_states
-        by = of_row * self._weight[:, None] * (hessian @ of_point - of_target)
-        return by[..., : len(of_point)], by[..., len(of_point) :]
-
-    @cached_property
-    def of_states(self) -> tuple[np.ndarray, np.ndarray]:
-        """(2d, 4d) each: what the numbers of z₀ and z₁, ÷ their scale, add to w and to the target.
-        An affine base map is counted, the flow of a law is not."""
-        data, chart = self.data, self.chart
-        dt = 1.0 if data.own_dt is not None else data.dt
-        eye = np.eye(2 * data.dim)
-        first, second, none = eye, eye, np.zeros_like(eye)
-        for piece in data.before:
-            first = getattr(piece, "matrix", eye) @ first
-        for piece in data.after:
-            second = getattr(piece, "matrix", eye) @ second
-        ends = ((first.T, none), (none, np.linalg.inv(second).T))
-        of_point = [chart.evaluation_point(*of).T * data.scale for of in ends]
-        of_target = [chart.target_gradient(*of, dt).T * data.scale for of in ends]
-        return np.concatenate(of_point, axis=1), np.concatenate(of_target, axis=1)
-
-    @property
-    def moved_by_states(self) -> bool:
-        """Return whether ``of_states`` is all that states' noise does: not behind the flow of a
-        law."""
-        return all(isinstance(p, (Affine, Damping)) for p in (*self.data.before, *self.data.after))
-
-    @property
-    def alike(self) -> float:
-        """The weight of misfit beside noise, where a size is chosen by its expected error."""
-        return uncertainty.ALIKE
-
     @property
     def largest_known(self) -> Size:
         """The largest size that a factor answers for."""
         return [size for size in self.sizes if size.group in self._factors][-1]
-
-    def state_deviations(self, size: Size) -> np.ndarray:
-        """(2d,) standard deviation of each coordinate's noise, ÷ its scale, from what this size
-        leaves of a sample of the training pairs."""
-        (w, target, *args), goes_on = self._sample(_NOISE_PAIRS)
-        solved, params = self.solve(size, Budget(), lambda message: None)
-        slopes = self._slopes(size.family, w, *args)
-        residual = slopes @ solved.coefficients - target * self._weight
-        first, second = self.by_states(size.family, params, w, *args)
-        step = np.linalg.solve(second, np.concatenate([residual[..., None], -first], axis=-1))
-        return of_pairs(step[..., 0], step[..., 1:], np.flatnonzero(goes_on))
-
-    def freedoms(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
-        """Degrees of freedom that noise takes of a fit of so many of the leading terms of a size:
-        as many, where no state stands in two pairs. near: whose residuals tell the noise; it may
-        be the larger one, whose terms begin with those of the other."""
-        (w, target, *args), goes_on = self._sample(-(-SAMPLE_ROWS * max(counts) // self._width))
-        if not goes_on.any() or not self.moved_by_states:
-            return [float(count) for count in counts]
-        solved, params = self.solve(near, Budget(), lambda message: None)
-        larger = max(near, most, key=lambda size: size.family.num_parameters)
-        slopes = self._slopes(larger.family, w, *args)
-        residual = slopes[..., : len(solved.coefficients)] @ solved.coefficients
-        residual = residual - target * self._weight
-        states = residual, *self.by_states(near.family, params, w, *args), goes_on
-        scores = shared_noise.scores(slopes, *states)
-        return [
-            shared_noise.degrees_of_freedom(slopes[..., :count], residual, scores[:, :count])
-            for count in counts
-        ]
-
-    @property
-    def _width(self) -> int:
-        return self._train[0].shape[1]
 
     def _rows_of(self, group) -> tuple[int, int]:
         """Pairs that a group's factor is made of, and rows of each. They are shuffled: the first of
         them are a sample, where all would take too long."""
         count, width = self._train[1].shape
         return min(count, max(1, int(_MOST_OPERATIONS / (group.num_parameters**2 * width)))), width
-
-    def _sample(self, pairs: int) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-        """Rows of about so many training pairs, and which of them go on with the next."""
-        places, goes_on = looked_at(self.data.pairs, self.data.training, pairs)
-        return tuple(a[places] for a in self._train), goes_on
-
-    def _noise(self, size: Size, larger: Size, data, states) -> float:
-        """The part of the residual's mean square that is noise, by what a larger size explains of
-        it: of all rows where that one was judged by all of them, else of these. states: residual,
-        its derivatives and which pairs go on, as `shared_noise.scores` takes them, or None."""
-
-        def left(of: Size) -> tuple[float, float, int]:
-            """Mean square, the degrees of freedom that noise takes, and the rows."""
-            count = of.family.num_parameters
-            reduced = (
-                self._factors[of.group].train if larger.group in self._factors
-                else least_squares.reduce(self.in_rows(of.family), [data], self._weight)
-            )  # fmt: skip
-            degrees = float(count)
-            if states is not None:
-                slopes = self._slopes(of.family, data[0], *data[2:])
-                scores = shared_noise.scores(slopes, *states)
-                degrees = shared_noise.degrees_of_freedom(slopes, states[0], scores)
-            square = reduced.residual_norm(count) ** 2 / max(reduced.rows, 1)
-            return square, degrees, reduced.rows
-
-        return part_of_noise(size, larger, left(size), left(larger))
 
     def _larger(self, size: Size) -> Size | None:
         """The size two further, as a symmetric map gains nothing from the odd degrees; the next, or
@@ -556,21 +337,6 @@ class LinearSweep(Generates):
             validation_bound=error.bound, deviations=error.deviations, train_rms=train_rms,
             fit_seconds=seconds,
         )  # fmt: skip
-
-
-def part_of_noise(
-    size: Size, larger: Size, left: tuple[float, float, int], rest: tuple[float, float, int]
-) -> float:
-    """The part of what a size leaves over that is noise, by what a larger one explains of it: the
-    mean square that either leaves, the degrees of freedom that noise takes, and the rows."""
-    (of_all, taken, _), (of_rest, more, rows) = left, rest
-    noise = of_rest / max(1.0 - more / rows, 1.0 / rows)
-    if not noise > 0:
-        return 1.0 if not of_all > 0 else 0.0
-    further = larger.family.num_parameters - size.family.num_parameters
-    each = noise * max(more - taken, 0.0) / further  # of noise, in what a further term explains
-    explained = rows * max(of_all - of_rest, 0.0)
-    return noise / (noise + uncertainty.misfit(explained, further, each) / rows)
 
 
 def _extent(family) -> float:
