@@ -31,7 +31,7 @@ from gfnn_jax.scenes import (
     henon_heiles,
     pendulum_length,
 )
-from gfnn_jax.scenes.trajectories import sample_params, sample_t0
+from gfnn_jax.scenes.draws import sample_params, sample_t0
 
 STEPS, ORBITS, BATCH = 1_000, 100, 1_000
 

@@ -25,7 +25,7 @@ from posteriors.calibration import pendulum
 
 import gfnn_jax as gfnn
 from gfnn_jax.scenes import Scene
-from gfnn_jax.scenes.trajectories import sample_sequences
+from gfnn_jax.scenes.draws import sample_sequences
 
 SIGMA, FRESH, FITS = 1e-3, 100_000, 22  # noise ÷ spread; fresh pairs; data sets a row
 SYSTEMS = {"henon-heiles": lambda: gfnn.scenes.make("henon-heiles-regular"), "pendulum": pendulum}

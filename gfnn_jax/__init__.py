@@ -31,12 +31,8 @@ if TYPE_CHECKING:
     from gfnn_jax.models.model import Fitted, TrainingData
     from gfnn_jax.phase_space import Pairs
     from gfnn_jax.scenes import Scene
-    from gfnn_jax.scenes.trajectories import (
-        reference_trajectories,
-        sample_pairs,
-        sample_states,
-        sample_test_states,
-    )
+    from gfnn_jax.scenes.draws import sample_pairs, sample_states, sample_test_states
+    from gfnn_jax.scenes.trajectories import reference_trajectories
 
     __version__: str
 
@@ -71,9 +67,9 @@ _HOMES = {
     "read": "data.recording",
     "reference_trajectories": "scenes.trajectories",
     "register": "maps.saved",
-    "sample_pairs": "scenes.trajectories",
-    "sample_states": "scenes.trajectories",
-    "sample_test_states": "scenes.trajectories",
+    "sample_pairs": "scenes.draws",
+    "sample_states": "scenes.draws",
+    "sample_test_states": "scenes.draws",
     "stroboscopic": "maps.stroboscopic",
 }
 

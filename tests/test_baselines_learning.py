@@ -14,7 +14,8 @@ from gfnn_jax.fitting.adam import Recipe
 from gfnn_jax.maps.rollout import rollout
 from gfnn_jax.phase_space import hamiltonian_vector_field
 from gfnn_jax.scenes import henon_heiles, standard_map
-from gfnn_jax.scenes.trajectories import flow_step, reference_trajectories, sample_sequences
+from gfnn_jax.scenes.draws import sample_sequences
+from gfnn_jax.scenes.trajectories import flow_step, reference_trajectories
 
 RECIPE = Recipe(batch_size=50, epochs=2, epoch_length=3, rate=1e-2, schedule="cosine")
 

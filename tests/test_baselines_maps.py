@@ -11,7 +11,8 @@ from gfnn_jax.baselines.srnn import leapfrog, tao
 from gfnn_jax.baselines.sympnets import g_init, g_step, la_init, la_step
 from gfnn_jax.phase_space import apply_j, split, symplecticity_defect
 from gfnn_jax.scenes import henon_heiles, pcr3bp
-from gfnn_jax.scenes.trajectories import reference_trajectories, sample_states
+from gfnn_jax.scenes.draws import sample_states
+from gfnn_jax.scenes.trajectories import reference_trajectories
 
 DT = 0.1
 STATES = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (20, 4)))

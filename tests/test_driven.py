@@ -26,7 +26,7 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.parameters import Parameters, sampled
 from gfnn_jax.models.hamiltonians.white import leaves_white
 from gfnn_jax.models.parameters import functions_of_parameters, state_libraries, walked
-from gfnn_jax.scenes.trajectories import sample_t0
+from gfnn_jax.scenes.draws import sample_t0
 
 PERIOD = 5.0
 RATE = 2 * np.pi / PERIOD

@@ -19,6 +19,7 @@ import gfnn_jax
 from gfnn_jax import scenes
 from gfnn_jax.coordinates import to_inner, to_user
 from gfnn_jax.phase_space import hamiltonian_vector_field, symplectic_form, symplecticity_defect
+from gfnn_jax.scenes import draws
 from gfnn_jax.scenes import trajectories as tr
 from gfnn_jax.scenes.two_body import angular_momentum, hamiltonian, kepler_flow
 
@@ -90,7 +91,7 @@ def test_the_ellipse_is_filled_uniformly():
 def test_two_body_law():
     """Uniform in a, e, mean anomaly and direction of the periapsis; counterclockwise."""
     q, p = np.split(
-        np.asarray(tr.sample_states(scenes.two_body(), 20_000, jax.random.key(0))), 2, 1
+        np.asarray(draws.sample_states(scenes.two_body(), 20_000, jax.random.key(0))), 2, 1
     )
     r = np.linalg.norm(q, axis=1)
     a = 1 / (2 / r - (p**2).sum(1))
@@ -126,7 +127,7 @@ def test_reversor(name):
     rho = np.array(scene.reversor, float)
     form = symplectic_form(scene.dim)
     np.testing.assert_array_equal(form * np.outer(rho, rho), -form)
-    y = to_inner(scene.coordinates, tr.sample_states(scene, 20, jax.random.key(1)))
+    y = to_inner(scene.coordinates, draws.sample_states(scene, 20, jax.random.key(1)))
     energy = jax.jit(jax.vmap(lambda y: scene.hamiltonian(scene.coordinates.inverse(y))))
     np.testing.assert_allclose(energy(y * rho), energy(y), atol=1e-14, rtol=0)
     if scene.features is not None:
@@ -138,7 +139,7 @@ def test_reversor(name):
 
 def test_polar_coordinates_are_canonical():
     scene = scenes.two_body()
-    z = tr.sample_states(scene, 50, jax.random.key(2))
+    z = draws.sample_states(scene, 50, jax.random.key(2))
     jacobian = jax.jit(jax.vmap(jax.jacfwd(scene.coordinates.forward)))(z)
     assert symplecticity_defect(np.asarray(jacobian)).max() < 1e-14
     y = to_inner(scene.coordinates, z)
@@ -243,14 +244,14 @@ def test_orbits_are_regular_or_chaotic_as_they_should_be(name):
     scene = scenes.make(name)
     if name == "pcr3bp":  # the orbit is regular; about one in twenty of its neighbours is not
         assert exponents(scene, jnp.array([scene.sampling.start]))[0] < 0.008
-        found = exponents(scene, tr.sample_states(scene, 60, jax.random.key(4)))
+        found = exponents(scene, draws.sample_states(scene, 60, jax.random.key(4)))
         assert np.median(found) < 0.008
         assert np.mean(~(found < 0.02)) < 0.15
     elif scene.regular:
-        found = exponents(scene, tr.sample_states(scene, 60, jax.random.key(4)))
+        found = exponents(scene, draws.sample_states(scene, 60, jax.random.key(4)))
         assert np.quantile(found, 0.95) < 0.008
     else:
-        found = exponents(scene, tr.sample_test_states(scene, 60, jax.random.key(4)))
+        found = exponents(scene, draws.sample_test_states(scene, 60, jax.random.key(4)))
         # An orbit may stick to an island for a part of the time.
         assert np.median(found) > 0.1
         assert found.min() > 2 * 0.008
@@ -260,10 +261,10 @@ def test_orbits_are_regular_or_chaotic_as_they_should_be(name):
 def test_orbits_of_the_section_stay_in_the_island_and_of_the_pendulum_near_the_disc():
     section, pendulum = scenes.henon_heiles_section(), scenes.driven_pendulum()
     law = jax.random.key(5)
-    z = tr.reference_trajectories(section, tr.sample_states(section, 20, law), 30)
+    z = tr.reference_trajectories(section, draws.sample_states(section, 20, law), 30)
     y, p_y = np.moveaxis(z, -1, 0)
     assert (((y - 0.25) / 0.32) ** 2 + (p_y / 0.2) ** 2 < 1).all()
-    z = tr.reference_trajectories(pendulum, tr.sample_test_states(pendulum, 40, law), 60)
+    z = tr.reference_trajectories(pendulum, draws.sample_test_states(pendulum, 40, law), 60)
     assert np.linalg.norm(z, axis=-1).max() < 0.8
 
 

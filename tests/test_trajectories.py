@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 import gfnn_jax.scenes.trajectories as tr
 from gfnn_jax import scenes
 from gfnn_jax.phase_space import hamiltonian_vector_field
+from gfnn_jax.scenes import draws
 
 KEY = jax.random.key(0)  # made once: that compiles as well
 INTEGRATED = ("henon-heiles-regular", "henon-heiles-printed", "pcr3bp")
@@ -55,7 +56,7 @@ def test_flow_agrees_with_another_solver(name):
 
 def test_the_stroboscopic_map_agrees_with_another_solver_and_starts_at_time_0_every_time():
     scene = scenes.driven_pendulum(periods=3)
-    z0 = tr.sample_states(scene, 3, jax.random.key(9))
+    z0 = draws.sample_states(scene, 3, jax.random.key(9))
     z = tr.reference_trajectories(scene, z0, 2)
     for start, path in zip(z0, z, strict=True):
         other = solve_ivp(
@@ -93,7 +94,7 @@ def test_the_return_map():
         """Step at most ten states: one compilation."""
         return tr.reference_trajectories(scene, np.resize(z, (10, 2)), 1)[: len(z), 1]
 
-    z0 = tr.sample_states(scene, 8, jax.random.key(9))
+    z0 = draws.sample_states(scene, 8, jax.random.key(9))
     z1 = step(z0)
     np.testing.assert_allclose(z1, [returned(z) for z in z0], atol=3e-13, rtol=0)
     assert np.linalg.norm(z1 - z0, axis=1).min() > 1e-2
@@ -119,7 +120,7 @@ def test_the_return_map():
 
 def test_integration_against_the_exact_kepler_solution():
     scene = scenes.two_body()
-    z0 = tr.sample_states(scene, 10, jax.random.key(1))
+    z0 = draws.sample_states(scene, 10, jax.random.key(1))
     exact = tr.reference_trajectories(scene, z0, 1000, save_every=10)
     z = tr.reference_trajectories(integrated("two-body"), z0, 1000, save_every=10)
     distance = np.linalg.norm(z - exact, axis=-1)
@@ -187,7 +188,7 @@ def test_time_dependent_hamiltonian():
 @pytest.mark.parametrize("name", long_ones_slow(scenes.names()))
 def test_pairs_are_the_same_bits_for_the_same_seed_and_conserve_the_invariants(name):
     scene = scenes.make(name)
-    pairs, again, other = (tr.sample_pairs(scene, 16, jax.random.key(s)) for s in (3, 3, 4))
+    pairs, again, other = (draws.sample_pairs(scene, 16, jax.random.key(s)) for s in (3, 3, 4))
     assert pairs.z0.shape == pairs.z1.shape == (16, 2 * scene.dim)
     assert isinstance(pairs.z0, np.ndarray)
     assert pairs.z0.dtype == pairs.z1.dtype == np.float64
@@ -209,12 +210,12 @@ def test_pairs_are_the_same_bits_for_the_same_seed_and_conserve_the_invariants(n
 def test_a_scene_with_a_parameter():
     """Check that each length conserves its energy; pairs at random times are those of the flow."""
     scene, key = scenes.pendulum_length(), jax.random.key(3)
-    pairs = tr.sample_pairs(scene, 30, key, dt_range=(0.1, 0.5))
+    pairs = draws.sample_pairs(scene, 30, key, dt_range=(0.1, 0.5))
     length = pairs.args["l"]
     assert ((length > 0.5) & (length < 2)).all()
     assert ((pairs.dt > 0.1) & (pairs.dt < 0.5)).all()
-    np.testing.assert_array_equal(tr.sample_states(scene, 30, key), pairs.z0)
-    np.testing.assert_array_equal(tr.sample_params(scene, 30, key)[:, 0], length)
+    np.testing.assert_array_equal(draws.sample_states(scene, 30, key), pairs.z0)
+    np.testing.assert_array_equal(draws.sample_params(scene, 30, key)[:, 0], length)
 
     def energy(z):
         return z[:, 1] ** 2 / (2 * length**2) - 9.81 * length * np.cos(z[:, 0])
@@ -228,7 +229,7 @@ def test_a_scene_with_a_parameter():
         tr.reference_trajectories(scene, pairs.z0, 1)
     for unfit in (scenes.standard_map(), scenes.driven_pendulum()):
         with pytest.raises(ValueError, match=r"a scene with a flow; got dt from 0\.1 to 0\.2"):
-            tr.sample_pairs(unfit, 5, key, dt_range=(0.1, 0.2))
+            draws.sample_pairs(unfit, 5, key, dt_range=(0.1, 0.2))
 
 
 @pytest.mark.parametrize("name", ["henon-heiles-regular", "pcr3bp", "standard-map-regular"])
@@ -236,7 +237,7 @@ def test_spread_around_the_orbit(name):
     """Centred Gaussian perturbations of every coordinate, of the paper's variance."""
     scene = scenes.make(name)
     law = dataclasses.replace(scene.sampling, num_steps=0)  # one state, so that σ is seen alone
-    z = tr.sample_states(dataclasses.replace(scene, sampling=law), 4_000, jax.random.key(6))
+    z = draws.sample_states(dataclasses.replace(scene, sampling=law), 4_000, jax.random.key(6))
     offset = z - np.array(law.start)
     if scene.coordinates.angles:
         offset = (offset + np.pi) % (2 * np.pi) - np.pi
@@ -250,7 +251,7 @@ def test_spread_around_the_orbit(name):
 @pytest.mark.slow
 def test_draws_run_all_along_the_orbit():
     scene = scenes.henon_heiles(energy=1 / 6)
-    z = tr.sample_test_states(scene, 400, jax.random.key(7))
+    z = draws.sample_test_states(scene, 400, jax.random.key(7))
     energy = jax.jit(jax.vmap(scene.hamiltonian))(z)
     np.testing.assert_allclose(energy, 1 / 6 - 1e-3, atol=1e-12, rtol=0)
     orbit = tr.reference_trajectories(scene, np.array([scene.test_states.start]), 10_000)[0]
@@ -264,21 +265,21 @@ def test_data_of_a_scene_take_one_compilation_per_program(compilations):
     flow = scenes.two_body().flow
     scene = dataclasses.replace(scenes.two_body(), flow=lambda z, t: flow(z, t))  # seen by no test
     with compilations() as of_pairs:
-        tr.sample_pairs(scene, 37, KEY)
+        draws.sample_pairs(scene, 37, KEY)
     with compilations() as of_tests:
-        z0 = tr.sample_test_states(scene, 11, KEY)
+        z0 = draws.sample_test_states(scene, 11, KEY)
         tr.reference_trajectories(scene, z0, 13)
     with compilations() as again:
-        tr.sample_pairs(dataclasses.replace(scene, dt=0.2), 37, KEY)
+        draws.sample_pairs(dataclasses.replace(scene, dt=0.2), 37, KEY)
         tr.reference_trajectories(scene, z0, 13)
     assert (of_pairs.count, of_tests.count, again.count) == (2, 1, 0)
     with compilations() as of_an_orbit:
-        tr.sample_pairs(scenes.standard_map(), 37, KEY)
-        tr.sample_test_states(scenes.standard_map(), 37, KEY)
+        draws.sample_pairs(scenes.standard_map(), 37, KEY)
+        draws.sample_test_states(scenes.standard_map(), 37, KEY)
     assert of_an_orbit.count <= 2  # the orbit and the pairs by one program
     with compilations() as of_more:
-        tr.sample_pairs(scenes.standard_map(), 38, KEY)
-        tr.sample_test_states(scenes.standard_map(), 1, KEY)
+        draws.sample_pairs(scenes.standard_map(), 38, KEY)
+        draws.sample_test_states(scenes.standard_map(), 1, KEY)
     assert of_more.count == 0
 
 
@@ -287,7 +288,7 @@ def test_a_state_has_the_same_bits_beside_any_others(name, compilations):
     """Alone, in another order, in blocks that are full or not, and for any number of steps."""
     scene = integrated("two-body") if name == "two-body" else scenes.make(name)
     num = 2 * tr.LANES_ON_CPU + 1
-    z0, t0 = tr.sample_states(scene, num, KEY), tr.sample_t0(scene, num, KEY)
+    z0, t0 = draws.sample_states(scene, num, KEY), draws.sample_t0(scene, num, KEY)
 
     def followed(rows, num_steps=3):
         times = None if t0 is None else t0[rows]
@@ -304,14 +305,14 @@ def test_a_state_has_the_same_bits_beside_any_others(name, compilations):
 def test_first_draws_are_those_of_more():
     scene, driven = scenes.standard_map(), scenes.make("driven-pendulum-phase")
     for num in (1, 37):
-        for draw in (partial(tr.sample_states, scene), partial(tr.sample_t0, driven)):
-            np.testing.assert_array_equal(draw(num, KEY), draw(tr.ROWS_DRAWN + 1, KEY)[:num])
+        for draw in (partial(draws.sample_states, scene), partial(draws.sample_t0, driven)):
+            np.testing.assert_array_equal(draw(num, KEY), draw(draws.ROWS_DRAWN + 1, KEY)[:num])
 
 
 def test_long_trajectories_go_on_from_call_to_call():
     """More states than one call returns, against a plain loop over the map."""
     scene, num_steps = scenes.standard_map(), 2 * tr.SAVED_AT_ONCE + 6
-    z0 = tr.sample_states(scene, 3, KEY)
+    z0 = draws.sample_states(scene, 3, KEY)
     found = tr.reference_trajectories(scene, z0, num_steps, save_every=2)
     path, step = [z0], jax.jit(jax.vmap(scene.step))
     for _ in range(num_steps):
@@ -321,13 +322,13 @@ def test_long_trajectories_go_on_from_call_to_call():
 
 @pytest.mark.slow
 def test_a_hundred_thousand_pairs_are_finite():
-    pairs = tr.sample_pairs(scenes.pcr3bp(), 100_000, jax.random.key(8))
+    pairs = draws.sample_pairs(scenes.pcr3bp(), 100_000, jax.random.key(8))
     assert np.isfinite(pairs.z1).all()
 
 
 def test_float32_is_refused():
     code = (
-        "import jax, gfnn_jax.scenes.trajectories as t, gfnn_jax.scenes as s;"
+        "import jax, gfnn_jax.scenes.draws as t, gfnn_jax.scenes as s;"
         "t.sample_pairs(s.two_body(), 2, jax.random.key(0))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

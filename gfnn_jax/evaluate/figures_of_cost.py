@@ -37,11 +37,8 @@ def speed_against_error(
     ax = axes_or_new(ax, WIDTH * 1.6, HEIGHT * 1.15)
     cost, error = np.asarray(kilo_operations, float), np.asarray(errors, float)
     order = np.argsort(cost, kind="stable")
-    best = np.minimum.accumulate(error[order])
-    front = np.flatnonzero(np.append(True, best[1:] < best[:-1]))
     ax.step(
-        cost[order][front],
-        best[front],
+        *_unbeaten(cost, error),
         where="post",
         color=COLOURS[0],
         lw=1,
@@ -186,14 +183,19 @@ def work_precision_panels(panels: Mapping, ylabel) -> Figure:
     return figure
 
 
-def _front(ax, curves):
-    """Draw the staircase through the points that no other beats in both cost and error."""
-    cost, error = (np.concatenate([np.ravel(c[i]) for c in curves]) for i in (0, 1))
+def _unbeaten(cost, error) -> tuple[np.ndarray, np.ndarray]:
+    """Points, by rising cost, that no other beats in both cost and error."""
     order = np.lexsort((error, cost))
     best = np.minimum.accumulate(error[order])
     front = np.flatnonzero(np.append(True, best[1:] < best[:-1]))
+    return cost[order][front], best[front]
+
+
+def _front(ax, curves):
+    """Draw the staircase through the points that no other beats in both cost and error."""
+    cost, error = (np.concatenate([np.ravel(c[i]) for c in curves]) for i in (0, 1))
     ax.step(
-        cost[order][front], best[front], where="post", color=COLOURS[5], lw=4, alpha=0.45,
+        *_unbeaten(cost, error), where="post", color=COLOURS[5], lw=4, alpha=0.45,
         label="best of our maps", zorder=1.5,
     )  # fmt: skip
 

@@ -24,13 +24,8 @@ from gfnn_jax.maps.bands import bands
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene
-from gfnn_jax.scenes.trajectories import (
-    reference_trajectories,
-    sample_pairs,
-    sample_params,
-    sample_t0,
-    sample_test_states,
-)
+from gfnn_jax.scenes.draws import sample_pairs, sample_params, sample_t0, sample_test_states
+from gfnn_jax.scenes.trajectories import reference_trajectories
 from gfnn_jax.storage.outputs import atomic_folder
 from gfnn_jax.storage.partial import unfinished
 

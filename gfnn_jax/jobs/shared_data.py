@@ -18,12 +18,8 @@ from gfnn_jax.jobs.measure import angles_of_z
 from gfnn_jax.jobs.rollouts import NUM_STEPS, NUM_TRAJECTORIES
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene
-from gfnn_jax.scenes.trajectories import (
-    reference_trajectories,
-    sample_pairs,
-    sample_sequences,
-    sample_test_states,
-)
+from gfnn_jax.scenes.draws import sample_pairs, sample_sequences, sample_test_states
+from gfnn_jax.scenes.trajectories import reference_trajectories
 
 _NUM_FRESH = 2_000
 _QUICK_PAIRS, _QUICK_TRAJECTORIES = 10_000, 10

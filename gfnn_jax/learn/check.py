@@ -17,8 +17,8 @@ from gfnn_jax.families.sums import site_terms
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.phase_space import Pairs, sizes, split
+from gfnn_jax.scenes.draws import sample_states
 from gfnn_jax.scenes.scene import AroundOrbit, Scene
-from gfnn_jax.scenes.trajectories import sample_states
 
 LEARNS = ("auto", "map", "hamiltonian")  # of pairs
 

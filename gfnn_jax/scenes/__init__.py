@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # what is collected below
     from gfnn_jax.scenes.toda import toda
     from gfnn_jax.scenes.two_body import two_body
 
-_OTHER_MODULES = ("scene", "trajectories")
+_OTHER_MODULES = ("scene", "trajectories", "draws")
 SCENES: dict[str, Callable[[], Scene]] = {}
 
 

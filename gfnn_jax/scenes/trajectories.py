@@ -1,16 +1,14 @@
-"""Reference trajectories of a scene, and the states, pairs and sequences that are drawn from them.
+"""Reference trajectories of a scene: its exact flow or map, else Dopri8 close to roundoff.
 
-Every key is a ``jax.random.key``; everything is float64 and needs x64 to be on. States come out as
-NumPy arrays. The reference of a scene is one program for any number of states and steps, which
-solves a few states at a time; a draw by a scene's own function is one for each number of states.
+Everything is float64 and needs x64 to be on. States come out as NumPy arrays. The reference of a
+scene is one program for any number of states and steps, which solves a few states at a time.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import numbers
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import partial
 
 import diffrax
 import jax
@@ -18,21 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gfnn_jax.coordinates import TWO_PI, to_inner, to_user
 from gfnn_jax.errors import InputError
-from gfnn_jax.phase_space import Pairs, hamiltonian_vector_field, require_x64
-from gfnn_jax.scenes.scene import AroundOrbit, DrawnFrom, Scene
+from gfnn_jax.phase_space import hamiltonian_vector_field, require_x64
+from gfnn_jax.scenes.scene import Scene
 
 States = Float[Array | np.ndarray, "batch phase"]
-Drawn = Float[np.ndarray, "num phase"]
 
 TOLERANCE = 1e-15  # 1e-14 costs 15 % less and drifts ten times more in energy
 MAX_SOLVER_STEPS = 1024  # for one dt; a state that needs more is about to collide
-KEPT_ORBITS = 8  # cached orbits that states are drawn around
 # States solved together: on a CPU more take hardly less time each, and one alone half that of 8.
 LANES_ON_CPU = 8
 LANES_ON_ACCELERATOR = 4096
-ROWS_DRAWN = 1024  # at the least, of which the first are taken
 SAVED_AT_ONCE = 64  # states of a trajectory that one call of the program returns
 LONGEST_RETURN = 1e6  # time allowed for a return to a section; lost orbits run out of steps before
 
@@ -167,7 +161,7 @@ def _advance(dt, step, section, hamiltonian, period):
     return _integrator(hamiltonian, dt)
 
 
-def _blocks(num):
+def blocks(num):
     """Yield ``rows``, the numbers of the states that are solved together, all of one length.
 
     The last state fills up the last block. A state has the same bits beside any others, for the
@@ -178,10 +172,10 @@ def _blocks(num):
         yield np.minimum(np.arange(first, first + lanes), num - 1)
 
 
-def _trajectories(z0, save_every: int, num_saved: int, *reference) -> np.ndarray:
+def trajectories_from(z0, save_every: int, num_saved: int, *reference) -> np.ndarray:
     """States after save_every, 2 save_every, ... steps: (num_saved, B, 2d)."""
     saved = np.empty((num_saved, *z0.shape))
-    for rows in _blocks(len(z0)):
+    for rows in blocks(len(z0)):
         start = z = z0[rows]
         for done in range(0, num_saved, SAVED_AT_ONCE):
             count = min(SAVED_AT_ONCE, num_saved - done)
@@ -207,8 +201,8 @@ def _check_traceable(scene: Scene) -> None:
             ) from None
 
 
-def _reference(scene: Scene) -> tuple:
-    """Everything that a trajectory of the scene depends on, as arguments of `_trajectories`.
+def reference_of(scene: Scene) -> tuple:
+    """Everything that a trajectory of the scene depends on, as arguments of `trajectories_from`.
 
     Raises InputError where the scene's flow, map or Hamiltonian is written with NumPy.
     """
@@ -219,6 +213,15 @@ def _reference(scene: Scene) -> tuple:
         hamiltonian = _WithArgs(hamiltonian, 2 * scene.dim, scene.any_phase)
     period = None if scene.any_phase else scene.period
     return scene.dt, scene.flow, scene.step, scene.section, hamiltonian, period
+
+
+@partial(jax.jit, static_argnames=("flow", "hamiltonian"))
+def after_own_dt(x, dt, *, flow, hamiltonian):
+    """Advance states x (B, ...), each by its own time dt (B,)."""
+    if flow is not None:
+        return jax.vmap(flow)(x, dt)
+    field = _field(hamiltonian)
+    return jax.vmap(lambda x, dt: _solve(field, 0.0, dt, x))(x, dt)
 
 
 def reference_trajectories(
@@ -234,13 +237,13 @@ def reference_trajectories(
     """
     require_x64("a reference trajectory")
     z0 = np.asarray(z0, np.float64)
-    x0 = _with_params(scene, z0, params, t0)
-    saved = _trajectories(x0, save_every, num_steps // save_every, *_reference(scene))
+    x0 = with_params(scene, z0, params, t0)
+    saved = trajectories_from(x0, save_every, num_steps // save_every, *reference_of(scene))
     saved = np.moveaxis(saved, 0, 1)[..., : z0.shape[1]]
     return np.concatenate([z0[:, None], saved], axis=1)
 
 
-def _with_params(scene: Scene, z0, params, t0=None):
+def with_params(scene: Scene, z0, params, t0=None):
     """Concatenate states, parameters and initial times of the drive (B, 2d + k)."""
     if (t0 is not None) != scene.any_phase:
         wanted = "t0, the time of the drive" if scene.any_phase else "no t0"
@@ -307,156 +310,3 @@ def reference_error(scene: Scene, z0: States, num_steps: int) -> float:
         second = reference_trajectories(scene, moved, num_steps)
     error = np.max(np.linalg.norm(second - first, axis=-1), axis=-1)
     return float(np.nanmax(error)) if not np.isnan(error).all() else float("nan")
-
-
-@partial(jax.jit, static_argnames=("draw", "num"))
-def _drawn(key, *, draw, num):
-    return draw(key, num)
-
-
-def _enough(num: int) -> int:
-    """Number of rows that are drawn where ``num`` are wanted, so that few programs are compiled.
-
-    JAX draws each entry from its index alone: the first rows of more are the same bits.
-    """
-    return max(ROWS_DRAWN, 1 << (num - 1).bit_length())
-
-
-@partial(jax.jit, static_argnames=("shape",))
-def _perturbations(key, *, length, shape):
-    """Random indices (num,) of states of an orbit, and standard normal noise (num, 2d)."""
-    key_time, key_noise = jax.random.split(key)
-    time = jax.random.randint(key_time, shape[:1], 0, length)
-    return time, jax.random.normal(key_noise, shape, jnp.float64)
-
-
-@lru_cache(maxsize=KEPT_ORBITS)
-def _orbit(law: AroundOrbit, *reference):
-    """States (num_steps + 1, 2d) of the law's orbit."""
-    start = np.array([law.start])
-    states = _trajectories(start, 1, law.num_steps, *reference)
-    return np.concatenate([start, states[:, 0]])
-
-
-def _reduce_angles(coordinates, z):
-    """Bring the angles of z (num, 2d) to [0, 2π)."""
-    if not coordinates.angles:
-        return z
-    y, angles = to_inner(coordinates, z), list(coordinates.angles)
-    y[:, angles] = np.mod(y[:, angles], TWO_PI)
-    return to_user(coordinates, y)
-
-
-def _check_drawn(scene, num, key) -> None:
-    if not isinstance(scene, Scene):
-        raise ValueError(f"expected a scene, e.g. gfnn.scenes.make('two-body'), got {scene!r}")
-    if not isinstance(num, numbers.Integral) or num < 1:
-        raise ValueError(f"expected a whole number of states ≥ 1, got {num!r}")
-    if not isinstance(key, (jax.Array, np.ndarray)):
-        raise ValueError(f"expected a key, e.g. jax.random.key(0), got {key!r}")
-
-
-def _draw(scene, law, num, key):
-    _check_drawn(scene, num, key)
-    require_x64("drawing states")
-    if isinstance(law, DrawnFrom):
-        return np.asarray(_drawn(key, draw=law.draw, num=num), np.float64)
-    orbit = _orbit(law, *_reference(scene))
-    time, noise = _perturbations(key, length=len(orbit), shape=(_enough(num), 2 * scene.dim))
-    z = orbit[np.asarray(time)[:num]] + law.sigma * np.asarray(noise)[:num]
-    return _reduce_angles(scene.coordinates, z)
-
-
-def sample_states(scene: Scene, num: int, key) -> Drawn:
-    """Draw ``num`` states of the scene's training law, (num, 2d)."""
-    return _draw(scene, scene.sampling, num, key)[:, : 2 * scene.dim]
-
-
-def sample_params(
-    scene: Scene, num: int, key, *, test: bool = False
-) -> Float[np.ndarray, "num params"] | None:
-    """Draw the parameters (num, k) that belong to `sample_states` with the same key.
-
-    With ``test`` they belong to `sample_test_states`. None where the scene has no parameters.
-    """
-    if not scene.parameters:
-        return None
-    law = (scene.test_states if test else None) or scene.sampling
-    return _draw(scene, law, num, key)[:, 2 * scene.dim :]
-
-
-def sample_t0(scene: Scene, num: int, key) -> Float[np.ndarray, "num"] | None:
-    """Draw the times of the drive (num,), uniform over its period, of states drawn with this key.
-
-    None where the scene does not begin at any phase.
-    """
-    if not scene.any_phase:
-        return None
-    assert scene.period is not None
-    return scene.period * _uniform(jax.random.fold_in(key, 2), num)
-
-
-def sample_test_states(scene: Scene, num: int, key) -> Drawn:
-    """Draw ``num`` states (num, 2d) for rollouts, of the scene's test law or else training law."""
-    return _draw(scene, scene.test_states or scene.sampling, num, key)[:, : 2 * scene.dim]
-
-
-def sample_sequences(
-    scene: Scene, num: int, length: int, key
-) -> Float[np.ndarray, "num length phase"]:
-    """Draw ``num`` reference sequences of ``length`` states, which start with the training law."""
-    return reference_trajectories(
-        scene, sample_states(scene, num, key), length - 1, params=sample_params(scene, num, key),
-        t0=sample_t0(scene, num, key),
-    )  # fmt: skip
-
-
-def sample_pairs(
-    scene: Scene, num_pairs: int, key, *, dt_range: tuple[float, float] | None = None
-) -> Pairs:
-    """Draw ``num_pairs`` states of the training law, and their images one ``dt`` later.
-
-    dt_range: the shortest and the longest time step, between which one is drawn uniformly for each
-    pair: irregular sampling. Raises ValueError where the scene has no autonomous flow.
-    """
-    _check_drawn(scene, num_pairs, key)
-    params = sample_params(scene, num_pairs, key)
-    args = None if params is None else dict(zip(scene.parameters, params.T, strict=True))
-    t0 = sample_t0(scene, num_pairs, key)
-    period = None if t0 is None else scene.period
-    if dt_range is None:
-        z = sample_sequences(scene, num_pairs, 2, key)
-        return Pairs(z[:, 0], z[:, 1], scene.dt, args, t0, period)
-    low, high = dt_range
-    stroboscopic = scene.period is not None and not scene.any_phase
-    if scene.timeless or stroboscopic or not 0 < low < high < np.inf:
-        raise ValueError(
-            f"expected 0 < shortest < longest dt, and a scene with a flow; got dt from {low:g} to "
-            f"{high:g} for the scene {scene.name}"
-        )
-    z0 = sample_states(scene, num_pairs, key)
-    dt = low + (high - low) * _uniform(jax.random.fold_in(key, 1), num_pairs)
-    reference = _reference(scene)
-    x0 = _with_params(scene, z0, params, t0)
-    z1 = np.empty_like(x0)
-    for rows in _blocks(num_pairs):
-        z1[rows] = _after(x0[rows], dt[rows], flow=reference[1], hamiltonian=reference[4])
-    return Pairs(z0, z1[:, : z0.shape[1]], dt, args, t0, period)
-
-
-def _uniform(key, num) -> Float[np.ndarray, "num"]:
-    return np.asarray(_uniform_rows(key, num=_enough(num)))[:num]
-
-
-@partial(jax.jit, static_argnames=("num",))
-def _uniform_rows(key, *, num):
-    return jax.random.uniform(key, (num,), jnp.float64)
-
-
-@partial(jax.jit, static_argnames=("flow", "hamiltonian"))
-def _after(x, dt, *, flow, hamiltonian):
-    """Advance states x (B, ...), each by its own time dt (B,)."""
-    if flow is not None:
-        return jax.vmap(flow)(x, dt)
-    field = _field(hamiltonian)
-    return jax.vmap(lambda x, dt: _solve(field, 0.0, dt, x))(x, dt)
