@@ -24,7 +24,8 @@ from gfnn_jax.flows.schedules import at_stages, interpolate
 from gfnn_jax.jobs.forecast import forecast_recording
 from gfnn_jax.models.lagrangians.text import speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
-from gfnn_jax.solve.latent_arcs import Observed, Steps, fit_arcs, rows_of_arcs
+from gfnn_jax.solve.arc_models import Observed, Steps
+from gfnn_jax.solve.latent_arcs import fit_arcs, rows_of_arcs
 
 
 def pendulum(gamma=0.05, noise=1e-3, end=40.0, dt=0.05, amplitude=1.2):

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.solve.latent_arcs import Observed, Steps
+from gfnn_jax.solve.arc_models import Observed, Steps
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -25,7 +25,8 @@ from gfnn_jax.maps import stops
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.signals.local_cubics import smooth
-from gfnn_jax.solve.latent_arcs import Observed, Steps, fit_arcs, linearised
+from gfnn_jax.solve.arc_models import Observed, Steps
+from gfnn_jax.solve.latent_arcs import fit_arcs, linearised
 
 FEWEST = 5  # samples from which a state is estimated
 _MOST = 160  # samples of a window that are used

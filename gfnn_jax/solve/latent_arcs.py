@@ -23,10 +23,11 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cached_property
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.solve.arc_models import Known, Model, Observed, Steps, evaluated
 from gfnn_jax.solve.levenberg_marquardt import Factors, Tried, descended
 from gfnn_jax.solve.robust import Loss, SoftL1, of_residuals
 
@@ -39,63 +40,12 @@ OUTLYING = 5.0  # standard deviations: a residual beyond does not tell the noise
 SOFT_L1 = SoftL1()
 
 
-class Steps(NamedTuple):
-    """The linearised defects of states (A, L, m): c_n (A, L − 1, m), Φ_n (…, m, m) and, in the n
-    coefficients, Γ_n (…, m, n)."""
-
-    closing: np.ndarray
-    by_state: np.ndarray
-    by_coefficients: np.ndarray
-
-
-class Observed(NamedTuple):
-    """g at the states (A, L, k), and its derivatives (A, L, k, m) and (A, L, k, n)."""
-
-    values: np.ndarray
-    by_state: np.ndarray
-    by_coefficients: np.ndarray
-
-
-@runtime_checkable
-class Model(Protocol):
-    """States that move and are seen: what `fit_arcs` asks of a law, or of any other map."""
-
-    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps: ...
-
-    def observe(self, p: np.ndarray, x: np.ndarray) -> Observed: ...
-
-
-def observed_whole(x: np.ndarray, coefficients: int) -> Observed:
-    """The states themselves, g(x; p) = x."""
-    own = np.broadcast_to(np.eye(x.shape[-1]), (*x.shape, x.shape[-1]))
-    return Observed(x, own, np.broadcast_to(0.0, (*x.shape, coefficients)))
-
-
-@dataclasses.dataclass(frozen=True)
-class Known:
-    """A model whose coefficients p (n,) are known: only states are latent."""
-
-    model: Model
-    p: np.ndarray
-
-
-def evaluated(model: Model | Known, p: np.ndarray, x: np.ndarray) -> tuple[Steps, Observed]:
-    """The linearised defects of states x (A, L, m), and what is seen of them."""
-    if not isinstance(model, Known):
-        return model.steps(p, x), model.observe(p, x)
-    steps, observed = evaluated(model.model, model.p, x)
-    return (
-        steps._replace(by_coefficients=steps.by_coefficients[..., :0]),
-        observed._replace(by_coefficients=observed.by_coefficients[..., :0]),
-    )
-
-
 @dataclasses.dataclass(frozen=True)
 class Fitted:
     """The fit of all arcs.
 
     p: (n,) coefficients. x: (A, L, m) states. residuals: (A, L, k) in units of the noise, NaN where
-    nothing was seen; whitened: the same after the whitening. sigma: the noise as given or
+    nothing was measured; whitened: the same after the whitening. sigma: the noise as given or
     estimated, (k,) or (A, L, k). factor: the triangle (n + 1, n + 1) of [∂r/∂p, r] without the
     states. scores: (A, n) each arc's part of the gradient in p. arcs: (A, m, m) triangles of each
     δx_0 with p fixed. transports: (A, m, m) ∂x_{L−1}/∂x_0. cost: infinite where the defects could
@@ -146,7 +96,7 @@ def fit_arcs(
 ) -> Fitted:
     """Fit p (n,) and the states x (A, L, m), from what they start at, to y (A, L, k).
 
-    Entries of y that are NaN were not seen. ``sigma`` (k,) or (A, L, k) is the noise of y,
+    Entries of y that are NaN were not measured. ``sigma`` (k,) or (A, L, k) is the noise of y,
     ``state_scale`` (m,) the defect that counts as one standard deviation. While defects matter, an
     iteration has to close them; then it has to lower the cost. Ends where it lowers it by less than
     ``tolerance`` of itself. The cost is infinite where the defects could not be closed.
@@ -155,8 +105,8 @@ def fit_arcs(
     estimated by every iteration, of (A, L, k) one factor for each of the k. None: sigma is known.
     whitening: (A, k, L, L) of residuals in units of sigma, by channel; None: they are white.
     """
-    seen = np.isfinite(y)
-    data = _Data(model, seen, np.where(seen, y, 0.0), least, tolerance)
+    measured = np.isfinite(y)
+    data = _Data(model, measured, np.where(measured, y, 0.0), least, tolerance)
     here = data.at(p, x, _Units(sigma, state_scale, loss, whitening))
     start = _AtStates(data, here, here)
     if not np.isfinite(here.cost):
@@ -216,18 +166,18 @@ def linearised(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Rows (A, L k, m + n + 1) of [δx_0, δp, r] of all arcs at p and x, weighted as robust loss has
     it, and δx_{L−1} (A, m, m + n + 1) by the same and by the defects before it."""
-    seen, (steps, observed) = np.isfinite(y), evaluated(model, p, x)
-    off = np.where(seen, np.where(seen, y, 0.0) - observed.values, 0.0)
+    measured, (steps, observed) = np.isfinite(y), evaluated(model, p, x)
+    off = np.where(measured, np.where(measured, y, 0.0) - observed.values, 0.0)
     units = _Units(sigma, np.ones(x.shape[-1]), loss, whitening)
-    return _linearised(_Iterate.at(p, x, steps, observed, seen, off, units), slice(None))
+    return _linearised(_Iterate.at(p, x, steps, observed, measured, off, units), slice(None))
 
 
 class _Data(NamedTuple):
-    """What arcs are fitted to: which of y (A, L, k) was seen, and y, 0 where it was not. least:
+    """What arcs are fitted to: which of y (A, L, k) was measured, and y, 0 where it was not. least:
     what of the residuals is no noise; None: the noise is known. tolerance: of the cost."""
 
     model: Model | Known
-    seen: np.ndarray
+    measured: np.ndarray
     known: np.ndarray
     least: np.ndarray | None
     tolerance: float
@@ -236,8 +186,8 @@ class _Data(NamedTuple):
         """The residuals and defects of coefficients p and states x."""
         with np.errstate(all="ignore"):
             steps, observed = evaluated(self.model, p, x)
-            off = np.where(self.seen, self.known - observed.values, 0.0)
-        return _Iterate.at(p, x, steps, observed, self.seen, off, units)
+            off = np.where(self.measured, self.known - observed.values, 0.0)
+        return _Iterate.at(p, x, steps, observed, self.measured, off, units)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -285,18 +235,18 @@ class _AtStates:
 
     def fitted(self, iterations: int, converged: bool) -> Fitted:
         """The fit that ends here."""
-        best, seen = self.best if self.closed(self.best) else self.here, self.data.seen
+        best, measured = self.best if self.closed(self.best) else self.here, self.data.measured
         rows, m = _reduced(best), best.x.shape[-1]
         return Fitted(
-            best.p, best.x, np.where(seen, best.residuals, np.nan),
-            np.where(seen, best.white, np.nan), best.units.sigma, rows.factor, rows.scores,
+            best.p, best.x, np.where(measured, best.residuals, np.nan),
+            np.where(measured, best.white, np.nan), best.units.sigma, rows.factor, rows.scores,
             rows.arcs[:, :, :m], rows.transports, best.cost if self.closed(best) else np.inf,
             iterations, converged,
         )  # fmt: skip
 
 
 class _Units(NamedTuple):
-    """σ of what is seen, the defects (m,) that count as much, the loss, and the whitening."""
+    """σ of what is measured, the defects (m,) that count as much, the loss, and the whitening."""
 
     sigma: np.ndarray
     state: np.ndarray
@@ -318,7 +268,7 @@ class _Iterate(NamedTuple):
     x: np.ndarray
     steps: Steps
     observed: Observed
-    seen: np.ndarray
+    measured: np.ndarray
     residuals: np.ndarray
     white: np.ndarray
     cost: float
@@ -326,7 +276,7 @@ class _Iterate(NamedTuple):
     units: _Units
 
     @classmethod
-    def at(cls, p, x, steps: Steps, observed: Observed, seen, off, units: _Units) -> _Iterate:
+    def at(cls, p, x, steps: Steps, observed: Observed, measured, off, units: _Units) -> _Iterate:
         """off: residuals (A, L, k) in the units of y."""
         with np.errstate(all="ignore"):
             residuals = off / units.sigma
@@ -335,7 +285,7 @@ class _Iterate(NamedTuple):
             gap = float(np.linalg.norm(steps.closing / units.state))
         if not np.isfinite(cost + gap):
             cost = gap = np.inf
-        return cls(p, x, steps, observed, seen, residuals, white, cost, gap, units)
+        return cls(p, x, steps, observed, measured, residuals, white, cost, gap, units)
 
     @property
     def merit(self) -> float:
@@ -346,19 +296,21 @@ class _Iterate(NamedTuple):
         as the latent state of its arc, and the coefficients, do not follow."""
         before = self.units.sigma
         off = self.residuals * before
-        free = np.where(self.seen, 1.0 - rows.leverage, 0.0)
+        free = np.where(self.measured, 1.0 - rows.leverage, 0.0)
         free *= max(1.0 - len(self.p) / free.sum(), 1e-3)
         if before.ndim == 1:
-            sigma = np.hypot(of_residuals(np.where(self.seen, off, np.nan), free, OUTLYING), least)
+            sigma = np.hypot(
+                of_residuals(np.where(self.measured, off, np.nan), free, OUTLYING), least
+            )
             moved = sigma / before
         else:
-            left = np.where(self.seen, self.residuals, np.nan)
+            left = np.where(self.measured, self.residuals, np.nan)
             moved = of_residuals(left, free, OUTLYING)
             sigma = np.hypot(moved * before, least)
-        # Of a state (q, v) whose positions are seen, velocities change as they do.
+        # Of a state (q, v) whose positions are measured, velocities change as they do.
         state = self.units.state * np.resize(moved, self.units.state.shape)
         units = self.units._replace(sigma=sigma, state=state)
-        return self.at(self.p, self.x, self.steps, self.observed, self.seen, off, units)
+        return self.at(self.p, self.x, self.steps, self.observed, self.measured, off, units)
 
 
 class _Rows(NamedTuple):
@@ -417,7 +369,7 @@ def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
     J /= sigma[..., None]
     J[..., -1] = residuals - J[..., -1]
     J = at.units.white(J, block)
-    weight = np.where(at.seen[block], np.sqrt(at.units.loss.weights(at.white[block])), 0.0)
+    weight = np.where(at.measured[block], np.sqrt(at.units.loss.weights(at.white[block])), 0.0)
     J *= weight[..., None]
     return J.reshape(num_arcs, length * k, -1), S[:, -1]
 

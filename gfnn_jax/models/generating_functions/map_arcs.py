@@ -24,14 +24,8 @@ import numpy as np
 from gfnn_jax.dataset.arcs import Arcs
 from gfnn_jax.fitting.triangle import Triangle, folded
 from gfnn_jax.generating.charts import AnyChart
-from gfnn_jax.solve.latent_arcs import (
-    Known,
-    Observed,
-    Steps,
-    eliminated_rows,
-    fit_arcs,
-    observed_whole,
-)
+from gfnn_jax.solve.arc_models import Known, Observed, Steps, observed_whole
+from gfnn_jax.solve.latent_arcs import eliminated_rows, fit_arcs
 from gfnn_jax.solve.robust import Biweight
 from gfnn_jax.threads import one_thread
 

@@ -18,7 +18,8 @@ from gfnn_jax.dataset.arcs import Arcs
 from gfnn_jax.errors import InputError
 from gfnn_jax.flows.collocation import Steps as FlowSteps
 from gfnn_jax.flows.collocation import images
-from gfnn_jax.solve.latent_arcs import Fitted, Known, Observed, Steps, fit_arcs, observed_whole
+from gfnn_jax.solve.arc_models import Known, Observed, Steps, observed_whole
+from gfnn_jax.solve.latent_arcs import Fitted, fit_arcs
 from gfnn_jax.solve.robust import Biweight, robust
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.observation import Observation
-from gfnn_jax.solve.latent_arcs import Observed, Steps
+from gfnn_jax.solve.arc_models import Observed, Steps
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
