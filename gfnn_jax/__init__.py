@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from gfnn_jax.exports.export import export
     from gfnn_jax.families import from_function
     from gfnn_jax.generating.charts import CHARTS, Chart
-    from gfnn_jax.learn.fit import Fit, fit
+    from gfnn_jax.learn.fit import fit
+    from gfnn_jax.learn.fitted import Fit
     from gfnn_jax.learn.monitors import Monitors, fit_monitors
     from gfnn_jax.learn.options import FitOptions
     from gfnn_jax.maps.saved import load, register
@@ -45,7 +46,7 @@ _MODULES = {
 _HOMES = {
     "CHARTS": "generating.charts",
     "Chart": "generating.charts",
-    "Fit": "learn.fit",
+    "Fit": "learn.fitted",
     "FitError": "errors",
     "FitOptions": "learn.options",
     "FitWarning": "errors",

@@ -427,7 +427,7 @@ def _summarise(ran: Any, out: Path) -> None:
     if ran is None:
         print(f"{out}: already holds the result of this job")
         return
-    from gfnn_jax.learn.fit import candidates_table
+    from gfnn_jax.learn.fitted import candidates_table
 
     _print_table(candidates_table(ran.fit))
     report = ran.report

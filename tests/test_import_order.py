@@ -38,6 +38,7 @@ SHORTHANDS = {
 SHORTHANDS |= {
     ("data.recording", "data.recording_summary"),
     ("data.recording_summary", "data.summary_screen"),
+    ("learn.fitted", "learn.accelerate"),
 }
 HOMES = {  # the module, and those whose names begin as its own does
     "argparse": "cli",

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from gfnn_jax.learn.fit import Fit
+from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.maps.saved import versions
 from gfnn_jax.solve.status import STATUS_NAMES
 

@@ -18,7 +18,7 @@ from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.rollouts import NUM_STEPS, NUM_TRAJECTORIES, map_rollouts
 from gfnn_jax.jobs.search import refusals, scene_named, search
 from gfnn_jax.jobs.written import MODEL, Ran, already_done, pairs_digest, write
-from gfnn_jax.learn.fit import Fit
+from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps.bands import bands
 from gfnn_jax.maps.symplectic_map import SymplecticMap

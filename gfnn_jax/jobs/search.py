@@ -15,7 +15,8 @@ from gfnn_jax import scenes
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.errors import FitError, InputError, WorkError
 from gfnn_jax.jobs.progress import Progress
-from gfnn_jax.learn.fit import Fit, fit
+from gfnn_jax.learn.fit import fit
+from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.symplectic_map import SymplecticMap

@@ -11,7 +11,7 @@ import numpy as np
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import report
-from gfnn_jax.learn.fit import Fit
+from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.maps import saved
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.storage.outputs import atomic_folder

@@ -24,7 +24,8 @@ import numpy as np
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.fit import Fit, fit
+from gfnn_jax.learn.fit import fit
+from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.posterior import Posterior
