@@ -235,7 +235,7 @@ def in_group(task: str, file: str) -> Numbers:
         pairs = next(iterate_pairs(file, SAMPLE))
         fit, _ = fitted(pairs, None, pairs, learn=task, tolerance=1e-6)
         held = pairs.take(slice(500))
-    group.told({})  # the others wait until the sample is fitted
+    group.broadcast({})  # the others wait until the sample is fitted
     before, started = peak_bytes(), time.perf_counter()
     if task == "reading":
         read_sample(file, num_pairs=10_000, group=group)
@@ -245,7 +245,7 @@ def in_group(task: str, file: str) -> Numbers:
         found["digest_states"] = np.asarray(again.map.step(held.z0)[0]).tolist()
         found["parameters"] = again.chosen.num_parameters
     else:
-        help_refit(group.told(), chunks, group)
+        help_refit(group.broadcast(), chunks, group)
     found |= {
         "seconds": time.perf_counter() - started, "sent": group.sent, "before": before,
         "peak": peak_bytes(),

@@ -147,8 +147,8 @@ class Budget:
             if now + seconds > self.max_seconds:
                 left = max(self.max_seconds - now, 0.0)
                 needed = f"{name} needs about {seconds:.2g} s with what must follow it"
-                left_over = f"{left:.2g} of {self.max_seconds:g} s are left"
-                self._end(_NO_TIME, f"{needed}, and {left_over} (--max-seconds)")
+                remaining = f"{left:.2g} of {self.max_seconds:g} s are left"
+                self._end(_NO_TIME, f"{needed}, and {remaining} (--max-seconds)")
         with self._timed(kind, count):
             yield
         self.operations += count
@@ -182,9 +182,9 @@ class Budget:
     def leave_out(self, what: str, why: str) -> None:
         """Have it told in the end; what the clock ended is told at length once, in ``ended``."""
         why = "no time" if why.startswith(_NO_TIME) else why
-        told = f"left out: {what} ({why})"
-        if told not in self.left_out:
-            self.left_out.append(told)
+        message = f"left out: {what} ({why})"
+        if message not in self.left_out:
+            self.left_out.append(message)
 
     def check(self) -> None:
         """Check between the parts of a unit: raises OutOfTime where it takes longer than foretold

@@ -64,7 +64,7 @@ class Group:
         """True in the process of index 0, which decides."""
         return self.share.index == 0
 
-    def told(self, arrays: dict[str, Any] | None = None) -> dict[str, Any]:
+    def broadcast(self, arrays: dict[str, Any] | None = None) -> dict[str, Any]:
         """Broadcast the arrays of the first process; the others pass None and receive them.
 
         The arrays remain in the runtime's store, so they should be small.
@@ -145,15 +145,15 @@ def join() -> Share:
     """
     import jax  # loaded when first used: refusing bad usage needs none
 
-    told = {}
+    given = {}
     for name in ("num_processes", "process_id"):
         text = os.environ.get(f"JAX_{name.upper()}")
         if text is not None and not text.isdecimal():
             raise InputError(f"expected a whole number as JAX_{name.upper()}, got '{text}'")
-        told[name] = None if text is None else int(text)
+        given[name] = None if text is None else int(text)
     try:
         jax.distributed.initialize(
-            **told, heartbeat_timeout_seconds=_HEARTBEAT, shutdown_timeout_seconds=_PATIENCE
+            **given, heartbeat_timeout_seconds=_HEARTBEAT, shutdown_timeout_seconds=_PATIENCE
         )
         jax.local_devices()  # all processes tell each other what they have: none may leave it out
     except (ValueError, TypeError, RuntimeError) as error:

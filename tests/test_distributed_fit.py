@@ -62,7 +62,7 @@ def in_threads(monkeypatch):
 @pytest.mark.parametrize("count", range(1, 8))
 def test_a_tree_merges_neighbours(count, in_threads):
     def work(group):
-        told = group.told({"a": np.array([7.0])} if group.first else None)
+        told = group.broadcast({"a": np.array([7.0])} if group.first else None)
         own = {"own": np.array([group.share.index])}
         found = group.folded(own, lambda a, b: {"own": np.append(a["own"], b["own"])})
         return told["a"].item(), found["own"].tolist(), group.sent
@@ -124,7 +124,7 @@ def refitted(group, pairs, held, fit):
     own = [pairs.take(group.share.of(PAIRS, 1))]
     if group.first:
         return refit(fit, own, held, group=group)
-    return help_refit(group.told(), own, group)
+    return help_refit(group.broadcast(), own, group)
 
 
 @pytest.mark.parametrize("learns", ["map", "hamiltonian"])

@@ -59,8 +59,8 @@ def network_field(sequences: Sequences, hidden: tuple[int, ...], key) -> tuple[C
 
     def field(params, z):
         dtype = jax.tree.leaves(params)[0].dtype
-        seen = inputs.network_inputs(z).astype(dtype)
-        return jnp.asarray(unit, dtype) * net(dtype).apply({"params": params}, seen)
+        entries = inputs.network_inputs(z).astype(dtype)
+        return jnp.asarray(unit, dtype) * net(dtype).apply({"params": params}, entries)
 
     params = initial(inputs.num_inputs, hidden, z.shape[1], ACTIVATION, jnp.float32, key)
     return field, params

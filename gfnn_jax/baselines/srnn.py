@@ -44,10 +44,10 @@ def srnn(sequences: Sequences, budget: Budget) -> Learned:
     def family(columns):
         """Make a scalar network of these columns of z alone."""
         others = tuple(i for i in range(2 * dim) if i not in columns)
-        seen = list(columns)
+        chosen = list(columns)
         return Mlp(
             box_inputs(z, angles=q_angles(sequences), cyclic=others), HIDDEN, ACTIVATION,
-            amplitude_of(z[:, seen], gradient[:, seen]),
+            amplitude_of(z[:, chosen], gradient[:, chosen]),
         )  # fmt: skip
 
     if sequences.separable:

@@ -98,7 +98,7 @@ def open_csv(path: Path, stream, dt, initial: bool, driven: bool) -> Source:
     with_time = "t" in names and (driven or not initial)
 
     def blocks(rows: int) -> Iterator[Block]:
-        seen: set[float] = set()
+        earlier: set[float] = set()
         last, count = np.full(2, np.nan), 0  # sequence and time of the row before; its place
         for table, lines in _cut(itertools.chain([first], tables), rows):
             if each_row:
@@ -107,12 +107,12 @@ def open_csv(path: Path, stream, dt, initial: bool, driven: bool) -> Source:
                 sequence = table[:, names.index("sequence")]
                 changes = np.flatnonzero(np.append(last[0], sequence[:-1]) != sequence)
                 for row in changes:
-                    if sequence[row] in seen or not np.isfinite(sequence[row]):
+                    if sequence[row] in earlier or not np.isfinite(sequence[row]):
                         raise InputError(
                             f"{path}: line {lines[row]}: the rows of sequence {sequence[row]:g} "
                             "must stand together"
                         )
-                    seen.add(float(sequence[row]))
+                    earlier.add(float(sequence[row]))
             else:
                 sequence = np.zeros(len(table))
             time = table[:, names.index("t")] if with_time else np.zeros(len(table))

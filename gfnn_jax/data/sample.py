@@ -51,7 +51,7 @@ def read_sample(
         found = _smallest(_both(found, new), num_pairs)
     told = {"count": [count], "hash": checksum, "low": [seen[0]], "high": [seen[1]]}
     all_told = group.folded({n: np.array(v) for n, v in told.items()}, _both)
-    total = group.told({"count": all_told["count"].sum()} if group.first else None)["count"]
+    total = group.broadcast({"count": all_told["count"].sum()} if group.first else None)["count"]
     if not total:
         raise InputError(f"{named(paths)}: no pair of consecutive states found")
     if group.share.count > 1:  # those that the first will want, and a few more

@@ -26,12 +26,12 @@ def summary(data: TrajectoryData) -> list[str]:
     dt = np.asarray(data.dt)
     every = f"{dt:g}" if dt.ndim == 0 else f"{dt.min():g} to {dt.max():g}"
     sampled = "" if data.sampled is None else f" (a sample of {data.sampled})"
-    told = [f"{data.num_pairs} pairs{sampled}, d = {data.dim}, dt = {every}"]
+    parts = [f"{data.num_pairs} pairs{sampled}, d = {data.dim}, dt = {every}"]
     if data.sampled is None:  # the pairs of a sample stand alone
-        told.append(f"sequences: {len(lengths)}, each of {of} states")
+        parts.append(f"sequences: {len(lengths)}, each of {of} states")
     if dt.ndim:
-        told.append(f"gaps: {np.count_nonzero(dt > longest_step(dt))}")
-    lines = ["; ".join([*told, f"copies: {copies}"])]
+        parts.append(f"gaps: {np.count_nonzero(dt > longest_step(dt))}")
+    lines = ["; ".join([*parts, f"copies: {copies}"])]
     move = np.sqrt(np.mean((pairs.z1 - pairs.z0) ** 2, axis=0))
     low, high = data.states.min(axis=0), data.states.max(axis=0)
     names = [f"{letter}{i + 1}" for letter in "qp" for i in range(data.dim)]

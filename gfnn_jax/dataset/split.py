@@ -120,8 +120,8 @@ def correlation_time(pairs: Pairs, goes_on: np.ndarray) -> int:
 def outermost(y: np.ndarray, free: tuple[int, ...] = ()) -> np.ndarray:
     """Mark the outermost twentieth of the states y (N, 2d), (N,) bool, by Mahalanobis'
     distance. free: coordinates that do not count, as angles that cover their circle."""
-    seen = y[:, [i for i in range(y.shape[1]) if i not in free]]
-    centred = seen - seen.mean(axis=0)
+    counted = y[:, [i for i in range(y.shape[1]) if i not in free]]
+    centred = counted - counted.mean(axis=0)
     inverse = np.linalg.pinv(centred.T @ centred, rcond=1e-12, hermitian=True)
     distance = np.sum((centred @ inverse) * centred, axis=1)
     return distance > np.quantile(distance, 1 - _OUTSIDE)

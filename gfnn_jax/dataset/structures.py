@@ -103,14 +103,14 @@ class Sites:
         fields = range(1, self.fields + 1)
         alone = tuple(f"{x}{k}" for x in own for k in fields)
         bonds = () if self.angles else tuple(f"q{k + self.fields} - q{k}" for k in fields)
-        seen = tuple(
+        parts = tuple(
             Part(
                 Terms((k + 1) * self.fields, names, _units(len(names))),
                 Windows(ends, k, self.fields),
             )
             for k, names in enumerate((alone, bonds)) if names
         )  # fmt: skip
-        return ranges_of(Sums(dim, seen), z)
+        return ranges_of(Sums(dim, parts), z)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -140,12 +140,14 @@ def _same_phase(t0: np.ndarray, period: float) -> bool:
 
 
 def _one_phase(t0: float, dt: float, period: float) -> str:
-    told = f"all pairs begin at the phase t = {t0:g} of the drive: the map from there is learned"
+    message = f"all pairs begin at the phase t = {t0:g} of the drive: the map from there is learned"
     turns = dt / period
     if abs(turns - round(turns)) <= _SAME * max(turns, 1.0) and round(turns) > 0:
-        return f"{told}, that of {round(turns)} whole period{'s' * (round(turns) > 1)} of the drive"
+        return (
+            f"{message}, that of {round(turns)} whole period{'s' * (round(turns) > 1)} of the drive"
+        )
     return (
-        f"{told}. A second step begins at another phase, for dt = {dt:g} is no whole number of "
+        f"{message}. A second step begins at another phase, for dt = {dt:g} is no whole number of "
         "periods: do not iterate this map. Sample pairs at several phases (t0)"
     )
 

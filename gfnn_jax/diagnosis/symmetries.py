@@ -95,11 +95,11 @@ def _reflected(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPai
     low, high = middle[train].min(axis=0)[plain], middle[train].max(axis=0)[plain]
     for text, matrix in reflections(data.dim, angles):
         there = middle[held] @ matrix.T
-        seen = ((there[:, plain] >= low) & (there[:, plain] <= high)).all(axis=1)
-        if np.mean(seen) < _SEEN:
+        inside = ((there[:, plain] >= low) & (there[:, plain] <= high)).all(axis=1)
+        if np.mean(inside) < _SEEN:
             continue
-        own = missed(middle[held][seen], gradient[held][seen])
-        left = missed(there[seen], gradient[held][seen] @ matrix.T)
+        own = missed(middle[held][inside], gradient[held][inside])
+        left = missed(there[inside], gradient[held][inside] @ matrix.T)
         if own <= _FITTED and left <= _AS_WELL * own:
             yield SymmetryOfPairs(text, left)
 

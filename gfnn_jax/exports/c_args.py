@@ -86,19 +86,19 @@ def inside_ranges(map_: SymplecticMap) -> list[str]:
 
 def about_args(map_: SymplecticMap, name: str) -> str:
     """Write what the comment at the top says about the args."""
-    told, parameters = "", map_.parameters
+    comment, parameters = "", map_.parameters
     if parameters is not None:
         ranges = ", ".join(
             f"{n} from {low:.6g} to {high:.6g}"
             for n, low, high in zip(parameters.names, parameters.low, parameters.high, strict=True)
         )
-        told = f"\n   args = ({', '.join(parameters.names)}), in the data {ranges}."
+        comment = f"\n   args = ({', '.join(parameters.names)}), in the data {ranges}."
         if parameters.period is not None:
-            told += (
+            comment += (
                 f"\n   {parameters.names[-1]}: the time of the drive at z, of the step and of its "
                 f"inverse; period {float(parameters.period):.6g}."
             )
-    return told if map_.signals is None else told + _about_inputs(map_, name)
+    return comment if map_.signals is None else comment + _about_inputs(map_, name)
 
 
 def _about_inputs(map_: SymplecticMap, name: str) -> str:

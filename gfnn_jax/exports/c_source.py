@@ -149,7 +149,7 @@ def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     turned = f" {', '.join(angles)}: period 2 pi, any number of turns." if angles else ""
     given = about_args(map_, name)
     outside = "z or args are" if map_.parameters is not None else "z lies"
-    told = "\n".join(
+    comment = "\n".join(
         f"   {key}: {value:.3g}" if isinstance(value, float) else f"   {key}: {value}"
         for key, value in about.items()
     )
@@ -169,6 +169,6 @@ def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
    cc -O3 -std=c99 -c {name}.c, and -lm for the linker. No -ffast-math: it takes away the tests for
    numbers that are not finite. Nothing is allocated or remembered: threads may call at once.
 
-{told}
+{comment}
 """
     return f"/*{text.replace('*/', '* /')}*/\n"

@@ -86,7 +86,7 @@ def _about(folder: Path | None) -> dict[str, Any]:
     fit = record.get("fit")
     relative = not isinstance(fit, Mapping) or fit.get("tolerance_is_relative", True)
     unit = "relative to each coordinate's spread" if relative else "in the data's units"
-    for part, key, told in (
+    for part, key, title in (
         ("data", "source", "data"),
         ("data", "units", "units"),
         ("fit", "tolerance", f"tolerance asked for, {unit}"),
@@ -95,5 +95,5 @@ def _about(folder: Path | None) -> dict[str, Any]:
     ):
         inside = record.get(part)
         if isinstance(inside, Mapping) and inside.get(key) not in (None, {}):
-            about[told] = inside[key]
+            about[title] = inside[key]
     return about

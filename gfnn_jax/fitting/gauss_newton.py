@@ -183,13 +183,13 @@ class Problem:
 
     def _parts(self, blocks, family, steps: Steps):
         """The blocks, spent, in lists of as many rows as make the merging of two lists cheap."""
-        least, part, seen = self.options.part_rows * (family.num_parameters + 1), [], 0
+        least, part, gathered = self.options.part_rows * (family.num_parameters + 1), [], 0
         for block in blocks:
             part.append(self._paid(block, family, steps, family))
-            seen += len(block) * self.z0.shape[1]
-            if seen >= least:
+            gathered += len(block) * self.z0.shape[1]
+            if gathered >= least:
                 yield part
-                part, seen = [], 0
+                part, gathered = [], 0
         if part:
             yield part
 
@@ -284,7 +284,7 @@ class Problem:
         scale, and the error up to which a row counts as resolved among them."""
         size = np.abs(self.residuals(family, c, steps, rows)).max(axis=1, initial=0.0)
 
-        def own_error(block) -> np.ndarray:
+        def truncation_error(block) -> np.ndarray:
             dt, args = self.given(block)
             return truncation(
                 family, c, self.z0[block], dt, steps, args=args, scale=self.scale,
@@ -293,10 +293,10 @@ class Problem:
 
         if row_blocks.devices() and len(rows):
             blocks = self._blocks(rows, 0, matrix_free(family))
-            found = row_blocks.each(lambda block, device: own_error(block), blocks)
+            found = row_blocks.each(lambda block, device: truncation_error(block), blocks)
             off = np.concatenate(found)
         else:
-            off = own_error(rows)
+            off = truncation_error(rows)
         off = np.abs(off / self.scale).max(axis=1, initial=0.0)
         known = np.isfinite(size) & np.isfinite(off)
         if not known.any():

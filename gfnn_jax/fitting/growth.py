@@ -102,7 +102,7 @@ def grow(
             resolved = min(best.rms, 1.0)
             family, c = basis.terms(list(present)), np.array(list(present.values()))
             (steps,) = problem.fine_steps(family, c, some, (_RESOLVED * resolved,))
-        looked = _Look(problem, basis, present, steps, some)
+        looked = _Linearised(problem, basis, present, steps, some)
         if not looked.rms <= _WORSE * best.rms:
             present = {m: 0.5 * (before.get(m, 0.0) + present.get(m, 0.0))
                        for m in before | present}  # fmt: skip
@@ -154,7 +154,7 @@ def _box(basis: Modes, z, pairs: int, options: Options) -> list[Mode]:
     return [modes[j] for j in kept]
 
 
-class _Look:
+class _Linearised:
     """The linearised problem of the present modes at their coefficients, on the pairs whose flow
     can be computed."""
 

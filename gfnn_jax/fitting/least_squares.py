@@ -76,16 +76,16 @@ def reduce(
     Raises FitError where a term's gradient or a target is not finite.
     """
 
-    def told(parts: Iterator[Any]) -> Iterator[Any]:
+    def reporting(parts: Iterator[Any]) -> Iterator[Any]:
         for part in parts:
             if on_block is not None:
                 on_block()
             yield part
 
     if row_blocks.devices():
-        found = _on_devices(family, rows, weight, told)
+        found = _on_devices(family, rows, weight, reporting)
     else:
-        found = _of_parts(family, told(_blocks(rows, family.num_parameters)), weight)
+        found = _of_parts(family, reporting(_blocks(rows, family.num_parameters)), weight)
     if not found.finite:
         raise FitError("expected finite gradients of all terms and finite targets on the pairs")
     return found
@@ -106,7 +106,7 @@ def _of_parts(family: Any, parts: Iterable[Sequence[Any]], weight) -> Triangle:
     return Triangle.of_blocks(rows(), m)
 
 
-def _on_devices(family: Any, rows, weight, told: Callable[[Iterator], Iterator]) -> Triangle:
+def _on_devices(family: Any, rows, weight, reporting: Callable[[Iterator], Iterator]) -> Triangle:
     """The triangle of rows that are shared out among devices."""
     m = family.num_parameters
     on_host = row_blocks.devices()[0].platform == "cpu" or not accelerated.takes(family)
@@ -124,7 +124,7 @@ def _on_devices(family: Any, rows, weight, told: Callable[[Iterator], Iterator])
         factor = accelerated.merged(one.factor, other.factor, device)
         return Triangle(factor, one.rows + other.rows)
 
-    found = row_blocks.tree(of_part, told(_blocks(rows, m, least)), of_both)
+    found = row_blocks.tree(of_part, reporting(_blocks(rows, m, least)), of_both)
     return Triangle.empty(m) if found is None else found
 
 

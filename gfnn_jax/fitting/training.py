@@ -73,7 +73,7 @@ class Limits(NamedTuple):
     block: Callable[[int], AbstractContextManager]
     target_rms: float
     patience: int
-    told: tuple[Callable[[LMState], Any] | None, ...]
+    reports: tuple[Callable[[LMState], Any] | None, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +115,7 @@ class _Training:
         train_rms, held_rms = math.sqrt(loss / self.size), self.validation_rms(theta)
         seconds = time.perf_counter() - self.started
         state = _next_state(self.state, theta, damping, train_rms, held_rms, seconds)
-        for report in self.options.told:
+        for report in self.options.reports:
             if report is not None:
                 report(state)
         further = dataclasses.replace(self, state=state)

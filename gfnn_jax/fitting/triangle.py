@@ -201,8 +201,8 @@ class Spectrum:
     @property
     def residual_norm(self) -> float:
         """‖A c − b‖ of the plain solution, to half of the digits of ‖b‖."""
-        told = np.sum(self.along[self.known] ** 2)
-        return float(np.sqrt(max(np.sum(self.b**2) - told, 0.0) + self.rest**2))
+        explained = np.sum(self.along[self.known] ** 2)
+        return float(np.sqrt(max(np.sum(self.b**2) - explained, 0.0) + self.rest**2))
 
     @cached_property
     def inverse(self) -> np.ndarray:

@@ -73,11 +73,11 @@ def root(
     columns scaled to one, are 0, as in the solution.
     """
     spectrum = train.spectrum(size)
-    along, told = spectrum.root(ridge), max(spectrum.degrees_of_freedom(ridge), 1.0)
+    along, degrees = spectrum.root(ridge), max(spectrum.degrees_of_freedom(ridge), 1.0)
     leverage = np.minimum(np.sum((sample @ along) ** 2, axis=1), _MOST_LEVERAGE)
     rows = np.linalg.qr((residual / (1 - leverage))[:, None] * sample, mode="r")
     share = 0.0 if noise is None else min(noise, 1.0)
-    misfit = (1 - share) * ALIKE * max(train.rows / told, 1.0)
+    misfit = (1 - share) * ALIKE * max(train.rows / degrees, 1.0)
     of_noise = rows if scores is None else np.linalg.qr(scores, mode="r")
     both = np.concatenate([np.sqrt(share) * of_noise, np.sqrt(misfit) * rows])
     weighted = np.linalg.qr(np.sqrt(train.rows / len(sample)) * both, mode="r")

@@ -83,10 +83,10 @@ def fit(
     reading = time.perf_counter() - started
     if not group.first:
         progress.say("waiting for the map of a sample")
-        told = group.told()
+        task = group.broadcast()
         progress.say("fitting the chosen model to the pairs of this process")
         with failures_of_arithmetic(), row_blocks.on_devices(own):
-            help_refit(told, pairs, group, scene=scene)
+            help_refit(task, pairs, group, scene=scene)
         return None
     for line in summary(trajectories):
         progress.tell(line)
@@ -96,7 +96,7 @@ def fit(
         **asked.deciding,
     }  # fmt: skip
     if already_done(out, job, resume):
-        group.told({})
+        group.broadcast({})
         return None
     with unfinished(out, job, what="fit", overwrite=overwrite, resume=resume) as kept_in:
         try:
@@ -116,10 +116,10 @@ def fit(
                                 scene=scene, group=group,
                             )  # fmt: skip
                 except OutOfTime:
-                    group.told({})
+                    group.broadcast({})
                     fitted = not_refitted(fitted, f"no time, it would take about {seconds:.2g} s")
             else:
-                group.told({})
+                group.broadcast({})
                 fitted = not_refitted(fitted, why_not(fitted.map)) if large else fitted
             progress.say("the report: the posterior, and the derivative of a step")
             fitted = fitted.settled()
@@ -136,8 +136,8 @@ def fit(
                 },
             )  # fmt: skip
         except KeyboardInterrupt as stop:
-            if told := publish(kept_in / BEST, out):
-                stop.add_note(told)
+            if note := publish(kept_in / BEST, out):
+                stop.add_note(note)
             raise
         with atomic_folder(out) as folder:
             write(folder, folder, fitted, result, job)

@@ -39,13 +39,13 @@ def learn_and_roll(
 
     cap: most operations of training, counted.
     """
-    told = Progress(
+    headed = Progress(
         lambda line: progress.say(f"{TITLES[method]}: {line}"),
         lambda line: progress.tell(f"{TITLES[method]}: {line}"),
     )
     if method == OURS:
-        return _ours(data, told)
-    budget = Budget(data.key(list(TITLES).index(method) + 100), cap, told.say)
+        return _ours(data, headed)
+    budget = Budget(data.key(list(TITLES).index(method) + 100), cap, headed.say)
     if method == PAPER_GFNN:
         return _papers(data, budget)
     return _baseline(method, data, budget)

@@ -142,14 +142,14 @@ def fit(
         data = data.divided(options.seed)
         for asked, same in structures_to_try(request, data):
             request, data = asked, same
-            seen = diagnose_request(request, data)
-            warn(seen.messages)
-            if seen.damping is not None:
-                on_progress(str(seen.damping))
-            found = searched(request, data, seen, on_better)
+            diagnosis = diagnose_request(request, data)
+            warn(diagnosis.messages)
+            if diagnosis.damping is not None:
+                on_progress(str(diagnosis.damping))
+            found = searched(request, data, diagnosis, on_better)
             if found.met_by_law:
                 break
-        seen, found, about_pairs = without_gross_errors(request, seen, found)
+        diagnosis, found, about_pairs = without_gross_errors(request, diagnosis, found)
         warn(about_pairs)
         found = without_bias(found, request)
         data = found.data
@@ -159,7 +159,7 @@ def fit(
         chosen, stated_by = with_test_rows(chosen, error, found, budget)
         conclusion = conclude(chosen, found, request)
         warn([*conclusion.messages, *filter(None, [error.few])])
-    damping = seen.damping if chosen.candidate.learns == "map" else None
+    damping = diagnosis.damping if chosen.candidate.learns == "map" else None
     if damping is not None:  # a fact, not a warning
         messages.append(damping.told(data.dt))
     judged = min(_JUDGED, block_of(2 * data.dim))
@@ -171,7 +171,7 @@ def fit(
         num_pairs=len(data),
         validation_pairs=data.pairs.take(data.validation),
         judgements=found.charts.judgements,
-        data_defect=seen.data_defect,
+        data_defect=diagnosis.data_defect,
         base_map=bool(chosen.data.before or chosen.data.after),
         hamiltonian=found.law,
         noise=conclusion.noise,

@@ -64,12 +64,12 @@ _WHAT = "the search for pairs that the map misses by far"
 class Cleaned(NamedTuple):
     """The diagnosis and the search without gross errors, and what is to be said of those."""
 
-    seen: Diagnosis
+    diagnosis: Diagnosis
     found: Searched
     messages: list[str]
 
 
-def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> Cleaned:
+def without_gross_errors(request: Request, diagnosis: Diagnosis, found: Searched) -> Cleaned:
     """Searched again without gross errors, as long as that lowers what is left over of the others,
     or without states that the map cannot follow, where the others then meet the tolerance; as it
     is, where the tolerance is met, there are none, or too many."""
@@ -104,8 +104,8 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
         at_rim = _at_the_rim(found, rows)
         request.say(f"without {gone} of {count} pairs that the map misses by far")
         data = found.data.take(others)
-        diagnosis = diagnose_request(request, data)
-        again = searched(request, data, diagnosis, None)
+        anew = diagnose_request(request, data)
+        again = searched(request, data, anew, None)
         left = _residuals(again)
         if left is not None:
             with request.budget.free(FLOW, left.work):
@@ -116,7 +116,7 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
             break
         named = found.data.row[rows]
         wrong, rim = (wrong, np.append(rim, named)) if at_rim else (np.append(wrong, named), rim)
-        seen, found = diagnosis, again
+        diagnosis, found = anew, again
     messages = []
     if len(wrong):
         messages.append(
@@ -129,7 +129,7 @@ def without_gross_errors(request: Request, seen: Diagnosis, found: Searched) -> 
             f"{_named(rim, count)} lie at the edge of the data, where S cannot follow them: the "
             "map is fitted, and its error stated, without them"
         )
-    return Cleaned(seen, found, messages)
+    return Cleaned(diagnosis, found, messages)
 
 
 def _named(rows: np.ndarray, count: int) -> str:

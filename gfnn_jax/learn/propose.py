@@ -37,8 +37,8 @@ def proposed(data: Dataset) -> list[str]:
 def structures_to_try(request: Request, data: Dataset) -> Iterator[tuple[Request, Dataset]]:
     """The request and its data: with the structure that explains nearly all of a sample, where a
     law is looked for and nothing is told of it; then as they are."""
-    told = request.options.terms or request.scene is not None or data.structure is not None
-    if request.seeks_law and not (told or request.of_network):
+    named = request.options.terms or request.scene is not None or data.structure is not None
+    if request.seeks_law and not (named or request.of_network):
         best, left = _best(data)
         if left < _TRIED:
             structure = structure_of(best, data.dim, data.coordinates)

@@ -114,7 +114,9 @@ def refit(
         worker.task["held"] = _states_of(apart)
         worker.task |= worker.resolving(held)
         bare = dataclasses.replace(old.map, posterior=None)
-        group.told({**packed(bare, scene), **{_OF_TASK + n: v for n, v in worker.task.items()}})
+        group.broadcast(
+            {**packed(bare, scene), **{_OF_TASK + n: v for n, v in worker.task.items()}}
+        )
         found = worker.solved(chunks, held, group)
         if found.outliers:
             warn(
@@ -139,7 +141,7 @@ def refit(
             chosen = dataclasses.replace(candidate, map=found.map, train_rms=found.train_rms)
             num_pairs = found.count
     else:
-        group.told({})
+        group.broadcast({})
     if chosen is None or not after <= _NO_WORSE * before:
         found_map = "no map" if chosen is None else f"a worse map (RMS error {after:.2e})"
         warn(
@@ -165,22 +167,22 @@ def _states_of(parts: Sequence[Pairs]) -> np.ndarray:
 
 
 def help_refit(
-    told: dict[str, Any], chunks: Iterable[Pairs], group: Group, *, scene: Scene | None = None
+    opening: dict[str, Any], chunks: Iterable[Pairs], group: Group, *, scene: Scene | None = None
 ) -> int:
     """The part of another process than the first in `refit`: how many pairs it has given.
 
-    told: what `refit` says to begin with; empty where there is nothing to be done. chunks: of the
+    opening: what `refit` broadcasts first; empty where there is nothing to be done. chunks: of the
     pairs that are this process's own.
     """
-    if not told:
+    if not opening:
         return 0
-    task = {n.removeprefix(_OF_TASK): v for n, v in told.items() if n.startswith(_OF_TASK)}
-    rest = {n: v for n, v in told.items() if not n.startswith(_OF_TASK)}
+    task = {n.removeprefix(_OF_TASK): v for n, v in opening.items() if n.startswith(_OF_TASK)}
+    rest = {n: v for n, v in opening.items() if not n.startswith(_OF_TASK)}
     worker = RowsOfRefit(jax.device_put(unpacked(rest, scene)), task)
-    own = worker.answer(chunks, group.told())
+    own = worker.answer(chunks, group.broadcast())
     while True:
         group.folded(own, worker.merged)
-        wanted = group.told()
+        wanted = group.broadcast()
         if not wanted:
             return int(own["count"])
         own = worker.answer(chunks, wanted)

@@ -161,7 +161,7 @@ class RowsOfRefit:
         counts: dict[str, Any] = {}
 
         def asked(c=()) -> dict[str, Any]:
-            wanted = group.told({"c": np.asarray(c)})
+            wanted = group.broadcast({"c": np.asarray(c)})
             found = group.folded(self.answer(chunks, wanted), self.merged)
             counts.update({n: int(found[n]) for n in _COUNTED})
             return found
@@ -181,7 +181,7 @@ class RowsOfRefit:
             if rows:
                 law = gauss_newton.summarised(c, found, None, made, self._steps)
                 coefficients, train_rms = law.coefficients, law.rms
-        group.told({})
+        group.broadcast({})
         if not rows:
             return _Solved(None, np.inf, None, **counts)
         params = jax.device_put(self.piece.family.unflatten(coefficients))

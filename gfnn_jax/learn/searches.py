@@ -63,19 +63,19 @@ class Searched(NamedTuple):
 
 
 def searched(
-    request: Request, data: Dataset, seen: Diagnosis, on_better: OnBetter | None
+    request: Request, data: Dataset, diagnosis: Diagnosis, on_better: OnBetter | None
 ) -> Searched:
     """Every candidate. Raises FitError where there is none."""
     tolerance, budget, say, tell = request.tolerance, request.budget, request.say, request.tell
-    options, scene, charts = request.options, request.scene, seen.charts
+    options, scene, charts = request.options, request.scene, diagnosis.charts
     better = _Better(on_better) if on_better is not None else None
     given = tolerance.bound, budget, say, tell, better
     # Small sizes first: a map is then there, however long the search for H.
     early = not _of_terms(data) or options.model is not None
-    climb = Search(_sweeps(request, data, seen) if early else [], *given)
+    climb = Search(_sweeps(request, data, diagnosis) if early else [], *given)
     climb.climb(most=_SMALL)
     # H with friction that depends on args is not learned.
-    lossy_by_args = seen.damping is not None and data.args is not None
+    lossy_by_args = diagnosis.damping is not None and data.args is not None
     law = None
     if not lossy_by_args:
         law = _law(request, data, better, MAX_COST_RATIO * climb.cheapest)
@@ -84,24 +84,24 @@ def searched(
     wanted = not early and options.learn != "hamiltonian" and not met_by_law
     if wanted and options.family == "auto":
         try:
-            of_terms = map_of(seen.data, tolerance, scene, options.chart, law, budget, say)
+            of_terms = map_of(diagnosis.data, tolerance, scene, options.chart, law, budget, say)
             if of_terms is not None and law is not None and _no_better(of_terms, law, tolerance):
                 of_terms = None
         except FitError as error:
             failed = error
     if wanted and data.args is not None and not _met(of_terms, tolerance):
         try:
-            seen = diagnosed(seen.data, options.chart, request.reversor, options.seed)
+            diagnosis = diagnosed(diagnosis.data, options.chart, request.reversor, options.seed)
         except FitError as error:
             failed = failed or error
-        charts = seen.charts
+        charts = diagnosis.charts
     if not early:
-        climb = Search(_sweeps(request, data, seen), *given)
+        climb = Search(_sweeps(request, data, diagnosis), *given)
     dearest = law.candidate.operations if law is not None and met_by_law else np.inf
     climb.climb(dearest)
     found = climb.found()
     dearest /= MAX_COST_RATIO  # of maps that would be chosen
-    lossy = seen.damping is not None or (law is not None and bool(law.friction))
+    lossy = diagnosis.damping is not None or (law is not None and bool(law.friction))
     if data.varied or lossy:  # pairs of H's flow are drawn, and factored out, at one dt
         pass
     elif (
@@ -127,7 +127,7 @@ def searched(
     best = min((c.validation_bound for c in known), default=np.inf)
     linear = None
     if budget.over and best > tolerance.bound:
-        linear = linear_map(seen.plain, tolerance)
+        linear = linear_map(diagnosis.plain, tolerance)
         if linear is not None and linear.validation_bound < best:
             tell(linear)
         elif known:
@@ -183,10 +183,10 @@ def _law(
     return law
 
 
-def _sweeps(request: Request, taken: Dataset, seen: Diagnosis) -> list[Any]:
+def _sweeps(request: Request, taken: Dataset, diagnosis: Diagnosis) -> list[Any]:
     """The sweeps of S over the charts that cover the data; none where H alone is learned, or the
     pairs are driven, or differ in dt and in parameters too."""
-    charts, data, tolerance = seen.charts.charts, seen.data, request.tolerance
+    charts, data, tolerance = diagnosis.charts.charts, diagnosis.data, request.tolerance
     options = request.options
     if options.model is not None:
         return [ModelSweep(options.model, taken, tolerance)]

@@ -99,7 +99,7 @@ class Search:
         self._beaten, self._stalled = [0] * len(sweeps), [0] * len(sweeps)
         self._left: set[int] = set()
         # (order, bound) of the estimates
-        self._seen: list[list[tuple[float, float]]] = [[] for _ in sweeps]
+        self._errors: list[list[tuple[float, float]]] = [[] for _ in sweeps]
         self._cheapest, self._kept, self._unfinished = np.inf, np.inf, False
 
     def climb(self, dearest: float = np.inf, most: float = np.inf) -> None:
@@ -149,8 +149,8 @@ class Search:
         self._beaten[i] += any(_beats(e.candidate, judged) for e in self._entries)
         if self._stalled[i] == _STALLED or self._beaten[i] == _BEATEN:
             self._left.add(i)
-        self._seen[i].append((size.order, judged.validation_bound))
-        self._left |= _hopeless(self.sweeps, self._seen, self._ratios, self._left, self._bound)
+        self._errors[i].append((size.order, judged.validation_bound))
+        self._left |= _hopeless(self.sweeps, self._errors, self._ratios, self._left, self._bound)
 
     def _validated(self, entry: Entry) -> Entry:
         """The entry with its error measured by steps, in its place among the others."""
@@ -185,7 +185,7 @@ class Search:
         ended = MET
         if not met:
             ended = self._budget.ended if self._unfinished else _why(sweeps, stalled, self._best)
-            ended += _promised(sweeps, self._seen, self._ratios, stalled, self._bound)
+            ended += _promised(sweeps, self._errors, self._ratios, stalled, self._bound)
         return Found(entries, _ranking(entries, self._bound), _stalled_sweeps(entries), ended)
 
     def _validate_the_best(self) -> None:
@@ -210,21 +210,23 @@ def _known(ratio: float) -> float:
     return 1.0 if ratio == 1.0 / _CALIBRATED else ratio
 
 
-def _decays(seen, ratio: list[float]) -> list[Decay | None]:
+def _decays(errors, ratio: list[float]) -> list[Decay | None]:
     """Extrapolate the errors of each sweep."""
-    return [decay_of([(x, r * e) for x, e in sizes]) for sizes, r in zip(seen, ratio, strict=True)]
+    return [
+        decay_of([(x, r * e) for x, e in sizes]) for sizes, r in zip(errors, ratio, strict=True)
+    ]
 
 
 def _hopeless(
-    sweeps: Sequence[Any], seen, ratio: list[float], left: set[int], bound: float
+    sweeps: Sequence[Any], errors, ratio: list[float], left: set[int], bound: float
 ) -> set[int]:
     """The sweeps whose largest size would miss the bound by far, where another sweep has a smaller
     error already, or has come as far and leads to the bound."""
     ends = {
         i: found.error_at(sweeps[i].sizes[-1].order)
-        for i, found in enumerate(_decays(seen, ratio)) if found is not None
+        for i, found in enumerate(_decays(errors, ratio)) if found is not None
     }  # fmt: skip
-    reached = _reached(seen, ratio)
+    reached = _reached(errors, ratio)
 
     def better(j: int, i: int) -> bool:
         leads = j not in left and ends.get(j, np.inf) <= bound and reached[j] <= reached[i]
@@ -234,19 +236,19 @@ def _hopeless(
     return {i for i in far if any(better(j, i) for j in range(len(sweeps)))}
 
 
-def _reached(seen, ratio: list[float]) -> list[float]:
+def _reached(errors, ratio: list[float]) -> list[float]:
     """The smallest error of each sweep, infinite where none is judged."""
-    return [r * min((e for _, e in s), default=np.inf) for s, r in zip(seen, ratio, strict=True)]
+    return [r * min((e for _, e in s), default=np.inf) for s, r in zip(errors, ratio, strict=True)]
 
 
 def _promised(
-    sweeps: Sequence[Any], seen, ratio: list[float], stalled: Sequence[int], bound: float
+    sweeps: Sequence[Any], errors, ratio: list[float], stalled: Sequence[int], bound: float
 ) -> str:
     """Extrapolation of the most accurate sweep's errors to a size that would meet the bound;
     nothing where they stall, or are too few to say."""
-    reached = _reached(seen, ratio)
+    reached = _reached(errors, ratio)
     i = int(np.argmin(reached)) if reached else 0
-    found = _decays(seen, ratio)[i] if reached else None
+    found = _decays(errors, ratio)[i] if reached else None
     if found is None or stalled[i] == _STALLED:
         return ""
     order = found.order_for(bound)

@@ -203,10 +203,11 @@ def _newton(equation, shared, lanes, state: _Iterate, *, most, settled) -> _Iter
     # The residual's slope along the step at its end; at its beginning it is -state.residual.
     slope = -jnp.sum(matrix * state.step[:, None, :], axis=-1)
     bent = largest(slope + state.residual) / jnp.maximum(largest(slope), merit)
-    told = state.residual + 0.5 * part * (slope - state.residual)
+    on_path = state.residual + 0.5 * part * (slope - state.residual)
     floor = RULES.floor * float(jnp.finfo(x.dtype).eps) * jnp.max(evaluation.size, axis=-1)
     near = (
-        largest(residual - told) <= RULES.off_path * state.factor * merit + RULES.rounding * floor
+        largest(residual - on_path)
+        <= RULES.off_path * state.factor * merit + RULES.rounding * floor
     )
     by_the_path = (bent <= RULES.bent) & near & (sign_here == state.sign)
     settled_here = state.error <= settled

@@ -45,11 +45,11 @@ def unfinished(
         try:
             yield folder
         except BaseException as error:
-            told = unfinished_note(out)
-            if told is None:
+            note = unfinished_note(out)
+            if note is None:
                 _discard(folder)
             if isinstance(error, KeyboardInterrupt):
-                error.add_note(told or f"nothing of the {what} was kept")
+                error.add_note(note or f"nothing of the {what} was kept")
             raise
         _discard(folder)
 

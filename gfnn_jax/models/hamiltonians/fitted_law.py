@@ -10,7 +10,7 @@ from gfnn_jax.dataset.measured_error import OneStepError
 from gfnn_jax.fitting.gauss_newton import FlowFit
 from gfnn_jax.models.hamiltonians.formula import Rival, Term
 from gfnn_jax.models.hamiltonians.fractions import Proposal
-from gfnn_jax.models.hamiltonians.whole_sequences import Whole
+from gfnn_jax.models.hamiltonians.whole_sequences import SequenceFit
 
 
 class Dropped(NamedTuple):
@@ -45,7 +45,7 @@ class FittedLaw(NamedTuple):
     noisy: bool = False
     larger: FittedLaw | None = None
     dropped: Dropped | None = None
-    whole: Whole | None = None
+    whole: SequenceFit | None = None
     constants: tuple[Term, ...] = ()
     symmetries: tuple[str, ...] = ()
     proposals: tuple[Proposal, ...] = ()

@@ -128,7 +128,7 @@ def followed(family, coefficients, data: Dataset, noise: float) -> Smoothed:
     return Smoothed(smoothed, max(substeps, 1), tuple(map(float, widths[dry])))
 
 
-def told_of(
+def kinds_of_friction(
     problem: Problem, family, coefficients, steps: Steps, data: Dataset,
     odds: dict[tuple[int, ...], float],
 ) -> WhichFriction | None:  # fmt: skip

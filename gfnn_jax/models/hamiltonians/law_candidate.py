@@ -34,7 +34,7 @@ from gfnn_jax.models.hamiltonians.formula import Term, formula
 from gfnn_jax.models.hamiltonians.friction_kinds import (
     followed,
     is_smooth,
-    told_of,
+    kinds_of_friction,
     without_turns,
 )
 from gfnn_jax.models.hamiltonians.law_messages import messages, unmet
@@ -120,7 +120,9 @@ def learned_from(
         friction=friction, constants=found.constants, symmetries=symmetries,
         proposals=found.proposals, rivals=found.rivals, widths=widths,
         turns=turns and found.error.bound <= tolerance.bound < error.bound,
-        kinds=partial(told_of, by_row, sharp, fit.coefficients, own_steps, data, found.odds or {}),
+        kinds=partial(
+            kinds_of_friction, by_row, sharp, fit.coefficients, own_steps, data, found.odds or {}
+        ),
     )  # fmt: skip
 
 

@@ -34,8 +34,8 @@ from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
 from gfnn_jax.models.hamiltonians.symmetries import restricted
 from gfnn_jax.models.hamiltonians.whole_sequences import (
     Measured,
+    SequenceFit,
     Sequences,
-    Whole,
     about_outliers,
     lacks_terms,
     noise_of,
@@ -62,7 +62,7 @@ _STEPS = Steps(6, 1)
 _SURE = 40.0  # logarithm of the largest odds that are told
 
 
-class _Told(NamedTuple):
+class _LawOfSequences(NamedTuple):
     """A law as whole sequences tell it, and its description length."""
 
     formula: Formula
@@ -144,20 +144,20 @@ def _chosen(
     held = sequences.arcs(np.sort(data.validation)[:_LOOKED_AT])
     if train is None or held is None:
         return None
-    told: list[_Told] = []
+    laws: list[_LawOfSequences] = []
     for tried, formula in enumerate(_worth(formulas)):
         with contextlib.suppress(np.linalg.LinAlgError, InputError):  # constants have run away
-            found = _told(sequences, train, formula)
-            told += [] if found is None else [found]
-        if tried and not told:  # none of the likeliest two can be followed along its arcs
+            found = _significant(sequences, train, formula)
+            laws += [] if found is None else [found]
+        if tried and not laws:  # none of the likeliest two can be followed along its arcs
             return None
-    if not told:
+    if not laws:
         return None
-    best = min(told, key=lambda law: law.length)
+    best = min(laws, key=lambda law: law.length)
     judged = _fitted(sequences, held, best.formula, best.fitted.p, only_states=True)
     for found in (best.fitted, judged):
         if found is None or not _rms(noise_of(found) / noise) <= _AS_NOISE:
-            for law in sorted(told, key=lambda law: law.length)[:3]:
+            for law in sorted(laws, key=lambda law: law.length)[:3]:
                 left = _rms(noise_of(law.fitted) / noise)
                 partly(PartialLaw(_shown(law), left, "times the noise"))
             return None
@@ -167,13 +167,13 @@ def _chosen(
         again = None if everyone is None else _fitted(sequences, everyone, formula, fitted.p)
         fitted = again or fitted
     found = _law(problem, formula, fitted, data, tolerance)
-    return found._replace(rivals=_rivals(best, told))
+    return found._replace(rivals=_rivals(best, laws))
 
 
-def _rivals(best: _Told, told: list[_Told]) -> tuple[Rival, ...]:
+def _rivals(best: _LawOfSequences, laws: list[_LawOfSequences]) -> tuple[Rival, ...]:
     """The next two laws of least description length, with the odds of the best against them."""
-    others: dict[frozenset, _Told] = {}
-    for law in sorted(told, key=lambda law: law.length):
+    others: dict[frozenset, _LawOfSequences] = {}
+    for law in sorted(laws, key=lambda law: law.length):
         if law.formula.kind != best.formula.kind:
             others.setdefault(law.formula.kind, law)
     return tuple(
@@ -182,7 +182,7 @@ def _rivals(best: _Told, told: list[_Told]) -> tuple[Rival, ...]:
     )
 
 
-def _shown(law: _Told) -> str:
+def _shown(law: _LawOfSequences) -> str:
     """The law as people read it."""
     formula, p = law.formula, law.fitted.p
     terms = len(formula.coefficients)
@@ -210,7 +210,7 @@ def _worth(formulas: list[Formula]) -> list[Formula]:
     return kept[:_FITTED]
 
 
-def _told(sequences: Sequences, arcs: Measured, formula: Formula) -> _Told | None:
+def _significant(sequences: Sequences, arcs: Measured, formula: Formula) -> _LawOfSequences | None:
     """The terms of a law that whole sequences tell from noise, fitted to them."""
     p = np.concatenate([formula.coefficients, formula.constants])
     while True:
@@ -231,7 +231,7 @@ def _told(sequences: Sequences, arcs: Measured, formula: Formula) -> _Told | Non
         np.sum(count * np.log(noise_of(found)))
         + 0.5 * np.log(count.sum()) * len(found.p) + OPTIONS.said * formula.said
     )  # fmt: skip
-    return _Told(formula, found, length)
+    return _LawOfSequences(formula, found, length)
 
 
 def _fitted(
@@ -253,11 +253,11 @@ def _certain(found: Fitted, formula: Formula) -> list[int]:
         columns = kept + [k for j in kept for k in own[j]]
         spectrum = problem.pruned(np.array(columns)).spectrum()
         p = spectrum.solution(spectrum.inverse)
-        told = np.abs(p / (noise * spectrum.deviations()))[: len(kept)]
-        weak = int((told < _CERTAIN).sum())
+        size = np.abs(p / (noise * spectrum.deviations()))[: len(kept)]
+        weak = int((size < _CERTAIN).sum())
         if not weak:
             break
-        gone = np.argsort(told)[: (weak + 1) // 2]
+        gone = np.argsort(size)[: (weak + 1) // 2]
         kept = [j for place, j in enumerate(kept) if place not in gone]
     return kept
 
@@ -284,19 +284,19 @@ def _law(
     family = formula.family(np.array(constants))
     inside = [j for j, places in enumerate(formula.numbers) for _ in places]
     names = [family.term_names[j] for j in inside]
-    told = tuple(map(Term, names, constants, deviations[terms:].tolist()))
+    inner = tuple(map(Term, names, constants, deviations[terms:].tolist()))
     coefficients = map(Term, family.term_names, c.tolist(), deviations.tolist())
-    near = proposals([*coefficients, *told], covariance, len(told))
+    near = proposals([*coefficients, *inner], covariance, len(inner))
     fit = problem.fit(family, c, data.training, rounds=False)
     fit = fit._replace(coefficients=c, standard_errors=deviations[:terms])
-    whole = Whole(
+    whole = SequenceFit(
         tuple(range(terms)), fit, _root_of_coefficients(covariance, terms), noise_of(fitted),
         len(fitted.x), about_outliers(fitted.residuals), lacks_terms(fitted),
     )  # fmt: skip
     error = validation_error(family, fit, data, tolerance)
     return FittedLaw(
         family, fit, data.training, error, (), noisy=True, stalled=True, whole=whole,
-        constants=told, symmetries=known.symmetries, proposals=near,
+        constants=inner, symmetries=known.symmetries, proposals=near,
     )  # fmt: skip
 
 

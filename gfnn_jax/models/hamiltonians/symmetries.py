@@ -76,7 +76,7 @@ def restricted(
     A restriction of r coefficients raises half the misfit by ½χ² and saves ½ r ln(rows). It is the
     linear problem of the least change of p in units of its covariance.
     """
-    terms, told = family.num_parameters, []
+    terms, texts = family.num_parameters, []
     for symmetry in _candidates(family, z[:_STATES], tuple(angles)):
         a = np.zeros((terms, len(p)))
         a[:, :terms] = _independent(symmetry.rows, p[:terms])
@@ -86,7 +86,7 @@ def restricted(
         if np.any(np.abs(a @ p)[known] > _HOLDS * parts[known]) or (~known).sum() == terms:
             continue
         if known.all():
-            told.append(symmetry.text)
+            texts.append(symmetry.text)
             continue
         a = a[~known]
         of_rows = a @ covariance @ a.T
@@ -98,8 +98,8 @@ def restricted(
             continue
         gain = covariance @ a.T @ inverse
         p, covariance = p - gain @ off, covariance - gain @ a @ covariance
-        told.append(symmetry.text)
-    return Restricted(p, covariance, tuple(told))
+        texts.append(symmetry.text)
+    return Restricted(p, covariance, tuple(texts))
 
 
 def _independent(rows: np.ndarray, c: np.ndarray) -> np.ndarray:

@@ -35,7 +35,7 @@ _IN_A_ROW = 2.5  # times the noise: neighbours of a state that stands alone stay
 _BY_CHANCE, _CLEAR = 2.0, 0.5
 
 
-class Whole(NamedTuple):
+class SequenceFit(NamedTuple):
     """kept: places of the family's terms that are left. fit: theirs. root: (k, k), rootᵀ root is
     the coefficients' covariance. noise: (2d,) standard deviation of each coordinate's noise. arcs:
     into which the sequences were cut. messages: about gross errors. misfit: as `lacks_terms`."""
@@ -116,7 +116,7 @@ class Sequences:
 def fitted_to_sequences(
     problem: Problem, family, fit: FlowFit, data: Dataset,
     allowance: Allowance,
-) -> Whole | None:  # fmt: skip
+) -> SequenceFit | None:  # fmt: skip
     """The law of these pairs' fit, fitted to their sequences. None where they are none of one dt in
     plain coordinates, where noise soon grows beyond the linear, or where held-out sequences do not
     bear the law out."""
@@ -153,7 +153,7 @@ def fitted_to_sequences(
         if again is not None:
             found = again
     root = widened * root_of(found)
-    return Whole(
+    return SequenceFit(
         kept,
         fit._replace(coefficients=found.p, standard_errors=np.linalg.norm(root, axis=0)),
         root, noise_of(found), len(found.x), about_outliers(found.residuals), lacks_terms(found),

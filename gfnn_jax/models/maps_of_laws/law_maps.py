@@ -58,17 +58,17 @@ def search_of_law(
         return None
     reversor = scene.reversor if scene else None
     try:
-        seen = diagnosed(data.validating(more), "auto", reversor, seed)
+        diagnosis = diagnosed(data.validating(more), "auto", reversor, seed)
     except FitError:  # drawn ones go further than the user's; the law itself is left
         return None
-    sweeps = list(sweeps_for("auto", seen.charts.charts, seen.data, tolerance, scene))
+    sweeps = list(sweeps_for("auto", diagnosis.charts.charts, diagnosis.data, tolerance, scene))
     found = search(sweeps, tolerance.bound, budget, say, tell, None, dearest)
     if not found.ranking:
         return None
     if found.ranking[0].candidate.validation_bound > tolerance.bound:
         return None
     found = found._replace(ended="the tolerance is met, by a map of pairs drawn from H's flow")
-    return LawMaps(found, seen.charts)
+    return LawMaps(found, diagnosis.charts)
 
 
 def law_explains_most(
@@ -98,12 +98,12 @@ def search_around(
             with budget.unit("what the flow of H leaves over", FLOW, _work(law, len(data))):
                 flows = [flow_of(family, c, data) for family, c in laws]
                 flow, rest = factored_out(flows, data, seed)
-                seen = diagnosed(rest, "auto", scene.reversor if scene else None, seed)
+                diagnosis = diagnosed(rest, "auto", scene.reversor if scene else None, seed)
         except OutOfTime:
             break
         except FitError:
             continue
-        found = _around(flow, seen, data, tolerance, scene, budget, say, tell, better)
+        found = _around(flow, diagnosis, data, tolerance, scene, budget, say, tell, better)
         if found.found.ranking and (
             best is None
             or found.found.ranking[0].candidate.validation_bound
@@ -121,12 +121,12 @@ def _work(law: LearnedHamiltonian, states: int) -> float:
 
 
 def _around(
-    flow: Flow, seen, data: Dataset, tolerance: Tolerance, scene: Scene | None, budget: Budget, say,
-    tell, better,
+    flow: Flow, diagnosis, data: Dataset, tolerance: Tolerance, scene: Scene | None,
+    budget: Budget, say, tell, better,
 ) -> LawMaps:  # fmt: skip
     """The search for S around one flow, whose operations are added to every candidate's."""
     more = flow_operations(flow, data)
-    sweeps = list(sweeps_for("auto", seen.charts.charts, seen.data, tolerance, scene))
+    sweeps = list(sweeps_for("auto", diagnosis.charts.charts, diagnosis.data, tolerance, scene))
     found = search(sweeps, tolerance.bound, budget, say, tell, better)
 
     def dearer(entry: Entry) -> Entry:
@@ -137,7 +137,7 @@ def _around(
         return entry._replace(candidate=candidate)
 
     entries, ranking = ([dearer(e) for e in part] for part in (found.entries, found.ranking))
-    return LawMaps(found._replace(entries=entries, ranking=ranking), seen.charts)
+    return LawMaps(found._replace(entries=entries, ranking=ranking), diagnosis.charts)
 
 
 def strongest(law: LearnedHamiltonian, data: Dataset) -> list[tuple[Terms, np.ndarray]]:

@@ -34,7 +34,7 @@ class Solved(NamedTuple):
     number of these.
 
     All S of this mixed term that the data can tell apart are ``free`` (m,), free motion, plus
-    combinations of the columns of ``told`` (m, n), which are orthonormal. root: (n, m), rootᵀ root
+    combinations of the orthonormal columns of ``determined`` (m, n). root: (n, m), rootᵀ root
     the covariance of the coefficients where what is left of the equations, in units of
     displacements, has standard deviation 1.
     """
@@ -43,7 +43,7 @@ class Solved(NamedTuple):
     rank: int
     condition: float
     free: np.ndarray
-    told: np.ndarray
+    determined: np.ndarray
     root: np.ndarray
 
 
@@ -71,13 +71,13 @@ def solve(family: Any, triples: Triples) -> Solved:
         # The changes of S that leave the mixed term as it is: all but the first column of Q.
         others = np.linalg.qr(np.column_stack([mixed, np.eye(len(mixed))]))[0][:, 1 : len(mixed)]
         u, values, v = np.linalg.svd(triangle @ others, full_matrices=False)
-    told = values > _NULL * values[0]
-    along = u[:, told].T @ (triangle @ free)
-    coefficients = free - others @ (v[told].T @ (along / values[told]))
-    condition = float(values[0] / values[told][-1])
-    directions = others @ v[told].T
-    root = (directions / values[told]).T
-    return Solved(coefficients, 1 + int(told.sum()), condition, free, directions, root)
+    determined = values > _NULL * values[0]
+    along = u[:, determined].T @ (triangle @ free)
+    coefficients = free - others @ (v[determined].T @ (along / values[determined]))
+    condition = float(values[0] / values[determined][-1])
+    directions = others @ v[determined].T
+    root = (directions / values[determined]).T
+    return Solved(coefficients, 1 + int(determined.sum()), condition, free, directions, root)
 
 
 def residuals(family: Any, params: Any, triples: Triples) -> np.ndarray:

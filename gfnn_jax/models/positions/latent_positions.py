@@ -78,13 +78,13 @@ def fit_latent(
     solved: least squares, which starts it and says which S there are. sigma: (d,) the first guess
     of the noise, which becomes that of the residuals.
     """
-    dim, told = triples.dim, solved.told.shape[1]
-    model = PositionArcs(family, triples.dt, family.unflatten(solved.free), solved.told)
-    p = solved.told.T @ (solved.coefficients - solved.free)
+    dim, determined = triples.dim, solved.determined.shape[1]
+    model = PositionArcs(family, triples.dt, family.unflatten(solved.free), solved.determined)
+    p = solved.determined.T @ (solved.coefficients - solved.free)
     x, y = nodes_of(arcs)
     equations = len(arcs) * (arcs.shape[1] - 2) * dim
     # Residuals of readings are smaller than the noise by what the unknowns take of them.
-    left = np.sqrt(arcs.size / max(equations - told, 1))
+    left = np.sqrt(arcs.size / max(equations - determined, 1))
     for _ in range(_SCALES):
         scale = np.tile(sigma, 2)
         with one_thread():
@@ -94,8 +94,8 @@ def fit_latent(
         sigma = sigma * change
         if np.all(np.abs(np.log(change)) < np.log(_SETTLED)):
             break
-    root = np.linalg.pinv(found.triangle).T @ solved.told.T * np.exp(np.mean(np.log(change)))
-    coefficients = solved.free + solved.told @ p
+    root = np.linalg.pinv(found.triangle).T @ solved.determined.T * np.exp(np.mean(np.log(change)))
+    coefficients = solved.free + solved.determined @ p
     return LatentFit(coefficients, root, sigma, equations, found.converged)
 
 

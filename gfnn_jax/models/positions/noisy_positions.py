@@ -44,7 +44,7 @@ def without_noise(
 ) -> Latent | None:  # fmt: skip
     """The S that readings with noise tell; None where latent positions explain arcs that were held
     out no better than least squares, or time ends before the first size."""
-    arcs, judges = arcs_of(training), arcs_of(held_out)
+    arcs, held_out_arcs = arcs_of(training), arcs_of(held_out)
     best: Latent | None = None
     sigma, worse = None, 0
     for family in families:
@@ -69,7 +69,7 @@ def without_noise(
     if best is None:
         return None
     latent, plain = (
-        held_out_cost(best.family, coefficients, held_out, best.fit.sigma, judges)
+        held_out_cost(best.family, coefficients, held_out, best.fit.sigma, held_out_arcs)
         for coefficients in (best.fit.coefficients, best.solved.coefficients)
     )
     gain = latent - plain

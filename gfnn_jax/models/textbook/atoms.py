@@ -183,8 +183,10 @@ def dictionary_of(
     for _ in range(2):  # the second time makes them orthogonal to roundoff
         columns = columns - base @ (base.T @ columns)
     size = np.linalg.norm(columns, axis=0)
-    told = np.flatnonzero(size > _INDEPENDENT)
-    return Dictionary([atoms[kept[i]] for i in told], columns[:, told] / size[told])
+    independent = np.flatnonzero(size > _INDEPENDENT)
+    return Dictionary(
+        [atoms[kept[i]] for i in independent], columns[:, independent] / size[independent]
+    )
 
 
 def blocks_of(arguments: Sequence[Argument], degree: int) -> list[tuple[Atom, ...]]:

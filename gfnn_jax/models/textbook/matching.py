@@ -69,7 +69,7 @@ class Matching:
         """(rows, atoms): the weighted gradients."""
         return np.stack([self._flat(gradient_of(a, self.arguments)) for a in atoms], axis=1)
 
-    def left_over(self, atoms: Sequence[Atom]) -> float:
+    def residual_of(self, atoms: Sequence[Atom]) -> float:
         """The part of the target that base and atoms do not explain."""
         return float(np.linalg.norm(self._residual(atoms)[0])) / self.size
 
@@ -146,7 +146,7 @@ class Matching:
     def refined(self, atoms: tuple[Atom, ...]) -> Match:
         """The match with the inner constants that leave least."""
         inner = [(i, k) for i, atom in enumerate(atoms) for k in range(len(constants_of(atom)))]
-        left = self.left_over(atoms)
+        left = self.residual_of(atoms)
         if not inner:
             return Match(atoms, left)
         start = _AtConstants(self, tuple(inner), Match(atoms, left))
@@ -207,15 +207,15 @@ class Matching:
             both = (a * a + b * b - 2 * gram * a * b) / free
         both = np.where(free > 1e-7, both, 0.0)
         order = np.argsort(-np.triu(both, 1), axis=None)[: 40 * _BRANCHES]
-        seen: set[tuple] = set()
+        kinds: set[tuple] = set()
         for k in order:
             i, j = divmod(int(k), len(top))
             pair = dictionary.atoms[top[i]], dictionary.atoms[top[j]]
             kind = tuple(tuple(f.form for f in atom) for atom in pair)
-            if kind not in seen:
-                seen.add(kind)
+            if kind not in kinds:
+                kinds.add(kind)
                 found.append(pair)
-            if len(seen) == _BRANCHES:
+            if len(kinds) == _BRANCHES:
                 break
         return found
 
@@ -230,8 +230,8 @@ class Matching:
         """(what of the residual lies along each column without what ``own`` spans of it, 0 where
         little of it is left; the length of that). Columns are without the base already."""
         size = np.sqrt(np.maximum(1 - np.sum((own.T @ columns) ** 2, axis=0), 0.0))
-        told = size > _INDEPENDENT
-        return np.where(told, residual @ columns / np.where(told, size, 1.0), 0.0), size
+        large = size > _INDEPENDENT
+        return np.where(large, residual @ columns / np.where(large, size, 1.0), 0.0), size
 
     def moved(self, atoms: tuple[Atom, ...], step: np.ndarray) -> tuple[Atom, ...]:
         """The atoms with their constants a step on. No θ more than doubles, or changes its sign; a
@@ -279,7 +279,7 @@ class _AtConstants:
         rows = np.vstack([slopes, damping * np.eye(len(size))])
         step = np.linalg.lstsq(rows, np.append(residual, np.zeros(len(size))), rcond=1e-12)[0]
         atoms = self.matching.moved(self.match.atoms, step / size)
-        there = Match(atoms, self.matching.left_over(atoms))
+        there = Match(atoms, self.matching.residual_of(atoms))
         return Tried(there, self.match.left - there.left, damping)
 
     def moved(self, there: Match, damping: float) -> tuple[_AtConstants, bool]:
@@ -290,13 +290,13 @@ class _AtConstants:
 
 def _apart(order: np.ndarray, atoms: list[Atom], count: int) -> list[int]:
     """The first of each kind of atom, whatever its constant."""
-    seen: dict[tuple, int] = {}
+    kinds: dict[tuple, int] = {}
     for i in order[: 60 * count]:
         kind = tuple(f.form for f in atoms[i])
-        seen.setdefault(kind, int(i))
-        if len(seen) == count:
+        kinds.setdefault(kind, int(i))
+        if len(kinds) == count:
             break
-    return list(seen.values())
+    return list(kinds.values())
 
 
 def orthonormal(columns: np.ndarray) -> np.ndarray:

@@ -333,7 +333,7 @@ class Textbook:
         for atoms in _shorter(state.match.atoms):
             if weight_of(atoms) >= weight_of(state.match.atoms):
                 continue
-            if matching.left_over(atoms) > _AS_WELL * max(state.match.left, _MATCHED):
+            if matching.residual_of(atoms) > _AS_WELL * max(state.match.left, _MATCHED):
                 continue
             found = self._converged(matching.refined(atoms), state.target)
             if found is not None and found.law.left <= bound:
