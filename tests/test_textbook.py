@@ -313,7 +313,7 @@ def test_a_law_outside_of_the_dictionary_is_no_formula():
 
 def test_a_good_approximation_is_no_formula():
     """cos(q) e^(−q²/10) is of no dictionary; five atoms of others come to 1e-11 of it."""
-    z0 = np.random.default_rng(0).uniform(-1.3, 1.3, (240, 2))
+    z0 = np.random.default_rng(0).uniform(-1.3, 1.3, (160, 2))
 
     def gradient(z):
         q = z[:, :1]
