@@ -119,12 +119,12 @@ def test_noise_leaves_the_six_terms_of_the_law(told_nothing):
 
 def test_bands_hold_the_true_error_of_a_noisy_law(noisy):
     scene, fit = noisy
-    z0 = np.asarray(gfnn.sample_test_states(scene, 50, jax.random.key(9)))
+    z0 = np.asarray(gfnn.sample_test_states(scene, 30, jax.random.key(9)))
     reference = np.asarray(gfnn.reference_trajectories(scene, z0, 100))
-    samples = fit.sample(jax.random.key(1), 50)
+    samples = fit.sample(jax.random.key(1), 30)
     states, info = samples.rollout(z0, 100)
     mean = np.asarray(fit.map.rollout(z0, 100)[0])
-    assert states.shape == (50, 50, 101, 4)
+    assert states.shape == (30, 30, 101, 4)
     assert (np.asarray(info.status) <= 1).all()
     band = 2 * bands(states, mean).std
     for step in (1, 10, 100):

@@ -15,8 +15,13 @@ ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 # What these show is tested always elsewhere: README, tests/test_args.py, tests/test_lattices.py,
 # tests/test_friction.py, tests/test_law_maps.py; charts and families by tests/test_charts.py,
-# tests/test_positions.py, tests/test_monitors.py, tests/test_damping.py; tests/test_bands.py.
-SLOW = ("your-own-data", "args", "many", "friction-and-inputs", "charts-and-families", "bands")
+# tests/test_positions.py, tests/test_monitors.py, tests/test_damping.py; bands by
+# tests/test_bands.py; extending by tests/test_own_models.py; scaling by tests/test_sharded.py and
+# tests/test_fit_on_devices.py.
+SLOW = (
+    "your-own-data", "args", "many", "friction-and-inputs", "charts-and-families", "bands",
+    "extending", "scaling",
+)  # fmt: skip
 sys.path.insert(0, str(ROOT / "benchmarks"))
 INSTALL = ("python3 -m venv ", ".venv/bin/pip install ")
 

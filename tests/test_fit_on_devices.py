@@ -36,7 +36,7 @@ warnings.simplefilter("ignore")
 assert len(jax.devices()) == 4
 pairs = {"map": kicked(3_000), "law": quartic(3_000), "networks": kicked(120)}
 options = {
-    "map": dict(learn="map", chart="midpoint", tolerance=1e-12),
+    "map": dict(learn="map", chart="midpoint", tolerance=1e-8),
     "law": dict(learn="hamiltonian", terms=("p1**2", "q1**4", "q1**2", "p1**4"), tolerance=1e-12),
     "networks": dict(family="mlp", chart="midpoint", ensemble=3, max_iterations=6,
                      max_seconds=None),

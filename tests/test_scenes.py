@@ -228,7 +228,9 @@ def exponents(scene, states):
     return np.asarray(optimised(states)) / LYAPUNOV_TIME
 
 
-LONG = ("henon-heiles-printed", "pcr3bp", "toda", "fput")
+LONG = (
+    "henon-heiles-printed", "henon-heiles-regular", "henon-heiles-chaotic", "pcr3bp", "toda", "fput"
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(
