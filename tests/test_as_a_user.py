@@ -11,8 +11,8 @@ import as_a_user as benchmark
 
 # Cases of a second or two; the others take up to their budget of two minutes, or are much alike.
 SHORT = {
-    "single-orbit", "twenty-pairs", "friction", "degrees", "wrapped-angle", "noise-pendulum-1e-04",
-    "copies", *benchmark.REFUSED,
+    "single-orbit", "twenty-pairs", "friction", "degrees", "wrapped-angle", "copies",
+    *benchmark.REFUSED,
 }  # fmt: skip
 
 
