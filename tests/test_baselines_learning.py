@@ -17,6 +17,7 @@ from gfnn_jax.scenes import henon_heiles, standard_map
 from gfnn_jax.scenes.trajectories import flow_step, reference_trajectories, sample_sequences
 
 RECIPE = Recipe(batch_size=50, epochs=2, epoch_length=3, rate=1e-2, schedule="cosine")
+LONGER = ("srnn-5", "onet-5")  # as srnn-2 and onet-2, of longer sequences
 
 
 def oscillator(num, length, dt=0.1, seed=0):
@@ -86,7 +87,9 @@ def test_the_loss_of_a_sequence():
     assert learned.training.history["train_rms"][0] == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow if n in LONGER else ()) for n in METHODS]
+)
 def test_every_method_ends_in_a_step(name, monkeypatch):
     """Two short epochs: finite, counted, the same for the same key, in float64."""
     method = METHODS[name]

@@ -17,10 +17,10 @@ PAGES = sorted((ROOT / "docs").glob("*.md"))
 # tests/test_friction.py, tests/test_law_maps.py; charts and families by tests/test_charts.py,
 # tests/test_positions.py, tests/test_monitors.py, tests/test_damping.py; bands by
 # tests/test_bands.py; extending by tests/test_own_models.py; scaling by tests/test_sharded.py and
-# tests/test_fit_on_devices.py.
+# tests/test_fit_on_devices.py; mathematics by tests/test_charts.py and tests/test_maps.py.
 SLOW = (
     "your-own-data", "args", "many", "friction-and-inputs", "charts-and-families", "bands",
-    "extending", "scaling",
+    "extending", "scaling", "mathematics",
 )  # fmt: skip
 sys.path.insert(0, str(ROOT / "benchmarks"))
 INSTALL = ("python3 -m venv ", ".venv/bin/pip install ")
