@@ -51,12 +51,12 @@ class Match:
 
 class _Left(NamedTuple):
     """What base and atoms leave over of the target, an orthonormal basis of them, and the atoms'
-    columns beside the base, of unit size, with their sizes; None where one is no number."""
+    columns, divided by their sizes and without the base, and these sizes; None where a column has
+    an entry that is not finite."""
 
     residual: np.ndarray
     basis: np.ndarray
-    part: np.ndarray | None = None
-    size: np.ndarray | None = None
+    own: tuple[np.ndarray, np.ndarray] | None = None
 
 
 class Matching:
@@ -200,13 +200,14 @@ class Matching:
         basis, residual = np.hstack([self.base, q[:, good]]), self._beside_base
         for _ in range(2):
             residual = residual - basis @ (basis.T @ residual)
-        return _Left(residual, basis, part, size)
+        return _Left(residual, basis, (part, size))
 
     def _coefficients(self, left: _Left, count: int) -> np.ndarray:
-        """Coefficients of so many atoms, 0 where one of them is no number."""
-        if left.part is None:
+        """Coefficients (count,) of the atoms; 0 where a column has an entry that is not finite."""
+        if left.own is None:
             return np.zeros(count)
-        return np.linalg.lstsq(left.part, self._beside_base, rcond=1e-13)[0] / left.size
+        part, size = left.own
+        return np.linalg.lstsq(part, self._beside_base, rcond=1e-13)[0] / size
 
     def _continued(self, match: Match, dictionary: Dictionary, most: int) -> list[tuple[Atom, ...]]:
         """The atoms, and pairs of atoms, that explain most of what a match leaves over."""
