@@ -349,6 +349,7 @@ else:
 """
 
 
+@pytest.mark.slow
 def test_batches_shared_out_among_devices(tmp_path):
     """Also gone on with, out of a checkpoint, on another number of devices."""
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=4"

@@ -116,6 +116,7 @@ def test_a_counted_budget_ends_where_it_is_spent():
     np.testing.assert_allclose(first.coefficients, TRUE, atol=1e-12)
 
 
+@pytest.mark.slow
 @QUIETLY
 def test_a_search_for_h_ends_at_its_cap(monkeypatch):
     pairs = sequences(0.3, 0.0)

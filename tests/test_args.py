@@ -176,6 +176,7 @@ def kicked(z, strength):
     return np.stack([z[:, 0] + p, p], axis=1)
 
 
+@pytest.mark.slow
 def test_noise_hides_no_law_with_a_parameter():
     """Powers of a parameter from −2 to 2 stand in for one another where there is noise."""
     rng = np.random.default_rng(22)

@@ -9,10 +9,10 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import as_a_user as benchmark
 
-# Cases of a second or two; the others take up to their budget of two minutes.
+# Cases of a second or two; the others take up to their budget of two minutes, or are much alike.
 SHORT = {
-    "single-orbit", "micro-units", "twenty-pairs", "friction", "degrees", "degrees-as-angle",
-    "wrapped-angle", "noise-pendulum-1e-04", "copies", *benchmark.REFUSED,
+    "single-orbit", "twenty-pairs", "friction", "degrees", "wrapped-angle", "copies",
+    *benchmark.REFUSED,
 }  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from gfnn_jax.scenes.draws import sample_sequences
 from gfnn_jax.scenes.trajectories import flow_step, reference_trajectories
 
 RECIPE = Recipe(batch_size=50, epochs=2, epoch_length=3, rate=1e-2, schedule="cosine")
+LONGER = ("srnn-5", "onet-5")  # as srnn-2 and onet-2, of longer sequences
 
 
 def oscillator(num, length, dt=0.1, seed=0):
@@ -87,7 +88,9 @@ def test_the_loss_of_a_sequence():
     assert learned.training.history["train_rms"][0] == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow if n in LONGER else ()) for n in METHODS]
+)
 def test_every_method_ends_in_a_step(name, monkeypatch):
     """Two short epochs: finite, counted, the same for the same key, in float64."""
     method = METHODS[name]

@@ -40,7 +40,7 @@ def spherical_pendulum_pairs(count, latitude=False):
     ],
 )
 def test_a_spherical_pendulum_told_nothing(latitude, expected):
-    pairs = spherical_pendulum_pairs(400, latitude)
+    pairs = spherical_pendulum_pairs(160, latitude)
     fit = gfnn.fit(pairs, learn="hamiltonian", tolerance=1e-8)
     assert fit.formula == expected
     assert fit.met

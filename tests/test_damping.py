@@ -85,7 +85,7 @@ def test_oscillators_of_different_friction_keep_no_multiple_of_the_form():
     field[[0, 1], [2, 3]], field[[2, 3], [0, 1]] = 1.0, [-1.0, -2.0]
     field[[2, 3], [2, 3]] = -rates
     z = np.random.default_rng(0).normal(size=(600, 4))
-    learned = gfnn.fit(Pairs(z, z @ expm(0.5 * field).T, 0.5))
+    learned = gfnn.fit(Pairs(z, z @ expm(0.5 * field).T, 0.5), learn="map")
     assert np.abs(learned.damping.factor - np.exp(-0.5 * rates)).max() < 1e-12
     assert learned.map.multiplier() is None
     assert "no multiple of the symplectic form" in str(learned.damping)
@@ -228,7 +228,7 @@ def test_a_periodic_orbit_closes_and_loses_area(learned):
     """(π, 2π) is a fixed point where the drift is 2π (1 − b)."""
     z = states_of(1_000, 3)
     image = damped_standard_map(z) - DRIFT + 2 * np.pi * (1 - B)
-    fit = gfnn.fit(Pairs(z, image, 1.0), angles=(0,))
+    fit = gfnn.fit(Pairs(z, image, 1.0), angles=(0,), learn="map")
     orbit = periodic_orbit(fit.map, np.array([3.0, 6.2]), 1, angles=(0,))
     assert np.abs(nearest_image(orbit.states - [np.pi, 2 * np.pi], (0,))).max() < 1e-12
     assert abs(np.prod(orbit.eigenvalues) - B) < 1e-12

@@ -320,6 +320,7 @@ def test_files_of_several_dt_are_all_taken(tmp_path):
     assert not any("is kept" in message for message in ran.fit.messages)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:no candidate:gfnn_jax.errors.FitWarning")
 def test_a_network_is_that_of_the_sample_and_says_so(tmp_path, monkeypatch):
     from gfnn_jax.learn import searches

@@ -13,9 +13,19 @@ from gfnn_jax import cli
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
-# What these show is tested always elsewhere: README, tests/test_args.py, tests/test_lattices.py,
-# tests/test_friction.py, tests/test_law_maps.py.
-SLOW = ("your-own-data", "args", "many", "friction-and-inputs")
+# What these pages show is tested always elsewhere: in the README, or in these modules.
+SLOW = {
+    "args": ("test_args",),
+    "bands": ("test_bands", "test_ensembles"),
+    "charts-and-families": ("test_charts", "test_positions", "test_monitors", "test_damping"),
+    "export": ("test_exports",),
+    "extending": ("test_own_models",),
+    "friction-and-inputs": ("test_friction", "test_law_maps"),
+    "many": ("test_lattices",),
+    "mathematics": ("test_charts", "test_maps"),
+    "scaling": ("test_sharded", "test_fit_on_devices", "test_distributed_fit"),
+    "your-own-data": ("test_readme",),
+}
 sys.path.insert(0, str(ROOT / "benchmarks"))
 INSTALL = ("python3 -m venv ", ".venv/bin/pip install ")
 
@@ -47,6 +57,11 @@ def test_code_runs(page, tmp_path, monkeypatch, as_a_user):
 def test_links_lead_somewhere(page):
     local = re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text(encoding="utf-8"))
     assert not [path for path in local if not (page.parent / path).exists()]
+
+
+def test_what_slow_pages_show_is_tested_elsewhere():
+    assert set(SLOW) < {page.stem for page in PAGES}
+    assert all((ROOT / "tests" / f"{n}.py").exists() for names in SLOW.values() for n in names)
 
 
 def test_every_page_is_in_the_navigation():

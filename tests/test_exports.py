@@ -145,18 +145,18 @@ def of_positions(part, both, angles=()):
 
 
 QUICK = {
-    "positions": lambda: of_positions(0.5, False),
     "positions both ways": lambda: of_positions(0.0, True, (0,)),
-    "type 1": lambda: map_in(TYPE1, 1, 4, predicted=False),
     "type 2, angles": lambda: map_in(TYPE2, 1, 4, angles=(0, 1)),
     "type 3, base map": lambda: map_in(TYPE3, 1, 4, around=(turning(1),)),
-    "midpoint": lambda: map_in(MIDPOINT, 2, 3),
     "damping": lambda: map_in(TYPE2, 1, 4, around=(Damping(np.asarray(0.9), np.full(1, 0.05)),)),
     "law": law,
     "Lagrangian": two_rods,
 }
 MAPS = {
     **QUICK,
+    "positions": lambda: of_positions(0.5, False),
+    "type 1": lambda: map_in(TYPE1, 1, 4, predicted=False),
+    "midpoint": lambda: map_in(MIDPOINT, 2, 3),
     **{f"{name}, d = 2": lambda chart=chart: map_in(chart, 2, 4, predicted=chart is not TYPE1)
        for name, chart in CHARTS.items()},
     "type 2": lambda: map_in(TYPE2, 1, 3),
@@ -211,10 +211,7 @@ def scattered(map_, z):
 @needs_cc
 @pytest.mark.parametrize(
     "kind",
-    [
-        k if k in QUICK and k != "midpoint" else pytest.param(k, marks=pytest.mark.slow)
-        for k in MAPS
-    ],
+    [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in MAPS],
 )
 def test_c_is_the_maps_own_step(kind, tmp_path):
     map_, z = MAPS[kind]()
@@ -262,7 +259,9 @@ def with_length(kind):
 
 
 @needs_cc
-@pytest.mark.parametrize("kind", ["law", "midpoint", "type 2", "damped"])
+@pytest.mark.parametrize(
+    "kind", ["law", pytest.param("midpoint", marks=pytest.mark.slow), "type 2", "damped"]
+)
 def test_c_of_a_map_with_parameters(kind, tmp_path):
     map_, z, args = with_length(kind)
     z = np.concatenate([z, z[:20], z[:2]])

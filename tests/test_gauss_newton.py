@@ -130,6 +130,7 @@ def test_standard_errors_are_those_of_noise():
     assert 0.5 < np.std(pulls) < 1.6
 
 
+@pytest.mark.slow
 def test_noise_leaves_the_terms_that_are_there():
     pairs = henon_heiles(1_500, 0.5)
     rng = np.random.default_rng(0)

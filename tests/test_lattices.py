@@ -179,7 +179,8 @@ def test_terms_of_a_site_that_a_user_knows():
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("structure", [pytest.param("ring:2", marks=pytest.mark.slow), "chain:2"])
+@pytest.mark.slow
+@pytest.mark.parametrize("structure", ["ring:2", "chain:2"])
 def test_two_fields_at_every_site(tmp_path, structure):
     """A chain of springs, each site with an oscillator on it: as written out, learned and saved."""
     dim, kind = 20, structure[:-2]
@@ -424,7 +425,8 @@ def test_gmres_takes_any_matrix():
     np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("reduced", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("reduced", [False, True])
 def test_coupled_standard_maps(tmp_path, reduced):
     """No flow: S of every site, whichever turns the images of the angles are given with."""
     scene = scenes.froeschle(dim=24)

@@ -205,6 +205,11 @@ def test_a_damped_pendulum_from_noisy_angles(swing):
     assert abs(fit.energy["closure"]) < 0.01 * abs(fit.energy["stored"])
 
 
+def undamped():
+    t, theta = pendulum(gamma=0.0, end=25.0)
+    return gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
+
+
 def test_the_friction_that_a_record_shows(swing):
     """Linear friction is told from the others, and limits of these are below what was put in."""
     _, fit = swing
@@ -214,14 +219,16 @@ def test_the_friction_that_a_record_shows(swing):
     assert found.odds["dry"] > 20
     assert all(0 < limit < 0.002 for limit in found.limits.values())
     assert "not seen, coefficients in R (2 σ): of |ω|³ below 0.00" in str(found)
-    t, theta = pendulum(gamma=0.0, end=25.0)
-    recording = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
-    without = gfnn.fit(recording)
+    without = gfnn.fit(undamped())
     assert without.friction.terms == ()
     assert without.which_friction.kinds == ()
     assert max(without.which_friction.limits.values()) < 1e-3
-    dry = gfnn.fit(recording, friction="dry+linear")  # told to, it takes what dissipates
-    assert all(term.coefficient > 0 for term in dry.friction.terms)
+
+
+@pytest.mark.slow
+def test_friction_that_is_asked_for_dissipates():
+    fit = gfnn.fit(undamped(), friction="dry+linear")
+    assert all(term.coefficient > 0 for term in fit.friction.terms)
 
 
 def test_linear_friction_of_one_mass_is_uniform(swing):

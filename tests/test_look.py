@@ -36,7 +36,9 @@ def test_each_mistake_is_named(tmp_path, name):
     assert any(kind in kinds or any(k in line for k in kinds) for kind, line in said), said
 
 
-@pytest.mark.parametrize("seed", range(900, 912))
+@pytest.mark.parametrize(
+    "seed", [*range(900, 905), *(pytest.param(n, marks=pytest.mark.slow) for n in range(905, 912))]
+)
 def test_nothing_is_said_of_a_clean_recording(tmp_path, seed):
     assert found(sheet(seed).written(tmp_path / "r.csv")) == []
 

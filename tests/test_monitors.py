@@ -111,6 +111,7 @@ def test_the_noise_of_both_monitors_is_told(noisy):
     assert np.abs(np.array(noisy.noise) / NOISE - 1).max() < 0.06
 
 
+@pytest.mark.slow
 def test_latent_readings_tell_more_than_momenta_as_they_are_read(noisy):
     first, second = read(200, 2, 1)
     as_read, latent = (

@@ -128,6 +128,7 @@ def flow_of_henon_heiles(number, steps, seed):
     return solution.y.reshape(4, number, -1).transpose(1, 2, 0)
 
 
+@pytest.mark.slow
 def test_where_a_flow_exists_the_map_is_the_flow_but_for_a_factor_of_momenta():
     """A symmetric S leaves no f(Q) − f(q); the kicks of half a step make c unlike 1."""
     recording = recorded(henon_heiles(1_200, 2, 0), ["x", "y"], dt=0.5)

@@ -129,6 +129,15 @@ def test_several_files_are_runs_and_a_column_may_be_missing(tmp_path):
     np.testing.assert_array_equal(recording.values("x", "two"), [1, np.nan])
 
 
+def test_a_run_is_the_one_of_that_very_name_where_another_is_the_same_number():
+    recording = gfnn.Recording(
+        {"run": ["1.0", "1", "b"], "t": [0.0, 1.0, 2.0], "x": [1.0, 2.0, 3.0]}, positions=["x"]
+    )
+    assert [recording.times(run).tolist() for run in ("1.0", "1", "b", 1)] == [[0], [1], [2], [1]]
+    with pytest.raises(InputError, match="no run c, found"):
+        recording.times("c")
+
+
 def test_slice_takes_both_ends_and_runs_as_numbers_or_text():
     recording = gfnn.Recording({"t": [0, 1, 2, 0, 1], "x": np.arange(5.0), "run": [1, 1, 1, 7, 7]})
     part = recording.slice(1, 2)

@@ -85,6 +85,7 @@ def test_a_law_of_few_terms_is_found_beyond_half_a_turn_and_that_is_said(dt):
     assert "beyond π" in " ".join(fit.messages)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")
 def test_a_map_without_such_a_law_is_told_of_its_turns():
     """A turn of 4 with a kick that no H of few terms has."""

@@ -53,8 +53,10 @@ def test_an_honest_velocity_is_used(record):
     ("made", "what"),
     [
         (lambda t, theta, omega: 0.97 * omega, "scale"),
-        (lambda t, theta, omega: np.interp(t - 0.02, t, omega), "lag"),
-        (lambda t, theta, omega: omega + 0.05, "bias"),
+        pytest.param(
+            lambda t, theta, omega: np.interp(t - 0.02, t, omega), "lag", marks=pytest.mark.slow
+        ),
+        pytest.param(lambda t, theta, omega: omega + 0.05, "bias", marks=pytest.mark.slow),
         (lambda t, theta, omega: np.gradient(theta, t), "colour"),
     ],
 )

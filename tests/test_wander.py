@@ -94,6 +94,7 @@ def swing():
     return recording, gfnn.fit(recording.slice(stop=55.0), friction="linear")
 
 
+@pytest.mark.slow
 def test_a_fit_finds_how_a_zero_wanders(swing, tmp_path):
     _, fit = swing
     found = fit.map.sensors.wander
@@ -107,6 +108,7 @@ def test_a_fit_finds_how_a_zero_wanders(swing, tmp_path):
     assert gfnn.load(tmp_path / "map").sensors.wander == found
 
 
+@pytest.mark.slow
 def test_forecasts_on_a_zero_that_wanders(swing):
     """Smaller errors than without it, and bands that hold them."""
     recording, fit = swing

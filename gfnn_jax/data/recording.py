@@ -303,8 +303,11 @@ class Recording:
     def _named(self, run: str | float) -> str:
         """The name of a run, given as text or as a number."""
         text = str(run)
+        if text in self._times:
+            return text
+        number = _number(text)
         for name in self.runs:
-            if name == text or _number(name) == _number(text) is not None:
+            if _number(name) == number is not None:
                 return name
         raise InputError(f"{self.source}: no run {run}, found {', '.join(self.runs[:12])}")
 

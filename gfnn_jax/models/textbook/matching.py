@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -48,6 +49,16 @@ class Match:
     left: float
 
 
+class _Left(NamedTuple):
+    """What base and atoms leave over of the target, an orthonormal basis of them, and the atoms'
+    columns, divided by their sizes and without the base, and these sizes; None where a column has
+    an entry that is not finite."""
+
+    residual: np.ndarray
+    basis: np.ndarray
+    own: tuple[np.ndarray, np.ndarray] | None = None
+
+
 class Matching:
     """The search for atoms that, beside a base, have the gradient ``target`` (rows,).
 
@@ -64,6 +75,8 @@ class Matching:
         self.weight, self.arguments, self._said, self._average = weight, arguments, said, average
         self.base, self.target = base, target
         self.size = float(np.linalg.norm(target))
+        self._beside_base = target - base @ (base.T @ target)
+        self._last: tuple[Sequence[Atom], _Left] | None = None
 
     def columns(self, atoms: Sequence[Atom]) -> np.ndarray:
         """(rows, atoms): the weighted gradients."""
@@ -71,7 +84,7 @@ class Matching:
 
     def residual_of(self, atoms: Sequence[Atom]) -> float:
         """The part of the target that base and atoms do not explain."""
-        return float(np.linalg.norm(self._residual(atoms)[0])) / self.size
+        return float(np.linalg.norm(self._residual(atoms).residual)) / self.size
 
     def best(
         self, dictionary: Dictionary, most: int, starts: Sequence[tuple[Atom, ...]] = ()
@@ -133,7 +146,7 @@ class Matching:
             j for j, a in enumerate(dictionary.atoms)
             if [f.place for f in a] == places and allowed(a)
         ]  # fmt: skip
-        residual, basis, _ = self._residual(others)
+        residual, basis, *_ = self._residual(others)
         if not own or not np.isfinite(residual).all():
             return []
         columns = dictionary.columns[:, own]
@@ -155,22 +168,28 @@ class Matching:
     def slopes(self, match: Match, inner: Sequence[tuple[int, int]]):
         """(residual, its slopes (rows, n) in these constants with base and coefficients
         projected out)."""
-        residual, basis, coefficients = self._residual(match.atoms)
+        left = self._residual(match.atoms)
+        coefficients = self._coefficients(left, len(match.atoms))
         columns = [
             coefficients[i] * self._flat(gradient_of(match.atoms[i], self.arguments, along=k))
             for i, k in inner
         ]
         slopes = np.stack(columns, axis=1)
-        return residual, slopes - basis @ (basis.T @ slopes)
+        return left.residual, slopes - left.basis @ (left.basis.T @ slopes)
 
-    def _residual(self, atoms: Sequence[Atom]):
-        """(what is left over, an orthonormal basis of base and atoms, the atoms' coefficients)."""
+    def _residual(self, atoms: Sequence[Atom]) -> _Left:
+        """What atoms leave over. The last is kept: the next step starts from the one just tried."""
+        if self._last is None or self._last[0] != atoms:
+            self._last = atoms, self._projected(atoms)
+        return self._last[1]
+
+    def _projected(self, atoms: Sequence[Atom]) -> _Left:
         if not atoms:
-            return self.target - self.base @ (self.base.T @ self.target), self.base, np.zeros(0)
+            return _Left(self._beside_base, self.base)
         with np.errstate(all="ignore"):
             columns = self.columns(atoms)
         if not np.isfinite(columns).all():
-            return np.full_like(self.target, np.inf), self.base, np.zeros(len(atoms))
+            return _Left(np.full_like(self.target, np.inf), self.base)
         size = np.linalg.norm(columns, axis=0)
         size = np.where(size > 0, size, 1.0)
         part = columns / size
@@ -178,16 +197,21 @@ class Matching:
             part = part - self.base @ (self.base.T @ part)
         q, r = np.linalg.qr(part)
         good = np.abs(np.diag(r)) > 1e-12
-        basis = np.hstack([self.base, q[:, good]])
-        residual = self.target - self.base @ (self.base.T @ self.target)
-        coefficients = np.linalg.lstsq(part, residual, rcond=1e-13)[0] / size
+        basis, residual = np.hstack([self.base, q[:, good]]), self._beside_base
         for _ in range(2):
             residual = residual - basis @ (basis.T @ residual)
-        return residual, basis, coefficients
+        return _Left(residual, basis, (part, size))
+
+    def _coefficients(self, left: _Left, count: int) -> np.ndarray:
+        """Coefficients (count,) of the atoms; 0 where a column has an entry that is not finite."""
+        if left.own is None:
+            return np.zeros(count)
+        part, size = left.own
+        return np.linalg.lstsq(part, self._beside_base, rcond=1e-13)[0] / size
 
     def _continued(self, match: Match, dictionary: Dictionary, most: int) -> list[tuple[Atom, ...]]:
         """The atoms, and pairs of atoms, that explain most of what a match leaves over."""
-        residual, basis, _ = self._residual(match.atoms)
+        residual, basis, *_ = self._residual(match.atoms)
         if not np.isfinite(residual).all():
             return []
         own, columns = basis[:, self.base.shape[1] :], dictionary.columns
@@ -221,7 +245,7 @@ class Matching:
 
     def gains(self, match: Match, dictionary: Dictionary) -> np.ndarray:
         """(atoms,): the part of the square of what a match leaves over that each atom explains."""
-        residual, basis, _ = self._residual(match.atoms)
+        residual, basis, *_ = self._residual(match.atoms)
         part, _ = self._parts(residual, basis[:, self.base.shape[1] :], dictionary.columns)
         return part**2 / max(float(residual @ residual), 1e-300)
 
