@@ -111,6 +111,35 @@ def learn_hamiltonian(
     else:  # a state of many sites is in the middle and far out at once
         outer = np.zeros(len(data.training), bool)
     data = everywhere.trained_on(everywhere.training[~outer])
+    best, options = _best_law(
+        problem, work, basis, data, tolerance, scene, terms, options, say, partly
+    )
+    _check_resolved(problem, best, data)
+    far = everywhere.training[outer]
+    best, outside = _simplified(problem, work, best, data, everywhere, far, tolerance, options, say)
+    problem.allowance, of_arcs = UNBOUNDED, None
+    if arcs is not None:
+        of_arcs = partial(covariance_root, best, problem, everywhere, best.fit.steps)
+        everywhere = of_steps
+        problem = Problem(
+            of_steps.y0, of_steps.y1, of_steps.dt, of_steps.scale, weight=of_steps.weight
+        )
+        best = best._replace(error=validation_error(best.family, best.fit, of_steps, tolerance))
+    if best.noisy or arcs is not None:
+        best = _along_sequences(problem, work, best, everywhere, tolerance, say)
+    best = _with_symmetries(best, everywhere)
+    seconds = time.perf_counter() - started
+    learned = learned_from(best, problem, everywhere, tolerance, seconds, options, of_arcs)
+    candidate = dataclasses.replace(learned.candidate, outside=outside)
+    return dataclasses.replace(learned, candidate=candidate, ended=work.ended)
+
+
+def _best_law(
+    problem, work: LawWork, basis, data: Dataset, tolerance: Tolerance, scene, terms,
+    options: Options, say, partly: OnPartial,
+) -> tuple[FittedLaw, Options]:  # fmt: skip
+    """The law of the smallest polynomials, of physics, of a mechanical system or of the libraries,
+    the first within the tolerance, else the best; and the options for fewer terms."""
     with_masses, best, early = None, None, list[FittedLaw]()
     if not terms and scene is None:
         if basis is None and data.args is None and data.structure is None:
@@ -130,14 +159,29 @@ def learn_hamiltonian(
                 raise
         if with_masses is not None and with_masses.error.relative <= best.error.relative:
             best = with_masses._replace(noisy=True)
+    return best, options
+
+
+def _check_resolved(problem, best: FittedLaw, data: Dataset) -> None:
+    """Raise FitError where one dt of this law takes more substeps than a flow may have."""
     everyone = np.arange(len(data)) if is_smooth(best.family) else best.rows
     if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
         raise FitError(
             f"the H found is too fast: one dt needs {MOST_SUBSTEPS} substeps or more. Use a "
             "smaller dt; if the pairs are of a map without a flow, use --learn map (learn='map')"
         )
-    outside, what, far = None, "", everywhere.training[outer]
-    whole, law = everywhere, (best.family, best.fit.coefficients)
+
+
+def _simplified(
+    problem, work: LawWork, best: FittedLaw, data: Dataset, whole: Dataset, far: np.ndarray,
+    tolerance: Tolerance, options: Options, say,
+) -> tuple[FittedLaw, float | None]:  # fmt: skip
+    """The law without the terms that are noise or not asked for, fitted to all training pairs, as
+    far as the budget goes; and its error at the outermost states, of a fit without them.
+
+    data: without the outermost states ``far``. whole: with them.
+    """
+    outside, what, law = None, "", (best.family, best.fit.coefficients)
     data, everywhere, there = (
         without_turns(rows, *law) for rows in (data, whole, whole.validated_on(far))
     )
@@ -150,43 +194,43 @@ def learn_hamiltonian(
         what = "dropping the terms of H that the pairs do not ask for"
         with work.again(what, best.family, len(best.fit.used)):
             best = sparse(problem, best, data, tolerance, options, say)
-        if len(there.validation) and outer.any():
+        if len(there.validation) and len(far):
             outside = validation_error(best.family, best.fit, there, tolerance).relative
-        misses = best.error.bound > tolerance.bound and np.isfinite(dearest)
+        misses = best.error.bound > tolerance.bound and np.isfinite(work.dearest)
         few = len(best.fit.used) < len(everywhere.training)
         if best.error.relative > ROUNDOFF and few and not misses:
             what = "the fit of H to all pairs"
             with work.again(what, best.family, len(everywhere.training)):
                 best = refitted(problem, best, everywhere.training, data, tolerance)
     except OutOfTime:  # what was found stands
-        budget.leave_out(what, work.ended)
-    problem.allowance, everywhere = UNBOUNDED, whole
-    of_arcs = None
-    if arcs is not None:
-        of_arcs = partial(covariance_root, best, problem, everywhere, best.fit.steps)
-        everywhere = of_steps
-        problem = Problem(
-            of_steps.y0, of_steps.y1, of_steps.dt, of_steps.scale, weight=of_steps.weight
-        )
-        best = best._replace(error=validation_error(best.family, best.fit, of_steps, tolerance))
-    noisy = best.noisy or arcs is not None
-    smooth = is_smooth(best.family)  # |v|v and sign v, whole sequences turn in
-    if noisy and smooth and best.error.bound > tolerance.bound:
-        what = "the fit of H to whole sequences"
-        say("H: fitting whole sequences")
-        try:
-            with work.again(what, best.family, len(everywhere.training)):
-                best = of_whole_sequences(problem, best, everywhere, tolerance, budget)
-        except OutOfTime:
-            budget.leave_out(what, budget.ended)
-        except np.linalg.LinAlgError as error:
-            budget.leave_out(what, f"its linear algebra failed: {error}")
+        work.budget.leave_out(what, work.ended)
+    return best, outside
+
+
+def _along_sequences(
+    problem, work: LawWork, best: FittedLaw, data: Dataset, tolerance: Tolerance, say
+) -> FittedLaw:
+    """The law fitted to whole sequences, where it misses the tolerance and is smooth: |v|v and
+    sign v are not where sequences turn."""
+    if not (is_smooth(best.family) and best.error.bound > tolerance.bound):
+        return best
+    what, budget = "the fit of H to whole sequences", work.budget
+    say("H: fitting whole sequences")
+    try:
+        with work.again(what, best.family, len(data.training)):
+            return of_whole_sequences(problem, best, data, tolerance, budget)
+    except OutOfTime:
+        budget.leave_out(what, budget.ended)
+    except np.linalg.LinAlgError as error:
+        budget.leave_out(what, f"its linear algebra failed: {error}")
+    return best
+
+
+def _with_symmetries(best: FittedLaw, data: Dataset) -> FittedLaw:
+    """The law with the symmetries that it has to roundoff imposed to the last bit."""
     if isinstance(best.family, Terms) and data.args is None and best.error.relative <= ROUNDOFF:
         c, deviations = best.fit.coefficients, best.fit.standard_errors
-        z = everywhere.y0[everywhere.validation]
+        z = data.y0[data.validation]
         c = imposed(best.family, c, deviations, z, data.coordinates.angles)
         best = best._replace(fit=best.fit._replace(coefficients=c))
-    seconds = time.perf_counter() - started
-    learned = learned_from(best, problem, everywhere, tolerance, seconds, options, of_arcs)
-    candidate = dataclasses.replace(learned.candidate, outside=outside)
-    return dataclasses.replace(learned, candidate=candidate, ended=work.ended)
+    return best
