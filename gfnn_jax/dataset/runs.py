@@ -151,8 +151,9 @@ def first_occurrences(pairs: Pairs) -> np.ndarray:
 
 
 def _all_differ(rows: np.ndarray) -> bool:
-    """Whether no two rows (n, k) have one sum of their bits times random factors: then all differ.
-    Sorting these sums takes a tenth of the time of sorting the rows."""
+    """Return whether no two rows (n, k) have one sum of their bits times random factors.
+
+    Then all rows differ. Sorting these sums takes a tenth of the time of sorting the rows."""
     bits = (rows + 0.0).view(np.uint64)  # no zero is negative
     factors = np.random.default_rng(0).integers(2**63, size=rows.shape[1], dtype=np.uint64) | 1
     sums = np.sort(bits @ factors)

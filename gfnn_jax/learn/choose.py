@@ -107,7 +107,7 @@ def _smaller(tried: list[tuple[Candidate, int, Entry]], budget: Budget, say) -> 
 
 
 def _validated(sweep: Any, sizes: Sequence[Any], budget: Budget, say) -> Iterator[Entry]:
-    """These sizes of a sweep, validated by steps, as far as the budget goes."""
+    """Sizes of a sweep, validated by steps, as far as the budget goes."""
     for size in sizes:
         work = sweep.work(size) + sweep.work_of_steps(size)
         try:

@@ -149,7 +149,7 @@ class _Residuals(NamedTuple):
 
 
 def _residuals(found: Searched) -> _Residuals | None:
-    """What the best map leaves of every pair; of a law by its steps ÷ scale, of S in its
+    """Residuals of every pair by the best map; of a law by its steps ÷ scale, of S in its
     gradient, which has the same unit. None where it meets the tolerance, is neither, or has dry
     friction: its steps are not smooth where a body turns, and no error of a measurement is."""
     law, data, tolerance = found.law, found.data, found.tolerance
@@ -225,8 +225,8 @@ def _work_of_neighbours(data: Dataset, far: np.ndarray) -> float:
 
 
 def _around(data: Dataset, size: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """What the residuals of all but a few of the neighbours of these rows stay below, of the state
-    or of the image: a state that is a gross error has no neighbours but its like."""
+    """Bound on the residuals of all but a few of the neighbours of these rows, of the state or of
+    the image: a state that is a gross error has no neighbours but its like."""
     around = np.full(len(far), np.inf)
     for y in (data.y0 / data.scale, data.y1 / data.scale):
         near = cKDTree(y).query(y[far], k=_NEIGHBOURS + 1)[1][:, 1:]
@@ -237,7 +237,7 @@ def _around(data: Dataset, size: np.ndarray, far: np.ndarray) -> np.ndarray:
 def _standing_alone(
     size: np.ndarray, far: np.ndarray, around: np.ndarray, ordinary: float
 ) -> np.ndarray:  # fmt: skip
-    """Those of the rows ``far`` whose residual is far beyond ``around``, that of their neighbours.
+    """Rows of ``far`` whose residual is far beyond ``around``, that of their neighbours.
 
     ordinary: times the median of all, that those neighbours' residuals stay below.
     """

@@ -220,7 +220,7 @@ def _states(q: list[np.ndarray], known: tuple[np.ndarray | None, ...]) -> list[n
 
 
 def _ends(rows: list[np.ndarray], k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of values (turns, n) at each place those at the ends of stretch k, turn by turn: the last
+    """Values at the ends of stretch k, of values (turns, n) at each place, turn by turn: the last
     stretch ends at the first place one turn later."""
     last = k + 1 == len(rows)
     return (rows[k][:-1], rows[0][1:]) if last else (rows[k], rows[k + 1])

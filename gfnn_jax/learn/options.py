@@ -272,7 +272,7 @@ class FitOptions:
 
     @property
     def _given(self) -> str:
-        """What was asked for of learn, family and chart."""
+        """Names of learn, family and chart that were asked for."""
         asked = {"learn": self.learn, "family": self.family, "chart": self.chart}
         return ", ".join(f"{n}={value!r}" for n, value in asked.items() if value != "auto")
 

@@ -246,7 +246,7 @@ class _Sweep:
         return self._found(found.family, about, *own, started)
 
     def _stalls(self, best: _Found) -> bool:
-        """Whether the next larger S leaves as much as the best one does."""
+        """Return whether the next larger S leaves as much as the best one does."""
         error, terms = best.candidate.validation_relative, best.candidate.num_parameters
         families = self._families(best.about.symmetric)
         larger = next((f for f in families if f.num_parameters > terms), None)

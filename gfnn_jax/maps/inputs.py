@@ -152,7 +152,7 @@ def _on_either_side(part: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shares(hold: str, at: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """What the samples at whole numbers ``places`` contribute to the value at times ``at`` (n,)."""
+    """Weights (n, k) of samples at the whole numbers ``places`` (k,) in values at times (n,)."""
     distance = at[:, None] - places
     if hold == "hold":
         return ((distance >= 0) & (distance < 1)).astype(float)

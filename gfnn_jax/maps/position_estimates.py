@@ -98,7 +98,7 @@ def _arcs(map_: Any, piece: Any) -> PositionArcs:
 
 
 def _ends(map_: Any, piece: Any, recording: Recording) -> _Ends:
-    """By an orbit of S through the last readings of every run."""
+    """Fit an orbit of S through the last readings of every run."""
     sensors, dim = map_.sensors, map_.dim
     if sensors is None:
         raise InputError("expected a map that knows its sensors, got one of an older release or of "

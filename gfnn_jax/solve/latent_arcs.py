@@ -173,8 +173,11 @@ def linearised(
 
 
 class _Data(NamedTuple):
-    """What arcs are fitted to: which of y (A, L, k) was measured, and y, 0 where it was not. least:
-    what of the residuals is no noise; None: the noise is known. tolerance: of the cost."""
+    """Data that arcs are fitted to.
+
+    measured, known: which of y (A, L, k) was measured, and y, 0 where it was not. least: what of
+    the residuals is no noise; None: the noise is known. tolerance: of the cost.
+    """
 
     model: Model | Known
     measured: np.ndarray
@@ -261,7 +264,7 @@ class _Units(NamedTuple):
 
 
 class _Iterate(NamedTuple):
-    """Where an iteration stands: residuals in units of σ, the same made white, their cost, and the
+    """State of an iteration: residuals in units of σ, the same made white, their cost, and the
     norm of the defects in units of the states'."""
 
     p: np.ndarray

@@ -115,7 +115,7 @@ def _independent(rows: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 
 def _candidates(family: Terms, z: np.ndarray, angles: tuple[int, ...]) -> Iterator[Symmetry]:
-    """Those that are looked for, at states z where every term is finite."""
+    """Symmetries that are looked for, at states z where every term is finite."""
     dim = family.dim
     with np.errstate(all="ignore"):
         gradients = family.term_gradients(z)

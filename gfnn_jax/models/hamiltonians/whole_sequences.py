@@ -215,8 +215,8 @@ def lacks_terms(found: Fitted) -> bool:
 
 
 def _misfit(scores: np.ndarray) -> tuple[float, bool]:
-    """What the arcs' gradients (arcs, count), in units of what noise makes of all of them, vary by
-    more than by noise, and whether that is certain."""
+    """Variation of the arcs' gradients (arcs, count) beyond that of noise, in whose units they are,
+    and whether that is certain."""
     arcs, count = scores.shape
     each = np.sum(scores**2, axis=1) / count
     misfit = max(float(each.sum()) / max(1 - count / arcs, 1 / arcs) - 1.0, 0.0)

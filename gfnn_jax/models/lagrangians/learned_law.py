@@ -137,7 +137,7 @@ class LearnedLaw:
 
     @property
     def _inputs_told(self) -> str:
-        """How inputs act, in words."""
+        """Describe how inputs act."""
         assert self.map.sensors is not None
         assert self.delay is not None
         delay, error = self.delay

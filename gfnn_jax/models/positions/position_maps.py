@@ -94,9 +94,9 @@ def _reduced(before, middle, of: list[int], moved: list[int]) -> tuple[list[floa
 
 
 def _turning(piece: Generated, triples: Triples) -> tuple[bool, float]:
-    """Whether a move that is longer by a turn only adds a turn to both momenta: a map of angles
-    that were measured modulo their period has momenta of this period too. And the factor of S by
-    which it is a turn to the last digit; its mixed term is a mean of differences."""
+    """Return whether a move that is longer by a turn only adds a turn to both momenta, and the
+    factor of S by which it is a turn to the last digit. A map of angles that were measured modulo
+    their period has momenta of this period too; its mixed term is a mean of differences."""
     if not triples.wrapped:
         return False, 1.0
     w, dim, turn = triples.ends[: len(triples)], triples.dim, 2 * np.pi

@@ -50,7 +50,7 @@ class Match:
 
 
 class _Left(NamedTuple):
-    """What base and atoms leave over of the target, an orthonormal basis of them, and the atoms'
+    """Residual of the target beside base and atoms, an orthonormal basis of them, and the atoms'
     columns, divided by their sizes and without the base, and these sizes; None where a column has
     an entry that is not finite."""
 
@@ -178,7 +178,8 @@ class Matching:
         return left.residual, slopes - left.basis @ (left.basis.T @ slopes)
 
     def _residual(self, atoms: Sequence[Atom]) -> _Left:
-        """What atoms leave over. The last is kept: the next step starts from the one just tried."""
+        """Residual beside the base and these atoms. The last is kept: the next step starts from the
+        one just tried."""
         if self._last is None or self._last[0] != atoms:
             self._last = atoms, self._projected(atoms)
         return self._last[1]
@@ -289,7 +290,7 @@ class _AtConstants:
 
     @cached_property
     def _linear(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """What is left over, the scaled slopes and their sizes; None where a slope is no number."""
+        """Residual, the scaled slopes and their sizes; None where a slope is no number."""
         residual, slopes = self.matching.slopes(self.match, self.inner)
         size = np.linalg.norm(slopes, axis=0)
         sound = np.isfinite(slopes).all() and np.isfinite(residual).all() and (size > 0).all()

@@ -225,7 +225,7 @@ class Textbook:
         return None
 
     def _is_exact(self, state: _State) -> bool:
-        """Whether the law is as exact as no approximation of so many numbers would be."""
+        """Return whether the law is as exact as no approximation of so many numbers would be."""
         options, width = self._options, 2 * self._dim
         others = [
             a for a in state.match.atoms if powers_of(a, self._arguments, width) is None
@@ -237,7 +237,7 @@ class Textbook:
         return state.law.left <= 10.0**-digits
 
     def _explains_nothing(self, state: _State, dictionary: Dictionary) -> bool:
-        """Whether no atom explains more of what is left over than it would of noise."""
+        """Return whether no atom explains more of what is left over than it would of noise."""
         gain = self._matching(state.target).gains(state.match, dictionary).max(initial=0.0)
         chance = 2 * np.log(len(dictionary.atoms)) + self._options.certain
         return bool(-self._middle.size * np.log1p(-min(gain, 1 - 1e-12)) < chance)
@@ -328,7 +328,7 @@ class Textbook:
         return self._rounded(state, bound)
 
     def _fewer(self, state: _State, bound: float) -> _State:
-        """Without the atoms, and their factors, that are not needed."""
+        """Drop the atoms, and their factors, that are not needed."""
         matching = self._matching(state.target)
         for atoms in _shorter(state.match.atoms):
             if weight_of(atoms) >= weight_of(state.match.atoms):
@@ -341,7 +341,7 @@ class Textbook:
         return state
 
     def _rounded(self, state: _State, bound: float) -> _State:
-        """With each constant of as few digits as leave the law as exact."""
+        """Round each constant to as few digits as leave the law as exact."""
         for i, atom in enumerate(state.match.atoms):
             for k, constant in enumerate(constants_of(atom)):
                 for rounded in _of_few_digits(constant):
