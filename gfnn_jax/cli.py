@@ -324,8 +324,8 @@ def _forecast(arguments: argparse.Namespace) -> None:
         inputs=arguments.inputs, compare=arguments.compare, overwrite=arguments.overwrite,
     )  # fmt: skip
     times = [f.times[-1] for f in found.values()]
-    print(f"{arguments.out}: forecasts of {len(found)} runs, up to t = {max(times):g} in the unit "
-          "of the file")  # fmt: skip
+    runs = "1 run" if len(found) == 1 else f"{len(found)} runs"
+    print(f"{arguments.out}: forecasts of {runs}, up to t = {max(times):g} in the unit of the file")
     if judged is not None:
         for name, (rms, median, within) in judged.columns.items():
             print(f"{name}: RMS error {rms:.4g}, median of its size {median:.4g}, in its unit; "

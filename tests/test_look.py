@@ -207,3 +207,15 @@ def test_a_million_rows_in_ten_seconds_and_a_gigabyte(tmp_path):
     assert done.returncode == 0
     assert after.ru_utime - before.ru_utime < 10
     assert after.ru_maxrss < 1 << 20  # kB
+
+
+def test_one_missing_value_is_told_as_one_row():
+    t = 0.01 * np.arange(600)
+    for gone, told in (
+        (slice(200, 201), "1 row, which is"),
+        (slice(200, 202), "2 rows, which are"),
+    ):
+        x = np.cos(6 * t)
+        x[gone] = np.nan
+        notes = str(gfnn.Recording({"t": t, "x": x}, positions=["x"]).summary())
+        assert f"x has no value in {told} not used for it" in notes

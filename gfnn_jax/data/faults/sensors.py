@@ -81,7 +81,8 @@ def missing(traits: Traits) -> Iterator[Fault]:
             found = f"{name} has no values in run {', '.join(gone[:8])}"
             yield Fault("missing column", found, "", wrong=False)
         elif cells:
-            found = f"{name} has no value in {cells} rows, which are not used for it"
+            rows = "1 row, which is" if cells == 1 else f"{cells} rows, which are"
+            found = f"{name} has no value in {rows} not used for it"
             yield Fault("missing", found, "", wrong=False)
 
 
