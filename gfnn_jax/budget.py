@@ -67,7 +67,7 @@ class Counted:
         self.spent += operations
 
 
-_NO_TIME = "there was no time for"
+_NO_TIME, _NO_OPERATIONS = "there was no time for", "there were no operations for"
 
 
 class Budget:
@@ -139,9 +139,9 @@ class Budget:
             self._reserved[then[0]] = max(self._reserved.get(then[0], 0.0), then[1])
         if self.operations + count > self._most:
             left = max(self._most - self.operations, 0)
-            needed = f"{name} needs {count:.1e}, and {left:.1e} of {self._most:,} are left"
+            needed = f"{name} needs {count:,}, and {left:,} of {self._most:,} are left"
             option = "--max-seconds" if self.max_operations is None else "--max-operations"
-            self._end("there were no operations for", f"{needed} ({option})")
+            self._end(_NO_OPERATIONS, f"{needed} ({option})")
         if self.max_seconds is not None:
             seconds, now = self._foretold(kind, count) + self._set_apart, self.seconds
             if now + seconds > self.max_seconds:
@@ -167,9 +167,9 @@ class Budget:
         if self.max_seconds is not None:
             late = self.seconds + self._foretold(kind, operations) > self.max_seconds
             self._closed = self._closed or late
-        spent = self.operations >= self._most
-        if self._closed or (decides and spent):
-            self.leave_out(name, _NO_TIME)
+        spent = decides and self.operations >= self._most
+        if self._closed or spent:
+            self.leave_out(name, _NO_TIME if self._closed else _NO_OPERATIONS)
             raise OutOfTime
         with self._timed(kind, operations):
             yield
@@ -180,8 +180,9 @@ class Budget:
         return self._timed(kind, operations)
 
     def leave_out(self, what: str, why: str) -> None:
-        """Have it told in the end; what the clock ended is told at length once, in ``ended``."""
-        why = "no time" if why.startswith(_NO_TIME) else why
+        """Have it told in the end; what the budget ended is told at length once, in ``ended``."""
+        for at_length, short in ((_NO_TIME, "no time"), (_NO_OPERATIONS, "no operations")):
+            why = short if why.startswith(at_length) else why
         message = f"left out: {what} ({why})"
         if message not in self.left_out:
             self.left_out.append(message)

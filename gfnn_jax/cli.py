@@ -445,8 +445,9 @@ def _summarise(ran: Any, out: Path) -> None:
     told = report["hamiltonian"] is not None and report["hamiltonian"]["symmetries"]
     if ran.fit.symmetries and not told:
         print(f"symmetries of the pairs: {'; '.join(map(str, ran.fit.symmetries))}")
-    for law in ran.fit.partial_laws:
-        print(law)
+    if not fit["tolerance_met"]:
+        for law in ran.fit.partial_laws:
+            print(law)
     print(f"the search ended: {fit['ended']}")
     rollout = report["rollout"]
     if rollout is not None:

@@ -134,6 +134,7 @@ def test_what_follows_the_search_takes_the_place_of_no_unit():
         pass
     with pytest.raises(OutOfTime), again.last("that of the next", COMPILE, 5.0, decides=True):
         pass
+    assert again.left_out == ["left out: that of the next (no operations)"]
     with again.last("its derivative", COMPILE, 7.0):  # changes nothing that is chosen
         pass
 
