@@ -335,6 +335,9 @@ LAWS: dict[str, Law] = {
          **{f"cos(q{i + 1})": -0.8 for i in range(8)}}, *_box(*[1.5] * 8, *[0.8] * 8), 0.1,
         LATTICE, size=3,
     ),
+    "soft-coulomb": Law(
+        {**_kinetic(2), "1/sqrt(0.53 + q1**2 + q2**2)": -1.0}, *_box(1.5, 1.5, 1, 1), 0.1, CONSTANTS
+    ),
     "kepler-quadrupole": Law(
         {**_kinetic(2), f"1/{_R}": -1.0, f"1/{_R}**3": -0.05, f"q2**2/{_R}**5": 0.15},
         *_box(2, 2, 1, 1), 0.1, CONSTANTS, _RING,

@@ -135,7 +135,8 @@ def test_atoms_are_the_formulas_that_they_are_written_as(dim):
     arguments = arguments_of(z, angles=(0,) if dim == 2 else ())
     for place, argument in enumerate(arguments):
         one_signed = np.ptp(np.sign(argument.value)) == 0
-        kinds = [("power", 3.0), ("root", 1.0), ("gauss", 0.0), ("exp", 1.0)]
+        kinds = [("power", 3.0), ("root", 1.0), ("softened", 0.0), ("gauss", 0.0)]
+        kinds.append(("exp", 1.0))
         kinds += [("power", -2.0)] if one_signed else []
         for kind in kinds:
             theta = 0.7 if has_constant(kind) else None

@@ -30,6 +30,9 @@ def values(kind: Kind, x, theta):
         case "root":  # √(θ ± x²)
             root = np.sqrt(theta + n * x * x)
             return root, n * x / root
+        case "softened":  # 1/√(θ + x²), of Plummer
+            under = theta + x * x
+            return under**-0.5, -x * under**-1.5
         case "sin":
             return np.sin(theta * x), theta * np.cos(theta * x)
         case "cos":
@@ -74,7 +77,7 @@ def kinds_for(x: np.ndarray, *, distance: bool = False, circular: bool = False) 
     if not distance:
         found += [("sin", 0.0), ("cos", 0.0)]
     found += [("exp", 0.0), ("exp", 1.0), ("root", 1.0), ("root", -1.0), ("pole", 0.0)]
-    return [*found, ("lorentz", 0.0), ("gauss", 0.0)]
+    return [*found, ("softened", 0.0), ("lorentz", 0.0), ("gauss", 0.0)]
 
 
 def parity(kind: Kind) -> int:
@@ -82,7 +85,8 @@ def parity(kind: Kind) -> int:
     name, n = kind
     if name == "power":
         return (-1) ** int(n) if n % 1 == 0 else 0
-    return {"cos": 1, "root": 1, "lorentz": 1, "gauss": 1, "sin": -1}.get(name, 0)
+    even = ("cos", "root", "softened", "lorentz", "gauss")
+    return {**dict.fromkeys(even, 1), "sin": -1}.get(name, 0)
 
 
 def constants_for(kind: Kind, x: np.ndarray) -> np.ndarray:
@@ -95,6 +99,8 @@ def constants_for(kind: Kind, x: np.ndarray) -> np.ndarray:
         case "root":
             around = np.geomspace(0.02, 10.0, 14) if kind[1] > 0 else 1 + np.geomspace(0.002, 5, 14)
             return around * size**2
+        case "softened":
+            return np.geomspace(0.001, 5.0, 16) * size**2
         case "sin" | "cos":
             return np.geomspace(0.5, 12.0, 16) / size
         case "pole":
@@ -134,6 +140,8 @@ def text_of(kind: Kind, x: str, square: str, theta: float | None) -> str:
             return f"{power}*{grown}" if n > 0 else f"{grown}/{power}"
         case "root":
             return f"sqrt({t} {'+' if n > 0 else '-'} {squared})"
+        case "softened":
+            return f"1/sqrt({t} + {squared})"
         case "sin" | "cos":
             return f"{name}({x})" if theta == 1 else f"{name}({t}*{inner})"
         case "pole":
