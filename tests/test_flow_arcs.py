@@ -16,8 +16,8 @@ from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.models.hamiltonians.flow_arcs import FlowOnArcs, fit_flow, longest_arc
 from gfnn_jax.models.hamiltonians.whole_sequences import (
     about_outliers,
-    lacks_terms,
     covariance_root_of,
+    lacks_terms,
 )
 from gfnn_jax.scenes import henon_heiles
 from gfnn_jax.solve.latent_arcs import OUTLYING

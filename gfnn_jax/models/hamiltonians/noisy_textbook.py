@@ -37,9 +37,9 @@ from gfnn_jax.models.hamiltonians.whole_sequences import (
     SequenceFit,
     Sequences,
     about_outliers,
+    covariance_root_of,
     lacks_terms,
     noise_of,
-    covariance_root_of,
     tells,
     triangle_of,
 )
@@ -290,8 +290,8 @@ def _law(
     fit = problem.fit(family, c, data.training, rounds=False)
     fit = fit._replace(coefficients=c, standard_errors=deviations[:terms])
     whole = SequenceFit(
-        tuple(range(terms)), fit, _covariance_root_of_coefficients(covariance, terms), noise_of(fitted),
-        len(fitted.x), about_outliers(fitted.residuals), lacks_terms(fitted),
+        tuple(range(terms)), fit, _covariance_root_of_coefficients(covariance, terms),
+        noise_of(fitted), len(fitted.x), about_outliers(fitted.residuals), lacks_terms(fitted),
     )  # fmt: skip
     error = validation_error(family, fit, data, tolerance)
     return FittedLaw(

@@ -14,9 +14,9 @@ from gfnn_jax.solve.arc_models import Observed, Steps
 @dataclasses.dataclass(frozen=True, eq=False)
 class LawOnArcs:
     """Steps h (A, L − 1) of a law with inputs u (A, L − 1, substeps, 6, k). What is seen are the
-    channels of ``observation`` plus the ``zeros`` of angles; their coefficients come last, first the
-    zeros', then the parameters of ``observation``. Coefficients that are not ``free`` (indices) stay as in
-    ``given``."""
+    channels of ``observation`` plus the ``zeros`` of angles; their coefficients come last, first
+    the zeros', then the parameters of ``observation``. Coefficients that are not ``free`` (indices)
+    stay as in ``given``."""
 
     form: Form
     observation: Observation

@@ -232,8 +232,8 @@ def _searched(
     scales = samples.scales
     inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
     record = (
-        nodes, scales, samples.angles, len(samples.recording.inputs), inputs, samples.observation, told,
-        options,
+        nodes, scales, samples.angles, len(samples.recording.inputs), inputs, samples.observation,
+        told, options,
     )  # fmt: skip
     found = search(*record) if asked is None else fit_given(asked, *record)
     fit = found.acting.fit
