@@ -16,8 +16,8 @@ from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.models.hamiltonians.flow_arcs import FlowOnArcs, fit_flow, longest_arc
 from gfnn_jax.models.hamiltonians.whole_sequences import (
     about_outliers,
+    covariance_root_of,
     lacks_terms,
-    root_of,
 )
 from gfnn_jax.scenes import henon_heiles
 from gfnn_jax.solve.latent_arcs import OUTLYING
@@ -241,7 +241,7 @@ def test_a_misfit_that_is_alike_along_an_arc_does_not_average_away(misfit):
     found = SimpleNamespace(
         factor=np.linalg.qr(whole, mode="r"), residuals=left, scores=left.sum(axis=1)
     )
-    deviation = abs(root_of(found)[0, 0])
+    deviation = abs(covariance_root_of(found)[0, 0])
     expected = misfit or 1 / np.sqrt(y.size)
     assert 0.7 * expected < deviation < 1.4 * expected
     assert lacks_terms(found) == bool(misfit)

@@ -89,20 +89,20 @@ def _read(
 ) -> tuple[Recording, dict[str, Any]]:
     """Read a recording with the columns that the law was learned from, but for velocities that it
     may lack, and return the keywords of `read` too."""
-    seen = sensors.seen
-    roles = _roles(sensors, job, seen.channels) | columns
+    observation = sensors.observation_model
+    roles = _roles(sensors, job, observation.channels) | columns
     try:
         return read(path, **roles), roles
     except InputError:
-        if seen.needed == seen.channels:
+        if observation.needed == observation.channels:
             raise
-    roles = _roles(sensors, job, seen.needed) | columns
+    roles = _roles(sensors, job, observation.needed) | columns
     return read(path, **roles), roles
 
 
 def _roles(sensors: Sensors, job: dict[str, Any], channels: tuple[str, ...]) -> dict[str, Any]:
     """Keywords of `read` for a recording with these columns."""
-    speeds = sensors.seen.speeds
+    speeds = sensors.observation_model.speeds
     roles: dict[str, Any] = {
         "positions": tuple(n for n in channels if n in sensors.positions),
         "velocities": tuple(n for n in channels if n in speeds),
@@ -132,7 +132,7 @@ def _last_samples(recording: Recording, run: str, count: int | None) -> Recordin
 
 def _judged(sensors: Sensors, found: dict[str, Forecast], measured: Recording) -> Judged:
     columns, count = {}, 0
-    for name in (n for n in sensors.seen.channels if n in measured.columns):
+    for name in (n for n in sensors.observation_model.channels if n in measured.columns):
         errors, stds = [], []
         for run, one in found.items():
             own = run if len(measured.runs) > 1 else next(iter(measured.runs))
@@ -144,9 +144,9 @@ def _judged(sensors: Sensors, found: dict[str, Forecast], measured: Recording) -
             if name in sensors.angles:
                 half = np.pi / factor
                 error = (error + half) % (2 * half) - half
-            seen = np.isfinite(error)
-            errors.append(error[seen])
-            stds.append(one.std[name][0][seen])
+            finite = np.isfinite(error)
+            errors.append(error[finite])
+            stds.append(one.std[name][0][finite])
         error, std = np.concatenate(errors), np.concatenate(stds)
         rms, median = np.sqrt(np.mean(error**2)), np.median(np.abs(error))
         columns[name] = (float(rms), float(median), float(np.mean(np.abs(error) <= 2 * std)))

@@ -138,7 +138,7 @@ def forecast(
     x, covariance = estimate_states(law, windows)
     ahead = np.broadcast_to(times, (len(windows), len(times)))
     orbits = propagate(law, windows, x, covariance, last, ahead)
-    names = sensors.seen.channels
+    names = sensors.observation_model.channels
     values = {n: orbits.values[..., k] for k, n in enumerate(names)}
     std = {n: orbits.std[..., k] for k, n in enumerate(names)}
     for i, n in enumerate(sensors.positions):
@@ -150,8 +150,8 @@ def forecast(
 
 def windows_of(sensors: Sensors, recording: Recording) -> list[Window]:
     """The last samples of each run. Raises InputError where a column is missing or they are few."""
-    channels = sensors.seen.channels
-    needed = (*sensors.seen.needed, *sensors.inputs)
+    channels = sensors.observation_model.channels
+    needed = (*sensors.observation_model.needed, *sensors.inputs)
     missing = [n for n in needed if n not in recording.columns]
     if missing:
         raise InputError(
@@ -165,13 +165,13 @@ def windows_of(sensors: Sensors, recording: Recording) -> list[Window]:
         u = [recording.values(n, run) for n in sensors.inputs]
         u = np.stack(u, axis=1) if u else np.zeros((len(t), 0))
         known = np.isfinite(u).all(axis=1)
-        seen = np.isfinite(sensors.coordinates_of(y)).all(axis=1)
-        if np.sum(seen) < FEWEST:
+        finite = np.isfinite(sensors.coordinates_of(y)).all(axis=1)
+        if np.sum(finite) < FEWEST:
             raise InputError(
                 f"{recording.source}: run {run}: expected at least {FEWEST} samples to estimate "
-                f"the state from, got {np.sum(seen)}"
+                f"the state from, got {np.sum(finite)}"
             )
-        times, places, noise = t[seen], y[seen], noise[seen]
+        times, places, noise = t[finite], y[finite], noise[finite]
         recent = times >= times[-FEWEST:].min()
         recent |= times >= times.max() - sensors.window
         window = Window(times[recent], places[recent], t[known], u[known], noise[recent])
@@ -218,8 +218,8 @@ class _Windows:
         return Steps(closing, step.by_state.reshape(*shape, m), np.zeros((*shape, 0)))
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
-        seen = self.law.sensors.seen(x)
-        return seen._replace(by_coefficients=seen.by_coefficients[..., :0])
+        shown = self.law.sensors.observation_model(x)
+        return shown._replace(by_coefficients=shown.by_coefficients[..., :0])
 
 
 def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np.ndarray]:
@@ -242,9 +242,13 @@ def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np
     t, y, x = np.array(t), np.array(y), np.array(x)
     u = _inputs(law, windows, t, substeps_of(sensors, np.max(np.diff(t, axis=1), initial=0.0)))
     arcs = _Windows(law, np.diff(t, axis=1), u)
-    sigma = sensors.seen.state_sigma(x[:, -1], sensors.sigma)
+    sigma = sensors.observation_model.state_sigma(x[:, -1], sensors.sigma)
     scale = np.concatenate([sigma, sigma * sensors.omega])
-    sigma, loss, wander = sensors.sigma * np.array(noise), sensors.seen.loss, sensors.wander
+    sigma, loss, wander = (
+        sensors.sigma * np.array(noise),
+        sensors.observation_model.loss,
+        sensors.wander,
+    )
     unseen = np.where(np.isfinite(y), np.array(noise), np.inf)
     white = None if wander is None else wander.whitening(t, unseen)
     found = fit_arcs(arcs, np.zeros(0), x, y, sigma, scale, loss=loss, whitening=white)
@@ -324,8 +328,8 @@ def propagate(
         spreads.append(spread)
     orbit, spread = np.stack(states, axis=1), np.stack(spreads, axis=1)
     orbit = _with_stops(law, windows, np.concatenate([begun[:, None], orbit], axis=1), ends)
-    seen, ahead = sensors.seen(orbit), times - last[:, None]
-    values, shown, further = seen.values, seen.by_state @ spread, 0.0
+    channels, ahead = sensors.observation_model(orbit), times - last[:, None]
+    values, shown, further = channels.values, channels.by_state @ spread, 0.0
     if sensors.wander is not None:
         left = sensors.wander.fading(ahead)[..., None]
         values = values + left * zeros[:, None]

@@ -39,7 +39,7 @@ class Sensors:
     wander: Wander | None = None
 
     @property
-    def seen(self) -> Observation:
+    def observation_model(self) -> Observation:
         """Observation of a state by the channels."""
         return self.observation or Observation.plain(self.positions)
 
@@ -52,10 +52,10 @@ class Sensors:
         """The coordinates (n, d) that channels y (n, k) of samples in a row show, angles lifted."""
         if self.observation is None:
             return y
-        q = self.seen.coordinates_of(y, self.turning)
+        q = self.observation_model.coordinates_of(y, self.turning)
         known = np.isfinite(q).all(axis=1)
         for i in self.turning:
-            if self.positions[i] not in self.seen.channels:
+            if self.positions[i] not in self.observation_model.channels:
                 q[known, i] = np.unwrap(q[known, i])
         return q
 

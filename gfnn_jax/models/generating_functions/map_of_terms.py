@@ -121,7 +121,7 @@ def learn_map(
         deviations=best.error.deviations, train_rms=best.train_rms,
         fit_seconds=time.perf_counter() - started,
     )  # fmt: skip
-    covariance = partial(_root, piece, data)
+    covariance = partial(_covariance_root, piece, data)
     return LearnedMap(with_error(candidate, best.error), piece, given, covariance, stalled)
 
 
@@ -265,7 +265,7 @@ def _weight(data: Dataset) -> np.ndarray:
     return data.dt / np.roll(data.scale, data.dim)
 
 
-def _root(piece: Generated, data: Dataset) -> np.ndarray:
+def _covariance_root(piece: Generated, data: Dataset) -> np.ndarray:
     """Root of the covariance. A larger library tells the noise in the residual, which it leaves."""
     family, count = piece.family, piece.family.num_parameters
     w, target, args = _data(piece.chart, family, data, data.training)

@@ -47,8 +47,8 @@ def centrifugal_terms(data: Dataset, rows: np.ndarray, family: Terms | Sums) -> 
     with_them, without = (
         joined(given_terms(dim, own), polynomial_terms(dim, 2)) for own in (texts + waves, waves)
     )
-    left = _left_over(with_them, data, rows)
-    others = [_left_over(known, data, rows) for known in (family, without)]
+    left = _held_out_residual(with_them, data, rows)
+    others = [_held_out_residual(known, data, rows) for known in (family, without)]
     return (*texts, *waves) if left <= _GAINED * min(others) else ()
 
 
@@ -58,7 +58,7 @@ def _between_poles(q: np.ndarray, pole: float) -> bool:
     return bool(np.ptp(np.floor((q - pole) / np.pi)) == 0)
 
 
-def _left_over(family: Terms | Sums, data: Dataset, rows: np.ndarray) -> float:
+def _held_out_residual(family: Terms | Sums, data: Dataset, rows: np.ndarray) -> float:
     """RMS of the held-out target gradients, in units of the coordinates' sizes, that least squares
     leave over; infinite where they fail."""
     count = -(-_ROWS_PER_TERM * family.num_parameters // (2 * data.dim))

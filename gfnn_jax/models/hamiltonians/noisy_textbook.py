@@ -37,9 +37,9 @@ from gfnn_jax.models.hamiltonians.whole_sequences import (
     SequenceFit,
     Sequences,
     about_outliers,
+    covariance_root_of,
     lacks_terms,
     noise_of,
-    root_of,
     tells,
     triangle_of,
 )
@@ -186,7 +186,7 @@ def _shown(law: _LawOfSequences) -> str:
     """The law as people read it."""
     formula, p = law.formula, law.fitted.p
     terms = len(formula.coefficients)
-    deviations = np.linalg.norm(root_of(law.fitted), axis=0)
+    deviations = np.linalg.norm(covariance_root_of(law.fitted), axis=0)
     inside = map(_readable, p[terms:].tolist(), deviations[terms:].tolist())
     names = formula.family(np.array(list(inside))).term_names
     return formula_of(list(map(Term, names, p[:terms].tolist(), deviations[:terms].tolist())))
@@ -272,7 +272,7 @@ def _law(
     times (m + k)/m for k constants beside m coefficients, which leaves the mean variance of the
     images at the states as it is.
     """
-    root, terms = root_of(fitted), len(formula.coefficients)
+    root, terms = covariance_root_of(fitted), len(formula.coefficients)
     coordinates, rows = data.coordinates, triangle_of(fitted).rows
     family = formula.family(fitted.p[terms:])
     known = restricted(
@@ -290,8 +290,8 @@ def _law(
     fit = problem.fit(family, c, data.training, rounds=False)
     fit = fit._replace(coefficients=c, standard_errors=deviations[:terms])
     whole = SequenceFit(
-        tuple(range(terms)), fit, _root_of_coefficients(covariance, terms), noise_of(fitted),
-        len(fitted.x), about_outliers(fitted.residuals), lacks_terms(fitted),
+        tuple(range(terms)), fit, _covariance_root_of_coefficients(covariance, terms),
+        noise_of(fitted), len(fitted.x), about_outliers(fitted.residuals), lacks_terms(fitted),
     )  # fmt: skip
     error = validation_error(family, fit, data, tolerance)
     return FittedLaw(
@@ -300,7 +300,7 @@ def _law(
     )  # fmt: skip
 
 
-def _root_of_coefficients(covariance: np.ndarray, terms: int) -> np.ndarray:
+def _covariance_root_of_coefficients(covariance: np.ndarray, terms: int) -> np.ndarray:
     """(terms, terms), rootᵀ root that of the coefficients with the constants as they are, times
     (m + k)/m. The covariance may be singular."""
     own, across = covariance[:terms, :terms], covariance[:terms, terms:]

@@ -152,7 +152,7 @@ def fitted_to_sequences(
         again = fitted(everyone, family, found.p) if everyone is not None else None
         if again is not None:
             found = again
-    root = widened * root_of(found)
+    root = widened * covariance_root_of(found)
     return SequenceFit(
         kept,
         fit._replace(coefficients=found.p, standard_errors=np.linalg.norm(root, axis=0)),
@@ -196,7 +196,7 @@ def _of_selection(triangle: Triangle, c: np.ndarray, few: np.ndarray) -> float:
     return float(np.sqrt(1 + bias / len(few)))
 
 
-def root_of(found: Fitted) -> np.ndarray:
+def covariance_root_of(found: Fitted) -> np.ndarray:
     """(m, m), rootᵀ root the covariance: that of independent noise, and of the misfit by which the
     arcs' own gradients vary by more than noise makes them.
 

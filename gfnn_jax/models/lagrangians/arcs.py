@@ -14,12 +14,12 @@ from gfnn_jax.solve.arc_models import Observed, Steps
 @dataclasses.dataclass(frozen=True, eq=False)
 class LawOnArcs:
     """Steps h (A, L − 1) of a law with inputs u (A, L − 1, substeps, 6, k). What is seen are the
-    channels of ``seen`` plus the ``zeros`` of angles; their coefficients come last, first the
-    zeros', then the parameters of ``seen``. Coefficients that are not ``free`` (indices) stay as in
-    ``given``."""
+    channels of ``observation`` plus the ``zeros`` of angles; their coefficients come last, first
+    the zeros', then the parameters of ``observation``. Coefficients that are not ``free`` (indices)
+    stay as in ``given``."""
 
     form: Form
-    seen: Observation
+    observation: Observation
     zeros: tuple[int, ...]
     h: np.ndarray
     u: np.ndarray
@@ -54,11 +54,11 @@ class LawOnArcs:
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         whole, first = self.full(p), self.form.count
         last = first + len(self.zeros)
-        seen = self.seen(x, whole[last:])
-        values, by = seen.values, np.zeros((*seen.values.shape, len(whole)))
-        by[..., last:] = seen.by_coefficients
+        shown = self.observation(x, whole[last:])
+        values, by = shown.values, np.zeros((*shown.values.shape, len(whole)))
+        by[..., last:] = shown.by_coefficients
         for k, i in enumerate(self.zeros, first):
-            channel = self.seen.direct[i]
+            channel = self.observation.direct[i]
             values[..., channel] += whole[k]
             by[..., channel, k] = 1.0
-        return Observed(values, seen.by_state, by[..., self.free])
+        return Observed(values, shown.by_state, by[..., self.free])

@@ -94,7 +94,7 @@ class Workbench:
     gauge: np.ndarray
     inputs: Any  # of arcs: ArcInputs, or a function in its place
     omega: float
-    seen: Observation
+    observation: Observation
     wander: Wander | None = None
 
     def whitening(self, arcs: Arcs) -> np.ndarray | None:
@@ -107,11 +107,11 @@ class Workbench:
         form = structure.form(self.gauge)
         u = self.inputs(arcs)
         h = np.diff(arcs.t, axis=1)
-        return LawOnArcs(form, self.seen, structure.zeros, h, u, given, free)
+        return LawOnArcs(form, self.observation, structure.zeros, h, u, given, free)
 
     def state_scale(self, sigma: np.ndarray) -> np.ndarray:
         """The defect (2d,) that counts as one standard deviation of the channels."""
-        own = self.seen.state_sigma(self._states, sigma)
+        own = self.observation.state_sigma(self._states, sigma)
         return np.concatenate([own, own * self.omega])
 
     @property
@@ -135,7 +135,7 @@ class Workbench:
             noise, scale = sigma * arcs.noise, self.state_scale(sigma)
             found = fit_arcs(
                 model, p, x, arcs.y, noise, scale, tolerance=1e-4 if rescale else 1e-3,
-                loss=self.seen.loss, whitening=whitening,
+                loss=self.observation.loss, whitening=whitening,
             )  # fmt: skip
             p, x = found.p, found.x
             change = np.nanmedian(np.abs(found.whitened), axis=(0, 1)) / 0.6745
@@ -149,7 +149,7 @@ class Workbench:
         """The cost (A,) of arcs that the fit has not seen, with their own states."""
         model = self.model(fit.structure, arcs, fit.p, np.arange(0))
         noise, scale = fit.sigma * arcs.noise, self.state_scale(fit.sigma)
-        loss = self.seen.loss
+        loss = self.observation.loss
         found = fit_arcs(
             model, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, 1e-3, loss,
             whitening=self.whitening(arcs),
@@ -174,7 +174,11 @@ class Workbench:
         """The fit without each third of the record, by one Gauss–Newton step from that to all of
         it: close to a fit its residuals are linear in the coefficients."""
         arcs, third = in_thirds(nodes, fit)
-        noise, scale, loss = fit.sigma * arcs.noise, self.state_scale(fit.sigma), self.seen.loss
+        noise, scale, loss = (
+            fit.sigma * arcs.noise,
+            self.state_scale(fit.sigma),
+            self.observation.loss,
+        )
         known = self.model(fit.structure, arcs, fit.p, np.arange(0))
         whitening = self.whitening(arcs)
         own = fit_arcs(
@@ -204,7 +208,7 @@ class Workbench:
         model = self.model(larger, fit.arcs, p, np.arange(len(p)))
         noise = fit.sigma * fit.arcs.noise
         white = self.whitening(fit.arcs)
-        R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, self.seen.loss, white)
+        R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, self.observation.loss, white)
         old = [keys.index(k) for k in known]
         own = [keys.index(k) for k in new]
         Q = np.linalg.qr(R[:, old])[0] if old else np.zeros((len(R), 0))
@@ -230,11 +234,11 @@ def in_thirds(nodes: Sequence[Nodes], fit: LawFit) -> tuple[Arcs, np.ndarray]:
 def correlation_time(residuals: np.ndarray) -> float:
     """1 + 2 Σ ρ_k of residuals (A, L, d) along arcs, until ρ_k falls below 0.05; at least 1."""
     r = np.where(np.isfinite(residuals), residuals, 0.0)
-    seen = np.isfinite(residuals).astype(float)
-    power = np.sum(r * r) / max(np.sum(seen), 1.0)
+    finite = np.isfinite(residuals).astype(float)
+    power = np.sum(r * r) / max(np.sum(finite), 1.0)
     total = 1.0
     for k in range(1, r.shape[1]):
-        pairs = np.sum(seen[:, k:] * seen[:, :-k])
+        pairs = np.sum(finite[:, k:] * finite[:, :-k])
         rho = np.sum(r[:, k:] * r[:, :-k]) / max(pairs, 1.0) / max(power, 1e-300)
         if rho < 0.05:
             break

@@ -142,7 +142,7 @@ def _table_of(bench: Workbench, fit: LawFit, candidates: Sequence[Loss]) -> Tabl
     larger = structure.plus([("loss", row) for row in others])
     p = larger.start(fit.values)
     model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
-    noise, loss = fit.sigma * fit.arcs.noise, bench.seen.loss
+    noise, loss = fit.sigma * fit.arcs.noise, bench.observation.loss
     white = bench.whitening(fit.arcs)
     rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, noise, loss, white)
     keys = larger.keys()

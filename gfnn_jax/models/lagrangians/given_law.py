@@ -28,20 +28,20 @@ from gfnn_jax.models.lagrangians.weak_start import weak_start
 
 def fit_given(
     given: Given, nodes: Sequence[Nodes], scales: Scales, angles: tuple[int, ...], num_inputs: int,
-    inputs: Mapping[str, ArcInputs], seen: Observation, told: Callable[[str], object],
+    inputs: Mapping[str, ArcInputs], observation: Observation, told: Callable[[str], object],
     options: SearchOptions,
 ) -> Found:  # fmt: skip
     """Fit exactly the terms that are given, with the result of `law_search.search`."""
-    d = seen.dim
+    d = observation.dim
     gauge = np.concatenate([n.x[:, :d] for n in nodes])
-    benches = {hold: Workbench(gauge, u, scales.omega, seen) for hold, u in inputs.items()}
-    sensors = tuple(zip(seen.parameters, map(float, seen.values), strict=True))
+    benches = {hold: Workbench(gauge, u, scales.omega, observation) for hold, u in inputs.items()}
+    sensors = tuple(zip(observation.parameters, map(float, observation.values), strict=True))
     linear = tuple(libraries.losses(d, (LINEAR,), 0.0)[:d])
     friction = linear if given.friction is None else given.friction
     structure = Structure(d, given.terms, friction, (), num_inputs, sensors)
     structure, known = weak_start(structure, nodes, scales, prune=False)
     plain = all(row[3] == 0 for row in given.terms)  # a sine or a phase says where zero is
-    turned = [i for i in angles if i in seen.direct and i not in seen.shifts()]
+    turned = [i for i in angles if i in observation.direct and i not in observation.shifts()]
     zeros = [i for i in turned if plain and any(row[2][i] for row in given.terms)]
     structure = structure.plus([("zero", i) for i in zeros])
     arcs = arcs_of(nodes, max(6, round(options.periods[0] * scales.per_period)))

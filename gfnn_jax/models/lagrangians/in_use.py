@@ -72,7 +72,7 @@ class Record:
             law, covariance = scaled(law, covariance, scale)
             gauge = f"the mean inertia of {name} over the data is {value:g}, as given"
         moving, of_moving = conformal(law, covariance)
-        root, sensors = _root(of_moving), self.sensors(bench, fit)
+        root, sensors = _covariance_root(of_moving), self.sensors(bench, fit)
         spread = np.nanstd(np.concatenate([s.y for s in self.found]), axis=0)
         thirds = self.thirds(bench, fit, sensors)
         used = law_in_use(moving, root, sensors)
@@ -81,16 +81,16 @@ class Record:
 
     def sensors(self, bench: Workbench, fit: LawFit) -> Sensors:
         """The sensors, as yet without a misfit."""
-        scales, recording, seen = self.scales, self.recording, bench.seen
+        scales, recording, observation = self.scales, self.recording, bench.observation
         noise = np.where(self.given > 0, self.given, np.minimum(scales.sigma, fit.rms()))
         if bench.wander is not None:  # sizes of wanders are in units of the white part
             noise = fit.sigma
-        plain = seen.is_plain and seen.loss == SOFT_L1
+        plain = observation.is_plain and observation.loss == SOFT_L1
         return Sensors(
             recording.coordinates, recording.inputs, recording.angles, noise, scales.omega,
             scales.period, self.hold, self.delay, np.array([scales.period]),
             np.zeros((1, len(noise))),
-            None if plain else dataclasses.replace(seen, values=fit.sensors), bench.wander,
+            None if plain else dataclasses.replace(observation, values=fit.sensors), bench.wander,
         )  # fmt: skip
 
     def thirds(self, bench: Workbench, fit: LawFit, sensors: Sensors) -> Thirds:
@@ -102,7 +102,7 @@ class Record:
             if sensors.observation is not None:
                 shown = dataclasses.replace(sensors.observation, values=other.sensors)
                 own = dataclasses.replace(sensors, observation=shown)
-            laws.append(law_in_use(law, fewer * _root(covariance), own))
+            laws.append(law_in_use(law, fewer * _covariance_root(covariance), own))
             begins.append(
                 next(
                     (i, t) for i, s in enumerate(self.found)
@@ -134,7 +134,7 @@ def best_in_use(
     return wandering if share < 1 else steady
 
 
-def _root(covariance: np.ndarray) -> np.ndarray:
+def _covariance_root(covariance: np.ndarray) -> np.ndarray:
     """rootᵀ root = covariance, of its eigenvalues above roundoff."""
     values, vectors = np.linalg.eigh(covariance)
     kept = values > 1e-14 * max(float(values.max(initial=0.0)), 1e-300)

@@ -47,12 +47,12 @@ def in_words(
     fit, law = best.fit, best.law
     sensors = map_.sensors
     assert sensors is not None  # of every map of a recording
-    channels = sensors.seen.channels
+    channels = sensors.observation_model.channels
     factors = np.array([recording.factors[name] for name in channels])
     lagrangian, friction = _expressions(best, names)
     gains = _gains(best, recording)
     zeros, parameters = _zeros_and_sensors(fit, recording)
-    shown = dict(zip(channels, sensors.seen.formulas, strict=True))
+    shown = dict(zip(channels, sensors.observation_model.formulas, strict=True))
     return LearnedLaw(
         map=map_, lagrangian=lagrangian, friction=friction, gains=gains, delay=delay,
         which_friction=which_friction_told(best.choice, best.scale, law.dim, names.speeds),

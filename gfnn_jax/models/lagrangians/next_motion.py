@@ -42,13 +42,13 @@ def next_motions(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[M
     known = {key for key in structure.keys() if key[0] != "sensor"}  # noqa: SIM118
     rows, more = (library(d, tuple(angles)) for library in (libraries.first, libraries.more))
     rows = [*rows, *more] if len(rows) + len(more) <= _MOST_TERMS else rows
-    library = libraries.without_forces(rows, bench.seen.shifts())
+    library = libraries.without_forces(rows, bench.observation.shifts())
     lacking = [("term", row) for row in library if row not in structure.terms]
     larger = structure.plus(lacking)
     keys = larger.keys()
     p, noise = larger.start(fit.values), fit.sigma * fit.arcs.noise
     model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
-    loss, white = bench.seen.loss, bench.whitening(fit.arcs)
+    loss, white = bench.observation.loss, bench.whitening(fit.arcs)
     R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, loss, white)[:, :-1]
     own = [k for k, key in enumerate(keys) if key in known]
     Q = np.linalg.qr(R[:, own])[0]
@@ -108,7 +108,7 @@ def _followed(bench: Workbench, fit: LawFit, starts: Sequence[np.ndarray]) -> li
     home, t = ((fit.arcs.home[0][0], 0, length),), h[0] * np.arange(length)[None]
     arcs = []
     for lane in states[np.all(off < far[:, None], axis=(1, 2))]:  # no NaN either
-        y = bench.seen(lane[None]).values
+        y = bench.observation(lane[None]).values
         arcs.append(Arcs(t, y, lane[None], np.ones(y.shape), home))
     return arcs
 

@@ -72,7 +72,7 @@ def fit_recording(
     samples = _samples(recording, loss, told)
     asked = _asked(terms, samples, options)
     nodes = nodes_of(samples.stretches, samples.scales)
-    gauge = np.concatenate([n.x[:, : samples.seen.dim] for n in nodes])
+    gauge = np.concatenate([n.x[:, : samples.observation.dim] for n in nodes])
     holds = _holds(recording, input_hold)
     acting, choice, nodes = _searched(samples, nodes, asked, holds, told, options)
     bench, fit = _with_finer_steps(acting, gauge, samples, nodes, told)
@@ -80,12 +80,14 @@ def fit_recording(
     for name, one in measured.items():
         told(f"velocity {name}: {one.text}")
     samples, nodes, bench, fit = _with_velocities(measured, samples, nodes, bench, fit)
-    _check_identifiable(fit, samples.seen)
+    _check_identifiable(fit, samples.observation)
     told("bands: forecasting from windows of the record")
     record = samples.record(nodes, mass or {}, acting)
     best = best_in_use(record, bench, fit, choice, told)
     map_ = _map(record, best, samples.angles)
-    traces = traces_of(recording, samples.seen.channels, best.fit, best.law, nodes, bench.inputs)
+    traces = traces_of(
+        recording, samples.observation.channels, best.fit, best.law, nodes, bench.inputs
+    )
     told("finding the motion to record next")
     motions = next_motions(best.bench, best.fit, samples.angles)
     delay = (acting.delay, acting.error) if recording.inputs else None
@@ -135,7 +137,7 @@ class _Samples:
     these are angles, stretches without gaps, their scales, and what was left out."""
 
     recording: Recording
-    seen: Observation
+    observation: Observation
     angles: tuple[int, ...]
     stretches: list[Stretch]
     scales: Scales
@@ -144,7 +146,7 @@ class _Samples:
     @property
     def given(self) -> np.ndarray:
         """σ (k,) of the channels as given, NaN where none is."""
-        return np.array([self.recording.std[name] or np.nan for name in self.seen.channels])
+        return np.array([self.recording.std[name] or np.nan for name in self.observation.channels])
 
     def record(self, nodes: Sequence[Nodes], mass: Mapping[str, float], acting: Acting) -> Record:
         """The data that the last fits share."""
@@ -156,21 +158,23 @@ class _Samples:
 
 def _samples(recording: Recording, loss: Loss | None, told: Told) -> _Samples:
     """The samples of the positions, without rests, each σ as given where it is."""
-    seen, angles = _observation(recording)
-    seen = seen if loss is None else dataclasses.replace(seen, loss=loss)
-    found = _stretches(recording, seen, angles)
-    offset = [i for i in seen.shifts() if i not in angles]
+    observation, angles = _observation(recording)
+    observation = observation if loss is None else dataclasses.replace(observation, loss=loss)
+    found = _stretches(recording, observation, angles)
+    offset = [i for i in observation.shifts() if i not in angles]
     if offset and not recording.guess:  # an offset starts at the middle of its coordinate
         middle = np.mean(np.concatenate([s.q for s in found]), axis=0)
-        seen = seen.shifted(np.where(np.isin(range(seen.dim), offset), middle, 0.0))
-        found = _stretches(recording, seen, angles)
-    samples = _Samples(recording, seen, angles, found, measure(found))
-    if seen.is_plain:
+        observation = observation.shifted(
+            np.where(np.isin(range(observation.dim), offset), middle, 0.0)
+        )
+        found = _stretches(recording, observation, angles)
+    samples = _Samples(recording, observation, angles, found, measure(found))
+    if observation.is_plain:
         found, resting = without_rests(found, samples.scales)
         if resting:
             line = f"{resting:.3g} s at rest left out: a body that stands still tells no law"
             told(line)
-            samples = _Samples(recording, seen, angles, found, measure(found), (line,))
+            samples = _Samples(recording, observation, angles, found, measure(found), (line,))
     sigma = np.where(samples.given > 0, samples.given, samples.scales.sigma)
     return dataclasses.replace(samples, scales=dataclasses.replace(samples.scales, sigma=sigma))
 
@@ -182,34 +186,42 @@ def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
     """
     names = recording.coordinates
     angles = tuple(i for i, name in enumerate(names) if name in recording.angles)
-    seen = observed(
+    observation = observed(
         recording.observe, names, speed_names(names, recording.velocities), recording.guess,
         offsets=recording.offsets, scales=recording.scales, columns=recording.columns,
     )  # fmt: skip
     lengths = [i for i in range(len(names)) if i not in angles]
-    open_ = seen.undetermined(lengths)
+    open_ = observation.undetermined(lengths)
     if open_:
         shown = ", ".join(names[i] for i in lengths)
         raise InputError(
             f"{', '.join(open_)}: not identifiable, for every scale of {shown} has a law of the "
             "same terms. Take it out of --scale or --observe, or observe a velocity of known scale"
         )
-    return seen, angles
+    return observation, angles
 
 
-def _stretches(recording: Recording, seen: Observation, angles: tuple[int, ...]) -> list[Stretch]:
-    """The stretches of a recording, as the parameters of ``seen`` show its coordinates."""
-    if seen.is_plain:
+def _stretches(
+    recording: Recording, observation: Observation, angles: tuple[int, ...]
+) -> list[Stretch]:
+    """The stretches of a recording, as the parameters of ``observation`` show its coordinates."""
+    if observation.is_plain:
         return stretches(recording)
-    return stretches(recording, seen.channels, partial(seen.coordinates_of, angles=angles))
+    return stretches(
+        recording, observation.channels, partial(observation.coordinates_of, angles=angles)
+    )
 
 
 def _asked(terms: Sequence[Any], samples: _Samples, options: SearchOptions) -> Given | None:
     """The terms that were given, by the names of formulas."""
-    seen = samples.seen
-    names = symbols((*seen.coordinates, *seen.speeds))
+    observation = samples.observation
+    names = symbols((*observation.coordinates, *observation.speeds))
     width = options.dry_width * float(np.mean(samples.scales.speed))
-    return given_terms(terms, names[: seen.dim], names[seen.dim :], width) if terms else None
+    return (
+        given_terms(terms, names[: observation.dim], names[observation.dim :], width)
+        if terms
+        else None
+    )
 
 
 def _searched(
@@ -220,8 +232,8 @@ def _searched(
     scales = samples.scales
     inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
     record = (
-        nodes, scales, samples.angles, len(samples.recording.inputs), inputs, samples.seen, told,
-        options,
+        nodes, scales, samples.angles, len(samples.recording.inputs), inputs, samples.observation,
+        told, options,
     )  # fmt: skip
     found = search(*record) if asked is None else fit_given(asked, *record)
     fit = found.acting.fit
@@ -236,7 +248,7 @@ def _with_finer_steps(
     """The fit with the steps between nodes that its noise asks for: local cubics may have seen more
     noise than there is."""
     fit, scales = acting.fit, samples.scales
-    bench = Workbench(gauge, acting.bench.inputs, scales.omega, samples.seen)
+    bench = Workbench(gauge, acting.bench.inputs, scales.omega, samples.observation)
     finer = scales.substeps_for(fit.sigma)
     if finer > scales.substeps:
         inputs = ArcInputs(nodes, finer, acting.hold, acting.delay)
@@ -256,23 +268,25 @@ def _with_velocities(
     if not used:
         return samples, nodes, bench, fit
     sigma = np.array([measured[name].sigma for name in used])
-    seen = samples.seen.beside({name: recording.velocities.index(name) for name in used})
+    observation = samples.observation.beside(
+        {name: recording.velocities.index(name) for name in used}
+    )
     nodes, arcs = with_channels(recording, nodes, fit.arcs, fit.fitted.x, used)
-    bench = dataclasses.replace(bench, seen=seen)
+    bench = dataclasses.replace(bench, observation=observation)
     fit = bench.fit(fit.structure, fit.values, arcs, np.concatenate([fit.sigma, sigma]))
     scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, sigma]))
-    found = _stretches(recording, seen, samples.angles)
+    found = _stretches(recording, observation, samples.angles)
     found = without_rests(found, scales)[0] if samples.messages else found
-    samples = dataclasses.replace(samples, seen=seen, stretches=found, scales=scales)
+    samples = dataclasses.replace(samples, observation=observation, stretches=found, scales=scales)
     return samples, nodes, bench, fit
 
 
-def _check_identifiable(fit: LawFit, seen: Observation) -> None:
+def _check_identifiable(fit: LawFit, observation: Observation) -> None:
     """Raises FitError where the record does not tell a sensor's parameters from the law."""
-    count = len(seen.parameters)
+    count = len(observation.parameters)
     R = fit.fitted.triangle
     size = np.linalg.norm(R, axis=0)
-    for name, k in zip(seen.parameters, range(len(fit.p) - count, len(fit.p)), strict=True):
+    for name, k in zip(observation.parameters, range(len(fit.p) - count, len(fit.p)), strict=True):
         others = np.delete(R, k, axis=1)
         left = R[:, k] - others @ np.linalg.lstsq(others, R[:, k], rcond=None)[0]
         if not np.linalg.norm(left) > _IMITATED * size[k]:

@@ -71,18 +71,18 @@ def search(
     angles: tuple[int, ...],
     num_inputs: int,
     inputs: Mapping[str, ArcInputs],
-    seen: Observation,
+    observation: Observation,
     told: Callable[[str], object] = lambda line: None,
     options: SearchOptions = SearchOptions(),
 ) -> Found:
     """The law of these nodes, by the best of the rules between samples of the ``inputs`` (hold ->
-    inputs of arcs). ``seen`` says how states are observed."""
-    d = seen.dim
+    inputs of arcs). ``observation`` says how states are observed."""
+    d = observation.dim
     gauge = np.concatenate([n.x[:, :d] for n in nodes])
-    benches = {hold: Workbench(gauge, u, scales.omega, seen) for hold, u in inputs.items()}
-    sensors = tuple(zip(seen.parameters, map(float, seen.values), strict=True))
-    shifted = seen.shifts()
-    turned = tuple(i for i in angles if i in seen.direct and i not in shifted)  # with a zero
+    benches = {hold: Workbench(gauge, u, scales.omega, observation) for hold, u in inputs.items()}
+    sensors = tuple(zip(observation.parameters, map(float, observation.values), strict=True))
+    shifted = observation.shifts()
+    turned = tuple(i for i in angles if i in observation.direct and i not in shifted)  # with a zero
 
     def length(periods: float) -> int:
         return max(6, round(periods * scales.per_period))
@@ -164,7 +164,7 @@ def describe(fit: LawFit) -> str:
 
 
 def _word(bench: Workbench, key: Key) -> str:
-    return word_of(key, bench.seen.coordinates, bench.seen.speeds)
+    return word_of(key, bench.observation.coordinates, bench.observation.speeds)
 
 
 def prune(

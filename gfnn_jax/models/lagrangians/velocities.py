@@ -73,16 +73,18 @@ def velocities(recording: Recording, fit: LawFit, nodes: Sequence[Nodes]) -> dic
             continue
         columns = [_column(recording, node.stretch, name) for node in nodes]
         measured = _at_nodes(arcs, nodes, columns)[..., 0]
-        seen = np.isfinite(measured) & np.isfinite(arcs.y[..., i])
-        if seen.sum() < 10:
+        finite = np.isfinite(measured) & np.isfinite(arcs.y[..., i])
+        if finite.sum() < 10:
             continue
         v = x[..., d + i]
-        X = np.stack([v, a[..., i], np.ones_like(v)], axis=-1)[seen]
-        r = (measured - v)[seen]
+        X = np.stack([v, a[..., i], np.ones_like(v)], axis=-1)[finite]
+        r = (measured - v)[finite]
         sizes = np.linalg.norm(X, axis=0)
         inverse = np.linalg.pinv(X / sizes) / sizes[:, None]
         beta = inverse @ r
-        left = np.where(seen, measured - v - np.stack([v, a[..., i], 1 + 0 * v], -1) @ beta, np.nan)
+        left = np.where(
+            finite, measured - v - np.stack([v, a[..., i], 1 + 0 * v], -1) @ beta, np.nan
+        )
         sigma = float(np.sqrt(np.nanmean(left**2)))
         tau = correlation_time(left[..., None] / sigma)
         error = sigma * np.sqrt(tau) * np.linalg.norm(inverse, axis=1)

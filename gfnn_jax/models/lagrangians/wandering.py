@@ -26,13 +26,13 @@ _TIMES = (0.1, 10.0)  # in periods of the fastest motion
 def wander_of(bench: Workbench, fit: LawFit) -> Wander | None:
     """The wander of the channels' zeros that the residuals of a fit show; None where they are
     white."""
-    arcs, loss, m = fit.arcs, bench.seen.loss, fit.fitted.x.shape[-1]
+    arcs, loss, m = fit.arcs, bench.observation.loss, fit.fitted.x.shape[-1]
     model = bench.model(fit.structure, arcs, fit.p, np.arange(len(fit.p)))
     rows, _ = linearised(model, fit.p, fit.fitted.x, arcs.y, fit.sigma * arcs.noise, loss)
-    seen = np.isfinite(arcs.y)
-    weights = np.where(seen, loss.weights(fit.fitted.residuals), np.nan)
-    noise = np.where(seen, arcs.noise / np.sqrt(weights), np.inf)
-    free = int(seen.sum()) - len(rows) * m - len(fit.p)
+    finite = np.isfinite(arcs.y)
+    weights = np.where(finite, loss.weights(fit.fitted.residuals), np.nan)
+    noise = np.where(finite, arcs.noise / np.sqrt(weights), np.inf)
+    free = int(finite.sum()) - len(rows) * m - len(fit.p)
     rows = rows.reshape(*arcs.y.shape, -1)
     period = 2 * np.pi / bench.omega
 
