@@ -22,7 +22,7 @@ from gfnn_jax.families.lagrangian import (
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import at_stages, interpolate
 from gfnn_jax.jobs.forecast import forecast_recording
-from gfnn_jax.models.lagrangians.text import speed_names, terms_of
+from gfnn_jax.models.lagrangians.text import WhichFriction, speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
 from gfnn_jax.solve.arc_models import Observed, Steps
 from gfnn_jax.solve.latent_arcs import fit_arcs, rows_of_arcs
@@ -208,6 +208,15 @@ def test_a_damped_pendulum_from_noisy_angles(swing):
 def undamped():
     t, theta = pendulum(gamma=0.0, end=25.0)
     return gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
+
+
+def test_friction_kept_against_odds_is_said_to_be_that_of_fewest_kinds():
+    kept = WhichFriction(("linear",), {"none": 1e7, "linear+dry": 1 / 3.9}, {})
+    assert str(kept) == (
+        "linear, on held-out arcs odds of 1 : 3.9 against linear+dry; "
+        "of sets within odds of 20 : 1 that of fewest kinds is kept"
+    )
+    assert "kept" not in str(WhichFriction(("linear",), {"none": 1e7, "linear+dry": 30.0}, {}))
 
 
 def test_the_friction_that_a_record_shows(swing):

@@ -34,7 +34,7 @@ from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench, correlatio
 from gfnn_jax.models.lagrangians.structure import Loss
 from gfnn_jax.solve.latent_arcs import rows_of_arcs
 
-_DECIDED = 20.0  # odds, below which two sets are as good
+DECIDED = 20.0  # odds, below which two sets are as good
 _NEEDED = 3.0  # odds, below which a direction is left out
 _SURE = 20.0  # the logarithm of the largest odds that are told
 _GAINS = 5.0  # standard errors below zero, at which friction would have to drive
@@ -108,7 +108,7 @@ def chosen(
         sets = sets[-1:]
     best = min(sets, key=lambda s: s.cost)
     evidence = _Evidence(best)
-    tied = [s for s in sets if evidence.odds(best, s) < _DECIDED]
+    tied = [s for s in sets if evidence.odds(best, s) < DECIDED]
     known = before.kinds if before else ()
     taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, _plainness(s.kinds)))
     odds = {s.kinds: evidence.odds(taken, s) for s in sets if s is not taken}

@@ -11,7 +11,7 @@ import numpy as np
 
 from gfnn_jax.exports.symbolic import as_sympy
 from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM, Friction, Terms
-from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
+from gfnn_jax.models.lagrangians.friction_choice import DECIDED, FrictionChoice
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, losses
 
 _GREEK = {
@@ -118,6 +118,8 @@ class WhichFriction:
         if self.odds:
             rival = min(self.odds, key=lambda name: self.odds[name])
             text += f", on held-out arcs odds of {odds_text(self.odds[rival])} against {rival}"
+            if self.odds[rival] < 1:
+                text += f"; of sets within odds of {DECIDED:.0f} : 1 that of fewest kinds is kept"
         seen = [f"of {_pretty(term)} below {limit:.2g}" for term, limit in self.limits.items()]
         return text + (f"; not seen, coefficients in R (2 σ): {', '.join(seen)}" if seen else "")
 
