@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import itertools
 import os
 import signal
 import subprocess
@@ -83,11 +84,20 @@ def _interruptible():
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+_MODULES_TOGETHER = 8
+_modules = itertools.count(1)
+
+
 @pytest.fixture(autouse=True, scope="module")
-def _no_more_programs_than_a_module_needs():
-    """Drop compiled programs after each module: all of the suite's would fill gigabytes."""
+def _no_more_programs_than_some_modules_need():
+    """Drop traced and compiled programs after every eighth module.
+
+    All of the suite's would fill gigabytes; dropped after each module, many would be traced and
+    lowered again.
+    """
     yield
-    jax.clear_caches()
+    if next(_modules) % _MODULES_TOGETHER == 0:
+        jax.clear_caches()
 
 
 @pytest.fixture(autouse=True)

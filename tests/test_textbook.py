@@ -70,6 +70,17 @@ def morse_pairs(count):
     return pairs_of(gradient, z0)
 
 
+def softened_pairs(count):
+    """H = ½|p|² − 1/√(0.53 + |q|²)."""
+
+    def gradient(z):
+        q, p = z[:, :2], z[:, 2:]
+        under = 0.53 + np.sum(q**2, axis=1, keepdims=True)
+        return np.concatenate([q / under**1.5, p], axis=1)
+
+    return pairs_of(gradient, np.random.default_rng(0).uniform(-1.5, 1.5, (count, 4)))
+
+
 def outside_pairs(count):
     """H = ½p² + 0.8 q arctan(2.3 q) + 0.4 log(1 + e^(1.7 q)), of no library."""
     z0 = np.random.default_rng(0).uniform(-1, 1, (count, 2)) * [2.0, 1.0]
@@ -219,6 +230,12 @@ def broken_kepler_pairs(count, broken):
         return np.concatenate([force + 2 * broken * q * [1.0, 0.0], p], axis=1)
 
     return pairs_of(gradient, ring(count))
+
+
+def test_a_softened_distance_is_found():
+    found = read(searched(softened_pairs(300)))
+    expected = {"p1²": 0.5, "p2²": 0.5, "1/sqrt(0.53 + q1**2 + q2**2)": -1.0}
+    assert found == pytest.approx(expected, abs=1e-11)
 
 
 def test_symmetries_of_the_pairs_shorten_the_dictionary():
