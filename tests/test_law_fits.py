@@ -22,6 +22,7 @@ from gfnn_jax.families.lagrangian import (
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import at_stages, interpolate
 from gfnn_jax.jobs.forecast import forecast_recording
+from gfnn_jax.maps.estimates import Window, estimate_states, law_of, propagate, propagate_each
 from gfnn_jax.models.lagrangians.text import WhichFriction, speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
 from gfnn_jax.solve.arc_models import Observed, Steps
@@ -191,6 +192,25 @@ def swing():
     t, theta = pendulum()
     recording = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
     return recording, gfnn.fit(recording.slice(stop=28.0))
+
+
+def test_lanes_that_follow_their_own_laws_are_followed_as_if_alone(swing):
+    law = law_of(swing[1].map)
+    laws = [law, law._replace(p=1.1 * law.p, root=2 * law.root)]
+    t, theta = pendulum()
+    samples = [slice(0, 20), slice(40, 61), slice(100, 120)]
+    windows = [Window(t[i], theta[i, None], t[i], np.zeros((len(t[i]), 0))) for i in samples]
+    x, covariance = estimate_states(law, windows)
+    last = np.array([w.t[-1] for w in windows])
+    times, which = last[:, None] + [0.3, 2.0, 7.0], np.array([1, 0, 1])
+    together = propagate_each(laws, which, windows, x, covariance, last, times)
+    for n, one in enumerate(which):
+        own = slice(n, n + 1)
+        alone = propagate(laws[one], windows[own], x[own], covariance[own], last[own], times[own])
+        for found, expected in zip(together, alone, strict=True):
+            np.testing.assert_allclose(found[own], expected, rtol=1e-11, atol=1e-14)
+    first = propagate(law, windows, x, covariance, last, times)
+    assert np.abs(together.values[0] - first.values[0]).max() > 0.01  # the laws differ
 
 
 def test_a_damped_pendulum_from_noisy_angles(swing):

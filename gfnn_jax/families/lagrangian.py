@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -102,6 +102,13 @@ class Terms:
 
     def quadratic(self) -> tuple[Any, Any, Any]:
         """A (P, d, d), b (P, d), c (P,) of ∏ v_i^k_i = ½ vᵀA v + b·v + c."""
+        return self._known_quadratic if namespace(self.phases) is np else self._quadratic()
+
+    @cached_property
+    def _known_quadratic(self) -> tuple[Any, Any, Any]:
+        return self._quadratic()
+
+    def _quadratic(self) -> tuple[Any, Any, Any]:
         xp, k = namespace(self.phases), self.speeds
         k = k.astype(self.phases.dtype)
         degree = k.sum(1)

@@ -45,7 +45,8 @@ class Step(NamedTuple):
 class Form:
     """A law whose coefficients are free: terms with θ = ``fixed`` + ``basis`` c (the gauge),
     friction, and gains of the inputs. Its coefficients are (c, ρ, G row by row); that of a row of
-    friction of the kind UNIFORM is γ, of the force −γ ∂L/∂v."""
+    friction of the kind UNIFORM is γ, of the force −γ ∂L/∂v. They are p (count,), or (N, count) of
+    N states that follow laws of their own; phases of the terms are then (P,) or (N, P)."""
 
     terms: Terms
     fixed: np.ndarray
@@ -62,16 +63,16 @@ class Form:
         return self.basis.shape[1] + self.friction.count + self.dim * self.num_inputs
 
     def split(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """c, ρ and G (d, inputs) of p (count,)."""
+        """c, ρ and G (..., d, inputs) of p (..., count)."""
         ends = np.cumsum([self.basis.shape[1], self.friction.count])
-        c, losses, gains = np.split(p, ends)
-        return c, losses, gains.reshape(self.dim, self.num_inputs)
+        c, losses, gains = np.split(p, ends, axis=-1)
+        return c, losses, gains.reshape(*p.shape[:-1], self.dim, self.num_inputs)
 
     def lagrangian(self, p: np.ndarray) -> Lagrangian:
         c, losses, gains = self.split(p)
-        theta, even = self.fixed + self.basis @ c, self.friction.kinds == UNIFORM
-        friction = self.friction.take(~even)
-        return Lagrangian(self.terms, theta, friction, losses[~even], losses[even].sum(), gains)
+        theta, even = self.fixed + c @ self.basis.T, self.friction.kinds == UNIFORM
+        friction, uniform = self.friction.take(~even), losses[..., even].sum(axis=-1)
+        return Lagrangian(self.terms, theta, friction, losses[..., ~even], uniform, gains)
 
     def accelerate(
         self, law: Lagrangian, q: np.ndarray, v: np.ndarray, u: np.ndarray, sensitive: bool = True
@@ -82,6 +83,7 @@ class Form:
         g, dg = self.terms.motion(v)
         A, _, _ = self.terms.quadratic()
         theta, d = law.coefficients, self.dim
+        gamma = np.asarray(law.uniform)[..., None]
         A = A.reshape(-1, d * d)
         even = self.friction.kinds == UNIFORM
         _, pull, stiffness = law.friction.tables(v)
@@ -90,28 +92,29 @@ class Form:
         forced, turned = theta * g, np.einsum("np,npi->ni", theta * along, dg)
         force = np.einsum("np,npi->ni", forced, df) - turned - (law.losses * pull) @ directions
         if self.num_inputs:
-            force = force + u @ law.gains.T
+            force = force + (law.gains @ u[..., None])[..., 0]
         if even.any():
             momentum = np.einsum("np,npi->ni", theta * f, dg)
-            force = force - law.uniform * momentum
-        inverse = np.linalg.inv(((theta * f) @ A).reshape(-1, d, d))
+            force = force - gamma * momentum
+        masses = ((theta * f) @ A).reshape(-1, d, d)
+        inverse = np.linalg.inv(masses) if d > 1 else 1 / masses
         a = np.einsum("nij,nj->ni", inverse, force)
         push = (a @ A.reshape(-1, d).T).reshape(df.shape)
-        weighted = theta[:, None] * df
+        weighted = theta[..., None] * df
         by_q = push.swapaxes(1, 2) @ weighted
-        by_q += dg.swapaxes(1, 2) @ (theta[:, None] * np.einsum("npij,nj->npi", ddf, v))
+        by_q += dg.swapaxes(1, 2) @ (theta[..., None] * np.einsum("npij,nj->npi", ddf, v))
         by_q -= np.einsum("np,npij->nij", forced, ddf)
         turned = dg.swapaxes(1, 2) @ weighted
         outer = (directions[:, :, None] * directions[:, None, :]).reshape(-1, d * d)
         by_v = ((theta * along) @ A + (law.losses * stiffness) @ outer).reshape(-1, d, d)
         by_v = by_v + turned - turned.swapaxes(1, 2)
         if even.any():
-            by_q += law.uniform * turned
-            by_v = by_v + law.uniform * ((theta * f) @ A).reshape(-1, d, d)
+            by_q += gamma[..., None] * turned
+            by_v = by_v + gamma[..., None] * masses
         columns = [by_q, by_v]
         if sensitive:
             rows = push * f[..., None] + dg * along[..., None] - g[..., None] * df
-            rows = rows + law.uniform * (f[..., None] * dg)
+            rows = rows + gamma[..., None] * (f[..., None] * dg)
             columns.append(rows.swapaxes(1, 2) @ self.basis)
             by_losses = np.empty((len(v), d, len(even)))
             by_losses[..., ~even] = (pull[..., None] * directions).swapaxes(1, 2)

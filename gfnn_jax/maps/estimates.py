@@ -226,14 +226,12 @@ def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np
     """(q, v, b) (B, m) at the last sample of each window, and its covariance (B, m, m) in the law:
     b (k,) the zeros of the channels where these wander, of length 0 where they do not."""
     sensors = law.sensors
+    windows, starts = zip(*(_started(sensors, w) for w in windows), strict=True)
     length = max(len(w.t) for w in windows)
     count = windows[0].y.shape[1]
     t, y, x, noise = [], [], [], []
-    for w in windows:
+    for w, own in zip(windows, starts, strict=True):
         pad = length - len(w.t)  # before the window: steps of no time, nothing seen
-        own = sensors.coordinates_of(w.y)
-        start = smooth(w.t, own, min(len(w.t), _near(sensors, w.t)))[0]
-        own = np.concatenate([start.q, start.v], axis=1)
         t.append(np.concatenate([np.full(pad, w.t[0]), w.t]))
         y.append(np.concatenate([np.full((pad, count), np.nan), w.y]))
         own_noise = np.ones(w.y.shape) if w.noise is None else w.noise
@@ -286,6 +284,28 @@ def _with_zeros(
     return np.concatenate([x, (c.swapaxes(1, 2) @ r)[..., 0] * sigma], axis=1), covariance
 
 
+def _started(sensors: Sensors, window: Window) -> tuple[Window, np.ndarray]:
+    """The window with places between samples that are farther apart than most, where nothing was
+    seen, and the states (n, 2d) of local cubics: one long step would make all of them shorter."""
+    t, own = window.t, sensors.coordinates_of(window.y)
+    start = smooth(t, own, min(len(t), _near(sensors, t)))[0]
+    x = np.concatenate([start.q, start.v], axis=1)
+    steps = np.diff(t)
+    parts = np.ceil(steps / max(np.median(steps), _FINE / sensors.omega) - 1e-3).astype(int)
+    measured = np.concatenate([[0], np.cumsum(parts)])
+    if measured[-1] == len(parts):
+        return window, x
+    every = np.arange(measured[-1] + 1)
+    times = np.interp(every, measured, t)
+    y, noise = np.full((len(every), window.y.shape[1]), np.nan), None
+    y[measured] = window.y
+    if window.noise is not None:
+        noise = np.ones(y.shape)
+        noise[measured] = window.noise
+    x = np.stack([np.interp(times, t, column) for column in x.T], axis=1)
+    return window._replace(t=times, y=y, noise=noise), x
+
+
 def _near(sensors: Sensors, t: np.ndarray) -> int:
     """Samples within a sixth of a period, over which a cubic follows the motion."""
     step = np.median(np.diff(t))
@@ -308,27 +328,44 @@ def propagate(
 ) -> Orbits:  # fmt: skip
     """Orbits from what `estimate_states` found, x (B, m) with its covariance, at times ``last``
     (B,), to times (B, n)."""
-    d, sensors, count = law.form.dim, law.sensors, len(law.p)
+    return propagate_each([law], np.zeros(len(x), int), windows, x, covariance, last, times)
+
+
+def propagate_each(
+    laws: Sequence[Law], which: np.ndarray, windows: Sequence[Window], x: np.ndarray,
+    covariance: np.ndarray, last: np.ndarray, times: np.ndarray,
+) -> Orbits:  # fmt: skip
+    """`propagate` of lanes of which each follows its own law, ``laws[which]``, which (B,).
+
+    The laws differ in coefficients, phases, covariance and the parameters of their channels only;
+    all else of the sensors is that of the first.
+    """
+    law, (form, p, roots) = laws[0], _side_by_side(laws, which)
+    d, sensors, count = form.dim, law.sensors, form.count
     ends, (x, zeros) = np.concatenate([last[:, None], times], axis=1), np.split(x, [2 * d], axis=1)
     begun, steps = x, np.diff(ends, axis=1)
     size = covariance.shape[-1]
     root = np.linalg.cholesky(covariance + 1e-300 * np.eye(size)) if len(x) else covariance
-    root = np.concatenate([root, np.zeros((len(x), size, law.root.shape[0]))], axis=2)
+    root = np.concatenate([root, np.zeros((len(x), size, roots.shape[1]))], axis=2)
     spread, of_zeros = root[:, : 2 * d], root[:, 2 * d :]
     states, spreads, now = [], [], last
     for k in range(times.shape[1]):
         parts = substeps_of(sensors, np.max(steps[:, k], initial=0.0))
         both = np.stack([now, times[:, k]], axis=1)
         u = _inputs(law, windows, both, parts)
-        step = law.form.step(law.p, x, steps[:, k], u[:, 0])
+        step = form.step(p, x, steps[:, k], u[:, 0])
         x, now = step.states, times[:, k]
         spread = step.by_state @ spread
-        spread[..., size:] += step.by_coefficients[..., :count] @ law.root.T
+        spread[..., size:] += step.by_coefficients[..., :count] @ roots.swapaxes(1, 2)
         states.append(x)
         spreads.append(spread)
     orbit, spread = np.stack(states, axis=1), np.stack(spreads, axis=1)
-    orbit = _with_stops(law, windows, np.concatenate([begun[:, None], orbit], axis=1), ends)
-    channels, ahead = sensors.observation_model(orbit), times - last[:, None]
+    for number, own in enumerate(laws):
+        lanes = np.flatnonzero(which == number)
+        some = np.concatenate([begun[lanes, None], orbit[lanes]], axis=1)
+        orbit[lanes] = _with_stops(own, [windows[i] for i in lanes.tolist()], some, ends[lanes])
+    scales = np.stack([law.sensors.observation_model.values for law in laws])[which, None]
+    channels, ahead = sensors.observation_model(orbit, scales), times - last[:, None]
     values, shown, further = channels.values, channels.by_state @ spread, 0.0
     if sensors.wander is not None:
         left = sensors.wander.fading(ahead)[..., None]
@@ -337,6 +374,17 @@ def propagate(
         further = sensors.wander.size**2 * (1 - left**2) * sensors.sigma**2
     own = np.sum(shown**2, axis=-1) + further + sensors.sigma**2 + sensors.misfit_at(ahead) ** 2
     return Orbits(values, np.sqrt(own), orbit, spread @ spread.swapaxes(2, 3))
+
+
+def _side_by_side(laws: Sequence[Law], which: np.ndarray) -> tuple[Form, np.ndarray, np.ndarray]:
+    """A form with the phases of each lane, coefficients (B, n) and roots (B, m, n) of lanes of
+    which each follows one of the laws."""
+    terms = laws[0].form.terms
+    phases = np.stack([law.form.terms.phases for law in laws])[which]
+    form = dataclasses.replace(laws[0].form, terms=dataclasses.replace(terms, phases=phases))
+    most = max(len(law.root) for law in laws)
+    roots = np.stack([np.pad(law.root, ((0, most - len(law.root)), (0, 0))) for law in laws])
+    return form, np.stack([law.p for law in laws])[which], roots[which]
 
 
 def _with_stops(

@@ -14,12 +14,12 @@ from __future__ import annotations
 import dataclasses
 from bisect import bisect
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Scales, Stretch
-from gfnn_jax.maps.estimates import Law, Window, estimate_states, propagate, thinned
+from gfnn_jax.maps.estimates import Law, Window, estimate_states, propagate_each, thinned
 
 _WINDOWS, _TRIED = 96, 16  # starts of forecasts; of those that choose the window
 _CHOICES = (0.25, 0.5, 1.0, 2.0)  # periods from which a state may be estimated
@@ -78,21 +78,19 @@ def calibrated(
     if not starts:
         return Calibration(law, [], np.zeros((0, len(spread))))
     short = (_SHORT - 1) * scales.dt
-    choices = []
-    for periods in _CHOICES:
-        window = max(periods * scales.period, short)
-        if choices and window <= choices[-1][0]:
-            continue
-        some = starts[:: -(-len(starts) // _TRIED)]
-        leads = np.array([0.5, 1.0]) * scales.period
-        errors, _ = _forecasts(thirds, found, some, np.full(len(some), window), leads)
-        with np.errstate(all="ignore"):
-            choices.append((window, np.nanmedian(np.abs(errors) / spread)))
-    best = min((c for c in choices if np.isfinite(c[1])), key=lambda c: c[1], default=choices[0])
+    tried = np.unique(np.maximum(np.array(_CHOICES) * scales.period, short))
+    some = starts[:: -(-len(starts) // _TRIED)]
+    leads = np.array([0.5, 1.0]) * scales.period
+    windows = np.repeat(tried, len(some))
+    errors, _ = _forecasts(thirds, found, some * len(tried), windows, leads)
+    with np.errstate(all="ignore"):
+        sizes = (np.abs(errors) / spread).reshape(len(tried), -1)
+        middle = np.nan_to_num(np.nanmedian(sizes, axis=1), nan=np.inf)
+    best = float(tried[np.argmin(middle)])
     longest = max(s.t[-1] - s.t[0] for s in found)
     leads = np.geomspace(max(_FIRST * scales.period, scales.dt), _LAST * scales.period, _LEADS)
     leads = leads[leads <= 0.9 * longest]
-    windows = np.where(np.arange(len(starts)) % 2, short, best[0])
+    windows = np.where(np.arange(len(starts)) % 2, short, best)
     errors, deviations = _forecasts(thirds, found, starts, windows, leads)
     errors, deviations = _shared(errors), _shared(deviations)
     told = np.isfinite(errors).all(axis=-1).sum(axis=0) >= _FEWEST
@@ -101,7 +99,7 @@ def calibrated(
         return Calibration(law, [], np.zeros((0, len(spread))))
     missed = np.nanquantile(errors**2 / 4 - deviations**2, _INSIDE, axis=0)
     misfit = np.sqrt(np.maximum(missed, 0.0))
-    sensors = dataclasses.replace(law.sensors, window=best[0], leads=leads, misfit=misfit)
+    sensors = dataclasses.replace(law.sensors, window=best, leads=leads, misfit=misfit)
     bands = np.where(np.isfinite(errors), 2 * np.hypot(deviations, misfit), np.nan)
     measured = np.max(np.nanquantile(np.abs(errors), _INSIDE, axis=0) / spread, axis=1)
     predicted = np.max(np.nanmedian(bands, axis=0) / spread, axis=1)
@@ -146,32 +144,23 @@ def _forecasts(
     """Errors (B, n, k) of forecasts by the law without the third in which they start, NaN where the
     record ends before, and their standard deviations; times are those of the samples nearest to the
     leads. windows: (B,) seconds from which each state is estimated."""
-    shape = (len(starts), len(leads), found[0].y.shape[1])
-    errors, deviations = np.full(shape, np.nan), np.full(shape, np.nan)
-    third = np.array([thirds.of(i, found[i].t[k]) for i, k in starts])
-    for number, law in enumerate(thirds.laws):
-        own = np.flatnonzero(third == number)
-        if len(own):
-            some = [(*starts[n], windows[n]) for n in own.tolist()]
-            errors[own], deviations[own] = _forecasts_of(law, found, some, leads)
-    return errors, deviations
-
-
-def _forecasts_of(
-    law: Law, found: Sequence[Stretch], starts: Sequence[tuple[int, int, float]],
-    leads: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """`_forecasts` of one law."""
-    windows, times, measured = [], [], []
-    for i, k, window in starts:
+    cut, times, measured = [], [], []
+    for (i, k), window in zip(starts, windows.tolist(), strict=True):
         s = found[i]
         first = min(int(np.searchsorted(s.t, s.t[k] - window)), max(0, k - _SHORT + 1))
-        windows.append(thinned(_window(s, first, k + 1)))
+        cut.append(thinned(_window(s, first, k + 1)))
         at = np.minimum(np.searchsorted(s.t, s.t[k] + leads), len(s.t) - 1)
         inside = s.t[k] + leads <= s.t[-1]
         times.append(np.where(inside, s.t[at], s.t[at[inside][-1]] if inside.any() else s.t[k]))
         measured.append(np.where(inside[:, None], s.y[at], np.nan))
-    x, covariance = estimate_states(law, windows)
-    last = np.array([w.t[-1] for w in windows])
-    orbits = propagate(law, windows, x, covariance, last, np.array(times))
+    third = np.array([thirds.of(i, found[i].t[k]) for i, k in starts])
+    last = np.array([w.t[-1] for w in cut])
+    states: list[Any] = [None] * len(cut)
+    for number, window in sorted(set(zip(third.tolist(), windows.tolist(), strict=True))):
+        own = np.flatnonzero((third == number) & (windows == window)).tolist()
+        found_there = estimate_states(thirds.laws[number], [cut[n] for n in own])
+        for n, x, covariance in zip(own, *found_there, strict=True):
+            states[n] = x, covariance
+    x, covariance = (np.stack(part) for part in zip(*states, strict=True))
+    orbits = propagate_each(thirds.laws, third, cut, x, covariance, last, np.array(times))
     return orbits.values - np.array(measured), orbits.std
