@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax.solve.linear import small_solve, solve_and_sign
+from gfnn_jax.solve.linear import covariance_root, small_solve, solve_and_sign
 
 both = jax.jit(solve_and_sign)
 
@@ -73,3 +73,14 @@ def test_a_singular_lane_of_many_is_not_finite_and_spoils_no_other():
     assert np.isnan(x[1]).all()
     expected = np.linalg.solve(matrix[[0, 2]], np.ones((2, 9, 1)))[..., 0]
     np.testing.assert_allclose(x[[0, 2]], expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("rank", [0, 2, 5])
+def test_the_root_of_a_covariance_whose_units_differ_and_which_may_be_singular(rank):
+    rng = np.random.default_rng(rank)
+    factor = rng.standard_normal((7, rank, 5)) * np.array([1e-9, 1.0, 1e6, 0.0, 1e-3])
+    covariance = factor.swapaxes(1, 2) @ factor
+    root = covariance_root(covariance)
+    size = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    room = 1e-14 * size[:, :, None] * size[:, None, :]
+    assert np.all(np.abs(root.swapaxes(1, 2) @ root - covariance) <= room)

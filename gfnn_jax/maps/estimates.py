@@ -27,6 +27,7 @@ from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.signals.local_cubics import smooth
 from gfnn_jax.solve.arc_models import Observed, Steps
 from gfnn_jax.solve.latent_arcs import fit_arcs, linearised
+from gfnn_jax.solve.linear import covariance_root
 
 FEWEST = 5  # samples from which a state is estimated
 _MOST = 160  # samples of a window that are used
@@ -344,8 +345,7 @@ def propagate_each(
     d, sensors, count = form.dim, law.sensors, form.count
     ends, (x, zeros) = np.concatenate([last[:, None], times], axis=1), np.split(x, [2 * d], axis=1)
     begun, steps = x, np.diff(ends, axis=1)
-    size = covariance.shape[-1]
-    root = np.linalg.cholesky(covariance + 1e-300 * np.eye(size)) if len(x) else covariance
+    root, size = covariance_root(covariance).swapaxes(1, 2), covariance.shape[-1]
     root = np.concatenate([root, np.zeros((len(x), size, roots.shape[1]))], axis=2)
     spread, of_zeros = root[:, : 2 * d], root[:, 2 * d :]
     states, spreads, now = [], [], last

@@ -113,3 +113,17 @@ def _by_lapack(matrix, rhs):
         regular = np.linalg.matrix_rank(matrix) == matrix.shape[-1]
         x = (np.linalg.pinv(matrix) @ rhs[..., None])[..., 0]
         return np.where(regular[..., None], x, np.nan)
+
+
+def covariance_root(covariance: np.ndarray) -> np.ndarray:
+    """root (..., n, n), rootᵀ root = covariance (..., n, n), which may be singular.
+
+    Of the matrix of correlations, whose units are one: eigenvalues that roundoff made negative
+    are zero.
+    """
+    deviations = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1).clip(0.0))
+    scale = np.where(deviations > 0, deviations, 1.0)
+    correlations = covariance / (scale[..., :, None] * scale[..., None, :])
+    values, vectors = np.linalg.eigh(correlations)
+    root = np.sqrt(values.clip(0.0))[..., :, None] * np.swapaxes(vectors, -1, -2)
+    return root * scale[..., None, :]

@@ -47,6 +47,7 @@ from gfnn_jax.models.hamiltonians.work import LawWork
 from gfnn_jax.models.textbook.noisy_search import OPTIONS, Formula, NoisyTextbook
 from gfnn_jax.models.textbook.weak_gradients import weak_gradients
 from gfnn_jax.solve.latent_arcs import Fitted
+from gfnn_jax.solve.linear import covariance_root
 
 _OPERATIONS = (2e8, 4e8, 8e8, 1.6e9)  # of a search, by degrees of freedom from 1
 _ORDER, _ALIKE = 6, 1.5  # of the differences that tell the noise, see `arcs`
@@ -305,9 +306,8 @@ def _covariance_root_of_coefficients(covariance: np.ndarray, terms: int) -> np.n
     (m + k)/m. The covariance may be singular."""
     own, across = covariance[:terms, :terms], covariance[:terms, terms:]
     inverse = np.linalg.pinv(covariance[terms:, terms:], hermitian=True)
-    values, vectors = np.linalg.eigh(own - across @ inverse @ across.T)
     more = len(covariance) / terms
-    return np.sqrt(more * values.clip(0.0))[:, None] * vectors.T
+    return np.sqrt(more) * covariance_root(own - across @ inverse @ across.T)
 
 
 def _readable(constant: float, deviation: float) -> float:

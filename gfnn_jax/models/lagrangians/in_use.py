@@ -24,6 +24,7 @@ from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.learned_law import in_columns, scaled
 from gfnn_jax.models.lagrangians.wandering import wander_of
 from gfnn_jax.solve.latent_arcs import SOFT_L1
+from gfnn_jax.solve.linear import covariance_root
 
 
 class InUse(NamedTuple):
@@ -72,7 +73,7 @@ class Record:
             law, covariance = scaled(law, covariance, scale)
             gauge = f"the mean inertia of {name} over the data is {value:g}, as given"
         moving, of_moving = conformal(law, covariance)
-        root, sensors = _covariance_root(of_moving), self.sensors(bench, fit)
+        root, sensors = covariance_root(of_moving), self.sensors(bench, fit)
         spread = np.nanstd(np.concatenate([s.y for s in self.found]), axis=0)
         thirds = self.thirds(bench, fit, sensors)
         used = law_in_use(moving, root, sensors)
@@ -102,7 +103,7 @@ class Record:
             if sensors.observation is not None:
                 shown = dataclasses.replace(sensors.observation, values=other.sensors)
                 own = dataclasses.replace(sensors, observation=shown)
-            laws.append(law_in_use(law, fewer * _covariance_root(covariance), own))
+            laws.append(law_in_use(law, fewer * covariance_root(covariance), own))
             begins.append(
                 next(
                     (i, t) for i, s in enumerate(self.found)
@@ -132,10 +133,3 @@ def best_in_use(
         f"err by {share:.3g} times as much"
     )
     return wandering if share < 1 else steady
-
-
-def _covariance_root(covariance: np.ndarray) -> np.ndarray:
-    """rootᵀ root = covariance, of its eigenvalues above roundoff."""
-    values, vectors = np.linalg.eigh(covariance)
-    kept = values > 1e-14 * max(float(values.max(initial=0.0)), 1e-300)
-    return np.sqrt(values[kept])[:, None] * vectors[:, kept].T
