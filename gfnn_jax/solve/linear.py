@@ -126,4 +126,4 @@ def covariance_root(covariance: np.ndarray) -> np.ndarray:
     correlations = covariance / (scale[..., :, None] * scale[..., None, :])
     values, vectors = np.linalg.eigh(correlations)
     root = np.sqrt(values.clip(0.0))[..., :, None] * np.swapaxes(vectors, -1, -2)
-    return root * scale[..., None, :]
+    return root * deviations[..., None, :]
