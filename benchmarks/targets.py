@@ -130,7 +130,9 @@ def paper_recipe(quick: bool) -> Numbers:
     scene = gfnn.scenes.two_body()
     data, fresh = drawn(scene, 10_000 if quick else 100_000, quick)
     sequences = Sequences(np.stack([data.z0, data.z1], axis=1), scene.dt)
-    learned = paper_gfnn(sequences, Budget(jax.random.key(SEED), say=lambda m: print(f"  {m}")))
+    learned = paper_gfnn(
+        sequences, Budget(jax.random.key(SEED), on_progress=lambda m: print(f"  {m}"))
+    )
     return {
         "one_step_rms": one_step_rms(learned.map, fresh),
         "pairs": len(data),

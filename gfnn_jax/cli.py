@@ -178,7 +178,7 @@ def _fit(arguments: argparse.Namespace) -> None:
         _set_up_jax(options.get("devices"))
         if arguments.distributed:
             group = processes.Group(processes.join())
-        _fit_and_tell(arguments, options, group)
+        _fit_and_report(arguments, options, group)
 
 
 def _fit_law(
@@ -221,7 +221,7 @@ def _fit_positions(
     _hold_to(arguments.strict, arguments.out)
 
 
-def _fit_and_tell(
+def _fit_and_report(
     arguments: argparse.Namespace, options: dict[str, Any], group: processes.Group | None
 ) -> None:
     from gfnn_jax.jobs.fit import fit
@@ -302,7 +302,7 @@ def _predict(arguments: argparse.Namespace) -> None:
         _set_up_jax(arguments.devices)
         if arguments.distributed:
             share = processes.join()
-        _predict_and_tell(arguments, share)
+        _predict_and_report(arguments, share)
 
 
 def _is_law(model: Path) -> bool:
@@ -333,7 +333,7 @@ def _forecast(arguments: argparse.Namespace) -> None:
                   "(95 % expected)")  # fmt: skip
 
 
-def _predict_and_tell(arguments: argparse.Namespace, share: processes.Share | None) -> None:
+def _predict_and_report(arguments: argparse.Namespace, share: processes.Share | None) -> None:
     from gfnn_jax.jobs.predict import predict
 
     with progress.on_stderr() as shown:

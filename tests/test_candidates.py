@@ -119,7 +119,7 @@ def test_the_estimate_is_of_the_size_of_the_error():
     """The held-out residual of the gradient is the step's error to first order."""
     sweep = of_kicks()
     for size in sweep.sizes[:2]:
-        judged = sweep.judge(size, Budget(), quiet)
+        judged = sweep.estimate(size, Budget(), quiet)
         measured = sweep.validate(size, judged, Budget(), quiet)
         assert 0.5 < measured.validation_relative / judged.validation_relative < 2
         assert 0.5 < judged.train_rms / judged.validation_relative < 2
@@ -136,7 +136,7 @@ def test_more_pairs_never_take_a_candidate_away(monkeypatch):
 def test_a_factorisation_stops_when_the_time_is_spent():
     sweep = of_kicks()
     with pytest.raises(OutOfTime):
-        sweep.judge(sweep.sizes[0], Budget(max_seconds=1e-9), quiet)
+        sweep.estimate(sweep.sizes[0], Budget(max_seconds=1e-9), quiet)
 
 
 def test_a_fit_that_goes_on_takes_the_factors_that_were_kept(monkeypatch, tmp_path):
@@ -170,6 +170,6 @@ def test_an_even_generating_function_is_known_by_its_pairs(odd, even, monkeypatc
     (found,) = sweeps.sweeps_for("polynomial", [MIDPOINT], data, Tolerance(1e-6), None)
     assert [size.family.degree for size in found.sizes] == ([2, 4] if even else [2, 3, 4])
     if even:
-        judged = found.judge(found.sizes[-1], Budget(), lambda message: None)
+        judged = found.estimate(found.sizes[-1], Budget(), lambda message: None)
         assert judged.label == "even polynomial 4"
         assert judged.num_parameters == 21 + 126

@@ -411,9 +411,9 @@ def test_silence_is_never_long(capsys, monkeypatch):
     """Where standard error is no terminal the last line is repeated."""
     monkeypatch.setattr(progress, "LONGEST_SILENCE", 0.2)
     with progress.on_stderr() as shown:
-        shown.say("factorising")
-        shown.say("not shown: too soon")
-        shown.tell("a candidate, error 1e-3")
+        shown.status("factorising")
+        shown.status("not shown: too soon")
+        shown.line("a candidate, error 1e-3")
         time.sleep(0.5)
     lines = [line.split("] ")[1] for line in capsys.readouterr().err.splitlines()]
     assert lines[:2] == ["factorising", "a candidate, error 1e-3"]

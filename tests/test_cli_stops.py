@@ -148,7 +148,7 @@ def test_a_fit_survives_two_of_each_signal(family, tmp_path, monkeypatch):
     tolerance = {"polynomial": 1e-14, "sines": 1e-14, "mlp": 1e-2}[family]
     fit = ("fit", data, "--family", family, "--chart", "midpoint", "--tolerance", tolerance)
     assert gfnn(*fit, "--out", tmp_path / "whole") == 0
-    say, count = progress._Lines.say, 0
+    say, count = progress._Lines.status, 0
     signals = [(signal.SIGINT, 2), (signal.SIGTERM, 3), (signal.SIGINT, 4), (signal.SIGTERM, 5)]
     for number, moment in signals:
         count = 0
@@ -160,12 +160,12 @@ def test_a_fit_survives_two_of_each_signal(family, tmp_path, monkeypatch):
             if count == moment:
                 signal.raise_signal(number)
 
-        monkeypatch.setattr(progress._Lines, "say", counting)
+        monkeypatch.setattr(progress._Lines, "status", counting)
         status = gfnn(*fit, "--out", tmp_path / "m", "--resume")
         assert status == (130 if number == signal.SIGINT else 143)
         if (tmp_path / "m").exists():
             assert np.isfinite(models.load(tmp_path / "m").step(np.full(2, 0.1))[0]).all()
-    monkeypatch.setattr(progress._Lines, "say", say)
+    monkeypatch.setattr(progress._Lines, "status", say)
     assert gfnn(*fit, "--out", tmp_path / "m", "--resume") == 0
     z = np.random.default_rng(1).uniform(-0.5, 0.5, (5, 2))
     images = [models.load(tmp_path / name).step(z)[0] for name in ("m", "whole")]

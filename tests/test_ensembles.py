@@ -149,11 +149,11 @@ def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path, monkeypat
         def __init__(self, at):
             self.at = at
 
-        def say(self, message):
+        def status(self, message):
             if f"iteration {self.at}," in message:
                 signal.raise_signal(signal.SIGINT)
 
-        def tell(self, line):
+        def line(self, line):
             pass
 
     def run(folder, at):

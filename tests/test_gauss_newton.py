@@ -102,7 +102,7 @@ def test_henon_heiles_told_nothing(dt):
 def test_an_exact_polynomial_ends_the_search_before_laws_of_physics():
     said = []
     data = Dataset.of(identified(henon_heiles(100, 1.0)).pairs, CARTESIAN).divided(0)
-    law = learn_hamiltonian(data, Tolerance(1e-12), say=said.append)
+    law = learn_hamiltonian(data, Tolerance(1e-12), on_progress=said.append)
     assert law.candidate.num_parameters == 6
     assert "H: 34 terms" in said
     assert not any("atoms" in line for line in said)

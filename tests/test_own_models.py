@@ -87,7 +87,7 @@ def test_a_noise_model(tmp_path):
     assert errors[0] < 3e-3  # the noise has a median of 4e-3
     assert errors[0] < errors[1] / 2
     again = kept(maps[0], tmp_path / "m")
-    assert again.sensors.seen.loss == own_module.HeavyTails(1.2)
+    assert again.sensors.observation_model.loss == own_module.HeavyTails(1.2)
     found, same = (map_.forecast(part, ahead) for map_ in (maps[0], again))
     np.testing.assert_array_equal(found.values["x"], same.values["x"])
     np.testing.assert_array_equal(found.std["x"], same.std["x"])

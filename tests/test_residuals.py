@@ -30,7 +30,7 @@ def test_white_residuals_are_white(rng):
         for _ in range(40)
     ]
     assert np.mean([of.white for of in found]) > 0.85
-    assert np.mean([of.inputs["u"].seen for of in found]) < 0.15
+    assert np.mean([of.inputs["u"].significant for of in found]) < 0.15
     assert found[0].fit_percent == pytest.approx(100 * (1 - 0.01 / np.sqrt(0.5)), abs=0.1)
     np.testing.assert_allclose(found[0].lags[:3], [0, STEP, 2 * STEP])
 
@@ -41,10 +41,10 @@ def test_coloured_residuals_and_those_of_an_input_are_told(rng):
     of = whiteness(traces(slow, u), ["x"], ["u"])["x"]
     assert not of.white
     assert of.autocorrelation[1] == pytest.approx(0.75, abs=0.1)
-    assert not of.inputs["u"].seen
+    assert not of.inputs["u"].significant
     late = noise + np.roll(u, 3)
     of = whiteness(traces(late, u), ["x"], ["u"])["x"]
-    assert of.inputs["u"].seen
+    assert of.inputs["u"].significant
     assert of.inputs["u"].lag == pytest.approx(3 * STEP)
     assert of.inputs["u"].correlation == pytest.approx(np.sqrt(0.5) * 47 / 50, abs=0.08)
     assert "; correlated with u (ρ = +0." in of.text

@@ -39,7 +39,7 @@ class Sweep:
     def work_of_steps(self, size):
         return WORK
 
-    def judge(self, size, budget, say):
+    def estimate(self, size, budget, on_progress):
         self.judged.append(size.operations)
         return Candidate(
             f"{self.family} {size.operations:g}", self.family, self.chart, 3, size.operations,

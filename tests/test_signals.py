@@ -151,7 +151,7 @@ def test_the_kind_of_friction(kind):
     rate = friction(kind, 0.05)
     fits, period = motion(lambda z: [-9 * np.sin(z[0]) - rate(z[1])], [1.2, 0.0], T)
     found = energy.loss(fits, [True], np.empty((0, len(fits.centres))), period)
-    assert found.seen
+    assert found.significant
     assert found.kind == kind
 
 
@@ -182,7 +182,7 @@ def double_pendulum(z):
 def test_no_friction_is_seen_where_there_is_none(force, start, angle):
     fits, period = motion(force, start, T[:1200], 1e-3)
     none = np.empty((0, len(fits.centres)))
-    assert not energy.loss(fits, [angle] * len(fits.values), none, period).seen
+    assert not energy.loss(fits, [angle] * len(fits.values), none, period).significant
 
 
 def test_what_an_input_supplies_is_no_gain():

@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from gfnn_jax.fitting.significance import told_from_noise
+from gfnn_jax.fitting.significance import terms_above_noise
 from gfnn_jax.fitting.triangle import Triangle
 
 RNG = np.random.default_rng(0)
@@ -30,7 +30,7 @@ def test_the_fewest_terms_that_explain_the_rows(true):
     c[list(true)] = 1.0
     b = a @ c + 1e-2 * RNG.normal(size=ROWS)
     start = RNG.normal(size=len(c))
-    found, values = told_from_noise(
+    found, values = terms_above_noise(
         Triangle.of(np.column_stack([a, a @ start - b])), start, CERTAIN
     )
     left = b - a @ np.linalg.lstsq(a, b, rcond=None)[0]
@@ -43,7 +43,7 @@ def test_the_fewest_terms_that_explain_the_rows(true):
 
 def test_nothing_is_told_where_all_is_noise():
     a = collinear()
-    kept, values = told_from_noise(
+    kept, values = terms_above_noise(
         Triangle.of(np.column_stack([a, RNG.normal(size=ROWS)])), np.zeros(a.shape[1]), CERTAIN
     )
     assert len(kept) == len(values) == 0

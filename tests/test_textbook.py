@@ -246,7 +246,7 @@ def test_symmetries_of_the_pairs_shorten_the_dictionary():
     counts, laws = [], []
     for symmetries in ((), symmetries_of_pairs(data)):
         told = []
-        search = Textbook(problem, np.arange(200), symmetries=symmetries, say=told.append)
+        search = Textbook(problem, np.arange(200), symmetries=symmetries, on_progress=told.append)
         laws.append(read(search.law()))
         counts.append(int(told[0].split("trying ")[1].split()[0]))
         assert search.symmetric == bool(symmetries)

@@ -55,12 +55,12 @@ class Budget:
     """Randomness and length of a training.
 
     key: a ``jax.random.key``. cap: most operations of the training, counted; None for no cap.
-    say: called with a line on the progress of the training.
+    on_progress: called with a line on the progress of the training.
     """
 
     key: Any
     cap: float | None = None
-    say: Callable[[str], Any] = lambda message: None
+    on_progress: Callable[[str], Any] = lambda message: None
 
 
 class Learned(NamedTuple):
@@ -103,7 +103,7 @@ def train(
     trained = minimise(
         loss, params, tuple(r[held:] for r in rows), tuple(r[:held] for r in rows),
         components=components, recipe=recipe, key=budget.key, cap=budget.cap,
-        on_epoch=lambda epoch, _, rms: budget.say(f"epoch {epoch}: error {rms:.1e}"),
+        on_epoch=lambda epoch, _, rms: budget.on_progress(f"epoch {epoch}: error {rms:.1e}"),
     )  # fmt: skip
     return in_float64(trained.params), trained
 

@@ -53,7 +53,9 @@ def paper_gfnn(pairs: Sequences, budget: Budget) -> PaperGfnn:
         family, family.init(budget.key, jnp.float32), (w[held:], target[held:]),
         (w[:held], target[:held]), pairs.dt * np.ones(2 * pairs.dim), recipe=recipe,
         key=budget.key, cap=budget.cap,
-        on_epoch=lambda epoch, _, rms: budget.say(f"{epoch * _PART} iterations: error {rms:.1e}"),
+        on_epoch=lambda epoch, _, rms: budget.on_progress(
+            f"{epoch * _PART} iterations: error {rms:.1e}"
+        ),
     )  # fmt: skip
     scale = sizes(z0)
     generated = Generated(family, in_float64(training.params), TYPE2, pairs.dt, scale)

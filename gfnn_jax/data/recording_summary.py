@@ -101,7 +101,7 @@ class RecordingSummary:
             "dt_resolved": self.coarsest,
             "loss_per_period": None if loss is None else loss.per_period,
             "loss_std": None if loss is None else loss.error,
-            "friction": None if loss is None or not loss.seen else (loss.kind or "seen"),
+            "friction": None if loss is None or not loss.significant else (loss.kind or "seen"),
             "faults": [
                 {"kind": f.kind, "message": f.message, "remedy": f.remedy, "wrong": f.wrong}
                 for f in self.faults

@@ -82,9 +82,9 @@ def _loss(summary: RecordingSummary) -> str:
         return "friction: not estimated, for the samples allow no balance of energy"
     beside = " beside what the inputs supply" if summary.driven else ""
     size = f"{100 * abs(loss.per_period):.2g} ± {100 * loss.error:.1g} % of the energy per period"
-    if not loss.seen and loss.error > _TOLD:
+    if not loss.significant and loss.error > _TOLD:
         return f"friction{beside} not determined ({size})"
-    if not loss.seen:
+    if not loss.significant:
         return f"no friction seen{beside} ({size})"
     if loss.per_period < 0:
         return f"a gain of {size}{beside}: a drive is missing (--inputs)"

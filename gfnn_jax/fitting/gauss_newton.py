@@ -204,7 +204,7 @@ class Problem:
 
     def fit(
         self, family, start, rows=None, *, rounds: bool = True, steps: Steps | None = None,
-        say: Callable[[str], Any] = lambda message: None,
+        on_progress: Callable[[str], Any] = lambda message: None,
     ) -> FlowFit:  # fmt: skip
         """Levenberg–Marquardt from ``start`` (terms,) over these rows.
 
@@ -231,7 +231,7 @@ class Problem:
                 break
             c, _, made = self._descend(family, c, coarse, quiet, options.early)
             iterations += made
-            say(f"H of {family.num_parameters} terms: {len(quiet)} of {len(rows)} pairs")
+            on_progress(f"H of {family.num_parameters} terms: {len(quiet)} of {len(rows)} pairs")
         if rounds:
             coarse = self._coarse(family, c, sample)
             quiet = self._resolved(family, c, coarse, sample)

@@ -61,7 +61,7 @@ def significant(
     return _eliminated(problem, np.arange(len(coefficients)), coefficients, threshold * noise)
 
 
-def told_from_noise(
+def terms_above_noise(
     triangle: Triangle, coefficients: np.ndarray, threshold: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """(kept, their coefficients) of the linearised problem of [∂r/∂c, r]: the terms that lower

@@ -80,7 +80,7 @@ def compare(
         for method in chosen:
             if _is_finished(kept_in, method):
                 continue
-            progress.say(f"{TITLES[method]}: data")
+            progress.status(f"{TITLES[method]}: data")
             try:
                 part, rollouts = learn_and_roll(method, data, cap * RATE, progress)
             except ValueError as error:  # the results of the other methods are kept
@@ -89,11 +89,11 @@ def compare(
                     "others)"
                 ) from error
             _keep(kept_in, method, part, rollouts)
-            progress.tell(
+            progress.line(
                 f"{TITLES[method]}: one-step error {part['fit']['validation_rms']:.2e}, "
                 f"{part['fit']['seconds']:.1f} s"
             )
-        progress.say("reference, measures and figures")
+        progress.status("reference, measures and figures")
         reported, measured = {}, {}
         for method in chosen:
             part, rollouts = _kept(kept_in, method)

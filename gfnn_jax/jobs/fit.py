@@ -82,14 +82,14 @@ def fit(
     )
     reading = time.perf_counter() - started
     if not group.first:
-        progress.say("waiting for the map of a sample")
+        progress.status("waiting for the map of a sample")
         task = group.broadcast()
-        progress.say("fitting the chosen model to the pairs of this process")
+        progress.status("fitting the chosen model to the pairs of this process")
         with failures_of_arithmetic(), row_blocks.on_devices(own):
             help_refit(task, pairs, group, scene=scene)
         return None
     for line in summary(trajectories):
-        progress.tell(line)
+        progress.line(line)
     job = {
         "command": "fit", "data": trajectories.digest,
         "dt": None if np.ndim(trajectories.dt) else trajectories.dt, "scene": scene_name,
@@ -109,7 +109,7 @@ def fit(
                 seconds = work_of_refit(fitted, trajectories.sampled, reading)
                 try:
                     with fitted.budget.last(_TO_ALL, READING, seconds, decides=True):
-                        progress.say("fitting the chosen model to all pairs")
+                        progress.status("fitting the chosen model to all pairs")
                         with failures_of_arithmetic(), row_blocks.on_devices(own):
                             fitted = refit(
                                 fitted, pairs, fitted.validation_pairs, test=fitted.test_pairs,
@@ -121,7 +121,7 @@ def fit(
             else:
                 group.broadcast({})
                 fitted = not_refitted(fitted, why_not(fitted.map)) if large else fitted
-            progress.say("the report: the posterior, and the derivative of a step")
+            progress.status("the report: the posterior, and the derivative of a step")
             fitted = fitted.settled()
             result = report.assemble(
                 fitted, scene=scene_name, dt=float(np.asarray(fitted.map.dt)), seed=asked.seed,

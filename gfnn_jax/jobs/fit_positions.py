@@ -34,10 +34,10 @@ def fit_positions(
     refuse_mistakes(recording, despite)
     with refusals(), failures_of_arithmetic():
         fitted = learn_fit(
-            recording, options=asked, on_progress=progress.say,
-            on_candidate=lambda candidate: progress.tell(line(candidate)),
+            recording, options=asked, on_progress=progress.status,
+            on_candidate=lambda candidate: progress.line(line(candidate)),
         )  # fmt: skip
-    progress.say("the report: the derivative of a step")
+    progress.status("the report: the derivative of a step")
     fitted = fitted.settled()
     result = report.assemble(
         fitted, scene=None, dt=float(np.asarray(fitted.map.dt)), seed=asked.seed, rollout=None,

@@ -45,7 +45,7 @@ def fit_recording(
     recording = read(list(data), **columns)
     refuse_mistakes(recording, despite)
     with refusals(), failures_of_arithmetic():
-        fitted = learn_fit(recording, options=asked, on_progress=progress.tell)
+        fitted = learn_fit(recording, options=asked, on_progress=progress.line)
     result = law_report.assemble(fitted, source=recording.source, seed=asked.seed)
     kept = ("seed", "device", "data", "fit", "map", "lagrangian", "friction", "gauge")
     job = {

@@ -40,12 +40,12 @@ def learn_and_roll(
     cap: most operations of training, counted.
     """
     headed = Progress(
-        lambda line: progress.say(f"{TITLES[method]}: {line}"),
-        lambda line: progress.tell(f"{TITLES[method]}: {line}"),
+        lambda line: progress.status(f"{TITLES[method]}: {line}"),
+        lambda line: progress.line(f"{TITLES[method]}: {line}"),
     )
     if method == OURS:
         return _ours(data, headed)
-    budget = Budget(data.key(list(TITLES).index(method) + 100), cap, headed.say)
+    budget = Budget(data.key(list(TITLES).index(method) + 100), cap, headed.status)
     if method == PAPER_GFNN:
         return _papers(data, budget)
     return _baseline(method, data, budget)
@@ -55,7 +55,7 @@ def _baseline(method: str, data: SharedData, budget: Budget) -> tuple[dict[str, 
     chosen = METHODS[method]
     sequences = data.sequences(chosen.length)
     learned = chosen.learn(sequences, budget)
-    budget.say("rollouts")
+    budget.on_progress("rollouts")
     fresh = data.fresh
     defects = symplecticity_defect(
         np.asarray(_jacobians(learned.step, fresh.z0[:_NUM_DEFECTS])),

@@ -170,11 +170,11 @@ def predict(
             predicted.append(
                 _written(request, part, z0[own], own_params, of_part, own_drawn, progress)
             )
-    progress.say("waiting for the other processes")
+    progress.status("waiting for the other processes")
     wait_for_all()
     if share.index == 0:
         there = [part for part, own in zip(parts, lanes, strict=True) if own.stop > own.start]
-        progress.say(f"writing {out}")
+        progress.status(f"writing {out}")
         put_together(there, out, job)
         return _finished(out, dt)._replace(seconds=sum(part.seconds for part in predicted))
     status, left_at = (
@@ -220,7 +220,7 @@ def _written(
         return _finished(out, dt)
     try:
         lanes = _go_on(request, z0, params, writer, drawn, progress)
-        progress.say(f"writing {out}")
+        progress.status(f"writing {out}")
         status, left_at = np.asarray(lanes.status), np.asarray(lanes.left_at)
         more: dict[str, Any] = {} if drawn is None else {"band": drawn.of}
         passed = None
@@ -285,7 +285,7 @@ def _go_on(
     options = {"params": params, "save_every": save_every, "stop_outside": stop_outside}
     started, begun = time.perf_counter(), writer.saved
     while writer.saved < writer.total:
-        progress.say(
+        progress.status(
             f"step {(writer.saved - 1) * save_every} of {abs(request.num_steps)}"
             + _time_left(time.perf_counter() - started, writer.saved - begun, writer)
         )

@@ -18,10 +18,10 @@ def _nothing(message: str) -> None:
 
 
 class Progress(NamedTuple):
-    """Functions that show messages: ``say`` the current work, now and then; ``tell`` always."""
+    """Functions that show messages: ``status`` the current work, now and then; ``line`` always."""
 
-    say: Callable[[str], Any] = _nothing
-    tell: Callable[[str], Any] = _nothing
+    status: Callable[[str], Any] = _nothing
+    line: Callable[[str], Any] = _nothing
 
 
 SILENT = Progress()
@@ -33,7 +33,7 @@ def on_stderr() -> Iterator[Progress]:
     if not sys.stderr.isatty():
         lines = _Lines()
         try:
-            yield Progress(lines.say, lines.tell)
+            yield Progress(lines.status, lines.line)
         finally:
             lines.stop()
         return
@@ -59,13 +59,13 @@ class _Lines:
         self._thread = threading.Thread(target=self._repeat, daemon=True)
         self._thread.start()
 
-    def say(self, message: str) -> None:
+    def status(self, message: str) -> None:
         with self._lock:
             self._message = message
             if time.perf_counter() >= self._last + BETWEEN:
                 self._print(message)
 
-    def tell(self, message: str) -> None:
+    def line(self, message: str) -> None:
         with self._lock:
             self._print(message)
 

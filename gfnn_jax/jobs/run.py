@@ -77,7 +77,7 @@ def run(
         return None
 
     with unfinished(out, job, what="run", overwrite=overwrite, resume=resume) as kept_in:
-        progress.say(f"reference data: {num_pairs} pairs, {num_trajectories} trajectories")
+        progress.status(f"reference data: {num_pairs} pairs, {num_trajectories} trajectories")
         key_pairs, key_test = _keys(asked.seed)
         pairs = _finite(sample_pairs(scene, num_pairs, key_pairs))
         z0 = np.asarray(sample_test_states(scene, num_trajectories, key_test))
@@ -88,16 +88,16 @@ def run(
         fitted = search(
             pairs, scene, asked, progress=progress, kept_in=kept_in, job=job
         ).settled()  # fmt: skip
-        progress.say(f"reference trajectories of {NUM_STEPS} steps")
+        progress.status(f"reference trajectories of {NUM_STEPS} steps")
         reference = np.asarray(reference_trajectories(scene, z0, NUM_STEPS, **given))
-        progress.say(f"rollouts of {NUM_STEPS} steps")
+        progress.status(f"rollouts of {NUM_STEPS} steps")
         rollouts = map_rollouts(fitted.map, z0, **given)
         measured = measure(rollouts, scene, reference, given["params"])
         result = report.assemble(
             fitted, scene=name, dt=scene.dt, seed=asked.seed, rollout=measured.report,
             data={"source": "reference data of the scene", "digest": pairs_digest(pairs)},
         )  # fmt: skip
-        progress.say("figures")
+        progress.status("figures")
         with atomic_folder(out) as folder:
             write(folder, folder / MODEL, fitted, result, job)
             # Samples are stepped by a program of their own, which takes as long to compile.

@@ -51,8 +51,8 @@ def search(
     with refusals(), failures_of_arithmetic():
         return fit(
             pairs, scene, options=options, spent=spent, checkpoints=checkpoints, factors=factors,
-            on_progress=progress.say,
-            on_candidate=lambda candidate: progress.tell(line(candidate)), on_better=on_better,
+            on_progress=progress.status,
+            on_candidate=lambda candidate: progress.line(line(candidate)), on_better=on_better,
         )  # fmt: skip
 
 

@@ -48,7 +48,7 @@ def choose(searched: Searched, request: Request) -> Chosen:
     best = ranking[0].candidate if ranking else None
     if law is None or not (best is None or preferred(law.candidate, best, request.tolerance)):
         return _of_ranking(ranking, request)
-    request.say(f"compiling the flow of {law.candidate.label}")
+    request.on_progress(f"compiling the flow of {law.candidate.label}")
     candidate, seconds, *_ = flow_assembled(law, *given)
     expected = max(bound, _CONFIRMED * law.candidate.validation_bound)
     if best is not None and not candidate.validation_bound <= expected:
@@ -64,13 +64,15 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     smaller ones of the best sweep follow, and of maps that all have such steps the one is taken of
     which the fewest do.
     """
-    budget, say, bound = request.budget, request.say, request.tolerance.bound
+    budget, on_progress, bound = request.budget, request.on_progress, request.tolerance.bound
     compile_seconds, tried = 0.0, []
     first = ranking[0]
-    larger = _larger(first, budget, say) if first.candidate.validation_bound <= bound else ()
-    smaller = _smaller(tried, budget, say)
+    larger = (
+        _larger(first, budget, on_progress) if first.candidate.validation_bound <= bound else ()
+    )
+    smaller = _smaller(tried, budget, on_progress)
     for entry in itertools.chain([first], larger, ranking[1:], smaller):
-        say(f"compiling the step of {entry.candidate.chart} {entry.candidate.label}")
+        on_progress(f"compiling the step of {entry.candidate.chart} {entry.candidate.label}")
         sweep = entry.sweep
         map_ = composed(sweep.piece(entry.size), sweep.data)
         assembled = measured(entry.candidate, map_, sweep.data, request.tolerance, budget)
@@ -87,33 +89,35 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     return Chosen(candidate, entry.sweep.data, compile_seconds, entry)
 
 
-def _larger(entry: Entry, budget: Budget, say) -> Iterator[Entry]:
+def _larger(entry: Entry, budget: Budget, on_progress) -> Iterator[Entry]:
     """The larger sizes of an entry's sweep, validated by steps, as far as the budget goes."""
     sizes = entry.sweep.sizes
-    return _validated(entry.sweep, sizes[sizes.index(entry.size) + 1 :], budget, say)
+    return _validated(entry.sweep, sizes[sizes.index(entry.size) + 1 :], budget, on_progress)
 
 
-def _smaller(tried: list[tuple[Candidate, int, Entry]], budget: Budget, say) -> Iterator[Entry]:
+def _smaller(
+    tried: list[tuple[Candidate, int, Entry]], budget: Budget, on_progress
+) -> Iterator[Entry]:
     """A few sizes below those of these whose sweep has the fewest failed steps, as far as the
     budget goes, up to one without; none where one of them has none already."""
     if not all(failed for _, failed, _ in tried):
         return
     sweep = min(tried, key=lambda t: t[1])[2].sweep
     least = min(sweep.sizes.index(e.size) for _, _, e in tried if e.sweep is sweep)
-    for entry in _validated(sweep, sweep.sizes[:least][: -_SMALLER - 1 : -1], budget, say):
+    for entry in _validated(sweep, sweep.sizes[:least][: -_SMALLER - 1 : -1], budget, on_progress):
         yield entry
         if not tried[-1][1]:
             return
 
 
-def _validated(sweep: Any, sizes: Sequence[Any], budget: Budget, say) -> Iterator[Entry]:
+def _validated(sweep: Any, sizes: Sequence[Any], budget: Budget, on_progress) -> Iterator[Entry]:
     """Sizes of a sweep, validated by steps, as far as the budget goes."""
     for size in sizes:
         work = sweep.work(size) + sweep.work_of_steps(size)
         try:
             with budget.unit(sweep.named(size), ROWS, work):
-                judged = sweep.judge(size, budget, say)
-                judged = sweep.validate(size, judged, budget, say)
+                estimated = sweep.estimate(size, budget, on_progress)
+                estimated = sweep.validate(size, estimated, budget, on_progress)
         except OutOfTime:
             return
-        yield Entry(judged, sweep, size)
+        yield Entry(estimated, sweep, size)

@@ -120,7 +120,7 @@ def fit(
 
     request = checked(
         pairs, scene, options, budget=budget, checkpoints=checkpoints, factors=factors,
-        say=on_progress, tell=on_candidate,
+        on_progress=on_progress, on_candidate=on_candidate,
     )  # fmt: skip
     warn(request.messages)
     taken = paid_for(identified(request.pairs), budget, options.seed)
@@ -232,7 +232,7 @@ def fit_positions(
     found = learn_positions(
         recording, tolerance=asked, structure=options.structure, seed=options.seed,
         budget=budget,
-        say=on_progress, tell=on_candidate,
+        on_progress=on_progress, on_candidate=on_candidate,
     )  # fmt: skip
     for message in found.messages:
         warnings.warn(message, FitWarning, stacklevel=3)

@@ -102,7 +102,7 @@ def without_gross_errors(request: Request, diagnosis: Diagnosis, found: Searched
         if not _rms(size) > _SPOILT * _rms(size[others]):
             break
         at_rim = _at_the_rim(found, rows)
-        request.say(f"without {gone} of {count} pairs that the map misses by far")
+        request.on_progress(f"without {gone} of {count} pairs that the map misses by far")
         data = found.data.take(others)
         anew = diagnose_request(request, data)
         again = searched(request, data, anew, None)

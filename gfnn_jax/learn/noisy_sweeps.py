@@ -66,7 +66,7 @@ def without_bias(found: Searched, request: Request) -> Searched:
         with request.budget.unit(_WHAT, ROWS, work):
             if not only_noise(best, found):
                 return found
-            request.say("fitting S to the states that noisy pairs most likely had")
+            request.on_progress("fitting S to the states that noisy pairs most likely had")
             entry = _corrected(rivals, request)
     except OutOfTime:
         request.budget.leave_out(_WHAT, request.budget.ended)
@@ -76,7 +76,7 @@ def without_bias(found: Searched, request: Request) -> Searched:
         return found
     if not entry.candidate.validation_relative <= COMPARABLE * best.candidate.validation_relative:
         return found
-    request.tell(entry.candidate)
+    request.on_candidate(entry.candidate)
     others = [e for e in found.found.entries if e.size is not entry.size]
     again = found.found._replace(entries=[*others, entry], ranking=[entry, *ranking])
     return found._replace(found=again)
@@ -113,7 +113,7 @@ class Expected(NamedTuple):
     noise: float
 
 
-def best_size(sweep: LinearSweep, near: Size, most: Size, budget: Budget, say) -> Expected:
+def best_size(sweep: LinearSweep, near: Size, most: Size, budget: Budget, on_progress) -> Expected:
     """The size of the smallest expected error, among those up to ``most``, and those beyond as long
     as the last one is the best.
 
@@ -122,7 +122,7 @@ def best_size(sweep: LinearSweep, near: Size, most: Size, budget: Budget, say) -
     near: whose residuals tell how noise is shared.
     """
     while True:
-        train = sweep.factors(most.group, budget, say).train
+        train = sweep.factors(most.group, budget, on_progress).train
         place = sweep.sizes.index(most)
         sizes = sweep.sizes[: place + 1]
         counts = [size.family.num_parameters for size in sizes]
@@ -147,30 +147,32 @@ def _last_of_group(sweep: LinearSweep, size: Size) -> Size:
 
 def _corrected(rivals: list[Entry], request: Request) -> Entry:
     """The entry of smallest expected error, or the cheapest that is as good."""
-    given = request.budget, request.say
+    given = request.budget, request.on_progress
     most = [entry.sweep.largest_known for entry in rivals]
     starts = [
         best_size(e.sweep, e.size, m, *given).size for e, m in zip(rivals, most, strict=True)
     ]  # fmt: skip
     # The same for all, so that their distances have one unit.
     deviations = rivals[0].sweep.state_deviations(starts[0])
-    judged: list[tuple[NoisySweep, Expected]] = []
+    estimated: list[tuple[NoisySweep, Expected]] = []
     for entry, start, m in zip(rivals, starts, most, strict=True):
         sweep = NoisySweep(entry.sweep, entry.sweep, start, deviations)
-        judged.append((sweep, best_size(sweep, start, m, *given)))
-    floor = min(expected.noise for _, expected in judged)
+        estimated.append((sweep, best_size(sweep, start, m, *given)))
+    floor = min(expected.noise for _, expected in estimated)
     risks = [max(expected.error - floor, expected.own) for _, expected in judged]
     sweep, expected = min(
-        (j for j, risk in zip(judged, risks, strict=True) if risk <= _NO_WORSE * min(risks)),
+        (j for j, risk in zip(estimated, risks, strict=True) if risk <= _NO_WORSE * min(risks)),
         key=lambda j: j[1].size.operations,
     )
     # Once more, by states that a corrected S has found: where an S of too many terms reaches beyond
     # the states, one pass is not enough.
-    size, m = expected.size, most[judged.index((sweep, expected))]
+    size, m = expected.size, most[estimated.index((sweep, expected))]
     sweep = NoisySweep(sweep.plain, sweep, size, deviations)
     size = best_size(sweep, size, m, *given).size
     free = Budget()
-    candidate = sweep.validate(size, sweep.judge(size, free, request.say), free, request.say)
+    candidate = sweep.validate(
+        size, sweep.estimate(size, free, request.on_progress), free, request.on_progress
+    )
     return Entry(candidate, sweep, size)
 
 
@@ -207,7 +209,7 @@ class NoisySweep(LinearSweep):
         self._along = nearest
         self._nearest, self._nearest_held = map(nearest, (data.training, data.validation))
 
-    def _computed(self, group, budget: Budget, say) -> Factors:
+    def _computed(self, group, budget: Budget, on_progress) -> Factors:
         pairs, width = self._rows_of(group)
         train = self._part(pairs * width).triangle(group, budget.check)
         held = self._nearest_held.triangle(group, budget.check)
@@ -231,14 +233,14 @@ class NoisySweep(LinearSweep):
         """Count the terms: the rows of an arc are independent."""
         return [float(count) for count in counts]
 
-    def judge(self, size: Size, budget: Budget, say) -> Candidate:
+    def estimate(self, size: Size, budget: Budget, on_progress) -> Candidate:
         """Judge as the sweep that was corrected does, by the measured points."""
-        return self.plain.judge(size, budget, say)
+        return self.plain.estimate(size, budget, on_progress)
 
-    def validate(self, size: Size, judged: Candidate, budget: Budget, say) -> Candidate:
+    def validate(self, size: Size, estimated: Candidate, budget: Budget, on_progress) -> Candidate:
         """The judged size solved in these rows, and its error measured by steps."""
-        plain = self.plain.validate(size, judged, budget, say)
-        solved, params = self.solve(size, budget, say)
+        plain = self.plain.validate(size, estimated, budget, on_progress)
+        solved, params = self.solve(size, budget, on_progress)
         candidate = dataclasses.replace(plain, condition=solved.condition, rank=solved.rank)
         return validated(candidate, self.data, self.tolerance, self.chart, size.family, params)
 

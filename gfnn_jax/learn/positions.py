@@ -97,8 +97,8 @@ class LearnedPositions(NamedTuple):
 
 def learn_positions(
     recording: Recording, *, tolerance: Tolerance, budget: Budget, structure: str | None = None,
-    seed: int = 0, say: Callable[[str], Any] = lambda message: None,
-    tell: Callable[[Candidate], Any] = lambda candidate: None,
+    seed: int = 0, on_progress: Callable[[str], Any] = lambda message: None,
+    on_candidate: Callable[[Candidate], Any] = lambda candidate: None,
 ) -> LearnedPositions:  # fmt: skip
     """The map behind the positions of a recording, at even times or by turns.
 
@@ -115,7 +115,9 @@ def learn_positions(
         recording.positions, (), recording.angles, np.zeros(triples.dim), 0.0,
         _WINDOW * triples.dt, "hold", 0.0, np.array([triples.dt]), np.zeros((1, triples.dim)),
     )  # fmt: skip
-    sweep = _Sweep(triples, sites, _split(triples, seed), tolerance, budget, say, tell, sensors)
+    sweep = _Sweep(
+        triples, sites, _split(triples, seed), tolerance, budget, on_progress, on_candidate, sensors
+    )
     best = sweep.best(symmetric=True)
     if best is None or best.candidate.validation_bound > tolerance.bound:
         other = sweep.best(symmetric=False)
@@ -126,7 +128,7 @@ def learn_positions(
             f"{len(triples)} triples of positions gave no S(q, Q) whose step can be solved. Add "
             "positions, or raise --max-seconds (max_seconds=)"
         )
-    return sweep.learned(sweep.without_noise(best), say)
+    return sweep.learned(sweep.without_noise(best), on_progress)
 
 
 class _Found(NamedTuple):
@@ -153,8 +155,8 @@ class _Sweep:
     split: Split
     tolerance: Tolerance
     budget: Budget
-    say: Callable[[str], Any]
-    tell: Callable[[Candidate], Any]
+    on_progress: Callable[[str], Any]
+    on_candidate: Callable[[Candidate], Any]
     sensors: Sensors
     tried: list[Candidate] = dataclasses.field(default_factory=list)
 
@@ -227,13 +229,13 @@ class _Sweep:
         else the best as it is."""
         if not self._stalls(best):
             return best
-        self.say("larger S are no more accurate: fitting the noise of the readings too")
+        self.on_progress("larger S are no more accurate: fitting the noise of the readings too")
         symmetric, split = best.about.symmetric, self.split
         training, held_out = (
             self.triples.take(np.sort(rows)) for rows in (split.training, split.validation)
         )
         families = self._families(symmetric)
-        found = without_noise(families, training, held_out, self.budget, self.say)
+        found = without_noise(families, training, held_out, self.budget, self.on_progress)
         if found is None:
             return best
         started = time.perf_counter()
@@ -267,7 +269,7 @@ class _Sweep:
 
     def _fitted(self, family: OfDisplacement, symmetric: bool) -> _Found:
         """S of this family by least squares."""
-        self.say(f"S of {family.label}, {family.num_parameters} terms")
+        self.on_progress(f"S of {family.label}, {family.num_parameters} terms")
         started, training = time.perf_counter(), self.triples.take(self.split.training)
         solved = solve(family, training)
         about = OfPositions(
@@ -302,7 +304,7 @@ class _Sweep:
             rank=about.rank,
         )  # fmt: skip
         self.tried.append(candidate)
-        self.tell(candidate)
+        self.on_candidate(candidate)
         return _Found(piece, candidate, about, root, noise)
 
     def error_of(self, positions: np.ndarray, rows: np.ndarray) -> OneStepError:
@@ -310,10 +312,10 @@ class _Sweep:
         error = nearest_image(positions - self.triples.after[rows], self.triples.angles)
         return one_step_error(error, self.spread, self.tolerance, self.split.stretch[rows])
 
-    def learned(self, best: _Found, say: Callable[[str], Any]) -> LearnedPositions:
+    def learned(self, best: _Found, on_progress: Callable[[str], Any]) -> LearnedPositions:
         """The map of the best S, its error that of the steps that users run, on triples that chose
         nothing where there are enough."""
-        say(f"compiling the step of {best.candidate.label}")
+        on_progress(f"compiling the step of {best.candidate.label}")
         sensors = dataclasses.replace(self.sensors, sigma=best.noise)
         map_, states = map_of(best.piece, best.root, sensors, self.triples, self.sites)
         test = self.split.test if len(self.split.test) else self.split.validation
@@ -335,7 +337,7 @@ class _Sweep:
                 f"accurate has a one-step error of {chosen.validation_relative:.2e} of the spread "
                 f"(95 % bound {chosen.validation_bound:.2e}); the search ended because {ended}"
             )
-        say(str(best.about))
+        on_progress(str(best.about))
         part = "took no part in the fit or its choices" if test is self.split.test else "also chose"
         return LearnedPositions(
             map_, tuple(sorted([*others, chosen], key=lambda c: c.operations)), best.about, states,

@@ -32,8 +32,8 @@ class Request:
     """Pairs in float64 and what is to be learned of them.
 
     options: of the fit, with ``learn`` as the pairs allow it. tolerance, structure: those of the
-    options, and the scene's. say, tell: on_progress and on_candidate of `gfnn.fit`. messages:
-    warnings about the pairs and the request. partial_laws: those that were found so far.
+    options, and the scene's. on_progress, on_candidate: those of `gfnn.fit`. messages: warnings
+    about the pairs and the request. partial_laws: those that were found so far.
     """
 
     pairs: Pairs
@@ -45,14 +45,14 @@ class Request:
     budget: Budget
     checkpoints: Any
     factors: Any
-    say: Callable[[str], Any]
-    tell: Callable[[Candidate], Any]
+    on_progress: Callable[[str], Any]
+    on_candidate: Callable[[Candidate], Any]
     messages: list[str]
     partial_laws: list[PartialLaw] = dataclasses.field(default_factory=list)
 
     def partly(self, law: PartialLaw) -> None:
         """Keep a law that explains a part."""
-        self.say(f"H: {law}")
+        self.on_progress(f"H: {law}")
         self.partial_laws.append(law)
 
     @property

@@ -66,10 +66,15 @@ def searched(
     request: Request, data: Dataset, diagnosis: Diagnosis, on_better: OnBetter | None
 ) -> Searched:
     """Every candidate. Raises FitError where there is none."""
-    tolerance, budget, say, tell = request.tolerance, request.budget, request.say, request.tell
+    tolerance, budget, on_progress, on_candidate = (
+        request.tolerance,
+        request.budget,
+        request.on_progress,
+        request.on_candidate,
+    )
     options, scene, charts = request.options, request.scene, diagnosis.charts
     better = _Better(on_better) if on_better is not None else None
-    given = tolerance.bound, budget, say, tell, better
+    given = tolerance.bound, budget, on_progress, on_candidate, better
     # Small sizes first: a map is then there, however long the search for H.
     early = not _of_terms(data) or options.model is not None
     climb = Search(_sweeps(request, data, diagnosis) if early else [], *given)
@@ -84,7 +89,9 @@ def searched(
     wanted = not early and options.learn != "hamiltonian" and not met_by_law
     if wanted and options.family == "auto":
         try:
-            of_terms = map_of(diagnosis.data, tolerance, scene, options.chart, law, budget, say)
+            of_terms = map_of(
+                diagnosis.data, tolerance, scene, options.chart, law, budget, on_progress
+            )
             if of_terms is not None and law is not None and _no_better(of_terms, law, tolerance):
                 of_terms = None
         except FitError as error:
@@ -109,9 +116,9 @@ def searched(
         and met_by_law
         and more_pairs_would_help(climb.sweeps, found, tolerance, dearest)
     ):
-        say("drawing pairs from the flow of H")
+        on_progress("drawing pairs from the flow of H")
         drawn = search_of_law(
-            law, data, tolerance, scene, dearest, budget, say, tell, options.seed
+            law, data, tolerance, scene, dearest, budget, on_progress, on_candidate, options.seed
         )  # fmt: skip
         if drawn is not None:
             found, charts = drawn
@@ -119,8 +126,10 @@ def searched(
         law is not None and not met_by_law and data.args is None
         and law_explains_most(law, found, tolerance, budget)
     ):  # fmt: skip
-        say(f"learning what the flow of {law.candidate.label} leaves over")
-        around = search_around(law, data, tolerance, scene, budget, say, tell, better, options.seed)
+        on_progress(f"learning what the flow of {law.candidate.label} leaves over")
+        around = search_around(
+            law, data, tolerance, scene, budget, on_progress, on_candidate, better, options.seed
+        )
         if around is not None and better_than(around.found, found, law):
             found, charts = around
     known = [f.candidate for f in (law, of_terms, *found.ranking[:1]) if f is not None]
@@ -129,7 +138,7 @@ def searched(
     if budget.over and best > tolerance.bound:
         linear = linear_map(diagnosis.plain, tolerance)
         if linear is not None and linear.validation_bound < best:
-            tell(linear)
+            on_candidate(linear)
         elif known:
             linear = None
     if not known and linear is None:
@@ -169,17 +178,17 @@ def _law(
     if request.of_network:
         law = learn_network(
             data, request.tolerance, request.scene, seed=options.seed, budget=request.budget,
-            say=request.say, max_iterations=options.max_iterations,
+            on_progress=request.on_progress, max_iterations=options.max_iterations,
         )  # fmt: skip
     else:
         law = law_of(
             data, request.tolerance, request.scene, options.learn, options.terms, request.budget,
-            request.say, dearest, request.partly,
+            request.on_progress, dearest, request.partly,
         )  # fmt: skip
     if law is not None:
         if better is not None:
             better.offer(law.candidate, lambda: composed(law.flow, data))
-        request.tell(law.candidate)
+        request.on_candidate(law.candidate)
     return law
 
 

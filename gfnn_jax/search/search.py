@@ -38,7 +38,7 @@ _FAR = 10.0  # times the tolerance: a sweep that leads to no smaller error misse
 
 
 class Entry(NamedTuple):
-    """A judged or validated candidate and where it came from."""
+    """A estimated or validated candidate and where it came from."""
 
     candidate: Candidate
     sweep: Any
@@ -46,8 +46,8 @@ class Entry(NamedTuple):
 
 
 class Found(NamedTuple):
-    """entries: every size that was judged. ranking: what may be chosen, the best first: those that
-    meet the tolerance by rising operations, then the others by rising error. stalled: (chart,
+    """entries: every size that was estimated. ranking: what may be chosen, the best first: those
+    that meet the tolerance by rising operations, then the others by rising error. stalled: (chart,
     family) of sweeps in which larger sizes stopped helping. ended: why the search ended."""
 
     entries: list[Entry]
@@ -60,13 +60,13 @@ def search(
     sweeps: Sequence[Any],
     bound: float,
     budget: Budget,
-    say: Callable[[str], Any],
-    tell: Callable[[Candidate], Any],
+    on_progress: Callable[[str], Any],
+    on_candidate: Callable[[Candidate], Any],
     on_validated: Callable[[Entry], Any] | None = None,
     dearest: float = np.inf,
 ) -> Found:
     """Climb the sweeps to their end: a `Search` in one go, its arguments those of ``climb``."""
-    started = Search(sweeps, bound, budget, say, tell, on_validated)
+    started = Search(sweeps, bound, budget, on_progress, on_candidate, on_validated)
     started.climb(dearest)
     return started.found()
 
@@ -75,21 +75,30 @@ class Search:
     """A climb of sweeps, which may be made in parts.
 
     A sweep has ``sizes`` by rising ``operations``, each of an ``order`` with which the
-    logarithm of the error falls in proportion, ``judge(size, budget, say)`` and ``validate(size,
-    judged, budget, say)``, which give candidates, ``work(size)`` and ``work_of_steps(size)``: the
-    operations that these take, ``short_of_pairs``: whether more pairs would allow larger sizes, and
-    ``at(order)``, which says what a size of this order is and takes.
+    logarithm of the error falls in proportion, ``estimate(size, budget, on_progress)`` and
+    ``validate(size, estimated, budget, on_progress)``, which give candidates, ``work(size)`` and
+    ``work_of_steps(size)``: the operations that these take, ``short_of_pairs``: whether more pairs
+    would allow larger sizes, and ``at(order)``, which says what a size of this order is and takes.
 
-    bound: the tolerance on a candidate's ``validation_bound``. tell: called with every candidate.
-    on_validated: called with every entry whose steps have been looked at.
+    bound: the tolerance on a candidate's ``validation_bound``. on_candidate: called with every
+    candidate. on_validated: called with every entry whose steps have been looked at.
     """
 
     def __init__(
-        self, sweeps: Sequence[Any], bound: float, budget: Budget, say: Callable[[str], Any],
-        tell: Callable[[Candidate], Any], on_validated: Callable[[Entry], Any] | None = None,
-    ):  # fmt: skip
+        self,
+        sweeps: Sequence[Any],
+        bound: float,
+        budget: Budget,
+        on_progress: Callable[[str], Any],
+        on_candidate: Callable[[Candidate], Any],
+        on_validated: Callable[[Entry], Any] | None = None,
+    ):
         self.sweeps, self._bound, self._budget = sweeps, bound, budget
-        self._say, self._tell, self._on_validated = say, tell, on_validated
+        self._on_progress, self._on_candidate, self._on_validated = (
+            on_progress,
+            on_candidate,
+            on_validated,
+        )
         self._queue = sorted(
             (size.operations, i, n) for i, s in enumerate(sweeps) for n, size in enumerate(s.sizes)
         )
@@ -124,21 +133,21 @@ class Search:
         sweep, size = self.sweeps[i], self.sweeps[i].sizes[n]
         follows = SOLVE, sweep.work_of_steps(size)
         with self._budget.unit(sweep.named(size), ROWS, sweep.work(size), then=follows):
-            judged = sweep.judge(size, self._budget, self._say)
+            estimated = sweep.estimate(size, self._budget, self._on_progress)
         size = sweep.sizes[n]  # with what was trained
-        entry = Entry(judged, sweep, size)
+        entry = Entry(estimated, sweep, size)
         self._entries.append(entry)
-        relative = judged.validation_relative
+        relative = estimated.validation_relative
         # Something to keep should the search be interrupted is worth a few more looks.
         keep = self._on_validated is not None and relative < _KEPT * self._kept
         self._kept = min(self._kept, relative) if keep else self._kept
-        if keep or self._ratio[i] * judged.validation_bound <= _WITHIN_REACH * self._bound:
+        if keep or self._ratio[i] * estimated.validation_bound <= _WITHIN_REACH * self._bound:
             entry = self._validated(entry)
             error = entry.candidate.validation_relative
             if np.isfinite(error) and relative > 0:
                 self._ratio[i] = error / relative
         candidate = entry.candidate
-        self._tell(candidate)
+        self._on_candidate(candidate)
         if candidate.validated and self._on_validated is not None:
             self._on_validated(entry)
         if candidate.validated and candidate.validation_bound <= self._bound:
@@ -146,10 +155,10 @@ class Search:
             self._left.add(i)
         self._stalled[i] = self._stalled[i] + 1 if relative > _WORTHWHILE * self._best[i] else 0
         self._best[i] = min(self._best[i], relative)
-        self._beaten[i] += any(_beats(e.candidate, judged) for e in self._entries)
+        self._beaten[i] += any(_beats(e.candidate, estimated) for e in self._entries)
         if self._stalled[i] == _STALLED or self._beaten[i] == _BEATEN:
             self._left.add(i)
-        self._errors[i].append((size.order, judged.validation_bound))
+        self._errors[i].append((size.order, estimated.validation_bound))
         self._left |= _hopeless(self.sweeps, self._errors, self._ratios, self._left, self._bound)
 
     def _validated(self, entry: Entry) -> Entry:
@@ -157,7 +166,7 @@ class Search:
         sweep, size = entry.sweep, entry.size
         name = f"steps of {sweep.named(size)}"
         with self._budget.unit(name, SOLVE, sweep.work_of_steps(size)):
-            candidate = sweep.validate(size, entry.candidate, self._budget, self._say)
+            candidate = sweep.validate(size, entry.candidate, self._budget, self._on_progress)
         return self._replaced(entry, candidate)
 
     def _replaced(self, entry: Entry, candidate: Candidate) -> Entry:
@@ -196,8 +205,10 @@ class Search:
                 work = entry.sweep.work_of_steps(entry.size)
                 with self._budget.free(SOLVE, work):
                     free = Budget()
-                    judged = entry.sweep.validate(entry.size, entry.candidate, free, self._say)
-                self._replaced(entry, judged)
+                    estimated = entry.sweep.validate(
+                        entry.size, entry.candidate, free, self._on_progress
+                    )
+                self._replaced(entry, estimated)
                 continue
             try:
                 self._validated(entry)
@@ -237,7 +248,7 @@ def _hopeless(
 
 
 def _reached(errors, ratio: list[float]) -> list[float]:
-    """The smallest error of each sweep, infinite where none is judged."""
+    """The smallest error of each sweep, infinite where none is estimated."""
     return [r * min((e for _, e in s), default=np.inf) for s, r in zip(errors, ratio, strict=True)]
 
 

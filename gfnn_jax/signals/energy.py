@@ -39,7 +39,7 @@ class Loss:
     kind: str | None
 
     @property
-    def seen(self) -> bool:
+    def significant(self) -> bool:
         """Return whether there is a loss, or a gain: more than three standard errors, and than
         1e-4."""
         return abs(self.per_period) > max(3 * self.error, 1e-4)

@@ -56,7 +56,7 @@ class CoefficientNoise(Generates):
     _weight: np.ndarray
     _factors: dict[Any, Factors]
 
-    def factors(self, group: Any, budget: Budget, say) -> Factors:
+    def factors(self, group: Any, budget: Budget, on_progress) -> Factors:
         """Factors of a group's largest family, which answer for all of its sizes."""
         raise NotImplementedError
 

@@ -68,7 +68,7 @@ class LatentReadings:
 
 def latent_readings(
     piece: Generated, ends: tuple[list[Any], list[Any]], turns: list[np.ndarray],
-    say: Callable[[str], Any] = lambda message: None,
+    on_progress: Callable[[str], Any] = lambda message: None,
 ) -> LatentReadings | None:  # fmt: skip
     """The S that the readings ``turns``, (n, 2d) of each stretch of turns without a gap, ask for by
     Akaike's criterion; None where they are too few, or every larger S leaves less: what is left is
@@ -84,7 +84,7 @@ def latent_readings(
     for family in _families(piece.family):
         if best and _PASSES * arcs.size * family.num_parameters**2 > _MOST_OPERATIONS:
             break
-        say(f"latent readings, S of {family.label}, {family.num_parameters} terms")
+        on_progress(f"latent readings, S of {family.label}, {family.num_parameters} terms")
         with one_thread():
             found = _fitted(piece, family, ends, arcs)
         if found.converged and (best is None or found.criterion < best.criterion):

@@ -29,7 +29,7 @@ from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms, joined, multiplied
 from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.linear_starts import fitted_gradients
-from gfnn_jax.fitting.significance import null_terms, significant, told_from_noise
+from gfnn_jax.fitting.significance import null_terms, significant, terms_above_noise
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import CHARTS, AnyChart
 from gfnn_jax.generating.generated import Generated
@@ -68,7 +68,7 @@ class _Tried(NamedTuple):
 
 def learn_map(
     data: Dataset, tolerance: Tolerance, scene: Any = None, *, chart: str = "auto",
-    budget: Budget | None = None, say: Callable[[str], Any] = lambda message: None,
+    budget: Budget | None = None, on_progress: Callable[[str], Any] = lambda message: None,
     needed: bool = True,
 ) -> LearnedMap:  # fmt: skip
     """The map of these pairs of one dt and several systems, or of many sites: of the first chart
@@ -82,7 +82,7 @@ def learn_map(
     tried: list[_Tried] = []
     try:
         for name in _CHARTS if chart == "auto" else (chart,):
-            attempts = _Attempts(CHARTS[name], data, tolerance, budget, say, needed)
+            attempts = _Attempts(CHARTS[name], data, tolerance, budget, on_progress, needed)
             for found in _of_chart(attempts, scene):
                 tried.append(found)
                 needed = False
@@ -127,13 +127,19 @@ def learn_map(
 
 def map_of(
     data: Dataset, tolerance: Tolerance, scene: Any, chart: str, law: Any, budget: Budget,
-    say: Callable[[str], Any],
+    on_progress: Callable[[str], Any],
 ) -> LearnedMap | None:  # fmt: skip
     """Learn by `learn_map`; None where it finds none beside a law."""
     try:
         with np.errstate(all="ignore"):
             return learn_map(
-                data, tolerance, scene, chart=chart, budget=budget, say=say, needed=law is None
+                data,
+                tolerance,
+                scene,
+                chart=chart,
+                budget=budget,
+                on_progress=on_progress,
+                needed=law is None,
             )
     except (FitError, OutOfTime):
         if law is None:
@@ -156,7 +162,7 @@ class _Attempts:
     data: Dataset
     tolerance: Tolerance
     budget: Budget
-    say: Callable[[str], Any]
+    on_progress: Callable[[str], Any]
     needed: bool
 
     def __post_init__(self) -> None:
@@ -166,7 +172,7 @@ class _Attempts:
     def __call__(self, family: Any) -> _Tried:
         name = f"S in {self.chart.name}: {family.num_parameters} terms"
         work = _work(family, self.data)
-        self.say(name)
+        self.on_progress(name)
         first, self.needed = self.needed, False
         unit = self.budget.free(ROWS, work) if first else self.budget.unit(name, ROWS, work)
         with unit:
@@ -311,9 +317,11 @@ def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance, noisy: bool) -> _
     residual = terms @ piece.params - (target * weight).ravel()
     triangle = Triangle.of(np.column_stack([terms, residual]))
     tried: set[int] = set()
-    tell, thresholds = (told_from_noise, (_CERTAIN,)) if noisy else (significant, _THRESHOLDS)
+    remaining_terms, thresholds = (
+        (terms_above_noise, (_CERTAIN,)) if noisy else (significant, _THRESHOLDS)
+    )
     for threshold in thresholds:
-        kept, _ = tell(triangle, piece.params, threshold)
+        kept, _ = remaining_terms(triangle, piece.params, threshold)
         if not 0 < len(kept) < piece.family.num_parameters or len(kept) in tried:
             continue
         tried.add(len(kept))

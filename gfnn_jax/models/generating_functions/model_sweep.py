@@ -61,10 +61,12 @@ class ModelSweep:
         """A fit to other rows counts one operation, too."""
         return 1.0
 
-    def judge(self, size: ModelSize, budget: Budget, say: Callable[[str], Any]) -> Candidate:
+    def estimate(
+        self, size: ModelSize, budget: Budget, on_progress: Callable[[str], Any]
+    ) -> Candidate:
         """The size fitted, and its error measured by steps on the validation rows."""
         started = time.perf_counter()
-        say(self.named(size))
+        on_progress(self.named(size))
         fitted = self._fitted[size.number] = self.model.fit(self._data, size.own)
         seconds = time.perf_counter() - started
         images = self._images_of_users(fitted, self.data.validation)
@@ -77,9 +79,11 @@ class ModelSweep:
             fit_seconds=seconds, validated=True,
         )  # fmt: skip
 
-    def validate(self, size: ModelSize, judged: Candidate, budget: Budget, say) -> Candidate:
+    def validate(
+        self, size: ModelSize, estimated: Candidate, budget: Budget, on_progress
+    ) -> Candidate:
         """The judged size as it is: its steps have been made."""
-        return judged
+        return estimated
 
     def at(self, order: float) -> str:
         """Name of the size of this number."""

@@ -64,13 +64,13 @@ class NetworkSweep(Generates):
         w, parameters = self._train[0], self.sizes[0].family.num_parameters
         return 2.0 * w.size * parameters**2
 
-    def judge(self, size: Size, budget: Budget, say: Callable[[str], Any]) -> Candidate:
+    def estimate(self, size: Size, budget: Budget, on_progress: Callable[[str], Any]) -> Candidate:
         """Train the network."""
         family = size.family
         held, _ = rows_of(self.data, self.chart, self.data.validation)
 
         def report(state: LMState) -> None:
-            say(
+            on_progress(
                 f"{self.chart.name} {family.label}: iteration {state.iteration}, "
                 f"validation {state.validation_rms:.2e} of the data's spread"
             )
@@ -107,11 +107,13 @@ class NetworkSweep(Generates):
         self._params = jax.tree.map(np.asarray, result.params)
         return result
 
-    def validate(self, size: Size, judged: Candidate, budget: Budget, say) -> Candidate:
+    def validate(self, size: Size, estimated: Candidate, budget: Budget, on_progress) -> Candidate:
         """The trained network with its error measured by steps."""
-        return validated(judged, self.data, self.tolerance, self.chart, size.family, self._params)
+        return validated(
+            estimated, self.data, self.tolerance, self.chart, size.family, self._params
+        )
 
-    def solve(self, size: Size, budget: Budget, say) -> tuple[Any, Any]:
+    def solve(self, size: Size, budget: Budget, on_progress) -> tuple[Any, Any]:
         """The params of the trained network."""
         return None, self._params
 

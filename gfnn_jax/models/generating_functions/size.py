@@ -42,7 +42,7 @@ class Generates:
     chart: AnyChart
     tolerance: Tolerance
 
-    def solve(self, size: Size, budget: Budget, say) -> tuple[Any, Any]:
+    def solve(self, size: Size, budget: Budget, on_progress) -> tuple[Any, Any]:
         """Solve for the params of the size's family; with them what is known of the solution."""
         raise NotImplementedError
 

@@ -169,32 +169,32 @@ class LinearSweep(CoefficientNoise):
         count, width = size.family.num_parameters, self._train[1].shape[1]
         return 2.0 * len(self.data) * width * (count + 1) ** 2 + OF_SOLVE * count**3
 
-    def judge(self, size: Size, budget: Budget, say: Callable[[str], Any]) -> Candidate:
+    def estimate(self, size: Size, budget: Budget, on_progress: Callable[[str], Any]) -> Candidate:
         """The size with its error estimated from the held-out residual of the gradient."""
         started = time.perf_counter()
-        train, held = self.factors(size.group, budget, say)[:2]
+        train, held = self.factors(size.group, budget, on_progress)[:2]
         count = size.family.num_parameters
         ((train_rms, held_rms),) = least_squares.residuals(train, held, [count])
         return self._candidate(size, train_rms, held_rms, time.perf_counter() - started)
 
-    def validate(self, size: Size, judged: Candidate, budget: Budget, say) -> Candidate:
+    def validate(self, size: Size, estimated: Candidate, budget: Budget, on_progress) -> Candidate:
         """The judged size solved, and its error measured by steps."""
         budget.check()
-        say(f"{judged.chart} {judged.label}: steps of the held-out pairs")
+        on_progress(f"{estimated.chart} {estimated.label}: steps of the held-out pairs")
         started = time.perf_counter()
-        solved, params = self.solve(size, budget, say)
-        factors = self.factors(size.group, budget, say)
+        solved, params = self.solve(size, budget, on_progress)
+        factors = self.factors(size.group, budget, on_progress)
         outside = None
         if factors.outer.rows:  # none where every coordinate covers its circle
             ((_, outside),) = least_squares.residuals(
                 factors.inner, factors.outer, [size.family.num_parameters]
             )
         candidate = dataclasses.replace(
-            judged, train_rms=solved.train_rms, condition=solved.condition, rank=solved.rank,
+            estimated, train_rms=solved.train_rms, condition=solved.condition, rank=solved.rank,
             outside=outside,
         )  # fmt: skip
         candidate = validated(candidate, self.data, self.tolerance, self.chart, size.family, params)
-        seconds = judged.fit_seconds + time.perf_counter() - started
+        seconds = estimated.fit_seconds + time.perf_counter() - started
         return dataclasses.replace(candidate, fit_seconds=seconds)
 
     def at(self, order: float) -> str:
@@ -212,11 +212,13 @@ class LinearSweep(CoefficientNoise):
         most = f", more than the {_MOST_TERMS:,} that are tried" if terms > _MOST_TERMS else ""
         return f"{label} ({terms:,} terms{most}; about {pairs:,} pairs)"
 
-    def solve(self, size: Size, budget: Budget, say) -> tuple[least_squares.LeastSquaresFit, Any]:
+    def solve(
+        self, size: Size, budget: Budget, on_progress
+    ) -> tuple[least_squares.LeastSquaresFit, Any]:
         """The coefficients of this size, and the params of its family: solved for once."""
         count = size.family.num_parameters
         if count not in self._solved:
-            train, held = self.factors(size.group, budget, say)[:2]
+            train, held = self.factors(size.group, budget, on_progress)[:2]
             self._solved[count] = least_squares.solve(train, held, count)
         solved = self._solved[count]
         return solved, size.family.unflatten(solved.coefficients)
@@ -290,10 +292,10 @@ class LinearSweep(CoefficientNoise):
             further += [Size(f, f, _extent(f)) for f in itertools.islice(beyond, 2 - len(further))]
         return further[-1] if further else None
 
-    def factors(self, group, budget: Budget, say) -> Factors:
+    def factors(self, group, budget: Budget, on_progress) -> Factors:
         """Factors of a group's largest family, which answer for all of its sizes."""
         if group not in self._factors:
-            self._factors[group] = self._known(group) or self._computed(group, budget, say)
+            self._factors[group] = self._known(group) or self._computed(group, budget, on_progress)
         return self._factors[group]
 
     def _known(self, group) -> Factors | None:
@@ -307,9 +309,11 @@ class LinearSweep(CoefficientNoise):
         )
         return Factors.of(inner, outer, held)
 
-    def _computed(self, group, budget: Budget, say) -> Factors:
+    def _computed(self, group, budget: Budget, on_progress) -> Factors:
         taken, _ = self._rows_of(group)
-        say(f"{self.chart.name}: {group.num_parameters} terms of {group.label}, {taken} pairs")
+        on_progress(
+            f"{self.chart.name}: {group.num_parameters} terms of {group.label}, {taken} pairs"
+        )
         started = time.perf_counter()
         train, outermost = tuple(a[:taken] for a in self._train), self._outermost[:taken]
         inner, outer, held = (

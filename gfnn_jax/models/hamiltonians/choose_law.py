@@ -42,7 +42,7 @@ def law_of(
     learn: str,
     terms: Sequence[str | Callable],
     budget: Budget,
-    say: Callable[[str], Any],
+    on_progress: Callable[[str], Any],
     dearest: float = np.inf,
     partly: OnPartial = lambda law: None,
 ) -> LearnedHamiltonian | None:
@@ -70,8 +70,8 @@ def law_of(
     try:
         with np.errstate(all="ignore"):  # starts that run away are part of the search
             return learn_hamiltonian(
-                data, tolerance, scene, terms=terms, budget=budget, say=say, options=options,
-                dearest=np.inf if foremost else dearest, partly=partly,
+                data, tolerance, scene, terms=terms, budget=budget, on_progress=on_progress,
+                options=options, dearest=np.inf if foremost else dearest, partly=partly,
             )  # fmt: skip
     except OutOfTime:
         budget.leave_out("H", "no set of terms was fitted within the budget")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from gfnn_jax.budget import Allowance, Budget
-from gfnn_jax.fitting.significance import significant_terms, told_from_noise
+from gfnn_jax.fitting.significance import significant_terms, terms_above_noise
 from gfnn_jax.models.hamiltonians.fitted_law import Dropped, FittedLaw
 from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
 from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
@@ -55,7 +55,7 @@ def _significant(problem, full: FittedLaw, rows, options: Options) -> FittedLaw 
     found = problem.linearised(full.family, full.fit.coefficients, full.fit.steps, resolved)
     if not np.isfinite(found.norm):
         return None
-    kept, start = told_from_noise(found, full.fit.coefficients, options.certain)
+    kept, start = terms_above_noise(found, full.fit.coefficients, options.certain)
     if not len(kept):
         return None
     return full._replace(
@@ -63,7 +63,7 @@ def _significant(problem, full: FittedLaw, rows, options: Options) -> FittedLaw 
     )
 
 
-def sparse(problem, full: FittedLaw, data, tolerance, options: Options, say) -> FittedLaw:
+def sparse(problem, full: FittedLaw, data, tolerance, options: Options, on_progress) -> FittedLaw:
     """Drop the terms that the pairs do not ask for, as far as the held-out error allows."""
     tried: set[tuple[int, ...]] = set()
     for threshold in options.thresholds:
@@ -74,7 +74,7 @@ def sparse(problem, full: FittedLaw, data, tolerance, options: Options, say) -> 
             continue
         tried.add(kept)
         family = full.family.take(kept)
-        say(f"H: {len(kept)} of {full.family.num_parameters} terms")
+        on_progress(f"H: {len(kept)} of {full.family.num_parameters} terms")
         start = full.fit.coefficients[list(kept)]
         fit = problem.fit(family, start, full.fit.used, rounds=False, steps=full.fit.steps)
         error = validation_error(family, fit, data, tolerance)
@@ -82,7 +82,7 @@ def sparse(problem, full: FittedLaw, data, tolerance, options: Options, say) -> 
         if error.relative <= max(options.rise * before, options.rounding):
             dropped = Dropped(full.family.num_parameters - len(kept), before, error.relative)
             change = f"error {error.relative:.2e}, before {before:.2e}"
-            say(f"H without {dropped.terms} terms: {change}")
+            on_progress(f"H without {dropped.terms} terms: {change}")
             return full._replace(family=family, fit=fit, error=error, dropped=dropped)
     return full
 

@@ -30,7 +30,7 @@ from gfnn_jax.maps.laws import STIFFEST
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, Table, chosen
 from gfnn_jax.models.lagrangians.libraries import losses
 from gfnn_jax.models.lagrangians.structure import Loss
-from gfnn_jax.models.lagrangians.text import WhichFriction, which_friction_told
+from gfnn_jax.models.lagrangians.text import WhichFriction, which_friction_line
 from gfnn_jax.phase_space import split
 
 _SHARP = 1e-9  # ε of dry friction in a fit, in rms speeds: of pairs in which none turns, roundoff
@@ -153,7 +153,7 @@ def kinds_of_friction(
         table = _table(problem, larger, c, steps, rows)
         limits = {} if table is None else table.limits(taken)
     sharp = {(c, kind, 0.0): limit for (c, kind, _), limit in limits.items()}
-    return which_friction_told(
+    return which_friction_line(
         FrictionChoice(taken, odds, sharp, gains=False), 1.0, data.dim,
         [f"v{i + 1}" for i in range(data.dim)],
     )  # fmt: skip

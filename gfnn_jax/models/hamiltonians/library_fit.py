@@ -15,7 +15,7 @@ _EXPLAINED = 0.05  # of the spread: an error below it is that of the right branc
 
 
 def fitted_library(
-    problem, work: LawWork, family, data, tolerance, last: FittedLaw | None, options, say
+    problem, work: LawWork, family, data, tolerance, last: FittedLaw | None, options, on_progress
 ) -> FittedLaw:
     """The library fitted to as many training pairs as tell its terms, from the best start."""
     names = family.term_names
@@ -36,7 +36,7 @@ def fitted_library(
     first = last is None and (data.varied or data.structure is not None)
     with work.library(f"H of {family.num_parameters} terms", family, len(rows), first=first):
         for start in starts(problem, family, rows, data.training[:_TURNING], last):
-            fit = problem.fit(family, start, rows, say=say)
+            fit = problem.fit(family, start, rows, on_progress=on_progress)
             error = validation_error(family, fit, data, tolerance)
             if best is None or error.relative < best.error.relative:
                 best = FittedLaw(family, fit, rows, error, null_names, undetermined)

@@ -54,7 +54,7 @@ _FIRST_ROUND = 5e8  # operations that the first round of growth is expected to t
 
 def of_libraries(
     problem, work: LawWork, basis: Modes | None, data: Dataset, tolerance: Tolerance, scene, terms,
-    options: Options, say, early: Sequence[FittedLaw],
+    options: Options, on_progress, early: Sequence[FittedLaw],
 ) -> tuple[FittedLaw, Options]:  # fmt: skip
     """The best library of terms of H, without friction or with it, and the options for fewer.
 
@@ -65,21 +65,23 @@ def of_libraries(
         forces: Forces | None = None, data: Dataset = data
     ) -> tuple[FittedLaw, Options]:  # fmt: skip
         known = early if forces is None else ()
-        return _searched(problem, work, data, tolerance, scene, terms, options, say, forces, known)
+        return _searched(
+            problem, work, data, tolerance, scene, terms, options, on_progress, forces, known
+        )
 
     if data.args is not None:
-        found = _walked(problem, work, data, tolerance, scene, terms, options, say)
+        found = _walked(problem, work, data, tolerance, scene, terms, options, on_progress)
     elif basis is not None:
-        found = _grown(problem, work, basis, data, tolerance, options, say), options
+        found = _grown(problem, work, basis, data, tolerance, options, on_progress), options
     else:
         found = search()
         if not terms and data.structure is None:
-            found = _beside_centrifugal(problem, work, found, data, tolerance, options, say)
+            found = _beside_centrifugal(problem, work, found, data, tolerance, options, on_progress)
     return beside_friction(problem, work, found, data, tolerance, search)
 
 
 def small_polynomials(
-    problem, work: LawWork, data: Dataset, tolerance: Tolerance, options: Options, say
+    problem, work: LawWork, data: Dataset, tolerance: Tolerance, options: Options, on_progress
 ) -> list[FittedLaw]:
     """The smallest polynomials that a search for H begins with, up to the first that is exact.
 
@@ -94,10 +96,10 @@ def small_polynomials(
         last = fitted[-1] if fitted else None
         if last is not None and too_dear(problem, family, last, data, tolerance, work.dearest):
             break
-        say(f"H: {family.num_parameters} terms")
+        on_progress(f"H: {family.num_parameters} terms")
         try:
             fitted.append(
-                fitted_library(problem, work, family, data, tolerance, last, options, say)
+                fitted_library(problem, work, family, data, tolerance, last, options, on_progress)
             )
         except OutOfTime:  # whatever follows finds no time either
             break
@@ -118,7 +120,7 @@ def _searched(
     scene,
     terms,
     options: Options,
-    say,
+    on_progress,
     forces: Forces | None = None,
     early: Sequence[FittedLaw] = (),
 ) -> tuple[FittedLaw, Options]:
@@ -135,14 +137,18 @@ def _searched(
     try:
         for i, family in enumerate(libraries):
             if tried and too_dear(problem, family, tried[-1], data, tolerance, work.dearest):
-                say(f"H: {family.num_parameters} terms skipped, dearer per step than the map found")
+                on_progress(
+                    f"H: {family.num_parameters} terms skipped, dearer per step than the map found"
+                )
                 continue
             if i < len(early):
                 found = early[i]
             else:
-                say(f"H: {family.num_parameters} terms")
+                on_progress(f"H: {family.num_parameters} terms")
                 last = tried[-1] if tried else None
-                found = fitted_library(problem, work, family, data, tolerance, last, options, say)
+                found = fitted_library(
+                    problem, work, family, data, tolerance, last, options, on_progress
+                )
             better = best is None or found.error.relative < options.gained * best.error.relative
             poor = 0 if better else poor + 1
             if best is None or found.error.relative < best.error.relative:
@@ -199,7 +205,7 @@ def _libraries(
 
 def _beside_centrifugal(
     problem, work: LawWork, before: tuple[FittedLaw, Options], data: Dataset, tolerance: Tolerance,
-    options: Options, say,
+    options: Options, on_progress,
 ) -> tuple[FittedLaw, Options]:  # fmt: skip
     """The best of libraries with centrifugal terms and their options, where ``before`` misses the
     tolerance, the pairs ask for such terms and these libraries are better; else ``before``."""
@@ -211,7 +217,7 @@ def _beside_centrifugal(
         return before
     options = dataclasses.replace(options, given_degrees=options.given_degrees[1:])
     try:
-        found = _searched(problem, work, data, tolerance, None, own, options, say)
+        found = _searched(problem, work, data, tolerance, None, own, options, on_progress)
     except OutOfTime:
         work.budget.leave_out("libraries of H with centrifugal terms", work.ended)
         return before
@@ -221,7 +227,14 @@ def _beside_centrifugal(
 
 
 def _walked(
-    problem, work: LawWork, data: Dataset, tolerance: Tolerance, scene, terms, options: Options, say
+    problem,
+    work: LawWork,
+    data: Dataset,
+    tolerance: Tolerance,
+    scene,
+    terms,
+    options: Options,
+    on_progress,
 ) -> tuple[FittedLaw, Options]:
     """The best of the libraries of states and parameters, which grow together; as `_searched`."""
     own = own_terms(data, terms) if terms else None
@@ -240,8 +253,8 @@ def _walked(
     tried: list[FittedLaw] = []
 
     def attempt(family: Terms) -> FittedLaw:
-        say(f"H: {family.num_parameters} terms")
-        return fitted_library(problem, work, family, data, tolerance, best, options, say)
+        on_progress(f"H: {family.num_parameters} terms")
+        return fitted_library(problem, work, family, data, tolerance, best, options, on_progress)
 
     try:
         for found in walked(
@@ -264,7 +277,13 @@ def _walked(
 
 
 def _grown(
-    problem, work: LawWork, basis: Modes, data: Dataset, tolerance: Tolerance, options: Options, say
+    problem,
+    work: LawWork,
+    basis: Modes,
+    data: Dataset,
+    tolerance: Tolerance,
+    options: Options,
+    on_progress,
 ) -> FittedLaw:
     """The library that has grown to the tolerance, or as far as the cap and the pairs allow."""
     goal = options.goal * bound_of(tolerance, problem.scale)
@@ -281,7 +300,7 @@ def _grown(
                 break
             grown, ended, expected = further, further.ended, work.made - before
             why = f": {ended}" if ended else ""
-            say(f"H grows: {len(grown.coefficients)} modes, error {grown.rms:.1e}{why}")
+            on_progress(f"H grows: {len(grown.coefficients)} modes, error {grown.rms:.1e}{why}")
     except OutOfTime:
         if grown is None:
             raise
@@ -294,7 +313,7 @@ def _grown(
     work.capped((1 - options.growth_part) * options.mode_operations)
     count = int(np.ceil(options.judged_rows * len(grown.coefficients) / (2 * data.dim)))
     rows = data.training[: max(count, 500)]
-    fit = problem.fit(grown.family, grown.coefficients, rows, rounds=False, say=say)
+    fit = problem.fit(grown.family, grown.coefficients, rows, rounds=False, on_progress=on_progress)
     error = validation_error(grown.family, fit, data, tolerance)
     return FittedLaw(grown.family, fit, rows, error, (), ended=ended)
 

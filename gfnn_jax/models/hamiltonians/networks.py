@@ -65,7 +65,8 @@ _RESOLVED = 0.1  # of the tolerance: what rounds may leave over of the gradient
 
 def learn_network(
     data: Dataset, tolerance: Tolerance, scene: Scene | None, *, seed: int, max_iterations: int,
-    budget: Budget, say: Callable[[str], Any] = lambda message: None, options: Options = OPTIONS,
+    budget: Budget, on_progress: Callable[[str], Any] = lambda message: None,
+    options: Options = OPTIONS,
 ) -> LearnedHamiltonian:  # fmt: skip
     """The network H whose flow is nearest to these pairs. It has no formula and no posterior.
 
@@ -105,7 +106,7 @@ def learn_network(
         flow = Flow(family, params, dt, scale, options.stages, substeps)
         images = np.asarray(_images(flow, y0))
         error = measured_error(data, tolerance, to_user(coordinates, images[count:]))
-        say(f"{label}: {done} iterations, error {error.relative:.2e}")
+        on_progress(f"{label}: {done} iterations, error {error.relative:.2e}")
         better = best is None or error.relative < (1 - options.gained) * best.error.relative
         idle = 0 if better else idle + 1
         if best is None or error.relative < best.error.relative:

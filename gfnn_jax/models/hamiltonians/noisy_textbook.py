@@ -73,7 +73,7 @@ class _LawOfSequences(NamedTuple):
 
 def law_of_sequences(
     problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance,
-    say: Callable[[str], Any], partly: OnPartial,
+    on_progress: Callable[[str], Any], partly: OnPartial,
 ) -> FittedLaw | None:  # fmt: skip
     """The law, or None where the pairs are no noisy sequences of one dt, or nothing in the
     dictionary leaves no more than their noise. partly: called with the three laws that come
@@ -86,7 +86,9 @@ def law_of_sequences(
     if noise is None or weak is None:
         return None
     angles = tuple(a for a in data.coordinates.angles if a < data.dim)
-    search = NoisyTextbook(weak, angles=angles, cyclic=data.coordinates.cyclic, say=say)
+    search = NoisyTextbook(
+        weak, angles=angles, cyclic=data.coordinates.cyclic, on_progress=on_progress
+    )
     name = "laws of physics behind noise"
     try:
         with work.budget.unit(name, MATCHING, _OPERATIONS[data.dim - 1]):

@@ -60,7 +60,7 @@ def learn_hamiltonian(
     *,
     terms: Sequence[str | Callable] = (),
     budget: Budget | None = None,
-    say: Callable[[str], Any] = lambda message: None,
+    on_progress: Callable[[str], Any] = lambda message: None,
     options: Options = OPTIONS,
     dearest: float = np.inf,
     partly: OnPartial = lambda law: None,
@@ -89,17 +89,17 @@ def learn_hamiltonian(
             data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
         )
         own = LawWork(problem, budget, most, dearest)
-        whole = law_of_sequences(problem, own, data, tolerance, say, partly)
+        whole = law_of_sequences(problem, own, data, tolerance, on_progress, partly)
         if whole is not None:
             seconds = time.perf_counter() - started
             problem.allowance = UNBOUNDED
             found = learned_from(whole, problem, data, tolerance, seconds, options, None)
             for note in found.notes:
-                say(note)
+                on_progress(note)
             return found
     of_steps, arcs = data, arcs_of(data)
     if arcs is not None:
-        say(f"H: fitting arcs of {arcs.length} steps, for single steps are too noisy")
+        on_progress(f"H: fitting arcs of {arcs.length} steps, for single steps are too noisy")
         data = arcs.data
     problem = Problem(
         data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
@@ -112,11 +112,13 @@ def learn_hamiltonian(
         outer = np.zeros(len(data.training), bool)
     data = everywhere.trained_on(everywhere.training[~outer])
     best, options = _best_law(
-        problem, work, basis, data, tolerance, scene, terms, options, say, partly
+        problem, work, basis, data, tolerance, scene, terms, options, on_progress, partly
     )
     _check_resolved(problem, best, data)
     far = everywhere.training[outer]
-    best, outside = _simplified(problem, work, best, data, everywhere, far, tolerance, options, say)
+    best, outside = _simplified(
+        problem, work, best, data, everywhere, far, tolerance, options, on_progress
+    )
     problem.allowance, of_arcs = UNBOUNDED, None
     if arcs is not None:
         of_arcs = partial(covariance_root, best, problem, everywhere, best.fit.steps)
@@ -126,7 +128,7 @@ def learn_hamiltonian(
         )
         best = best._replace(error=validation_error(best.family, best.fit, of_steps, tolerance))
     if best.noisy or arcs is not None:
-        best = _along_sequences(problem, work, best, everywhere, tolerance, say)
+        best = _along_sequences(problem, work, best, everywhere, tolerance, on_progress)
     best = _with_symmetries(best, everywhere)
     seconds = time.perf_counter() - started
     learned = learned_from(best, problem, everywhere, tolerance, seconds, options, of_arcs)
@@ -136,23 +138,23 @@ def learn_hamiltonian(
 
 def _best_law(
     problem, work: LawWork, basis, data: Dataset, tolerance: Tolerance, scene, terms,
-    options: Options, say, partly: OnPartial,
+    options: Options, on_progress, partly: OnPartial,
 ) -> tuple[FittedLaw, Options]:  # fmt: skip
     """The law of the smallest polynomials, of physics, of a mechanical system or of the libraries,
     the first within the tolerance, else the best; and the options for fewer terms."""
     with_masses, best, early = None, None, list[FittedLaw]()
     if not terms and scene is None:
         if basis is None and data.args is None and data.structure is None:
-            early = small_polynomials(problem, work, data, tolerance, options, say)
+            early = small_polynomials(problem, work, data, tolerance, options, on_progress)
             best = early[-1] if early and is_exact(early[-1], tolerance) else None
         if best is None:
-            best = law_of_physics(problem, work, data, tolerance, say, partly)
+            best = law_of_physics(problem, work, data, tolerance, on_progress, partly)
         if best is None:
             best = with_masses = mechanical(problem, work, data, tolerance)
     if best is None or not best.error.bound <= tolerance.bound:
         try:
             best, options = of_libraries(
-                problem, work, basis, data, tolerance, scene, terms, options, say, early
+                problem, work, basis, data, tolerance, scene, terms, options, on_progress, early
             )
         except (OutOfTime, FitError):
             if best is None:
@@ -174,7 +176,7 @@ def _check_resolved(problem, best: FittedLaw, data: Dataset) -> None:
 
 def _simplified(
     problem, work: LawWork, best: FittedLaw, data: Dataset, whole: Dataset, far: np.ndarray,
-    tolerance: Tolerance, options: Options, say,
+    tolerance: Tolerance, options: Options, on_progress,
 ) -> tuple[FittedLaw, float | None]:  # fmt: skip
     """The law without the terms that are noise or not asked for, fitted to all training pairs, as
     far as the budget goes; and its error at the outermost states, of a fit without them.
@@ -193,7 +195,7 @@ def _simplified(
                 best = without_noise(problem, best, data.training, data, tolerance, options)
         what = "dropping the terms of H that the pairs do not ask for"
         with work.again(what, best.family, len(best.fit.used)):
-            best = sparse(problem, best, data, tolerance, options, say)
+            best = sparse(problem, best, data, tolerance, options, on_progress)
         if len(there.validation) and len(far):
             outside = validation_error(best.family, best.fit, there, tolerance).relative
         misses = best.error.bound > tolerance.bound and np.isfinite(work.dearest)
@@ -208,14 +210,14 @@ def _simplified(
 
 
 def _along_sequences(
-    problem, work: LawWork, best: FittedLaw, data: Dataset, tolerance: Tolerance, say
+    problem, work: LawWork, best: FittedLaw, data: Dataset, tolerance: Tolerance, on_progress
 ) -> FittedLaw:
     """The law fitted to whole sequences, where it misses the tolerance and is smooth: |v|v and
     sign v are not where sequences turn."""
     if not (is_smooth(best.family) and best.error.bound > tolerance.bound):
         return best
     what, budget = "the fit of H to whole sequences", work.budget
-    say("H: fitting whole sequences")
+    on_progress("H: fitting whole sequences")
     try:
         with work.again(what, best.family, len(data.training)):
             return of_whole_sequences(problem, best, data, tolerance, budget)

@@ -41,7 +41,7 @@ _EXACT = 1e-9  # of the spread: the error of a law that is no approximation
 
 def law_of_physics(
     problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance,
-    say: Callable[[str], Any], partly: OnPartial,
+    on_progress: Callable[[str], Any], partly: OnPartial,
 ) -> FittedLaw | None:  # fmt: skip
     """The law, or None where none is found, or the pairs are of no autonomous flow of a few degrees
     of freedom in plain coordinates and angles. partly: called with the three laws that come
@@ -55,7 +55,7 @@ def law_of_physics(
     symmetric, search = (
         Textbook(
             own, rows, angles=tuple(a for a in coordinates.angles if a < data.dim),
-            cyclic=coordinates.cyclic, say=say, symmetries=symmetries,
+            cyclic=coordinates.cyclic, on_progress=on_progress, symmetries=symmetries,
         )
         for symmetries in (symmetries_of_pairs(data), ())
     )  # fmt: skip

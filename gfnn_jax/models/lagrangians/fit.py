@@ -59,7 +59,7 @@ class LawFit:
         """Covariance of p: that of white residuals, times their correlation time."""
         return self.fitted.covariance() * self.correlation
 
-    def untold(self) -> dict[Key, float]:
+    def degenerate(self) -> dict[Key, float]:
         """The combination of coefficients that moves nothing, where there is one: as any two
         springs without friction follow from Lagrangians of a whole family."""
         R = self.fitted.triangle
@@ -217,8 +217,8 @@ class Workbench:
         scores = {}
         for key, k in zip(new, own, strict=True):
             size = np.linalg.norm(rest[:, k])
-            told_apart = size > 0.03 * length[k] and size > 0
-            z = rest[:, k] @ rest[:, -1] / size / np.sqrt(fit.correlation) if told_apart else 0.0
+            independent = size > 0.03 * length[k] and size > 0
+            z = rest[:, k] @ rest[:, -1] / size / np.sqrt(fit.correlation) if independent else 0.0
             scores[key] = float(abs(z))
         return scores
 

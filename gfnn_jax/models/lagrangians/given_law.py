@@ -28,7 +28,7 @@ from gfnn_jax.models.lagrangians.weak_start import weak_start
 
 def fit_given(
     given: Given, nodes: Sequence[Nodes], scales: Scales, angles: tuple[int, ...], num_inputs: int,
-    inputs: Mapping[str, ArcInputs], observation: Observation, told: Callable[[str], object],
+    inputs: Mapping[str, ArcInputs], observation: Observation, on_progress: Callable[[str], object],
     options: SearchOptions,
 ) -> Found:  # fmt: skip
     """Fit exactly the terms that are given, with the result of `law_search.search`."""
@@ -46,7 +46,7 @@ def fit_given(
     structure = structure.plus([("zero", i) for i in zeros])
     arcs = arcs_of(nodes, max(6, round(options.periods[0] * scales.per_period)))
     fit, bench, _ = choose_rule(benches, nodes, structure, known, arcs, scales.sigma, scales.dt)
-    told(f"{options.periods[0]:g} periods: {describe(fit)}")
+    on_progress(f"{options.periods[0]:g} periods: {describe(fit)}")
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     for periods in options.periods[1:]:
         arcs = arcs_of(nodes, max(6, round(periods * scales.per_period)))
@@ -54,10 +54,10 @@ def fit_given(
             break  # no run is longer
         fit = bench.fit(structure, fit.values, arcs, fit.sigma)
         nodes = with_states(nodes, fit.arcs, fit.fitted.x)
-        told(f"{periods:g} periods: {describe(fit)}")
+        on_progress(f"{periods:g} periods: {describe(fit)}")
     if given.friction is None:
         tried = frictions_tried(d, scales, options)
-        fit, choice = choose_friction(bench, nodes, fit, tried, told, options)
+        fit, choice = choose_friction(bench, nodes, fit, tried, on_progress, options)
     else:
         choice = FrictionChoice(given.friction, {}, {}, gains=False)
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)

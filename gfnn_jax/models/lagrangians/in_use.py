@@ -115,7 +115,7 @@ class Record:
 
 def best_in_use(
     record: Record, bench: Workbench, fit: LawFit, choice: FrictionChoice,
-    told: Callable[[str], object],
+    on_progress: Callable[[str], object],
 ) -> InUse:  # fmt: skip
     """The fit as it is, or fitted anew with zeros of channels that wander: where its residuals show
     these (the likelihood's evidence) and forecasts of held-out data do not err more with them."""
@@ -128,7 +128,7 @@ def best_in_use(
     fit = bench.fit(fit.structure, fit.values, arcs, fit.sigma)
     wandering = record.in_use(bench, fit, choice)
     share = wandering.calibration.against(steady.calibration)
-    told(
+    on_progress(
         f"zeros that wander by {wander.size:.2g} σ over {wander.time:.3g} s: held-out forecasts "
         f"err by {share:.3g} times as much"
     )

@@ -21,7 +21,7 @@ from gfnn_jax.models.lagrangians.text import (
     friction_of,
     speed_names,
     terms_of,
-    which_friction_told,
+    which_friction_line,
     word_of,
 )
 from gfnn_jax.models.lagrangians.velocities import Velocity
@@ -55,7 +55,7 @@ def in_words(
     shown = dict(zip(channels, sensors.observation_model.formulas, strict=True))
     return LearnedLaw(
         map=map_, lagrangian=lagrangian, friction=friction, gains=gains, delay=delay,
-        which_friction=which_friction_told(best.choice, best.scale, law.dim, names.speeds),
+        which_friction=which_friction_line(best.choice, best.scale, law.dim, names.speeds),
         hamiltonian=hamiltonian_of(law.terms, lagrangian, names.coordinates), zeros=zeros,
         noise=dict(zip(channels, map(float, sensors.sigma / factors), strict=True)),
         residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)),
@@ -189,7 +189,7 @@ def _alike(fit: LawFit, lagrangian: Expression, friction: Expression) -> tuple[s
     texts = dict(zip(fit.structure.terms, (t.term for t in lagrangian.terms), strict=True))
     texts |= dict(zip(fit.structure.friction, (t.term for t in friction.terms), strict=True))
     names = {key: texts.get(key[1], " ".join(map(str, key))) for key in fit.values}
-    listed, together = list(names.values()), [names[key] for key in fit.untold()]
+    listed, together = list(names.values()), [names[key] for key in fit.degenerate()]
     pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > _ALIKE, 1)), strict=True)
     only = (f"{', '.join(together)}: only together",) if together else ()
     return only + tuple(

@@ -111,7 +111,7 @@ class LearnedLaw:
         for name, forces in self.gains.items():
             told = ", ".join(f"{q} {g:.6g} ± {s:.2g}" for q, (g, s) in forces.items())
             lines.append(f"gain of {name}, force per unit of it: {told}")
-        lines += [self._inputs_told] if self.delay is not None else []
+        lines += [self._inputs_line] if self.delay is not None else []
         energy = self.energy
         lines.append(
             f"energy per second: stored {energy['stored']:.3g} = supplied "
@@ -136,7 +136,7 @@ class LearnedLaw:
         return "\n".join(lines)
 
     @property
-    def _inputs_told(self) -> str:
+    def _inputs_line(self) -> str:
         """Describe how inputs act."""
         assert self.map.sensors is not None
         assert self.delay is not None

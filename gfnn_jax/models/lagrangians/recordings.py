@@ -41,7 +41,7 @@ from gfnn_jax.solve.robust import Loss
 
 _IMITATED = 1e-4  # of what a sensor's parameter changes, that no coefficient of the law does
 
-Told = Callable[[str], object]
+OnProgress = Callable[[str], object]
 
 
 def fit_recording(
@@ -65,30 +65,30 @@ def fit_recording(
     _check(recording, input_hold, mass)
     steps: list[str] = []
 
-    def told(line: str) -> None:
+    def note(line: str) -> None:
         steps.append(line)
         on_progress(line)
 
-    samples = _samples(recording, loss, told)
+    samples = _samples(recording, loss, note)
     asked = _asked(terms, samples, options)
     nodes = nodes_of(samples.stretches, samples.scales)
     gauge = np.concatenate([n.x[:, : samples.observation.dim] for n in nodes])
     holds = _holds(recording, input_hold)
-    acting, choice, nodes = _searched(samples, nodes, asked, holds, told, options)
-    bench, fit = _with_finer_steps(acting, gauge, samples, nodes, told)
+    acting, choice, nodes = _searched(samples, nodes, asked, holds, note, options)
+    bench, fit = _with_finer_steps(acting, gauge, samples, nodes, note)
     measured = velocities(recording, fit, nodes)
     for name, one in measured.items():
-        told(f"velocity {name}: {one.text}")
+        note(f"velocity {name}: {one.text}")
     samples, nodes, bench, fit = _with_velocities(measured, samples, nodes, bench, fit)
     _check_identifiable(fit, samples.observation)
-    told("bands: forecasting from windows of the record")
+    note("bands: forecasting from windows of the record")
     record = samples.record(nodes, mass or {}, acting)
-    best = best_in_use(record, bench, fit, choice, told)
+    best = best_in_use(record, bench, fit, choice, note)
     map_ = _map(record, best, samples.angles)
     traces = traces_of(
         recording, samples.observation.channels, best.fit, best.law, nodes, bench.inputs
     )
-    told("finding the motion to record next")
+    note("finding the motion to record next")
     motions = next_motions(best.bench, best.fit, samples.angles)
     delay = (acting.delay, acting.error) if recording.inputs else None
     seconds = time.process_time() - started
@@ -156,7 +156,7 @@ class _Samples:
         )  # fmt: skip
 
 
-def _samples(recording: Recording, loss: Loss | None, told: Told) -> _Samples:
+def _samples(recording: Recording, loss: Loss | None, on_progress: OnProgress) -> _Samples:
     """The samples of the positions, without rests, each σ as given where it is."""
     observation, angles = _observation(recording)
     observation = observation if loss is None else dataclasses.replace(observation, loss=loss)
@@ -173,7 +173,7 @@ def _samples(recording: Recording, loss: Loss | None, told: Told) -> _Samples:
         found, resting = without_rests(found, samples.scales)
         if resting:
             line = f"{resting:.3g} s at rest left out: a body that stands still tells no law"
-            told(line)
+            on_progress(line)
             samples = _Samples(recording, observation, angles, found, measure(found), (line,))
     sigma = np.where(samples.given > 0, samples.given, samples.scales.sigma)
     return dataclasses.replace(samples, scales=dataclasses.replace(samples.scales, sigma=sigma))
@@ -226,14 +226,14 @@ def _asked(terms: Sequence[Any], samples: _Samples, options: SearchOptions) -> G
 
 def _searched(
     samples: _Samples, nodes: Sequence[Nodes], asked: Given | None, holds: Sequence[str],
-    told: Told, options: SearchOptions,
+    on_progress: OnProgress, options: SearchOptions,
 ) -> Found:  # fmt: skip
     """The law that a search finds, or that of the terms which were asked for."""
     scales = samples.scales
     inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
     record = (
         nodes, scales, samples.angles, len(samples.recording.inputs), inputs, samples.observation,
-        told, options,
+        on_progress, options,
     )  # fmt: skip
     found = search(*record) if asked is None else fit_given(asked, *record)
     fit = found.acting.fit
@@ -243,7 +243,11 @@ def _searched(
 
 
 def _with_finer_steps(
-    acting: Acting, gauge: np.ndarray, samples: _Samples, nodes: Sequence[Nodes], told: Told
+    acting: Acting,
+    gauge: np.ndarray,
+    samples: _Samples,
+    nodes: Sequence[Nodes],
+    on_progress: OnProgress,
 ) -> tuple[Workbench, LawFit]:
     """The fit with the steps between nodes that its noise asks for: local cubics may have seen more
     noise than there is."""
@@ -254,7 +258,7 @@ def _with_finer_steps(
         inputs = ArcInputs(nodes, finer, acting.hold, acting.delay)
         bench = dataclasses.replace(bench, inputs=inputs)
         fit = bench.fit(fit.structure, fit.values, fit.arcs, fit.sigma)
-        told(f"{finer} steps between nodes: {describe(fit)}")
+        on_progress(f"{finer} steps between nodes: {describe(fit)}")
     return bench, fit
 
 

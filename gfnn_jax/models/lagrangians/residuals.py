@@ -42,7 +42,7 @@ class OfInput(NamedTuple):
 
     correlation: float
     lag: float
-    seen: bool
+    significant: bool
 
 
 class Whiteness(NamedTuple):
@@ -61,13 +61,13 @@ class Whiteness(NamedTuple):
     @property
     def text(self) -> str:
         """A line for people."""
-        seen = np.flatnonzero(self.autocorrelation[1:] > self.bound)
+        significant = np.flatnonzero(self.autocorrelation[1:] > self.bound)
         found = "white" if self.white else (
             f"not white (ρ = {self.autocorrelation[1:][np.argmax(self.autocorrelation[1:])]:.2f}"
-            + (f", up to a lag of {self.lags[1 + seen[-1]]:.3g} s)" if len(seen) else ")")
+            + (f", up to a lag of {self.lags[1 + seen[-1]]:.3g} s)" if len(significant) else ")")
         )  # fmt: skip
         told = "".join(
-            f"; {'correlated' if one.seen else 'not correlated'} with {name} (ρ = "
+            f"; {'correlated' if one.significant else 'not correlated'} with {name} (ρ = "
             f"{one.correlation:+.2f} at a lag of {one.lag:.3g} s)"
             for name, one in self.inputs.items()
         )
@@ -93,8 +93,8 @@ def whiteness(
             series = [trace.inputs[:, j] - mean for trace in traces]
             both = {lag: _correlation(series, r, lag) for lag in range(-_LAGS // 4, _LAGS + 1)}
             best = max(both, key=lambda lag: abs(both[lag]))
-            seen = bool(abs(both[best]) > bound * np.sqrt(colour))
-            of_inputs[u] = OfInput(both[best], best * step, seen)
+            significant = bool(abs(both[best]) > bound * np.sqrt(colour))
+            of_inputs[u] = OfInput(both[best], best * step, significant)
         measured = np.concatenate([trace.measured[:, k] for trace in traces])
         left = measured - np.concatenate([trace.fitted[:, k] for trace in traces])
         percent = 100 * (1 - np.sqrt(np.nanmean(left**2)) / max(np.nanstd(measured), 1e-300))

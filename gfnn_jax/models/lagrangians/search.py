@@ -72,7 +72,7 @@ def search(
     num_inputs: int,
     inputs: Mapping[str, ArcInputs],
     observation: Observation,
-    told: Callable[[str], object] = lambda line: None,
+    on_progress: Callable[[str], object] = lambda line: None,
     options: SearchOptions = SearchOptions(),
 ) -> Found:
     """The law of these nodes, by the best of the rules between samples of the ``inputs`` (hold ->
@@ -111,7 +111,7 @@ def search(
             rule = choose_rule(benches, nodes, structure, known, arcs, scales.sigma, scales.dt)
             benches = {rule.hold: rule.bench}  # inputs act so in the other libraries too
             starts.append(rule.fit)
-            told(f"{options.periods[0]:g} periods: {describe(starts[-1])}")
+            on_progress(f"{options.periods[0]:g} periods: {describe(starts[-1])}")
     if not starts:
         raise FitError(NO_LAW)
     (bench,) = benches.values()
@@ -137,19 +137,19 @@ def search(
             break  # no run is longer
         fit = bench.fit(fit.structure, fit.values, arcs, fit.sigma)
         if periods == 1:
-            fit = grow(bench, nodes, fit, frictions, told, options)
-            fit = prune(bench, nodes, fit, told, options)
-            fit = grow(bench, nodes, fit, every, told, options)
+            fit = grow(bench, nodes, fit, frictions, on_progress, options)
+            fit = prune(bench, nodes, fit, on_progress, options)
+            fit = grow(bench, nodes, fit, every, on_progress, options)
         nodes = with_states(nodes, fit.arcs, fit.fitted.x)
-        told(f"{periods:g} periods: {describe(fit)}")
-    fit, choice = choose_friction(bench, nodes, fit, every.friction, told, options)
+        on_progress(f"{periods:g} periods: {describe(fit)}")
+    fit, choice = choose_friction(bench, nodes, fit, every.friction, on_progress, options)
     terms = dataclasses.replace(every, friction=())
     before = fit.structure
-    fit = prune(bench, nodes, fit, told, options, friction=False)
-    fit = grow(bench, nodes, fit, terms, told, options)
-    fit = prune(bench, nodes, fit, told, options, friction=False)
+    fit = prune(bench, nodes, fit, on_progress, options, friction=False)
+    fit = grow(bench, nodes, fit, terms, on_progress, options)
+    fit = prune(bench, nodes, fit, on_progress, options, friction=False)
     if fit.structure != before:
-        fit, choice = choose_friction(bench, nodes, fit, every.friction, told, options)
+        fit, choice = choose_friction(bench, nodes, fit, every.friction, on_progress, options)
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     return Found(with_delay(bench, nodes, fit, scales.dt), choice, nodes)
 
@@ -168,14 +168,14 @@ def _word(bench: Workbench, key: Key) -> str:
 
 
 def prune(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, told: Callable, options: SearchOptions,
-    friction: bool = True,
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, on_progress: Callable,
+    options: SearchOptions, friction: bool = True,
 ) -> LawFit:  # fmt: skip
     """The fit without terms that are not seen, the least seen first, as long as held-out arcs do
     not lose; and, unless ``friction`` has been chosen, without that which would drive. First, of
     terms that the record tells only together, without one."""
     refused: set[Key] = set()
-    fit = told_apart(bench, fit, told)
+    fit = without_degeneracies(bench, fit, on_progress)
     costs = None
     while True:
         z = significance(fit)
@@ -194,12 +194,12 @@ def prune(
             if gains(without, costs, options.gain):
                 refused.add(key)
                 continue
-        told(f"  dropped {_word(bench, key)}: {z[key]:.1f} standard errors")
+        on_progress(f"  dropped {_word(bench, key)}: {z[key]:.1f} standard errors")
         arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
         fit, costs = bench.fit(smaller, fit.values, arcs, fit.sigma), None
 
 
-def told_apart(bench: Workbench, fit: LawFit, told: Callable) -> LawFit:
+def without_degeneracies(bench: Workbench, fit: LawFit, on_progress: Callable) -> LawFit:
     """The fit without the first term, kinetic ones before others, of each combination that moves
     nothing; which costs nothing. Masses that couple two coordinates give way to a spring that
     does as well."""
@@ -215,9 +215,9 @@ def told_apart(bench: Workbench, fit: LawFit, told: Callable) -> LawFit:
             arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
             larger = fit.structure.plus([("term", spring)])
             with_it = bench.fit(larger, fit.values, arcs, fit.sigma, rescale=False)
-            fit = with_it if with_it.untold() else fit
+            fit = with_it if with_it.degenerate() else fit
     while True:
-        step = fit.untold()
+        step = fit.degenerate()
         open_ = [key for key in step if key[0] == "term" and key not in fixed]
         if not open_:
             return fit
@@ -231,7 +231,7 @@ def told_apart(bench: Workbench, fit: LawFit, told: Callable) -> LawFit:
             fixed = fixed | {gone}
             continue
         others = ", ".join(_word(bench, key) for key in open_[1:])
-        told(f"  dropped {_word(bench, gone)}: told only together with {others}")
+        on_progress(f"  dropped {_word(bench, gone)}: told only together with {others}")
         fit = without
 
 
@@ -251,7 +251,7 @@ def gains(costs: np.ndarray, others: np.ndarray, share: float) -> bool:
 
 
 def grow(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, every: Structure, told: Callable,
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, every: Structure, on_progress: Callable,
     options: SearchOptions,
 ) -> LawFit:  # fmt: skip
     """The fit with terms that the residuals ask for, each kept where held-out arcs gain."""
@@ -268,7 +268,7 @@ def grow(
         larger = fit.structure.plus([key])
         with_it = bench.cross_validate(nodes, fit, larger, fit.values)
         kept = gains(costs, with_it, options.gain)
-        told(
+        on_progress(
             f"  {'added' if kept else 'refused'} {_word(bench, key)}: "
             f"{scores[key]:.1f} standard errors, cost of held-out arcs {np.sum(costs):.5g} → "
             f"{np.sum(with_it):.5g}"
@@ -284,7 +284,7 @@ def grow(
 
 def choose_friction(
     bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, candidates: Sequence[Loss],
-    told: Callable, options: SearchOptions,
+    on_progress: Callable, options: SearchOptions,
 ) -> tuple[LawFit, FrictionChoice]:  # fmt: skip
     """The fit with the friction that held-out arcs choose, and how sure that is. Arcs are as long
     as those of the fit, or as long as three of them can be. A choice holds close to its fit, so
@@ -297,7 +297,7 @@ def choose_friction(
     choice = which_friction(bench, fit, candidates, options.choose_friction)
     for _ in range(options.choices):
         rows = [_word(bench, ("loss", row)) for row in choice.rows]
-        told(f"  friction: {', '.join(rows) or 'none'}")
+        on_progress(f"  friction: {', '.join(rows) or 'none'}")
         if set(choice.rows) == set(fit.structure.friction):
             break
         structure = dataclasses.replace(fit.structure, friction=choice.rows)

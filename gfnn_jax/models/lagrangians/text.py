@@ -124,7 +124,7 @@ class WhichFriction:
         return text + (f"; not seen, coefficients in R (2 σ): {', '.join(seen)}" if seen else "")
 
 
-def which_friction_told(
+def which_friction_line(
     choice: FrictionChoice, scale: float, dim: int, speeds: Sequence[str]
 ) -> WhichFriction:
     """The choice in the recording's words; ``scale`` is that of L."""

@@ -47,7 +47,7 @@ def more_pairs_would_help(sweeps, found: Found, bound: Tolerance, dearest: float
 
 def search_of_law(
     law: LearnedHamiltonian, data: Dataset, tolerance: Tolerance, scene: Scene | None,
-    dearest: float, budget: Budget, say, tell, seed: int,
+    dearest: float, budget: Budget, on_progress, on_candidate, seed: int,
 ) -> LawMaps | None:  # fmt: skip
     """Maps fitted to pairs that are drawn from the law's flow, and judged by the user's validation
     rows; None where none of them meets the tolerance, or no chart covers the drawn pairs."""
@@ -62,7 +62,7 @@ def search_of_law(
     except FitError:  # drawn ones go further than the user's; the law itself is left
         return None
     sweeps = list(sweeps_for("auto", diagnosis.charts.charts, diagnosis.data, tolerance, scene))
-    found = search(sweeps, tolerance.bound, budget, say, tell, None, dearest)
+    found = search(sweeps, tolerance.bound, budget, on_progress, on_candidate, None, dearest)
     if not found.ranking:
         return None
     if found.ranking[0].candidate.validation_bound > tolerance.bound:
@@ -85,7 +85,7 @@ def law_explains_most(
 
 def search_around(
     law: LearnedHamiltonian, data: Dataset, tolerance: Tolerance, scene: Scene | None,
-    budget: Budget, say, tell, better, seed: int,
+    budget: Budget, on_progress, on_candidate, better, seed: int,
 ) -> LawMaps | None:  # fmt: skip
     """Maps of a law's flow Φ and of S, which learns what Φ leaves over: of the whole law, then of
     its strongest terms, which leave more over but smoother. None where Φ has no image of some of
@@ -103,7 +103,9 @@ def search_around(
             break
         except FitError:
             continue
-        found = _around(flow, diagnosis, data, tolerance, scene, budget, say, tell, better)
+        found = _around(
+            flow, diagnosis, data, tolerance, scene, budget, on_progress, on_candidate, better
+        )
         if found.found.ranking and (
             best is None
             or found.found.ranking[0].candidate.validation_bound
@@ -122,12 +124,12 @@ def _work(law: LearnedHamiltonian, states: int) -> float:
 
 def _around(
     flow: Flow, diagnosis, data: Dataset, tolerance: Tolerance, scene: Scene | None,
-    budget: Budget, say, tell, better,
+    budget: Budget, on_progress, on_candidate, better,
 ) -> LawMaps:  # fmt: skip
     """The search for S around one flow, whose operations are added to every candidate's."""
     more = flow_operations(flow, data)
     sweeps = list(sweeps_for("auto", diagnosis.charts.charts, diagnosis.data, tolerance, scene))
-    found = search(sweeps, tolerance.bound, budget, say, tell, better)
+    found = search(sweeps, tolerance.bound, budget, on_progress, on_candidate, better)
 
     def dearer(entry: Entry) -> Entry:
         candidate = dataclasses.replace(

@@ -40,7 +40,7 @@ class Latent(NamedTuple):
 
 def without_noise(
     families: Iterable[Any], training: Triples, held_out: Triples, budget: Budget,
-    say: Callable[[str], Any],
+    on_progress: Callable[[str], Any],
 ) -> Latent | None:  # fmt: skip
     """The S that readings with noise tell; None where latent positions explain arcs that were held
     out no better than least squares, or time ends before the first size."""
@@ -53,7 +53,7 @@ def without_noise(
             break
         try:
             with budget.unit(f"latent positions, S of {family.label}", FLOW, work):
-                say(f"latent positions, S of {family.label}, {family.num_parameters} terms")
+                on_progress(f"latent positions, S of {family.label}, {family.num_parameters} terms")
                 solved = solve(family, training)
                 if sigma is None:
                     sigma = starting_noise(family, solved.coefficients, training)

@@ -133,9 +133,9 @@ class NoisyTextbook:
 
     def __init__(
         self, weak: WeakGradients, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
-        options: Options = OPTIONS, say: Callable[[str], Any] = lambda message: None,
+        options: Options = OPTIONS, on_progress: Callable[[str], Any] = lambda message: None,
     ):  # fmt: skip
-        self._weak, self._options, self._say = weak, options, say
+        self._weak, self._options, self._on_progress = weak, options, on_progress
         self._dim = dim = weak.states.shape[1] // 2
         self._arguments = arguments_of(weak.states, tuple(angles), tuple(cyclic))
         every = polynomial_terms(dim, 2, cyclic=(*angles, *cyclic))
@@ -188,7 +188,7 @@ class NoisyTextbook:
             self._arguments, self._weight, self._spanned, degree=self._degree, products=products,
             average=self._weak.average,
         )  # fmt: skip
-        self._say(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
+        self._on_progress(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
         said = options.said / (len(self._target) * np.log(2))
         matching = Matching(
             self._spanned, self._target, self._weight, self._arguments, said, self._weak.average

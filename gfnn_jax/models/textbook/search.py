@@ -111,13 +111,18 @@ class Textbook:
     def __init__(
         self, problem: Problem, rows: np.ndarray, *, angles: Sequence[int] = (),
         cyclic: Sequence[int] = (), options: Options = OPTIONS,
-        say: Callable[[str], Any] = lambda message: None,
+        on_progress: Callable[[str], Any] = lambda message: None,
         symmetries: Sequence[SymmetryOfPairs] = (),
     ):  # fmt: skip
         dim = problem.z0.shape[1] // 2
         if dim > options.most_dim:
             raise ValueError(f"expected at most {options.most_dim} degrees of freedom, got {dim}")
-        self._problem, self._options, self._say, self._dim = problem, options, say, dim
+        self._problem, self._options, self._on_progress, self._dim = (
+            problem,
+            options,
+            on_progress,
+            dim,
+        )
         rows = np.asarray(rows[: options.rows])
         moved = np.linalg.norm((problem.z1 - problem.z0)[rows] / problem.scale, axis=1)
         self._rows = np.sort(rows[np.argsort(moved)[: int(np.ceil(options.quiet * len(rows)))]])
@@ -201,7 +206,7 @@ class Textbook:
         options = self._options
         if self._closest is not None and self._explains_nothing(self._closest, dictionary):
             return None  # what is left over is noise
-        self._say(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
+        self._on_progress(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
         rows = self._middle.size
         most = rows / options.rows_per_term - self._base.num_parameters
         blocks = [b for b in blocks if len(b) < most]
