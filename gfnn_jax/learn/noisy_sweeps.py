@@ -159,7 +159,7 @@ def _corrected(rivals: list[Entry], request: Request) -> Entry:
         sweep = NoisySweep(entry.sweep, entry.sweep, start, deviations)
         estimated.append((sweep, best_size(sweep, start, m, *given)))
     floor = min(expected.noise for _, expected in estimated)
-    risks = [max(expected.error - floor, expected.own) for _, expected in judged]
+    risks = [max(expected.error - floor, expected.own) for _, expected in estimated]
     sweep, expected = min(
         (j for j, risk in zip(estimated, risks, strict=True) if risk <= _NO_WORSE * min(risks)),
         key=lambda j: j[1].size.operations,

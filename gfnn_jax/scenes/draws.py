@@ -108,7 +108,7 @@ def sample_params(
     return _draw(scene, law, num, key)[:, 2 * scene.dim :]
 
 
-def sample_t0(scene: Scene, num: int, key) -> Float[np.ndarray, "num"] | None:
+def sample_t0(scene: Scene, num: int, key) -> Float[np.ndarray, "num"] | None:  # noqa: F821
     """Draw the times of the drive (num,), uniform over its period, of states drawn with this key.
 
     None where the scene does not begin at any phase.
@@ -167,7 +167,7 @@ def sample_pairs(
     return Pairs(z0, z1[:, : z0.shape[1]], dt, args, t0, period)
 
 
-def _uniform(key, num) -> Float[np.ndarray, "num"]:
+def _uniform(key, num) -> Float[np.ndarray, "num"]:  # noqa: F821
     return np.asarray(_uniform_rows(key, num=_enough(num)))[:num]
 
 

@@ -13,7 +13,7 @@ ENERGY = 0.1
 FIXED_POINT = (0.2755, 0.0)  # to four digits
 
 
-def lift(z: State) -> Float[Array, "whole"]:
+def lift(z: State) -> Float[Array, "whole"]:  # noqa: F821
     """(0, y, p_x, p_y) of z = (y, p_y), with p_x > 0 such that the energy is ENERGY; NaN where the
     energy does not reach so far."""
     y, p_y = z

@@ -81,7 +81,7 @@ class Section:
     index: int
     lift: Callable
 
-    def coordinates(self, x: Float[Array, "whole"]) -> State:
+    def coordinates(self, x: Float[Array, "whole"]) -> State:  # noqa: F821
         """Coordinates z (2d,) of a state x (2d + 2,) on the section."""
         return jnp.delete(x, np.array([self.index, self.index + x.shape[0] // 2]))
 

@@ -61,17 +61,16 @@ class Whiteness(NamedTuple):
     @property
     def text(self) -> str:
         """A line for people."""
-        significant = np.flatnonzero(self.autocorrelation[1:] > self.bound)
-        found = "white" if self.white else (
-            f"not white (ρ = {self.autocorrelation[1:][np.argmax(self.autocorrelation[1:])]:.2f}"
-            + (f", up to a lag of {self.lags[1 + seen[-1]]:.3g} s)" if len(significant) else ")")
-        )  # fmt: skip
-        told = "".join(
+        rho = self.autocorrelation[1:]
+        beyond = np.flatnonzero(rho > self.bound)
+        upto = f", up to a lag of {self.lags[1 + beyond[-1]]:.3g} s" if len(beyond) else ""
+        found = "white" if self.white else f"not white (ρ = {np.max(rho):.2f}{upto})"
+        inputs = "".join(
             f"; {'correlated' if one.significant else 'not correlated'} with {name} (ρ = "
             f"{one.correlation:+.2f} at a lag of {one.lag:.3g} s)"
             for name, one in self.inputs.items()
         )
-        return f"{found}{told}; {self.fit_percent:.2f} % of the variation followed"
+        return f"{found}{inputs}; {self.fit_percent:.2f} % of the variation followed"
 
 
 def whiteness(
