@@ -1,21 +1,23 @@
 """Measured records and peers: the same training parts, forecasts of the same held-out thirds.
 
-    python benchmarks/peers.py                     pendulum, two_carts, double_pendulum
+    python benchmarks/peers.py                     pendulum, two_carts, double_pendulum, arm2
     python benchmarks/peers.py --only pendulum --overwrite
     python benchmarks/peers.py --quick             the pendulum, little training, into runs/
 
-Each peer ends in an acceleration q̈ = a(q, v) that JAX integrates (diffrax): a rigid body whose
-equations are written by hand, its constants fitted by SciPy; a neural ODE (flax, optax, diffrax);
-PySINDy, its library given by hand (pip install '.[peers]'; left out where it is not installed). All
-see positions only. The state before a forecast is estimated by least squares from 20 samples
-through the peer's own equations, as `benchmarks/measured.py` does through ours; its results stand
-beside them in the table. Seconds are of the processor, compilation included.
+The records are those that come with the package. Each peer ends in an acceleration q̈ = a(q, v)
+that JAX integrates (diffrax): a rigid body whose equations are written by hand, its constants
+fitted by SciPy; a neural ODE (flax, optax, diffrax); PySINDy, its library given by hand, by
+derivatives and in weak form (pip install '.[peers]'; left out where it is not installed). All see
+positions only. The state before a forecast is estimated by least squares from 20 samples through
+the own equations of each, as `benchmarks/measured.py` does through ours, which is fitted in the
+same run. Seconds are of the processor, compilation included.
 """
 
 from __future__ import annotations
 
 import functools
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -31,7 +33,7 @@ from harness import (
     provenance,
     read,
 )
-from measured import RECORDS, SAMPLES, held_windows, split
+from measured import RECORDS, SAMPLES, forecasts, held_windows, split
 
 import diffrax  # isort: skip
 import flax.linen as nn
@@ -39,6 +41,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import least_squares
 
 import gfnn_jax as gfnn
@@ -47,6 +50,8 @@ from gfnn_jax.signals.local_cubics import choose_half, smooth
 
 Acceleration = Callable[[Any, jax.Array, jax.Array], jax.Array]  # (params, q, v) -> q̈, (d,) each
 LENGTH = 24  # samples of an arc that a peer is fitted to
+FINER = 4  # points of the even grid of a weak form, per sample
+DOMAINS = 100  # of the weak form, per arc
 THRESHOLDS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3)  # of PySINDy's sparse regression, tried in turn
 
 
@@ -87,15 +92,19 @@ def carts(c: Any, q: jax.Array, v: jax.Array) -> jax.Array:
 
 
 def double_pendulum(c: Any, q: jax.Array, v: jax.Array) -> jax.Array:
-    """L = ½ω₁² + a ω₂² + b ω₁ω₂ cos(θ₁ − θ₂) + g₁ cos θ₁ + g₂ cos θ₂, with linear friction."""
-    a, b, g1, g2, c1, c2 = c
+    """L = ½ω₁² + a ω₂² + b ω₁ω₂ cos(θ₁ − θ₂) + g₁ cos θ₁ + g₂ cos θ₂, with linear friction at the
+    pivot and in the joint, and quadratic friction there too where it has constants."""
+    a, b, g1, g2, *friction = c
     difference = q[0] - q[1]
     cross = b * jnp.cos(difference)
     mass = jnp.array([[1.0, cross], [cross, 2 * a]])
-    relative = c2 * (v[1] - v[0])
+    speeds = jnp.array([v[0], v[1] - v[0]])
+    pivot, joint = jnp.asarray(friction[:2]) * speeds
+    if len(friction) == 4:
+        pivot, joint = jnp.array([pivot, joint]) + jnp.asarray(friction[2:]) * speeds * abs(speeds)
     force = jnp.array([
-        -b * v[1] ** 2 * jnp.sin(difference) - g1 * jnp.sin(q[0]) - c1 * v[0] + relative,
-        b * v[0] ** 2 * jnp.sin(difference) - g2 * jnp.sin(q[1]) - relative,
+        -b * v[1] ** 2 * jnp.sin(difference) - g1 * jnp.sin(q[0]) - pivot + joint,
+        b * v[0] ** 2 * jnp.sin(difference) - g2 * jnp.sin(q[1]) - joint,
     ])  # fmt: skip
     return jnp.linalg.solve(mass, force)
 
@@ -135,6 +144,12 @@ SYSTEMS = {
     "double_pendulum": System(
         double_pendulum, (0.2, 0.4, 60.0, 20.0, 0.01, 0.01), _double_pendulum_library, _angles,
         0.011, "the textbook's Lagrangian; the 40 terms of its solved equations",
+    ),
+    "arm2": System(
+        double_pendulum, (0.2, 0.4, -60.0, -20.0, 0.01, 0.01, 0.0, 0.0), _double_pendulum_library,
+        _angles, 0.01,
+        "the textbook's Lagrangian, linear and quadratic friction; the 40 terms of its solved "
+        "equations",
     ),
 }  # fmt: skip
 
@@ -275,39 +290,85 @@ def neural_ode(system: System, arcs: Arcs, quick: bool) -> tuple[Acceleration, A
 
 
 def pysindy_sparse(system: System, arcs: Arcs, quick: bool) -> tuple[Acceleration, Any]:
-    """Sparse regression of q̈, from smoothed positions, on the library; the threshold whose
-    equations follow the last quarter of the arcs best."""
+    """Sparse regression on the library of the accelerations of smoothed positions, or of the
+    smoothed speeds in weak form; of both, and of all thresholds, the equations that follow the
+    last quarter of the arcs best."""
     import pysindy as ps
 
-    dim = arcs.y.shape[-1]
     half = choose_half([(t, y) for t, y in zip(arcs.t, arcs.y, strict=True)])[0]
     smoothed = [smooth(t, y, half)[0] for t, y in zip(arcs.t, arcs.y, strict=True)]
-    inner = slice(2, -2)  # cubics are poor at the ends of an arc
-    states = [np.hstack([s.q, s.v])[inner] for s in smoothed]
-    rates = [s.a[inner] for s in smoothed]
-    few = slice(None, -max(1, len(states) // 4))
+    few = slice(None, -max(1, len(smoothed) // 4))
     check = slice(few.stop, None)
-    columns = [
-        np.stack(np.broadcast_arrays(*system.library(x[:, :dim].T, x[:, dim:].T)), axis=1)
-        for x in states
-    ]
+    by_derivatives = _derivatives(system, smoothed[few])
+    by_weak_form = _weak_form(system, arcs.t[few], smoothed[few])
 
     def acceleration(params: Any, q: jax.Array, v: jax.Array) -> jax.Array:
         return params @ jnp.stack(system.library(q, v))
 
     best, kept = np.inf, None
     for threshold in THRESHOLDS[:2] if quick else THRESHOLDS:
-        sparse = ps.STLSQ(threshold=threshold, alpha=1e-6, normalize_columns=True)
-        sparse.fit(np.concatenate(columns[few]), np.concatenate(rates[few]))
-        params = jnp.asarray(sparse.coef_)
-        x0, t, y = arcs.x0[check], arcs.t[check], arcs.y[check]
-        x0 = estimated(acceleration, params, x0, t, y, system.step)
-        error = float(jnp.mean((positions(acceleration, params, x0, t, system.step) - y) ** 2))
-        if error < best:
-            best, kept = error, params
+        for regression in (by_derivatives, by_weak_form):
+            sparse = ps.STLSQ(threshold=threshold, alpha=1e-6, normalize_columns=True)
+            params = jnp.asarray(regression(sparse))
+            x0, t, y = arcs.x0[check], arcs.t[check], arcs.y[check]
+            x0 = estimated(acceleration, params, x0, t, y, system.step)
+            error = float(jnp.mean((positions(acceleration, params, x0, t, system.step) - y) ** 2))
+            if error < best:
+                best, kept = error, params
     if kept is None:
         raise RuntimeError("PySINDy's equations run away along every arc, at each threshold")
     return acceleration, kept
+
+
+def _derivatives(system: System, smoothed: Sequence[Any]) -> Callable[[Any], np.ndarray]:
+    """Return the regression of the accelerations of local cubics: optimizer -> (d, terms)."""
+    inner = slice(2, -2)  # cubics are poor at the ends of an arc
+    columns = [
+        np.stack(np.broadcast_arrays(*system.library(s.q.T, s.v.T)), axis=1) for s in smoothed
+    ]
+    features = np.concatenate([c[inner] for c in columns])
+    rates = np.concatenate([s.a[inner] for s in smoothed])
+    return lambda sparse: sparse.fit(features, rates).coef_
+
+
+def _weak_form(
+    system: System, times: np.ndarray, smoothed: Sequence[Any]
+) -> Callable[[Any], np.ndarray]:
+    """Return the regression of −∫ψ̇ v on ∫ψ φ(q, v), ψ bumps on an even grid, by PySINDy's weak
+    library: optimizer -> (d, terms)."""
+    import pysindy as ps
+
+    dim = smoothed[0].q.shape[1]
+    grid = np.linspace(0, min(t[-1] for t in times), FINER * times.shape[1])
+    states = []
+    for t, s in zip(times, smoothed, strict=True):
+        q = CubicHermiteSpline(t, s.q, s.v)
+        states.append(np.hstack([q(grid), q(grid, 1)]))
+
+    def term(k: int) -> Callable[..., np.ndarray]:
+        # PySINDy tells the variables of a term by the names of its arguments.
+        names = ", ".join(f"x{i}" for i in range(2 * dim))
+        scope = {
+            "of": lambda *x: np.asarray(system.library(np.stack(x[:dim]), np.stack(x[dim:]))[k])
+        }
+        return eval(f"lambda {names}: of({names})", scope)
+
+    count = len(system.library(np.ones((dim, 1)), np.ones((dim, 1))))
+    terms = ps.CustomLibrary(
+        [term(k) for k in range(count)], [lambda *_, k=k: f"f{k}" for k in range(count)],
+        interaction_only=True,
+    )  # fmt: skip
+
+    def regression(sparse: Any) -> np.ndarray:
+        # PySINDy draws its domains from the global generator.
+        np.random.seed(SEED)  # noqa: NPY002
+        weak = ps.WeakPDELibrary(terms, spatiotemporal_grid=grid, K=DOMAINS)
+        model = ps.SINDy(optimizer=sparse, feature_library=weak)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return model.fit(states, t=grid).coefficients()[dim:]
+
+    return regression
 
 
 PEERS = {
@@ -359,13 +420,19 @@ def judged(name: str, a: Acceleration, params: Any, held: Any) -> dict[str, floa
 
 
 def measure(name: str, quick: bool) -> Numbers:
-    """Fit each peer to the first two thirds of a record, and judge its forecasts of the last."""
-    recording = gfnn.read(gfnn.records.path(name), positions=list(RECORD_POSITIONS[name]),
-                          angles=list(RECORD_ANGLES[name]))  # fmt: skip
+    """Fit ours and each peer to the first two thirds of a record, and judge the forecasts of its
+    last."""
+    record = gfnn.records.RECORDS[name]
+    recording = gfnn.read(gfnn.records.path(name), positions=list(record.positions),
+                          angles=list(record.angles))  # fmt: skip
     training, held = split(recording, 2)
     system = SYSTEMS[name]
     arcs = arcs_of(list(stretches(training)))
-    found: Numbers = {"told": system.told, "num_arcs": len(arcs.t)}
+    found: Numbers = {
+        "told": system.told,
+        "num_arcs": len(arcs.t),
+        OURS: ours(name, training, held),
+    }
     for peer, fit in PEERS.items():
         started = time.process_time()
         try:
@@ -380,28 +447,34 @@ def measure(name: str, quick: bool) -> Numbers:
     return found
 
 
-RECORD_POSITIONS = {"pendulum": ("theta",), "two_carts": ("x1", "x2"),
-                    "double_pendulum": ("theta1", "theta2")}  # fmt: skip
-RECORD_ANGLES = RECORD_POSITIONS | {"two_carts": ()}
+def ours(name: str, training: Any, held: Any) -> Numbers:
+    """The law that the package finds, and its forecasts."""
+    times, unit, _, _ = RECORDS[name]
+    started = time.process_time()
+    fit = gfnn.fit(training)
+    seconds = time.process_time() - started
+    errors, _ = forecasts(fit.map, held, times)
+    median = {str(t): None if e is None else e * unit for t, e in zip(times, errors, strict=True)}
+    return {"median": median, "seconds": seconds, "formula": fit.formula}
+
+
+OURS = "gfnn_jax"
 PIECES = {name: functools.partial(measure, name) for name in SYSTEMS}
 
 
 def tables() -> None:
-    """The table of RESULTS.md: ours from `measured.py`'s results, and the peers."""
+    """The table of RESULTS.md."""
     found = read({name: RESULTS / f"peers-{name}.json" for name in SYSTEMS})
-    ours = read({name: RESULTS / f"measured-{name}.json" for name in SYSTEMS})
     if not found:
         return
     rows = []
     for name, result in found.items():
-        m = ours.get(name, {}).get("measured", {}).get("2")
-        if m:
-            rows.append([name, "gfnn_jax", "which columns are angles", *_cells(m)])
-        for peer in PEERS:
-            if peer in result["measured"]:
-                told = result["measured"]["told"].split("; ")
-                told = {"rigid body by hand": told[0], "PySINDy": told[-1]}.get(peer, "angles")
-                rows.append([name, peer, told, *_cells(result["measured"][peer])])
+        m = result["measured"]
+        body, library = m["told"].split("; ")
+        angles = "which columns are angles" if gfnn.records.RECORDS[name].angles else "positions"
+        told = {"rigid body by hand": body, "PySINDy": library}
+        rows += [[name, method, told.get(method, angles), *_cells(m[method])]
+                 for method in (OURS, *PEERS) if method in m]  # fmt: skip
     heads = ("record", "method", "told", "median error ahead", "CPU s")
     between_markers(TABLES, "peers", f"{markdown(heads, rows)}\n\n{provenance(found)}")
 
