@@ -291,36 +291,40 @@ def neural_ode(system: System, arcs: Arcs, quick: bool) -> tuple[Acceleration, A
 
 def pysindy_sparse(system: System, arcs: Arcs, quick: bool) -> tuple[Acceleration, Any]:
     """Sparse regression on the library of the accelerations of smoothed positions, or of the
-    smoothed speeds in weak form; of both, and of all thresholds, the equations that follow the
-    last quarter of the arcs best."""
+    smoothed speeds in weak form. The kind and the threshold are those whose equations, from three
+    quarters of the arcs, follow the last quarter best; they are then fitted to all."""
     import pysindy as ps
 
     half = choose_half([(t, y) for t, y in zip(arcs.t, arcs.y, strict=True)])[0]
     smoothed = [smooth(t, y, half)[0] for t, y in zip(arcs.t, arcs.y, strict=True)]
     few = slice(None, -max(1, len(smoothed) // 4))
     check = slice(few.stop, None)
-    by_derivatives = _derivatives(system, smoothed[few])
-    by_weak_form = _weak_form(system, arcs.t[few], smoothed[few])
 
     def acceleration(params: Any, q: jax.Array, v: jax.Array) -> jax.Array:
         return params @ jnp.stack(system.library(q, v))
 
-    best, kept = np.inf, None
-    for threshold in THRESHOLDS[:2] if quick else THRESHOLDS:
-        for regression in (by_derivatives, by_weak_form):
-            sparse = ps.STLSQ(threshold=threshold, alpha=1e-6, normalize_columns=True)
-            params = jnp.asarray(regression(sparse))
+    def sparse(threshold: float) -> Any:
+        return ps.STLSQ(threshold=threshold, alpha=1e-6, normalize_columns=True)
+
+    best, chosen = np.inf, None
+    for kind in (_derivatives, _weak_form):
+        regression = kind(system, arcs.t[few], smoothed[few])
+        for threshold in THRESHOLDS[:2] if quick else THRESHOLDS:
+            params = jnp.asarray(regression(sparse(threshold)))
             x0, t, y = arcs.x0[check], arcs.t[check], arcs.y[check]
             x0 = estimated(acceleration, params, x0, t, y, system.step)
             error = float(jnp.mean((positions(acceleration, params, x0, t, system.step) - y) ** 2))
             if error < best:
-                best, kept = error, params
-    if kept is None:
+                best, chosen = error, (kind, threshold)
+    if chosen is None:
         raise RuntimeError("PySINDy's equations run away along every arc, at each threshold")
-    return acceleration, kept
+    kind, threshold = chosen
+    return acceleration, jnp.asarray(kind(system, arcs.t, smoothed)(sparse(threshold)))
 
 
-def _derivatives(system: System, smoothed: Sequence[Any]) -> Callable[[Any], np.ndarray]:
+def _derivatives(
+    system: System, times: np.ndarray, smoothed: Sequence[Any]
+) -> Callable[[Any], np.ndarray]:
     """Return the regression of the accelerations of local cubics: optimizer -> (d, terms)."""
     inner = slice(2, -2)  # cubics are poor at the ends of an arc
     columns = [
