@@ -19,8 +19,8 @@ from gfnn_jax.families.lagrangian import (
     Lagrangian,
     Terms,
 )
-from gfnn_jax.flows.motion import Form
-from gfnn_jax.flows.schedules import at_stages, interpolate
+from gfnn_jax.flows.motion import NODES, Form
+from gfnn_jax.flows.schedules import HOLDS, at_stages, interpolate
 from gfnn_jax.jobs.forecast import forecast_recording
 from gfnn_jax.maps.estimates import Window, estimate_states, law_of, propagate, propagate_each
 from gfnn_jax.models.lagrangians.text import WhichFriction, speed_names, terms_of
@@ -164,11 +164,41 @@ def test_inputs_between_samples():
     at = np.linspace(4, 6, 41)
     assert np.abs(interpolate(t, u, at, "band")[:, 0] - np.sin(3 * at)).max() < 1e-3
     assert np.abs(interpolate(t, u, at, "linear")[:, 0] - np.sin(3 * at)).max() < 0.02
-    held = at_stages(t, u, np.array([4.0, 4.1, 4.3, 4.3]), 1, "hold", delay=0.03)
-    for step, mean in enumerate((0.3 * u[39] + 0.7 * u[40], 0.15 * u[40] + 0.5 * u[41])):
-        mean = mean + (0.35 * u[42] if step else 0.0)
-        np.testing.assert_allclose(held[step, 0], np.tile(mean, (6, 1)), atol=1e-12)
-    np.testing.assert_array_equal(held[2, 0], np.tile(u[42], (6, 1)))  # no time: the value there
+    start, end = np.array([4.0, 4.1, 4.3]), np.array([4.1, 4.3, 4.3])
+    for hold in HOLDS:
+        found = at_stages(t, u, start, end, 2, hold, delay=0.03)
+        for k in range(2):  # moments of the parabola, and of a fine sum
+            for half in range(2):
+                h = (end[k] - start[k]) / 2
+                s = (np.arange(20_000) + 0.5) / 20_000
+                value = interpolate(t, u, start[k] - 0.03 + (half + s) * h, hold)[:, 0]
+                parabola = np.polynomial.Polynomial.fit(NODES, found[k, half, :, 0], 2)(s)
+                for power in range(3):
+                    expected, moment = np.mean(value * s**power), np.mean(parabola * s**power)
+                    assert abs(moment - expected) < 1e-5
+    np.testing.assert_array_equal(
+        found[2, 0, :, 0], interpolate(t, u, np.full(6, 4.27), "band")[:, 0]
+    )
+
+
+def test_steps_that_are_longer_than_inputs_are_held():
+    """A pendulum pushed by numbers at random, eight to a step: as by a step for each."""
+    rng, d = np.random.default_rng(0), 1
+    t = np.linspace(0, 4, 401)
+    u = rng.normal(size=(len(t), 1))
+    terms = Terms.of([((2,), (0,), (0,), 0.0), ((0,), (0,), (1,), 0.0)], d)
+    form = Form(terms, np.zeros(2), np.eye(2), Friction.of([((1,), LINEAR, 0.0)], d), 1)
+    p, found = np.array([0.5, 1.0, 0.1, 1.0]), []
+    for substeps in (1, 8):
+        x = np.array([[0.5, 0.0]])
+        for k in range(0, len(t) - 1, 8):
+            h = t[k + 8] - t[k]
+            x = form.advance(
+                p, x, np.array([h]), at_stages(t, u, t[[k]], t[[k]] + h, substeps, "hold")
+            )
+        found.append(x)
+    assert np.abs(found[0] - found[1]).max() < 1e-5
+    assert np.abs(found[0]).max() > 0.1
 
 
 def test_text_of_a_law():

@@ -8,7 +8,7 @@ forty to a period of the fastest motion, each with the state (q, v) that local c
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -48,13 +48,14 @@ class Stretch:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Nodes:
     """Samples ``at`` (m,) of a stretch, with their times t (m,), channels y (m, k) and states x
-    (m, 2d)."""
+    (m, 2d); ``zero``: of the channels (k,) in this run, which arcs are without."""
 
     stretch: Stretch
     at: np.ndarray
     t: np.ndarray
     y: np.ndarray
     x: np.ndarray
+    zero: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -210,7 +211,7 @@ def nodes_of(found: Sequence[Stretch], scales: Scales) -> list[Nodes]:
                 continue
             q, v, _ = smooth(s.t, s.q, scales.half, block)[0]
             x = np.concatenate([q, v], axis=1)
-            nodes.append(Nodes(s, block, s.t[block], s.y[block], x))
+            nodes.append(Nodes(s, block, s.t[block], s.y[block], x, np.zeros(s.y.shape[1])))
     return nodes
 
 
@@ -229,7 +230,7 @@ def arcs_of(nodes: Sequence[Nodes], length: int) -> Arcs:
         x.append(nodes[i].x[index])
         noise.append(nodes[i].stretch.noise[nodes[i].at[index]])
         seen = np.arange(a, a + longest) < b
-        y.append(np.where(seen[:, None], nodes[i].y[index], np.nan))
+        y.append(np.where(seen[:, None], nodes[i].y[index] - nodes[i].zero, np.nan))
     return Arcs(np.array(t), np.array(y), np.array(x), np.array(noise), tuple(home))
 
 
@@ -239,3 +240,13 @@ def with_states(nodes: Sequence[Nodes], arcs: Arcs, x: np.ndarray) -> list[Nodes
     for k, (i, a, b) in enumerate(arcs.home):
         states[i][a:b] = x[k, : b - a]
     return [dataclasses.replace(n, x=s) for n, s in zip(nodes, states, strict=True)]
+
+
+def shifted(nodes: Sequence[Nodes], zeros: Mapping[str, np.ndarray]) -> list[Nodes]:
+    """The nodes with further zeros (d,) of each run, of channels that are the coordinates."""
+    found = []
+    for n in nodes:
+        own = zeros[n.stretch.run]
+        x = n.x - np.concatenate([own, np.zeros(n.x.shape[1] - len(own))])
+        found.append(dataclasses.replace(n, x=x, zero=n.zero + own))
+    return found

@@ -75,11 +75,11 @@ class Form:
         return Lagrangian(self.terms, theta, friction, losses[..., ~even], uniform, gains)
 
     def accelerate(
-        self, law: Lagrangian, q: np.ndarray, v: np.ndarray, u: np.ndarray, sensitive: bool = True
+        self, law: Lagrangian, q: np.ndarray, v: np.ndarray, u: np.ndarray, order: int = 2
     ) -> tuple[np.ndarray, np.ndarray]:
-        """a (N, d), and its derivatives in q, v and, where ``sensitive``, in the coefficients
-        (N, d, 2d + count)."""
-        f, df, ddf = self.terms.potentials(q)
+        """a (N, d), and its derivatives: none (N, d, 0) of ``order`` 0, in q and v (N, d, 2d) of 1,
+        in the coefficients too (N, d, 2d + count) of 2."""
+        f, df, ddf = self.terms.potentials(q, order=2 if order else 1)
         g, dg = self.terms.motion(v)
         A, _, _ = self.terms.quadratic()
         theta, d = law.coefficients, self.dim
@@ -99,6 +99,8 @@ class Form:
         masses = ((theta * f) @ A).reshape(-1, d, d)
         inverse = np.linalg.inv(masses) if d > 1 else 1 / masses
         a = np.einsum("nij,nj->ni", inverse, force)
+        if not order:
+            return a, np.zeros((*a.shape, 0))
         push = (a @ A.reshape(-1, d).T).reshape(df.shape)
         weighted = theta[..., None] * df
         by_q = push.swapaxes(1, 2) @ weighted
@@ -112,7 +114,7 @@ class Form:
             by_q += gamma[..., None] * turned
             by_v = by_v + gamma[..., None] * masses
         columns = [by_q, by_v]
-        if sensitive:
+        if order > 1:
             rows = push * f[..., None] + dg * along[..., None] - g[..., None] * df
             rows = rows + gamma[..., None] * (f[..., None] * dg)
             columns.append(rows.swapaxes(1, 2) @ self.basis)
@@ -121,18 +123,19 @@ class Form:
             if even.any():
                 by_losses[..., even] = momentum[..., None]
             columns.append(by_losses)
-        if sensitive and self.num_inputs:
+        if order > 1 and self.num_inputs:
             pushed = -u[:, None, None, :] * np.eye(d)[:, :, None]
             columns.append(pushed.reshape(len(v), d, -1))
         return a, -inverse @ np.concatenate(columns, axis=-1)
 
     def step(
-        self, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray, sensitive: bool = True
+        self, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray, order: int = 2
     ) -> Step:
-        """One step h (N,) of states x (N, 2d) with its derivatives, those in the coefficients where
-        ``sensitive``; u (N, substeps, 6, inputs) are the inputs at the nodes of each substep."""
+        """One step h (N,) of states x (N, 2d) with its derivatives in the states (``order`` 1) and
+        in the coefficients (2); u (N, substeps, 6, inputs) are the inputs at the nodes of each
+        substep."""
         law, d, substeps = self.lagrangian(p), self.dim, u.shape[1]
-        n, width = len(x), 2 * d + (self.count if sensitive else 0)
+        n, width = len(x), 2 * d + (self.count if order > 1 else 0)
         h = (h / substeps)[:, None]
         wide = h[..., None]
         D = np.zeros((n, 2 * d, width))
@@ -143,7 +146,7 @@ class Form:
                 xi, Di = x, D
                 for j in np.flatnonzero(_A[i]):
                     xi, Di = xi + _A[i, j] * h * rates[j], Di + _A[i, j] * wide * slopes[j]
-                a, by = self.accelerate(law, xi[:, :d], xi[:, d:], u[:, k, i], sensitive)
+                a, by = self.accelerate(law, xi[:, :d], xi[:, d:], u[:, k, i], order)
                 slope = np.empty_like(D)
                 slope[:, :d] = Di[:, d:]
                 slope[:, d:] = by[..., : 2 * d] @ Di
@@ -160,7 +163,7 @@ class Form:
         for k in range(substeps):
 
             def rate(i: int, x: np.ndarray, k: int = k) -> np.ndarray:
-                a = law.acceleration(x[:, :d], x[:, d:], u[:, k, i])
+                a, _ = self.accelerate(law, x[:, :d], x[:, d:], u[:, k, i], 0)
                 return np.concatenate([x[:, d:], a], axis=1)
 
             x = runge_kutta(rate, x, (h / substeps)[:, None])

@@ -32,6 +32,7 @@ from gfnn_jax.solve.linear import covariance_root
 FEWEST = 5  # samples from which a state is estimated
 _MOST = 160  # samples of a window that are used
 _FINE = 0.16  # radians of the fastest motion in a step
+_AT_ONCE = 4_096  # steps whose derivatives are taken together
 
 
 class Forecast(NamedTuple):
@@ -213,7 +214,7 @@ class _Windows:
         num = arcs * (length - 1)
         u = self.u.reshape(num, *self.u.shape[2:])
         start = x[:, :-1].reshape(num, m)
-        step = self.law.form.step(self.law.p, start, self.h.reshape(num), u, sensitive=False)
+        step = self.law.form.step(self.law.p, start, self.h.reshape(num), u, order=1)
         shape = (arcs, length - 1, m)
         closing = step.states.reshape(shape) - x[:, 1:]
         return Steps(closing, step.by_state.reshape(*shape, m), np.zeros((*shape, 0)))
@@ -341,29 +342,17 @@ def propagate_each(
     The laws differ in coefficients, phases, covariance and the parameters of their channels only;
     all else of the sensors is that of the first.
     """
-    law, (form, p, roots) = laws[0], _side_by_side(laws, which)
-    d, sensors, count = form.dim, law.sensors, form.count
-    ends, (x, zeros) = np.concatenate([last[:, None], times], axis=1), np.split(x, [2 * d], axis=1)
-    begun, steps = x, np.diff(ends, axis=1)
-    root, size = covariance_root(covariance).swapaxes(1, 2), covariance.shape[-1]
-    root = np.concatenate([root, np.zeros((len(x), size, roots.shape[1]))], axis=2)
-    spread, of_zeros = root[:, : 2 * d], root[:, 2 * d :]
-    states, spreads, now = [], [], last
-    for k in range(times.shape[1]):
-        parts = substeps_of(sensors, np.max(steps[:, k], initial=0.0))
-        both = np.stack([now, times[:, k]], axis=1)
-        u = _inputs(law, windows, both, parts)
-        step = form.step(p, x, steps[:, k], u[:, 0])
-        x, now = step.states, times[:, k]
-        spread = step.by_state @ spread
-        spread[..., size:] += step.by_coefficients[..., :count] @ roots.swapaxes(1, 2)
-        states.append(x)
-        spreads.append(spread)
-    orbit, spread = np.stack(states, axis=1), np.stack(spreads, axis=1)
-    for number, own in enumerate(laws):
+    law, d, sensors = laws[0], laws[0].form.dim, laws[0].sensors
+    x, zeros = np.split(x, [2 * d], axis=1)
+    root = covariance_root(covariance).swapaxes(1, 2)
+    ends, asked = _in_steps(sensors, np.concatenate([last[:, None], times], axis=1))
+    u = _inputs(law, windows, ends, 1)
+    orbit, spread = _followed(laws, which, x, root[:, : 2 * d], np.diff(ends, axis=1), u, asked)
+    of_zeros = np.pad(root[:, 2 * d :], ((0, 0), (0, 0), (0, spread.shape[-1] - root.shape[-1])))
+    for number, one in enumerate(laws):
         lanes = np.flatnonzero(which == number)
-        some = np.concatenate([begun[lanes, None], orbit[lanes]], axis=1)
-        orbit[lanes] = _with_stops(own, [windows[i] for i in lanes.tolist()], some, ends[lanes])
+        orbit[lanes] = _with_stops(one, orbit[lanes], ends[lanes], u[lanes, :, 0])
+    orbit = orbit[:, asked]
     scales = np.stack([law.sensors.observation_model.values for law in laws])[which, None]
     channels, ahead = sensors.observation_model(orbit, scales), times - last[:, None]
     values, shown, further = channels.values, channels.by_state @ spread, 0.0
@@ -374,6 +363,39 @@ def propagate_each(
         further = sensors.wander.size**2 * (1 - left**2) * sensors.sigma**2
     own = np.sum(shown**2, axis=-1) + further + sensors.sigma**2 + sensors.misfit_at(ahead) ** 2
     return Orbits(values, np.sqrt(own), orbit, spread @ spread.swapaxes(2, 3))
+
+
+def _followed(
+    laws: Sequence[Law], which: np.ndarray, x: np.ndarray, root: np.ndarray, h: np.ndarray,
+    u: np.ndarray, asked: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Orbits (B, M + 1, 2d) of the laws from states x (B, 2d), whose covariance is root rootᵀ, by
+    steps h (B, M) with inputs u; and the roots (B, n, 2d, ·) of the covariances after the steps
+    that are ``asked`` (n,), with that of the coefficients.
+
+    States are followed one step after another, then all derivatives are taken together.
+    """
+    form, p, roots = _side_by_side(laws, which)
+    orbit = [x]
+    for k in range(h.shape[1]):
+        orbit.append(form.advance(p, orbit[-1], h[:, k], u[:, k]))
+    size, count = root.shape[-1], roots.shape[-1]
+    spread = np.concatenate([root, np.zeros((*x.shape, roots.shape[1]))], axis=2)
+    spreads, most = {}, max(1, _AT_ONCE // len(x))
+    for first in range(0, h.shape[1], most):
+        some = slice(first, first + most)
+        begun = np.stack(orbit[:-1][some], axis=1)
+        form, p, _ = _side_by_side(laws, np.repeat(which, begun.shape[1]))
+        flat = (a.reshape(p.shape[0], *a.shape[2:]) for a in (begun, h[:, some], u[:, some]))
+        step = form.step(p, *flat)
+        by_state = step.by_state.reshape(*begun.shape, begun.shape[-1])
+        further = step.by_coefficients[..., :count].reshape(*begun.shape, count)
+        further = further @ roots[:, None].swapaxes(2, 3)
+        for k in range(begun.shape[1]):
+            spread = by_state[:, k] @ spread
+            spread[..., size:] += further[:, k]
+            spreads[first + k + 1] = spread
+    return np.stack(orbit, axis=1), np.stack([spreads[k] for k in asked.tolist()], axis=1)
 
 
 def _side_by_side(laws: Sequence[Law], which: np.ndarray) -> tuple[Form, np.ndarray, np.ndarray]:
@@ -387,25 +409,28 @@ def _side_by_side(laws: Sequence[Law], which: np.ndarray) -> tuple[Form, np.ndar
     return form, np.stack([law.p for law in laws])[which], roots[which]
 
 
-def _with_stops(
-    law: Law, windows: Sequence[Window], orbit: np.ndarray, ends: np.ndarray
-) -> np.ndarray:
-    """Orbits (B, n, 2d) from the first states (B, n + 1, 2d) on, those that dry friction brings to
-    rest followed anew (`maps.stops`)."""
-    lagrangian, sensors = law.form.lagrangian(law.p), law.sensors
-    lanes = np.flatnonzero(stops.resting(lagrangian, orbit, ends, sensors.omega))
-    if not len(lanes):
-        return orbit[:, 1:]
-    some, orbit = [windows[i] for i in lanes.tolist()], orbit.copy()
-    parts = substeps_of(sensors, np.max(np.diff(ends, axis=1), initial=0.0))
+def _with_stops(law: Law, orbit: np.ndarray, ends: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Orbits (B, n, 2d) at the times ``ends`` (B, n) with inputs u (B, n − 1, 6, k) at the stages
+    between them, those that dry friction brings to rest followed anew (`maps.stops`)."""
+    lagrangian = law.form.lagrangian(law.p)
+    lanes = np.flatnonzero(stops.resting(lagrangian, orbit[:, 1:], ends[:, 1:], law.sensors.omega))
+    if len(lanes):
+        orbit, held = orbit.copy(), u[lanes].swapaxes(2, 3) @ WEIGHTS
+        found = stops.stopped(lagrangian, orbit[lanes, 0], ends[lanes], held)
+        solved = np.isfinite(found).all(axis=(1, 2))
+        orbit[lanes[solved], 1:] = found[solved]
+    return orbit
 
-    def inputs(k: int) -> np.ndarray:
-        return _inputs(law, some, ends[lanes, k : k + 2], parts)[:, 0].swapaxes(2, 3) @ WEIGHTS
 
-    found = stops.stopped(lagrangian, orbit[lanes, 0], ends[lanes], inputs)
-    solved = np.isfinite(found).all(axis=(1, 2))
-    orbit[lanes[solved], 1:] = found[solved]
-    return orbit[:, 1:]
+def _in_steps(sensors: Sensors, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times (B, n) with those between them that Runge–Kutta steps need, and the places of all but
+    the first."""
+    steps = np.diff(times, axis=1)
+    parts = [substeps_of(sensors, np.max(h, initial=0.0)) for h in steps.T]
+    between = [
+        times[:, k, None] + steps[:, k, None] * np.arange(n) / n for k, n in enumerate(parts)
+    ]
+    return np.concatenate([*between, times[:, -1:]], axis=1), np.cumsum(parts)
 
 
 def substeps_of(sensors: Sensors, h: float) -> int:
@@ -415,11 +440,8 @@ def substeps_of(sensors: Sensors, h: float) -> int:
 
 def _inputs(law: Law, windows: Sequence[Window], t: np.ndarray, substeps: int) -> np.ndarray:
     """Inputs (B, L − 1, substeps, 6, k) of the steps between times t (B, L)."""
-    sensors = law.sensors
-    if sensors.inputs and sensors.hold == "hold":  # a substep for each of their samples at least
-        between = min(float(np.median(np.diff(w.inputs_t))) for w in windows)
-        substeps = max(substeps, int(np.ceil(np.max(np.diff(t)) / between - 1e-6)))
+    hold, delay = law.sensors.hold, law.sensors.delay
     return np.stack([
-        at_stages(w.inputs_t, w.inputs, ends, substeps, sensors.hold, sensors.delay)
+        at_stages(w.inputs_t, w.inputs, ends[:-1], ends[1:], substeps, hold, delay)
         for w, ends in zip(windows, t, strict=True)
     ])  # fmt: skip

@@ -7,8 +7,6 @@ where it would rest. Orbits that come to rest are therefore followed anew with C
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from gfnn_jax.families.lagrangian import DRY, Lagrangian
@@ -28,19 +26,13 @@ def resting(law: Lagrangian, states: np.ndarray, times: np.ndarray, omega: float
     return np.any(slow & (slow_for > _RESTING / omega), axis=(1, 2))
 
 
-def stopped(
-    law: Lagrangian, x: np.ndarray, ends: np.ndarray, inputs: Callable[[int], np.ndarray]
-) -> np.ndarray:
+def stopped(law: Lagrangian, x: np.ndarray, ends: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Orbits (B, n, 2d) of the law with Coulomb's friction from states x = (q, v) (B, 2d) at the
     first of the times ``ends`` (B, n + 1) to the others; NaN from where a step has no solution.
-
-    inputs: k -> those in the parts of step k, constant in each (B, parts, inputs).
-    """
+    Inputs u (B, n, inputs) are constant in each step."""
     motion, found = Coulomb.of(law), []
-    modes = motion.begin(x, inputs(0)[:, 0])
+    modes = motion.begin(x, u[:, 0])
     for k, h in enumerate(np.diff(ends, axis=1).T):
-        u = inputs(k)
-        for n in range(u.shape[1]):
-            x, modes = motion.advance(x, modes, h / u.shape[1], u[:, n])
+        x, modes = motion.advance(x, modes, h, u[:, k])
         found.append(x)
     return np.stack(found, axis=1)

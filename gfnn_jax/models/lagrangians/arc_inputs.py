@@ -17,11 +17,9 @@ class ArcInputs:
     def __init__(self, nodes: Sequence[Nodes], substeps: int, hold: str, delay: float = 0.0):
         self.hold, self.delay = hold, delay
         self._nodes, self._substeps = nodes, substeps
-        if hold == "hold" and nodes[0].stretch.u.shape[1]:  # a substep for each: none is lost
-            apart = max(int(np.max(np.diff(n.at), initial=1)) for n in nodes)
-            substeps = apart * -(-substeps // apart)
         self._of_nodes = [
-            at_stages(n.stretch.t, n.stretch.u, n.t, substeps, hold, delay) for n in nodes
+            at_stages(n.stretch.t, n.stretch.u, n.t[:-1], n.t[1:], substeps, hold, delay)
+            for n in nodes
         ]
 
     def delayed(self, delay: float) -> ArcInputs:

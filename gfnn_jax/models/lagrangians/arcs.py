@@ -40,7 +40,7 @@ class LawOnArcs:
             x[:, :-1].reshape(num, m),
             self.h.reshape(num),
             self.u.reshape(num, *self.u.shape[2:]),
-            sensitive=len(self.free) > 0,
+            order=2 if len(self.free) else 1,
         )
         by = np.zeros((num, m, len(whole)))
         by[..., : step.by_coefficients.shape[-1]] = step.by_coefficients

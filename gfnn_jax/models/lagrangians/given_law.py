@@ -24,6 +24,7 @@ from gfnn_jax.models.lagrangians.search import (
 )
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.weak_start import weak_start
+from gfnn_jax.models.lagrangians.zeros_of_runs import with_zeros_of_runs
 
 
 def fit_given(
@@ -53,7 +54,7 @@ def fit_given(
         if arcs.t.shape == fit.arcs.t.shape:
             break  # no run is longer
         fit = bench.fit(structure, fit.values, arcs, fit.sigma)
-        nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+        nodes, fit = with_zeros_of_runs(bench, nodes, fit, on_progress)
         on_progress(f"{periods:g} periods: {describe(fit)}")
     if given.friction is None:
         tried = frictions_tried(d, scales, options)

@@ -23,6 +23,7 @@ from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.learned_law import in_columns, scaled
 from gfnn_jax.models.lagrangians.wandering import wander_of
+from gfnn_jax.models.lagrangians.zeros_of_runs import wander_of_runs
 from gfnn_jax.solve.latent_arcs import SOFT_L1
 from gfnn_jax.solve.linear import covariance_root
 
@@ -84,14 +85,15 @@ class Record:
         """The sensors, as yet without a misfit."""
         scales, recording, observation = self.scales, self.recording, bench.observation
         noise = np.where(self.given > 0, self.given, np.minimum(scales.sigma, fit.rms()))
+        wander = wander_of_runs(self.nodes, noise)
         if bench.wander is not None:  # sizes of wanders are in units of the white part
-            noise = fit.sigma
+            noise, wander = fit.sigma, bench.wander
         plain = observation.is_plain and observation.loss == SOFT_L1
         return Sensors(
             recording.coordinates, recording.inputs, recording.angles, noise, scales.omega,
             scales.period, self.hold, self.delay, np.array([scales.period]),
             np.zeros((1, len(noise))),
-            None if plain else dataclasses.replace(observation, values=fit.sensors), bench.wander,
+            None if plain else dataclasses.replace(observation, values=fit.sensors), wander,
         )  # fmt: skip
 
     def thirds(self, bench: Workbench, fit: LawFit, sensors: Sensors) -> Thirds:

@@ -122,6 +122,8 @@ class LearnedLaw:
         for name, sigma in self.noise.items():
             zero = "" if wander is None else (
                 f" on a zero that wanders by {wander.size * sigma:.3g} over {wander.time:.3g} s"
+                if np.isfinite(wander.time)
+                else f" on a zero that differs from run to run by {wander.size * sigma:.3g}"
             )  # fmt: skip
             lines.append(
                 f"{name}: noise σ {sigma:.3g}{zero}, RMS residual {self.residual[name]:.3g} (unit "

@@ -27,6 +27,7 @@ from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.structure import Key, Loss, Structure
 from gfnn_jax.models.lagrangians.text import word_of
 from gfnn_jax.models.lagrangians.weak_start import protected, weak_start
+from gfnn_jax.models.lagrangians.zeros_of_runs import with_zeros_of_runs
 
 _AS_WELL = 1.01  # times the cost, with which a law follows the record as well
 
@@ -136,6 +137,7 @@ def search(
         if arcs.t.shape == fit.arcs.t.shape:
             break  # no run is longer
         fit = bench.fit(fit.structure, fit.values, arcs, fit.sigma)
+        nodes, fit = with_zeros_of_runs(bench, nodes, fit, on_progress)
         if periods == 1:
             fit = grow(bench, nodes, fit, frictions, on_progress, options)
             fit = prune(bench, nodes, fit, on_progress, options)

@@ -27,7 +27,7 @@ def traces_of(
     acting = np.tensordot(inputs(arcs), WEIGHTS, axes=(3, 0)).mean(axis=2)  # (A, L − 1, m)
     for k, (i, a, b) in enumerate(arcs.home):
         n, stretch = b - a, nodes[i].stretch
-        t, y, x = arcs.t[k, :n], arcs.y[k, :n], fit.fitted.x[k, :n]
+        t, y, x = arcs.t[k, :n], arcs.y[k, :n] + nodes[i].zero, fit.fitted.x[k, :n]
         q, v = x[:, :d] + fit.zeros, x[:, d:]
         rate = law.power(q, v)[0][:, : law.friction.count + (law.uniform != 0)]
         lost = 0.5 * np.diff(t)[:, None] * (rate[1:] + rate[:-1])

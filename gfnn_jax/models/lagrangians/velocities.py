@@ -130,8 +130,10 @@ def with_channels(
                 for k, own in enumerate((s.y, s.noise))
             )
             wider[id(s)] = dataclasses.replace(s, y=y, noise=noise)
-        extended.append(dataclasses.replace(node, stretch=wider[id(s)], y=wider[id(s)].y[node.at]))
-    y = _at_nodes(arcs, extended, [node.stretch.y for node in extended])
+        zero = np.pad(node.zero, (0, len(names)))
+        y = wider[id(s)].y[node.at]
+        extended.append(dataclasses.replace(node, stretch=wider[id(s)], y=y, zero=zero))
+    y = _at_nodes(arcs, extended, [node.stretch.y - node.zero for node in extended])
     y = np.where(np.isfinite(arcs.y).any(axis=-1, keepdims=True), y, np.nan)
     noise = _at_nodes(arcs, extended, [node.stretch.noise for node in extended])
     return extended, dataclasses.replace(arcs, y=y, noise=noise, x=x)
