@@ -171,6 +171,21 @@ def test_inputs_between_samples():
     np.testing.assert_array_equal(held[2, 0], np.tile(u[42], (6, 1)))  # no time: the value there
 
 
+@pytest.mark.parametrize(("hold", "error"), [("hold", 0.02), ("linear", 0.01), ("band", 0.01)])
+def test_inputs_with_missing_samples(hold, error):
+    """A logger that drops samples leaves the inputs near what they were with all of them."""
+    t = np.arange(0, 10, 0.05)
+    u = np.sin(2 * t)[:, None]
+    keep = np.random.default_rng(0).random(len(t)) > 0.1
+    keep[[0, -1]] = True
+    ends = np.linspace(4, 6, 41)
+    whole, fewer = (at_stages(t[k], u[k], ends, 1, hold) for k in (np.ones(len(t), bool), keep))
+    assert np.abs(fewer - whole).max() < error
+    uneven = np.sort(np.random.default_rng(1).random(200))  # times at which a switch was thrown
+    found = at_stages(uneven, u, uneven, 1, "hold")
+    np.testing.assert_allclose(found[:, 0, 0], u[:-1], atol=1e-9)
+
+
 def test_text_of_a_law():
     terms = Terms.of([((2, 0), (0, 0), (0, 0), 0.0), ((1, 1), (0, 0), (1, -1), 0.1)], 2)
     names = ("theta1", "theta2")

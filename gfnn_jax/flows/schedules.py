@@ -10,6 +10,8 @@ from gfnn_jax.flows.motion import NODES
 HOLDS = ("hold", "linear", "band")
 _TAPS = 32  # samples on either side, of band-limited interpolation
 _AT_ONCE = 4_096  # times
+_UNEVEN = 0.1  # median steps, by which even samples are off a whole number of them at most
+_BRIDGED = 4  # median steps from sample to sample, up to which samples count as missing
 
 
 def stage_times(t: np.ndarray, substeps: int) -> np.ndarray:
@@ -24,14 +26,34 @@ def at_stages(
 ) -> np.ndarray:
     """u(· − delay) (..., L − 1, substeps, 6, k) at the stages of steps between times ``ends``
     (..., L), of samples u (n, k) at times t (n,). Where inputs are held, every stage of a substep
-    sees their mean over it, so that the substep takes up all of their momentum."""
+    sees their mean over it, so that the substep takes up all of their momentum. Samples that a
+    record lacks are linear between those beside them, whatever the rule."""
     at = stage_times(ends, substeps) - delay
     if u.shape[1] == 0:
         return np.zeros((*at.shape, 0))
+    t, u = _filled(t, u)
     if hold == "hold":
         mean = _mean_of_held(t, u, at[..., 0], at[..., -1])
         return np.broadcast_to(mean[..., None, :], (*at.shape, u.shape[1]))
     return interpolate(t, u, at, hold)
+
+
+def _filled(t: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Samples u (n, k) at t (n,), and those between them that are missing: of even samples a few in
+    a row, as a logger drops them."""
+    if len(t) < 3:
+        return t, u
+    steps = np.diff(t)
+    apart = steps / np.median(steps)
+    whole = np.rint(apart).astype(int)
+    even = (np.abs(apart - whole) < _UNEVEN) | (whole > _BRIDGED)
+    parts = np.where((whole > 1) & (whole <= _BRIDGED), whole, 1)
+    if not np.all(even) or np.all(parts == 1):
+        return t, u
+    first = np.repeat(np.arange(len(steps)), parts)
+    share = (np.arange(len(first)) - np.searchsorted(first, first)) / parts[first]
+    filled = np.append(t[first] + share * steps[first], t[-1])
+    return filled, np.stack([np.interp(filled, t, column) for column in u.T], axis=1)
 
 
 def interpolate(t: np.ndarray, u: np.ndarray, at: np.ndarray, hold: str) -> np.ndarray:
