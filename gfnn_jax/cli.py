@@ -197,8 +197,11 @@ def _fit_law(
     print(learned.fit.table)
     print(f"written to {arguments.out}")
     told = " --inputs FILE" if learned.fit.gains else ""
-    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000"
-          f"{told} --out forecast.csv")  # fmt: skip
+    ahead = f" --num-steps 1000{told}"
+    if "stop" in columns:  # what no fit has seen is in the file
+        ahead, told = f" --to {columns['stop']:g} --compare {arguments.data[0]}", ""
+    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]}{ahead} --out "
+          "forecast.csv")  # fmt: skip
     if told:
         print(f"      FILE holds {', '.join(learned.fit.gains)} at the times of the forecast")
 
@@ -268,7 +271,7 @@ _OF_MAPS = (
     "max_seconds", "max_operations", "resume", "distributed",
 )  # fmt: skip
 _OF_STEPS = ("dt", "samples", "horizon", "outside", "devices", "distributed", "resume")
-_OF_FORECAST = ("estimate_from", "inputs", "compare")
+_OF_FORECAST = ("stop", "estimate_from", "inputs", "compare")
 
 
 def _refuse_given(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
@@ -317,18 +320,22 @@ def _forecast(arguments: argparse.Namespace) -> None:
     """Forecast from the end of a recording."""
     _set_up_jax()
     from gfnn_jax.jobs.forecast import forecast_recording
+    from gfnn_jax.maps.saved import record
 
     found, judged = forecast_recording(
         arguments.model, arguments.initial, out=arguments.out, num_steps=arguments.num_steps,
-        save_every=arguments.save_every, estimate_from=arguments.estimate_from,
-        inputs=arguments.inputs, compare=arguments.compare, overwrite=arguments.overwrite,
+        save_every=arguments.save_every, stop=arguments.stop,
+        estimate_from=arguments.estimate_from, inputs=arguments.inputs, compare=arguments.compare,
+        overwrite=arguments.overwrite,
     )  # fmt: skip
     times = [f.times[-1] for f in found.values()]
     runs = "1 run" if len(found) == 1 else f"{len(found)} runs"
-    print(f"{arguments.out}: forecasts of {runs}, up to t = {max(times):g} in the unit of the file")
+    unit = record(arguments.model).get("job", {}).get("time_unit", "s")
+    print(f"{arguments.out}: forecasts of {runs}, up to t = {max(times):g} {unit}")
     if judged is not None:
         for name, (rms, median, within) in judged.columns.items():
-            print(f"{name}: RMS error {rms:.4g}, median of its size {median:.4g}, in its unit; "
+            unit = f" {judged.units[name]}" if judged.units[name] else ""
+            print(f"{name}: RMS error {rms:.4g}{unit}, median of its size {median:.4g}{unit}; "
                   f"{within:.0%} of {judged.num_samples} samples within two standard deviations "
                   "(95 % expected)")  # fmt: skip
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from gfnn_jax.cli_columns import add_column_options
+from gfnn_jax.cli_columns import add_column_options, finite
 from gfnn_jax.errors import InputError
 from gfnn_jax.learn.options import COUNT, DEVICES, OPTIONS, POSITIVE, SEED, FitOptions, Kind
 
@@ -147,6 +147,10 @@ def parser() -> argparse.ArgumentParser:
         help="initial states; or a trajectory file, whose sequences continue from their last "
         "states; or a recording, whose runs continue from the states estimated at their ends (of a "
         "map of positions, from their last two positions)",
+    )  # fmt: skip
+    command.add_argument(
+        "--to", dest="stop", type=finite, metavar="T",
+        help="of a recording: forecast from time T, in the file's unit, as if it ended there",
     )  # fmt: skip
     command.add_argument(
         "--num-steps", type=_steps, metavar="N", help="steps to predict, backwards where N < 0"

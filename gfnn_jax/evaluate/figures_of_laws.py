@@ -61,7 +61,7 @@ def _forecast(axes, fit: LearnedLaw, recording: Recording, run: str, name: str) 
     axes.fill_between(ahead, (value - 2 * std) / factor, (value + 2 * std) / factor, alpha=0.25)
     low, high = np.nanmin(seen) / factor, np.nanmax(seen) / factor
     axes.set_ylim(low - 0.3 * (high - low), high + 0.3 * (high - low))
-    unit = recording.units.get(name) or ("rad" if angle else "")
+    unit = recording.unit(name)
     axes.set_ylabel(f"{name} [{unit}]" if unit else name)
     axes.set_xlabel("t [s]")
 
