@@ -232,9 +232,10 @@ def test_units_stand_in_names_too(tmp_path):
 )
 def test_every_column_has_its_unit(names, units):
     names, t = names.split(","), 0.01 * np.arange(300)
-    positions, velocities = np.array([np.sin(3 * t), np.cos(2 * t)]), [np.cos(3 * t), -np.sin(2 * t)]
     half = len(names) // 2
-    columns = [*positions[:half], *velocities[:half], np.sign(np.sin(5 * t))]
+    positions = [np.sin(3 * t), np.cos(2 * t)][:half]
+    velocities = [3 * np.cos(3 * t), -2 * np.sin(2 * t)][:half]
+    columns = [*positions, *velocities, np.sign(np.sin(5 * t))]
     recording = gfnn.Recording({"t": t} | dict(zip(names, columns, strict=False)))
     assert recording.positions == tuple(names[:half])
     assert recording.velocities == tuple(names[half : 2 * half])
