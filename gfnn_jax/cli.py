@@ -95,9 +95,9 @@ def _records(arguments: argparse.Namespace) -> None:
     from gfnn_jax.records import RECORDS, path
 
     for name, record in RECORDS.items():
-        options = f"--positions {','.join(record.positions)}"
-        options += f" --angles {','.join(record.angles)}" if record.angles else ""
-        print(f"{name:16} {record.what}\n{'':16} gfnn fit {path(name)} {options} --out {name}")
+        print(f"{name:16} {record.what}; positions {', '.join(record.positions)}\n"
+              f"{'':16} {path(name)}")  # fmt: skip
+    print("gfnn run NAME learns the law of two thirds of a record and forecasts the last third")
 
 
 def _scenes(arguments: argparse.Namespace) -> None:
@@ -109,9 +109,14 @@ def _scenes(arguments: argparse.Namespace) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    out = arguments.out = arguments.out or Path("runs") / arguments.scene
+    from gfnn_jax.records import RECORDS
+
+    data = Path(arguments.scene)
+    out = arguments.out = arguments.out or Path("runs") / data.stem
     if not arguments.resume:
         ensure_new(out, arguments.overwrite, folder=True)
+    if arguments.scene in RECORDS or data.is_file():
+        return _run_record(arguments)
     _set_up_jax()
     from gfnn_jax.jobs.run import run
 
@@ -123,6 +128,31 @@ def _run(arguments: argparse.Namespace) -> None:
         )  # fmt: skip
     _summarise(ran, out)
     _hold_to(arguments.strict, out / "model")
+
+
+def _run_record(arguments: argparse.Namespace) -> None:
+    """The law and the forecasts of a record of the package, or of a file."""
+    others = tuple(name for name in (*_OF_MAPS, "learn", "dt") if name != "scene")
+    _refuse_given(arguments, others, "not for the law of a recording")
+    _set_up_jax()
+    from gfnn_jax.jobs.run_record import run_record
+    from gfnn_jax.records import RECORDS, path
+
+    data, columns = Path(arguments.scene), {}
+    if arguments.scene in RECORDS:
+        record, data = RECORDS[arguments.scene], path(arguments.scene)
+        columns = {"positions": record.positions, "angles": record.angles}
+    with progress.on_stderr() as shown:
+        ran = run_record(data, out=arguments.out, columns=columns, progress=shown)
+    print(ran.learned.fit.table)
+    ahead = ", ".join(f"{seconds:.3g}" for seconds in ran.forecasts.ahead)
+    for name, errors in ran.forecasts.median.items():
+        sizes = ", ".join(f"{error:.3g}" for error in errors)
+        unit = f" {ran.unseen.unit(name)}".rstrip()
+        print(f"the last third, which no fit has seen: {name} errs by {sizes}{unit} after {ahead} "
+              "s (medians)")  # fmt: skip
+    print(f"{ran.forecasts.within:.0%} of it lies within two standard deviations (95 % expected)")
+    print(f"written to {arguments.out}")
 
 
 def _look(arguments: argparse.Namespace) -> None:

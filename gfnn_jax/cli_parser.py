@@ -76,12 +76,17 @@ def parser() -> argparse.ArgumentParser:
     command.set_defaults(command="records")
 
     command = commands.add_parser(
-        "run", help="a scene from reference data to figures",
-        description="Reference data of a scene, fit, rollouts, metrics, figures, report.json.",
+        "run", help="a scene from reference data to figures, or a measured record to forecasts",
+        description="Reference data of a scene, fit, rollouts, metrics, figures, report.json. Of a "
+        "measured record, or of your own recording: the law of its first two thirds, and forecasts "
+        "of its last third.",
         **fitting,
     )  # fmt: skip
     command.set_defaults(command="run")
-    command.add_argument("scene", metavar="SCENE", help="a name that `gfnn scenes` lists")
+    command.add_argument(
+        "scene", metavar="SCENE",
+        help="a name that `gfnn scenes` or `gfnn records` lists, or the file of a recording",
+    )  # fmt: skip
     command.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/SCENE)")
     command.add_argument("--quick", action="store_true", help="fewer pairs and rollouts")
     command.add_argument("--dt", type=_positive, metavar="H", help="another time step")
