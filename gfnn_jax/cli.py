@@ -95,9 +95,9 @@ def _records(arguments: argparse.Namespace) -> None:
     from gfnn_jax.records import RECORDS, path
 
     for name, record in RECORDS.items():
-        options = f"--positions {','.join(record.positions)}"
-        options += f" --angles {','.join(record.angles)}" if record.angles else ""
-        print(f"{name:16} {record.what}\n{'':16} gfnn fit {path(name)} {options} --out {name}")
+        print(f"{name:16} {record.what}; positions {', '.join(record.positions)}\n"
+              f"{'':16} {path(name)}")  # fmt: skip
+    print("gfnn run NAME learns the law of two thirds of a record and forecasts the last third")
 
 
 def _scenes(arguments: argparse.Namespace) -> None:
@@ -109,9 +109,14 @@ def _scenes(arguments: argparse.Namespace) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    out = arguments.out = arguments.out or Path("runs") / arguments.scene
+    from gfnn_jax.records import RECORDS
+
+    data = Path(arguments.scene)
+    out = arguments.out = arguments.out or Path("runs") / data.stem
     if not arguments.resume:
         ensure_new(out, arguments.overwrite, folder=True)
+    if arguments.scene in RECORDS or data.is_file():
+        return _run_record(arguments)
     _set_up_jax()
     from gfnn_jax.jobs.run import run
 
@@ -123,6 +128,31 @@ def _run(arguments: argparse.Namespace) -> None:
         )  # fmt: skip
     _summarise(ran, out)
     _hold_to(arguments.strict, out / "model")
+
+
+def _run_record(arguments: argparse.Namespace) -> None:
+    """The law and the forecasts of a record of the package, or of a file."""
+    others = tuple(name for name in (*_OF_MAPS, "learn", "dt") if name != "scene")
+    _refuse_given(arguments, others, "not for the law of a recording")
+    _set_up_jax()
+    from gfnn_jax.jobs.run_record import run_record
+    from gfnn_jax.records import RECORDS, path
+
+    data, columns = Path(arguments.scene), {}
+    if arguments.scene in RECORDS:
+        record, data = RECORDS[arguments.scene], path(arguments.scene)
+        columns = {"positions": record.positions, "angles": record.angles}
+    with progress.on_stderr() as shown:
+        ran = run_record(data, out=arguments.out, columns=columns, progress=shown)
+    print(ran.learned.fit.table)
+    ahead = ", ".join(f"{seconds:.3g}" for seconds in ran.forecasts.ahead)
+    for name, errors in ran.forecasts.median.items():
+        sizes = ", ".join(f"{error:.3g}" for error in errors)
+        unit = f" {ran.unseen.unit(name)}".rstrip()
+        print(f"the last third, which no fit has seen: {name} errs by {sizes}{unit} after {ahead} "
+              "s (medians)")  # fmt: skip
+    print(f"{ran.forecasts.within:.0%} of it lies within two standard deviations (95 % expected)")
+    print(f"written to {arguments.out}")
 
 
 def _look(arguments: argparse.Namespace) -> None:
@@ -197,8 +227,11 @@ def _fit_law(
     print(learned.fit.table)
     print(f"written to {arguments.out}")
     told = " --inputs FILE" if learned.fit.gains else ""
-    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000"
-          f"{told} --out forecast.csv")  # fmt: skip
+    ahead = f" --num-steps 1000{told}"
+    if "stop" in columns:  # what no fit has seen is in the file
+        ahead, told = f" --to {columns['stop']:g} --compare {arguments.data[0]}", ""
+    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]}{ahead} --out "
+          "forecast.csv")  # fmt: skip
     if told:
         print(f"      FILE holds {', '.join(learned.fit.gains)} at the times of the forecast")
 
@@ -268,7 +301,7 @@ _OF_MAPS = (
     "max_seconds", "max_operations", "resume", "distributed",
 )  # fmt: skip
 _OF_STEPS = ("dt", "samples", "horizon", "outside", "devices", "distributed", "resume")
-_OF_FORECAST = ("estimate_from", "inputs", "compare")
+_OF_FORECAST = ("stop", "estimate_from", "inputs", "compare")
 
 
 def _refuse_given(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
@@ -317,18 +350,22 @@ def _forecast(arguments: argparse.Namespace) -> None:
     """Forecast from the end of a recording."""
     _set_up_jax()
     from gfnn_jax.jobs.forecast import forecast_recording
+    from gfnn_jax.maps.saved import record
 
     found, judged = forecast_recording(
         arguments.model, arguments.initial, out=arguments.out, num_steps=arguments.num_steps,
-        save_every=arguments.save_every, estimate_from=arguments.estimate_from,
-        inputs=arguments.inputs, compare=arguments.compare, overwrite=arguments.overwrite,
+        save_every=arguments.save_every, stop=arguments.stop,
+        estimate_from=arguments.estimate_from, inputs=arguments.inputs, compare=arguments.compare,
+        overwrite=arguments.overwrite,
     )  # fmt: skip
     times = [f.times[-1] for f in found.values()]
     runs = "1 run" if len(found) == 1 else f"{len(found)} runs"
-    print(f"{arguments.out}: forecasts of {runs}, up to t = {max(times):g} in the unit of the file")
+    unit = record(arguments.model).get("job", {}).get("time_unit", "s")
+    print(f"{arguments.out}: forecasts of {runs}, up to t = {max(times):g} {unit}")
     if judged is not None:
         for name, (rms, median, within) in judged.columns.items():
-            print(f"{name}: RMS error {rms:.4g}, median of its size {median:.4g}, in its unit; "
+            unit = f" {judged.units[name]}" if judged.units[name] else ""
+            print(f"{name}: RMS error {rms:.4g}{unit}, median of its size {median:.4g}{unit}; "
                   f"{within:.0%} of {judged.num_samples} samples within two standard deviations "
                   "(95 % expected)")  # fmt: skip
 

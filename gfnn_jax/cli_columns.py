@@ -60,12 +60,12 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--from",
         dest="start",
-        type=_finite,
+        type=finite,
         metavar="T",
         help="rows from time T on, in the file's unit",
     )
     group.add_argument(
-        "--to", dest="stop", type=_finite, metavar="T", help="rows up to time T, in that unit"
+        "--to", dest="stop", type=finite, metavar="T", help="rows up to time T, in that unit"
     )
     group.add_argument("--every", type=_count, metavar="K", help="every K-th row")
 
@@ -145,7 +145,8 @@ def _formula(text: str) -> list[tuple[str, str]]:
     return [(column.strip(), formula.strip())]
 
 
-def _finite(text: str) -> float:
+def finite(text: str) -> float:
+    """The number that an option's text is."""
     if not math.isfinite(_float(text)):
         raise argparse.ArgumentTypeError(f"expected a finite number, got '{text}'")
     return float(text)

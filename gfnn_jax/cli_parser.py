@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from gfnn_jax.cli_columns import add_column_options
+from gfnn_jax.cli_columns import add_column_options, finite
 from gfnn_jax.errors import InputError
 from gfnn_jax.learn.options import COUNT, DEVICES, OPTIONS, POSITIVE, SEED, FitOptions, Kind
 
@@ -76,12 +76,17 @@ def parser() -> argparse.ArgumentParser:
     command.set_defaults(command="records")
 
     command = commands.add_parser(
-        "run", help="a scene from reference data to figures",
-        description="Reference data of a scene, fit, rollouts, metrics, figures, report.json.",
+        "run", help="a scene from reference data to figures, or a measured record to forecasts",
+        description="Reference data of a scene, fit, rollouts, metrics, figures, report.json. Of a "
+        "measured record, or of your own recording: the law of its first two thirds, and forecasts "
+        "of its last third.",
         **fitting,
     )  # fmt: skip
     command.set_defaults(command="run")
-    command.add_argument("scene", metavar="SCENE", help="a name that `gfnn scenes` lists")
+    command.add_argument(
+        "scene", metavar="SCENE",
+        help="a name that `gfnn scenes` or `gfnn records` lists, or the file of a recording",
+    )  # fmt: skip
     command.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/SCENE)")
     command.add_argument("--quick", action="store_true", help="fewer pairs and rollouts")
     command.add_argument("--dt", type=_positive, metavar="H", help="another time step")
@@ -147,6 +152,10 @@ def parser() -> argparse.ArgumentParser:
         help="initial states; or a trajectory file, whose sequences continue from their last "
         "states; or a recording, whose runs continue from the states estimated at their ends (of a "
         "map of positions, from their last two positions)",
+    )  # fmt: skip
+    command.add_argument(
+        "--to", dest="stop", type=finite, metavar="T",
+        help="of a recording: forecast from time T, in the file's unit, as if it ended there",
     )  # fmt: skip
     command.add_argument(
         "--num-steps", type=_steps, metavar="N", help="steps to predict, backwards where N < 0"

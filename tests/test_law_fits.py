@@ -6,9 +6,11 @@ import jax
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
+from gfnn_jax.dataset.stretches import nodes_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import (
     DRY,
@@ -23,6 +25,10 @@ from gfnn_jax.flows.motion import NODES, Form
 from gfnn_jax.flows.schedules import HOLDS, at_stages, interpolate
 from gfnn_jax.jobs.forecast import forecast_recording
 from gfnn_jax.maps.estimates import Window, estimate_states, law_of, propagate, propagate_each
+from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
+from gfnn_jax.models.lagrangians.input_rules import choose_again
+from gfnn_jax.models.lagrangians.recordings import _samples
+from gfnn_jax.models.lagrangians.search import search
 from gfnn_jax.models.lagrangians.text import WhichFriction, speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
 from gfnn_jax.solve.arc_models import Observed, Steps
@@ -199,6 +205,23 @@ def test_steps_that_are_longer_than_inputs_are_held():
         found.append(x)
     assert np.abs(found[0] - found[1]).max() < 1e-5
     assert np.abs(found[0]).max() > 0.1
+
+
+@pytest.mark.parametrize(("hold", "error"), [("hold", 0.02), ("linear", 0.01), ("band", 0.01)])
+def test_inputs_with_missing_samples(hold, error):
+    """A logger that drops samples leaves the inputs near what they were with all of them."""
+    t = np.arange(0, 10, 0.05)
+    u = np.sin(2 * t)[:, None]
+    keep = np.random.default_rng(0).random(len(t)) > 0.1
+    keep[[0, -1]] = True
+    ends = np.linspace(4, 6, 41)
+    whole, fewer = (
+        at_stages(t[k], u[k], ends[:-1], ends[1:], 1, hold) for k in (np.ones(len(t), bool), keep)
+    )
+    assert np.abs(fewer - whole).max() < error
+    uneven = np.sort(np.random.default_rng(1).random(200))  # times at which a switch was thrown
+    found = at_stages(uneven, u, uneven[:-1], uneven[1:], 1, "hold")
+    np.testing.assert_allclose(found[:, 0, 0], u[:-1], atol=1e-9)
 
 
 def test_text_of_a_law():
@@ -416,6 +439,9 @@ def test_the_command_line_learns_and_forecasts(tmp_path, capsys):
     assert main([*arguments, "--compare", everything, "--estimate-from", "40"]) == 0
     told = capsys.readouterr().out
     assert "within two standard deviations" in told
+    assert "in L and R: theta in rad, times in s" in told
+    assert "theta: noise σ 0.00" in told
+    assert " rad, RMS residual 0.00" in told
     rows = np.genfromtxt(out, delimiter=",", names=True)
     wanted = np.interp(rows["t"], *clean)
     assert np.abs(rows["theta"] - wanted).max() < 0.01
@@ -423,6 +449,61 @@ def test_the_command_line_learns_and_forecasts(tmp_path, capsys):
     assert len(np.genfromtxt(out, delimiter=",", names=True)) == 20
     assert main([*arguments, "--overwrite"]) == 2
     assert "--num-steps" in capsys.readouterr().err
+    of_all = ["predict", model, "--initial", everything, "--out", str(out), "--overwrite"]
+    assert main([*of_all, "--compare", everything]) == 2
+    assert "--to T" in capsys.readouterr().err
+    assert main([*of_all, "--compare", everything, "--to", "15"]) == 0  # the rest of one file
+    assert " rad; " in capsys.readouterr().out
+    assert np.genfromtxt(out, delimiter=",", names=True)["t"][0] == pytest.approx(15.05)
+
+
+def test_a_recording_is_run_from_file_to_forecasts(tmp_path, capsys):
+    """The law of two thirds of a file, and what it says of the third that it has not seen."""
+    t, theta = pendulum(end=24.0)
+    lines = ["t,theta", *(f"{a:.4f},{b:.6f}" for a, b in zip(t, theta, strict=True))]
+    (tmp_path / "swing.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    out = tmp_path / "out"
+    arguments = ["run", str(tmp_path / "swing.csv"), "--out", str(out)]
+    assert main(arguments) == 0
+    told = capsys.readouterr().out
+    assert "the last third, which no fit has seen: theta errs by 0.00" in told
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert report["data"]["num_samples"] == pytest.approx(2 / 3 * len(t), abs=1)
+    found = report["forecasts"]
+    assert found["begin"] == pytest.approx(16.0, abs=0.1)
+    assert max(found["median"]["theta"]) < 2e-3  # noise of 1e-3, the law's own error on top
+    assert found["within_two_deviations"] > 0.85
+    assert (out / "forecasts.png").stat().st_size > 10_000
+    assert gfnn.load(out / "model").sensors.positions == ("theta",)
+    assert main(arguments) == 2  # exists already
+    assert main([*arguments, "--overwrite", "--tolerance", "1e-3"]) == 2
+    assert "--tolerance" in capsys.readouterr().err
+    assert len(json.loads((out / "report.json").read_text(encoding="utf-8"))["forecasts"]) == 5
+
+
+def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
+    """ẍ = −9 x − 0.3 ẋ + 2 u, u held: a law that was found with u linear in between."""
+    rng, dt = np.random.default_rng(2), 0.1
+    u, x = np.repeat(rng.normal(size=75), 4), np.zeros((301, 2))
+    step = expm(np.array([[0, 1, 0], [-9, -0.3, 2], [0, 0, 0]]) * dt)
+    for k, one in enumerate(u):
+        x[k + 1] = (step @ np.append(x[k], one))[:2]
+    table = {"t": dt * np.arange(300), "x": x[:-1, 0] + 1e-4 * rng.normal(size=300), "u": u}
+    samples = _samples(gfnn.Recording(table), None, print)
+    nodes = nodes_of(samples.stretches, samples.scales)
+    inputs = {hold: ArcInputs(nodes, samples.scales.substeps, hold) for hold in HOLDS}
+    found = {
+        hold: search(nodes, samples.scales, (), 1, {hold: inputs[hold]}, samples.observation)
+        for hold in ("linear", "hold")
+    }
+    of = {
+        hold: choose_again(one.acting, inputs, one.nodes, 30, samples.scales.dt)
+        for hold, one in found.items()
+    }
+    assert [one.hold for one in of.values()] == ["hold", "hold"]
+    assert of["hold"].fit is found["hold"].acting.fit  # chosen before: as it was
+    assert set(of["hold"].others) == {"linear", "band"}
+    assert min(of["hold"].others.values()) > 1.5
 
 
 @pytest.mark.slow

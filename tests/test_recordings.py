@@ -218,6 +218,29 @@ def test_units_stand_in_names_too(tmp_path):
     recording = gfnn.read(write(tmp_path / "r.csv", text))
     assert (recording.positions, recording.angles) == (("angle_deg",), ("angle_deg",))
     np.testing.assert_allclose(recording.values("angle_deg", 0), THETA, rtol=1e-12)
+    assert recording.unit("angle_deg") == "deg"
+
+
+@pytest.mark.parametrize(
+    ("names", "units"),
+    [
+        ("x1_mm,x2_mm,v1_mm_s,v2_mm_s,force_N", "mm,mm,mm/s,mm/s,N"),
+        ("theta_rad,theta_dot_rad_per_s,u_V", "rad,rad/s,V"),
+        ("theta,omega,tau", "rad,rad/s,"),  # an angle's name, no unit of the torque
+        ("x,v", ","),
+    ],
+)
+def test_every_column_has_its_unit(names, units):
+    names, t = names.split(","), 0.01 * np.arange(300)
+    half = len(names) // 2
+    positions = [np.sin(3 * t), np.cos(2 * t)][:half]
+    velocities = [3 * np.cos(3 * t), -2 * np.sin(2 * t)][:half]
+    columns = [*positions, *velocities, np.sign(np.sin(5 * t))]
+    recording = gfnn.Recording({"t": t} | dict(zip(names, columns, strict=False)))
+    assert recording.positions == tuple(names[:half])
+    assert recording.velocities == tuple(names[half : 2 * half])
+    assert recording.inputs == tuple(names[2 * half :])
+    assert [recording.unit(name) for name in names] == units.split(",")
 
 
 def test_names_as_they_can_stand_in_a_formula():

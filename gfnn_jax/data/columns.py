@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.data.roles import ROLES, by_name, is_angle, is_time, plain, unit_in
+from gfnn_jax.data.roles import ROLES, by_name, is_angle, is_time, plain
 from gfnn_jax.data.roles_by_data import parameters, positions_and_velocities
 from gfnn_jax.errors import InputError
 
@@ -93,7 +93,7 @@ def factors_of(names: Sequence[str], in_degrees: set[str]) -> dict[str, float]:
 
 
 def _unit(units: Mapping[str, str], name: str) -> str:
-    return units.get(name, unit_in(name)).strip().lower()
+    return units.get(name, "").strip().lower()
 
 
 def check_known(source: str, what: str, wanted: Any, known: Sequence[str]) -> None:

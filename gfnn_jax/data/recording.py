@@ -27,7 +27,7 @@ from gfnn_jax.data.columns import (
     roles_of,
     time_unit_of,
 )
-from gfnn_jax.data.roles import ROLES, is_run, is_time
+from gfnn_jax.data.roles import ROLES, is_run, is_time, unit_in
 from gfnn_jax.data.runs import restarts, runs_of
 from gfnn_jax.data.sigmas import check_sigmas, typical, with_sigmas
 from gfnn_jax.data.tables import Table, from_arrays, from_memory
@@ -50,7 +50,8 @@ class Recording:
     angles:     positions of period 2π, in radians, wrapped or not.
     std:        name -> standard deviation σ of the column's noise, the median where it was given
                 for each value (`sigma`), or None where it was not; in radians where the column is.
-    units:      name -> unit, as the file gives it.
+    units:      name -> unit, as the file gives it, in its header or at the end of the name; of all
+                columns: `unit`.
     factors:    name -> value here ÷ number in the file: π/180 of a column in degrees, else 1.
     time_unit:  of the file; `times` are in seconds.
     coordinates: what moves, the positions unless other names were given.
@@ -133,7 +134,8 @@ class Recording:
         tables, sigmas = with_sigmas(tables, std or {})
         source = ", ".join(dict.fromkeys(t.source for t in tables))
         names = list(dict.fromkeys(name for t in tables for name in t.columns))
-        units = {name: unit for t in reversed(tables) for name, unit in t.units.items()}
+        units = {name: unit_in(name) for name in names if unit_in(name)}
+        units |= {name: unit for t in reversed(tables) for name, unit in t.units.items()}
         columned = [name for name in names if not is_run(name) and not is_time(name)]
         numbers = [name for name in columned if name not in sigmas.values()]
         unit = time_unit_of(source, names, units, time_unit)
@@ -225,6 +227,15 @@ class Recording:
     def explained(self) -> frozenset[str]:
         """Columns whose sensor is told by ``observe``, an offset or a scale."""
         return frozenset({*self.observe, *self.offsets, *self.scales})
+
+    def unit(self, name: str) -> str:
+        """The unit of a column's numbers in the file, "" where it is not known."""
+        if name in self.velocities[: len(self.positions)] and name not in self.units:
+            of = self.positions[self.velocities.index(name)]
+            known = of in self.angles or of in self.units
+            return f"{self.unit(of)}/s" if known and self.factors[of] == self.factors[name] else ""
+        plain = "rad" if name in self.angles else ""
+        return self.units.get(name) or ("deg" if self.factors.get(name, 1.0) != 1 else plain)
 
     def times(self, run: str | float) -> np.ndarray:
         """Times (n,) of a run in seconds, rising."""

@@ -215,7 +215,7 @@ def _column(known: Traits, name: str) -> Column:
     given = recording.std.get(name)
     sigma = given if given is not None else noise.sigma if noise else None
     return Column(
-        name, role, recording.units.get(name, ""),
+        name, role, recording.unit(name),
         float(np.nanmin(values)) / factor if have else np.nan,
         float(np.nanmax(values)) / factor if have else np.nan,
         None if resolution is None else resolution / factor,

@@ -42,7 +42,10 @@ _WORDS = {
 _ROLE_OF = {word: role for role, words in _WORDS.items() for word in words}
 # A word, perhaps an index (a number or the letter of an axis) after it.
 _INDEXED = re.compile(r"([a-z]+?)_?(\d+|[xyz])?")
-_UNIT = re.compile(r"_(deg|rad)$")
+# A unit at the end of a name: theta_deg, omega_rad_s, x1_mm, v_mm_s, force_N, u_V.
+_UNIT = re.compile(
+    r"_((?i:deg|rad)|[µumcdk]?m|px|[mk]?N|Nm|[mk]?V|m?A)((?:_|_?per_?|/)(s|sec))?$", re.ASCII
+)
 # A derivative of another column: theta_dot, thetadot, dtheta, dtheta_dt, dtheta/dt, d_theta, θ̇.
 _DERIVATIVES = (
     re.compile(r"(?P<of>.+?)_?(dot|prime|')(?P<index>_?\d*)"),
@@ -90,21 +93,21 @@ def is_angle(name: str) -> bool:
 
 
 def unit_in(name: str) -> str:
-    """The unit of an angle that its name ends with: deg of theta_deg; "" of none."""
-    found = _UNIT.search(plain(name))
-    return found[1] if found else ""
+    """The unit that a name ends with: deg of theta_deg, mm/s of v_mm_s; "" of none."""
+    found = _UNIT.search(name.strip())
+    return found[1] + ("/s" if found[3] else "") if found else ""
 
 
 def _bare(name: str) -> str:
     """The plain name without a unit at its end."""
-    return _UNIT.sub("", plain(name))
+    return plain(_UNIT.sub("", name.strip()))
 
 
 def derivative_of(name: str) -> str | None:
     """The plain name of the column whose derivative this one's name says it is; None if it says
     nothing of the kind."""
     for pattern in _DERIVATIVES:
-        found = pattern.fullmatch(plain(name))
+        found = pattern.fullmatch(_bare(name))
         if found:
             return f"{found['of']}{found['index'].lstrip('_')}"
     return None
@@ -150,7 +153,7 @@ def _mate(positions: list[str], name: str) -> str | None:
     """The position whose derivative, or whose index, this name has."""
     of = derivative_of(name)
     for position in positions:
-        if plain(position) == of:
+        if of in (plain(position), _bare(position)):
             return position
     index = _index(name)
     same = [p for p in positions if index and (_index(p) == index or plain(p) == index)]

@@ -99,7 +99,7 @@ def _columns(summary: RecordingSummary) -> Table:
     for column in summary.columns[: 2 * _MOST]:
         table.add_row(
             column.name, column.role, f"{column.low:.4g}", f"{column.high:.4g}",
-            column.unit or ("rad" if column.angle else ""), _short(column.resolution),
+            column.unit, _short(column.resolution),
             _short(column.sigma), " ".join(f"{f:.3g}" for f in column.frequencies),
             _remarks(column), style="dim" if column.role == "ignored" else None,
         )  # fmt: skip

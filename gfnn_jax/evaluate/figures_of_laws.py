@@ -10,6 +10,7 @@ import numpy as np
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
+from gfnn_jax.evaluate.forecasts import Forecasts
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 
 _AHEAD = 2 / 3  # of the longest run that a forecast is shown for
@@ -35,7 +36,37 @@ def law_figure(fit: LearnedLaw, recording: Recording, path: Path) -> Path:
     _energy(axes[-1, 0], fit)
     for empty in axes[-1, 1:]:
         empty.axis("off")
-    axes[-1, 1].text(0, 1, f"L = {fit.lagrangian}\nR = {fit.friction}", va="top", wrap=True)
+    law = axes[-1, 1].text(0, 1, f"L = {fit.lagrangian}\nR = {fit.friction}", va="top", wrap=True)
+    law.set_in_layout(False)  # a long law makes no panel narrower
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return path
+
+
+def forecasts_figure(found: Forecasts, recording: Recording, path: Path) -> Path:
+    """Write the figure of three forecasts of what no fit has seen: measured and forecast above,
+    what the forecast missed and its band below, in the file's units."""
+    names = list(found.median)[:_MOST_CHANNELS]
+    shown = [found.each[k] for k in sorted({0, len(found.each) // 2, len(found.each) - 1})]
+    figure, axes = plt.subplots(
+        2 * len(names), len(shown), figsize=(3.6 * len(shown), 3.6 * len(names)), squeeze=False,
+        sharey="row", layout="constrained",
+    )  # fmt: skip
+    for column, one in zip(axes.T, shown, strict=True):
+        for above, below, name in zip(column[::2], column[1::2], names, strict=True):
+            missed = one.values[name] - one.measured[name]
+            above.plot(one.t, one.measured[name], ".", ms=3, color="0.5", label="measured")
+            above.plot(one.t, one.values[name], lw=1, color="C0", label="forecast")
+            band = 2 * one.std[name]
+            below.fill_between(one.t, -band, band, alpha=0.25, label="± 2 standard deviations")
+            below.plot(one.t, missed, ".", ms=3, color="C0")
+        column[-1].set_xlabel("t [s]")
+    for name, above, below in zip(names, axes[::2, 0], axes[1::2, 0], strict=True):
+        unit = f" [{recording.unit(name)}]" if recording.unit(name) else ""
+        above.set_ylabel(f"{name}{unit}")
+        below.set_ylabel(f"forecast − measured{unit}")
+    axes[0, 0].legend(fontsize=8)
+    axes[1, 0].legend(fontsize=8)
     figure.savefig(path, dpi=110)
     plt.close(figure)
     return path
@@ -61,7 +92,7 @@ def _forecast(axes, fit: LearnedLaw, recording: Recording, run: str, name: str) 
     axes.fill_between(ahead, (value - 2 * std) / factor, (value + 2 * std) / factor, alpha=0.25)
     low, high = np.nanmin(seen) / factor, np.nanmax(seen) / factor
     axes.set_ylim(low - 0.3 * (high - low), high + 0.3 * (high - low))
-    unit = recording.units.get(name) or ("rad" if angle else "")
+    unit = recording.unit(name)
     axes.set_ylabel(f"{name} [{unit}]" if unit else name)
     axes.set_xlabel("t [s]")
 

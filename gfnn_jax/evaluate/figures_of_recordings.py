@@ -37,7 +37,7 @@ def recording_figure(recording: Recording, summary: RecordingSummary, path: Path
 
 
 def _label(recording: Recording, name: str) -> str:
-    unit = recording.units.get(name) or ("rad" if name in recording.angles else "")
+    unit = recording.unit(name)
     return f"{name} [{unit}]" if unit else name
 
 

@@ -59,6 +59,7 @@ def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:
         },
         "inputs": {
             "hold": sensors.hold,
+            "other_rules": fit.input_rules,
             "delay": sensors.delay,
             "delay_std": None if fit.delay is None or np.isnan(fit.delay[1]) else fit.delay[1],
             "gains": {
@@ -70,6 +71,7 @@ def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:
         "observe": fit.observe,
         "sensors": {name: {"value": c, "std": s} for name, (c, s) in fit.sensors.items()},
         "noise": {n: {"sigma": s, "residual": fit.residual[n]} for n, s in fit.noise.items()},
+        "units": fit.units,
         "wander": None if sensors.wander is None else dataclasses.asdict(sensors.wander),
         "velocities": {name: one._asdict() for name, one in fit.velocities.items()},
         "whiteness": {

@@ -13,6 +13,8 @@ _TAPS = 32  # samples on either side, of band-limited interpolation
 _AT_ONCE = 4_096  # times
 _GAUSS = 0.5 + np.sqrt(0.15) * np.array([-1, 0, 1])  # nodes of Gauss's rule of order 6, in [0, 1]
 _SHARES = np.array([5, 8, 5]) / 18  # and its weights
+_UNEVEN = 0.1  # median steps, by which even samples are off a whole number of them at most
+_BRIDGED = 4  # median steps from sample to sample, up to which samples count as missing
 
 
 def at_stages(
@@ -24,10 +26,12 @@ def at_stages(
 
     A substep sees the parabola that has the moments ∫ sⁿ u ds, n = 0, 1, 2, of its inputs. It takes
     up their momentum, and moves as far by it, however many samples there are within it. Moments are
-    by Gauss's rule between samples, exact where inputs are held or linear.
+    by Gauss's rule between samples, exact where inputs are held or linear. Samples that a record
+    lacks are linear between those beside them, whatever the rule.
     """
     if u.shape[1] == 0:
         return np.zeros((*start.shape, substeps, len(NODES), 0))
+    t, u = _filled(t, u)
     whole = (end - start)[..., None] / substeps
     a = start[..., None] - delay + whole * np.arange(substeps)
     b = a + whole
@@ -50,6 +54,24 @@ def at_stages(
 def _legendre(s: np.ndarray) -> np.ndarray:
     """Legendre's polynomials (..., 3) of degree 0, 1 and 2 of a variable in [0, 1]."""
     return np.stack([np.ones_like(s), 2 * s - 1, 6 * s * (s - 1) + 1], axis=-1)
+
+
+def _filled(t: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Samples u (n, k) at t (n,), and those between them that are missing: of even samples a few in
+    a row, as a logger drops them."""
+    if len(t) < 3:
+        return t, u
+    steps = np.diff(t)
+    apart = steps / np.median(steps)
+    whole = np.rint(apart).astype(int)
+    even = (np.abs(apart - whole) < _UNEVEN) | (whole > _BRIDGED)
+    parts = np.where((whole > 1) & (whole <= _BRIDGED), whole, 1)
+    if not np.all(even) or np.all(parts == 1):
+        return t, u
+    first = np.repeat(np.arange(len(steps)), parts)
+    share = (np.arange(len(first)) - np.searchsorted(first, first)) / parts[first]
+    filled = np.append(t[first] + share * steps[first], t[-1])
+    return filled, np.stack([np.interp(filled, t, column) for column in u.T], axis=1)
 
 
 def interpolate(t: np.ndarray, u: np.ndarray, at: np.ndarray, hold: str) -> np.ndarray:

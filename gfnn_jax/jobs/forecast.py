@@ -24,21 +24,23 @@ from gfnn_jax.storage.outputs import atomic_write, ensure_new
 
 class Judged(NamedTuple):
     """A forecast against what was measured: column -> (root mean square error, its median size,
-    both in the column's unit, share of samples within two standard deviations), and the number of
-    samples."""
+    both in the column's unit, share of samples within two standard deviations), the units, and the
+    number of samples."""
 
     columns: dict[str, tuple[float, float, float]]
+    units: dict[str, str]
     num_samples: int
 
 
 def forecast_recording(
     model: Path, initial: Path, *, out: Path, num_steps: int | None = None, save_every: int = 1,
-    estimate_from: int | None = None, inputs: Path | None = None, compare: Path | None = None,
-    columns: dict[str, Any] | None = None, overwrite: bool = False,
+    stop: float | None = None, estimate_from: int | None = None, inputs: Path | None = None,
+    compare: Path | None = None, columns: dict[str, Any] | None = None, overwrite: bool = False,
 ) -> tuple[dict[str, Forecast], Judged | None]:  # fmt: skip
     """Forecast from the states at the ends of a recording's runs; run -> its forecast.
 
-    num_steps: of the model's dt; saved every so many. estimate_from: samples of each run that the
+    num_steps: of the model's dt; saved every so many. stop: time, in the file's unit, at which the
+    recording ends that lies in the file. estimate_from: samples of each run that the
     state is estimated from; None: as many as the model found best. inputs: a recording of the
     inputs ahead. compare: one of what was measured, which gives the times. columns: keywords of
     `gfnn_jax.read` beside the roles, which the model knows.
@@ -53,11 +55,14 @@ def forecast_recording(
         raise InputError(f"{model}: was not learned from a recording: --initial needs states q, p")
     sensors = map_.sensors
     job = record(model).get("job", {})
-    recording, roles = _read(initial, sensors, job, columns or {})
+    columns = columns or {}
+    recording, roles = _read(initial, sensors, job, columns)
+    if stop is not None:
+        recording = recording.slice(stop=stop * SECONDS[recording.time_unit])
     bare = ("positions", "velocities", "sensors", "coordinates", "angles", "degrees")
     only_inputs = {**roles, **dict.fromkeys(bare)}
     ahead = None if inputs is None else read(inputs, **only_inputs)
-    measured = None if compare is None else _read(compare, sensors, job, columns or {})[0]
+    measured = None if compare is None else _read(compare, sensors, job, columns)[0]
     if num_steps is None and measured is None:
         raise InputError("expected --num-steps, or --compare, whose times the forecast is for")
     if ahead is None and sensors.inputs and measured is not None:
@@ -71,7 +76,10 @@ def forecast_recording(
             times = own[own > last]
             times = times[:num_steps] if num_steps else times
             if not len(times):
-                raise InputError(f"{compare}: run {run}: holds no sample after {last:g} s")
+                raise InputError(
+                    f"{compare}: holds no sample of run {run} after the end of {initial}, {last:g} "
+                    "s. To forecast a part of one file: --to T ends --initial there"
+                )
         else:
             assert num_steps is not None
             steps = np.arange(save_every, num_steps + 1, save_every)
@@ -151,7 +159,7 @@ def _judged(sensors: Sensors, found: dict[str, Forecast], measured: Recording) -
         rms, median = np.sqrt(np.mean(error**2)), np.median(np.abs(error))
         columns[name] = (float(rms), float(median), float(np.mean(np.abs(error) <= 2 * std)))
         count = len(error)
-    return Judged(columns, count)
+    return Judged(columns, {name: measured.unit(name) for name in columns}, count)
 
 
 def _write(out: Path, names: tuple[str, ...], found: dict[str, Forecast]) -> None:

@@ -41,7 +41,7 @@ def on_stderr() -> Iterator[Progress]:
     from rich.markup import escape
 
     console = Console(stderr=True)
-    with console.status("starting") as status:
+    with console.status("working") as status:
         yield Progress(
             lambda message: status.update(escape(message)),
             lambda message: console.print(escape(message), highlight=False),
@@ -49,24 +49,26 @@ def on_stderr() -> Iterator[Progress]:
 
 
 class _Lines:
-    """Writer of lines with the seconds since the start; a thread repeats the last one."""
+    """Writer of lines with the seconds since the start; a thread repeats the last status, or the
+    last line of a job that gives none."""
 
     def __init__(self):
         self._started = time.perf_counter()
         self._last = self._started - BETWEEN  # the first line comes at once
-        self._message = "starting"
+        self._message, self._has_status = "starting", False
         self._lock, self._stopped = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._repeat, daemon=True)
         self._thread.start()
 
     def status(self, message: str) -> None:
         with self._lock:
-            self._message = message
+            self._message, self._has_status = message, True
             if time.perf_counter() >= self._last + BETWEEN:
                 self._print(message)
 
     def line(self, message: str) -> None:
         with self._lock:
+            self._message = self._message if self._has_status else message.strip()
             self._print(message)
 
     def stop(self) -> None:

@@ -20,8 +20,10 @@ def constant(traits: Traits) -> Iterator[Fault]:
         for name in getattr(recording, role):
             values = traits.columns[name]
             if np.isfinite(values).any() and np.nanmin(values) == np.nanmax(values):
+                shown = np.nanmin(values) / recording.factors[name]
                 yield Fault(
-                    "constant", f"{name} is {np.nanmin(values):g} in all rows",
+                    "constant",
+                    f"{name} is {shown:g} {recording.unit(name)}".rstrip() + " in all rows",
                     f"Leave it out of --{role}", wrong=role != "inputs",
                 )  # fmt: skip
 
@@ -51,7 +53,8 @@ def clipped(traits: Traits) -> Iterator[Fault]:
                 shown = extreme / recording.factors[name]
                 yield Fault(
                     "clipped",
-                    f"{name} saturates: {count} times it stays at its extreme, {shown:.6g}",
+                    f"{name} saturates: {count} times it stays at its extreme, {shown:.6g} "
+                    f"{recording.unit(name)}".rstrip(),
                     "Leave these samples out: --from, --to, or NaN in them",
                 )
 

@@ -46,7 +46,8 @@ def fit_given(
     zeros = [i for i in turned if plain and any(row[2][i] for row in given.terms)]
     structure = structure.plus([("zero", i) for i in zeros])
     arcs = arcs_of(nodes, max(6, round(options.periods[0] * scales.per_period)))
-    fit, bench, _ = choose_rule(benches, nodes, structure, known, arcs, scales.sigma, scales.dt)
+    rule = choose_rule(benches, nodes, structure, known, arcs, scales.sigma, scales.dt)
+    fit, bench = rule.fit, rule.bench
     on_progress(f"{options.periods[0]:g} periods: {describe(fit)}")
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     for periods in options.periods[1:]:

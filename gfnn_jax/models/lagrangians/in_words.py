@@ -12,6 +12,7 @@ from gfnn_jax.data.roles import symbols
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.in_use import InUse
+from gfnn_jax.models.lagrangians.input_rules import Acting
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw, NextMotion, hamiltonian_of
 from gfnn_jax.models.lagrangians.next_motion import Motion
 from gfnn_jax.models.lagrangians.residuals import Trace, whiteness
@@ -35,13 +36,12 @@ Gains = dict[str, dict[str, tuple[float, float]]]
 def in_words(
     recording: Recording, best: InUse, map_: SymplecticMap, traces: tuple[Trace, ...],
     motions: Sequence[Motion], measured: Mapping[str, Velocity],
-    delay: tuple[float, float] | None, messages: Sequence[str], steps: tuple[str, ...],
-    seconds: float,
+    acting: Acting, messages: Sequence[str], steps: tuple[str, ...], seconds: float,
 ) -> LearnedLaw:  # fmt: skip
     """The law, its sensors and what its fit showed, by names of columns and in the file's units.
 
-    measured: columns of velocities against the law. delay: of the inputs, with its standard error.
-    messages: warnings that come before those of the fit.
+    measured: columns of velocities against the law. acting: how the inputs act. messages: warnings
+    that come before those of the fit.
     """
     names = _names(recording)
     fit, law = best.fit, best.law
@@ -54,13 +54,16 @@ def in_words(
     zeros, parameters = _zeros_and_sensors(fit, recording)
     shown = dict(zip(channels, sensors.observation_model.formulas, strict=True))
     return LearnedLaw(
-        map=map_, lagrangian=lagrangian, friction=friction, gains=gains, delay=delay,
+        map=map_, lagrangian=lagrangian, friction=friction, gains=gains,
+        delay=(acting.delay, acting.error) if recording.inputs else None,
+        input_rules=dict(acting.others),
         which_friction=which_friction_line(best.choice, best.scale, law.dim, names.speeds),
         hamiltonian=hamiltonian_of(law.terms, lagrangian, names.coordinates), zeros=zeros,
         noise=dict(zip(channels, map(float, sensors.sigma / factors), strict=True)),
         residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)),
         gauge=best.gauge,
-        velocities={n: one.scaled(1 / recording.factors[n]) for n, one in measured.items()},
+        units={n: recording.unit(n) for n in (*recording.columns, *recording.coordinates)},
+        velocities={n: one.in_file(recording, n) for n, one in measured.items()},
         whiteness=whiteness(traces, channels, recording.inputs), traces=traces,
         next_motions=_next_motions(motions, recording, names),
         observe={n: f for n, f in shown.items() if n != f}, sensors=parameters,
@@ -159,8 +162,9 @@ def parameters_left_out(recording: Recording) -> list[str]:
         values = np.concatenate([recording.values(name, run) for run in recording.runs])
         least, most = np.nanmin(values), np.nanmax(values)
         if least < most:
+            unit = f" {recording.unit(name)}" if recording.unit(name) else ""
             found.append(
-                f"{name} is {least:g} to {most:g} and the law is one for all runs. If {name} "
+                f"{name} is {least:g} to {most:g}{unit} and the law is one for all runs. If {name} "
                 "moves anything, fit the runs of each value by themselves"
             )
     return found
@@ -176,7 +180,9 @@ def _next_motions(
             name: float(q / recording.factors.get(name, 1.0))
             for name, q in zip(recording.coordinates, motion.start, strict=True)
         }
-        named.append(NextMotion(start, {word_of(k, *names): g for k, g in motion.gains.items()}))
+        units = {name: recording.unit(name) for name in start}
+        gains = {word_of(k, *names): g for k, g in motion.gains.items()}
+        named.append(NextMotion(start, gains, units))
     return tuple(named)
 
 

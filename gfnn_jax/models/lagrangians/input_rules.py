@@ -8,22 +8,30 @@ A fit's residuals are linear in a small delay τ as they are in the coefficients
 with G' the gains of further inputs ∂u(t − τ)/∂τ. So one evaluation of the arcs tells the delay that
 fits best, with its standard error, and how far the coefficients imitate it. It is taken where it is
 significant and held-out arcs gain by it. The rule between samples is that of which held-out arcs
-cost least, each with its own delay.
+cost least, each with its own delay: chosen with the first law, whose misfit may hide the choice,
+and again with the last.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.dataset.stretches import Arcs, Nodes
+from gfnn_jax.dataset.stretches import Arcs, Nodes, arcs_of, with_states
+from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
 from gfnn_jax.models.lagrangians.structure import Key, Structure
 from gfnn_jax.solve.latent_arcs import sensitivities
 
+RULES = {
+    "hold": "held from sample to sample",
+    "linear": "linear between samples",
+    "band": "band-limited between samples",
+}
 _SIGNIFICANT = 4.0  # standard errors of a delay
 _APART = 0.05  # of a sample: the change of a delay by which inputs are differentiated
 _SETTLED = 0.1  # standard errors, within which a delay is found
@@ -34,11 +42,13 @@ _IMITATED = 0.03  # of what a delay changes, that no coefficient does: less is n
 
 class Acting(NamedTuple):
     """A fit, the workbench with the inputs as they act, and the standard error of their delay, in
-    seconds: NaN where the record does not tell it."""
+    seconds: NaN where the record does not tell it. others: other rules between samples -> their
+    cost of held-out arcs over that of this one."""
 
     fit: LawFit
     bench: Workbench
     error: float
+    others: Mapping[str, float] = MappingProxyType({})
 
     @property
     def hold(self) -> str:
@@ -61,7 +71,26 @@ def choose_rule(
         found.append(with_delay(bench, nodes, fit, interval))
     if len(found) == 1:
         return found[0]
-    return min(found, key=lambda one: _held_out(one, nodes, sigma))
+    costs = [_held_out(one, nodes, sigma) for one in found]
+    best = int(np.argmin(costs))
+    others = {one.hold: c / costs[best] for one, c in zip(found, costs, strict=True)}
+    return found[best]._replace(others={h: c for h, c in others.items() if h != found[best].hold})
+
+
+def choose_again(
+    last: Acting, inputs: Mapping[str, ArcInputs], nodes: Sequence[Nodes], length: int,
+    interval: float,
+) -> Acting:  # fmt: skip
+    """The rule between samples (of ``inputs``: rule -> inputs of arcs) that held-out arcs choose
+    with the last law: ``last`` as it was, where that is its own. length: nodes of these arcs; many
+    short ones tell it better than a few long ones."""
+    if len(inputs) < 2:
+        return last
+    fit = last.fit
+    benches = {hold: dataclasses.replace(last.bench, inputs=of) for hold, of in inputs.items()}
+    arcs = arcs_of(with_states(nodes, fit.arcs, fit.fitted.x), length)
+    best = choose_rule(benches, nodes, fit.structure, fit.values, arcs, fit.sigma, interval)
+    return last._replace(others=best.others) if best.hold == last.hold else best
 
 
 def with_delay(bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, interval: float) -> Acting:

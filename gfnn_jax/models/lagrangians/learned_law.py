@@ -12,15 +12,11 @@ from gfnn_jax.families.lagrangian import Lagrangian, Terms
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.calibration import Horizon
 from gfnn_jax.models.lagrangians.fit import LawFit
+from gfnn_jax.models.lagrangians.input_rules import RULES
 from gfnn_jax.models.lagrangians.residuals import Trace, Whiteness
 from gfnn_jax.models.lagrangians.text import Expression, Term, WhichFriction, measured, terms_of
 from gfnn_jax.models.lagrangians.velocities import Velocity
 
-_RULES = {
-    "hold": "held from sample to sample",
-    "linear": "linear between samples",
-    "band": "band-limited between samples",
-}
 _SHOWN = 3  # pairs of coefficients that are not told apart
 
 
@@ -31,15 +27,21 @@ def _time(seconds: float) -> str:
     return f"for {seconds:.3g} s" if np.isfinite(seconds) else "for more than eight periods"
 
 
+def _of(value: float, unit: str) -> str:
+    """A number with its unit, where that is known."""
+    return f"{value:.3g} {unit}".rstrip()
+
+
 class NextMotion(NamedTuple):
     """A motion to record: where to let go, at rest, and by how much that makes the standard errors
-    of terms smaller, the most improved first."""
+    of terms smaller, the most improved first. units: of the coordinates, "" where not known."""
 
     start: dict[str, float]
     gains: dict[str, float]
+    units: dict[str, str]
 
     def __str__(self) -> str:
-        at = ", ".join(f"{name} = {q:.3g}" for name, q in self.start.items())
+        at = ", ".join(f"{name} = {_of(q, self.units[name])}" for name, q in self.start.items())
         best = ", ".join(f"of {t} {min(g, 1000):.2g}×" for t, g in [*self.gains.items()][:3])
         return f"release from rest at {at}. Standard errors shrink: {best}"
 
@@ -52,11 +54,14 @@ class LearnedLaw:
     names of columns, with standard errors. which_friction: its kinds, with what odds, and limits of
     those that were not seen. gains: input -> force on each position, with its standard error.
     delay: how much later than measured inputs act, in seconds, with its standard error (NaN where
-    the record does not tell it); None without inputs. hamiltonian: H in words, its terms as of L.
+    the record does not tell it); None without inputs. input_rules: other rules between samples of
+    the inputs -> their cost of held-out arcs over that of the one taken. hamiltonian: H in words,
+    its terms as of L.
     zeros: angle -> (where it is zero, standard error), already inside the formula. observe: column
     -> what its sensor shows, where that is not the coordinate; sensors: the parameters in it,
     fitted, with standard errors. noise: column -> σ of its samples; residual: of the fit's arcs,
-    both in the file's unit. velocities: columns of these against the law of the positions, and
+    both in the file's unit. units: column or coordinate ->
+    unit, "" where not known. velocities: columns of these against the law of the positions, and
     whether they were used. whiteness: of the residuals, column by column; traces: the arcs that
     were fitted. gauge: what fixes the scale of L. alike: coefficients that the record cannot tell
     apart. next_motions: those that would tell the most, the best first. horizon: for how long a
@@ -71,12 +76,14 @@ class LearnedLaw:
     which_friction: WhichFriction
     gains: dict[str, dict[str, tuple[float, float]]]
     delay: tuple[float, float] | None
+    input_rules: dict[str, float]
     hamiltonian: Hamiltonian
     zeros: dict[str, tuple[float, float]]
     observe: dict[str, str]
     sensors: dict[str, tuple[float, float]]
     noise: dict[str, float]
     residual: dict[str, float]
+    units: dict[str, str]
     velocities: dict[str, Velocity]
     whiteness: dict[str, Whiteness]
     traces: tuple[Trace, ...]
@@ -99,7 +106,7 @@ class LearnedLaw:
     @property
     def table(self) -> str:
         """The law, its errors and its horizon, a line each."""
-        lines = [f"L = {self.lagrangian}", f"R = {self.friction}"]
+        lines = [f"L = {self.lagrangian}", f"R = {self.friction}", self._units_line]
         lines += [f"friction: {self.which_friction}", f"scale of L: {self.gauge}"]
         lines += [f"not told apart: {pair}" for pair in self.alike[:_SHOWN]]
         lines += [
@@ -110,24 +117,28 @@ class LearnedLaw:
         lines += [f"velocity {name}: {one.text}" for name, one in self.velocities.items()]
         for name, forces in self.gains.items():
             told = ", ".join(f"{q} {g:.6g} ± {s:.2g}" for q, (g, s) in forces.items())
-            lines.append(f"gain of {name}, force per unit of it: {told}")
+            unit = self.units[name]
+            lines.append(f"gain of {name}, force per {unit or 'unit'} of it: {told}")
         lines += [self._inputs_line] if self.delay is not None else []
         energy = self.energy
         lines.append(
-            f"energy per second: stored {energy['stored']:.3g} = supplied "
+            f"energy per second, in the unit of L: stored {energy['stored']:.3g} = supplied "
             f"{sum(energy['supplied'].values()):.3g} - lost {sum(energy['lost'].values()):.3g} + "
             f"unexplained {energy['closure']:.1g}"
         )
         wander = self.map.sensors.wander if self.map.sensors is not None else None
         for name, sigma in self.noise.items():
             zero = "" if wander is None else (
-                f" on a zero that wanders by {wander.size * sigma:.3g} over {wander.time:.3g} s"
+                f" on a zero that wanders by {_of(wander.size * sigma, self.units[name])} over "
+                f"{wander.time:.3g} s"
                 if np.isfinite(wander.time)
-                else f" on a zero that differs from run to run by {wander.size * sigma:.3g}"
+                else " on a zero that differs from run to run by "
+                f"{_of(wander.size * sigma, self.units[name])}"
             )  # fmt: skip
             lines.append(
-                f"{name}: noise σ {sigma:.3g}{zero}, RMS residual {self.residual[name]:.3g} (unit "
-                f"of the file); residuals {self.whiteness[name].text}"
+                f"{name}: noise σ {_of(sigma, self.units[name])}{zero}, RMS residual "
+                f"{_of(self.residual[name], self.units[name])}; residuals "
+                f"{self.whiteness[name].text}"
             )
         for fraction, seconds, predicted in self.horizon:
             lines.append(
@@ -138,17 +149,28 @@ class LearnedLaw:
         return "\n".join(lines)
 
     @property
+    def _units_line(self) -> str:
+        """Units of the variables in L and R."""
+        assert self.map.sensors is not None
+        units = self.units | dict.fromkeys(self.map.sensors.angles, "rad")
+        told = [f"{name} in {units[name]}" for name in self.map.sensors.positions if units[name]]
+        return f"in L and R: {', '.join([*told, 'times in s'])}"
+
+    @property
     def _inputs_line(self) -> str:
         """Describe how inputs act."""
         assert self.map.sensors is not None
         assert self.delay is not None
         delay, error = self.delay
-        rule = _RULES[self.map.sensors.hold]
         if not np.isfinite(error):
-            return f"inputs: {rule}; the record does not determine their delay"
-        if delay == 0:
-            return f"inputs: {rule}, no delay seen (standard error {error:.2g} s)"
-        return f"inputs: {rule}, acting {measured(delay, error)} s later"
+            when = "; the record does not determine their delay"
+        elif delay == 0:
+            when = f", no delay seen (standard error {error:.2g} s)"
+        else:
+            when = f", acting {measured(delay, error)} s later"
+        others = [f"{RULES[rule]} {cost:.3g}" for rule, cost in self.input_rules.items()]
+        chosen = f"; cost of held-out arcs, this rule 1: {', '.join(others)}" if others else ""
+        return f"inputs: {RULES[self.map.sensors.hold]}{when}{chosen}"
 
     def __repr__(self) -> str:
         return f"LearnedLaw(L = {self.lagrangian}; R = {self.friction})"

@@ -29,7 +29,7 @@ from gfnn_jax.models.lagrangians.given_law import fit_given
 from gfnn_jax.models.lagrangians.given_terms import Given, given_terms
 from gfnn_jax.models.lagrangians.in_use import InUse, Record, best_in_use
 from gfnn_jax.models.lagrangians.in_words import in_words
-from gfnn_jax.models.lagrangians.input_rules import Acting
+from gfnn_jax.models.lagrangians.input_rules import RULES, Acting, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.next_motion import next_motions
@@ -78,7 +78,7 @@ def fit_recording(
     bench, fit = _with_finer_steps(acting, gauge, samples, nodes, note)
     measured = velocities(recording, fit, nodes)
     for name, one in measured.items():
-        note(f"velocity {name}: {one.text}")
+        note(f"velocity {name}: {one.in_file(recording, name).text}")
     samples, nodes, bench, fit = _with_velocities(measured, samples, nodes, bench, fit)
     _check_identifiable(fit, samples.observation)
     note("bands: forecasting from windows of the record")
@@ -90,10 +90,9 @@ def fit_recording(
     )
     note("finding the motion to record next")
     motions = next_motions(best.bench, best.fit, samples.angles)
-    delay = (acting.delay, acting.error) if recording.inputs else None
     seconds = time.process_time() - started
     return in_words(
-        recording, best, map_, traces, motions, measured, delay, samples.messages, tuple(steps),
+        recording, best, map_, traces, motions, measured, acting, samples.messages, tuple(steps),
         seconds,
     )  # fmt: skip
 
@@ -231,11 +230,21 @@ def _searched(
     """The law that a search finds, or that of the terms which were asked for."""
     scales = samples.scales
     inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
-    record = (
-        nodes, scales, samples.angles, len(samples.recording.inputs), inputs, samples.observation,
-        on_progress, options,
-    )  # fmt: skip
-    found = search(*record) if asked is None else fit_given(asked, *record)
+    find = search if asked is None else partial(fit_given, asked)
+
+    def with_rules(inputs: Mapping[str, ArcInputs]) -> Found:
+        return find(
+            nodes, scales, samples.angles, len(samples.recording.inputs), inputs,
+            samples.observation, on_progress, options,
+        )  # fmt: skip
+
+    found = with_rules(inputs)
+    period = max(6, round(scales.per_period))
+    acting = choose_again(found.acting, inputs, found.nodes, period, scales.dt)
+    if acting.hold != found.acting.hold:
+        on_progress(f"inputs {RULES[acting.hold]}: held-out arcs choose it with the law found")
+        found = with_rules({acting.hold: inputs[acting.hold]})
+    found = found._replace(acting=found.acting._replace(others=acting.others))
     fit = found.acting.fit
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
         raise FitError(NO_LAW)

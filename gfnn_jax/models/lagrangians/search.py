@@ -157,10 +157,12 @@ def search(
 
 
 def describe(fit: LawFit) -> str:
-    rms = " ".join(f"{r:.3g}" for r in fit.rms())
+    """A line for people; residuals in units of their channels' standard deviations."""
+    share = 100 * fit.rms() / np.nanstd(fit.arcs.y, axis=(0, 1))
+    rms = ", ".join(f"{r:.2g}" for r in share)
     return (
-        f"{len(fit.p)} coefficients, RMS residual {rms} correlated over {fit.correlation:.1f} "
-        f"points, {fit.fitted.iterations} iterations"
+        f"{len(fit.p)} coefficients, RMS residual {rms} % of the spread, correlated over "
+        f"{fit.correlation:.1f} samples, {fit.fitted.iterations} iterations"
         + ("" if fit.fitted.converged else ", not converged")
     )
 

@@ -31,7 +31,8 @@ _COLOURED, _NEAR = 0.2, 8  # correlation of noise, of so many neighbours, that i
 
 class Velocity(NamedTuple):
     """A column against the law: scale, lag (s) and bias with the standard errors that its own noise
-    makes, σ of that, whether it is white, and whether the column is used."""
+    makes, σ of that, whether it is white, whether the column is used, and the unit of bias and σ,
+    where it is known."""
 
     scale: tuple[float, float]
     lag: tuple[float, float]
@@ -39,11 +40,14 @@ class Velocity(NamedTuple):
     sigma: float
     white: bool
     used: bool
+    unit: str = ""
 
-    def scaled(self, factor: float) -> Velocity:
-        """Convert to a unit of which ``factor`` make one."""
-        bias = self.bias[0] * factor, self.bias[1] * factor
-        return self._replace(bias=bias, sigma=self.sigma * factor)
+    def in_file(self, recording: Recording, name: str) -> Velocity:
+        """Convert to the unit that its column has in the file."""
+        factor = recording.factors[name]
+        bias = self.bias[0] / factor, self.bias[1] / factor
+        unit = recording.unit(name)
+        return self._replace(bias=bias, sigma=self.sigma / factor, unit=unit)
 
     @property
     def text(self) -> str:
@@ -53,7 +57,7 @@ class Velocity(NamedTuple):
         return (
             f"{why}; against the law its scale is {self.scale[0]:.4f} ± {self.scale[1]:.1g}, its "
             f"lag {1e3 * self.lag[0]:.2g} ± {1e3 * self.lag[1]:.1g} ms, its noise {colour} with "
-            f"σ {self.sigma:.3g}"
+            f"σ {self.sigma:.3g} {self.unit}".rstrip()
         )
 
 

@@ -1,0 +1,95 @@
+"""Forecasts of a part of a recording that no fit has seen, from states along it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.errors import InputError
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+
+_SAMPLES = 20  # that a state is estimated from
+_STARTS = 24
+
+
+class Ahead(NamedTuple):
+    """One forecast: where it begins (s), its times (n,) in s, and by columns what was measured,
+    what was forecast and its standard deviation (n,), in the file's units."""
+
+    begin: float
+    t: np.ndarray
+    measured: dict[str, np.ndarray]
+    values: dict[str, np.ndarray]
+    std: dict[str, np.ndarray]
+
+
+class Forecasts(NamedTuple):
+    """Forecasts from states along a recording. ahead: times (k,) in s; median: column -> median
+    size of the error (k,) that far ahead, in the file's unit; within: share of all that was
+    measured within two standard deviations."""
+
+    each: tuple[Ahead, ...]
+    ahead: tuple[float, ...]
+    median: dict[str, tuple[float, ...]]
+    within: float
+
+
+def forecasts_along(map_: SymplecticMap, unseen: Recording, ahead: Sequence[float]) -> Forecasts:
+    """Forecasts from up to 24 states along ``unseen``, each estimated from the 20 samples before,
+    for as long as the last of the times ``ahead`` (s).
+
+    Raises InputError where no run holds that many samples and as much time behind them.
+    """
+    times = {run: unseen.times(run) for run in unseen.runs}
+    starts = [
+        (run, k)
+        for run, t in times.items()
+        for k in range(_SAMPLES - 1, len(t) - 1)
+        if t[k] + ahead[-1] <= t[-1]
+    ]
+    if not starts:
+        raise InputError(
+            f"{unseen.source}: no run has {_SAMPLES} samples and {ahead[-1]:.3g} s behind them "
+            "that no fit has seen"
+        )
+    chosen = np.linspace(0, len(starts) - 1, min(_STARTS, len(starts))).astype(int)
+    each = tuple(_ahead(map_, unseen, run, k, ahead[-1]) for run, k in (starts[i] for i in chosen))
+    names = list(each[0].values)
+    median = {
+        name: tuple(
+            float(np.nanmedian([
+                np.interp(one.begin + s, one.t, np.abs(one.values[name] - one.measured[name]))
+                for one in each
+            ]))
+            for s in ahead
+        )
+        for name in names
+    }  # fmt: skip
+    inside = [
+        np.abs(one.values[n] - one.measured[n]) <= 2 * one.std[n] for one in each for n in names
+    ]
+    known = [np.isfinite(one.measured[n]) for one in each for n in names]
+    within = float(np.mean(np.concatenate(inside)[np.concatenate(known)]))
+    return Forecasts(each, tuple(ahead), median, within)
+
+
+def _ahead(map_: SymplecticMap, unseen: Recording, run: str, k: int, longest: float) -> Ahead:
+    """The forecast of a run from its sample k on; angles as near what was measured as turns go."""
+    t = unseen.times(run)
+    begin = float(t[k])
+    later = unseen.slice(np.nextafter(begin, np.inf), begin + longest, run=run)
+    start = unseen.slice(float(t[k - _SAMPLES + 1]), begin, run=run)
+    own = unseen.slice(run=run) if unseen.inputs else None
+    found = map_.forecast(start, later.times(run), own)
+    measured, values, std = {}, {}, {}
+    for name in found.values:
+        factor = unseen.factors[name]
+        seen, value = later.values(name, run), found.values[name][0]
+        if name in unseen.angles:
+            seen = seen + 2 * np.pi * np.round((value - seen) / (2 * np.pi))
+        measured[name], values[name] = seen / factor, value / factor
+        std[name] = found.std[name][0] / factor
+    return Ahead(begin, later.times(run), measured, values, std)

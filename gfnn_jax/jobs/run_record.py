@@ -1,0 +1,69 @@
+"""Job of ``gfnn run RECORD``: the law of the first two thirds of a recording, and forecasts of its
+last third, which no fit sees."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.data.recording import SECONDS, Recording, read
+from gfnn_jax.evaluate import report
+from gfnn_jax.evaluate.figures_of_laws import forecasts_figure
+from gfnn_jax.evaluate.forecasts import Forecasts, forecasts_along
+from gfnn_jax.jobs.fit_recording import Learned, fit_recording
+from gfnn_jax.jobs.progress import SILENT, Progress
+from gfnn_jax.jobs.written import REPORT
+from gfnn_jax.storage.outputs import atomic_folder
+
+FIGURE = "forecasts.png"
+_PART = 2 / 3  # of the record, in time, that is learned from
+_PERIODS = (0.25, 1.0, 2.0)  # of the fastest motion, that is forecast ahead, if there are as many
+
+
+class Ran(NamedTuple):
+    """A law, where it was written, its forecasts of the rest, and that part of the recording."""
+
+    learned: Learned
+    forecasts: Forecasts
+    unseen: Recording
+
+
+def run_record(
+    data: Path, *, out: Path, columns: Mapping[str, Any], progress: Progress = SILENT,
+    **options: Any,
+) -> Ran:  # fmt: skip
+    """Write the model, its report and the figures of law and forecasts into the folder ``out``.
+
+    columns: keywords of `gfnn_jax.read`. options: `FitOptions`. Raises InputError where the file is
+    no recording, or its last third is too short to forecast.
+    """
+    whole = read(data, **columns)
+    times = np.concatenate([whole.times(run) for run in whole.runs])
+    end = float(times.min() + _PART * np.ptp(times))
+    stop = end / SECONDS[whole.time_unit]
+    with atomic_folder(out) as folder:
+        learned = fit_recording(
+            [data], out=folder / "model", columns={**columns, "stop": stop}, progress=progress,
+            **options,
+        )  # fmt: skip
+        map_ = learned.fit.map
+        assert map_.sensors is not None
+        progress.line("forecasting the last third, which no fit has seen")
+        unseen = whole.slice(start=np.nextafter(end, np.inf))
+        half = max(np.ptp(unseen.times(run)) for run in unseen.runs) / 2
+        ahead = [periods * 2 * np.pi / map_.sensors.omega for periods in _PERIODS]
+        ahead = [seconds for seconds in ahead if seconds < half] or [half]
+        found = forecasts_along(map_, unseen, ahead)
+        forecasts_figure(found, unseen, folder / FIGURE)
+        result = learned.report | {
+            "forecasts": {
+                "begin": end, "num": len(found.each), "ahead": list(found.ahead),
+                "median": {name: list(of) for name, of in found.median.items()},
+                "within_two_deviations": found.within,
+            }
+        }  # fmt: skip
+        (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
+    return Ran(learned, found, unseen)
