@@ -27,6 +27,7 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
+from gfnn_jax.fitting.training import Limits
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.rates import rates, substeps_for
@@ -97,9 +98,12 @@ def learn_network(
     while idle < options.idle and done < max_iterations and not budget.over:
         result = levenberg_marquardt(
             family, params, w[:count], target[:count], validation=(w[count:], target[count:]),
-            weight=weight, max_iterations=options.iterations[done > 0],
-            block=lambda n: budget.unit(f"{n} iterations of {label}", NETWORK, n * work),
-            target_rms=_RESOLVED * tolerance.bound,
+            weight=weight,
+            limits=Limits(
+                options.iterations[done > 0],
+                block=lambda n: budget.unit(f"{n} iterations of {label}", NETWORK, n * work),
+                target_rms=_RESOLVED * tolerance.bound,
+            ),
         )  # fmt: skip
         params, done = jax.tree.map(np.asarray, result.params), done + max(result.iterations, 1)
         substeps = substeps_for(family, params, y0[:_STATES], dt, options.reach)
