@@ -9,35 +9,22 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import math
 import os
-import signal
 import sys
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from gfnn_jax import processes
 from gfnn_jax.cli_columns import column_options, masses, names_roles
 from gfnn_jax.cli_parser import fit_options, parser
-from gfnn_jax.compiling import enable_compile_cache
+from gfnn_jax.cli_process import Terminated, set_up_jax, stopped_by_sigterm, warnings_in_one_line
+from gfnn_jax.cli_summary import print_status, print_summary, print_table
 from gfnn_jax.data.kinds import are_recordings
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new
 from gfnn_jax.storage.partial import unfinished_note
-
-_FEW_TERMS = 15  # of a law with noise that is shown as H
-_MEANS = {
-    "left the domain": " (extrapolated from there)", "not converged": " (NaN from there)",
-    "non-finite": " (NaN from there)",
-}  # fmt: skip
-
-
-class _Terminated(KeyboardInterrupt):
-    """Stop by SIGTERM, as clean as one by Ctrl-C."""
-
 
 _TO_BEGIN = (
     "try `gfnn run two-body --quick`, or with your own pairs `gfnn fit DATA.npz --out MODEL`; "
@@ -52,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not argv:
             raise InputError(f"expected a command, got none: {_TO_BEGIN}")
         arguments = parser().parse_args(argv)
-        with _sigterm(), _warnings_in_one_line():
+        with stopped_by_sigterm(), warnings_in_one_line():
             _COMMANDS[arguments.command](arguments)
         return 0
     except InputError as error:
@@ -63,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, lasts until exit
         return 1
     except KeyboardInterrupt as stop:
-        terminated = isinstance(stop, _Terminated)
+        terminated = isinstance(stop, Terminated)
         # The job's notes name what it has kept; before its work, an earlier job may have kept some.
         before = unfinished_note(arguments.out) if getattr(arguments, "out", None) else None
         kept = getattr(stop, "__notes__", [before or "nothing was kept"])
@@ -117,7 +104,7 @@ def _run(arguments: argparse.Namespace) -> None:
         ensure_new(out, arguments.overwrite, folder=True)
     if arguments.scene in RECORDS or data.is_file():
         return _run_record(arguments)
-    _set_up_jax()
+    set_up_jax()
     from gfnn_jax.jobs.run import run
 
     with progress.on_stderr() as shown:
@@ -126,7 +113,7 @@ def _run(arguments: argparse.Namespace) -> None:
             overwrite=arguments.overwrite, resume=arguments.resume, progress=shown,
             **fit_options(arguments),
         )  # fmt: skip
-    _summarise(ran, out)
+    print_summary(ran, out)
     _hold_to(arguments.strict, out / "model")
 
 
@@ -134,7 +121,7 @@ def _run_record(arguments: argparse.Namespace) -> None:
     """The law and the forecasts of a record of the package, or of a file."""
     others = tuple(name for name in (*_OF_MAPS, "learn", "dt") if name != "scene")
     _refuse_given(arguments, others, "not for the law of a recording")
-    _set_up_jax()
+    set_up_jax()
     from gfnn_jax.jobs.run_record import run_record
     from gfnn_jax.records import RECORDS, path
 
@@ -172,7 +159,7 @@ def _look(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print(json.dumps(summary.as_json(), indent=2, ensure_ascii=False))
     else:
-        _print_table(summary)
+        print_table(summary)
         print(f"figure: {figure}")
     wrong = sum(fault.wrong for fault in summary.faults)
     if arguments.strict and wrong:
@@ -205,7 +192,7 @@ def _fit(arguments: argparse.Namespace) -> None:
         group = None
         if arguments.distributed:
             stack.enter_context(processes.watched(f"gfnn: {processes.LOST}"))
-        _set_up_jax(options.get("devices"))
+        set_up_jax(options.get("devices"))
         if arguments.distributed:
             group = processes.Group(processes.join())
         _fit_and_report(arguments, options, group)
@@ -216,7 +203,7 @@ def _fit_law(
 ) -> None:
     """The law of a recording."""
     _refuse_given(arguments, _OF_MAPS, "not for the law of a recording")
-    _set_up_jax()
+    set_up_jax()
     from gfnn_jax.jobs.fit_recording import fit_recording
 
     with progress.on_stderr() as shown:
@@ -240,7 +227,7 @@ def _fit_positions(
     arguments: argparse.Namespace, columns: dict[str, Any], options: dict[str, Any]
 ) -> None:
     """Learn the map of a recording of positions."""
-    _set_up_jax()
+    set_up_jax()
     from gfnn_jax.jobs.fit_positions import fit_positions
 
     with progress.on_stderr() as shown:
@@ -248,7 +235,7 @@ def _fit_positions(
             arguments.data, out=arguments.out, columns=columns, despite=arguments.despite,
             progress=shown, **options,
         )  # fmt: skip
-    _summarise(ran, arguments.out)
+    print_summary(ran, arguments.out)
     print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
           "--out prediction.npz")  # fmt: skip
     _hold_to(arguments.strict, arguments.out)
@@ -271,7 +258,7 @@ def _fit_and_report(
             sent = f"{group.sent / 1e6:.3g} MB sent"
             print(f"process {group.share.index} of {group.share.count}: {sent}")
             return
-    _summarise(ran, arguments.out)
+    print_summary(ran, arguments.out)
     print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
           "--out prediction.npz")  # fmt: skip
     _hold_to(arguments.strict, arguments.out)
@@ -332,7 +319,7 @@ def _predict(arguments: argparse.Namespace) -> None:
         share = None
         if arguments.distributed:
             stack.enter_context(processes.watched(f"gfnn: {processes.LOST}"))
-        _set_up_jax(arguments.devices)
+        set_up_jax(arguments.devices)
         if arguments.distributed:
             share = processes.join()
         _predict_and_report(arguments, share)
@@ -340,7 +327,7 @@ def _predict(arguments: argparse.Namespace) -> None:
 
 def _is_law(model: Path) -> bool:
     """Return whether the model is the law of a recording, and no map of its positions."""
-    _set_up_jax()
+    set_up_jax()
     from gfnn_jax.maps.saved import record
 
     return "lagrangian" in record(model)
@@ -348,7 +335,7 @@ def _is_law(model: Path) -> bool:
 
 def _forecast(arguments: argparse.Namespace) -> None:
     """Forecast from the end of a recording."""
-    _set_up_jax()
+    set_up_jax()
     from gfnn_jax.jobs.forecast import forecast_recording
     from gfnn_jax.maps.saved import record
 
@@ -389,7 +376,7 @@ def _predict_and_report(arguments: argparse.Namespace, share: processes.Share | 
     back = " backwards" if arguments.num_steps < 0 else ""
     print(f"{arguments.out}: {num_lanes} trajectories of {abs(arguments.num_steps)} steps{back}, "
           f"{predicted.seconds:.1f} s")  # fmt: skip
-    _print_status(predicted.status, predicted.left_at)
+    print_status(predicted.status, predicted.left_at)
     if predicted.horizon is not None:
         passed = predicted.horizon[predicted.horizon >= 0]
         first = f", the first at step {passed.min()}" if passed.size else ""
@@ -401,7 +388,7 @@ def _export(arguments: argparse.Namespace) -> None:
     _check_exists(arguments.model)
     if arguments.out is not None:
         ensure_new(arguments.out, arguments.overwrite)
-    _set_up_jax()
+    set_up_jax()
     from gfnn_jax.exports.export import export
 
     out = export(arguments.model, arguments.to, arguments.out, overwrite=arguments.overwrite)
@@ -412,7 +399,7 @@ def _compare(arguments: argparse.Namespace) -> None:
     out = arguments.out = arguments.out or Path("runs") / f"compare-{arguments.scene}"
     if not arguments.resume:
         ensure_new(out, arguments.overwrite, folder=True)
-    _set_up_jax()
+    set_up_jax()
     from gfnn_jax.jobs.compare import compare
     from gfnn_jax.jobs.comparison_table import table
 
@@ -425,7 +412,7 @@ def _compare(arguments: argparse.Namespace) -> None:
     if compared is None:
         print(f"{out}: already holds the result of this job")
         return
-    _print_table(table(compared.report))
+    print_table(table(compared.report))
     print(f"written to {out}")
 
 
@@ -433,156 +420,3 @@ _COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "scenes": _scenes, "records": _records, "run": _run, "look": _look, "fit": _fit,
     "predict": _predict, "export": _export, "compare": _compare,
 }  # fmt: skip
-
-
-def law_line(report: dict[str, Any]) -> str:
-    """Line about the law. One that misses the tolerance is no H, unless it has few terms and noise
-    explains the miss."""
-    fit, law = report["fit"], report["hamiltonian"]
-    chosen = report["model"]["learns"] == "hamiltonian"
-    noisy = report["data"]["noise"] is not None and len(law["terms"]) <= _FEW_TERMS
-    if chosen and not fit["tolerance_met"] and not noisy:
-        return (
-            f"best partial law: H of {len(law['terms'])} terms, one-step error "
-            f"{fit['validation_relative']:.1e} of the spread (report.json)"
-        )
-    return f"{'' if chosen else 'found, and dearer per step than the map: '}H = {law['formula']}"
-
-
-def error_line(fit: dict[str, Any]) -> str:
-    """Line about the one-step error, its bound, and the tolerance that this bound is held to."""
-    unit = "of the spread" if fit["tolerance_is_relative"] else "in the data's units"
-    return (
-        f"one-step error {fit['validation_rms']:.2e} in the data's units, "
-        f"{fit['validation_relative']:.2e} of the spread; 95 % bound "
-        f"{fit['validation_bound']:.2e}, tolerance {fit['tolerance']:g} {unit}: "
-        f"{'met' if fit['tolerance_met'] else 'not met'}"
-    )
-
-
-def _summarise(ran: Any, out: Path) -> None:
-    if ran is None:
-        print(f"{out}: already holds the result of this job")
-        return
-    from gfnn_jax.learn.fitted import candidates_table
-
-    _print_table(candidates_table(ran.fit))
-    report = ran.report
-    fit, defect = report["fit"], report["map"]["symplecticity_defect"]
-    print(f"{report['model']['chart']} {report['model']['label']}: {error_line(fit)}")
-    print(f"symplecticity defect {'not computed (no time)' if defect is None else f'{defect:.1e}'}")
-    if report["hamiltonian"] is not None:
-        print(law_line(report))
-        for note in report["hamiltonian"]["notes"]:
-            print(note)
-        for loss in report["hamiltonian"]["friction"]:
-            print(f"friction {loss['term']}: {loss['coefficient']:.6g} ± {loss['std']:.1g}")
-    if ran.fit.damping is not None:
-        print(ran.fit.damping.told(float(ran.fit.map.dt)))
-    told = report["hamiltonian"] is not None and report["hamiltonian"]["symmetries"]
-    if ran.fit.symmetries and not told:
-        print(f"symmetries of the pairs: {'; '.join(map(str, ran.fit.symmetries))}")
-    if not fit["tolerance_met"]:
-        for law in ran.fit.partial_laws:
-            print(law)
-    print(f"the search ended: {fit['ended']}")
-    rollout = report["rollout"]
-    if rollout is not None:
-        errors = ", ".join(f"{e:.1e} at step {n}" for n, e in rollout["error"].items())
-        print(f"mean position error {errors}")
-        if rollout["growth_exponent"] is not None:
-            print(f"growth of the error: as steps to the power {rollout['growth_exponent']:.2f}")
-        counts = rollout["status_counts"].items()
-        print("rollouts: " + ", ".join(f"{n} {name}" for name, n in counts if n))
-    print(_holds(ran.fit))
-    print(f"written to {out}")
-
-
-def _holds(fit: Any) -> str:
-    """Describe where the map may be trusted, in one sentence."""
-    parts = ["valid where the data are: gfnn predict names the trajectories that leave them"]
-    outside = fit.chosen.outside
-    if outside is not None and math.isfinite(outside):
-        parts.append(
-            f"a fit without the outermost 5 % of the states errs there by {outside:.1e} of the "
-            "spread"
-        )
-    if fit.chosen.learns == "hamiltonian":
-        parts.append("other time steps: gfnn predict --dt")
-    return "; ".join(parts)
-
-
-def _print_table(table: Any) -> None:
-    from rich.console import Console
-
-    wide = Console() if sys.stdout.isatty() else Console(width=132)
-    wide.print(table)
-
-
-def _print_status(status, left_at) -> None:
-    """Print the number of lanes by status, and the steps at which lanes left the domain."""
-    from gfnn_jax.evaluate.report import status_counts
-
-    counts = status_counts(status).items()
-    print(", ".join(f"{n} {name}{_MEANS.get(name, '')}" for name, n in counts if n))
-    left = [lane for lane in range(len(left_at)) if left_at[lane] >= 0]
-    shown = ", ".join(f"{lane} at step {left_at[lane]}" for lane in left[:10])
-    if left:
-        more = f", and {len(left) - 10} more" if len(left) > 10 else ""
-        print(f"left the data's domain: trajectory {shown}{more}")
-
-
-# The process: JAX, signals, warnings.
-
-
-def _set_up_jax(devices: int | str | None = None) -> None:
-    """Switch on float64, and keep compiled programs in the user's cache folder.
-
-    devices: number of devices that a CPU shall have, or "all" its cores; by default it has one.
-    """
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if devices is not None and not told:
-        with contextlib.suppress(RuntimeError):  # in a session that has its devices already
-            most = _cores() if isinstance(devices, str) else min(devices, _cores())
-            jax.config.update("jax_num_cpu_devices", most)
-    enable_compile_cache()
-
-
-def _cores() -> int:
-    """Number of processor cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-@contextlib.contextmanager
-def _sigterm() -> Iterator[None]:
-    """Let SIGTERM stop the work as Ctrl-C does. Nothing is done outside the main thread."""
-
-    def stop(*_):
-        raise _Terminated
-
-    try:
-        before = signal.signal(signal.SIGTERM, stop)
-    except ValueError:
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-@contextlib.contextmanager
-def _warnings_in_one_line() -> Iterator[None]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("default", UserWarning)
-
-        def show(message, category, filename, lineno, file=None, line=None):
-            print(f"gfnn: warning: {message}", file=sys.stderr)
-
-        warnings.showwarning = show
-        yield

@@ -23,7 +23,7 @@ from command_line import (
     predict,
 )
 
-from gfnn_jax import cli, scenes
+from gfnn_jax import cli, cli_process, cli_summary, scenes
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
@@ -472,7 +472,7 @@ def test_a_forecast_takes_no_options_of_steps(model, tmp_path, capsys, monkeypat
 def test_an_error_is_told_beside_what_it_is_held_to(relative, met, end):
     fit = {"validation_rms": 2e-6, "validation_relative": 1e-6, "validation_bound": 3e-6,
            "tolerance": 1e-6, "tolerance_is_relative": relative, "tolerance_met": met}  # fmt: skip
-    assert cli.error_line(fit).endswith(f"; 95 % bound 3.00e-06, tolerance {end}")
+    assert cli_summary.error_line(fit).endswith(f"; 95 % bound 3.00e-06, tolerance {end}")
 
 
 def test_warnings_are_one_line(fitted, tmp_path, capsys, monkeypatch):
@@ -575,7 +575,7 @@ def test_compiled_programs_are_kept_in_the_users_cache(tmp_path, monkeypatch):
     of_the_tests = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", None)
     try:
-        cli._set_up_jax()
+        cli_process.set_up_jax()
         assert jax.config.jax_compilation_cache_dir == str(tmp_path / "gfnn_jax")
     finally:
         jax.config.update("jax_compilation_cache_dir", of_the_tests)
@@ -606,4 +606,4 @@ def test_a_law_that_has_met_nothing_is_not_printed_as_h(met, noise, terms, line)
         "hamiltonian": {"formula": "q1²", "terms": [{}] * terms},
         "model": {"learns": "hamiltonian"}, "data": {"noise": noise},
     }  # fmt: skip
-    assert cli.law_line(report) == line
+    assert cli_summary.law_line(report) == line

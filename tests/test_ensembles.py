@@ -11,7 +11,7 @@ from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp
 from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
 from gfnn_jax.fitting.together import levenberg_marquardt_together
-from gfnn_jax.fitting.training import LMState
+from gfnn_jax.fitting.training import Limits, LMState
 from gfnn_jax.jobs.predict import predict
 from gfnn_jax.jobs.progress import Progress
 from gfnn_jax.jobs.search import search
@@ -63,16 +63,17 @@ def test_members_are_trained_as_they_are_alone():
     def begun(theta, damping):
         return LMState(theta, theta, damping, 0, np.nan, np.inf, np.inf, np.inf, 0, 0.0)
 
-    options, together = {"validation": held, "max_iterations": 3, "chunk": 40}, []
+    options, together = {"validation": held, "chunk": 40}, []
     levenberg_marquardt_together(
-        family, starts, w, target, shares=np.ones((3, 90)), on_progress=together.append,
-        resume=begun(theta, np.full(3, 1e3)), **options,
+        family, starts, w, target, shares=np.ones((3, 90)),
+        limits=Limits(3, reports=(together.append,)), resume=begun(theta, np.full(3, 1e3)),
+        **options,
     )  # fmt: skip
     for i, start in enumerate(starts):
         alone = []
         levenberg_marquardt(
-            family, start, w, target, on_progress=alone.append, resume=begun(theta[i], 1e3),
-            **options,
+            family, start, w, target, limits=Limits(3, reports=(alone.append,)),
+            resume=begun(theta[i], 1e3), **options,
         )  # fmt: skip
         for ours, its in zip(together, alone, strict=True):
             np.testing.assert_allclose(ours.theta[i], its.theta, rtol=1e-6, atol=1e-9)
@@ -85,7 +86,7 @@ def test_shares_are_the_weights_of_the_pairs():
     family = Mlp(box_inputs(w), (4,), "tanh")
     start = family.init(jax.random.key(0), np.float64)
     shares = np.repeat([[2.0, 0.0, 1.0]], 20, axis=1)
-    options = {"validation": held, "max_iterations": 4}
+    options = {"validation": held, "limits": Limits(4)}
     found = levenberg_marquardt_together(family, [start], w, target, shares=shares, **options)
     rows = np.repeat(np.arange(60), shares[0].astype(int))
     other = levenberg_marquardt_together(

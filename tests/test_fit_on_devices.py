@@ -173,7 +173,7 @@ def test_operations_are_spent_as_by_one(count, sharing):
         budget = Counted(np.inf)
         problem = gauss_newton.Problem(
             pairs.z0, pairs.z1, DT, np.ones(2), allowance=Allowance(cap=budget),
-            options=gauss_newton.Options(block_bytes=2**20, part_bytes=2**20),
+            options=gauss_newton.GaussNewtonOptions(block_bytes=2**20, part_bytes=2**20),
         )  # fmt: skip
         with sharing(devices):
             found = problem.linearised(family, c, Steps(4, 1), np.arange(5_000))
@@ -192,7 +192,7 @@ def test_a_flow_that_fails_has_no_cost(sharing):
     z0 = np.array(pairs.z0)
     z0[1_700] = 1e200
     problem = gauss_newton.Problem(
-        z0, pairs.z1, DT, np.ones(2), options=gauss_newton.Options(part_bytes=2**18)
+        z0, pairs.z1, DT, np.ones(2), options=gauss_newton.GaussNewtonOptions(part_bytes=2**18)
     )
     with sharing(2):
         assert problem.linearised(family, np.ones(2), Steps(4, 1), np.arange(3_000)).norm == np.inf

@@ -20,7 +20,8 @@ ORDER = (
     "models.model", "models.parameters", "models.positions", "models.lagrangians",
     "models.textbook", "models.generating_functions", "models.hamiltonians",
     "search", "models.maps_of_laws",
-    "learn", "baselines", "evaluate", "jobs", "cli_columns", "cli_parser", "cli", "__main__",
+    "learn", "baselines", "evaluate", "jobs", "cli_columns", "cli_parser", "cli_process",
+    "cli_summary", "cli", "__main__",
 )  # fmt: skip
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {

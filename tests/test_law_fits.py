@@ -31,7 +31,7 @@ from gfnn_jax.models.lagrangians.recordings import _samples
 from gfnn_jax.models.lagrangians.search import search
 from gfnn_jax.models.lagrangians.text import WhichFriction, speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
-from gfnn_jax.solve.arc_models import Observed, Steps
+from gfnn_jax.solve.arc_models import Defects, Observed
 from gfnn_jax.solve.latent_arcs import fit_arcs, rows_of_arcs
 
 
@@ -70,11 +70,11 @@ def chain(noise=1e-3, runs=3, end=12.0, dt=0.02, uniform=0.0):
 class _Decay:
     """x' = −k x sampled at times 0.1 apart, seen directly: what `fit_arcs` asks of a model."""
 
-    def steps(self, p, x):
+    def defects(self, p, x):
         factor = np.exp(-0.1 * p[0])
         here = x[:, :-1]
         by_state = np.full((*here.shape, 1), factor)
-        return Steps(factor * here - x[:, 1:], by_state, -0.1 * factor * here[..., None])
+        return Defects(factor * here - x[:, 1:], by_state, -0.1 * factor * here[..., None])
 
     def observe(self, p, x):
         return Observed(x, np.ones((*x.shape, 1)), np.zeros((*x.shape, 1)))

@@ -15,7 +15,7 @@ from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.family import DifferentiatedByJax, from_function
 from gfnn_jax.fitting import levenberg_marquardt as lm
 from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
-from gfnn_jax.fitting.training import BLOCK
+from gfnn_jax.fitting.training import BLOCK, Limits
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("amplitude",), meta_fields=())
@@ -64,12 +64,12 @@ def pendulum(w):
 TRAINING, VALIDATION = gradient_data(pendulum, 130, 0), gradient_data(pendulum, 50, 1)
 
 
-def fit_pendulum(**options):
+def fit_pendulum(*, chunk=40, resume=None, **limits):
     """13 hidden units; 130 pairs in chunks of 40 need padding."""
-    options = {"max_iterations": 12, "chunk": 40, **options}
     return levenberg_marquardt(
-        NETWORK, network_params(2, 13), *TRAINING, validation=VALIDATION, **options
-    )
+        NETWORK, network_params(2, 13), *TRAINING, validation=VALIDATION, chunk=chunk,
+        resume=resume, limits=Limits(**{"max_iterations": 12, **limits}),
+    )  # fmt: skip
 
 
 def test_recovers_an_exactly_representable_function_to_roundoff():
@@ -108,7 +108,7 @@ def test_finds_the_optimum_that_scipy_finds():
 
 def test_training_error_falls_at_every_iteration_whatever_the_chunk():
     history = []
-    whole = fit_pendulum(on_progress=lambda state: history.append(state.train_rms), chunk=1_000)
+    whole = fit_pendulum(reports=(lambda state: history.append(state.train_rms),), chunk=1_000)
     assert len(history) == 12
     assert np.all(np.diff(history) < 0)
     assert whole.train_rms < 1e-2
@@ -125,8 +125,7 @@ def test_the_best_parameters_on_validation_are_returned():
         w,
         target,
         validation=VALIDATION,
-        max_iterations=15,
-        on_progress=states.append,
+        limits=Limits(15, reports=(states.append,)),
     )
     best = min(states, key=lambda state: state.validation_rms)
     assert best.iteration < result.iterations
@@ -136,7 +135,7 @@ def test_the_best_parameters_on_validation_are_returned():
 
 def test_resuming_is_bit_identical_to_never_having_stopped():
     states = []
-    whole = fit_pendulum(checkpoint=states.append)
+    whole = fit_pendulum(reports=(states.append,))
     resumed = fit_pendulum(resume=states[4])
     assert resumed.iterations == whole.iterations == 12
     assert (resumed.train_rms, resumed.validation_rms) == (whole.train_rms, whole.validation_rms)
@@ -155,7 +154,7 @@ def test_a_second_fit_of_the_same_shapes_compiles_nothing(compilations):
     with compilations() as found:
         result = levenberg_marquardt(
             Network(amplitude=2.0), start, w, target, validation=VALIDATION,
-            max_iterations=2, chunk=40,
+            limits=Limits(2), chunk=40,
         )  # fmt: skip
     assert found.count == 0
     assert result.compile_seconds < 0.1

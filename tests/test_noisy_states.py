@@ -94,10 +94,10 @@ def test_an_arc_is_linearised_as_its_steps_change(chart):
     model = GeneratedOnArcs(family, chart, DT, np.ones((40, 1), bool), ((half,), (half,)))
     w = chart.evaluation_point(half.image(z0), half.inverse().image(z1))
     p = coefficients_of(family, params, w)
-    at = model.steps(p, np.stack([z0, z1], axis=1))
+    at = model.defects(p, np.stack([z0, z1], axis=1))
     np.testing.assert_allclose(at.closing, 0, atol=1e-9)
     moved = 1e-6 * np.random.default_rng(3).normal(size=(2, 40, 2))
-    off = model.steps(p, np.stack([z0 + moved[0], z1 + moved[1]], axis=1))
+    off = model.defects(p, np.stack([z0 + moved[0], z1 + moved[1]], axis=1))
     linear = (at.by_state[:, 0] @ moved[0][..., None])[..., 0] - moved[1]
     np.testing.assert_allclose(off.closing[:, 0], linear, atol=1e-10)
 

@@ -105,10 +105,10 @@ def test_steps_with_a_constant_inside_have_its_derivative():
         return FlowWithConstants(family, 0.1, Steps(5, 1), np.ones((3, 3), bool), terms=3)
 
     p = np.array([0.5, -1.6, 0.8, 1.3])
-    found = model().steps(p, x)
+    found = model().defects(p, x)
     for k in range(4):
         ahead, behind = (p + sign * 1e-5 * np.eye(4)[k] for sign in (1, -1))
-        slope = (model().steps(ahead, x).closing - model().steps(behind, x).closing) / 2e-5
+        slope = (model().defects(ahead, x).closing - model().defects(behind, x).closing) / 2e-5
         np.testing.assert_allclose(found.by_coefficients[..., k], slope, rtol=1e-4, atol=1e-9)
 
 

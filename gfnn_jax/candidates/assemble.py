@@ -116,7 +116,7 @@ def block_of(width: int) -> int:
     return max(1, min(_BLOCK, _BLOCK_NUMBERS // width))
 
 
-class Steps(NamedTuple):
+class Stepped(NamedTuple):
     """Images (N, 2d) of states, Newton's iterations and whether a step failed (N,), the time of a
     step in a block, and the seconds that compiling took."""
 
@@ -129,7 +129,7 @@ class Steps(NamedTuple):
 
 def stepped(
     map_: SymplecticMap, z: np.ndarray, dt: Any = None, args=None, *, timed: bool = True
-) -> Steps:
+) -> Stepped:
     """One step of the states z (N, 2d), in blocks of one shape; times are 0 unless ``timed``, and
     blocks are then shared out among the devices of the fit. dt: of each state (N,), or that of the
     map. args: name -> (N,), as those of `Pairs`."""
@@ -163,4 +163,4 @@ def stepped(
         np.concatenate(parts)[: len(z)]
         for parts in zip(*((i, f.status, f.iterations) for i, f in blocks), strict=True)
     )
-    return Steps(images, iterations, status > LEFT_DOMAIN, 1e6 * seconds / size, compiling)
+    return Stepped(images, iterations, status > LEFT_DOMAIN, 1e6 * seconds / size, compiling)

@@ -136,8 +136,23 @@ def adam(
     params:     any pytree of floating-point arrays: the start.
     validation: (w, target_gradient) of pairs kept apart.
     weight:     (2d,).
-    The other arguments, and what is raised later, are those of `minimise`. Raises ValueError where
-    shapes do not agree or data are not finite.
+    key:        a ``jax.random.key``; decides the order of the rows.
+    on_epoch:   called with (epochs done, train_rms, validation_rms) after each epoch.
+    checkpoint: called with (epochs done, state) after each epoch, to save the state: dicts and
+                lists of NumPy arrays and numbers (and the containers of ``params``). Given back as
+                ``resume`` the fit goes on as though it had never stopped, bit for bit on one
+                device; ``params`` then only lends its structure.
+    cap:        operations of the training, counted (`fitting.operations`): the epochs are as many
+                as it allows, one or more, and the rate goes through its whole schedule in them.
+    devices:    JAX's, of this process, among which the rows of each batch are shared out; their
+                number divides that of the rows. Batches are the same, so that the results differ by
+                rounding from those of one device, and a state may be gone on with on another
+                number. Every device holds all rows of train.
+
+    An interrupt (Ctrl-C) passes through; the last state given to ``checkpoint`` is whole.
+    Raises ValueError where shapes do not agree, data are not finite or the loss is not finite at
+    the start, RuntimeError where float64 is asked for and JAX's x64 mode is off. Where numbers
+    cease to be finite later, the fit stops and says so.
     """
     weight = np.asarray(weight, recipe.dtype)
     train, validation = ((np.asarray(w), np.asarray(target)) for w, target in (train, validation))
@@ -223,43 +238,25 @@ def minimise(
     recipe: Recipe,
     key: Any,
     on_epoch: Callable[[int, float, float], Any] | None = None,
-    checkpoint: Callable[[int, dict[str, Any]], Any] | None = None,
-    resume: dict[str, Any] | None = None,
     cap: float | None = None,
-    devices: Sequence[Any] = (),
 ) -> AdamFit:
     """Minimise ``loss(params, *batch)``, a mean over the rows of a batch, over all rows of train.
 
     params:     any pytree of floating-point arrays: the start.
     train, validation: tuples of arrays that agree in their first axis, the rows.
     components: what a row's loss is a sum of: the errors reported are √(loss / components).
-    key:        a ``jax.random.key``; decides the order of the rows.
-    on_epoch:   called with (epochs done, train_rms, validation_rms) after each epoch.
-    checkpoint: called with (epochs done, state) after each epoch, to save the state: dicts and
-                lists of NumPy arrays and numbers (and the containers of ``params``). Given back as
-                ``resume`` the fit goes on as though it had never stopped, bit for bit on one
-                device; ``params`` then only lends its structure.
-    cap:        operations of the training, counted (`fitting.operations`): the epochs are as many
-                as it allows, one or more, and the rate goes through its whole schedule in them.
-    devices:    JAX's, of this process, among which the rows of each batch are shared out; their
-                number divides that of the rows. Batches are the same, so that the results differ by
-                rounding from those of one device, and a state may be gone on with on another
-                number. Every device holds all rows of train.
-
-    An interrupt (Ctrl-C) passes through; the last state given to ``checkpoint`` is whole.
-    Raises ValueError where the loss is not finite at the start, RuntimeError where float64 is asked
-    for and JAX's x64 mode is off. Where numbers cease to be finite later, the fit stops and says
-    so. What is compiled serves the next call with this very ``loss`` and shapes.
+    recipe, key, on_epoch, cap: as of `adam`, and so is what is raised. What is compiled serves the
+                next call with this very ``loss`` and shapes.
     """
     return _minimise(
         _LossOfRows(loss), None, params, train, validation, components=components, recipe=recipe,
-        key=key, on_epoch=on_epoch, checkpoint=checkpoint, resume=resume, cap=cap, devices=devices,
+        key=key, on_epoch=on_epoch, cap=cap,
     )  # fmt: skip
 
 
 def _minimise(
-    loss, given, params, train, validation, *, components, recipe, key, on_epoch, checkpoint,
-    resume, cap, devices,
+    loss, given, params, train, validation, *, components, recipe, key, on_epoch, cap,
+    checkpoint=None, resume=None, devices=(),
 ) -> AdamFit:  # fmt: skip
     """`minimise` of ``loss(given, params, *batch)``: what is given, a pytree, may change without
     another compilation."""

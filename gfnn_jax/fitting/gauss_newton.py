@@ -29,7 +29,7 @@ from gfnn_jax.flows.rates import MOST_SUBSTEPS, substeps_for
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class GaussNewtonOptions:
     """Tuned on Hénon–Heiles at dt 0.5 to 3 and on three bodies at dt 0.1 and 0.5.
 
     fractions: of the pairs, those that the present H explains best, in the rounds of a fit.
@@ -64,7 +64,7 @@ class Options:
     selections: int = 4
 
 
-OPTIONS = Options()
+OPTIONS = GaussNewtonOptions()
 # A step's own error, of the coordinates' sizes, that is roundoff; at dt of long arcs too.
 _FINE, _ROUNDED = 5e-16, 1e-13
 
@@ -99,7 +99,7 @@ class Problem:
     """
 
     def __init__(
-        self, z0, z1, dt, scale, *, args=None, weight=None, options: Options = OPTIONS,
+        self, z0, z1, dt, scale, *, args=None, weight=None, options: GaussNewtonOptions = OPTIONS,
         allowance: Allowance = UNBOUNDED,
     ):  # fmt: skip
         self.z0, self.z1, self.dt, self.scale, self.args = z0, z1, dt, scale, args

@@ -25,7 +25,7 @@ from gfnn_jax.flows.collocation import Steps
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class GrowthOptions:
     """Tuned on the double pendulum at dt 0.05 and 0.2.
 
     boxes: (order, degree) of the first library, the largest that has at most ``box`` modes and for
@@ -53,7 +53,7 @@ class Options:
     idle: int = 4
 
 
-OPTIONS = Options()
+OPTIONS = GrowthOptions()
 _BOX_PAIRS = 2_000  # that the first box is told by
 _GAINED, _WORSE = 0.9, 1.2  # of the residual: a gain, and what fewer modes may cost
 _SETTLED = 0.1  # of the residual, below which a step is taken before candidates are looked at
@@ -73,8 +73,7 @@ class Grown(NamedTuple):
 
 
 def grow(
-    problem: Problem, basis: Modes, rows: np.ndarray, goal: float, most: int, *,
-    options: Options = OPTIONS,
+    problem: Problem, basis: Modes, rows: np.ndarray, goal: float, most: int
 ) -> Iterator[Grown]:  # fmt: skip
     """The modes that these rows ask for, round by round, each better than the one before, until the
     residual is within ``goal`` or none gains.
@@ -83,7 +82,7 @@ def grow(
     """
     enough = rows[:_BOX_PAIRS]
     z0, z1 = problem.z0[enough], problem.z1[enough]
-    modes = _box(basis, z0, len(rows), options)
+    modes = _box(basis, z0, len(rows))
     if not modes:
         return
     start = basis.terms(modes)
@@ -92,12 +91,12 @@ def grow(
     best, before, idle, ended = Grown(start, c, np.inf), present, 0, ""
     pace: list[tuple[int, float]] = []
     steps, resolved = None, 1.0
-    for _ in range(options.rounds):
-        if idle == options.idle:
+    for _ in range(OPTIONS.rounds):
+        if idle == OPTIONS.idle:
             ended = "no further mode gains"
             break
-        count = int(options.rows_per_mode * len(present) / (2 * basis.dim))
-        some = rows[: max(options.pairs, count)]
+        count = int(OPTIONS.rows_per_mode * len(present) / (2 * basis.dim))
+        some = rows[: max(OPTIONS.pairs, count)]
         if steps is None or best.rms < _AGAIN * resolved:
             resolved = min(best.rms, 1.0)
             family, c = basis.terms(list(present)), np.array(list(present.values()))
@@ -117,12 +116,12 @@ def grow(
             ended = "the training pairs meet the tolerance"
             break
         before = present
-        solved, rest, span = looked.solved(options.significant)
+        solved, rest, span = looked.solved(OPTIONS.significant)
         room = most - len(solved)
         gain = np.linalg.norm(rest) / np.linalg.norm(looked.residual)
         # What a long step leaves over is curvature, which asks for any mode.
         tried = basis.around(solved) if gain > _SETTLED else []
-        found = looked.candidates(tried, rest, span, room, options)
+        found = looked.candidates(tried, rest, span, room)
         if not found and gain > _GAINED:
             ended = (
                 "the pairs have no room for more modes" if room <= 0 else "no further mode gains"
@@ -132,7 +131,7 @@ def grow(
             ended = f"more than {most} modes are needed"
             break
         present = solved | dict.fromkeys(found, 0.0)
-    yield best._replace(ended=ended or f"{options.rounds} rounds are over")
+    yield best._replace(ended=ended or f"{OPTIONS.rounds} rounds are over")
 
 
 def _out_of_reach(pace: list[tuple[int, float]], goal: float, most: int) -> bool:
@@ -145,10 +144,10 @@ def _out_of_reach(pace: list[tuple[int, float]], goal: float, most: int) -> bool
     return added > 0 and gained / added * (most - count) < np.log(rms / goal)
 
 
-def _box(basis: Modes, z, pairs: int, options: Options) -> list[Mode]:
+def _box(basis: Modes, z, pairs: int) -> list[Mode]:
     """The first library, without the modes that others explain."""
-    most = min(pairs * 2 * basis.dim / options.rows_per_mode, options.box)
-    boxes = (basis.box(*size) for size in options.boxes)
+    most = min(pairs * 2 * basis.dim / OPTIONS.rows_per_mode, OPTIONS.box)
+    boxes = (basis.box(*size) for size in OPTIONS.boxes)
     modes = next((modes for modes in boxes if len(modes) <= most), [])
     kept, _ = null_terms(basis.terms(modes), z[: max(200, len(modes))]) if modes else ([], [])
     return [modes[j] for j in kept]
@@ -202,26 +201,26 @@ class _Linearised:
         span = np.linalg.qr(self.matrix[:, kept])[0]
         return {self.modes[j]: float(v) for j, v in zip(kept, c, strict=True)}, rest, span
 
-    def candidates(self, tried: list[Mode], rest, span, room: int, options: Options) -> list[Mode]:
+    def candidates(self, tried: list[Mode], rest, span, room: int) -> list[Mode]:
         """Select among the modes that are tried those that the residual asks for: the heaviest,
         then the one that is heaviest beside it, and so on. rest, span: as `solved` gives them."""
         degrees = np.sqrt(max(len(rest) - span.shape[1], 0))
         columns, heaviest = np.zeros((len(rest), 0)), np.zeros(0, dtype=int)
-        for first in range(0, len(tried), options.block):
-            part = np.arange(first, min(first + options.block, len(tried)))
-            found = self._beside(span, [tried[j] for j in part], options.null)
+        for first in range(0, len(tried), OPTIONS.block):
+            part = np.arange(first, min(first + OPTIONS.block, len(tried)))
+            found = self._beside(span, [tried[j] for j in part], OPTIONS.null)
             columns, heaviest = np.hstack([columns, found]), np.concatenate([heaviest, part])
-            order = np.argsort(-np.abs(rest @ columns), kind="stable")[: options.shortlist]
+            order = np.argsort(-np.abs(rest @ columns), kind="stable")[: OPTIONS.shortlist]
             columns, heaviest = columns[:, order], heaviest[order]
         chosen, least = [], 0.0
         size = np.linalg.norm(columns, axis=0)
-        while len(chosen) < min(room, options.at_once, columns.shape[1]):
+        while len(chosen) < min(room, OPTIONS.at_once, columns.shape[1]):
             left = np.linalg.norm(columns, axis=0)
-            new = left > options.null * size
+            new = left > OPTIONS.null * size
             weights = np.abs(rest @ columns) / np.where(new, left, np.inf)
             weights *= degrees / np.linalg.norm(rest)
             j = int(np.argmax(weights))
-            least = least or max(options.significant, options.weighty * weights[j])
+            least = least or max(OPTIONS.significant, OPTIONS.weighty * weights[j])
             if not weights[j] >= least:
                 break
             chosen.append(tried[heaviest[j]])

@@ -24,8 +24,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any
 
@@ -55,13 +53,8 @@ def levenberg_marquardt(
     *,
     validation: tuple[Rows, Rows],
     weight: Any = 1.0,
-    max_iterations: int = 200,
-    block: Callable[[int], AbstractContextManager] = lambda iterations: nullcontext(),
-    target_rms: float = 0.0,
-    patience: int = 20,
+    limits: Limits = Limits(),  # noqa: B008, it is frozen
     chunk: int = 500,
-    on_progress: Callable[[LMState], Any] | None = None,
-    checkpoint: Callable[[LMState], Any] | None = None,
     resume: LMState | None = None,
 ) -> LMResult:
     """Minimise the mean of ‖weight · (∇S(params, w) − target_gradient)‖² over the pairs.
@@ -72,25 +65,15 @@ def levenberg_marquardt(
     validation:  (w, target_gradient) of pairs kept apart; the parameters that fit them best are
                  returned.
     weight:      (2d,), or one for all: what makes a row of ∇S unit-free.
-    max_iterations: when to stop. A run repeats to the last bit on one machine with the same number
-                 of threads.
-    block:       gives the context in which the next so many iterations are made; it raises
-                 OutOfTime to stop before them.
-    target_rms:  stop once the validation RMS is as small.
-    patience:    stop when train_rms fell by less than 1 % in so many iterations.
+    limits:      when to stop, and what is called with the states.
     chunk:       at most so many pairs have their Jacobian in memory at once.
-    on_progress: called with the state after every iteration.
-    checkpoint:  likewise, to save the state. Given back as ``resume`` the fit goes on as though it
-                 had never stopped, bit for bit (``params`` then only lends its structure).
+    resume:      a state that was reported: the fit goes on from there as though it had never
+                 stopped, bit for bit (``params`` then only lends its structure).
     """
     theta, layout = flattened(params)
-    rows = (np.asarray(a) for a in (w, target_gradient, *validation))
-    w, target_gradient, held_w, held_target = rows
-    check_rows(theta, w, target_gradient, held_w, held_target)
-    weight = np.broadcast_to(np.asarray(weight, theta.dtype), w.shape[-1:])
+    w, target_gradient, weight, held = prepared(theta, w, target_gradient, validation, weight)
     # On the device once, not in every iteration.
     chunks = jax.device_put(chunked(w, target_gradient, weight, chunk))
-    held = jax.device_put((held_w, held_target, weight[None, :]))
 
     def linearised(theta):
         """Trial steps from θ, of any damping: all of them share one linearisation."""
@@ -116,11 +99,8 @@ def levenberg_marquardt(
     started = time.perf_counter()
     _compile(family, chunks, held, theta, layout)
     compile_seconds = time.perf_counter() - started
-    options = Limits(
-        max_iterations, block, target_rms, patience, (on_progress, checkpoint)
-    )  # fmt: skip
     first = first_state(theta, math.nan, validation_rms(theta)) if resume is None else resume
-    state, why = trained(first, linearised, Nielsen(), validation_rms, w.size, options)
+    state, why = trained(first, linearised, Nielsen(), validation_rms, w.size, limits)
     params = unflattened(np.asarray(state.best_theta), layout)
     return result_of(state, params, compile_seconds, why)
 
@@ -233,7 +213,16 @@ def chunked(w, target_gradient, weight, chunk):
     return tuple(a.reshape(num_chunks, rows, -1) for a in (w[take], target_gradient[take], weights))
 
 
-def check_rows(theta, *data):
+def prepared(theta, w, target_gradient, validation, weight):
+    """Rows w, target_gradient (N, 2d) and weight (2d,) as arrays, and on the device those that
+    validate, with their weight. Raises as `_check_rows` does."""
+    w, target_gradient, *held = (np.asarray(a) for a in (w, target_gradient, *validation))
+    _check_rows(theta, w, target_gradient, *held)
+    weight = np.broadcast_to(np.asarray(weight, theta.dtype), w.shape[-1:])
+    return w, target_gradient, weight, jax.device_put((*held, weight[None, :]))
+
+
+def _check_rows(theta, *data):
     names = ("w", "target_gradient", "the validation's w", "the validation's target_gradient")
     for name, array in zip(("params", *names), (theta, *data), strict=True):
         if array.dtype != np.float64:

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -24,10 +23,10 @@ from gfnn_jax.fitting.levenberg_marquardt import (
     OF_LARGEST,
     Rows,
     attempt,
-    check_rows,
     chunked,
     flattened,
     linearize,
+    prepared,
     residual,
     unflattened,
 )
@@ -47,13 +46,8 @@ def levenberg_marquardt_together(
     validation: tuple[Rows, Rows],
     weight: Any = 1.0,
     shares: Float[np.ndarray, "_ _"],
-    max_iterations: int = 200,
-    block: Callable[[int], AbstractContextManager] = lambda iterations: nullcontext(),
-    target_rms: float = 0.0,
-    patience: int = 20,
+    limits: Limits = Limits(),  # noqa: B008, it is frozen
     chunk: int = 500,
-    on_progress: Callable[[LMState], Any] | None = None,
-    checkpoint: Callable[[LMState], Any] | None = None,
     resume: LMState | None = None,
 ) -> LMResult:
     """Minimise that loss for E members of a family at once, each from its own start and with its
@@ -71,11 +65,7 @@ def levenberg_marquardt_together(
     """
     flat = [flattened(member) for member in members]
     theta, layout = np.stack([t for t, _ in flat]), flat[0][1]
-    rows = (np.asarray(a) for a in (w, target_gradient, *validation))
-    w, target_gradient, held_w, held_target = rows
-    check_rows(theta, w, target_gradient, held_w, held_target)
-    weight = np.broadcast_to(np.asarray(weight, theta.dtype), w.shape[-1:])
-    held = jax.device_put((held_w, held_target, weight[None, :]))
+    w, target_gradient, weight, held = prepared(theta, w, target_gradient, validation, weight)
     *points, weights = chunked(w, target_gradient, weight, chunk)
     padding = weights.shape[0] * weights.shape[1] - len(w)
     parts = np.pad(np.sqrt(shares), ((0, 0), (0, padding))).reshape(-1, *weights.shape[:2], 1)
@@ -101,11 +91,8 @@ def levenberg_marquardt_together(
     program = compiled(family, on_device, theta, layout)
     _loss_of_mean.lower(family, held, theta, layout=layout).compile()
     compile_seconds = time.perf_counter() - started
-    options = Limits(
-        max_iterations, block, target_rms, patience, (on_progress, checkpoint)
-    )  # fmt: skip
     first = first_state(theta, unknown, validation_rms(theta)) if resume is None else resume
-    state, why = trained(first, linearised, WAITING, validation_rms, w.size, options)
+    state, why = trained(first, linearised, WAITING, validation_rms, w.size, limits)
     each = [unflattened(one, layout) for one in np.asarray(state.best_theta)]
     return result_of(state, jax.tree.map(lambda *a: np.stack(a), *each), compile_seconds, why)
 

@@ -10,7 +10,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -67,13 +67,22 @@ class LMResult(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Limits of a training, and what is called with its states."""
+    """Limits of a training, and what is called with its states.
 
-    max_iterations: int
-    block: Callable[[int], AbstractContextManager]
-    target_rms: float
-    patience: int
-    reports: tuple[Callable[[LMState], Any] | None, ...]
+    max_iterations: most iterations. A run repeats to the last bit on one machine with the same
+                number of threads.
+    block:      gives the context in which the next so many iterations are made; it raises
+                OutOfTime to stop before them.
+    target_rms: stop once the validation RMS is as small.
+    patience:   stop when train_rms fell by less than 1 % in so many iterations.
+    reports:    called with the state after every iteration.
+    """
+
+    max_iterations: int = 200
+    block: Callable[[int], AbstractContextManager] = lambda iterations: nullcontext()
+    target_rms: float = 0.0
+    patience: int = 20
+    reports: tuple[Callable[[LMState], Any], ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,18 +96,18 @@ class _Training:
     linearised: Callable[[Any], Callable[[Any], Tried]]
     validation_rms: Callable[[Any], float]
     size: int
-    options: Limits
+    limits: Limits
     started: float
 
     @property
     def stopped_because(self) -> str | None:
         """The reason why there is no further iteration, None where there is one."""
-        state, options = self.state, self.options
-        if state.best_validation_rms <= options.target_rms:
+        state, limits = self.state, self.limits
+        if state.best_validation_rms <= limits.target_rms:
             return "target"
-        if state.iteration >= options.max_iterations:
+        if state.iteration >= limits.max_iterations:
             return "iterations"
-        if state.iteration - state.landmark_iteration >= options.patience:
+        if state.iteration - state.landmark_iteration >= limits.patience:
             return "no progress"
         return None
 
@@ -115,22 +124,21 @@ class _Training:
         train_rms, held_rms = math.sqrt(loss / self.size), self.validation_rms(theta)
         seconds = time.perf_counter() - self.started
         state = _next_state(self.state, theta, damping, train_rms, held_rms, seconds)
-        for report in self.options.reports:
-            if report is not None:
-                report(state)
+        for report in self.limits.reports:
+            report(state)
         further = dataclasses.replace(self, state=state)
         return further, further.stopped_because is not None
 
 
 def trained(
-    state: LMState, linearised, rule: Rule, validation_rms, size: int, options: Limits
+    state: LMState, linearised, rule: Rule, validation_rms, size: int, limits: Limits
 ) -> tuple[LMState, str]:
     """The last state from this one on, and why there is no further one."""
     started = time.perf_counter() - state.seconds
-    here = _Training(state, linearised, validation_rms, size, options, started)
+    here = _Training(state, linearised, validation_rms, size, limits, started)
     while (stopped_because := here.stopped_because) is None:
         try:
-            with options.block(BLOCK):
+            with limits.block(BLOCK):
                 found = descended(here, rule, BLOCK, here.state.damping)
                 here = found.problem
         except OutOfTime:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.solve.arc_models import Observed, Steps
+from gfnn_jax.solve.arc_models import Defects, Observed
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class PositionArcs:
     given: Any
     basis: np.ndarray
 
-    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
+    def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
         arcs, length, m = x.shape
         d, w = m // 2, x.reshape(-1, m)
         params = self.given + self.family.unflatten(self.basis @ p)
@@ -56,7 +56,7 @@ class PositionArcs:
         moved[..., range(d), range(d, m)] = 1.0
         by_state = np.concatenate([moved, solved[..., 1 : 1 + m]], axis=-2)
         of_terms = solved[..., 1 + m :]
-        return Steps(
+        return Defects(
             closing, by_state, np.concatenate([np.zeros_like(of_terms), of_terms], axis=-2)
         )
 

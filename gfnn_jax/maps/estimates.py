@@ -25,7 +25,7 @@ from gfnn_jax.maps import stops
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.signals.local_cubics import smooth
-from gfnn_jax.solve.arc_models import Observed, Steps
+from gfnn_jax.solve.arc_models import Defects, Observed
 from gfnn_jax.solve.latent_arcs import fit_arcs, linearised
 from gfnn_jax.solve.linear import covariance_root
 
@@ -209,7 +209,7 @@ class _Windows:
     h: np.ndarray
     u: np.ndarray
 
-    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
+    def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
         arcs, length, m = x.shape
         num = arcs * (length - 1)
         u = self.u.reshape(num, *self.u.shape[2:])
@@ -217,7 +217,7 @@ class _Windows:
         step = self.law.form.step(self.law.p, start, self.h.reshape(num), u, order=1)
         shape = (arcs, length - 1, m)
         closing = step.states.reshape(shape) - x[:, 1:]
-        return Steps(closing, step.by_state.reshape(*shape, m), np.zeros((*shape, 0)))
+        return Defects(closing, step.by_state.reshape(*shape, m), np.zeros((*shape, 0)))
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         shown = self.law.sensors.observation_model(x)

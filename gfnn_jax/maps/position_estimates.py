@@ -63,7 +63,7 @@ def forecast(map_: Any, recording: Recording, times: Any) -> Forecast:
     before = ends.positions[:, None, :dim] + orbits[:, :1] - ends.positions[:, None, dim:]
     nodes = nodes_of(np.concatenate([before, orbits], axis=1))[0]
     arcs, spread = _arcs(map_, piece), ends.spread
-    moved = arcs.steps(np.zeros(arcs.basis.shape[1]), nodes)
+    moved = arcs.defects(np.zeros(arcs.basis.shape[1]), nodes)
     deviations = np.empty((len(spread), 1 + steps.max(), dim))
     for k in range(steps.max() + 1):
         deviations[:, k] = np.sqrt(np.sum(spread[:, dim:] ** 2, axis=2) + sensors.sigma**2)

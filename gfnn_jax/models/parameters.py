@@ -23,7 +23,7 @@ from gfnn_jax.phase_space import TIME
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class ParameterOptions:
     """Tuned on pendulums of varied length, or driven, and on Kepler's problem of varied mass.
 
     harmonics: of a drive, the largest, in turn.
@@ -46,21 +46,21 @@ class Options:
     apart: float = 1.2
 
 
-OPTIONS = Options()
+OPTIONS = ParameterOptions()
 _FAR_FROM_ZERO = 0.02  # of the largest value: nearer to it a parameter has no negative powers
 
 
 def state_libraries(
     dim: int, parameters: tuple[str, ...], *, angles: Sequence[int], cyclic: Sequence[int],
-    plain: tuple[str, ...], features, reversor, own: Terms | None, options: Options = OPTIONS,
+    plain: tuple[str, ...], features, reversor, own: Terms | None,
 ) -> list[Terms]:  # fmt: skip
     """Libraries of the state alone, by rising size. angles: that enter H, plain: the names of the
     other coordinates. own: a user's terms, which stand in all of them, at first alone."""
     if angles and features is None:
         basis = Modes(dim, tuple(angles), plain)
-        found = [basis.terms(basis.box(*size)) for size in options.boxes]
+        found = [basis.terms(basis.box(*size)) for size in OPTIONS.boxes]
     else:
-        degrees = options.polynomials if features is None else options.features
+        degrees = OPTIONS.polynomials if features is None else OPTIONS.features
         found = [
             polynomial_terms(dim, d, cyclic=cyclic, features=features, reversor=reversor)
             for d in degrees
@@ -71,20 +71,20 @@ def state_libraries(
 
 def functions_of_parameters(
     dim: int, parameters: tuple[str, ...], args: np.ndarray, own: bool,
-    period: float | None = None, options: Options = OPTIONS,
+    period: float | None = None,
 ) -> list[list[Terms]]:  # fmt: skip
     """Rows of sets of functions of the parameters, whose values args are (N, k); in each row every
     set spans those before it. own: whether none at all is the first. period: of a drive, whose
     time is the last of them."""
     none = [_constant(dim, parameters)] if own else []
     if period is None:
-        powers = _powers(dim, parameters, args, options)
-        series = [_chebyshev(dim, parameters, args, degree, options) for degree in options.degrees]
+        powers = _powers(dim, parameters, args)
+        series = [_chebyshev(dim, parameters, args, degree) for degree in OPTIONS.degrees]
         return [[*none, powers], series]
-    in_time = [_harmonics(dim, parameters, most, period) for most in options.harmonics]
+    in_time = [_harmonics(dim, parameters, most, period) for most in OPTIONS.harmonics]
     if len(parameters) == 1:
         return [[*none, *in_time]]
-    others = functions_of_parameters(dim, parameters[:-1], args[:, :-1], False, options=options)
+    others = functions_of_parameters(dim, parameters[:-1], args[:, :-1], False)
     of_all = [
         [
             multiplied(dataclasses.replace(functions, parameters=parameters), harmonics)
@@ -114,11 +114,11 @@ def _constant(dim: int, parameters: tuple[str, ...]) -> Terms:
     return Terms(dim, (), ((),), parameters)
 
 
-def _powers(dim: int, parameters: tuple[str, ...], args, options: Options) -> Terms:
+def _powers(dim: int, parameters: tuple[str, ...], args) -> Terms:
     """Products of whole powers, negative ones where a parameter keeps away from 0."""
     inverse = [_keeps_away(column) for column in args.T]
-    ranges = [range(-options.powers if i else 0, options.powers + 1) for i in inverse]
-    exponents = [e for e in product(*ranges) if sum(map(abs, e)) <= options.total]
+    ranges = [range(-OPTIONS.powers if i else 0, OPTIONS.powers + 1) for i in inverse]
+    exponents = [e for e in product(*ranges) if sum(map(abs, e)) <= OPTIONS.total]
     variables = (*parameters, *(f"1/{name}" for name in parameters))
     rows = tuple((*(max(a, 0) for a in e), *(max(-a, 0) for a in e)) for e in exponents)
     return Terms(dim, variables, rows, parameters)
@@ -129,14 +129,14 @@ def _keeps_away(values) -> bool:
     return bool(np.ptp(np.sign(values)) == 0 and size.min() > _FAR_FROM_ZERO * size.max())
 
 
-def _chebyshev(dim: int, parameters: tuple[str, ...], args, degree: int, options: Options) -> Terms:
+def _chebyshev(dim: int, parameters: tuple[str, ...], args, degree: int) -> Terms:
     """Products of Chebyshev polynomials, of total degree up to ``degree``."""
     arguments = []
     for name, values in zip(parameters, args.T, strict=True):
         if (
             values.min() > 0
             and _keeps_away(values)
-            and np.ptp(np.log(values)) > np.log(options.apart)
+            and np.ptp(np.log(values)) > np.log(OPTIONS.apart)
         ):
             name, values = f"log({name})", np.log(values)
         centre, half = 0.5 * (values.max() + values.min()), 0.5 * np.ptp(values)
@@ -157,7 +157,6 @@ def walked(
     *,
     bound: float,
     most: float,
-    options: Options = OPTIONS,
 ) -> Iterator[Any]:
     """Iterate over what ``attempt`` finds for products of a library of the state and one of the
     parameters, as they are tried: of each row of functions, both grow, whichever lowers the error,
@@ -181,13 +180,13 @@ def walked(
                 tried.append((family.num_parameters, error, (more, further)))
                 if best <= bound:
                     return
-                if error < options.leap * here:
+                if error < OPTIONS.leap * here:
                     break
             # The smallest of those that are hardly worse than the best.
             lowest = min((error for _, error, _ in tried), default=np.inf)
-            near = [entry for entry in tried if options.gained * entry[1] <= lowest]
+            near = [entry for entry in tried if OPTIONS.gained * entry[1] <= lowest]
             _, error, move = min(near, default=(0, np.inf, (0, 0)))
-            if error < options.gained * here:
+            if error < OPTIONS.gained * here:
                 at, level, here = at + move[0], level + move[1], error
                 moves = [(0, 1), (1, 0), (1, 1)]
                 if move[0] and not move[1]:  # what has helped may help again

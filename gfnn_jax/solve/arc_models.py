@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 
-class Steps(NamedTuple):
+class Defects(NamedTuple):
     """The linearised defects of states (A, L, m): c_n (A, L − 1, m), Φ_n (…, m, m) and, in the n
     coefficients, Γ_n (…, m, n)."""
 
@@ -34,7 +34,7 @@ class Observed(NamedTuple):
 class Model(Protocol):
     """States that move and are measured: what `fit_arcs` asks of a law, or of any other map."""
 
-    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps: ...
+    def defects(self, p: np.ndarray, x: np.ndarray) -> Defects: ...
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed: ...
 
@@ -53,12 +53,12 @@ class Known:
     p: np.ndarray
 
 
-def evaluated(model: Model | Known, p: np.ndarray, x: np.ndarray) -> tuple[Steps, Observed]:
+def evaluated(model: Model | Known, p: np.ndarray, x: np.ndarray) -> tuple[Defects, Observed]:
     """The linearised defects of states x (A, L, m), and what is measured of them."""
     if not isinstance(model, Known):
-        return model.steps(p, x), model.observe(p, x)
-    steps, observed = evaluated(model.model, model.p, x)
+        return model.defects(p, x), model.observe(p, x)
+    defects, observed = evaluated(model.model, model.p, x)
     return (
-        steps._replace(by_coefficients=steps.by_coefficients[..., :0]),
+        defects._replace(by_coefficients=defects.by_coefficients[..., :0]),
         observed._replace(by_coefficients=observed.by_coefficients[..., :0]),
     )

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.solve.arc_models import Known, Model, Observed, Steps, evaluated
+from gfnn_jax.solve.arc_models import Defects, Known, Model, Observed, evaluated
 from gfnn_jax.solve.levenberg_marquardt import Factors, Tried, descended
 from gfnn_jax.solve.robust import Loss, SoftL1, of_residuals
 
@@ -166,10 +166,10 @@ def linearised(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Rows (A, L k, m + n + 1) of [δx_0, δp, r] of all arcs at p and x, weighted as robust loss has
     it, and δx_{L−1} (A, m, m + n + 1) by the same and by the defects before it."""
-    measured, (steps, observed) = np.isfinite(y), evaluated(model, p, x)
+    measured, (defects, observed) = np.isfinite(y), evaluated(model, p, x)
     off = np.where(measured, np.where(measured, y, 0.0) - observed.values, 0.0)
     units = _Units(sigma, np.ones(x.shape[-1]), loss, whitening)
-    return _linearised(_Iterate.at(p, x, steps, observed, measured, off, units), slice(None))
+    return _linearised(_Iterate.at(p, x, defects, observed, measured, off, units), slice(None))
 
 
 class _Data(NamedTuple):
@@ -188,9 +188,9 @@ class _Data(NamedTuple):
     def at(self, p: np.ndarray, x: np.ndarray, units: _Units) -> _Iterate:
         """The residuals and defects of coefficients p and states x."""
         with np.errstate(all="ignore"):
-            steps, observed = evaluated(self.model, p, x)
+            defects, observed = evaluated(self.model, p, x)
             off = np.where(self.measured, self.known - observed.values, 0.0)
-        return _Iterate.at(p, x, steps, observed, self.measured, off, units)
+        return _Iterate.at(p, x, defects, observed, self.measured, off, units)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,7 +215,7 @@ class _AtStates:
     def tried(self, damping: float, failures: int) -> Tried:
         """A step of p and x; each that failed halves the next."""
         here, share = self.here, 0.5**failures
-        dp, dx = _solve(self._rows, here.steps, damping)
+        dp, dx = _solve(self._rows, here.defects, damping)
         there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
         if self.closed(here):
             return Tried(there, here.merit * (1 + 1e-9) - there.merit, damping)
@@ -269,7 +269,7 @@ class _Iterate(NamedTuple):
 
     p: np.ndarray
     x: np.ndarray
-    steps: Steps
+    defects: Defects
     observed: Observed
     measured: np.ndarray
     residuals: np.ndarray
@@ -279,16 +279,18 @@ class _Iterate(NamedTuple):
     units: _Units
 
     @classmethod
-    def at(cls, p, x, steps: Steps, observed: Observed, measured, off, units: _Units) -> _Iterate:
+    def at(
+        cls, p, x, defects: Defects, observed: Observed, measured, off, units: _Units
+    ) -> _Iterate:
         """off: residuals (A, L, k) in the units of y."""
         with np.errstate(all="ignore"):
             residuals = off / units.sigma
             white = units.white(residuals)
             cost = float(np.sum(units.loss.of(white)))
-            gap = float(np.linalg.norm(steps.closing / units.state))
+            gap = float(np.linalg.norm(defects.closing / units.state))
         if not np.isfinite(cost + gap):
             cost = gap = np.inf
-        return cls(p, x, steps, observed, measured, residuals, white, cost, gap, units)
+        return cls(p, x, defects, observed, measured, residuals, white, cost, gap, units)
 
     @property
     def merit(self) -> float:
@@ -313,7 +315,7 @@ class _Iterate(NamedTuple):
         # Of a state (q, v) whose positions are measured, velocities change as they do.
         state = self.units.state * np.resize(moved, self.units.state.shape)
         units = self.units._replace(sigma=sigma, state=state)
-        return self.at(self.p, self.x, self.steps, self.observed, self.measured, off, units)
+        return self.at(self.p, self.x, self.defects, self.observed, self.measured, off, units)
 
 
 class _Rows(NamedTuple):
@@ -355,7 +357,7 @@ def _reduced(at: _Iterate, *, leverage: bool = False) -> _Rows:
 def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
     """Weighted rows (a, L k, m + n + 1) of [δx_0, δp, r] of these arcs, and δx_{L−1}
     (a, m, m + n + 1) by δx_0, by δp, and by the defects before it."""
-    steps = Steps(*(part[block] for part in at.steps))
+    defects = Defects(*(part[block] for part in at.defects))
     observed = Observed(*(part[block] for part in at.observed))
     residuals = at.residuals[block]
     sigma = np.broadcast_to(at.units.sigma, at.residuals.shape)[block]
@@ -364,9 +366,9 @@ def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
     S = np.zeros((num_arcs, length, m, m + n + 1))
     S[:, 0, range(m), range(m)] = 1.0
     for i in range(length - 1):
-        S[:, i + 1] = steps.by_state[:, i] @ S[:, i]
-        S[:, i + 1, :, m : m + n] += steps.by_coefficients[:, i]
-        S[:, i + 1, :, -1] += steps.closing[:, i]
+        S[:, i + 1] = defects.by_state[:, i] @ S[:, i]
+        S[:, i + 1, :, m : m + n] += defects.by_coefficients[:, i]
+        S[:, i + 1, :, -1] += defects.closing[:, i]
     J = observed.by_state @ S
     J[..., m:-1] += observed.by_coefficients
     J /= sigma[..., None]
@@ -377,7 +379,7 @@ def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
     return J.reshape(num_arcs, length * k, -1), S[:, -1]
 
 
-def _solve(rows: _Rows, steps: Steps, damping: float) -> tuple[np.ndarray, np.ndarray]:
+def _solve(rows: _Rows, defects: Defects, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """δp (n,) and δx (A, L, m), with Levenberg and Marquardt's damping of δp."""
     m, R = rows.arcs.shape[1], rows.factor
     n = R.shape[1] - 1
@@ -392,7 +394,7 @@ def _solve(rows: _Rows, steps: Steps, damping: float) -> tuple[np.ndarray, np.nd
     except np.linalg.LinAlgError:  # an arc of gross errors alone
         moved = np.linalg.pinv(rows.arcs[:, :, :m]) @ right
     dx = [moved[..., 0]]
-    for i in range(steps.closing.shape[1]):
-        carried = (steps.by_state[:, i] @ dx[-1][..., None])[..., 0]
-        dx.append(carried + steps.by_coefficients[:, i] @ dp + steps.closing[:, i])
+    for i in range(defects.closing.shape[1]):
+        carried = (defects.by_state[:, i] @ dx[-1][..., None])[..., 0]
+        dx.append(carried + defects.by_coefficients[:, i] @ dp + defects.closing[:, i])
     return dp, np.stack(dx, axis=1)

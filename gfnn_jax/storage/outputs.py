@@ -9,7 +9,7 @@ import contextlib
 import os
 import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -77,25 +77,33 @@ def failures_as_work_errors(path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Delay SIGINT and SIGTERM until the block ends.
+def signals_handled(
+    numbers: Iterable[int], handler: Callable[[int, Any], object]
+) -> Iterator[None]:
+    """Call ``handler(number, frame)`` at these signals until the block ends.
 
     Nothing is done outside the main thread, where no signal arrives.
     """
-    waiting: list[int] = []
     try:
-        before = {
-            number: signal.signal(number, lambda number, _: waiting.append(number))
-            for number in (signal.SIGINT, signal.SIGTERM)
-        }
+        before = {number: signal.signal(number, handler) for number in numbers}
     except ValueError:
         yield
         return
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Delay SIGINT and SIGTERM until the block ends."""
+    waiting: list[int] = []
+    try:
+        with signals_handled((signal.SIGINT, signal.SIGTERM), lambda n, _: waiting.append(n)):
+            yield
+    finally:
         if waiting:
             signal.raise_signal(waiting[0])
 

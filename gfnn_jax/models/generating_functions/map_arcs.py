@@ -24,7 +24,7 @@ import numpy as np
 from gfnn_jax.dataset.arcs import Arcs
 from gfnn_jax.fitting.triangle import Triangle, folded
 from gfnn_jax.generating.charts import AnyChart
-from gfnn_jax.solve.arc_models import Known, Observed, Steps, observed_whole
+from gfnn_jax.solve.arc_models import Defects, Known, Observed, observed_whole
 from gfnn_jax.solve.latent_arcs import eliminated_rows, fit_arcs
 from gfnn_jax.solve.robust import Biweight
 from gfnn_jax.threads import one_thread
@@ -55,7 +55,7 @@ class GeneratedOnArcs:
     along: Any = None
     joint: bool = False
 
-    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
+    def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
         width, free = x.shape[-1], 0 if self.along is None else self.along.num_parameters
         found = np.zeros((*self.moves.shape, width, 1 + width + free))
         found[..., 1 : 1 + width] = np.eye(width)
@@ -63,7 +63,7 @@ class GeneratedOnArcs:
         for first in range(0, len(lanes), _LANES):
             some = np.unravel_index(lanes[first : first + _LANES], self.moves.shape)
             found[some] = self._linearised(p, x[:, :-1][some], x[:, 1:][some])
-        return Steps(found[..., 0], found[..., 1 : 1 + width], found[..., 1 + width :])
+        return Defects(found[..., 0], found[..., 1 : 1 + width], found[..., 1 + width :])
 
     def _linearised(self, p: np.ndarray, y0: np.ndarray, y1: np.ndarray) -> np.ndarray:
         """[c, Φ, Γ] (n, 2d, 1 + 2d + free) of steps from z to Z (n, 2d)."""

@@ -17,7 +17,7 @@ from gfnn_jax.dataset.rows import rows_of
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
-from gfnn_jax.fitting.training import LMResult, LMState
+from gfnn_jax.fitting.training import Limits, LMResult, LMState
 from gfnn_jax.models.generating_functions.size import OF_STEPS, Generates, Size
 
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
@@ -76,13 +76,18 @@ class NetworkSweep(Generates):
             )
 
         resume = self._checkpoints.latest(self._like()) if self._checkpoints else None
-        result = self._trained(
-            validation=held, weight=self._weight, max_iterations=self._max_iterations,
+        reports: list[Callable[[LMState], None]] = [report]
+        if self._checkpoints is not None:
+            reports.append(_every_few_seconds(self._checkpoints))
+        limits = Limits(
+            self._max_iterations,
             block=lambda count: budget.unit(
                 f"{count} iterations of {family.label}", NETWORK, count * self._work_of_iteration
             ),
-            target_rms=0.5 * self.tolerance.bound,
-            on_progress=report, checkpoint=_every_few_seconds(self._checkpoints),
+            target_rms=0.5 * self.tolerance.bound, reports=tuple(reports),
+        )  # fmt: skip
+        result = self._trained(
+            validation=held, weight=self._weight, limits=limits,
             resume=resume[1] if resume else None,
         )  # fmt: skip
         error = estimated_error(self.data, self.tolerance, result.validation_rms)
@@ -118,10 +123,8 @@ class NetworkSweep(Generates):
         return None, self._params
 
 
-def _every_few_seconds(checkpoints) -> Callable | None:
-    """A checkpoint callback that saves when ten seconds have passed since it last did."""
-    if checkpoints is None:
-        return None
+def _every_few_seconds(checkpoints) -> Callable[[LMState], None]:
+    """A report that saves the state when ten seconds have passed since it last did."""
     last = time.monotonic()
 
     def save(state: LMState) -> None:

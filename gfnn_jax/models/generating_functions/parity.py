@@ -20,7 +20,7 @@ from gfnn_jax.generating.charts import MIDPOINT
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class ParityOptions:
     """Options of the guess (benchmarks/constants.py --only parity).
 
     from_dim: degrees of freedom from which terms are scarce. rows_per_term: that the test needs.
@@ -37,7 +37,7 @@ class Options:
     no_gain: float = 0.98
 
 
-OPTIONS = Options()
+OPTIONS = ParityOptions()
 _ALIKE = 2  # degree up to which the terms that are not even are the coordinates alone
 
 

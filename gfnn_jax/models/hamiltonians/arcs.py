@@ -20,7 +20,7 @@ from gfnn_jax.phase_space import Pairs
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class ArcOptions:
     """Tuned on Hénon–Heiles at dt 0.005 to 0.5 with noise of 1e-3 (`benchmarks/bands.py`).
 
     quiet: displacements, in units of their noise, of a step that needs no arcs, and of those that
@@ -38,7 +38,7 @@ class Options:
     fewest: int = 50
 
 
-OPTIONS = Options()
+OPTIONS = ArcOptions()
 
 
 class Arcs(NamedTuple):
@@ -48,7 +48,7 @@ class Arcs(NamedTuple):
     length: int
 
 
-def arcs_of(data: Dataset, options: Options = OPTIONS) -> Arcs | None:
+def arcs_of(data: Dataset) -> Arcs | None:
     """The arcs that H is to be learned from; None where the pairs themselves serve: where no
     sequences are, where a step is long against its noise, and for pairs of many dt or parameters,
     or of a structure."""
@@ -56,19 +56,19 @@ def arcs_of(data: Dataset, options: Options = OPTIONS) -> Arcs | None:
         return None
     starts, lengths = _runs(data.pairs)
     usual = int(np.median(np.repeat(lengths, lengths)))  # that a pair stands in
-    if usual <= options.order:
+    if usual <= OPTIONS.order:
         return None
     moved = (data.y1 - data.y0) / data.scale
     displacement = float(np.sqrt(np.mean(moved**2)))
     runs = [moved[first : first + count] for first, count in zip(starts, lengths, strict=True)]
-    noise = of_differences(runs, options.order, options.alike)
-    if noise is None or displacement > options.short:
+    noise = of_differences(runs, OPTIONS.order, OPTIONS.alike)
+    if noise is None or displacement > OPTIONS.short:
         return None
-    wanted = int(np.ceil(options.quiet * np.sqrt(2) * noise / displacement))
-    length = min(wanted, int(options.part * usual))
+    wanted = int(np.ceil(OPTIONS.quiet * np.sqrt(2) * noise / displacement))
+    length = min(wanted, int(OPTIONS.part * usual))
     if length < 2:
         return None
-    return _strided(data, starts, lengths, length, options)
+    return _strided(data, starts, lengths, length)
 
 
 def _runs(pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
@@ -77,7 +77,7 @@ def _runs(pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
     return starts, np.diff(np.append(starts, len(pairs)))
 
 
-def _strided(data: Dataset, starts, lengths, length: int, options: Options) -> Arcs | None:
+def _strided(data: Dataset, starts, lengths, length: int) -> Arcs | None:
     """The arcs of so many steps that are wholly in the training pairs, or in those held out."""
     first = np.concatenate([
         np.arange(begin + offset, begin + count - length + 1, length)
@@ -101,7 +101,7 @@ def _strided(data: Dataset, starts, lengths, length: int, options: Options) -> A
         inside = np.zeros(len(moved), bool)
         inside[own] = True
         rows.append(np.random.default_rng(0).permutation(np.flatnonzero(inside[along].all(axis=1))))
-    if min(map(len, rows)) < options.fewest:
+    if min(map(len, rows)) < OPTIONS.fewest:
         return None
     split = Split(rows[0], rows[1], np.zeros(0, int), np.arange(len(first)))
     arcs = dataclasses.replace(data, pairs=strided, row=data.row[first], y0=y0, y1=y1, split=split)

@@ -10,7 +10,7 @@ import numpy as np
 from gfnn_jax.budget import Allowance, Budget
 from gfnn_jax.fitting.significance import significant_terms, terms_above_noise
 from gfnn_jax.models.hamiltonians.fitted_law import Dropped, FittedLaw
-from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
+from gfnn_jax.models.hamiltonians.options import OPTIONS, LawOptions
 from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
 from gfnn_jax.models.hamiltonians.whole_sequences import fitted_to_sequences
 
@@ -18,7 +18,7 @@ ROUNDOFF = 1e-12  # of the spread: above it the pairs carry noise, and every one
 
 
 def without_noise(
-    problem, smallest: FittedLaw, rows, data, tolerance, options: Options
+    problem, smallest: FittedLaw, rows, data, tolerance, options: LawOptions
 ) -> FittedLaw:
     """The terms that these pairs tell from noise: of the smallest library whose error is that of
     the noise, and those of the largest that they tell beside them. An error that is noise for the
@@ -38,7 +38,7 @@ def without_noise(
     return found
 
 
-def _pruned(problem, full: FittedLaw, rows, data, tolerance, options: Options) -> FittedLaw:
+def _pruned(problem, full: FittedLaw, rows, data, tolerance, options: LawOptions) -> FittedLaw:
     """The terms that all of these pairs tell from noise, fitted to them."""
     few = _significant(problem, full, rows, options)
     if few is not None:
@@ -48,7 +48,7 @@ def _pruned(problem, full: FittedLaw, rows, data, tolerance, options: Options) -
     return refitted(problem, full, rows, data, tolerance)
 
 
-def _significant(problem, full: FittedLaw, rows, options: Options) -> FittedLaw | None:
+def _significant(problem, full: FittedLaw, rows, options: LawOptions) -> FittedLaw | None:
     """The terms that these pairs tell from noise, which one Gauss–Newton problem of all terms says,
     so that only a few are fitted to many pairs; None where it tells none."""
     resolved = np.setdiff1d(rows, np.setdiff1d(full.rows, full.fit.used))
@@ -63,7 +63,9 @@ def _significant(problem, full: FittedLaw, rows, options: Options) -> FittedLaw 
     )
 
 
-def sparse(problem, full: FittedLaw, data, tolerance, options: Options, on_progress) -> FittedLaw:
+def sparse(
+    problem, full: FittedLaw, data, tolerance, options: LawOptions, on_progress
+) -> FittedLaw:
     """Drop the terms that the pairs do not ask for, as far as the held-out error allows."""
     tried: set[tuple[int, ...]] = set()
     for threshold in options.thresholds:

@@ -16,15 +16,14 @@ import numpy as np
 from gfnn_jax.budget import UNBOUNDED, Allowance
 from gfnn_jax.dataset.arcs import Arcs
 from gfnn_jax.errors import InputError
-from gfnn_jax.flows.collocation import Steps as FlowSteps
-from gfnn_jax.flows.collocation import images
-from gfnn_jax.solve.arc_models import Known, Observed, Steps, observed_whole
+from gfnn_jax.flows.collocation import Steps, images
+from gfnn_jax.solve.arc_models import Defects, Known, Observed, observed_whole
 from gfnn_jax.solve.latent_arcs import Fitted, fit_arcs
 from gfnn_jax.solve.robust import Biweight, robust
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class FlowArcOptions:
     """Tuned on Hénon–Heiles at dt 0.5 and 0.05 with noise of 1e-3 to 1e-2 (benchmarks/bands.py).
 
     longest: steps of an arc. grown: noise ÷ spread at its end, if that of its first state goes on
@@ -40,7 +39,7 @@ class Options:
     block: int = 4_096
 
 
-OPTIONS, BIWEIGHT = Options(), Biweight()
+OPTIONS, BIWEIGHT = FlowArcOptions(), Biweight()
 _FORWARD = 1e-6  # of a constant: a forward difference, whose error is as large a part of it
 
 
@@ -51,11 +50,11 @@ class FlowOnArcs:
 
     family: Any
     dt: float
-    how: FlowSteps
+    how: Steps
     moves: np.ndarray
     allowance: Allowance = UNBOUNDED
 
-    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
+    def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
         arcs, length, width = x.shape
         ends = x[:, :-1].copy()
         by_state = np.empty((arcs, length - 1, width, width))
@@ -68,7 +67,7 @@ class FlowOnArcs:
             found = images(self.family, p, x[some], self.dt, self.how, derivatives=True)
             ends[some], by_state[some] = found.states, found.by_state
             by_p[some] = found.by_coefficient
-        return Steps(ends - x[:, 1:], by_state, by_p)
+        return Defects(ends - x[:, 1:], by_state, by_p)
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         return observed_whole(x, len(p))
@@ -154,7 +153,7 @@ def _defects(model: FlowOnArcs, c, arcs: Arcs) -> np.ndarray:
     return off
 
 
-def longest_arc(family, c, z, dt: float, how: FlowSteps, noise) -> int:
+def longest_arc(family, c, z, dt: float, how: Steps, noise) -> int:
     """Steps of an arc: as many as it takes noise (÷ spread) to grow to ``grown`` from nearly all of
     the states z (n, 2d), and no more than ``longest``."""
     width = z.shape[1]
@@ -178,10 +177,10 @@ class FlowWithConstants(FlowOnArcs):
 
     terms: int = 0
 
-    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
+    def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
         c, constants = p[: self.terms], p[self.terms :]
         try:
-            found = self._at(constants).steps(c, x)
+            found = self._at(constants).defects(c, x)
             by_constant = []
             for k, theta in enumerate(constants):
                 moved, slope = constants.copy(), np.zeros(found.closing.shape)
@@ -192,9 +191,9 @@ class FlowWithConstants(FlowOnArcs):
         except InputError:
             arcs, length, width = x.shape
             lost = np.full((arcs, length - 1, width, max(width, len(p))), np.nan)
-            return Steps(lost[..., 0], lost[..., :width], lost[..., : len(p)])
+            return Defects(lost[..., 0], lost[..., :width], lost[..., : len(p)])
         slopes = np.stack([*np.moveaxis(found.by_coefficients, -1, 0), *by_constant], axis=-1)
-        return Steps(found.closing, found.by_state, slopes)
+        return Defects(found.closing, found.by_state, slopes)
 
     def images(self, p: np.ndarray, z: np.ndarray, direction: int = 1) -> np.ndarray:
         return self._at(p[self.terms :]).images(p[: self.terms], z, direction)

@@ -33,7 +33,7 @@ from gfnn_jax.models.hamiltonians.friction_kinds import (
 )
 from gfnn_jax.models.hamiltonians.legendre import lagrangian_of
 from gfnn_jax.models.hamiltonians.libraries import libraries_of, modes_of
-from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
+from gfnn_jax.models.hamiltonians.options import OPTIONS, LawOptions
 from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
 from gfnn_jax.models.hamiltonians.work import LawWork
 
@@ -43,7 +43,7 @@ _ALIKE = 0.7  # of what uniform friction leaves over: what rates of their own mu
 _LOOKED_AT = 600  # pairs that tell whether friction explains anything
 _BOXES = ((1, 1), (1, 2), (2, 2))  # (order, degree) of the modes of angles that are tried
 
-Searched = tuple[FittedLaw, Options]
+Searched = tuple[FittedLaw, LawOptions]
 Forces = Callable[[Any], Any]  # what makes a family with friction of one of H
 Search = Callable[[Forces, Dataset], Searched]  # of laws with these forces, by these pairs
 
@@ -159,7 +159,9 @@ def mechanical(
     return beside_friction(problem, work, (alone, OPTIONS), data, tolerance, search)[0]
 
 
-def libraries_with(forces: Forces, data: Dataset, scene, terms, options: Options) -> Iterator[Any]:
+def libraries_with(
+    forces: Forces, data: Dataset, scene, terms, options: LawOptions
+) -> Iterator[Any]:
     """The families of H by rising size, each with these forces; of angles their shortest modes."""
     basis = modes_of(data, scene, terms)
     if basis is None:

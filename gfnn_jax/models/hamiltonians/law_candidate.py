@@ -39,7 +39,7 @@ from gfnn_jax.models.hamiltonians.friction_kinds import (
 )
 from gfnn_jax.models.hamiltonians.law_messages import messages, unmet
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
-from gfnn_jax.models.hamiltonians.options import Options
+from gfnn_jax.models.hamiltonians.options import LawOptions
 from gfnn_jax.models.hamiltonians.steps_of_law import bound_of, cheapest, error_of_steps, resolving
 from gfnn_jax.models.hamiltonians.symmetries import symmetries_of
 
@@ -48,7 +48,7 @@ _NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
 
 def learned_from(
     found: FittedLaw, problem, data: Dataset, tolerance: Tolerance, seconds: float,
-    options: Options, of_arcs: Callable[[], np.ndarray] | None,
+    options: LawOptions, of_arcs: Callable[[], np.ndarray] | None,
 ) -> LearnedHamiltonian:  # fmt: skip
     """Make the candidate of a fitted law, with the cheapest steps that are fine enough.
 

@@ -15,7 +15,7 @@ from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.families.terms import Terms, given_terms, joined, multiplied, polynomial_terms
 from gfnn_jax.generating.charts import MIDPOINT
-from gfnn_jax.models.hamiltonians.options import Options
+from gfnn_jax.models.hamiltonians.options import LawOptions
 
 _TELLING = 60  # pairs, from which on the midpoints of a sample tell libraries apart
 _WORSE = 3.0  # times what another library leaves of their gradients: too far from them
@@ -63,7 +63,7 @@ def check_finite(given: Terms, data: Dataset, rows) -> None:
             )
 
 
-def libraries_of(data: Dataset, scene, terms, options: Options) -> Iterator[Terms | Sums]:
+def libraries_of(data: Dataset, scene, terms, options: LawOptions) -> Iterator[Terms | Sums]:
     """Families by rising size, of as many terms as the training rows tell apart."""
     dim, coordinates = data.dim, data.coordinates
     if data.structure is not None:

@@ -36,7 +36,7 @@ from gfnn_jax.models.hamiltonians.libraries import (
     promising,
 )
 from gfnn_jax.models.hamiltonians.library_fit import fitted_library
-from gfnn_jax.models.hamiltonians.options import Options
+from gfnn_jax.models.hamiltonians.options import LawOptions
 from gfnn_jax.models.hamiltonians.steps_of_law import bound_of, validation_error
 from gfnn_jax.models.hamiltonians.work import LawWork
 from gfnn_jax.models.hamiltonians.worth import too_dear
@@ -54,8 +54,8 @@ _FIRST_ROUND = 5e8  # operations that the first round of growth is expected to t
 
 def of_libraries(
     problem, work: LawWork, basis: Modes | None, data: Dataset, tolerance: Tolerance, scene, terms,
-    options: Options, on_progress, early: Sequence[FittedLaw],
-) -> tuple[FittedLaw, Options]:  # fmt: skip
+    options: LawOptions, on_progress, early: Sequence[FittedLaw],
+) -> tuple[FittedLaw, LawOptions]:  # fmt: skip
     """The best library of terms of H, without friction or with it, and the options for fewer.
 
     early: the first libraries without friction, where these are fitted already.
@@ -63,7 +63,7 @@ def of_libraries(
 
     def search(
         forces: Forces | None = None, data: Dataset = data
-    ) -> tuple[FittedLaw, Options]:  # fmt: skip
+    ) -> tuple[FittedLaw, LawOptions]:  # fmt: skip
         known = early if forces is None else ()
         return _searched(
             problem, work, data, tolerance, scene, terms, options, on_progress, forces, known
@@ -81,7 +81,7 @@ def of_libraries(
 
 
 def small_polynomials(
-    problem, work: LawWork, data: Dataset, tolerance: Tolerance, options: Options, on_progress
+    problem, work: LawWork, data: Dataset, tolerance: Tolerance, options: LawOptions, on_progress
 ) -> list[FittedLaw]:
     """The smallest polynomials that a search for H begins with, up to the first that is exact.
 
@@ -119,11 +119,11 @@ def _searched(
     tolerance: Tolerance,
     scene,
     terms,
-    options: Options,
+    options: LawOptions,
     on_progress,
     forces: Forces | None = None,
     early: Sequence[FittedLaw] = (),
-) -> tuple[FittedLaw, Options]:
+) -> tuple[FittedLaw, LawOptions]:
     """The smallest library that meets the tolerance, else the best; and the options, which try no
     fewer terms where the tolerance is out of reach. forces: friction, that libraries have too.
     early: the first libraries, where these are fitted already."""
@@ -174,8 +174,8 @@ def _searched(
 
 
 def _as_noise_tells(
-    tried: Sequence[FittedLaw], best: FittedLaw, options: Options
-) -> tuple[FittedLaw, Options]:
+    tried: Sequence[FittedLaw], best: FittedLaw, options: LawOptions
+) -> tuple[FittedLaw, LawOptions]:
     """The first and simplest of the libraries that are as good as the best, and the options that
     drop what is noise, where there are several: they have met the pairs' noise, and the fewest
     terms leave no more of it. Else the best."""
@@ -187,7 +187,7 @@ def _as_noise_tells(
 
 
 def _libraries(
-    data: Dataset, tolerance: Tolerance, scene, terms, options: Options,
+    data: Dataset, tolerance: Tolerance, scene, terms, options: LawOptions,
     forces: Forces | None = None,
 ) -> tuple[list[Any], list[float]]:  # fmt: skip
     """Libraries by rising size, and the errors of those before them that are known to be hopeless
@@ -204,9 +204,9 @@ def _libraries(
 
 
 def _beside_centrifugal(
-    problem, work: LawWork, before: tuple[FittedLaw, Options], data: Dataset, tolerance: Tolerance,
-    options: Options, on_progress,
-) -> tuple[FittedLaw, Options]:  # fmt: skip
+    problem, work: LawWork, before: tuple[FittedLaw, LawOptions], data: Dataset,
+    tolerance: Tolerance, options: LawOptions, on_progress,
+) -> tuple[FittedLaw, LawOptions]:  # fmt: skip
     """The best of libraries with centrifugal terms and their options, where ``before`` misses the
     tolerance, the pairs ask for such terms and these libraries are better; else ``before``."""
     best, _ = before
@@ -233,9 +233,9 @@ def _walked(
     tolerance: Tolerance,
     scene,
     terms,
-    options: Options,
+    options: LawOptions,
     on_progress,
-) -> tuple[FittedLaw, Options]:
+) -> tuple[FittedLaw, LawOptions]:
     """The best of the libraries of states and parameters, which grow together; as `_searched`."""
     own = own_terms(data, terms) if terms else None
     angles, plain = angles_and_others(data)
@@ -282,7 +282,7 @@ def _grown(
     basis: Modes,
     data: Dataset,
     tolerance: Tolerance,
-    options: Options,
+    options: LawOptions,
     on_progress,
 ) -> FittedLaw:
     """The library that has grown to the tolerance, or as far as the cap and the pairs allow."""

@@ -27,6 +27,7 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
+from gfnn_jax.fitting.training import Limits
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.rates import rates, substeps_for
@@ -38,7 +39,7 @@ from gfnn_jax.scenes.scene import Scene
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class NetworkOptions:
     """Tuned on a pendulum of 600 pairs at dt 0.3.
 
     hidden, activation: of the network. pairs: that it is fitted to, at most. iterations: of the
@@ -57,7 +58,7 @@ class Options:
     reach: float = 1.0
 
 
-OPTIONS = Options()
+OPTIONS = NetworkOptions()
 _STATES = 500  # at which the flow's frequencies are measured
 _SHORT = 0.5  # radians of a step (ωh) up to which rounds are known to gain tenfold and more
 _RESOLVED = 0.1  # of the tolerance: what rounds may leave over of the gradient
@@ -66,7 +67,6 @@ _RESOLVED = 0.1  # of the tolerance: what rounds may leave over of the gradient
 def learn_network(
     data: Dataset, tolerance: Tolerance, scene: Scene | None, *, seed: int, max_iterations: int,
     budget: Budget, on_progress: Callable[[str], Any] = lambda message: None,
-    options: Options = OPTIONS,
 ) -> LearnedHamiltonian:  # fmt: skip
     """The network H whose flow is nearest to these pairs. It has no formula and no posterior.
 
@@ -79,7 +79,7 @@ def learn_network(
     if unfit is not None:
         raise FitError(f"expected pairs of one autonomous flow to learn a network H from: {unfit}")
     started = time.perf_counter()
-    count = len(data.training[: options.pairs])
+    count = len(data.training[: OPTIONS.pairs])
     rows = np.concatenate([data.training[:count], data.validation])
     y0, y1, dt, scale = data.y0[rows], data.y1[rows], data.dt, data.scale
     w, wanted = MIDPOINT.evaluation_point(y0, y1), MIDPOINT.target_gradient(y0, y1, dt)
@@ -88,26 +88,29 @@ def learn_network(
         w, angles=tuple(a for a in coordinates.angles if a < data.dim),
         cyclic=coordinates.cyclic,
     )  # fmt: skip
-    family = Mlp(inputs, options.hidden, options.activation, amplitude_of(w, wanted))
+    family = Mlp(inputs, OPTIONS.hidden, OPTIONS.activation, amplitude_of(w, wanted))
     params, label = family.init(jax.random.key(seed), np.float64), f"H, {family.label}"
     weight, target = residual_weight(MIDPOINT, scale, dt), wanted
     work = 2.0 * w[:count].size * family.num_parameters**2  # of an iteration
     best: _Round | None = None
     idle = done = 0
-    while idle < options.idle and done < max_iterations and not budget.over:
+    while idle < OPTIONS.idle and done < max_iterations and not budget.over:
         result = levenberg_marquardt(
             family, params, w[:count], target[:count], validation=(w[count:], target[count:]),
-            weight=weight, max_iterations=options.iterations[done > 0],
-            block=lambda n: budget.unit(f"{n} iterations of {label}", NETWORK, n * work),
-            target_rms=_RESOLVED * tolerance.bound,
+            weight=weight,
+            limits=Limits(
+                OPTIONS.iterations[done > 0],
+                block=lambda n: budget.unit(f"{n} iterations of {label}", NETWORK, n * work),
+                target_rms=_RESOLVED * tolerance.bound,
+            ),
         )  # fmt: skip
         params, done = jax.tree.map(np.asarray, result.params), done + max(result.iterations, 1)
-        substeps = substeps_for(family, params, y0[:_STATES], dt, options.reach)
-        flow = Flow(family, params, dt, scale, options.stages, substeps)
+        substeps = substeps_for(family, params, y0[:_STATES], dt, OPTIONS.reach)
+        flow = Flow(family, params, dt, scale, OPTIONS.stages, substeps)
         images = np.asarray(_images(flow, y0))
         error = measured_error(data, tolerance, to_user(coordinates, images[count:]))
         on_progress(f"{label}: {done} iterations, error {error.relative:.2e}")
-        better = best is None or error.relative < (1 - options.gained) * best.error.relative
+        better = best is None or error.relative < (1 - OPTIONS.gained) * best.error.relative
         idle = 0 if better else idle + 1
         if best is None or error.relative < best.error.relative:
             best = _Round(flow, images[count:], error, result.train_rms)

@@ -6,7 +6,7 @@ import dataclasses
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class LawOptions:
     """Tuned on Hénon–Heiles at dt 0.5 to 3, on three bodies and on the double pendulum.
 
     degrees: of the products of coordinates; feature_degrees: of a scene's features; given_degrees:
@@ -57,4 +57,4 @@ class Options:
     only_within: bool = True
 
 
-OPTIONS = Options()
+OPTIONS = LawOptions()

@@ -46,7 +46,7 @@ from gfnn_jax.models.hamiltonians.libraries import (
 )
 from gfnn_jax.models.hamiltonians.library_search import is_exact, of_libraries, small_polynomials
 from gfnn_jax.models.hamiltonians.noisy_textbook import law_of_sequences
-from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
+from gfnn_jax.models.hamiltonians.options import OPTIONS, LawOptions
 from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
 from gfnn_jax.models.hamiltonians.symmetries import imposed
 from gfnn_jax.models.hamiltonians.textbook import law_of_physics
@@ -61,7 +61,7 @@ def learn_hamiltonian(
     terms: Sequence[str | Callable] = (),
     budget: Budget | None = None,
     on_progress: Callable[[str], Any] = lambda message: None,
-    options: Options = OPTIONS,
+    options: LawOptions = OPTIONS,
     dearest: float = np.inf,
     partly: OnPartial = lambda law: None,
 ) -> LearnedHamiltonian:
@@ -138,8 +138,8 @@ def learn_hamiltonian(
 
 def _best_law(
     problem, work: LawWork, basis, data: Dataset, tolerance: Tolerance, scene, terms,
-    options: Options, on_progress, partly: OnPartial,
-) -> tuple[FittedLaw, Options]:  # fmt: skip
+    options: LawOptions, on_progress, partly: OnPartial,
+) -> tuple[FittedLaw, LawOptions]:  # fmt: skip
     """The law of the smallest polynomials, of physics, of a mechanical system or of the libraries,
     the first within the tolerance, else the best; and the options for fewer terms."""
     with_masses, best, early = None, None, list[FittedLaw]()
@@ -176,7 +176,7 @@ def _check_resolved(problem, best: FittedLaw, data: Dataset) -> None:
 
 def _simplified(
     problem, work: LawWork, best: FittedLaw, data: Dataset, whole: Dataset, far: np.ndarray,
-    tolerance: Tolerance, options: Options, on_progress,
+    tolerance: Tolerance, options: LawOptions, on_progress,
 ) -> tuple[FittedLaw, float | None]:  # fmt: skip
     """The law without the terms that are noise or not asked for, fitted to all training pairs, as
     far as the budget goes; and its error at the outermost states, of a fit without them.

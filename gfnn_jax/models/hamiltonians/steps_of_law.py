@@ -17,7 +17,7 @@ from gfnn_jax.fitting.gauss_newton import FlowFit
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.models.hamiltonians.cost_of_flow import operations_of
-from gfnn_jax.models.hamiltonians.options import OPTIONS, Options
+from gfnn_jax.models.hamiltonians.options import OPTIONS, LawOptions
 
 NEAR_ROUNDOFF = 3e-15  # of the spread
 
@@ -60,7 +60,7 @@ def resolving(family, coefficients, steps: Steps, data: Dataset, tolerance: Tole
 
 
 def cheapest(
-    problem, family, fit: FlowFit, fastest, data: Dataset, tolerance: Tolerance, options: Options
+    problem, family, fit: FlowFit, fastest, data: Dataset, tolerance: Tolerance, options: LawOptions
 ) -> Steps:
     """Steps whose own error is a tenth of the tolerance; near roundoff, or at it, where that is not
     twice as dear."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.observation import Observation
-from gfnn_jax.solve.arc_models import Observed, Steps
+from gfnn_jax.solve.arc_models import Defects, Observed
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class LawOnArcs:
         whole[self.free] = p
         return whole
 
-    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
+    def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
         arcs, length, m = x.shape
         whole, num = self.full(p), arcs * (length - 1)
         step = self.form.step(
@@ -45,7 +45,7 @@ class LawOnArcs:
         by = np.zeros((num, m, len(whole)))
         by[..., : step.by_coefficients.shape[-1]] = step.by_coefficients
         shape = (arcs, length - 1, m)
-        return Steps(
+        return Defects(
             step.states.reshape(shape) - x[:, 1:],
             step.by_state.reshape(*shape, m),
             by[..., self.free].reshape(*shape, len(self.free)),

@@ -33,7 +33,7 @@ from gfnn_jax.models.textbook.weak_gradients import WeakGradients
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class NoisyTextbookOptions:
     """Tuned on the laws of benchmarks/textbook.py with noise of 1e-3 of the spread.
 
     degrees: of products of coordinates, by degrees of freedom from 1. atoms: of a law, beside the
@@ -53,7 +53,7 @@ class Options:
     exchanged: int = 4
 
 
-OPTIONS = Options()
+OPTIONS = NoisyTextbookOptions()
 _LOOKED_AT = 30  # matches that are read as laws
 _FAR = 3.0  # deviations, beyond which a row has less weight
 
@@ -133,16 +133,16 @@ class NoisyTextbook:
 
     def __init__(
         self, weak: WeakGradients, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
-        options: Options = OPTIONS, on_progress: Callable[[str], Any] = lambda message: None,
+        on_progress: Callable[[str], Any] = lambda message: None,
     ):  # fmt: skip
-        self._weak, self._options, self._on_progress = weak, options, on_progress
+        self._weak, self._on_progress = weak, on_progress
         self._dim = dim = weak.states.shape[1] // 2
         self._arguments = arguments_of(weak.states, tuple(angles), tuple(cyclic))
         every = polynomial_terms(dim, 2, cyclic=(*angles, *cyclic))
         kept, _ = null_terms(every, weak.states)
         self._base = every.take(kept)
         self._weigh(weak.deviation)
-        degrees = options.degrees
+        degrees = OPTIONS.degrees
         self._degree = degrees[dim - 1] if dim <= len(degrees) else 3
 
     def formulas(self) -> list[Formula]:
@@ -154,9 +154,9 @@ class NoisyTextbook:
                 first = self._searched(products)[0]
                 self._weigh(self._deviations(first))
                 found = self._searched(products)
-                if found[0].left <= self._options.explained:
+                if found[0].left <= OPTIONS.explained:
                     break
-            return found[: self._options.finalists]
+            return found[: OPTIONS.finalists]
 
     def _searched(self, products: bool) -> list[Formula]:
         """The laws of each kind, by rising length."""
@@ -183,33 +183,32 @@ class NoisyTextbook:
         return found * np.maximum(1.0, np.where(np.isfinite(off), off, np.inf) / _FAR)
 
     def _matches(self, products: bool) -> list[Match]:
-        options = self._options
         dictionary = dictionary_of(
             self._arguments, self._weight, self._spanned, degree=self._degree, products=products,
             average=self._weak.average,
         )  # fmt: skip
         self._on_progress(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
-        said = options.said / (len(self._target) * np.log(2))
+        said = OPTIONS.said / (len(self._target) * np.log(2))
         matching = Matching(
             self._spanned, self._target, self._weight, self._arguments, said, self._weak.average
         )
-        found = matching.best(dictionary, options.atoms)
+        found = matching.best(dictionary, OPTIONS.atoms)
         if not products:
             most = len(self._target) / 4 - self._base.num_parameters
             blocks = [b for b in blocks_of(self._arguments, self._degree) if len(b) < most]
             found += [matching.refined(block) for block in blocks]
-        likeliest = sorted(found, key=self._length_of_match)[: options.exchanged]
+        likeliest = sorted(found, key=self._length_of_match)[: OPTIONS.exchanged]
         return found + [m for best in likeliest for m in matching.exchanged(best, dictionary)]
 
     def _length_of_match(self, match: Match) -> float:
-        said = self._options.said * weight_of(match.atoms)
+        said = OPTIONS.said * weight_of(match.atoms)
         return len(self._target) * np.log(match.left) + said
 
     def _length(self, formula: Formula) -> float:
         """Description length: natural logarithms."""
         told = np.log(len(self._target))
         numbers = len(formula.coefficients) + len(formula.constants)
-        said = self._options.said * formula.said + 0.5 * told * numbers
+        said = OPTIONS.said * formula.said + 0.5 * told * numbers
         return len(self._target) * np.log(formula.left) + said
 
     def _formula(self, match: Match) -> Formula:
@@ -238,7 +237,7 @@ class NoisyTextbook:
             deviation = left * np.linalg.norm(np.linalg.pinv(own), axis=1)
             told = np.abs(c) / deviation
             worst = int(np.argmin(told))
-            if told[worst] >= self._options.kept or len(kept) == 1:
+            if told[worst] >= OPTIONS.kept or len(kept) == 1:
                 return whole.take(kept.tolist(), c / size)._replace(left=float(left))
             kept = np.delete(kept, worst)
 

@@ -46,7 +46,7 @@ _AS_WELL = 1e3  # times what a match leaves over: below it a simpler one is look
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class TextbookOptions:
     """Tuned on the laws of benchmarks/textbook.py.
 
     rows: pairs that are looked at; quiet: the part of them that move least, which is used: their
@@ -81,7 +81,7 @@ class Options:
     certain: float = 10.0
 
 
-OPTIONS = Options()
+OPTIONS = TextbookOptions()
 
 
 class Law(NamedTuple):
@@ -105,27 +105,22 @@ class Textbook:
 
     angles, cyclic: indices of z. symmetries: of the pairs; only what has them by itself is tried.
     null: the coordinates and products of two that the states do not tell from those before.
-    Raises ValueError for more degrees of freedom than ``options.most_dim``.
+    Raises ValueError for more degrees of freedom than ``OPTIONS.most_dim``.
     """
 
     def __init__(
         self, problem: Problem, rows: np.ndarray, *, angles: Sequence[int] = (),
-        cyclic: Sequence[int] = (), options: Options = OPTIONS,
+        cyclic: Sequence[int] = (),
         on_progress: Callable[[str], Any] = lambda message: None,
         symmetries: Sequence[SymmetryOfPairs] = (),
     ):  # fmt: skip
         dim = problem.z0.shape[1] // 2
-        if dim > options.most_dim:
-            raise ValueError(f"expected at most {options.most_dim} degrees of freedom, got {dim}")
-        self._problem, self._options, self._on_progress, self._dim = (
-            problem,
-            options,
-            on_progress,
-            dim,
-        )
-        rows = np.asarray(rows[: options.rows])
+        if dim > OPTIONS.most_dim:
+            raise ValueError(f"expected at most {OPTIONS.most_dim} degrees of freedom, got {dim}")
+        self._problem, self._on_progress, self._dim = problem, on_progress, dim
+        rows = np.asarray(rows[: OPTIONS.rows])
         moved = np.linalg.norm((problem.z1 - problem.z0)[rows] / problem.scale, axis=1)
-        self._rows = np.sort(rows[np.argsort(moved)[: int(np.ceil(options.quiet * len(rows)))]])
+        self._rows = np.sort(rows[np.argsort(moved)[: int(np.ceil(OPTIONS.quiet * len(rows)))]])
         z0, z1 = problem.z0[self._rows], problem.z1[self._rows]
         dt = of_lanes(problem.dt, self._rows)
         self._h = dt[:, None] if np.ndim(dt) else dt
@@ -177,7 +172,7 @@ class Textbook:
 
     @property
     def _degree(self) -> int:
-        degrees = self._options.degrees
+        degrees = OPTIONS.degrees
         return degrees[self._dim - 1] if self._dim <= len(degrees) else 3
 
     def _dictionary(self, products: bool = False, centres: bool = False) -> Dictionary:
@@ -203,15 +198,14 @@ class Textbook:
     ) -> _State | None:  # fmt: skip
         """The simplest law of these atoms that is exact. blocks: of atoms that laws have together,
         tried as a whole; starts: others, beside which the search looks for more."""
-        options = self._options
         if self._closest is not None and self._explains_nothing(self._closest, dictionary):
             return None  # what is left over is noise
         self._on_progress(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
         rows = self._middle.size
-        most = rows / options.rows_per_term - self._base.num_parameters
+        most = rows / OPTIONS.rows_per_term - self._base.num_parameters
         blocks = [b for b in blocks if len(b) < most]
         target, last = self._target, np.inf
-        for _ in range(options.rounds):
+        for _ in range(OPTIONS.rounds):
             matching = self._matching(target)
             tried = self._finalists(matching, dictionary, starts)
             whole = sorted((matching.refined(b) for b in blocks), key=lambda m: m.left)
@@ -224,47 +218,46 @@ class Textbook:
                 return None
             self._partial += states
             best = min(states, key=lambda s: s.law.left)
-            if not best.law.left < options.contracted * last:
+            if not best.law.left < OPTIONS.contracted * last:
                 break
             target, last, self._closest = best.target, best.law.left, best
         return None
 
     def _is_exact(self, state: _State) -> bool:
         """Return whether the law is as exact as no approximation of so many numbers would be."""
-        options, width = self._options, 2 * self._dim
+        width = 2 * self._dim
         others = [
             a for a in state.match.atoms if powers_of(a, self._arguments, width) is None
         ]  # fmt: skip
         if not others:
-            return state.law.left <= options.roundoff
+            return state.law.left <= OPTIONS.roundoff
         numbers = len(state.match.atoms) + sum(len(constants_of(a)) for a in others)
-        digits = options.digits + options.digits_a_number * numbers
+        digits = OPTIONS.digits + OPTIONS.digits_a_number * numbers
         return state.law.left <= 10.0**-digits
 
     def _explains_nothing(self, state: _State, dictionary: Dictionary) -> bool:
         """Return whether no atom explains more of what is left over than it would of noise."""
         gain = self._matching(state.target).gains(state.match, dictionary).max(initial=0.0)
-        chance = 2 * np.log(len(dictionary.atoms)) + self._options.certain
+        chance = 2 * np.log(len(dictionary.atoms)) + OPTIONS.certain
         return bool(-self._middle.size * np.log1p(-min(gain, 1 - 1e-12)) < chance)
 
     def _finalists(
         self, matching: Matching, dictionary: Dictionary, starts: list[tuple[Atom, ...]]
     ) -> list[Match]:
         """The best matches, and plainer ones that leave hardly more."""
-        options = self._options
-        tried = matching.best(dictionary, options.atoms, starts)[: options.finalists]
-        plainer = [matching.plainer(m, dictionary) for m in tried[: options.plainer]]
+        tried = matching.best(dictionary, OPTIONS.atoms, starts)[: OPTIONS.finalists]
+        plainer = [matching.plainer(m, dictionary) for m in tried[: OPTIONS.plainer]]
         return list({m.atoms: m for m in [*plainer, *tried]}.values())
 
     def _converged(self, match: Match, target: np.ndarray) -> _State | None:
         """The match with coefficients and constants as far as corrections lead; None where its
         flow fails."""
-        best, options = None, self._options
-        for _ in range(options.corrections):
+        best = None
+        for _ in range(OPTIONS.corrections):
             law, corrected = self._corrected(match, target)
             if law is None:
                 return best
-            if best is not None and not law.left < options.contracted * best.law.left:
+            if best is not None and not law.left < OPTIONS.contracted * best.law.left:
                 return best if best.law.left <= law.left else _State(match, law, corrected)
             best, target = _State(match, law, corrected), corrected
             match = self._matching(target).refined(match.atoms)
@@ -288,7 +281,7 @@ class Textbook:
         images = self._problem.images(family, c, self._rows, _STEPS).states
         off = (images - self._z1) / self._problem.scale
         known = np.isfinite(off).all(axis=1)
-        if np.mean(~known) > self._options.lost:
+        if np.mean(~known) > OPTIONS.lost:
             return None, target
         corrected = family.gradient(c, self._middle) - apply_j(self._z1 - images) / self._h
         corrected = np.where(known[:, None], corrected, target)
@@ -317,12 +310,12 @@ class Textbook:
         of them, constants of fewer digits."""
         dictionary = self._dictionary()
         matching = self._matching(state.target)
-        bound = 3 * max(state.law.left, self._options.roundoff)
-        options = [
+        bound = 3 * max(state.law.left, OPTIONS.roundoff)
+        simpler = [
             m for m in matching.best(dictionary, min(3, len(state.match.atoms)))
             if m.left <= _AS_WELL * max(state.match.left, _MATCHED)
         ]  # fmt: skip
-        for match in sorted(options, key=lambda m: weight_of(m.atoms)):
+        for match in sorted(simpler, key=lambda m: weight_of(m.atoms)):
             if weight_of(match.atoms) >= weight_of(state.match.atoms):
                 break
             found = self._converged(match, state.target)
