@@ -19,9 +19,9 @@ from gfnn_jax.data.channels import channels_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import UNIFORM, Friction, Lagrangian
-from gfnn_jax.flows.motion import WEIGHTS, Form
+from gfnn_jax.flows import coulomb
+from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import at_stages
-from gfnn_jax.maps import stops
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.signals.local_cubics import smooth
@@ -66,8 +66,9 @@ class Law(NamedTuple):
 
 def law_in_use(law: Lagrangian, root: np.ndarray | None, sensors: Sensors) -> Law:
     """Prepare a Lagrangian and the root (m, n) of the covariance of (θ, ρ, G), and of γ where there
-    is uniform friction."""
-    count, rows, losses = law.terms.count, law.friction.rows(), law.losses
+    is uniform friction. Dry friction that creeps by less than the sensors see slides or sticks."""
+    count, losses = law.terms.count, law.losses
+    rows = [(c, kind, ε if ε > sensors.creep else 0.0) for c, kind, ε in law.friction.rows()]
     order = np.arange(count + law.friction.count + law.gains.size)
     if law.uniform != 0:  # γ, the last of all, stands behind ρ in a form
         rows, losses = [*rows, ((0,) * law.dim, UNIFORM, 0.0)], np.append(losses, law.uniform)
@@ -213,7 +214,7 @@ class _Windows:
         num = arcs * (length - 1)
         u = self.u.reshape(num, *self.u.shape[2:])
         start = x[:, :-1].reshape(num, m)
-        step = self.law.form.step(self.law.p, start, self.h.reshape(num), u, sensitive=False)
+        step, _ = coulomb.step(self.law.form, self.law.p, start, self.h.reshape(num), u, False)
         shape = (arcs, length - 1, m)
         closing = step.states.reshape(shape) - x[:, 1:]
         return Steps(closing, step.by_state.reshape(*shape, m), np.zeros((*shape, 0)))
@@ -344,26 +345,22 @@ def propagate_each(
     law, (form, p, roots) = laws[0], _side_by_side(laws, which)
     d, sensors, count = form.dim, law.sensors, form.count
     ends, (x, zeros) = np.concatenate([last[:, None], times], axis=1), np.split(x, [2 * d], axis=1)
-    begun, steps = x, np.diff(ends, axis=1)
+    steps = np.diff(ends, axis=1)
     root, size = covariance_root(covariance).swapaxes(1, 2), covariance.shape[-1]
     root = np.concatenate([root, np.zeros((len(x), size, roots.shape[1]))], axis=2)
     spread, of_zeros = root[:, : 2 * d], root[:, 2 * d :]
-    states, spreads, now = [], [], last
+    states, spreads, now, modes = [], [], last, None
     for k in range(times.shape[1]):
         parts = substeps_of(sensors, np.max(steps[:, k], initial=0.0))
         both = np.stack([now, times[:, k]], axis=1)
         u = _inputs(law, windows, both, parts)
-        step = form.step(p, x, steps[:, k], u[:, 0])
+        step, modes = coulomb.step(form, p, x, steps[:, k], u[:, 0], modes=modes)
         x, now = step.states, times[:, k]
         spread = step.by_state @ spread
         spread[..., size:] += step.by_coefficients[..., :count] @ roots.swapaxes(1, 2)
         states.append(x)
         spreads.append(spread)
     orbit, spread = np.stack(states, axis=1), np.stack(spreads, axis=1)
-    for number, own in enumerate(laws):
-        lanes = np.flatnonzero(which == number)
-        some = np.concatenate([begun[lanes, None], orbit[lanes]], axis=1)
-        orbit[lanes] = _with_stops(own, [windows[i] for i in lanes.tolist()], some, ends[lanes])
     scales = np.stack([law.sensors.observation_model.values for law in laws])[which, None]
     channels, ahead = sensors.observation_model(orbit, scales), times - last[:, None]
     values, shown, further = channels.values, channels.by_state @ spread, 0.0
@@ -385,27 +382,6 @@ def _side_by_side(laws: Sequence[Law], which: np.ndarray) -> tuple[Form, np.ndar
     most = max(len(law.root) for law in laws)
     roots = np.stack([np.pad(law.root, ((0, most - len(law.root)), (0, 0))) for law in laws])
     return form, np.stack([law.p for law in laws])[which], roots[which]
-
-
-def _with_stops(
-    law: Law, windows: Sequence[Window], orbit: np.ndarray, ends: np.ndarray
-) -> np.ndarray:
-    """Orbits (B, n, 2d) from the first states (B, n + 1, 2d) on, those that dry friction brings to
-    rest followed anew (`maps.stops`)."""
-    lagrangian, sensors = law.form.lagrangian(law.p), law.sensors
-    lanes = np.flatnonzero(stops.resting(lagrangian, orbit, ends, sensors.omega))
-    if not len(lanes):
-        return orbit[:, 1:]
-    some, orbit = [windows[i] for i in lanes.tolist()], orbit.copy()
-    parts = substeps_of(sensors, np.max(np.diff(ends, axis=1), initial=0.0))
-
-    def inputs(k: int) -> np.ndarray:
-        return _inputs(law, some, ends[lanes, k : k + 2], parts)[:, 0].swapaxes(2, 3) @ WEIGHTS
-
-    found = stops.stopped(lagrangian, orbit[lanes, 0], ends[lanes], inputs)
-    solved = np.isfinite(found).all(axis=(1, 2))
-    orbit[lanes[solved], 1:] = found[solved]
-    return orbit[:, 1:]
 
 
 def substeps_of(sensors: Sensors, h: float) -> int:

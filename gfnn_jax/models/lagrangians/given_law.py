@@ -56,7 +56,7 @@ def fit_given(
         nodes = with_states(nodes, fit.arcs, fit.fitted.x)
         on_progress(f"{periods:g} periods: {describe(fit)}")
     if given.friction is None:
-        tried = frictions_tried(d, scales, options)
+        tried = frictions_tried(d, options)
         fit, choice = choose_friction(bench, nodes, fit, tried, on_progress, options)
     else:
         choice = FrictionChoice(given.friction, {}, {}, gains=False)
