@@ -117,9 +117,9 @@ def recording(twin: Twin, noise: float, draw: int) -> gfnn.Recording:
 
 
 def plain(term: str) -> str:
-    """The term without zeros of angles, dry friction without its width."""
+    """The term without zeros of angles; dry friction in a word."""
     term = re.sub(r" [-+] \d\.?[\d.e-]*\)", ")", term)
-    return "dry" if "sqrt" in term else term
+    return "dry" if re.fullmatch(r"abs\([^()]*\)", term) else term
 
 
 def case(twin: Twin, noise: float, draw: int) -> Numbers:

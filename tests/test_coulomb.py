@@ -4,8 +4,9 @@ and against exact solutions."""
 import numpy as np
 import scipy.integrate
 
-from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Lagrangian, Terms
-from gfnn_jax.flows.coulomb import Coulomb
+from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Terms
+from gfnn_jax.flows import coulomb
+from gfnn_jax.flows.motion import NODES, Form
 
 # Two unit masses between three springs.
 TERMS = [
@@ -15,19 +16,21 @@ TERMS = [
 SPRINGS = np.array([0.5, 0.5, -1.0, -1.0, 1.0])
 
 
-def blocks(friction, losses, gains=((), ())):
-    return Lagrangian(
-        Terms.of(TERMS, 2), SPRINGS, Friction.of(friction, 2), np.array(losses), 0.0,
-        np.array(gains, float),
-    )  # fmt: skip
+def blocks(friction, losses, gain=0.0, terms=TERMS, springs=SPRINGS):
+    """The form of a law, its first coordinate pushed by an input, and its coefficients."""
+    dim, count = len(terms[0][0]), len(terms)
+    friction = Friction.of(friction, dim)
+    form = Form(Terms.of(terms, dim), np.zeros(count), np.eye(count), friction, 1)
+    return form, np.concatenate([springs, losses, [gain], np.zeros(dim - 1)])
 
 
-def followed(law, x, h, u):
-    """States (n, 4) of one lane after steps h with inputs u (n, inputs), and its modes."""
-    motion, x, found, passed = Coulomb.of(law), np.array([x]), [], []
-    modes = motion.begin(x, u[:1])
+def followed(form, p, x, h, u):
+    """States (n, 2d) of one lane after steps h with inputs u (n,), and its modes."""
+    x, modes, found, passed = np.array([x]), None, [], []
     for now in u:
-        x, modes = motion.advance(x, modes, np.array([h]), now[None])
+        inputs = np.full((1, 1, 6, 1), now)
+        step, modes = coulomb.step(form, p, x, np.array([h]), inputs, modes=modes)
+        x = step.states
         found.append(x[0])
         passed.append(modes[0])
     return np.array(found), np.array(passed)
@@ -35,11 +38,13 @@ def followed(law, x, h, u):
 
 def test_bodies_that_stick_together_and_to_the_ground():
     """Friction of one mass on the ground and of both on each other, with linear friction beside."""
-    width, h, count = 3e-5, 0.1, 70
-    rows = [((1, 0), DRY, width), ((-1, 1), DRY, width), ((0, 1), LINEAR, 0.0)]
-    law = blocks(rows, [0.3, 0.15, 0.2])
+    h, count, losses = 0.1, 70, [0.3, 0.15, 0.2]
+    directions = [((1, 0), DRY), ((-1, 1), DRY), ((0, 1), LINEAR)]
     start = [0.5, 0.2, 0.1, 0.9]
-    found, modes = followed(law, start, h, np.zeros((count, 0)))
+    form, p = blocks([(*row, 0.0) for row in directions], losses)
+    found, modes = followed(form, p, start, h, np.zeros(count))
+    wide, p = blocks([(*row, 3e-5) for row in directions], losses)
+    law = wide.lagrangian(p)
     expected = scipy.integrate.solve_ivp(
         lambda _, x: np.concatenate([x[2:], law.acceleration(x[:2], x[2:])]), (0, h * count),
         start, "Radau", h * np.arange(1, count + 1), rtol=1e-6, atol=1e-8,
@@ -52,12 +57,10 @@ def test_bodies_that_stick_together_and_to_the_ground():
 
 def test_an_input_moves_a_body_once_it_is_strong_enough():
     """A mass that sticks on a slope: ẍ₁ = u − ρ sign(ẋ₁), its spring cut."""
-    law = Lagrangian(
-        Terms.of([((2,), (0,), (0,), 0.0)], 1), np.array([0.5]),
-        Friction.of([((1,), DRY, 0.1)], 1), np.array([0.5]), 0.0, np.ones((1, 1)),
-    )  # fmt: skip
-    u = np.array([0.4, -0.5, 0.9, 0.9, 0.0, -0.2, 0.0, -0.7])[:, None]
-    found, modes = followed(law, [0.0, 0.0], 1.0, u)
+    mass = [((2,), (0,), (0,), 0.0)]
+    form, p = blocks([((1,), DRY, 0.0)], [0.5], 1.0, mass, [0.5])
+    u = np.array([0.4, -0.5, 0.9, 0.9, 0.0, -0.2, 0.0, -0.7])
+    found, modes = followed(form, p, [0.0, 0.0], 1.0, u)
     # Held until u = 0.9; 0.5 slows it down for 0.6 of a unit of time, 0.7 for 3/7 of one.
     v = [0.0, 0.0, 0.4, 0.8, 0.3, 0.0, 0.0, -0.2]
     q = [0.0, 0.0, 0.2, 0.8, 1.35, 1.35 + 0.09 / 1.4, 1.35 + 0.09 / 1.4, 1.25 + 0.09 / 1.4]
@@ -67,18 +70,42 @@ def test_an_input_moves_a_body_once_it_is_strong_enough():
 
 def test_more_directions_than_coordinates():
     """At rest within what three frictions of two coordinates hold together."""
-    rows = [((1, 0), DRY, 0.1), ((0, 1), DRY, 0.1), ((-1, 1), DRY, 0.1)]
-    law = blocks(rows, [0.1, 0.1, 0.1])
-    found, modes = followed(law, [0.05, 0.03, 0, 0], 0.5, np.zeros((9, 0)))
+    rows = [((1, 0), DRY, 0.0), ((0, 1), DRY, 0.0), ((-1, 1), DRY, 0.0)]
+    found, modes = followed(*blocks(rows, [0.1, 0.1, 0.1]), [0.05, 0.03, 0, 0], 0.5, np.zeros(9))
     np.testing.assert_allclose(found, np.tile([0.05, 0.03, 0, 0], (9, 1)), atol=1e-15)
     assert not modes.any()
 
 
 def test_steps_do_not_matter():
     """A turn is found to the order of the steps, wherever in one it falls."""
-    law = blocks([((1, 0), DRY, 0.1), ((0, 1), DRY, 0.1)], [0.05, 0.03])
+    law = blocks([((1, 0), DRY, 0.0), ((0, 1), DRY, 0.0)], [0.05, 0.03])
     start = [0.6, 0.2, 0.0, 0.3]
     (coarse, _), (fine, _) = (
-        followed(law, start, 7.0 / count, np.zeros((count, 0))) for count in (70, 210)
+        followed(*law, start, 7.0 / count, np.zeros(count)) for count in (70, 210)
     )
-    np.testing.assert_allclose(coarse[-1], fine[-1], atol=2e-6)
+    np.testing.assert_allclose(coarse[-1], fine[-1], atol=1e-7)
+
+
+def test_derivatives_across_turns_and_stops():
+    """Against finite differences: in the state, and in coefficients of all kinds, with an input
+    that changes within the step."""
+    rows = [((1, 0), DRY, 0.0), ((-1, 1), DRY, 0.0), ((0, 1), LINEAR, 0.0)]
+    form, p = blocks(rows, [0.3, 0.15, 0.2], 1.0)
+    x, h = 0.6 * np.random.default_rng(0).normal(size=(400, 4)), np.full(400, 0.25)
+    times = (np.arange(2)[:, None] + NODES) / 2
+    u = np.broadcast_to(0.3 * np.sin(2 * times)[..., None], (400, 2, 6, 1))
+    step, modes = coulomb.step(form, p, x, h, u)
+    speeds = np.stack([x[:, 2], x[:, 3] - x[:, 2]], axis=1)
+    assert np.mean(np.any(modes != np.sign(speeds), axis=1)) > 0.3
+    assert np.any(modes == 0)
+    e = 1e-6
+
+    def slope(vary, count):
+        both = [[coulomb.step(form, *vary(s * e * row), h, u)[0].states for s in (1, -1)]
+                for row in np.eye(count)]  # fmt: skip
+        return np.stack([(up - down) / (2 * e) for up, down in both], axis=-1)
+
+    by_state = slope(lambda change: (p, x + change), 4)
+    by_coefficients = slope(lambda change: (p + change, x), len(p))
+    np.testing.assert_allclose(step.by_state, by_state, atol=3e-5)
+    np.testing.assert_allclose(step.by_coefficients, by_coefficients, atol=3e-5)

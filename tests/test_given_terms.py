@@ -14,7 +14,7 @@ V1 = ((2, 0), (0, 0), (0, 0), 0.0)
 
 
 def read(*texts):
-    return given_terms(texts, POSITIONS, SPEEDS, 0.1)
+    return given_terms(texts, POSITIONS, SPEEDS)
 
 
 def test_terms_are_read_as_they_are_written():
@@ -29,7 +29,7 @@ def test_terms_are_read_as_they_are_written():
         ((0, 0), (2, 1), (0, 2), -np.pi / 2),
     )  # fmt: skip
     assert found.friction == (
-        ((1, 0), LINEAR, 0.0), ((-1, 1), QUADRATIC, 0.0), ((0, 1), DRY, 0.2), ((1, 0), DRY, 0.1)
+        ((1, 0), LINEAR, 0.0), ((-1, 1), QUADRATIC, 0.0), ((0, 1), DRY, 0.2), ((1, 0), DRY, 0.0)
     )  # fmt: skip
 
 

@@ -8,10 +8,11 @@ import scipy.integrate
 
 import gfnn_jax as gfnn
 from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Lagrangian, Terms
-from gfnn_jax.maps import stops
 from gfnn_jax.maps.energy import ledger
+from gfnn_jax.maps.estimates import Window, law_in_use, propagate
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.laws import law_of_map, map_of_law, states_of, sticking, velocities_of
+from gfnn_jax.maps.sensors import Sensors
 
 # A pendulum whose pivot is driven by a motor.
 TERMS = Terms.of([((2,), (0,), (0,), 0.0), ((0,), (0,), (1,), 0.0)], 1)
@@ -193,30 +194,32 @@ def block(turn, friction, time):
     return expected, turn
 
 
-def test_a_stop_is_located():
-    """Orbits that dry friction brings to rest are seen, and followed to where they stop."""
-    time, sizes = 0.1 * np.arange(201), (0.42, -0.33, 9.0)
-    orbits = [
-        scipy.integrate.solve_ivp(
-            lambda _, x: [x[1], -x[0] - 0.05 * x[1] / np.hypot(x[1], 0.05)], (0, 20), [a, 0.0],
-            t_eval=time, rtol=1e-8, atol=1e-10,
-        ).y.T
-        for a in sizes
-    ]  # fmt: skip
+def test_a_forecast_and_its_band_across_a_stop():
+    """A block that comes to rest, of a start and a friction known to a part in some hundreds: where
+    it stops, and how sure that is, are those of the exact motion."""
+    time, turn, friction, errors = 0.1 * np.arange(201), 0.42, 0.05, np.array([2e-3, 3e-4])
     law = Lagrangian(
-        SPRING, np.array([0.5, -0.5]), Friction.of([((1,), DRY, 0.05)], 1), np.array([0.05]), 0.0,
-        np.zeros((1, 0)),
+        SPRING, np.array([0.5, -0.5]), Friction.of([((1,), DRY, 1e-6)], 1), np.array([friction]),
+        0.0, np.zeros((1, 0)),
     )  # fmt: skip
-    orbit, ends = np.stack(orbits), np.tile(time, (3, 1))
-    rests = stops.resting(law, orbit, ends, 1.0)
-    np.testing.assert_array_equal(rests, [True, True, False])
+    sigma, ends = np.array([1e-5]), np.array([20.0])
+    sensors = Sensors(("x",), (), (), sigma, 1.0, 1.0, "hold", 0.0, ends, np.zeros((1, 1)),
+                      creep=1e-6)  # fmt: skip
+    root, covariance = np.diag([0.0, 0.0, errors[1]]), np.diag([errors[0] ** 2, 0.0])
+    used = law_in_use(law, root, sensors)
+    window = Window(time[:1], np.full((1, 1), turn), np.zeros(0), np.zeros((0, 0)))
+    start = np.array([[turn, 0.0]]), covariance[None], time[:1]
+    found = propagate(used, [window], *start, time[None, 1:])
 
-    found = stops.stopped(law, orbit[:2, 0], ends[:2], np.zeros((2, len(ends[0]) - 1, 0)))
-    for k in range(2):
-        expected, stop = block(sizes[k], 0.05, time)
-        assert abs(stop) < 0.05  # it has stopped, and not where the spring is slack
-        np.testing.assert_allclose(found[k, :, 0], expected[1:], atol=1e-7)
-        assert abs(orbit[k, -1, 0] - stop) > 1e-2  # where the smooth law has it creep to
+    expected, stop = block(turn, friction, time)
+    assert abs(stop) < friction  # it has stopped, and not where the spring is slack
+    np.testing.assert_allclose(found.values[0, :, 0], expected[1:], atol=1e-8)
+    e = 1e-5
+    slopes = [block(turn + e * a, friction + e * b, time)[0] - block(turn - e * a, friction - e * b,
+              time)[0] for a, b in np.eye(2)]  # fmt: skip
+    spread = np.linalg.norm(np.stack(slopes) / (2 * e) * errors[:, None], axis=0)
+    np.testing.assert_allclose(found.std[0, :, 0], np.hypot(spread[1:], sigma), rtol=1e-3)
+    assert found.covariances[0, -1, 1, 1] < 1e-20  # it stands still
 
 
 @pytest.mark.slow

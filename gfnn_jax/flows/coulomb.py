@@ -1,14 +1,21 @@
-"""Motion with Coulomb's dry friction: bodies slide, or stick.
+"""Motion with Coulomb's dry friction: bodies slide, or stick. States, and their derivatives.
 
-Dry friction of a law is smoothed over speeds ε, |s| as √(s² + ε²) − ε, so that a body that it holds
-creeps. Here ε = 0. With s = c·v for each direction c of dry friction,
+Dry friction of a law may have a width ε of speeds, |s| as √(s² + ε²); a body that it holds creeps
+then. Where it has none,
 
     M a = f(q, v) − Σ c λ,      λ = ρ sign(s) where s slides,      |λ| ≤ ρ, c·a = 0 where it sticks
 
-(J. J. Moreau, in "Nonsmooth Mechanics and Applications" (1988) 1). As long as no direction changes
-from one to the other the motion is smooth, followed by Runge–Kutta steps. A step in which a sliding
-speed turns, or a λ that holds passes ρ, ends there: at the root of a cubic through the speeds and
-their slopes at the step's ends, or of a line through λ.
+with s = c·v for each direction c (J. J. Moreau, in "Nonsmooth Mechanics and Applications" (1988)
+1). As long as no direction changes from one to the other the motion is smooth, followed by
+Runge–Kutta steps. A step in which a sliding speed turns, or a λ that holds passes ρ, ends there: at
+the root of a cubic through the speeds and their slopes at the step's ends, or of a line through λ.
+Where a speed turns at the time τ the acceleration jumps from a₋ to a₊, and so do derivatives D of
+the state, for τ depends on it too (M. A. Aizerman & F. R. Gantmacher, Q. J. Mech. Appl. Math. 11
+(1958) 225):
+
+    D → D + (0, a₋ − a₊) dτ,      dτ = −c·D_v / c·a₋
+
+A direction that sticks has lost the error of its speed.
 """
 
 from __future__ import annotations
@@ -17,150 +24,201 @@ import dataclasses
 
 import numpy as np
 
-from gfnn_jax.families.lagrangian import DRY, Lagrangian
-from gfnn_jax.flows.motion import runge_kutta
+from gfnn_jax.flows.motion import NODES, Form, Rates, Step, coulomb_rows
+from gfnn_jax.solve.linear import among
 
-_EVENTS = 64  # of a lane in one step, after which it has no solution
-_ALIKE = 1e-9  # of the largest mobility, added for directions that depend on each other
+_EVENTS = 64  # of a lane in one substep, after which it has no solution
 _HALVINGS = 40  # of a step, to the root of its cubic
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Coulomb:
-    """A law without its dry friction, and that: directions c (F, d), forces ρ (F,).
+def step(
+    form: Form, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray, order: int = 2,
+    modes: np.ndarray | None = None,
+) -> tuple[Step, np.ndarray]:  # fmt: skip
+    """`Form.step` of laws with dry friction of any kind, and the modes (N, F) in which it ends:
+    which directions without a width slide forward, 1, or backward, −1, and which stick, 0.
+    ``modes``: those in which it begins, by default those of the states."""
+    if not coulomb_rows(form.friction).any():
+        return form.step(p, x, h, u, order), np.zeros((len(x), 0))
+    motion, d = _Motion(form, p, order), form.dim
+    modes = motion.begin(x, u[:, 0, 0]) if modes is None else modes
+    D = form.unmoved(len(x), order)
+    for k in range(u.shape[1]):
+        x, D, modes = motion.substep(x, D, modes, h / u.shape[1], u[:, k])
+    return Step(x, D[..., : 2 * d], D[..., 2 * d :]), modes
 
-    States are x = (q, v) (B, 2d); ``modes`` (B, F) says which directions slide forward, 1, or
-    backward, −1, and which stick, 0; inputs are u (B, inputs).
+
+def modes_of(form: Form, p: np.ndarray, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """The modes (N, F) in which states x (N, 2d) start, with inputs u (N, inputs)."""
+    if not coulomb_rows(form.friction).any():
+        return np.zeros((len(x), 0))
+    return _Motion(form, p, 0).begin(x, u)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Motion:
+    """A law whose dry friction slides or sticks, with coefficients p (count,) or (N, count).
+
+    States are x = (q, v) (N, 2d), their derivatives D (N, 2d, n), inputs u (N, inputs).
     """
 
-    smooth: Lagrangian
-    directions: np.ndarray
-    losses: np.ndarray
+    form: Form
+    p: np.ndarray
+    order: int
 
-    @staticmethod
-    def of(law: Lagrangian) -> Coulomb:
-        """Coulomb's friction in the place of the dry friction of a law."""
-        dry = law.friction.kinds == DRY
-        smooth = dataclasses.replace(law, friction=law.friction.take(~dry), losses=law.losses[~dry])
-        return Coulomb(smooth, law.friction.directions[dry].astype(float), law.losses[dry])
+    @property
+    def directions(self) -> np.ndarray:
+        """c (F, d)."""
+        rows = coulomb_rows(self.form.friction)
+        return self.form.friction.directions[rows].astype(float)
+
+    def losses(self, lanes: np.ndarray) -> np.ndarray:
+        """ρ (n, F) of some lanes."""
+        friction = self.form.split(self.p)[1][..., coulomb_rows(self.form.friction)]
+        return friction[lanes] if friction.ndim > 1 else np.tile(friction, (len(lanes), 1))
 
     def speeds(self, x: np.ndarray) -> np.ndarray:
-        """s = c·v (B, F)."""
-        return x[:, self.smooth.dim :] @ self.directions.T
+        """s = c·v (N, F)."""
+        return x[:, self.form.dim :] @ self.directions.T
+
+    def rates(self, lanes, x, modes, u) -> Rates:
+        """The rates of some lanes in these modes."""
+        form, p = self._of(lanes)
+        d = form.dim
+        return form.accelerate(form.lagrangian(p), x[:, :d], x[:, d:], u, 0, modes)
+
+    def _of(self, lanes: np.ndarray) -> tuple[Form, np.ndarray]:
+        return self.form.take(lanes), self.p[lanes] if self.p.ndim > 1 else self.p
 
     def begin(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """The modes in which states start."""
-        return self._released(x, np.sign(self.speeds(x)), u)
+        return self._released(np.arange(len(x)), x, np.sign(self.speeds(x)), u)
 
-    def advance(
-        self, x: np.ndarray, modes: np.ndarray, h: np.ndarray, u: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """States and modes a time h (B,) later, the inputs constant meanwhile; NaN of lanes with
-        more events than can be followed."""
-        x, modes, left = x.copy(), modes.copy(), h.copy()
-        lanes = np.flatnonzero(left > 0)
+    def substep(self, x, D, modes, h, u):
+        """States, derivatives and modes a time h (N,) later, with inputs u (N, 6, inputs) at its
+        nodes; NaN of lanes with more events than can be followed."""
+        x, D, modes, done = x.copy(), D.copy(), modes.copy(), np.zeros(len(x))
+        lanes = np.arange(len(x))
+        self._forget(lanes, D, x, modes, u[:, 0])
         for _ in range(_EVENTS):
             if not len(lanes):
-                break
+                return x, D, modes
+            now, left = u[lanes], 1 - done[lanes]
+            if done.any():
+                now = _within(now, done[lanes], np.ones(len(lanes)))
+            before, mode = x[lanes], modes[lanes]
+            new, moved, first = self._smooth(lanes, before, D[lanes], left * h[lanes], now, mode)
             part = np.ones(len(lanes))
-            new, slope, held = self._step(x[lanes], modes[lanes], left[lanes], u[lanes])
-            part, event = self._first(x[lanes], new, modes[lanes], left[lanes], slope, held)
-            cut = np.flatnonzero(part < 1)
+            speeds = self.speeds(before) * mode, self.speeds(new) * mode
+            open_ = np.flatnonzero(np.any((speeds[1] < 0) | (mode == 0), axis=1))
+            cut, event = open_, np.zeros(0, int)
+            if len(open_):
+                last = self.rates(lanes[open_], new[open_], mode[open_], now[open_, -1])
+                along = (left * h[lanes])[open_, None] * mode[open_]
+                slopes = [along * (a @ self.directions.T) for a in (first.a[open_], last.a)]
+                spare = [self.losses(lanes[open_]) - np.abs(k)
+                         for k in (first.held[open_], last.held)]  # fmt: skip
+                shares, event = _first(mode[open_], *(s[open_] for s in speeds), *slopes, *spare)
+                part[open_] = shares
+                cut, event = open_[shares < 1], event[shares < 1]
             if len(cut):
-                some, which = lanes[cut], event[cut]
-                new[cut], _, held = self._step(
-                    x[some], modes[some], part[cut] * left[some], u[some]
+                some, start = lanes[cut], (before[cut], D[lanes[cut]])
+                for _ in range(2):  # the root of the cubic, and one step of Newton's from it
+                    inside = _within(now[cut], np.zeros(len(cut)), part[cut])
+                    span = part[cut] * left[cut] * h[some]
+                    at, by, _ = self._smooth(some, *start, span, inside, mode[cut])
+                    rates = self.rates(some, at, mode[cut], inside[:, -1])
+                    k = np.arange(len(cut)), event
+                    slope = _turning((rates.a @ self.directions.T)[k], mode[cut][k])
+                    short = self.speeds(at)[k] / slope / (left[cut] * h[some])
+                    part[cut] = np.clip(part[cut] - short, 0, 1)
+                new[cut], moved[cut], modes[some] = self._changed(
+                    some, at, by, mode[cut], event, inside[:, -1], rates, slope
                 )
-                modes[some], new[cut] = self._changed(new[cut], modes[some], which, held, u[some])
-            x[lanes], left[lanes] = new, (1 - part) * left[lanes]
-            lanes = lanes[left[lanes] > 0]
+            x[lanes], D[lanes] = new, moved
+            done[lanes] = np.where(part < 1, done[lanes] + part * left, 1.0)
+            lanes = lanes[cut][done[lanes[cut]] < 1]
         x[lanes] = np.nan
-        return x, modes
+        return x, D, modes
 
-    def _rates(self, x, modes, u) -> tuple[np.ndarray, np.ndarray]:
-        """Accelerations a (B, d) and forces λ (B, F)."""
-        d, c = self.smooth.dim, self.directions
-        M, force = self.smooth.balance(x[:, :d], x[:, d:], u)
-        held, inverse = self.losses * modes, np.linalg.inv(M)
-        a = np.einsum("bij,bj->bi", inverse, force - held @ c)
-        if modes.all():
-            return a, held
-        pushed = inverse @ c.T  # (B, d, F)
-        holding = _among(modes == 0, c @ pushed, a @ c.T)
-        return a - np.einsum("bif,bf->bi", pushed, holding), held + holding
+    def _smooth(self, lanes, x, D, h, u, modes):
+        form, p = self._of(lanes)
+        return form.substep(form.lagrangian(p), x, D, h, u, self.order, modes)
 
-    def _step(self, x, modes, h, u):
-        """The states h (B,) later in the same modes; accelerations along c, and λ, at the step's
-        begin and end: each (2, B, F)."""
-        d, slopes, forces = self.smooth.dim, [], []
+    def _changed(self, lanes, x, D, modes, event, u, before, slope):
+        """States, derivatives and modes where the direction ``event`` (n,) changes its own, speeds
+        that stick 0; before, slope: the rates there, and that of its speed (n,)."""
+        k, c, d = (np.arange(len(x)), event), self.directions, self.form.dim
+        x, modes = x.copy(), modes.copy()
+        modes[k] = np.where(modes[k] != 0, 0, np.sign(before.held[k]))
+        x[:, d:] -= self._impulse(lanes, x, modes, self.speeds(x)[..., None])[..., 0]
+        modes = self._released(lanes, x, modes, u)
+        after = self.rates(lanes, x, modes, u)
+        late = -np.einsum("nd,ndw->nw", c[event], D[:, d:]) / slope[:, None]
+        D = D.copy()
+        D[:, d:] += (before.a - after.a)[..., None] * late[:, None]
+        return x, D, modes
 
-        def rate(_: int, inside: np.ndarray) -> np.ndarray:
-            a, held = self._rates(inside, modes, u)
-            slopes.append(a @ self.directions.T)
-            forces.append(held)
-            return np.concatenate([inside[:, d:], a], axis=1)
+    def _impulse(self, lanes, x, modes, speeds):
+        """The change of velocities (n, d, m) that takes away the speeds (n, F, m) of directions
+        that stick."""
+        form, p = self._of(lanes)
+        masses, c = form.lagrangian(p).masses(x[:, : form.dim]), self.directions
+        pushed = np.linalg.solve(masses, np.broadcast_to(c.T, (len(x), *c.T.shape)))
+        return pushed @ among(modes == 0, c @ pushed, speeds)
 
-        new = runge_kutta(rate, x, h[:, None])
-        rate(0, new)
-        ends = [0, -1]
-        return new, np.array(slopes)[ends], np.array(forces)[ends]
+    def _forget(self, lanes, D, x, modes, u) -> None:
+        """Take from derivatives the speeds of directions that stick: they end at once."""
+        d, some = self.form.dim, np.flatnonzero(np.any(modes == 0, axis=1))
+        if len(some):
+            off = self.directions @ D[some, d:]
+            D[some, d:] -= self._impulse(lanes[some], x[some], modes[some], off)
 
-    def _first(self, x, new, modes, h, slope, held):
-        """The part (B,) of a step at which its first direction changes, 1 where none does, and
-        which one (B,)."""
-        part = np.ones(modes.shape)
-        before, after = self.speeds(x) * modes, self.speeds(new) * modes
-        turns = np.nonzero((modes != 0) & (after < 0))
-        if len(turns[0]):
-            along = (h[:, None] * modes * slope)[:, *turns]
-            part[turns] = _root(before[turns], after[turns], *along)
-        spare = self.losses - np.abs(held)  # (2, B, F)
-        lost = np.nonzero((modes == 0) & (spare[1] < 0))
-        begun, ended = spare[:, *lost]
-        part[lost] = np.maximum(begun, 0) / (np.maximum(begun, 0) - ended)
-        event = np.argmin(part, axis=1)
-        return part[np.arange(len(part)), event], event
-
-    def _changed(self, x, modes, event, held, u):
-        """Modes of states in which the direction ``event`` (B,) changes its own, and the states
-        with speeds of 0 where they stick."""
-        k = np.arange(len(x)), event
-        modes = modes.copy()
-        modes[k] = np.where(modes[k] == 0, np.sign(held[1][k]), 0)
-        d, c = self.smooth.dim, self.directions
-        M = self.smooth.masses(x[:, :d])
-        pushed = np.linalg.solve(M, np.broadcast_to(c.T, (len(x), *c.T.shape)))
-        impulse = _among(modes == 0, c @ pushed, self.speeds(x))
-        v = x[:, d:] - np.einsum("bif,bf->bi", pushed, impulse)
-        x = np.concatenate([x[:, :d], v], axis=1)
-        return self._released(x, modes, u), x
-
-    def _released(self, x, modes, u) -> np.ndarray:
+    def _released(self, lanes, x, modes, u) -> np.ndarray:
         """Modes without the directions that stick by a λ beyond ρ, the farthest beyond it first:
         they slide to where λ held them from."""
         modes = modes.copy()
-        for _ in range(len(self.losses)):
-            _, held = self._rates(x, modes, u)
-            beyond = np.where(modes == 0, np.abs(held) - self.losses, 0.0)
-            lanes = np.flatnonzero(beyond.max(axis=1, initial=0.0) > 0)
-            if not len(lanes):
+        some = np.flatnonzero(np.any(modes == 0, axis=1))
+        for _ in range(modes.shape[1]):
+            if not len(some):
                 break
-            k = lanes, np.argmax(beyond, axis=1)[lanes]
-            modes[k] = np.sign(held[k])
+            held = self.rates(lanes[some], x[some], modes[some], u[some]).held
+            beyond = np.where(modes[some] == 0, np.abs(held) - self.losses(lanes[some]), 0.0)
+            open_ = np.flatnonzero(beyond.max(axis=1, initial=0.0) > 0)
+            k = some[open_], np.argmax(beyond, axis=1)[open_]
+            modes[k] = np.sign(held[open_, k[1]])
+            some = some[open_]
         return modes
 
 
-def _among(stuck: np.ndarray, mobility: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """λ (B, F) of directions that are ``stuck``, 0 of others: mobility λ = wanted among them, the
-    least λ where they depend on each other (Tikhonov's, iterated once)."""
-    count = stuck.shape[1]
-    both = stuck[:, :, None] & stuck[:, None, :]
-    size = np.abs(mobility).max(axis=(1, 2), initial=0.0)[:, None]
-    own = np.where(stuck, _ALIKE * size, 1.0)[:, :, None] * np.eye(count)
-    mobility = np.where(both, mobility, 0.0)
-    wanted = np.where(stuck, wanted, 0.0)[..., None]
-    found = np.linalg.solve(mobility + own, wanted)
-    return (found + np.linalg.solve(mobility + own, wanted - mobility @ found))[..., 0]
+def _turning(slope: np.ndarray, mode: np.ndarray) -> np.ndarray:
+    """The rate of a speed that turns; infinite of one that is let go, where nothing jumps."""
+    return np.where((mode != 0) & (slope != 0), slope, np.inf)
+
+
+def _within(u: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Inputs u (n, 6, k) at the nodes of the part of a step from ``begin`` to ``end`` (n,), by the
+    polynomial through those at the nodes of the whole."""
+    at = begin[:, None] + (end - begin)[:, None] * NODES
+    weights = np.ones((len(u), 6, 6))
+    for j, node in enumerate(NODES):
+        for other in np.delete(NODES, j):
+            weights[:, :, j] *= (at - other) / (node - other)
+    return weights @ u
+
+
+def _first(modes, before, after, slope_before, slope_after, spare_before, spare_after):
+    """The part (n,) of a step at which its first direction changes, 1 where none does, and which
+    one (n,), of (n, F) at the step's ends: the speeds and their slopes along the modes, and by how
+    much λ is below ρ."""
+    part = np.ones(modes.shape)
+    turns = (modes != 0) & (after < 0)
+    part[turns] = _root(before[turns], after[turns], slope_before[turns], slope_after[turns])
+    lost = (modes == 0) & (spare_after < 0)
+    begun = np.maximum(spare_before[lost], 0)
+    part[lost] = begun / (begun - spare_after[lost])
+    event = np.argmin(part, axis=1)
+    return part[np.arange(len(part)), event], event
 
 
 def _root(before, after, slope_before, slope_after) -> np.ndarray:

@@ -7,17 +7,18 @@ acceleration known all its derivatives are explicit:
 
 One step between two samples is a Runge–Kutta step of Dormand and Prince (order 5), with as many
 substeps as the fastest motion asks; all steps of a recording are taken at once, as one batch.
+Where dry friction has no width its force jumps: `flows.coulomb` steps from one jump to the next.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.lagrangian import UNIFORM, Friction, Lagrangian, Terms
+from gfnn_jax.families.lagrangian import DRY, UNIFORM, Friction, Lagrangian, Terms
+from gfnn_jax.solve.linear import among
 
 # Dormand & Prince, J. Comput. Appl. Math. 6 (1980) 19: the solution of order 5.
 NODES = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])
@@ -41,6 +42,15 @@ class Step(NamedTuple):
     by_coefficients: np.ndarray
 
 
+class Rates(NamedTuple):
+    """Accelerations a (N, d), their derivatives in q, v and, where asked for, in the coefficients
+    (N, d, 2d + n), and the forces λ (N, F) of dry friction that slides or sticks."""
+
+    a: np.ndarray
+    by: np.ndarray
+    held: np.ndarray
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Form:
     """A law whose coefficients are free: terms with θ = ``fixed`` + ``basis`` c (the gauge),
@@ -62,6 +72,20 @@ class Form:
     def count(self) -> int:
         return self.basis.shape[1] + self.friction.count + self.dim * self.num_inputs
 
+    @property
+    def identity(self) -> np.ndarray:
+        """Derivatives (2d, 2d + count) of a state in itself and in the coefficients."""
+        return np.eye(2 * self.dim, 2 * self.dim + self.count)
+
+    def take(self, lanes: np.ndarray) -> Form:
+        """The form of some lanes, where each has its own phases."""
+        phases = self.terms.phases
+        if phases.ndim == 1:
+            return self
+        return dataclasses.replace(
+            self, terms=dataclasses.replace(self.terms, phases=phases[lanes])
+        )
+
     def split(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """c, ρ and G (..., d, inputs) of p (..., count)."""
         ends = np.cumsum([self.basis.shape[1], self.friction.count])
@@ -75,10 +99,12 @@ class Form:
         return Lagrangian(self.terms, theta, friction, losses[..., ~even], uniform, gains)
 
     def accelerate(
-        self, law: Lagrangian, q: np.ndarray, v: np.ndarray, u: np.ndarray, order: int = 2
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """a (N, d), and its derivatives: none (N, d, 0) of ``order`` 0, in q and v (N, d, 2d) of 1,
-        in the coefficients too (N, d, 2d + count) of 2."""
+        self, law: Lagrangian, q: np.ndarray, v: np.ndarray, u: np.ndarray, order: int = 2,
+        modes: np.ndarray | None = None,
+    ) -> Rates:  # fmt: skip
+        """The rates, with derivatives in the states (``order`` 1) and in the coefficients (2).
+        modes: (N, F) of the dry friction without a width, 1 or −1 where it slides, 0 where it
+        sticks."""
         f, df, ddf = self.terms.potentials(q, order=2 if order else 1)
         g, dg = self.terms.motion(v)
         A, _, _ = self.terms.quadratic()
@@ -88,6 +114,9 @@ class Form:
         even = self.friction.kinds == UNIFORM
         _, pull, stiffness = law.friction.tables(v)
         directions = law.friction.directions
+        dry = coulomb_rows(law.friction)
+        if modes is not None:
+            pull[:, dry] = modes
         along = np.einsum("npi,ni->np", df, v)
         forced, turned = theta * g, np.einsum("np,npi->ni", theta * along, dg)
         force = np.einsum("np,npi->ni", forced, df) - turned - (law.losses * pull) @ directions
@@ -99,8 +128,14 @@ class Form:
         masses = ((theta * f) @ A).reshape(-1, d, d)
         inverse = np.linalg.inv(masses) if d > 1 else 1 / masses
         a = np.einsum("nij,nj->ni", inverse, force)
+        held, c = law.losses[..., dry] * pull[:, dry], directions[dry].astype(float)
+        stuck = np.zeros((1, 0)) if modes is None else modes == 0
+        moved = inverse @ c.T  # (N, d, F)
+        if stuck.any():
+            holding = among(stuck, c @ moved, (a @ c.T)[..., None])
+            a, held = a - (moved @ holding)[..., 0], held + holding[..., 0]
         if not order:
-            return a, np.zeros((*a.shape, 0))
+            return Rates(a, np.zeros((*a.shape, 0)), held)
         push = (a @ A.reshape(-1, d).T).reshape(df.shape)
         weighted = theta[..., None] * df
         by_q = push.swapaxes(1, 2) @ weighted
@@ -126,7 +161,10 @@ class Form:
         if order > 1 and self.num_inputs:
             pushed = -u[:, None, None, :] * np.eye(d)[:, :, None]
             columns.append(pushed.reshape(len(v), d, -1))
-        return a, -inverse @ np.concatenate(columns, axis=-1)
+        by = -inverse @ np.concatenate(columns, axis=-1)
+        if stuck.any():
+            by = by - moved @ among(stuck, c @ moved, c @ by)
+        return Rates(a, by, held)
 
     def step(
         self, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray, order: int = 2
@@ -135,51 +173,44 @@ class Form:
         in the coefficients (2); u (N, substeps, 6, inputs) are the inputs at the nodes of each
         substep."""
         law, d, substeps = self.lagrangian(p), self.dim, u.shape[1]
-        n, width = len(x), 2 * d + (self.count if order > 1 else 0)
-        h = (h / substeps)[:, None]
-        wide = h[..., None]
-        D = np.zeros((n, 2 * d, width))
-        D[:, range(2 * d), range(2 * d)] = 1.0
+        D = self.unmoved(len(x), order)
         for k in range(substeps):
-            rates, slopes = [], []
-            for i in range(6):
-                xi, Di = x, D
-                for j in np.flatnonzero(_A[i]):
-                    xi, Di = xi + _A[i, j] * h * rates[j], Di + _A[i, j] * wide * slopes[j]
-                a, by = self.accelerate(law, xi[:, :d], xi[:, d:], u[:, k, i], order)
-                slope = np.empty_like(D)
-                slope[:, :d] = Di[:, d:]
-                slope[:, d:] = by[..., : 2 * d] @ Di
-                slope[:, d:, 2 * d :] += by[..., 2 * d :]
-                rates.append(np.concatenate([xi[:, d:], a], axis=1))
-                slopes.append(slope)
-            for i in np.flatnonzero(WEIGHTS):
-                x, D = x + WEIGHTS[i] * h * rates[i], D + WEIGHTS[i] * wide * slopes[i]
+            x, D, _ = self.substep(law, x, D, h / substeps, u[:, k], order)
         return Step(x, D[..., : 2 * d], D[..., 2 * d :])
 
-    def advance(self, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """States (N, 2d) after a step, as `step` has them, without derivatives."""
-        law, d, substeps = self.lagrangian(p), self.dim, u.shape[1]
-        for k in range(substeps):
+    def unmoved(self, num: int, order: int) -> np.ndarray:
+        """Derivatives of ``num`` states in themselves and in the coefficients, as far as ``order``
+        asks for them."""
+        width = (0, 2 * self.dim, 2 * self.dim + self.count)[order]
+        return np.tile(self.identity[:, :width], (num, 1, 1))
 
-            def rate(i: int, x: np.ndarray, k: int = k) -> np.ndarray:
-                a, _ = self.accelerate(law, x[:, :d], x[:, d:], u[:, k, i], 0)
-                return np.concatenate([x[:, d:], a], axis=1)
+    def substep(
+        self, law: Lagrangian, x: np.ndarray, D: np.ndarray, h: np.ndarray, u: np.ndarray,
+        order: int = 2, modes: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, Rates]:  # fmt: skip
+        """States x (N, 2d) and their derivatives D (N, 2d, n) a time h (N,) later, with inputs u
+        (N, 6, inputs) at its nodes, and the rates at its begin; ``order`` and ``modes`` as of
+        `accelerate`."""
+        d, every, rates, slopes = self.dim, [], [], []
+        h, wide = h[:, None], h[:, None, None]
+        for i in range(6):
+            xi, Di = x, D
+            for j in np.flatnonzero(_A[i]):
+                xi, Di = xi + _A[i, j] * h * rates[j], Di + _A[i, j] * wide * slopes[j]
+            now = self.accelerate(law, xi[:, :d], xi[:, d:], u[:, i], order, modes)
+            every.append(now)
+            slope = np.empty_like(D)
+            if order:
+                slope[:, :d] = Di[:, d:]
+                slope[:, d:] = now.by[..., : 2 * d] @ Di
+                slope[:, d:, 2 * d :] += now.by[..., 2 * d :]
+            rates.append(np.concatenate([xi[:, d:], now.a], axis=1))
+            slopes.append(slope)
+        for i in np.flatnonzero(WEIGHTS):
+            x, D = x + WEIGHTS[i] * h * rates[i], D + WEIGHTS[i] * wide * slopes[i]
+        return x, D, every[0]
 
-            x = runge_kutta(rate, x, (h / substeps)[:, None])
-        return x
 
-
-def runge_kutta(
-    rate: Callable[[int, np.ndarray], np.ndarray], x: np.ndarray, h: np.ndarray
-) -> np.ndarray:
-    """States (N, m) after one step h (N, 1) of ẋ = rate(i, x), i the number of the stage."""
-    rates: list[np.ndarray] = []
-    for i in range(6):
-        xi = x
-        for j in np.flatnonzero(_A[i]):
-            xi = xi + _A[i, j] * h * rates[j]
-        rates.append(rate(i, xi))
-    for i in np.flatnonzero(WEIGHTS):
-        x = x + WEIGHTS[i] * h * rates[i]
-    return x
+def coulomb_rows(friction: Friction) -> np.ndarray:
+    """The dry friction (F,) that has no width: its force jumps where its speed turns."""
+    return (friction.kinds == DRY) & (friction.widths == 0)

@@ -32,7 +32,7 @@ def at_stages(
     if u.shape[1] == 0:
         return np.zeros((*start.shape, substeps, len(NODES), 0))
     t, u = _filled(t, u)
-    whole = (end - start)[..., None] / substeps
+    whole = np.asarray(end - start)[..., None] / substeps
     a = start[..., None] - delay + whole * np.arange(substeps)
     b = a + whole
     first = np.searchsorted(t, a, side="right")

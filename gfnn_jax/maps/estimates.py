@@ -19,9 +19,9 @@ from gfnn_jax.data.channels import channels_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import UNIFORM, Friction, Lagrangian
-from gfnn_jax.flows.motion import WEIGHTS, Form
+from gfnn_jax.flows import coulomb
+from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import at_stages
-from gfnn_jax.maps import stops
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.signals.local_cubics import smooth
@@ -67,8 +67,9 @@ class Law(NamedTuple):
 
 def law_in_use(law: Lagrangian, root: np.ndarray | None, sensors: Sensors) -> Law:
     """Prepare a Lagrangian and the root (m, n) of the covariance of (θ, ρ, G), and of γ where there
-    is uniform friction."""
-    count, rows, losses = law.terms.count, law.friction.rows(), law.losses
+    is uniform friction. Dry friction that creeps by less than the sensors see slides or sticks."""
+    count, losses = law.terms.count, law.losses
+    rows = [(c, kind, ε if ε > sensors.creep else 0.0) for c, kind, ε in law.friction.rows()]
     order = np.arange(count + law.friction.count + law.gains.size)
     if law.uniform != 0:  # γ, the last of all, stands behind ρ in a form
         rows, losses = [*rows, ((0,) * law.dim, UNIFORM, 0.0)], np.append(losses, law.uniform)
@@ -214,7 +215,7 @@ class _Windows:
         num = arcs * (length - 1)
         u = self.u.reshape(num, *self.u.shape[2:])
         start = x[:, :-1].reshape(num, m)
-        step = self.law.form.step(self.law.p, start, self.h.reshape(num), u, order=1)
+        step, _ = coulomb.step(self.law.form, self.law.p, start, self.h.reshape(num), u, order=1)
         shape = (arcs, length - 1, m)
         closing = step.states.reshape(shape) - x[:, 1:]
         return Defects(closing, step.by_state.reshape(*shape, m), np.zeros((*shape, 0)))
@@ -349,9 +350,6 @@ def propagate_each(
     u = _inputs(law, windows, ends, 1)
     orbit, spread = _followed(laws, which, x, root[:, : 2 * d], np.diff(ends, axis=1), u, asked)
     of_zeros = np.pad(root[:, 2 * d :], ((0, 0), (0, 0), (0, spread.shape[-1] - root.shape[-1])))
-    for number, one in enumerate(laws):
-        lanes = np.flatnonzero(which == number)
-        orbit[lanes] = _with_stops(one, orbit[lanes], ends[lanes], u[lanes, :, 0])
     orbit = orbit[:, asked]
     scales = np.stack([law.sensors.observation_model.values for law in laws])[which, None]
     channels, ahead = sensors.observation_model(orbit, scales), times - last[:, None]
@@ -376,18 +374,22 @@ def _followed(
     States are followed one step after another, then all derivatives are taken together.
     """
     form, p, roots = _side_by_side(laws, which)
-    orbit = [x]
+    orbit, sliding = [x], [coulomb.modes_of(form, p, x, u[:, 0, 0, 0])]
     for k in range(h.shape[1]):
-        orbit.append(form.advance(p, orbit[-1], h[:, k], u[:, k]))
+        step, after = coulomb.step(form, p, orbit[-1], h[:, k], u[:, k], order=0, modes=sliding[-1])
+        orbit.append(step.states)
+        sliding.append(after)
     size, count = root.shape[-1], roots.shape[-1]
     spread = np.concatenate([root, np.zeros((*x.shape, roots.shape[1]))], axis=2)
     spreads, most = {}, max(1, _AT_ONCE // len(x))
     for first in range(0, h.shape[1], most):
         some = slice(first, first + most)
-        begun = np.stack(orbit[:-1][some], axis=1)
+        begun, begun_in = (np.stack(of[:-1][some], axis=1) for of in (orbit, sliding))
         form, p, _ = _side_by_side(laws, np.repeat(which, begun.shape[1]))
-        flat = (a.reshape(p.shape[0], *a.shape[2:]) for a in (begun, h[:, some], u[:, some]))
-        step = form.step(p, *flat)
+        x, hs, us, modes = (
+            a.reshape(p.shape[0], *a.shape[2:]) for a in (begun, h[:, some], u[:, some], begun_in)
+        )
+        step, _ = coulomb.step(form, p, x, hs, us, modes=modes)
         by_state = step.by_state.reshape(*begun.shape, begun.shape[-1])
         further = step.by_coefficients[..., :count].reshape(*begun.shape, count)
         further = further @ roots[:, None].swapaxes(2, 3)
@@ -407,19 +409,6 @@ def _side_by_side(laws: Sequence[Law], which: np.ndarray) -> tuple[Form, np.ndar
     most = max(len(law.root) for law in laws)
     roots = np.stack([np.pad(law.root, ((0, most - len(law.root)), (0, 0))) for law in laws])
     return form, np.stack([law.p for law in laws])[which], roots[which]
-
-
-def _with_stops(law: Law, orbit: np.ndarray, ends: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Orbits (B, n, 2d) at the times ``ends`` (B, n) with inputs u (B, n − 1, 6, k) at the stages
-    between them, those that dry friction brings to rest followed anew (`maps.stops`)."""
-    lagrangian = law.form.lagrangian(law.p)
-    lanes = np.flatnonzero(stops.resting(lagrangian, orbit[:, 1:], ends[:, 1:], law.sensors.omega))
-    if len(lanes):
-        orbit, held = orbit.copy(), u[lanes].swapaxes(2, 3) @ WEIGHTS
-        found = stops.stopped(lagrangian, orbit[lanes, 0], ends[lanes], held)
-        solved = np.isfinite(found).all(axis=(1, 2))
-        orbit[lanes[solved], 1:] = found[solved]
-    return orbit
 
 
 def _in_steps(sensors: Sensors, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ from gfnn_jax.families.lagrangian import DRY, LINEAR, Lagrangian
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre, family_of, law_of
+from gfnn_jax.flows.motion import coulomb_rows
 from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.inputs import Signals
@@ -70,6 +71,14 @@ def map_of_law(
         (flow,), coordinates, covering(z, ignore=whole), scale, centre, float(dt),
         posterior=posterior, signals=signals,
     )  # fmt: skip
+
+
+def smoothed(law: Lagrangian, width: float) -> Lagrangian:
+    """The law whose dry friction, where it has no width, is smoothed over these speeds: a flow has
+    no events."""
+    friction = law.friction
+    widths = np.where(coulomb_rows(friction), width, friction.widths)
+    return dataclasses.replace(law, friction=dataclasses.replace(friction, widths=widths))
 
 
 def sticking(law: Lagrangian, noise: float, duration: float) -> Lagrangian:

@@ -22,7 +22,8 @@ class Sensors:
     forecasts of data that the law was not learned from, as far as neither the noise nor the errors
     of state and coefficients explain it. observation: how channels show a state, and the loss of
     their noise; None where they are the positions, and it is the usual one. wander: how zeros of
-    channels move, each in units of its σ; None where they stay.
+    channels move, each in units of its σ; None where they stay. creep: the speed of what moves by a
+    σ in a period: of dry friction that is smoothed over no more, forecasts slide or stick.
     """
 
     positions: tuple[str, ...]
@@ -37,6 +38,7 @@ class Sensors:
     misfit: Any
     observation: Observation | None = None
     wander: Wander | None = None
+    creep: float = 0.0
 
     @property
     def observation_model(self) -> Observation:

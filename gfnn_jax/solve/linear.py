@@ -127,3 +127,18 @@ def covariance_root(covariance: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(correlations)
     root = np.sqrt(values.clip(0.0))[..., :, None] * np.swapaxes(vectors, -1, -2)
     return root * deviations[..., None, :]
+
+
+_ALIKE = 1e-9  # of the largest entry, added for unknowns that depend on each other
+
+
+def among(some, matrix, rhs):
+    """x (B, n, m) with matrix (B, n, n) x = rhs (B, n, m) among ``some`` (B, n) of the unknowns, 0
+    of the others; the least x where they depend on each other (Tikhonov's, iterated once)."""
+    both = some[:, :, None] & some[:, None, :]
+    size = np.abs(matrix).max(axis=(1, 2), initial=0.0)[:, None]
+    own = np.where(some, _ALIKE * size, 1.0)[:, :, None] * np.eye(some.shape[1])
+    matrix = np.where(both, matrix, 0.0)
+    rhs = np.where(some[..., None], rhs, 0.0)
+    found = np.linalg.solve(matrix + own, rhs)
+    return found + np.linalg.solve(matrix + own, rhs - matrix @ found)

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from gfnn_jax.flows import coulomb
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.solve.arc_models import Defects, Observed
@@ -35,7 +36,8 @@ class LawOnArcs:
     def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
         arcs, length, m = x.shape
         whole, num = self.full(p), arcs * (length - 1)
-        step = self.form.step(
+        step, _ = coulomb.step(
+            self.form,
             whole[: self.form.count],
             x[:, :-1].reshape(num, m),
             self.h.reshape(num),

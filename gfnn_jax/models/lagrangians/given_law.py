@@ -58,7 +58,7 @@ def fit_given(
         nodes, fit = with_zeros_of_runs(bench, nodes, fit, on_progress)
         on_progress(f"{periods:g} periods: {describe(fit)}")
     if given.friction is None:
-        tried = frictions_tried(d, scales, options)
+        tried = frictions_tried(d, options)
         fit, choice = choose_friction(bench, nodes, fit, tried, on_progress, options)
     else:
         choice = FrictionChoice(given.friction, {}, {}, gains=False)

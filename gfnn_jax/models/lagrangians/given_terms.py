@@ -31,15 +31,13 @@ class Given(NamedTuple):
     friction: tuple[Loss, ...] | None
 
 
-def given_terms(
-    texts: Sequence[Any], positions: Sequence[str], speeds: Sequence[str], width: float
-) -> Given:
-    """The terms that these texts name. ``width`` is ε of dry friction where a text has none.
+def given_terms(texts: Sequence[Any], positions: Sequence[str], speeds: Sequence[str]) -> Given:
+    """The terms that these texts name.
 
     Without a kinetic term each coordinate has its ½v². Raises InputError, a line with the text, for
     what is no term of such a law.
     """
-    reader = _Reader(tuple(positions), tuple(speeds), width)
+    reader = _Reader(tuple(positions), tuple(speeds))
     rows: list[Row] = []
     losses: list[Loss] = []
     kinds = set()
@@ -95,7 +93,6 @@ class _Reader(NamedTuple):
 
     positions: tuple[str, ...]
     speeds: tuple[str, ...]
-    width: float
 
     def row(self, node: Node, text: str) -> Row:
         """(k, n, m, φ) of a product."""
@@ -131,7 +128,6 @@ class _Reader(NamedTuple):
         if _called(factor) == "abs" and power in (1, 3):
             assert isinstance(factor, ast.Call)
             inside, kind = factor.args[0], (DRY if power == 1 else QUADRATIC)
-            width = self.width if power == 1 else 0.0
         elif _called(factor) == "sqrt" and power == 1:
             assert isinstance(factor, ast.Call)
             inside, width = self.smoothed(factor.args[0], text)

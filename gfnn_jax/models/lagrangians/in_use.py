@@ -94,6 +94,7 @@ class Record:
             scales.period, self.hold, self.delay, np.array([scales.period]),
             np.zeros((1, len(noise))),
             None if plain else dataclasses.replace(observation, values=fit.sensors), wander,
+            float(np.min(bench.state_scale(noise)[: observation.dim]) / scales.period),
         )  # fmt: skip
 
     def thirds(self, bench: Workbench, fit: LawFit, sensors: Sensors) -> Thirds:

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.exports import symbolic
-from gfnn_jax.families.lagrangian import Lagrangian, Terms
+from gfnn_jax.families.lagrangian import DRY, Lagrangian, Terms
+from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.calibration import Horizon
 from gfnn_jax.models.lagrangians.fit import LawFit
@@ -108,6 +109,12 @@ class LearnedLaw:
         """The law, its errors and its horizon, a line each."""
         lines = [f"L = {self.lagrangian}", f"R = {self.friction}", self._units_line]
         lines += [f"friction: {self.which_friction}", f"scale of L: {self.gauge}"]
+        sensors = self.map.sensors
+        if sensors is not None and np.any(law_of_map(self.map).friction.kinds == DRY):
+            lines.append(
+                f"dry friction: bodies slide or stick in fits and forecasts; rollouts of the map "
+                f"smooth it over speeds of {sensors.creep:.2g}"
+            )
         lines += [f"not told apart: {pair}" for pair in self.alike[:_SHOWN]]
         lines += [
             f"{name}: zero at {measured(zero, std)} rad" for name, (zero, std) in self.zeros.items()
@@ -126,7 +133,7 @@ class LearnedLaw:
             f"{sum(energy['supplied'].values()):.3g} - lost {sum(energy['lost'].values()):.3g} + "
             f"unexplained {energy['closure']:.1g}"
         )
-        wander = self.map.sensors.wander if self.map.sensors is not None else None
+        wander = sensors.wander if sensors is not None else None
         for name, sigma in self.noise.items():
             zero = "" if wander is None else (
                 f" on a zero that wanders by {_of(wander.size * sigma, self.units[name])} over "

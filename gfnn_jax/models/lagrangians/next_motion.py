@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs
+from gfnn_jax.flows import coulomb
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
 from gfnn_jax.models.lagrangians.structure import Key
@@ -101,7 +102,7 @@ def _followed(bench: Workbench, fit: LawFit, starts: Sequence[np.ndarray]) -> li
     x = [np.concatenate([first, np.zeros((len(starts), d))], axis=1)]
     for _ in range(length - 1):
         with np.errstate(all="ignore"):
-            x.append(fit.form.advance(coefficients, x[-1], h, still))
+            x.append(coulomb.step(fit.form, coefficients, x[-1], h, still, order=0)[0].states)
     states = np.stack(x, axis=1)
     off = np.abs(states[..., :d] - first[:, None])
     far = 10 * (np.ptp(bench.gauge, axis=0) + np.abs(first))

@@ -20,7 +20,7 @@ from gfnn_jax.dataset.rests import without_rests
 from gfnn_jax.dataset.stretches import Nodes, Scales, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.maps.inputs import HOLDS, Signals
-from gfnn_jax.maps.laws import map_of_law
+from gfnn_jax.maps.laws import map_of_law, smoothed
 from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
@@ -70,7 +70,7 @@ def fit_recording(
         on_progress(line)
 
     samples = _samples(recording, loss, note)
-    asked = _asked(terms, samples, options)
+    asked = _asked(terms, samples)
     nodes = nodes_of(samples.stretches, samples.scales)
     gauge = np.concatenate([n.x[:, : samples.observation.dim] for n in nodes])
     holds = _holds(recording, input_hold)
@@ -211,16 +211,12 @@ def _stretches(
     )
 
 
-def _asked(terms: Sequence[Any], samples: _Samples, options: SearchOptions) -> Given | None:
+def _asked(terms: Sequence[Any], samples: _Samples) -> Given | None:
     """The terms that were given, by the names of formulas."""
     observation = samples.observation
     names = symbols((*observation.coordinates, *observation.speeds))
-    width = options.dry_width * float(np.mean(samples.scales.speed))
-    return (
-        given_terms(terms, names[: observation.dim], names[observation.dim :], width)
-        if terms
-        else None
-    )
+    d = observation.dim
+    return given_terms(terms, names[:d], names[d:]) if terms else None
 
 
 def _searched(
@@ -318,8 +314,9 @@ def _map(record: Record, best: InUse, angles: tuple[int, ...]) -> SymplecticMap:
     z = np.concatenate([q, law.momentum(q, v)], axis=1)
     signals = Signals(names, record.hold, record.delay) if names else None
     inputs = np.concatenate([n.stretch.u[n.at] for n in record.nodes]) if names else None
+    sensors = best.calibration.law.sensors
     map_ = map_of_law(
-        best.moving, z, record.scales.dt, angles=angles, signals=signals, inputs=inputs,
-        root=best.root,
+        smoothed(best.moving, sensors.creep), z, record.scales.dt, angles=angles, signals=signals,
+        inputs=inputs, root=best.root,
     )  # fmt: skip
-    return dataclasses.replace(map_, sensors=best.calibration.law.sensors)
+    return dataclasses.replace(map_, sensors=sensors)

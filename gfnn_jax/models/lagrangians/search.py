@@ -52,7 +52,6 @@ class SearchOptions:
     )
     gain: float = 0.05  # of the held-out cost, that a term has to bring
     choices: int = 3  # of the friction, each close to the fit with the one before
-    dry_width: float = 0.05  # ε of dry friction, in rms speeds
     frictions: tuple[str, ...] = FRICTIONS
     choose_friction: bool = True  # by held-out arcs; else all of these
 
@@ -128,7 +127,7 @@ def search(
         d, libraries.without_forces(
             (*libraries.first(d, angles), *libraries.more(d, angles)), shifted
         ),
-        frictions_tried(d, scales, options), turned, num_inputs, sensors,
+        frictions_tried(d, options), turned, num_inputs, sensors,
     )  # fmt: skip
     frictions = dataclasses.replace(every, terms=every.terms[:1])
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
@@ -312,11 +311,11 @@ def choose_friction(
     return bench.fit(fit.structure, fit.values, whole, sigma), choice
 
 
-def frictions_tried(dim: int, scales: Scales, options: SearchOptions) -> tuple[Loss, ...]:
+def frictions_tried(dim: int, options: SearchOptions) -> tuple[Loss, ...]:
     """Friction of all the kinds that are asked for, in every direction."""
     kinds = tuple(libraries.KINDS[FRICTIONS.index(k)] for k in options.frictions)
     if dim == 1 and len(kinds) > 1:  # linear friction is uniform there
         kinds = tuple(kind for kind in kinds if kind != UNIFORM)
-    rows = libraries.losses(dim, kinds, options.dry_width * float(np.mean(scales.speed)))
+    rows = libraries.losses(dim, kinds, 0.0)
     turned = [one for one in map(libraries.opposite, rows) if one is not None]
     return tuple(sorted((*rows, *turned), key=lambda row: row[1] == UNIFORM))

@@ -18,7 +18,7 @@ import numpy as np
 from gfnn_jax.dataset.stretches import Nodes, arcs_of, shifted, with_states
 from gfnn_jax.models.lagrangians.arcs import LawOnArcs
 from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
-from gfnn_jax.solve.arc_models import Observed, Steps
+from gfnn_jax.solve.arc_models import Observed, Defects
 from gfnn_jax.solve.latent_arcs import rows_of_arcs
 from gfnn_jax.solve.wander import Wander
 
@@ -107,8 +107,8 @@ class _ByRun:
     runs: np.ndarray
     count: int
 
-    def steps(self, p: np.ndarray, x: np.ndarray) -> Steps:
-        steps = self.law.steps(p[: len(self.law.free)], x)
+    def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
+        steps = self.law.defects(p[: len(self.law.free)], x)
         more = np.zeros((*steps.closing.shape, len(p) - len(self.law.free)))
         by = np.concatenate([steps.by_coefficients, more], axis=-1)
         return steps._replace(by_coefficients=by)
