@@ -32,14 +32,14 @@ def at_stages(
     if u.shape[1] == 0:
         return np.zeros((*start.shape, substeps, len(NODES), 0))
     t, u = _filled(t, u)
-    whole = np.asarray(end - start)[..., None] / substeps
+    whole = (end - start)[..., None] / substeps
     a = start[..., None] - delay + whole * np.arange(substeps)
     b = a + whole
     first = np.searchsorted(t, a, side="right")
     most = int(np.max(np.searchsorted(t, b) - first, initial=0))
     inside = t[np.minimum(first[..., None] + np.arange(most), len(t) - 1)]
     cuts = [a[..., None], np.clip(inside, a[..., None], b[..., None]), b[..., None]]
-    parts = np.diff(np.concatenate(cuts, axis=-1))[..., None]
+    parts: np.ndarray = np.diff(np.concatenate(cuts, axis=-1))[..., None]
     at = np.concatenate(cuts[:2], axis=-1)[..., None] + parts * _GAUSS
     passed = np.broadcast_to(whole > 0, a.shape)[..., None, None]
     share = np.where(passed, _SHARES * parts / np.where(passed, whole[..., None, None], 1.0), 0.0)

@@ -18,7 +18,7 @@ import numpy as np
 from gfnn_jax.dataset.stretches import Nodes, arcs_of, shifted, with_states
 from gfnn_jax.models.lagrangians.arcs import LawOnArcs
 from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
-from gfnn_jax.solve.arc_models import Observed, Defects
+from gfnn_jax.solve.arc_models import Defects, Observed
 from gfnn_jax.solve.latent_arcs import rows_of_arcs
 from gfnn_jax.solve.wander import Wander
 
