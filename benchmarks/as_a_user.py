@@ -337,9 +337,9 @@ def main(argv: Sequence[str] | None = None) -> None:
             continue
         measured[name] = m = measure(name) | {"code": code}
         measured = {n: measured[n] for n in CASES if n in measured}
-        codes = {m.get("code") for m in measured.values()}  # the file is as old as its oldest case
+        same = all(m.get("code") == code for m in measured.values())  # as old as its oldest case
         write(path, {"quick": arguments.quick, "measured": measured,
-                     "code": code if codes == {code} else None})  # fmt: skip
+                     "code": code if same else None})  # fmt: skip
         verdict = "; ".join(m["wrong"]) or "truthful"
         print(
             f"{name}: {m['seconds']:.1f} s, {m['model']}, claimed {number(m['claimed'])}, true "

@@ -1,9 +1,11 @@
 """Which results are of current code, and those that are not measured again, oldest first.
 
-A result holds a digest of the code that it measured: of the package and of its study, comments,
-docstrings and layout left out. Every change of the package makes all results old, for what it may
-change is not known: `--tell` says how long it would take to measure them again. A run that is
-interrupted goes on with what is still old.
+A result holds a digest of every file that it ran (`ran`): of the package those of which a function
+ran, or a constant was taken by one of these, and the study's own; comments, docstrings and layout
+left out. It is of current code where each of these files means what it meant. A study that starts
+Python anew, in which nothing is noted, counts the whole package. Of an older result whose files are
+not recorded nothing is known: it is old. `--tell` says what has changed, and how long measuring
+again would take. A run that is interrupted goes on with what is still old.
 """
 
 from __future__ import annotations
@@ -20,8 +22,11 @@ from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import ran
+
 HERE = Path(__file__).resolve().parent
 PACKAGE = HERE.parent / "gfnn_jax"
+_RECORDING = {HERE / "current.py", HERE / "ran.py"}  # which change no result
 # Numbers that moved by more than this part are told, the largest moves first; names of times and
 # circumstances, which move with the machine.
 _MOVED, _TOLD = 0.1, 4
@@ -41,18 +46,60 @@ class Result(NamedTuple):
         return [sys.executable, str(self.study), *only]
 
     @property
-    def current(self) -> bool:
-        found = json.loads(self.path.read_text(encoding="utf-8"))
-        return found.get("code") == code_of(self.study)
+    def changed(self) -> list[str] | None:
+        """The files that it ran and that have changed since; None where it does not say which."""
+        found = json.loads(self.path.read_text(encoding="utf-8")).get("code")
+        if not isinstance(found, dict):
+            return None
+        return [name for name, digest in found.items() if _digest(PACKAGE.parent / name) != digest]
+
+
+def code_of(study: Path) -> dict[str, str | None]:
+    """Digests, by file, of what this process has run of the package, of a study and of the
+    studies' modules that it imports; of the folder of the package where it is not known."""
+    own, noted = _modules_of(study) - _RECORDING, ran.files(PACKAGE.name)
+    elsewhere = any("sys.executable" in path.read_text(encoding="utf-8") for path in own)
+    used = {PACKAGE} if noted is None or elsewhere else _with_constants(noted)
+    paths = sorted({path.resolve() for path in used | own})
+    return {str(path.relative_to(PACKAGE.parent)): _digest(path) for path in paths}
+
+
+def _digest(path: Path) -> str | None:
+    """Digest of a file, or of all files of a folder; None where it is gone."""
+    if not path.exists():
+        return None
+    digest = hashlib.sha256()
+    for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+        digest.update(file.name.encode() + _meaning(file).encode())
+    return digest.hexdigest()[:8]
+
+
+def _with_constants(files: set[Path]) -> set[Path]:
+    """These files of the package, and those whose constants they import."""
+    found, left = set(), list(files)
+    while left:
+        path = left.pop()
+        if path in found:
+            continue
+        found.add(path)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(PACKAGE.name):
+                of = (PACKAGE.parent / str(node.module).replace(".", "/")).with_suffix(".py")
+                if of.exists() and {alias.name for alias in node.names} & _constants(of):
+                    left.append(of)
+    return found
 
 
 @functools.cache
-def code_of(study: Path) -> str:
-    """Digest of the package, of a study and of the studies' modules that it imports."""
-    digest = hashlib.sha256()
-    for path in [*sorted(PACKAGE.rglob("*.py")), *sorted(_modules_of(study))]:
-        digest.update(path.name.encode() + _meaning(path).encode())
-    return digest.hexdigest()[:16]
+def _constants(path: Path) -> frozenset[str]:
+    """Names that a module assigns."""
+    body = ast.parse(path.read_text(encoding="utf-8")).body
+    targets = [
+        target for node in body
+        for target in (node.targets if isinstance(node, ast.Assign) else
+                       [node.target] if isinstance(node, ast.AnnAssign) else [])
+    ]  # fmt: skip
+    return frozenset(target.id for target in targets if isinstance(target, ast.Name))
 
 
 def _modules_of(study: Path) -> set[Path]:
@@ -137,7 +184,7 @@ def check(
     for path in sorted(set(folder.glob("*.json")) - set(known)):
         say(f"{path.name}: no study of this folder makes it: remove it?")
     asked = [result for result in known.values() if not only or result.study.stem in only]
-    old = [result for result in asked if not result.current]
+    old = [result for result in asked if result.changed != []]
     say(f"{len(asked) - len(old)} of {len(asked)} results are of current code")
     failed = False
     if only_tell:
@@ -169,11 +216,20 @@ def _tell(old: list[Result], say: Callable[[str], Any]) -> None:
         seconds = _seconds(json.loads(result.path.read_text(encoding="utf-8")))
         known += [] if seconds is None else [seconds]
         took = "time not known" if seconds is None else f"{seconds:.0f} s"
-        say(f"{result.path.name}: older than the code that it measures ({_age(result)[0]}, {took})")
+        say(f"{result.path.name}: {_why(result)} ({_age(result)[0]}, {took})")
     if old:
         unknown = len(old) - len(known)
         others = f", and {unknown} more whose time is not known" if unknown else ""
         say(f"all of them again: about {sum(known) / 3600:.1f} h{others}")
+
+
+def _why(result: Result) -> str:
+    """Say what makes a result old."""
+    changed = result.changed
+    if changed is None:
+        return "which files it ran is not recorded"
+    more = f" and {len(changed) - _TOLD} more" if len(changed) > _TOLD else ""
+    return f"changed since: {', '.join(changed[:_TOLD])}{more}"
 
 
 def _seconds(found: dict[str, Any]) -> float | None:

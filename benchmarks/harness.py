@@ -24,7 +24,11 @@ if PROCESSOR_TIME in sys.argv:
     time.perf_counter = time.monotonic = time.process_time
 
 import jax  # noqa: E402
+import ran  # noqa: E402
 from current import code_of  # noqa: E402
+
+if "gfnn_jax" not in sys.modules:  # else all of it counts
+    ran.note("gfnn_jax")
 
 jax.config.update("jax_enable_x64", True)
 

@@ -9,18 +9,17 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import current
+import ran
 
 STUDY = '''"""A study."""
 import json, pathlib, sys
-sys.path.insert(0, {benchmarks!r})
-from current import code_of
 
 def main(doc, pieces, prefix):
     piece = sys.argv[2]
     if piece == "broken":
         sys.exit(1)
     out = pathlib.Path({out!r}) / f"{{prefix}}-{{piece}}.json"
-    code = {code!r}
+    code = {{"tries.py": {code!r}}}
     out.write_text(json.dumps({{"date": "2026-11-23", "code": code, "measured": {{"rms": 2.0}}}}))
 
 main(__doc__, {{}}, "tries")
@@ -36,25 +35,71 @@ def test_code_is_told_by_what_it_does(tmp_path):
     assert meanings[0] == meanings[1] != meanings[2]
 
 
+def test_a_result_is_old_where_a_file_changed_that_it_ran(tmp_path, monkeypatch):
+    """Of a package that is imported whole, the files of which a function ran count, and those whose
+    constants they take."""
+    package, study = tmp_path / "noted_package", tmp_path / "study.py"
+    package.mkdir()
+    files = {
+        "__init__": "from noted_package import ran_one, idle, limits",
+        "ran_one": "from noted_package.limits import MOST\n"
+        "def f(x):\n    'Doc.'\n    return min(x, MOST)",
+        "idle": "def g(x):\n    return x",
+        "limits": "MOST = 3\ndef h():\n    return MOST",
+    }  # fmt: skip
+    for name, text in files.items():
+        (package / f"{name}.py").write_text(f"{text}\n")
+    study.write_text("import noted_package\n")
+    monkeypatch.setattr(current, "HERE", tmp_path)
+    monkeypatch.setattr(current, "PACKAGE", package)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert list(current.code_of(study)) == ["noted_package", "study.py"]  # nothing is noted
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path])
+    ran.note("noted_package")
+    import noted_package  # pyright: ignore[reportMissingImports]
+
+    with pytest.raises(RuntimeError, match="imported already"):
+        ran.note("noted_package")
+    assert noted_package.ran_one.f(5) == 3
+    assert noted_package.ran_one.f.__doc__ == "Doc."
+    path = tmp_path / "study.json"
+    path.write_text(json.dumps({"code": current.code_of(study)}))
+    result = current.Result(path, study, "")
+    assert result.changed == []
+    for name, text, changed in (
+        ("idle", "def g(x):\n    return x + 1", []),
+        ("ran_one", files["ran_one"] + "  # a comment", []),
+        ("limits", "MOST = 4", ["noted_package/limits.py"]),
+    ):
+        (package / f"{name}.py").write_text(f"{text}\n")
+        current._meaning.cache_clear()
+        assert result.changed == changed, name
+    path.write_text(json.dumps({"code": "0123456789abcdef"}))  # as of a version before
+    assert result.changed is None
+    study.write_text("import sys\nprint(sys.executable)\n")  # what Python it starts runs is unknown
+    assert "noted_package" in current.code_of(study)
+
+
 def test_what_is_old_is_measured_again(tmp_path, monkeypatch):
     study, said = tmp_path / "tries.py", []
     monkeypatch.setattr(current, "HERE", tmp_path)
     monkeypatch.setattr(current, "PACKAGE", tmp_path / "none")
-    folder = str(Path(current.__file__).parent)
-    study.write_text(STUDY.format(benchmarks=folder, out=str(tmp_path), code="new"))
-    monkeypatch.setattr(current, "code_of", lambda path: "new")
+    study.write_text(STUDY.format(out=str(tmp_path), code="new"))
+    monkeypatch.setattr(current, "_digest", lambda path: "new")
     for name, date, code in (
         ("new", "2026-11-20", "new"), ("young", "2026-11-22", "old"), ("old", "2026-11-21", "old"),
         ("broken", "2026-11-22", None),
     ):  # fmt: skip
-        result = {"date": date, "code": code, "seconds": 9.0, "measured": {"rms": 1.0}}
+        of = code and {"tries.py": code}
+        result = {"date": date, "code": of, "seconds": 9.0, "measured": {"rms": 1.0}}
         (tmp_path / f"tries-{name}.json").write_text(json.dumps(result))
     assert current.check(["tries"], tmp_path, only_tell=True, say=said.append) == 0
     assert said[0] == "1 of 4 results are of current code"
     assert [line.split(":")[0] for line in said[1:]] == [
         "tries-old.json", "tries-young.json", "tries-broken.json", "all of them again"
     ]  # fmt: skip
-    assert said[1].endswith("(2026-11-21, 9 s)")
+    assert said[1].endswith(": changed since: tries.py (2026-11-21, 9 s)")
+    assert "which files it ran is not recorded" in said[3]
     said.clear()
     assert current.check(["tries"], tmp_path, say=said.append) == 1
     assert said[1] == "tries-old.json: rms 1 → 2"
@@ -71,20 +116,20 @@ def test_a_study_alone_leaves_the_others_results_and_what_a_kill_left_is_found(
     said = []
     monkeypatch.setattr(current, "HERE", tmp_path)
     monkeypatch.setattr(current, "PACKAGE", tmp_path / "none")
-    monkeypatch.setattr(current, "code_of", lambda path: "new")
+    monkeypatch.setattr(current, "_digest", lambda path: "new")
     for name in ("tries", "tries_again"):
         prefix = name.replace("_", "-")
-        text = STUDY.replace('"tries")', f'"{prefix}")').format(
-            benchmarks=str(Path(current.__file__).parent), out=str(tmp_path), code="new"
-        )
+        text = STUDY.replace('"tries")', f'"{prefix}")').format(out=str(tmp_path), code="new")
         (tmp_path / f"{name}.py").write_text(text)
-        result = {"date": "2026-11-21", "code": "old", "seconds": 9.0, "measured": {"rms": 1.0}}
+        result = {"date": "2026-11-21", "code": {"tries.py": "old"}, "measured": {"rms": 1.0}}
         (tmp_path / f"{prefix}-one.json").write_text(json.dumps(result))
     (tmp_path / "tries-one.json").rename(tmp_path / "tries-one.before")  # killed
     both = ["tries", "tries_again"]
     assert current.check(both, tmp_path, only=["tries"], say=said.append) == 0
     assert said == ["0 of 1 results are of current code", "tries-one.json: rms 1 → 2"]
-    assert json.loads((tmp_path / "tries-again-one.json").read_text())["code"] == "old"
+    assert json.loads((tmp_path / "tries-again-one.json").read_text())["code"] == {
+        "tries.py": "old"
+    }
     assert not list(tmp_path.glob("*.before"))
 
 
@@ -113,7 +158,6 @@ def test_what_moved():
 def test_every_result_of_the_repository_has_a_study(monkeypatch):
     from benchmarks.__main__ import studies
 
-    monkeypatch.setattr(current, "code_of", lambda study: "")  # how old they are says no name
     folder, said = Path(current.__file__).parent / "results", []
     assert current.check(list(studies()), folder, only_tell=True, say=said.append) == 0
     assert not [line for line in said if "no study" in line]
