@@ -1,19 +1,24 @@
 """Simulated twins of measured records: whether the law that was put in comes out, with true errors.
 
-    python benchmarks/twins.py            every twin (some three minutes)
+    python benchmarks/twins.py            every twin (some twenty minutes of a processor)
     python benchmarks/twins.py --quick    two of them, one draw of the noise
 
-Each twin is integrated by SciPy from its own equations of motion, with the coefficients, the
-sampling and the length of the record that it is named for. To its positions noise is added, from
-1e-6 to 1e-2 of their spread. Counted are fits whose formula has exactly the terms and the kinds of
-friction that were put in, and coefficients of these that lie within three standard errors.
+Each twin is integrated by SciPy from its own equations of motion, with coefficients, sampling and
+length close to those of the record that it is named for (of the filmed pendulum, the robot arm and
+the circuit a part of its length); inputs are held from sample to sample. To its positions noise is
+added, from 1e-6 to 1e-2 of their spread. Counted are fits whose formula has exactly the terms and
+the kinds of friction that were put in, and coefficients of these that lie within three standard
+errors.
 """
 
 from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import cache
+from itertools import pairwise
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,8 +33,10 @@ WITHIN = 3.0  # standard errors
 
 
 class Twin(NamedTuple):
-    """accelerate(q, v) -> q̈; the start of each run (q, v), their end and step; the terms of L and R
-    as formulas have them, where each angle's zero is its own."""
+    """accelerate(q, v, u) -> q̈; the start of each run (q, v), their end and step; the terms of L
+    and R as formulas have them, where each angle's zero is its own. inputs: by name their force on
+    each coordinate, held from sample to sample; push(rng, t) -> (n, inputs) a run's. inertia: the
+    two terms of M₁₁, whose mean over the data is 1 in a fit. wrapped: angles in (−π, π]."""
 
     accelerate: Callable
     starts: tuple[tuple[float, ...], ...]
@@ -39,34 +46,88 @@ class Twin(NamedTuple):
     angles: tuple[str, ...]
     lagrangian: dict[str, float]
     friction: dict[str, float]
+    inputs: Mapping[str, tuple[float, ...]] = MappingProxyType({})
+    push: Callable | None = None
+    inertia: tuple[str, str] | None = None
+    wrapped: bool = False
 
 
-def _pendulum(q, v):
+def _pendulum(q, v, u):
     return -1.357 * np.sin(q) - 0.012 * v
 
 
-def _track(q, v):
+def _track(q, v, u):
     return -6.22 * q - 0.014 * v
 
 
-def _carts(q, v):
+def _carts(q, v, u):
     force = [-85.6 * q[0] + 77.8 * q[1], -85.4 * q[1] + 77.8 * q[0]]
     return np.array(force) / [1.0, 2.44]
 
 
-def _double_pendulum(q, v):
-    c, s = 0.407 * np.cos(q[0] - q[1]), 0.407 * np.sin(q[0] - q[1])
+def sign(v):
+    """Of a speed, over a thousandth of a unit: SciPy's steps follow it."""
+    return v / np.hypot(v, 1e-3)
+
+
+def _oscillator(q, v, u):
+    return -184_200 * q - 734_000 * q**3 - 41 * v + 180_000 * u
+
+
+def links(masses, weights, friction):
+    """Of links with angles of their own: L = Σ ½ M_ij v_i v_j cos(q_i − q_j) + Σ c_i cos q_i, the
+    M_ij ``masses`` and c_i ``weights``, and the forces friction(v)."""
+
+    def accelerate(q, v, u):
+        off = q[:, None] - q
+        force = friction(v) - weights * np.sin(q) - (masses * np.sin(off)) @ v**2
+        return np.linalg.solve(masses * np.cos(off), force)
+
+    return accelerate
+
+
+def joints(v, forces):
+    """Forces on links of joints, of which each is a function of their relative speeds."""
+    push = -np.array([force(s) for force, s in zip(forces, np.diff(v, prepend=0.0), strict=True)])
+    return push - np.append(push[1:], 0.0)
+
+
+_ROD, _REACH, _FAR = 0.33, 0.22, 0.165
+
+
+def _robot(q, v, u):
+    """Two links, the second's angle measured from the first."""
+    c, s, both = np.cos(q[1]), np.sin(q[1]), np.sin(q[0] + q[1])
+    across = 2 * _FAR + _REACH * c
     force = [
-        -s * v[1] ** 2 - 62.2 * np.sin(q[0]) - 0.02 * v[0] - 0.008 * (v[0] - v[1]),
-        s * v[0] ** 2 - 23.0 * np.sin(q[1]) - 0.008 * (v[1] - v[0]),
-    ]
-    return np.linalg.solve(np.array([[1.0, c], [c, 0.316]]), force)
+        _REACH * s * v[1] * (2 * v[0] + v[1]) - 14 * np.sin(q[0]) - 10.5 * both
+        + 10 * u[0] - 1.4 * sign(v[0]),
+        -_REACH * s * v[0] ** 2 - 10.5 * both + 10 * u[1] - 0.8 * sign(v[1]),
+    ]  # fmt: skip
+    return np.linalg.solve([[2 * _ROD + 2 * _REACH * c, across], [across, 2 * _FAR]], force)
 
 
-def _arm(q, v):
-    return 64.0 * np.sin(q) - 0.0047 * v * abs(v) - 0.13 * v / np.hypot(v, 1e-3)
+def multisine(lowest, highest, count, sizes):
+    """(n, inputs) at times t of sines of as many frequencies (Hz) as ``count``, their sizes the rms
+    of each input."""
+
+    def push(rng, t):
+        frequencies = np.linspace(lowest, highest, count)
+        phases = rng.uniform(0, 2 * np.pi, (count, len(sizes)))
+        waves = np.sin(2 * np.pi * frequencies[:, None] * t[:, None, None] + phases)
+        return waves.sum(axis=1) * np.array(sizes) * np.sqrt(2 / count)
+
+    return push
 
 
+def swings(count, dim, angle, speed, about=0.0):
+    """Starts of so many runs, angles and speeds up to these."""
+    rng = np.random.default_rng(count)
+    q = about + rng.uniform(-angle, angle, (count, dim))
+    return tuple(map(tuple, np.concatenate([q, rng.uniform(-speed, speed, (count, dim))], axis=1)))
+
+
+TWO, THREE = ("theta1", "theta2"), ("theta1", "theta2", "theta3")
 TWINS = {
     "pendulum": Twin(
         _pendulum, ((1.45, 0.0),), 57.0, 1 / 6, ("theta",), ("theta",),
@@ -81,50 +142,133 @@ TWINS = {
         {"v1**2": 0.5, "v2**2": 1.22, "x1**2": -42.8, "x1*x2": 77.8, "x2**2": -42.7}, {},
     ),
     "double_pendulum": Twin(
-        _double_pendulum, ((1.3, -1.2, 0.0, 8.0), (-1.0, 0.4, 3.0, 0.0)), 2.6, 0.01,
-        ("theta1", "theta2"), ("theta1", "theta2"),
+        links(
+            np.array([[1.0, 0.407], [0.407, 0.316]]), np.array([62.2, 23.0]),
+            lambda v: joints(v, [lambda s: 0.02 * s, lambda s: 0.008 * s]),
+        ),
+        ((1.3, -1.2, 0.0, 8.0), (-1.0, 0.4, 3.0, 0.0)), 2.6, 0.01, TWO, TWO,
         {"omega1**2": 0.5, "omega1*omega2*cos(theta1 - theta2)": 0.407, "omega2**2": 0.158,
          "cos(theta1)": 62.2, "cos(theta2)": 23.0},
         {"omega1**2": 0.01, "(omega2 - omega1)**2": 0.004},
     ),
     "arm1": Twin(
-        _arm, ((4.7, 0.0), (4.2, 0.0)), 9.0, 0.004, ("theta",), ("theta",),
-        {"omega**2": 0.5, "cos(theta)": -64.0},
-        {"abs(omega)**3": 0.0047 / 3, "dry": 0.13},
+        lambda q, v, u: 64.0 * np.sin(q) - 0.0047 * v * abs(v) - 0.13 * sign(v),
+        ((4.7, 0.0), (4.2, 0.0)), 9.0, 0.004, ("theta",), ("theta",),
+        {"omega**2": 0.5, "cos(theta)": -64.0}, {"abs(omega)**3": 0.0047 / 3, "abs(omega)": 0.13},
+    ),
+    "arm2": Twin(
+        links(
+            np.array([[1.0, 0.4914], [0.4914, 0.5563]]), np.array([-58.9, -27.83]),
+            lambda v: joints(v, [lambda s: 0.003 * s * abs(s), lambda s: 0.056 * sign(s)])
+            - [0.0, 0.002 * v[1] * abs(v[1])],
+        ),
+        swings(16, 2, 1.0, 4.0, about=np.pi), 2.667, 0.001, TWO, TWO,
+        {"omega1**2": 0.5, "omega1*omega2*cos(theta1 - theta2)": 0.4914, "omega2**2": 0.27815,
+         "cos(theta1)": -58.9, "cos(theta2)": -27.83},
+        {"abs(omega1)**3": 0.001, "abs(omega2)**3": 0.002 / 3, "abs(omega2 - omega1)": 0.056},
+    ),
+    "arm3": Twin(
+        links(
+            np.array([[1.0, 0.778, 0.2], [0.778, 0.966, 0.265], [0.2, 0.265, 0.22]]),
+            np.array([-58.0, -44.0, -11.3]),
+            lambda v: joints(v, [lambda s: 0.033 * sign(s), lambda s: 0.027 * sign(s),
+                                 lambda s: 0.0006 * s * abs(s)]),
+        ),
+        swings(12, 3, 0.5, 2.0, about=np.pi), 1.539, 0.001, THREE, THREE,
+        {"omega1**2": 0.5, "omega1*omega2*cos(theta1 - theta2)": 0.778,
+         "omega1*omega3*cos(theta1 - theta3)": 0.2, "omega2**2": 0.483,
+         "omega2*omega3*cos(theta2 - theta3)": 0.265, "omega3**2": 0.11,
+         "cos(theta1)": -58.0, "cos(theta2)": -44.0, "cos(theta3)": -11.3},
+        {"abs(omega3 - omega2)**3": 0.0002, "abs(omega1)": 0.033, "abs(omega2 - omega1)": 0.027},
+    ),
+    "video_double_pendulum": Twin(
+        links(
+            np.array([[1.0, 0.35], [0.35, 0.27]]), np.array([105.0, 38.0]),
+            lambda v: joints(v, [lambda s: 0.03 * s, lambda s: 0.004 * s]),
+        ),
+        ((1.95, -0.08, 0.0, 0.0), (2.3, 0.1, 0.0, 0.0)), 20.0, 0.0025, TWO, TWO,
+        {"omega1**2": 0.5, "omega1*omega2*cos(theta1 - theta2)": 0.35, "omega2**2": 0.135,
+         "cos(theta1)": 105.0, "cos(theta2)": 38.0},
+        {"omega1**2": 0.015, "(omega2 - omega1)**2": 0.002}, wrapped=True,
+    ),
+    "robot_arm": Twin(
+        _robot, ((0.0,) * 4,) * 3, 10.0, 0.002, TWO, TWO,
+        {"omega1**2": _ROD, "omega1**2*cos(theta2)": _REACH, "omega1*omega2*cos(theta2)": _REACH,
+         "omega1*omega2": 2 * _FAR, "omega2**2": _FAR, "cos(theta1)": 14.0,
+         "cos(theta1 + theta2)": 10.5},
+        {"abs(omega1)": 1.4, "abs(omega2)": 0.8},
+        {"tau1": (10.0, 0.0), "tau2": (0.0, 10.0)}, multisine(0.2, 2.5, 12, (0.4, 0.3)),
+        ("omega1**2", "omega1**2*cos(theta2)"),
+    ),
+    "silverbox": Twin(
+        _oscillator, ((0.0, 0.0),), 20.0, 1 / 610.35, ("y",), (),
+        {"y_dot**2": 0.5, "y**2": -92_100.0, "y**4": -183_500.0}, {"y_dot**2": 20.5},
+        {"u": (180_000.0,)}, multisine(1.0, 200.0, 400, (0.022,)),
     ),
 }  # fmt: skip
 
 
-def recording(twin: Twin, noise: float, draw: int) -> gfnn.Recording:
+@cache
+def orbits(name: str, draw: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times (n,), positions (runs, d, n) and inputs (runs, n, k) of a twin's runs."""
+    twin, rng = TWINS[name], np.random.default_rng(draw)
+    t, d = np.arange(0, twin.end, twin.dt), len(twin.names)
+    x = np.array(twin.starts) * (1 + 0.02 * draw)
+    options = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-11, "max_step": 0.05}
+    if twin.push is None:
+
+        def rate(_, x):
+            return [*x[d:], *np.ravel(twin.accelerate(x[:d], x[d:], None))]
+
+        q = [solve_ivp(rate, (0, t[-1]), one, t_eval=t, **options).y[:d] for one in x]
+        return t, np.array(q), np.zeros((len(x), len(t), 0))
+    u, q = np.array([twin.push(rng, t) for _ in x]), [x[:, :d]]
+    for k, (begin, end) in enumerate(pairwise(t)):
+
+        def rate(_, y, k=k):
+            states = y.reshape(-1, 2 * d)
+            return np.ravel([[*s[d:], *np.ravel(twin.accelerate(s[:d], s[d:], now))]
+                             for s, now in zip(states, u[:, k], strict=True)])  # fmt: skip
+
+        x = solve_ivp(rate, (begin, end), x.ravel(), **options).y[:, -1].reshape(x.shape)
+        q.append(x[:, :d])
+    return t, np.stack(q, axis=-1), u
+
+
+def recording(name: str, noise: float, draw: int) -> gfnn.Recording:
     """Positions of the twin's runs with noise, a share of their spread, and velocities of none."""
-    rng, t, tables = np.random.default_rng(draw), np.arange(0, twin.end, twin.dt), []
-    d = len(twin.names)
-    orbits = []
-    for start in twin.starts:
-        first = np.array(start) * (1 + 0.02 * draw)
-        orbits.append(
-            solve_ivp(
-                lambda _, x: [*x[d:], *np.ravel(twin.accelerate(x[:d], x[d:]))], (0, t[-1]), first,
-                t_eval=t, method="DOP853", rtol=1e-11, atol=1e-11, max_step=0.05,
-            ).y[:d]
-        )  # fmt: skip
-    spread = np.concatenate(orbits, axis=1).std(axis=1)
-    for run, q in enumerate(orbits):
+    twin, rng = TWINS[name], np.random.default_rng([draw, round(-np.log10(noise))])
+    t, every, inputs = orbits(name, draw)
+    spread, tables = every.swapaxes(0, 1).reshape(len(twin.names), -1).std(axis=1), []
+    for run, (q, u) in enumerate(zip(every, inputs, strict=True)):
         seen = q + noise * spread[:, None] * rng.normal(size=q.shape)
-        columns = dict(zip(twin.names, seen, strict=True))
+        if twin.wrapped:
+            seen = np.pi - (np.pi - seen) % (2 * np.pi)
+        columns = {**dict(zip(twin.names, seen, strict=True)),
+                   **dict(zip(twin.inputs, u.T, strict=True))}  # fmt: skip
         tables.append({"run": np.full(len(t), str(run)), "t": t, **columns})
-    return gfnn.Recording(tables, positions=twin.names, angles=twin.angles)
+    return gfnn.Recording(
+        tables, positions=twin.names, angles=twin.angles, inputs=tuple(twin.inputs)
+    )
 
 
 def plain(term: str) -> str:
-    """The term without zeros of angles; dry friction in a word."""
-    term = re.sub(r" [-+] \d\.?[\d.e-]*\)", ")", term)
-    return "dry" if re.fullmatch(r"abs\([^()]*\)", term) else term
+    """The term without zeros of angles."""
+    return re.sub(r" [-+] \d\.?[\d.e-]*\)", ")", term)
 
 
-def case(twin: Twin, noise: float, draw: int) -> Numbers:
+def scale_of(twin: Twin, found: dict[str, tuple[float, float]]) -> float:
+    """The factor of L as a fit has it: its own terms tell the mean over the data of ∂²L/∂v₁²."""
+    if twin.inertia is None or not set(twin.inertia) <= set(found):
+        return 1.0
+    own, turning = twin.inertia
+    mean = (0.5 - found[own][0]) / found[turning][0]
+    return 0.5 / (twin.lagrangian[own] + mean * twin.lagrangian[turning])
+
+
+def case(name: str, noise: float, draw: int) -> Numbers:
     """One fit: whether its terms are those put in, and its errors in standard errors."""
-    record = recording(twin, noise, draw)
+    twin, record = TWINS[name], recording(name, noise, draw)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
         done = once(lambda: gfnn.fit(record))
@@ -135,12 +279,16 @@ def case(twin: Twin, noise: float, draw: int) -> Numbers:
         "lagrangian": set(found) == set(twin.lagrangian),
         "friction": set(lost) == set(twin.friction),
     }
-    off = {}
-    for put_in, came_out in ((twin.lagrangian, found), (twin.friction, lost)):
+    off, scale = {}, scale_of(twin, found)
+    for of, put_in, came_out in (("", twin.lagrangian, found), ("R: ", twin.friction, lost)):
         for term, value in put_in.items():
             c, std = came_out.get(term, (0.0, 0.0))
             if std > 0:
-                off[f"R: {term}" if put_in is twin.friction else term] = abs(c - value) / std
+                off[of + term] = abs(c - scale * value) / std
+    for u, forces in twin.inputs.items():
+        for q, force in zip(twin.names, forces, strict=True):
+            gain, std = fit.gains[u][q]
+            off[f"gain of {u} on {q}"] = abs(gain - scale * force) / std
     off |= {f"zero of {name}": abs(zero) / std for name, (zero, std) in fit.zeros.items()}
     return {
         "noise": noise, "draw": draw, "same": same, "standard_errors": off,
@@ -153,7 +301,7 @@ def measured(name: str, quick: bool) -> Numbers:
     cases = []
     for noise in NOISES:
         for draw in range(1 if quick else DRAWS):
-            cases.append(case(TWINS[name], noise, draw))
+            cases.append(case(name, noise, draw))
             c = cases[-1]
             worst = max(c["standard_errors"].items(), key=lambda item: item[1], default=("", 0))
             print(f"  {noise:g}: {c['same']}, {worst[0]} off by {worst[1]:.1f}; {c['formula']} | "

@@ -63,7 +63,14 @@ class Sensors:
 
     def misfit_at(self, ahead: np.ndarray) -> np.ndarray:
         """The law's own error (..., k) at times ``ahead`` (...); beyond the last lead it grows on
-        as it did on the mean until there."""
-        columns = [np.interp(ahead, self.leads, column) for column in self.misfit.T]
-        beyond = np.maximum(1.0, ahead / self.leads[-1])
-        return np.stack(columns, axis=-1) * beyond[..., None]
+        with the power of time by which it grew from half of that lead on, none to the first: errors
+        of a driven, damped motion grow no more."""
+        t, m = self.leads, np.maximum(self.misfit, 1e-300)
+        columns = [np.interp(ahead, t, column) for column in self.misfit.T]
+        recent = t >= t[-1] / 2
+        slope = np.zeros(m.shape[1])
+        if np.sum(recent) > 1:
+            slope = np.polyfit(np.log(t[recent]), np.log(m[recent]), 1)[0]
+        power = np.clip(slope, 0.0, 1.0)
+        beyond = np.maximum(1.0, ahead / t[-1])
+        return np.stack(columns, axis=-1) * beyond[..., None] ** power
