@@ -95,17 +95,17 @@ class RadialBumps:
 
 
 @gfnn.register
-@partial(jax.tree_util.register_dataclass, data_fields=("force", "dt"), meta_fields=())
+@partial(jax.tree_util.register_dataclass, data_fields=("params", "dt"), meta_fields=())
 @dataclasses.dataclass(frozen=True, eq=False)
 class Verlet:
     """A step of Störmer and Verlet, of order 2: half a kick, a drift, half a kick. The force is a
-    polynomial Σ force_k q^k of one coordinate."""
+    polynomial Σ params_k q^k of one coordinate."""
 
-    force: jax.Array
+    params: jax.Array
     dt: float
 
     def _kicked(self, q, p):
-        return p + self.dt / 2 * jnp.polyval(self.force[::-1], q)
+        return p + self.dt / 2 * jnp.polyval(self.params[::-1], q)
 
     def step(self, z, args=None, *, unrolled=False):
         q, p = z[..., 0], z[..., 1]
@@ -137,9 +137,11 @@ class Kicks:
         (q0, p0), (q1, p1) = data.y0.T, data.y1.T
         powers = np.arange(size + 1)
         design = data.dt / 2 * (q0[:, None] ** powers + q1[:, None] ** powers)
-        force = np.linalg.lstsq(design, p1 - p0, rcond=None)[0]
+        force, left, _, _ = np.linalg.lstsq(design, p1 - p0, rcond=None)
+        variance = left.item() / (len(q0) - size - 1)
+        root = np.sqrt(variance) * np.linalg.inv(np.linalg.qr(design, mode="r")).T
         piece = Verlet(force, float(data.dt))
-        return gfnn.Fitted(piece, f"kicks {size}", size + 1, 8.0 * size)
+        return gfnn.Fitted(piece, f"kicks {size}", size + 1, 8.0 * size, root)
 
 
 @gfnn.register

@@ -169,3 +169,23 @@ def test_public_names():
     assert set(gfnn_jax.__all__) <= set(dir(gfnn_jax))
     with pytest.raises(AttributeError, match="no attribute 'Mapp'"):
         gfnn_jax.Mapp  # noqa: B018
+
+
+def models_told_apart():
+    """``isinstance`` with a class of `models` in the search and in what follows it."""
+    for name, tree in modules():
+        if room_of(name) not in ("search", "learn"):
+            continue
+        of_models = {
+            alias.asname or alias.name
+            for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)
+            and (node.module or "").startswith("gfnn_jax.models.") for alias in node.names
+        }  # fmt: skip
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance":
+                classes = {n.id for n in ast.walk(node.args[1]) if isinstance(n, ast.Name)}
+                yield from (f"{name} asks for {model}" for model in classes & of_models)
+
+
+def test_search_and_choice_know_no_model_by_name():
+    assert list(models_told_apart()) == []

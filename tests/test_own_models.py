@@ -24,6 +24,16 @@ def error_of(map_, pairs):
     return np.sqrt(np.mean((np.asarray(map_.step(pairs.z0)[0]) - np.asarray(pairs.z1)) ** 2))
 
 
+def covariance_of(pairs, map_):
+    """Of the force, by the normal equations of all pairs, with the noise that they leave."""
+    (q0, p0), (q1, p1) = np.asarray(pairs.z0).T, np.asarray(pairs.z1).T
+    force = np.asarray(map_.pieces[0].params)
+    powers = np.arange(len(force))
+    design = pairs.dt / 2 * (q0[:, None] ** powers + q1[:, None] ** powers)
+    left = np.sum((p1 - p0 - design @ force) ** 2) / (len(q0) - len(force))
+    return left * np.linalg.inv(design.T @ design)
+
+
 def kept(map_, folder):
     """The map, saved and loaded."""
     map_.save(folder)
@@ -57,6 +67,11 @@ def test_a_model_and_its_piece(pairs, fresh, tmp_path):
     assert not np.any(info.status)
     back, _ = again.inverse(states[:, -1])
     np.testing.assert_allclose(back, states[:, -2], rtol=0, atol=1e-14)
+    drawn = again.sample(jax.random.key(2), 200)
+    spread = np.std(np.asarray(drawn.params), axis=0)
+    np.testing.assert_allclose(spread, np.sqrt(np.diag(covariance_of(pairs, again))), rtol=0.2)
+    many, _ = drawn.rollout(fresh.z0[:5], 1)
+    assert np.all(np.std(many[:, :, 1, 1], axis=0) > 0)
 
 
 def swinging(seed, num=400, dt=0.03):

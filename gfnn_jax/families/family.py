@@ -32,6 +32,16 @@ class Family(Protocol):
     """
 
     @property
+    def name(self) -> str:
+        """Kind of family, one word: what a saved map knows it by."""
+        ...
+
+    @property
+    def label(self) -> str:
+        """Kind and size, as tables and reports show them."""
+        ...
+
+    @property
     def operations(self) -> tuple[int, int]:
         """Floating-point operations of a gradient, and of a gradient with its Hessian."""
         ...

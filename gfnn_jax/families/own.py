@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from typing import Any
 
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.family import LinearFamily
 from gfnn_jax.families.inputs import Inputs
 
+# The members of `families.family.LinearFamily`.
 _NEEDED = (
     "name", "label", "operations", "num_parameters", "value", "gradient", "gradient_and_hessian",
     "term_gradients", "unflatten",
@@ -25,7 +25,7 @@ def own_families(given: Any, inputs: Inputs) -> Iterator[Any]:
 
     Raises FitError where a family lacks a member that a fit needs.
     """
-    families = [given] if isinstance(given, LinearFamily) else given(inputs)
+    families = [given] if hasattr(given, "term_gradients") else given(inputs)
     last = 0
     for family in families:
         missing = [name for name in _NEEDED if not hasattr(family, name)]

@@ -17,7 +17,6 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.learn.stated import Stated
-from gfnn_jax.models.generating_functions.sweeps import LinearSweep
 
 _WHAT = "the fit of the chosen size to the test pairs too"
 _WORDS = "; the map is fitted to them too"
@@ -31,7 +30,7 @@ def with_test_rows(
     rows are then missed by more."""
     entry, candidate = chosen.entry, error.candidate
     chosen = chosen._replace(candidate=candidate)
-    if error.by != "test" or entry is None or not isinstance(entry.sweep, LinearSweep):
+    if error.by != "test" or entry is None or not entry.sweep.linear:
         return chosen, error.words
     sweep, size = entry.sweep, entry.size
     work = sweep.work_of_test_rows(size)

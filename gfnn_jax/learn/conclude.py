@@ -23,7 +23,6 @@ from gfnn_jax.learn.propose import proposed
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.generating_functions.size import OF_SOLVE, OF_STEPS
-from gfnn_jax.models.generating_functions.sweeps import LinearSweep
 from gfnn_jax.models.hamiltonians.choose_law import long_step
 from gfnn_jax.models.hamiltonians.law_messages import TURNS
 from gfnn_jax.models.hamiltonians.white import leaves_white
@@ -292,7 +291,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     if known_noise is not None:
         return _beside_known(noise, known_noise)
     own, sizes_of_noise = "", _by_name(noise)
-    if candidate.learns == "map" and entry is not None and isinstance(entry.sweep, LinearSweep):
+    if candidate.learns == "map" and entry is not None and entry.sweep.linear:
         part = entry.sweep.error_by_noise(entry.size) / np.sqrt(np.mean((noise / data.spread) ** 2))
         if part > _OWN_ERROR:
             message = (

@@ -181,7 +181,7 @@ def _best(found: Searched) -> Candidate | None:
 def _swept(found: Searched) -> tuple[LinearSweep, Size] | None:
     """The sweep and size of the first generated map, where the sweep is of these pairs."""
     entry = next(iter(found.found.ranking), None)
-    if entry is None or not isinstance(entry.sweep, LinearSweep):
+    if entry is None or not entry.sweep.linear:
         return None
     return (entry.sweep, entry.size) if entry.sweep.data.pairs is found.data.pairs else None
 

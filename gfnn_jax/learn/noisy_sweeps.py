@@ -96,7 +96,7 @@ def _as_far(found: Searched) -> list[Entry]:
 
 
 def _can_be_corrected(entry: Entry) -> bool:
-    plain = isinstance(entry.sweep, LinearSweep) and isinstance(entry.size.family, Products)
+    plain = entry.sweep.linear and isinstance(entry.size.family, Products)
     if not plain:
         return False
     return not entry.sweep.data.varied and entry.sweep.moved_by_states

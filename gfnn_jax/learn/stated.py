@@ -33,7 +33,6 @@ from gfnn_jax.fitting.left_out import without_each
 from gfnn_jax.flows.collocation import Steps, truncation
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.models.generating_functions.network_sweep import NetworkSweep
 from gfnn_jax.models.hamiltonians.work import work_of_refit
 
 _FOLDS = 5
@@ -197,14 +196,15 @@ def _refits(chosen: Chosen, found: Searched) -> _Refits | None:
     entry, law = chosen.entry, found.law
     if entry is not None:
         sweep, size = entry.sweep, entry.size
-        if isinstance(sweep, NetworkSweep) or sweep.data.pairs is not found.data.pairs:
+        work = sweep.work_of_refit(size)
+        if not np.isfinite(work) or sweep.data.pairs is not found.data.pairs:
             return None
 
         def predicts(parts: list[np.ndarray]) -> list[np.ndarray]:
             rows = np.concatenate(parts)
             return [sweep.predicted(size, np.setdiff1d(rows, part), part) for part in parts]
 
-        return _Refits(predicts, ROWS, sweep.work_of_refit(size))
+        return _Refits(predicts, ROWS, work)
     flow = law is not None and chosen.candidate.learns == "hamiltonian" and law.terms
     return _of_law(found) if flow else None
 

@@ -135,13 +135,16 @@ def sampled(map_: SymplecticMap, key, num: int) -> Samples:
     if map_.posterior is None:
         raise ValueError(
             "the map has no posterior to draw from: gfnn.fit gives one to a map fitted to the "
-            "pairs themselves that is linear in its coefficients or an ensemble of networks"
+            "pairs themselves whose model knows the covariance of its coefficients: one that is "
+            "linear in them, a law, or an ensemble of networks"
         )
     if num < 1:
         raise ValueError(f"expected a number of samples above 0, got {num}")
     piece, root = map_.pieces[map_.posterior.piece], np.asarray(map_.posterior.root)
     drawn = _generator(key).normal(size=(num, len(root))) @ root
-    params = np.asarray(piece.params) + piece.family.unflatten(drawn)
+    if hasattr(piece, "family"):
+        drawn = piece.family.unflatten(drawn)
+    params = np.asarray(piece.params) + drawn
     bare = dataclasses.replace(map_, posterior=None)
     return Samples(bare, jax.device_put(params.astype(map_.scale.dtype)), map_.posterior.piece)
 

@@ -45,13 +45,15 @@ class Fitted(NamedTuple):
     """A size of a model, fitted.
 
     piece: of a map (`maps.piece.Piece`). label: as the table of candidates shows it.
-    operations: counted, of a predicted step.
+    operations: counted, of a predicted step. root: (k, m) covariance root of ``piece.params`` (m,),
+    the covariance being rootᵀ root, from which maps are drawn; None where it is not known.
     """
 
     piece: Any
     label: str
     num_parameters: int
     operations: float
+    root: np.ndarray | None = None
 
 
 @runtime_checkable

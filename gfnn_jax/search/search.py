@@ -18,6 +18,7 @@ import numpy as np
 from gfnn_jax.budget import ROWS, SOLVE, Budget, OutOfTime
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.search.extrapolate import Decay, decay_of
+from gfnn_jax.search.sweep import Sweep
 
 # A size that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
 # the odd degrees), and larger families only fit noise.
@@ -38,7 +39,7 @@ _FAR = 10.0  # times the tolerance: a sweep that leads to no smaller error misse
 
 
 class Entry(NamedTuple):
-    """A estimated or validated candidate and where it came from."""
+    """A candidate, estimated or validated, of a size of a sweep (`search.sweep.Sweep`)."""
 
     candidate: Candidate
     sweep: Any
@@ -57,7 +58,7 @@ class Found(NamedTuple):
 
 
 def search(
-    sweeps: Sequence[Any],
+    sweeps: Sequence[Sweep],
     bound: float,
     budget: Budget,
     on_progress: Callable[[str], Any],
@@ -72,13 +73,7 @@ def search(
 
 
 class Search:
-    """A climb of sweeps, which may be made in parts.
-
-    A sweep has ``sizes`` by rising ``operations``, each of an ``order`` with which the
-    logarithm of the error falls in proportion, ``estimate(size, budget, on_progress)`` and
-    ``validate(size, estimated, budget, on_progress)``, which give candidates, ``work(size)`` and
-    ``work_of_steps(size)``: the operations that these take, ``short_of_pairs``: whether more pairs
-    would allow larger sizes, and ``at(order)``, which says what a size of this order is and takes.
+    """A climb of sweeps (`search.sweep.Sweep`), which may be made in parts.
 
     bound: the tolerance on a candidate's ``validation_bound``. on_candidate: called with every
     candidate. on_validated: called with every entry whose steps have been looked at.
@@ -86,7 +81,7 @@ class Search:
 
     def __init__(
         self,
-        sweeps: Sequence[Any],
+        sweeps: Sequence[Sweep],
         bound: float,
         budget: Budget,
         on_progress: Callable[[str], Any],

@@ -7,8 +7,8 @@ the residual is noise, a larger size tells: it leaves that too.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,6 +63,10 @@ class CoefficientNoise(Generates):
     def _larger(self, size: Size) -> Size | None:
         """A larger size, which tells noise from misfit."""
         raise NotImplementedError
+
+    def posterior(self, size: Size) -> Callable[[], np.ndarray]:
+        """Function that makes the covariance root of the size's coefficients."""
+        return partial(self.root, size)
 
     def root(self, size: Size) -> np.ndarray:
         """(m, m): rootᵀ root is the covariance of the size's coefficients.

@@ -8,6 +8,8 @@ say how much wider the posterior is.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -63,6 +65,10 @@ class EnsembleSweep(NetworkSweep):
         )
         self._take(result.params)
         return result
+
+    def posterior(self, size: Size) -> Callable[[], np.ndarray]:
+        """Function that makes the covariance root of the members' weights."""
+        return partial(self.root, size)
 
     def root(self, size: Size) -> np.ndarray:
         """(E, E): rootᵀ root is the covariance of the weights, the members' own times a factor.

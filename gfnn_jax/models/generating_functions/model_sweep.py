@@ -38,6 +38,7 @@ class ModelSweep:
     """The sizes of one model, each fitted to the training pairs and judged by its own steps."""
 
     short_of_pairs = False
+    linear = False
 
     def __init__(self, model: Model, data: Dataset, tolerance: Tolerance):
         self.model, self.data, self.tolerance = model, data, tolerance
@@ -92,6 +93,11 @@ class ModelSweep:
     def piece(self, size: ModelSize) -> Any:
         """The fitted piece."""
         return self._fitted[size.number].piece
+
+    def posterior(self, size: ModelSize) -> Callable[[], np.ndarray] | None:
+        """Function that gives the covariance root; None where the model found none."""
+        root = self._fitted[size.number].root
+        return None if root is None else lambda: np.asarray(root)
 
     def predicted(self, size: ModelSize, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Images (n, 2d) of these rows, in the user's coordinates, by a fit to other rows."""

@@ -30,6 +30,7 @@ class NetworkSweep(Generates):
 
     kind = "mlp"
     short_of_pairs = False  # its one size is trained on any number of pairs
+    linear = False
 
     def __init__(
         self, data: Dataset, tolerance: Tolerance, chart, max_iterations, seed, checkpoints
@@ -57,6 +58,18 @@ class NetworkSweep(Generates):
     def work_of_steps(self, size: Size) -> float:
         """Operations that validating the judged size takes."""
         return OF_STEPS * len(self.data.validation) * size.operations
+
+    def work_of_refit(self, size: Size) -> float:
+        """Infinite: a network is not trained anew."""
+        return np.inf
+
+    def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Raise NotImplementedError: a network is not trained anew."""
+        raise NotImplementedError
+
+    def posterior(self, size: Size) -> Callable[[], np.ndarray] | None:
+        """Return None: one network does not tell how well it is determined."""
+        return None
 
     @property
     def _work_of_iteration(self) -> float:

@@ -99,6 +99,8 @@ class LinearSweep(CoefficientNoise):
     number of terms.
     """
 
+    linear = True
+
     def __init__(
         self, data: Dataset, tolerance: Tolerance, chart: AnyChart, kind: str, features, reversor,
         factors=None, even=False, own: Callable[[Inputs], Iterable[Any]] | None = None,
