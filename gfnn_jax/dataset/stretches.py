@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gfnn_jax.data.channels import channels_of
+from gfnn_jax.data.channels import args_of, channels_of, parameters_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.signals.local_cubics import choose_half, smooth
@@ -34,8 +34,8 @@ _SHORTEST_ARC = 5
 @dataclasses.dataclass(frozen=True, eq=False)
 class Stretch:
     """Samples without a gap of ``run``: times t (n,), channels y (n, k), NaN where one was not
-    seen, inputs u (n, inputs), the coordinates q (n, d) that the channels show, and the ``noise``
-    (n, k) of each value in units of its channel's."""
+    seen, inputs u (n, inputs), the coordinates q (n, d) that the channels show, the ``noise``
+    (n, k) of each value in units of its channel's, and the parameters args (k,) of the system."""
 
     run: str
     t: np.ndarray
@@ -43,6 +43,7 @@ class Stretch:
     u: np.ndarray
     q: np.ndarray
     noise: np.ndarray
+    args: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -125,7 +126,7 @@ def stretches(
     Raises FitError where no stretch is long enough.
     """
     names = recording.positions if channels is None else channels
-    found = []
+    varied, found = parameters_of(recording), []
     for run in recording.runs:
         t, u = recording.times(run), recording.array("inputs", run)
         y, noise = channels_of(recording, names, run)
@@ -137,7 +138,7 @@ def stretches(
         if coordinates_of is not None and len(q):
             q = q.copy()
             q[:, turns] = np.unwrap(q[:, turns], axis=0)
-        found += pieces(run, t, y, u, q, noise)
+        found += pieces(run, t, y, u, q, noise, args_of(recording, run, varied))
     found = [s for s in found if len(s.t) >= _SHORTEST]
     if not found:
         raise FitError(
@@ -149,13 +150,13 @@ def stretches(
 
 def pieces(
     run: str, t: np.ndarray, y: np.ndarray, u: np.ndarray, q: np.ndarray, noise: np.ndarray,
-    gap: float = GAP,
+    args: np.ndarray, gap: float = GAP,
 ) -> list[Stretch]:  # fmt: skip
     """A run cut at its gaps."""
     steps = np.diff(t)
     cuts = np.flatnonzero(steps > gap * np.median(steps)) + 1 if len(steps) else []
     parts = (np.split(a, cuts) for a in (t, y, u, q, noise))
-    return [Stretch(run, *part) for part in zip(*parts, strict=True)]
+    return [Stretch(run, *part, args) for part in zip(*parts, strict=True)]
 
 
 def measure(found: Sequence[Stretch]) -> Scales:

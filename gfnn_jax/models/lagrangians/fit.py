@@ -78,6 +78,27 @@ class LawFit:
         return np.sqrt(np.nanmean(left**2, axis=(0, 1))) * self.sigma
 
 
+class Systems(NamedTuple):
+    """Parameters of the systems that a recording is of: their names, and values (n, k) of the
+    stretch of each of the nodes, and (m, k) of the positions of the gauge."""
+
+    names: tuple[str, ...]
+    of_nodes: np.ndarray
+    of_gauge: np.ndarray
+
+    @classmethod
+    def of(cls, names: tuple[str, ...], nodes: Sequence[Nodes]) -> Systems | None:
+        """Those of the runs that the nodes are of; None where there are no such ``names``."""
+        if not names:
+            return None
+        values = np.stack([n.stretch.args for n in nodes])
+        return cls(names, values, np.repeat(values, [len(n.t) for n in nodes], axis=0))
+
+    def __call__(self, arcs: Arcs) -> np.ndarray:
+        """(A, k) of arcs."""
+        return self.of_nodes[[i for i, _, _ in arcs.home]]
+
+
 class Without(NamedTuple):
     """A fit without a third of the record, and the run and the time at which that third begins."""
 
@@ -89,13 +110,15 @@ class Without(NamedTuple):
 @dataclasses.dataclass(frozen=True, eq=False)
 class Workbench:
     """Basis that all fits of one recording share: positions of the gauge, the inputs of arcs, the
-    fastest frequency ω, how states are seen, and how zeros of channels wander, if they do."""
+    fastest frequency ω, how states are seen, how zeros of channels wander, if they do, and the
+    parameters of the systems, if these differ."""
 
     gauge: np.ndarray
     inputs: Any  # of arcs: ArcInputs, or a function in its place
     omega: float
     observation: Observation
     wander: Wander | None = None
+    systems: Systems | None = None
 
     def whitening(self, arcs: Arcs) -> np.ndarray | None:
         """Whitening (A, k, L, L) of the residuals of arcs; None where they are white."""
@@ -104,10 +127,14 @@ class Workbench:
         return self.wander.whitening(arcs.t, np.where(np.isfinite(arcs.y), arcs.noise, np.inf))
 
     def model(self, structure: Structure, arcs: Arcs, given: np.ndarray, free: np.ndarray):
-        form = structure.form(self.gauge)
         u = self.inputs(arcs)
         h = np.diff(arcs.t, axis=1)
-        return LawOnArcs(form, self.observation, structure.zeros, h, u, given, free)
+        if self.systems is None:
+            form, args = structure.form(self.gauge), None
+        else:
+            form, args = structure.form(self.gauge, self.systems.of_gauge), self.systems(arcs)
+        args = None if form.powers is None else args
+        return LawOnArcs(form, self.observation, structure.zeros, h, u, given, free, args)
 
     def state_scale(self, sigma: np.ndarray) -> np.ndarray:
         """The defect (2d,) that counts as one standard deviation of the channels."""

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.data.channels import parameters_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.dataset.rests import without_rests
@@ -33,6 +34,7 @@ from gfnn_jax.models.lagrangians.input_rules import Acting
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.next_motion import next_motions
+from gfnn_jax.models.lagrangians.of_systems import search_of_systems
 from gfnn_jax.models.lagrangians.search import NO_LAW, Found, SearchOptions, describe, search
 from gfnn_jax.models.lagrangians.text import speed_names
 from gfnn_jax.models.lagrangians.traces import traces_of
@@ -235,7 +237,13 @@ def _searched(
         nodes, scales, samples.angles, len(samples.recording.inputs), inputs, samples.observation,
         on_progress, options,
     )  # fmt: skip
-    found = search(*record) if asked is None else fit_given(asked, *record)
+    parameters = parameters_of(samples.recording)
+    if asked is not None:
+        found = fit_given(asked, *record, parameters)
+    elif parameters:
+        found = search_of_systems(*record, parameters)
+    else:
+        found = search(*record)
     fit = found.acting.fit
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
         raise FitError(NO_LAW)
@@ -252,7 +260,7 @@ def _with_finer_steps(
     """The fit with the steps between nodes that its noise asks for: local cubics may have seen more
     noise than there is."""
     fit, scales = acting.fit, samples.scales
-    bench = Workbench(gauge, acting.bench.inputs, scales.omega, samples.observation)
+    bench = dataclasses.replace(acting.bench, gauge=gauge)
     finer = scales.substeps_for(fit.sigma)
     if finer > scales.substeps:
         inputs = ArcInputs(nodes, finer, acting.hold, acting.delay)
@@ -306,11 +314,12 @@ def _map(record: Record, best: InUse, angles: tuple[int, ...]) -> SymplecticMap:
     x = np.concatenate([n.x for n in record.nodes])
     d = fit.form.dim
     q, v = x[:, :d] + fit.zeros, x[:, d:]
-    z = np.concatenate([q, law.momentum(q, v)], axis=1)
+    parameters = () if law.powers is None else parameters_of(record.recording)
+    z = np.concatenate([q, law.at(record.args).momentum(q, v)], axis=1)
     signals = Signals(names, record.hold, record.delay) if names else None
     inputs = np.concatenate([n.stretch.u[n.at] for n in record.nodes]) if names else None
     map_ = map_of_law(
         best.moving, z, record.scales.dt, angles=angles, signals=signals, inputs=inputs,
-        root=best.root,
+        parameters=parameters, args=record.args, root=best.root,
     )  # fmt: skip
     return dataclasses.replace(map_, sensors=best.calibration.law.sensors)

@@ -123,12 +123,7 @@ def search(
     simple = [k for k, start in enumerate(starts) if start.structure.terms in plain_terms]
     simple = [k for k in simple if misfit[k] <= options.plain_is_enough * misfit[best]]
     fit = starts[min(simple, key=lambda k: misfit[k]) if simple else best]
-    every = Structure(
-        d, libraries.without_forces(
-            (*libraries.first(d, angles), *libraries.more(d, angles)), shifted
-        ),
-        frictions_tried(d, scales, options), turned, num_inputs, sensors,
-    )  # fmt: skip
+    every = everything(scales, angles, num_inputs, observation, options)
     frictions = dataclasses.replace(every, terms=every.terms[:1])
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     for periods in options.periods[1:]:
@@ -142,6 +137,30 @@ def search(
             fit = grow(bench, nodes, fit, every, on_progress, options)
         nodes = with_states(nodes, fit.arcs, fit.fitted.x)
         on_progress(f"{periods:g} periods: {describe(fit)}")
+    return finished(bench, nodes, fit, every, scales, on_progress, options)
+
+
+def everything(
+    scales: Scales, angles: tuple[int, ...], num_inputs: int, observation: Observation,
+    options: SearchOptions,
+) -> Structure:  # fmt: skip
+    """All terms and frictions that a search may come to."""
+    d, shifted = observation.dim, observation.shifts()
+    rows = (*libraries.first(d, angles), *libraries.more(d, angles))
+    turned = tuple(i for i in angles if i in observation.direct and i not in shifted)
+    sensors = tuple(zip(observation.parameters, map(float, observation.values), strict=True))
+    return Structure(
+        d, libraries.without_forces(rows, shifted), frictions_tried(d, scales, options), turned,
+        num_inputs, sensors,
+    )  # fmt: skip
+
+
+def finished(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, every: Structure, scales: Scales,
+    on_progress: Callable, options: SearchOptions,
+) -> Found:  # fmt: skip
+    """The law that a fit to the longest arcs comes to: its friction chosen, terms dropped and
+    added."""
     fit, choice = choose_friction(bench, nodes, fit, every.friction, on_progress, options)
     terms = dataclasses.replace(every, friction=())
     before = fit.structure
@@ -154,6 +173,22 @@ def search(
     return Found(with_delay(bench, nodes, fit, scales.dt), choice, nodes)
 
 
+def arcs_by_length(
+    bench: Workbench, nodes: Sequence[Nodes], structure: Structure, known: Mapping[Key, float],
+    scales: Scales, options: SearchOptions,
+) -> tuple[LawFit, list[Nodes]]:  # fmt: skip
+    """A structure fitted to arcs of growing length, and the nodes with its states."""
+    fit, sigma, nodes = None, scales.sigma, list(nodes)
+    for periods in options.periods:
+        arcs = arcs_of(nodes, max(6, round(periods * scales.per_period)))
+        if fit is not None and arcs.t.shape == fit.arcs.t.shape:
+            break  # no run is longer
+        fit = bench.fit(structure, known, arcs, sigma)
+        known, sigma, nodes = fit.values, fit.sigma, with_states(nodes, arcs, fit.fitted.x)
+    assert fit is not None  # there is a length
+    return fit, nodes
+
+
 def describe(fit: LawFit) -> str:
     rms = " ".join(f"{r:.3g}" for r in fit.rms())
     return (
@@ -164,7 +199,8 @@ def describe(fit: LawFit) -> str:
 
 
 def _word(bench: Workbench, key: Key) -> str:
-    return word_of(key, bench.observation.coordinates, bench.observation.speeds)
+    names = () if bench.systems is None else bench.systems.names
+    return word_of(key, bench.observation.coordinates, bench.observation.speeds, names)
 
 
 def prune(
