@@ -326,6 +326,8 @@ def _forecast(arguments: argparse.Namespace) -> None:
     times = [f.times[-1] for f in found.values()]
     runs = "1 run" if len(found) == 1 else f"{len(found)} runs"
     print(f"{arguments.out}: forecasts of {runs}, up to t = {max(times):g} in the unit of the file")
+    for line in (line for one in found.values() for line in one.outside):
+        print(f"note: {line}")
     if judged is not None:
         for name, (rms, median, within) in judged.columns.items():
             print(f"{name}: RMS error {rms:.4g}, median of its size {median:.4g}, in its unit; "

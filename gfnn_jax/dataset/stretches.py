@@ -16,7 +16,7 @@ import numpy as np
 from gfnn_jax.data.channels import args_of, channels_of, parameters_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.signals.local_cubics import choose_half, smooth
+from gfnn_jax.signals.local_cubics import Smooth, choose_half, smooth
 
 GAP = 3.5  # median steps: a longer one ends a stretch
 PER_PERIOD = 40  # nodes
@@ -29,6 +29,7 @@ _SHORTEST = (
     9  # samples of a stretch, nodes of an arc: shorter ones tell less than their state needs
 )
 _SHORTEST_ARC = 5
+_SLOW = 0.1  # of the rms speed: less of it, in one of several systems, tells no frequency
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -165,7 +166,6 @@ def measure(found: Sequence[Stretch]) -> Scales:
     every = max(1, sum(len(s.t) for s in found) // 2_000)
     smooths = [smooth(s.t, s.q, half, np.arange(0, len(s.t), every))[0] for s in found]
     speed = np.sqrt(np.mean(np.concatenate([s.v for s in smooths]) ** 2, axis=0))
-    acceleration = np.sqrt(np.mean(np.concatenate([s.a for s in smooths]) ** 2, axis=0))
     if not np.all(speed > 0):
         still = ", ".join(str(i + 1) for i in np.flatnonzero(~(speed > 0)))
         raise InputError(
@@ -179,7 +179,19 @@ def measure(found: Sequence[Stretch]) -> Scales:
     size = np.sqrt(np.nanmean(steps**2, axis=0))
     sigma = np.maximum(sigma, 1e-9 * np.maximum(resolution, size))  # clean data have none
     spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
-    return Scales(sigma, speed, float(np.max(acceleration / speed)), dt, half, spread)
+    systems: dict[tuple[float, ...], list[Smooth]] = {}
+    for stretch, own in zip(found, smooths, strict=True):
+        systems.setdefault(tuple(stretch.args.tolist()), []).append(own)
+    omega = max(_frequency(own, _SLOW * speed) for own in systems.values())
+    return Scales(sigma, speed, omega, dt, half, spread)
+
+
+def _frequency(smooths: Sequence[Smooth], slow: np.ndarray) -> float:
+    """The largest ratio of the rms acceleration of a coordinate to its rms speed, or to that which
+    is ``slow`` (d,): below it noise moves."""
+    speed = np.sqrt(np.mean(np.concatenate([s.v for s in smooths]) ** 2, axis=0))
+    acceleration = np.sqrt(np.mean(np.concatenate([s.a for s in smooths]) ** 2, axis=0))
+    return float(np.max(acceleration / np.maximum(speed, slow)))
 
 
 def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:

@@ -19,6 +19,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.maps.estimates import Forecast
 from gfnn_jax.maps.saved import load, record
 from gfnn_jax.maps.sensors import Sensors
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.storage.outputs import atomic_write, ensure_new
 
 
@@ -53,11 +54,11 @@ def forecast_recording(
         raise InputError(f"{model}: was not learned from a recording: --initial needs states q, p")
     sensors = map_.sensors
     job = record(model).get("job", {})
-    recording, roles = _read(initial, sensors, job, columns or {})
-    bare = ("positions", "velocities", "sensors", "coordinates", "angles", "degrees")
+    recording, roles = _read(initial, map_, job, columns or {})
+    bare = ("positions", "velocities", "sensors", "coordinates", "angles", "degrees", "parameters")
     only_inputs = {**roles, **dict.fromkeys(bare)}
     ahead = None if inputs is None else read(inputs, **only_inputs)
-    measured = None if compare is None else _read(compare, sensors, job, columns or {})[0]
+    measured = None if compare is None else _read(compare, map_, job, columns or {})[0]
     if num_steps is None and measured is None:
         raise InputError("expected --num-steps, or --compare, whose times the forecast is for")
     if ahead is None and sensors.inputs and measured is not None:
@@ -85,18 +86,21 @@ def forecast_recording(
 
 
 def _read(
-    path: Path, sensors: Sensors, job: dict[str, Any], columns: dict[str, Any]
+    path: Path, map_: SymplecticMap, job: dict[str, Any], columns: dict[str, Any]
 ) -> tuple[Recording, dict[str, Any]]:
     """Read a recording with the columns that the law was learned from, but for velocities that it
     may lack, and return the keywords of `read` too."""
+    sensors = map_.sensors
+    assert sensors is not None
     observation = sensors.observation_model
-    roles = _roles(sensors, job, observation.channels) | columns
+    varied = {} if map_.parameters is None else {"parameters": map_.parameters.names}
+    roles = _roles(sensors, job, observation.channels) | varied | columns
     try:
         return read(path, **roles), roles
     except InputError:
         if observation.needed == observation.channels:
             raise
-    roles = _roles(sensors, job, observation.needed) | columns
+    roles = _roles(sensors, job, observation.needed) | varied | columns
     return read(path, **roles), roles
 
 
@@ -120,7 +124,7 @@ def _in_units(one: Forecast, factors: Mapping[str, float], second: float) -> For
         {name: array / factors.get(name, 1.0) for name, array in of.items()}
         for of in (one.values, one.std)
     )
-    return Forecast(one.times / second, values, std)
+    return Forecast(one.times / second, values, std, one.outside)
 
 
 def _last_samples(recording: Recording, run: str, count: int | None) -> Recording:

@@ -38,7 +38,8 @@ _FINE = 0.16  # radians of the fastest motion in a step
 
 class Forecast(NamedTuple):
     """Forecast of what sensors will show, and of coordinates that no column is named for: name ->
-    (runs, n), and their standard deviations."""
+    (runs, n), and their standard deviations. outside: lines about runs whose parameters lie beyond
+    those that the law was learned from."""
 
     times: np.ndarray
     values: dict[str, np.ndarray]
@@ -187,14 +188,16 @@ def _outside(
     """A line for each parameter of a run that lies beyond those that the law was learned from."""
     if parameters is None:
         return ()
-    low, high = (np.asarray(bound) for bound in parameters.bounds)
+    low, high = (np.asarray(end) for end in (parameters.low, parameters.high))
+    least, most = (np.asarray(bound) for bound in parameters.bounds)
     return tuple(
-        f"run {run}: {name} = {value:g} is outside {a:g} to {b:g}, which the law was learned from"
+        f"run {run}: {name} = {value:g} is outside {low[k]:g} to {high[k]:g}, which the law was "
+        "learned from"
         for run, window in zip(recording.runs, windows, strict=True)
-        for name, value, a, b in zip(
-            parameters.names, np.asarray(window.args), low, high, strict=True
+        for k, (name, value) in enumerate(
+            zip(parameters.names, np.asarray(window.args), strict=True)
         )
-        if not a <= value <= b
+        if not least[k] <= value <= most[k]
     )
 
 

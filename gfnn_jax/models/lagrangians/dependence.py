@@ -10,7 +10,8 @@ are compared without another look at the arcs. c(μ) is the inertia M₁₁: L �
 within a run, and what is told of the coefficients is their ratio to it. It is constant, or has one
 power more where the others are plainer by it, as where a mass is added to the body that M₁₁ is of.
 Gains of inputs do not depend on the parameters. Each coefficient counts as 16, the square of four
-standard errors; sets grow, shrink and change a function at a time.
+standard errors, and each power as 1, so that of functions that do as well the plainest is taken;
+sets grow, shrink and change a function at a time.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from gfnn_jax.models.parameters import keeps_away
 
 _LARGEST, _TOTAL = 2, 3  # powers of one parameter, and of all of them, as of laws of pairs
 _SIGNIFICANT = 4.0  # standard errors of a coefficient that is one more
+_BELOW = 0.5  # of a power, that a negative one counts more
 _STEPS = 8  # of Gauss and Newton
 _MOST = 30  # changes of a set
 
@@ -37,7 +39,7 @@ Sets = tuple[tuple[Function, ...], ...]  # the functions of each coefficient
 
 
 class Seen(NamedTuple):
-    """What the runs of one value args (k,) of the parameters tell: coefficients p (n,), and the
+    """Findings from the runs of one value args (k,) of the parameters: coefficients p (n,), and the
     triangle (n, n) of their information, residuals in units of their scatter."""
 
     args: np.ndarray
@@ -59,11 +61,16 @@ def functions_tried(args: np.ndarray) -> list[Function]:
     away from 0."""
     ranges = [range(-_LARGEST if keeps_away(a) else 0, _LARGEST + 1) for a in args.T]
     found = [powers for powers in product(*ranges) if sum(map(abs, powers)) <= _TOTAL]
-    return sorted(found, key=lambda powers: (sum(map(abs, powers)), powers))
+    return sorted(found, key=_size_of)
+
+
+def _size_of(function: Function) -> float:
+    """The size of the powers: that of the plainest function is 0."""
+    return sum(abs(n) + _BELOW * (n < 0) for n in function)
 
 
 def seen(fit: LawFit, args: np.ndarray) -> Seen:
-    """What a fit to the runs of one value tells."""
+    """Take them from a fit to the runs of one value."""
     return Seen(args, fit.p, fit.fitted.triangle / np.sqrt(fit.correlation))
 
 
@@ -135,11 +142,11 @@ class _Problem:
         p = np.stack([one.p for one in self.values])
         cost, best = np.inf, x
         for _ in range(_STEPS):
-            mean = by_inertia @ x
-            shares = np.where(scaled, 1 / mean[:, None], 1.0)
-            own = (turn @ x) * shares
-            off = np.einsum("vij,vj->vi", R, own[:, 1:] - p)
-            now = float(np.sum(off**2))
+            with np.errstate(all="ignore"):  # of no inertia in some run
+                shares = np.where(scaled, 1 / (by_inertia @ x)[:, None], 1.0)
+                own = (turn @ x) * shares
+                off = np.einsum("vij,vj->vi", R, own[:, 1:] - p)
+                now = float(np.sum(off**2))
             if not now < cost * (1 - 1e-6):
                 break
             cost, best = now, x
@@ -149,7 +156,8 @@ class _Problem:
             size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
             x = x.copy()
             x[open_] -= np.linalg.lstsq(J / size, off.ravel(), rcond=1e-10)[0] / size
-        return _Solved(sets, best, cost + _SIGNIFICANT**2 * len(open_))
+        rare = sum(_size_of(function) for functions in sets for function in functions)
+        return _Solved(sets, best, cost + _SIGNIFICANT**2 * len(open_) + rare)
 
     def _begun(self, home: np.ndarray, further: int) -> np.ndarray:
         """Coefficients to start from: the mean of the values."""

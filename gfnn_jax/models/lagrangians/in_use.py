@@ -96,13 +96,13 @@ class Record:
             row for row, term in zip(law.powers, law.terms.rows(), strict=False) if term[0][0] == 2
         ]
         if law.num_inputs:
-            return f"; gains are taken to be the same for all values of {names}"
+            return f"; gains of inputs are the same for all values of {names}"
         if any(map(any, inertia)):
             return (
-                f"; of what depends on {names}, ratios to the inertia alone are told, and the "
-                "plainest law with these is taken"
+                f"; a run tells ratios of coefficients alone, and of laws with the same ratios for "
+                f"every {names} this has the fewest terms"
             )
-        return f", for all values of {names}: ratios to it are what runs tell"
+        return f"; for every {names}, since a run tells ratios of coefficients alone"
 
     def sensors(self, bench: Workbench, fit: LawFit) -> Sensors:
         """The sensors, as yet without a misfit."""

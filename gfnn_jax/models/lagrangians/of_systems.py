@@ -18,6 +18,7 @@ from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of, with_states
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import UNIFORM
 from gfnn_jax.maps.observation import Observation
+from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.dependence import (
     dependence,
@@ -90,14 +91,21 @@ def search_of_systems(
     if not gains(alike, apart, options.gain):
         return search(*together)
     every = everything(scales, angles, num_inputs, observation, options)
-    none, friction = (0,) * len(parameters), fit.structure.friction
-    of_terms, of_friction = functions_in(fit.structure.terms, none), functions_in(friction, none)
-    directed = [row for row in every.friction if row[1] != UNIFORM]
-    every = dataclasses.replace(
-        every, terms=with_functions(every.terms, of_terms),
-        friction=(*with_functions(directed, of_friction), *every.friction[len(directed) :]),
-    )  # fmt: skip
+    every = _depending(every, fit.structure, (0,) * len(parameters))
     return finished(bench, followed, fit, every, scales, on_progress, options)
+
+
+def _depending(every: Structure, found: Structure, none: tuple[int, ...]) -> Structure:
+    """All terms and frictions, each with the functions of parameters that the law which was found
+    has. Friction of a sum of speeds is among them where one system showed it."""
+    shown = {row[:3] for row in found.friction}
+    sums = {libraries.opposite(row) for row in every.friction} - shown
+    directed = [row for row in every.friction if row[1] != UNIFORM and row not in sums]
+    uniform = [row for row in every.friction if row[1] == UNIFORM]
+    return dataclasses.replace(
+        every, terms=with_functions(every.terms, functions_in(found.terms, none)),
+        friction=(*with_functions(directed, functions_in(found.friction, none)), *uniform),
+    )  # fmt: skip
 
 
 def _of_one_value(nodes: Sequence[Nodes]) -> list[list[int]]:

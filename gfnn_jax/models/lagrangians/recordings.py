@@ -217,13 +217,10 @@ def _stretches(
 def _asked(terms: Sequence[Any], samples: _Samples, options: SearchOptions) -> Given | None:
     """The terms that were given, by the names of formulas."""
     observation = samples.observation
-    names = symbols((*observation.coordinates, *observation.speeds))
+    d, varied = observation.dim, parameters_of(samples.recording)
+    names = symbols((*observation.coordinates, *observation.speeds, *varied))
     width = options.dry_width * float(np.mean(samples.scales.speed))
-    return (
-        given_terms(terms, names[: observation.dim], names[observation.dim :], width)
-        if terms
-        else None
-    )
+    return given_terms(terms, names[:d], names[d : 2 * d], width, names[2 * d :]) if terms else None
 
 
 def _searched(

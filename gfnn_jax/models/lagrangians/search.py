@@ -20,7 +20,7 @@ from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
+from gfnn_jax.models.lagrangians.fit import LawFit, Workbench, a_third
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, which_friction
 from gfnn_jax.models.lagrangians.input_rules import Acting, choose_rule, with_delay
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
@@ -326,7 +326,7 @@ def choose_friction(
     as those of the fit, or as long as three of them can be. A choice holds close to its fit, so
     that it is made again until it stands."""
     whole, sigma = dataclasses.replace(fit.arcs, x=fit.fitted.x), fit.sigma
-    length = max(6, min(whole.t.shape[1], sum(len(n.t) for n in nodes) // FOLDS))
+    length = max(6, min(whole.t.shape[1], a_third(nodes, bench.systems)))
     arcs = arcs_of(with_states(nodes, whole, whole.x), length)
     if arcs.t.shape != whole.t.shape:
         fit = bench.fit(fit.structure, fit.values, arcs, sigma)
